@@ -1,0 +1,57 @@
+"""Every error that nurec_sim raises on purpose.
+
+::
+
+    NurecSimError
+    ├── ClipError        a driving log is missing something or contradicts itself
+    ├── ArchiveError     a scene archive cannot be read, or must not be
+    ├── ReconstructError a clip lacks what the reconstruction method needs
+    ├── RequestError     a render request is malformed                (gRPC INVALID_ARGUMENT)
+    │   ├── UnknownSceneError  no such scene                          (gRPC NOT_FOUND)
+    │   ├── OutOfRangeError    a time outside the scene               (gRPC OUT_OF_RANGE)
+    │   └── TooLargeError      more pixels or items than allowed      (gRPC RESOURCE_EXHAUSTED)
+    ├── PlanError        a policy answered something that cannot be driven
+    └── ScenarioError    a scenario file is wrong
+
+Texts say what was wrong, what was given and what is allowed.
+"""
+
+
+class NurecSimError(Exception):
+    """Base of all errors raised on purpose; catch it to tell them from bugs."""
+
+
+class ClipError(NurecSimError):
+    """A driving log is missing something or contradicts itself."""
+
+
+class ArchiveError(NurecSimError):
+    """A scene archive cannot be read, or must not be."""
+
+
+class ReconstructError(NurecSimError):
+    """A clip lacks what the reconstruction method needs."""
+
+
+class RequestError(NurecSimError):
+    """A render request is malformed."""
+
+
+class UnknownSceneError(RequestError):
+    """No scene of that name is served."""
+
+
+class OutOfRangeError(RequestError):
+    """A time outside of what the scene covers."""
+
+
+class TooLargeError(RequestError):
+    """A request for more pixels, beams or items than allowed."""
+
+
+class PlanError(NurecSimError):
+    """A policy answered something that cannot be driven."""
+
+
+class ScenarioError(NurecSimError):
+    """A scenario file is wrong."""
