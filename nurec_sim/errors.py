@@ -11,7 +11,8 @@
     │   ├── OutOfRangeError    a time outside the scene               (gRPC OUT_OF_RANGE)
     │   └── TooLargeError      more pixels or items than allowed      (gRPC RESOURCE_EXHAUSTED)
     ├── PlanError        a policy answered something that cannot be driven
-    └── ScenarioError    a scenario file is wrong
+    ├── ScenarioError    a scenario file is wrong
+    └── ServerError      a sensor server cannot be reached, or failed
 
 Texts say what was wrong, what was given and what is allowed.
 """
@@ -55,3 +56,7 @@ class PlanError(NurecSimError):
 
 class ScenarioError(NurecSimError):
     """A scenario file is wrong."""
+
+
+class ServerError(NurecSimError):
+    """A sensor server cannot be reached, or failed."""

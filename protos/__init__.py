@@ -1,0 +1,1 @@
+"""The text of the wire contract and its compiled descriptor set."""

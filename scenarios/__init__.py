@@ -1,0 +1,1 @@
+"""Scenario files and the demo clip; data only."""

@@ -1,1 +1,18 @@
+"""Driving logs: open, check, describe and write clip folders."""
 
+from nurec_sim.logs.check import check_clip
+from nurec_sim.logs.clip import Clip
+from nurec_sim.logs.describe import ClipSummary, describe_clip
+from nurec_sim.logs.reader import open_clip
+from nurec_sim.logs.write import CameraEntry, LidarEntry, write_clip
+
+__all__ = [
+    "CameraEntry",
+    "Clip",
+    "ClipSummary",
+    "LidarEntry",
+    "check_clip",
+    "describe_clip",
+    "open_clip",
+    "write_clip",
+]

@@ -1,1 +1,42 @@
+"""Camera and LiDAR models: point to pixel or beam, pixel to ray, and the instant at which each is measured."""
 
+from nurec_sim.sensors.camera import (
+    check_camera,
+    in_image,
+    pixel_rays,
+    project,
+    project_rolling,
+    scaled_camera,
+    shutter_fraction,
+    unproject,
+)
+from nurec_sim.sensors.ftheta_fit import fill_ftheta, fit_ftheta
+from nurec_sim.sensors.lidar import (
+    beam_coordinates,
+    beam_directions,
+    check_lidar,
+    column_fraction,
+    compensate_sweep,
+)
+from nurec_sim.sensors.lidar_tables import LIDAR_TABLES, LidarTable, lidar_model
+
+__all__ = [
+    "LIDAR_TABLES",
+    "LidarTable",
+    "beam_coordinates",
+    "beam_directions",
+    "check_camera",
+    "check_lidar",
+    "column_fraction",
+    "compensate_sweep",
+    "fill_ftheta",
+    "fit_ftheta",
+    "in_image",
+    "lidar_model",
+    "pixel_rays",
+    "project",
+    "project_rolling",
+    "scaled_camera",
+    "shutter_fraction",
+    "unproject",
+]

@@ -1,1 +1,52 @@
+"""A small MuJoCo street: a seeded plan, true sensors for any pose, and driving logs with exact boxes and maps.
 
+``street_plan(seed)`` decides everything as plain data, ``TrueWorld(plan)`` draws it, ``write_street_clip`` writes a log.
+Names are loaded on first use, so that importing this package does not load MuJoCo.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from nurec_sim.world.backend import BACKENDS, pick_backend
+    from nurec_sim.world.build import Street, build_street
+    from nurec_sim.world.layout import street_plan
+    from nurec_sim.world.plan import Actor, Building, Prop, Road, RoadPiece, StreetPlan
+    from nurec_sim.world.rig import LIDAR_ID, street_rig
+    from nurec_sim.world.road import RoadLine
+    from nurec_sim.world.sense import TrueScan, TrueView, TrueWorld
+    from nurec_sim.world.surface import LABEL_OF_CLASS, SurfaceClass
+    from nurec_sim.world.write import write_street_clip
+
+_MODULE_OF = {
+    "BACKENDS": "backend",
+    "pick_backend": "backend",
+    "Street": "build",
+    "build_street": "build",
+    "street_plan": "layout",
+    "Actor": "plan",
+    "Building": "plan",
+    "Prop": "plan",
+    "Road": "plan",
+    "RoadPiece": "plan",
+    "StreetPlan": "plan",
+    "LIDAR_ID": "rig",
+    "street_rig": "rig",
+    "RoadLine": "road",
+    "TrueScan": "sense",
+    "TrueView": "sense",
+    "TrueWorld": "sense",
+    "LABEL_OF_CLASS": "surface",
+    "SurfaceClass": "surface",
+    "write_street_clip": "write",
+}
+
+__all__ = sorted(_MODULE_OF)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

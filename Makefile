@@ -1,0 +1,35 @@
+# Two commands do everything, set-up included: `make demo` and `make test`.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+OUT ?= runs
+
+.PHONY: demo test check format bench clean
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(f"nurec_sim needs Python 3.11 or newer; $(PYTHON) is {sys.version.split()[0]}. Try: make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: $(VENV)/.installed ## log -> Gaussian scene -> gRPC server -> closed loop -> report
+	$(BIN)/nurec-sim demo --out $(OUT)
+
+test: $(VENV)/.installed ## all tests, at most ten minutes on two cores
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+check: $(VENV)/.installed ## format, lint, import arrows, types
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/lint-imports --no-cache
+	$(BIN)/mypy
+
+format: $(VENV)/.installed ## rewrite the code in house style
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: $(VENV)/.installed ## renderer timings, written to build/bench.json
+	$(BIN)/python benchmarks/render.py
+
+clean: ## forget the virtual environment and everything built
+	rm -rf $(VENV) build dist *.egg-info

@@ -1,0 +1,390 @@
+"""The command line: one function per verb; heavy modules are imported by the verb that needs them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from nurec_sim.errors import NurecSimError
+
+app = tyro.extras.SubcommandApp()
+out = Console()
+err = Console(stderr=True)
+
+Paths = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH...")]
+OnePath = Annotated[Path, tyro.conf.Positional]
+Report = Callable[[str, float], None]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one verb; errors of ours become one line and exit status 1, Ctrl-C becomes 130."""
+    try:
+        app.cli(
+            prog="nurec-sim",
+            description="An open closed-loop sensor simulator for driving. A log becomes a Gaussian world, a gRPC server "
+            "renders it, policies drive through it, a report says which is better. Start with: nurec-sim demo",
+            args=None if arguments is None else list(arguments),
+        )
+    except NurecSimError as error:
+        err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False)
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        err.print("interrupted; what was finished is kept, the same command goes on from there", markup=False)
+        raise SystemExit(130) from None
+
+
+@app.command
+def inspect(clip: OnePath) -> None:
+    """Show what a driving log holds, and check it.
+
+    Prints a table of sensors, rates, spans and boxes, then every fault as one line. Exit status 1 if there are faults.
+
+    Args:
+        clip: a clip folder, or a .zip of one (docs/clip_format.md).
+    """
+    from nurec_sim import logs
+
+    log = logs.open_clip(clip)
+    print_table(f"clip {log.id}", logs.describe_clip(log))
+    with progress("checking") as report:
+        faults = logs.check_clip(log, progress=report)
+    for fault in faults:
+        out.print(f"fault: {fault}", style="red", markup=False, highlight=False, soft_wrap=True)
+    if faults:
+        raise SystemExit(1)
+    out.print("no faults")
+
+
+@app.command
+def world(out_path: Annotated[Path, tyro.conf.arg(name="out")], *, seed: int = 7, truth: Path | None = None) -> None:
+    """Draw a small MuJoCo street and write it as a driving log.
+
+    Args:
+        out_path: the clip to write: a folder, or a .zip.
+        seed: same seed, same street, same bytes.
+        truth: also write exact depth and labels into this folder, apart from the log.
+    """
+    from nurec_sim.world import StreetPlan, write_street_clip
+
+    with progress("drawing the street") as report:
+        path = write_street_clip(StreetPlan(seed=seed), out_path, truth=truth, progress=report)
+    out.print(f"wrote {path}", soft_wrap=True)
+
+
+@app.command
+def reconstruct(
+    clip: OnePath,
+    *,
+    out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+    method: Literal["lift"] = "lift",
+    cameras: tuple[str, ...] = (),
+    overwrite: bool = False,
+) -> None:
+    """Turn a driving log into a Gaussian scene archive (.usdz).
+
+    Args:
+        clip: a clip folder, or a .zip of one.
+        out_path: the archive to write; CLIP's name with .usdz in the current folder if not given.
+        method: how to reconstruct; lift colours LiDAR points, no learning.
+        cameras: use only these cameras; all if not given.
+        overwrite: replace an archive that is there.
+    """
+    from nurec_sim import logs, scene
+    from nurec_sim.reconstruct import reconstruct as run_method
+
+    log = logs.open_clip(clip)
+    target = out_path or Path(f"{log.id}.usdz")
+    if target.exists() and not overwrite:
+        raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
+    with progress("reconstructing") as report:
+        world_scene = run_method(log, method, cameras=cameras or None, progress=report)
+    scene.write_scene(world_scene, target, overwrite=overwrite)
+    print_table(f"scene {world_scene.id}", scene.summary(world_scene))
+    for text in world_scene.provenance.get("unknown", ()):
+        out.print(f"not known: {text}", markup=False)
+    out.print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+
+
+@app.command
+def render(
+    source: OnePath,
+    *,
+    out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("frame.png"),
+    camera: str | None = None,
+    frame: int = 0,
+    left_m: float = 0.0,
+    yaw_deg: float = 0.0,
+    layer: Literal["rgb", "depth", "alpha", "label"] = "rgb",
+    width: int | None = None,
+) -> None:
+    """Render one camera image of a scene to a PNG, from where it was recorded or beside it.
+
+    Args:
+        source: a scene archive or a clip.
+        out_path: the PNG to write.
+        camera: camera id; the first if not given.
+        frame: which recorded frame's time and pose to take.
+        left_m: move the car to the left by so many metres.
+        yaw_deg: turn the car to the left by so many degrees.
+        layer: what to draw.
+        width: image width in pixels; the camera's own if not given.
+    """
+    from nurec_sim.render.still import render_still
+
+    scene_ = load_scene(source)
+    render_still(scene_, out_path, camera, frame, left_m=left_m, yaw_deg=yaw_deg, layer=layer, width_px=width)
+    out.print(f"wrote {out_path}", soft_wrap=True)
+
+
+@app.command
+def serve(
+    sources: Paths,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    threads: int | None = None,
+    cache: Path = Path.home() / ".cache" / "nurec_sim",
+) -> None:
+    """Serve scenes over gRPC, for AlpaSim, CARLA and NuRec clients. Ctrl-C stops.
+
+    Prints `Serving on <host>:<port>` when ready. Clips are reconstructed on first use and kept in the cache.
+
+    Args:
+        sources: scene archives, clips, or folders of them.
+        host: address to listen on; only this machine unless said otherwise.
+        port: 0 takes a free one.
+        threads: render threads; the number of cores if not given.
+        cache: where reconstructed clips are kept.
+    """
+    from nurec_sim.scene_store import SceneStore
+    from nurec_sim.server import serve as run_server
+
+    run_server(SceneStore(sources, cache_dir=cache, render_threads=threads), host=host, port=port)
+
+
+@app.command
+def run(
+    sources: Paths,
+    *,
+    scenario: str = "short",
+    policies: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (),
+    out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs"),
+    resume: Path | None = None,
+    address: str | None = None,
+    cache: Path = Path.home() / ".cache" / "nurec_sim",
+    video: bool = True,
+) -> None:
+    """Drive policies closed-loop through scenes, measure, and write a report.
+
+    Starts a server of its own unless --address names one. The run folder holds report.html, metrics.parquet,
+    metrics.csv and one folder per rollout; runs/latest points to the newest.
+
+    Args:
+        sources: scene archives or clips.
+        scenario: a shipped scenario's name, or a YAML file.
+        policies: names, files as my_policy.py:Class, or entry points; the scenario's own if not given.
+        seeds: one rollout each per scene and policy; the scenario's own if not given.
+        out_path: folder that collects run folders.
+        resume: go on with this run folder; finished rollouts are kept.
+        address: host:port of a running server that serves the same scenes.
+        cache: where reconstructed clips are kept.
+        video: also record the front camera of every rollout.
+    """
+    drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video)
+
+
+@app.command
+def demo(
+    *,
+    out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs"),
+    cache: Path = Path.home() / ".cache" / "nurec_sim",
+) -> None:
+    """Run the whole chain on the log that ships with the package: about five minutes on two cores.
+
+    Args:
+        out_path: folder that collects run folders.
+        cache: where the reconstructed scene is kept.
+    """
+    clip = resources.files("nurec_sim.scenarios") / "demo_clip.zip"
+    with resources.as_file(clip) as path:
+        drive((path,), "demo", (), (), out_path, None, None, cache, True)
+
+
+@app.command
+def evaluate(
+    clip: OnePath,
+    *,
+    method: Literal["lift"] = "lift",
+    input_cameras: tuple[str, ...] = (),
+    target_cameras: tuple[str, ...] = (),
+    hold_out_sweeps: int = 0,
+    local: bool = False,
+    images: Path | None = None,
+    json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
+) -> None:
+    """Measure a reconstruction against what the log recorded: images of other cameras, LiDAR sweeps left out.
+
+    Args:
+        clip: a clip folder, or a .zip of one.
+        method: how to reconstruct.
+        input_cameras: cameras that the reconstruction may see; all if not given.
+        target_cameras: cameras to compare with; the input cameras if not given.
+        hold_out_sweeps: leave out every so-manieth sweep and simulate it; 0 leaves out none.
+        local: render in this process instead of through gRPC.
+        images: also write rendered and recorded images side by side into this folder.
+        json_path: write all figures here.
+    """
+    from nurec_sim import logs
+    from nurec_sim.evaluate import evaluate as run_evaluation
+
+    log = logs.open_clip(clip)
+    with progress("evaluating") as report:
+        figures = run_evaluation(
+            log,
+            method,
+            input_cameras=input_cameras or None,
+            target_cameras=target_cameras or None,
+            hold_out_every=hold_out_sweeps,
+            via_grpc=not local,
+            images_dir=images,
+            progress=report,
+        )
+    if json_path is not None:
+        json_path.write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
+    print_table(f"{method} on {log.id}", flatten(figures))
+
+
+@app.command
+def report(run_folder: OnePath) -> None:
+    """Write report.html of a run folder anew.
+
+    Args:
+        run_folder: a folder made by `nurec-sim run`.
+    """
+    from nurec_sim import runs
+
+    out.print(f"wrote {runs.write_report(run_folder)}", soft_wrap=True)
+
+
+@app.command
+def policies(check: Annotated[str | None, tyro.conf.Positional] = None) -> None:
+    """List the policies that can be driven, or check that one keeps the contract.
+
+    Args:
+        check: a policy's name, or my_policy.py:Class.
+    """
+    from nurec_sim import plugins
+
+    if check is None:
+        print_table("policies", [(name, plugins.describe_policy(name)) for name in plugins.available_policies()])
+        return
+    from nurec_sim.sim.conformance import check_policy
+
+    faults = check_policy(plugins.load_policy(check))
+    for fault in faults:
+        out.print(f"fault: {fault}", style="red", markup=False, highlight=False, soft_wrap=True)
+    if faults:
+        raise SystemExit(1)
+    out.print(f"{check} keeps the contract")
+
+
+def drive(
+    sources: Sequence[Path],
+    scenario_name: str,
+    policy_names: Sequence[str],
+    seeds: Sequence[int],
+    out_dir: Path,
+    resume: Path | None,
+    address: str | None,
+    cache: Path,
+    video: bool,
+) -> None:
+    """Scenes, server, rollouts, report: what `run` and `demo` share."""
+    from nurec_sim import runs, sim
+    from nurec_sim.client import RemoteSensors
+    from nurec_sim.scene_store import SceneStore
+    from nurec_sim.server import SensorServer
+
+    started = time.monotonic()
+    scenario = sim.load_scenario(scenario_name)
+    store = SceneStore(sources, cache_dir=cache)
+    with progress("reconstructing") as advance:
+        scenes = [store.load(scene_id, progress=advance) for scene_id in store.scene_ids()]
+    with contextlib.ExitStack() as stack:
+        if address is None:
+            address = stack.enter_context(SensorServer(store)).address
+        out.print(f"sensors from {address}; {len(scenes)} scene(s), scenario {scenario.name}")
+        with progress("driving") as advance:
+            folder = runs.execute(
+                scenes,
+                scenario,
+                policy_names or scenario.policies,
+                lambda scene_id: stack.enter_context(RemoteSensors(address, scene_id)).sense,
+                out_dir,
+                seeds=seeds or scenario.seeds,
+                resume=resume,
+                video=video,
+                progress=advance,
+            )
+    print_table("policies", runs.headline(folder))
+    out.print(f"{time.monotonic() - started:.0f} s. Report: {(folder / 'report.html').resolve()}", soft_wrap=True)
+
+
+def load_scene(source: Path):  # noqa: ANN201  (the return type would import the heavy modules)
+    """A scene from an archive, or from a clip that is reconstructed now."""
+    from nurec_sim.scene_store import SceneStore
+
+    store = SceneStore([source])
+    with progress("loading") as advance:
+        return store.load(store.scene_ids()[0], progress=advance)
+
+
+@contextlib.contextmanager
+def progress(title: str) -> Iterator[Report]:
+    """A progress bar on stderr, fed with (what is being done, fraction 0..1)."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f}%"), TimeElapsedColumn())
+    with Progress(*columns, console=err, transient=True) as bar:
+        task = bar.add_task(title, total=1.0)
+
+        def advance(stage: str, fraction: float) -> None:
+            bar.update(task, description=f"{title}: {stage}" if stage else title, completed=fraction)
+
+        yield advance
+
+
+def print_table(title: str, rows: Sequence[Sequence[object]]) -> None:
+    """Rows as a table; the first row holds the headings where its cells are all text and rows have over two columns."""
+    table = Table(title=title, title_justify="left", show_header=bool(rows) and len(rows[0]) > 2)
+    heading, body = (rows[0], rows[1:]) if table.show_header else (("", ""), rows)
+    for cell in heading:
+        table.add_column(str(cell))
+    for row in body:
+        table.add_row(*(str(cell) for cell in row))
+    out.print(table)
+
+
+def flatten(figures: dict, prefix: str = "") -> list[tuple[str, str]]:
+    """Nested figures as dotted rows; lists stay in the JSON file."""
+    rows: list[tuple[str, str]] = []
+    for key, value in figures.items():
+        if isinstance(value, dict):
+            rows += flatten(value, f"{prefix}{key}.")
+        elif not isinstance(value, list):
+            rows.append((prefix + key, f"{value:.4g}" if isinstance(value, float) else str(value)))
+    return rows
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

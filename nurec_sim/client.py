@@ -1,0 +1,198 @@
+"""Sensors on the far side of a wire: the same ``sense`` as a renderer in this process, bit for bit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import grpc
+
+from nurec_sim import wire
+from nurec_sim.errors import ServerError
+from nurec_sim.types import CameraModel, LidarModel, SensorFrame, SensorRequest, Track, Trajectory
+from nurec_sim.wire import common, sensorsim
+
+MAX_MESSAGE_BYTES = 64 << 20
+MAX_BATCH_ITEMS = 64
+_BATCH_REPLY_BYTES = 60 << 20
+_RETRY = {"maxAttempts": 5, "initialBackoff": "0.2s", "maxBackoff": "2s", "backoffMultiplier": 2.0}
+
+
+class RemoteSensors:
+    """One scene of a sensor server.
+
+    Calls wait for a server that is starting, and are repeated when it goes away in between; both end at ``timeout_s``.
+    Every method raises the errors of ``nurec_sim.errors`` that the server raised, and ``ServerError`` when it cannot be
+    reached in time or failed. Use it as a context manager, or call ``close``. Safe to use from many threads.
+
+    Args:
+        address: ``host:port``.
+        scene_id: id or alias of the scene; the ids inside requests are not looked at.
+        timeout_s: for one call; a server may first have to reconstruct the scene.
+        apply_isp: whether images get the camera's colour correction.
+    """
+
+    def __init__(self, address: str, scene_id: str = "", *, timeout_s: float = 300.0, apply_isp: bool = True) -> None:
+        self.address, self.scene_id = address, scene_id
+        self._timeout_s, self._apply_isp = timeout_s, apply_isp
+        config = {"methodConfig": [{"name": [{}], "retryPolicy": _RETRY | {"retryableStatusCodes": ["UNAVAILABLE"]}}]}
+        self._channel = grpc.insecure_channel(
+            address,
+            options=[
+                ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+                ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+                ("grpc.max_reconnect_backoff_ms", 1000),
+                ("grpc.service_config", json.dumps(config)),
+            ],
+        )
+        self._procedures = {
+            name: self._channel.unary_unary(
+                f"/{wire.SERVICE}/{name}",
+                request_serializer=method.request.SerializeToString,
+                response_deserializer=method.reply.FromString,
+            )
+            for name, method in wire.METHODS.items()
+        }
+
+    def close(self) -> None:
+        """Ends the connection."""
+        self._channel.close()
+
+    def __enter__(self) -> RemoteSensors:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # ------------------------------------------------------------------------------------------------------- rendering
+
+    def sense(self, requests: Sequence[SensorRequest]) -> list[SensorFrame]:
+        """Renders requests, one frame each, in order; ``types.Sense``.
+
+        Cameras travel together, LiDARs beside them. Camera frames hold ``rgb`` only.
+
+        Raises:
+            RequestError: a request is malformed or beyond the server's scene or limits.
+            ServerError: the server cannot be reached in time, or failed.
+        """
+        calls = []
+        for indices in _batches(requests):
+            batch = sensorsim.BatchRGBRenderRequest()
+            for i in indices:
+                item = batch.items.add(camera_name=requests[i].sensor.id)
+                wire.write_camera_request(requests[i], item.request, scene_id=self.scene_id, apply_isp=self._apply_isp)
+            calls.append((indices, self._begin("batch_render_rgb", batch)))
+        for i, request in enumerate(requests):
+            if isinstance(request.sensor, LidarModel):
+                message = sensorsim.LidarRenderRequest()
+                wire.write_lidar_request(request, message, scene_id=self.scene_id)
+                calls.append(([i], self._begin("render_lidar", message)))
+        frames: dict[int, SensorFrame] = {}
+        try:
+            for indices, call in calls:
+                reply = _outcome(call)
+                if isinstance(reply, sensorsim.LidarRenderReturn):
+                    frames[indices[0]] = wire.read_lidar_frame(reply, requests[indices[0]])
+                else:
+                    frames |= _read_batch(reply, requests, indices)
+        finally:
+            for _, call in calls:
+                call.cancel()  # without effect on those that are done
+        return [frames[i] for i in range(len(requests))]
+
+    # ------------------------------------------------------------------------------------------------------- discovery
+
+    def scenes(self) -> list[str]:
+        """Ids of all scenes of the server."""
+        return list(self._call("get_available_scenes", common.Empty()).scene_ids)
+
+    def cameras(self) -> dict[str, CameraModel]:
+        """Cameras of the scene by id, at their native size."""
+        reply = self._call("get_available_cameras", sensorsim.AvailableCamerasRequest(scene_id=self.scene_id))
+        result = {}
+        for entry in reply.available_cameras:
+            mounting = wire.read_mounting(entry.rig_to_camera, f"rig_to_camera of {entry.logical_id!r}")
+            camera = wire.read_camera(entry.intrinsics, 0, 0, {})
+            result[entry.logical_id] = replace(camera, id=entry.logical_id, rig_from_camera=mounting)
+        return result
+
+    def lidars(self) -> dict[str, LidarModel]:
+        """LiDARs of the scene by id; only servers of ours tell."""
+        reply = self._call("get_available_lidars", sensorsim.AvailableLidarsRequest(scene_id=self.scene_id))
+        result = {}
+        for entry in reply.available_lidars:
+            mounting = wire.read_mounting(entry.rig_from_lidar, f"rig_from_lidar of {entry.logical_id!r}")
+            lidar = wire.read_lidar(entry.lidar_config)
+            result[entry.logical_id] = replace(lidar, id=entry.logical_id, rig_from_lidar=mounting)
+        return result
+
+    def trajectory(self) -> Trajectory:
+        """Recorded path of the rig in the world."""
+        request = sensorsim.AvailableTrajectoriesRequest(scene_id=self.scene_id)
+        found = self._call("get_available_trajectories", request).available_trajectories
+        if not found:
+            raise ServerError(f"{self.address}: scene {self.scene_id!r} has no trajectory")
+        return wire.read_trajectory(found[0].trajectory, "available_trajectories[0]")
+
+    def tracks(self) -> list[Track]:
+        """Tracks of the scene."""
+        reply = self._call("get_dynamic_objects", sensorsim.DynamicObjectsRequest(scene_id=self.scene_id))
+        return [wire.read_track(track) for track in reply.dynamic_objects]
+
+    def server_config(self) -> Mapping[str, str]:
+        """Options of the server as text."""
+        return dict(self._call("get_server_config", common.Empty()).config)
+
+    def version(self) -> str:
+        """Version of the server's software."""
+        return self._call("get_version", common.Empty()).version_id
+
+    # ----------------------------------------------------------------------------------------------------------- calls
+
+    def _begin(self, name: str, request) -> grpc.Future:
+        return self._procedures[name].future(request, timeout=self._timeout_s, wait_for_ready=True)
+
+    def _call(self, name: str, request):
+        return _outcome(self._begin(name, request))
+
+
+def _outcome(call: grpc.Future):
+    try:
+        return call.result()
+    except grpc.RpcError as error:
+        raise wire.error_of(error.code(), error.details() or "no reason given") from error
+
+
+def _batches(requests: Sequence[SensorRequest]) -> Iterator[list[int]]:
+    """Indices of the camera requests, in groups whose replies fit one message and name each camera once."""
+    group: list[int] = []
+    names: set[str] = set()
+    size = 0
+    for i, request in enumerate(requests):
+        if not isinstance(request.sensor, CameraModel):
+            continue
+        image_bytes = 3 * request.sensor.width_px * request.sensor.height_px
+        full = size + image_bytes > _BATCH_REPLY_BYTES or len(group) == MAX_BATCH_ITEMS
+        if group and (full or request.sensor.id in names):
+            yield group
+            group, names, size = [], set(), 0
+        group.append(i)
+        names.add(request.sensor.id)
+        size += image_bytes
+    if group:
+        yield group
+
+
+def _read_batch(reply, requests: Sequence[SensorRequest], indices: list[int]) -> dict[int, SensorFrame]:
+    """Frames of a batch by index of the request; replies may come in any order."""
+    items = {item.camera_name: item for item in reply.items}
+    frames: dict[int, SensorFrame] = {}
+    for i in indices:
+        item = items.get(requests[i].sensor.id)
+        if item is None:
+            raise ServerError(f"the server's reply lacks camera {requests[i].sensor.id!r}; has {sorted(items)}")
+        if not item.success:
+            raise wire.error_of(item.error_code, f"camera {requests[i].sensor.id!r}: {item.error_message}")
+        frames[i] = wire.read_camera_frame(item.result, requests[i])
+    return frames

@@ -1,0 +1,304 @@
+"""Rigs, tracks and maps as JSON and back, field for field as in ``types``.
+
+Poses are written ``T_a_b`` in files: a 4x4 that takes coordinates of b to a.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from typing import Any
+
+import numpy as np
+
+from nurec_sim import geometry, sensors
+from nurec_sim.errors import ClipError
+from nurec_sim.logs import fields
+from nurec_sim.types import (
+    Box,
+    CameraModel,
+    Fisheye,
+    FTheta,
+    FThetaReference,
+    LidarModel,
+    Pinhole,
+    Rig,
+    RoadMap,
+    Shutter,
+    Spin,
+    Track,
+    Trajectory,
+    Windshield,
+    WindshieldReference,
+)
+
+CALIBRATION_FILE = "calib.json"
+LENS_KINDS: dict[str, type[Pinhole] | type[Fisheye] | type[FTheta]] = {
+    "pinhole": Pinhole,
+    "fisheye": Fisheye,
+    "ftheta": FTheta,
+}
+
+
+def rig_to_json(rig: Rig, intensity_scale: int) -> dict[str, Any]:
+    """calib.json of a rig."""
+    return {
+        "ego_frame": "x forward, y left, z up, origin at the rear axle on the ground",
+        "ground_z_in_ego_m": 0.0,
+        "body": _plain(rig.body),
+        "cameras": {name: _camera_to_json(camera) for name, camera in rig.cameras.items()},
+        "lidars": {
+            name: {**_lidar_to_json(lidar), "intensity_scale": intensity_scale} for name, lidar in rig.lidars.items()
+        },
+    }
+
+
+def _camera_to_json(camera: CameraModel) -> dict[str, Any]:
+    kind = next(name for name, lens in LENS_KINDS.items() if isinstance(camera.lens, lens))
+    row = {
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "lens": {"model": kind, **_plain(camera.lens)},
+        "shutter": camera.shutter.value,
+        "T_ego_cam": np.asarray(camera.rig_from_camera, np.float64).tolist(),
+    }
+    if camera.windshield is not None:
+        row["windshield"] = _plain(camera.windshield)
+    return row
+
+
+def _lidar_to_json(lidar: LidarModel) -> dict[str, Any]:
+    row = _plain(lidar)
+    row["T_ego_lidar"] = row.pop("rig_from_lidar")
+    del row["id"]
+    return row
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses, enums, tuples and arrays as what JSON knows."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def rig_from_json(calib: dict[str, Any]) -> tuple[Rig, dict[str, float]]:
+    """A rig on the ground from calib.json, and the intensity scale of each LiDAR.
+
+    Raises:
+        ClipError: a field is missing or wrong.
+    """
+    rig_from_ego = ground_shift(calib)
+    body = Rig({}, {}).body
+    if "body" in calib:
+        where = f"{CALIBRATION_FILE}: body"
+        center, size = (fields.array(where, calib["body"], key, (3,)) for key in ("center_m", "size_m"))
+        body = Box((center[0], center[1], center[2]), (size[0], size[1], size[2]))
+    cameras = {
+        name: camera_from_json(name, row, rig_from_ego)
+        for name, row in fields.of_kind(CALIBRATION_FILE, calib, "cameras", dict).items()
+    }
+    lidars, scales = {}, {}
+    for name, row in fields.of_kind(CALIBRATION_FILE, calib, "lidars", dict).items():
+        lidars[name] = lidar_from_json(name, row, rig_from_ego)
+        scales[name] = positive_scale(f"{CALIBRATION_FILE}: LiDAR {name!r}", row)
+    return Rig(cameras, lidars, body), scales
+
+
+def ground_shift(calib: dict[str, Any]) -> np.ndarray:
+    """rig_from_ego: the rig frame lies on the ground, straight below the origin of the log's ego frame."""
+    height = fields.number(CALIBRATION_FILE, calib, "ground_z_in_ego_m", default=0.0)
+    return geometry.pose(np.eye(3), np.array([0.0, 0.0, -height]))
+
+
+def positive_scale(where: str, row: dict[str, Any]) -> float:
+    """The number by which stored intensities are divided."""
+    scale = fields.number(where, row, "intensity_scale", default=255.0)
+    if scale <= 0:
+        raise ClipError(f"{where}: intensity_scale must be positive, got {scale}")
+    return scale
+
+
+def camera_from_json(name: str, row: Any, rig_from_ego: np.ndarray) -> CameraModel:
+    """One camera of calib.json.
+
+    Raises:
+        ClipError: a field is missing or wrong.
+    """
+    where = f"{CALIBRATION_FILE}: camera {name!r}"
+    lens_row = fields.of_kind(where, row, "lens", dict)
+    kind = fields.of_kind(f"{where}: lens", lens_row, "model", str)
+    if kind not in LENS_KINDS:
+        raise ClipError(f"{where}: unknown lens model {kind!r}; known are {list(LENS_KINDS)}")
+    glass = None
+    if row.get("windshield") is not None:
+        glass = _from_plain(f"{where}: windshield", Windshield, row["windshield"])
+    camera = CameraModel(
+        id=name,
+        width_px=fields.integer(where, row, "width"),
+        height_px=fields.integer(where, row, "height"),
+        lens=_from_plain(f"{where}: lens", LENS_KINDS[kind], {k: v for k, v in lens_row.items() if k != "model"}),
+        rig_from_camera=rig_from_ego @ fields.transform(where, row, "T_ego_cam"),
+        shutter=_member(where, Shutter, row.get("shutter", Shutter.GLOBAL.value)),
+        windshield=glass,
+    )
+    return checked_camera(camera)
+
+
+def checked_camera(camera: CameraModel) -> CameraModel:
+    """The camera, if it can be used.
+
+    Raises:
+        ClipError: it cannot.
+    """
+    try:
+        sensors.check_camera(camera)
+    except ValueError as error:
+        raise ClipError(f"{CALIBRATION_FILE}: {error}") from error
+    return camera
+
+
+_ENUMS: dict[str, type[enum.Enum]] = {"FThetaReference": FThetaReference, "WindshieldReference": WindshieldReference}
+
+
+def _from_plain(where: str, cls: type, row: Any) -> Any:
+    """A flat dataclass of numbers, tuples of numbers and enums from JSON; unknown keys are errors."""
+    known = {field.name: field for field in dataclasses.fields(cls)}
+    if not isinstance(row, dict):
+        raise ClipError(f"{where}: must be a JSON object, got {type(row).__name__}")
+    if unknown := sorted(set(row) - set(known)):
+        raise ClipError(f"{where}: unknown field {unknown[0]!r}; known are {list(known)}")
+    values: dict[str, Any] = {}
+    for name, field in known.items():
+        if name not in row and field.default is not dataclasses.MISSING:
+            continue
+        if field.type in _ENUMS:
+            values[name] = _member(where, _ENUMS[str(field.type)], fields.required(where, row, name))
+        elif str(field.type).startswith("tuple"):
+            values[name] = tuple(fields.array(where, row, name, (None,)).tolist())
+        else:
+            values[name] = fields.number(where, row, name)
+    return cls(**values)
+
+
+def _member(where: str, kind: type[enum.Enum], value: Any) -> Any:
+    allowed = [member.value for member in kind]
+    if value not in allowed:
+        raise ClipError(f"{where}: {kind.__name__.lower()} {value!r} is unknown; known are {allowed}")
+    return kind(value)
+
+
+def lidar_from_json(name: str, row: Any, rig_from_ego: np.ndarray) -> LidarModel:
+    """One LiDAR of calib.json: angles of its own, or the name of a ``table`` (and ``columns``).
+
+    Raises:
+        ClipError: a field is missing or wrong, or the table is unknown.
+    """
+    where = f"{CALIBRATION_FILE}: LiDAR {name!r}"
+    pose = rig_from_ego @ fields.transform(where, row, "T_ego_lidar")
+    try:
+        if "table" in row:
+            columns = fields.integer(where, row, "columns") if "columns" in row else None
+            return sensors.lidar_model(row["table"], pose, id=name, columns=columns)
+        near_far = fields.array(where, row, "range_m", (2,)) if "range_m" in row else (0.5, 200.0)
+        lidar = LidarModel(
+            id=name,
+            elevation_rad=fields.array(where, row, "elevation_rad", (None,)),
+            azimuth_rad=fields.array(where, row, "azimuth_rad", (None,)),
+            row_azimuth_offset_rad=fields.array(where, row, "row_azimuth_offset_rad", (None,)),
+            rig_from_lidar=pose,
+            spin=_member(where, Spin, row.get("spin", Spin.CLOCKWISE.value)),
+            frequency_hz=fields.number(where, row, "frequency_hz", default=10.0),
+            range_m=(float(near_far[0]), float(near_far[1])),
+        )
+        sensors.check_lidar(lidar)
+    except ValueError as error:
+        raise ClipError(f"{CALIBRATION_FILE}: {error}") from error
+    return lidar
+
+
+def track_to_json(track: Track) -> dict[str, Any]:
+    """One entry of tracks.json."""
+    return {
+        "id": track.id,
+        "label": track.label,
+        "size_lwh": [float(value) for value in track.size_m],
+        "controllable": track.controllable,
+        "t_us": track.path.t_us.tolist(),
+        "T_world_box": track.path.world_from_body.tolist(),
+    }
+
+
+def trajectory_from_json(where: str, row: Any, pose_key: str) -> Trajectory:
+    """Times ``t_us`` and poses as a trajectory.
+
+    Raises:
+        ClipError: a field is missing or wrong, or the times do not increase.
+    """
+    times = fields.of_kind(where, row, "t_us", list)
+    if not times or not all(isinstance(t, int) and not isinstance(t, bool) for t in times):
+        raise ClipError(f"{where}: 't_us' must be a list of whole microseconds with at least one entry")
+    poses = fields.array(where, row, pose_key, (len(times), 4, 4))
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        raise ClipError(f"{where}: t_us goes back or stands still at pose {back[0] + 1} ({times[back[0] + 1]} us)")
+    return Trajectory(np.array(times, np.int64), poses)
+
+
+def track_from_json(index: int, row: Any) -> Track:
+    """One entry of tracks.json.
+
+    Raises:
+        ClipError: a field is missing or wrong.
+    """
+    where = f"tracks.json: track {index}"
+    size = fields.array(where, row, "size_lwh", (3,))
+    if (size <= 0).any():
+        raise ClipError(f"{where}: size_lwh must be positive, got {size.tolist()}")
+    return Track(
+        id=fields.of_kind(where, row, "id", str),
+        label=fields.of_kind(where, row, "label", str),
+        size_m=(float(size[0]), float(size[1]), float(size[2])),
+        path=trajectory_from_json(where, row, "T_world_box"),
+        controllable=fields.of_kind(where, row, "controllable", bool, default=True),
+    )
+
+
+def map_to_json(road_map: RoadMap) -> dict[str, Any]:
+    """map.json."""
+    return {
+        "drivable": [
+            {"outer": area[0].tolist(), "holes": [hole.tolist() for hole in area[1:]]} for area in road_map.drivable
+        ],
+        "lanes": [lane.tolist() for lane in road_map.lanes],
+    }
+
+
+def map_from_json(row: dict[str, Any]) -> RoadMap:
+    """A map from map.json.
+
+    Raises:
+        ClipError: a ring or a lane is not a list of points.
+    """
+    areas, lanes = [], []
+    for index, area in enumerate(fields.of_kind("map.json", row, "drivable", list, default=[])):
+        where = f"map.json: drivable area {index}"
+        holes = dict(enumerate(fields.of_kind(where, area, "holes", list, default=[])))
+        rings = [fields.array(where, area, "outer", (None, 2))]
+        rings += [
+            fields.array(f"{where}: hole {number}", {"hole": hole}, "hole", (None, 2)) for number, hole in holes.items()
+        ]
+        if any(len(ring) < 3 for ring in rings):
+            raise ClipError(f"{where}: a ring needs at least 3 points")
+        areas.append(tuple(rings))
+    for index, lane in enumerate(fields.of_kind("map.json", row, "lanes", list, default=[])):
+        line = fields.array(f"map.json: lane {index}", {"lane": lane}, "lane", (None, 3))
+        if len(line) < 2:
+            raise ClipError(f"map.json: lane {index} needs at least 2 points, got {len(line)}")
+        lanes.append(line)
+    return RoadMap(tuple(areas), tuple(lanes))

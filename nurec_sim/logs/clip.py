@@ -1,0 +1,191 @@
+"""A driving log in memory: its poses and tables at once, its images and sweeps when asked for."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from nurec_sim.errors import ClipError
+from nurec_sim.logs.storage import Storage
+from nurec_sim.logs.sweeps import SweepRecord, read_sweep
+from nurec_sim.types import CameraModel, LidarModel, Rig, RoadMap, Sweep, Track, Trajectory
+
+IMAGES_KEPT = 6
+SWEEPS_KEPT = 2
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class ImageRecord:
+    """One frame of a camera: where its file is, when it was exposed and from where."""
+
+    file: str
+    start_us: int
+    end_us: int
+    world_from_camera: Float64[np.ndarray, "2 4 4"]
+
+
+class _Recent:
+    """The few values asked for last."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._values: OrderedDict[Any, Any] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: Any, make: Callable[[], T]) -> T:
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
+        value = make()
+        with self._lock:
+            self._values[key] = value
+            while len(self._values) > self._size:
+                self._values.popitem(last=False)
+        return value
+
+
+class Clip:
+    """A driving log (``types.Clip``); make one with ``open_clip``.
+
+    Attributes:
+        id: name of the clip.
+        rig: its sensors.
+        ego: poses of the rig.
+        tracks: labelled objects; poses are those of box centres in the world.
+        road_map: what the log knows of the road, or None.
+        facts: what else the log says of itself (dataset, licence, source of poses, ...), plain JSON.
+    """
+
+    def __init__(
+        self,
+        id: str,
+        rig: Rig,
+        ego: Trajectory,
+        tracks: Sequence[Track],
+        road_map: RoadMap | None,
+        images: Mapping[str, Sequence[ImageRecord]],
+        sweeps: Mapping[str, Sequence[SweepRecord]],
+        storage: Storage,
+        facts: Mapping[str, Any],
+    ) -> None:
+        self.id = id
+        self.rig = rig
+        self.ego = ego
+        self.tracks = tuple(tracks)
+        self.road_map = road_map
+        self.facts = dict(facts)
+        self.storage = storage
+        self._images = {name: tuple(records) for name, records in images.items()}
+        self._sweeps = {name: tuple(records) for name, records in sweeps.items()}
+        self._recent_images = _Recent(IMAGES_KEPT)
+        self._recent_sweeps = _Recent(SWEEPS_KEPT)
+
+    def __repr__(self) -> str:
+        return f"Clip({self.id!r}, cameras={list(self.rig.cameras)}, lidars={list(self.rig.lidars)})"
+
+    @property
+    def span_us(self) -> tuple[int, int]:
+        """[start, end) of everything recorded: ego poses, exposures and sweeps."""
+        records = [r for group in (self._images, self._sweeps) for records in group.values() for r in records]
+        starts = [self.ego.start_us, *(record.start_us for record in records)]
+        ends = [self.ego.end_us, *(record.end_us for record in records)]
+        return min(starts), max(ends) + 1
+
+    def camera(self, camera_id: str) -> CameraModel:
+        """A camera of the rig.
+
+        Raises:
+            ClipError: there is none of that name.
+        """
+        return _named(self.id, "camera", camera_id, self.rig.cameras)
+
+    def lidar(self, lidar_id: str) -> LidarModel:
+        """A LiDAR of the rig.
+
+        Raises:
+            ClipError: there is none of that name.
+        """
+        return _named(self.id, "LiDAR", lidar_id, self.rig.lidars)
+
+    def frame_count(self, camera_id: str) -> int:
+        """Number of frames of a camera."""
+        return len(self.image_records(camera_id))
+
+    def sweep_count(self, lidar_id: str) -> int:
+        """Number of sweeps of a LiDAR."""
+        return len(self.sweep_records(lidar_id))
+
+    def image_records(self, camera_id: str) -> Sequence[ImageRecord]:
+        """Files, times and poses of a camera's frames."""
+        self.camera(camera_id)
+        return self._images.get(camera_id, ())
+
+    def sweep_records(self, lidar_id: str) -> Sequence[SweepRecord]:
+        """Files, times and poses of a LiDAR's sweeps."""
+        self.lidar(lidar_id)
+        return self._sweeps.get(lidar_id, ())
+
+    def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:
+        """Exposure start and end of every frame; equal where the log knows one time only."""
+        records = self.image_records(camera_id)
+        return np.array([(r.start_us, r.end_us) for r in records], np.int64).reshape(-1, 2)
+
+    def sweep_times_us(self, lidar_id: str) -> Int64[np.ndarray, "sweeps 2"]:
+        """Start and end of every sweep; equal where the log knows one time only."""
+        records = self.sweep_records(lidar_id)
+        return np.array([(r.start_us, r.end_us) for r in records], np.int64).reshape(-1, 2)
+
+    def world_from_camera(self, camera_id: str, index: int) -> Float64[np.ndarray, "2 4 4"]:
+        """Camera poses at the start and the end of the exposure."""
+        return self._record("camera", camera_id, self.image_records(camera_id), index).world_from_camera.copy()
+
+    def image(self, camera_id: str, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        """One RGB frame, read-only.
+
+        Raises:
+            ClipError: no such frame; its file is missing or broken, or its size is not the calibration's.
+        """
+        record = self._record("camera", camera_id, self.image_records(camera_id), index)
+        return self._recent_images.get((camera_id, index), lambda: self._read_image(camera_id, record))
+
+    def sweep(self, lidar_id: str, index: int) -> Sweep:
+        """One motion-compensated sweep; its arrays are read-only.
+
+        Raises:
+            ClipError: no such sweep; its file is missing or broken.
+        """
+        record = self._record("LiDAR", lidar_id, self.sweep_records(lidar_id), index)
+        spin = self.rig.lidars[lidar_id].spin
+        return self._recent_sweeps.get((lidar_id, index), lambda: read_sweep(self.storage, record, spin, self.ego))
+
+    def _record(self, kind: str, name: str, records: Sequence[T], index: int) -> T:
+        if not 0 <= index < len(records):
+            raise ClipError(f"clip {self.id!r}: {kind} {name!r} has frames 0 to {len(records) - 1}, asked for {index}")
+        return records[index]
+
+    def _read_image(self, camera_id: str, record: ImageRecord) -> UInt8[np.ndarray, "h w 3"]:
+        camera = self.rig.cameras[camera_id]
+        image = self.storage.read_image(record.file)
+        height, width = image.shape[:2]
+        if (width, height) != (camera.width_px, camera.height_px):
+            raise ClipError(
+                f"clip {self.id!r}: image {record.file} is {width} x {height} pixels, "
+                f"but the calibration of {camera_id!r} says {camera.width_px} x {camera.height_px}"
+            )
+        image.setflags(write=False)
+        return image
+
+
+def _named(clip_id: str, kind: str, name: str, known: Mapping[str, T]) -> T:
+    if name not in known:
+        raise ClipError(f"clip {clip_id!r} has no {kind} {name!r}; have {list(known)}")
+    return known[name]

@@ -1,0 +1,95 @@
+"""Reading fields of JSON objects: each is checked, and an error names the file, the place and what is allowed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from nurec_sim.errors import ClipError
+from nurec_sim.types import Matrix4
+
+
+def required(where: str, row: Any, key: str) -> Any:
+    """A field that must be there.
+
+    Raises:
+        ClipError: ``row`` is not an object or lacks the field.
+    """
+    if not isinstance(row, dict):
+        raise ClipError(f"{where}: must be a JSON object, got {type(row).__name__}")
+    if key not in row:
+        raise ClipError(f"{where}: {key!r} is missing; have {sorted(row)}")
+    return row[key]
+
+
+def of_kind(where: str, row: Any, key: str, kind: type, default: Any = None) -> Any:
+    """A field of one JSON type (dict, list, str, bool), or ``default`` where that is given and the field is not.
+
+    Raises:
+        ClipError: it is missing without a default, or of another type.
+    """
+    if default is not None and isinstance(row, dict) and row.get(key) is None:
+        return default
+    value = required(where, row, key)
+    if not isinstance(value, kind):
+        raise ClipError(f"{where}: {key!r} must be a {kind.__name__}, got {type(value).__name__}")
+    return value
+
+
+def number(where: str, row: Any, key: str, default: float | None = None) -> float:
+    """A finite number.
+
+    Raises:
+        ClipError: it is missing without a default, or not a finite number.
+    """
+    if default is not None and isinstance(row, dict) and row.get(key) is None:
+        return default
+    value = required(where, row, key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(float(value)):
+        raise ClipError(f"{where}: {key!r} must be a finite number, got {value!r}")
+    return float(value)
+
+
+def integer(where: str, row: Any, key: str) -> int:
+    """A whole number.
+
+    Raises:
+        ClipError: it is missing or not a whole number.
+    """
+    value = required(where, row, key)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ClipError(f"{where}: {key!r} must be a whole number, got {value!r}")
+    return value
+
+
+def array(where: str, row: Any, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Nested lists of finite numbers with a shape; None in ``shape`` allows any length.
+
+    Raises:
+        ClipError: it is missing, ragged, not finite or of another shape.
+    """
+    value = required(where, row, key)
+    try:
+        result = np.array(value, np.float64)
+    except (ValueError, TypeError) as error:
+        raise ClipError(f"{where}: {key!r} must be lists of numbers: {error}") from error
+    fits = result.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, result.shape, strict=True))
+    if not fits:
+        wanted = " x ".join("n" if n is None else str(n) for n in shape)
+        raise ClipError(f"{where}: {key!r} must have the shape {wanted}, got {result.shape}")
+    if not np.isfinite(result).all():
+        raise ClipError(f"{where}: {key!r} must be finite")
+    return result
+
+
+def transform(where: str, row: Any, key: str) -> Matrix4:
+    """A 4x4 whose last row is 0 0 0 1. Whether its rotation is one is checked with all others (``check.py``).
+
+    Raises:
+        ClipError: it is missing, not finite, not 4x4, or ends in another row.
+    """
+    matrix = array(where, row, key, (4, 4))
+    if not np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0)):
+        raise ClipError(f"{where}: {key!r} must end in the row 0 0 0 1, got {matrix[3].tolist()}")
+    return matrix

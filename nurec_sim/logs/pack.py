@@ -1,0 +1,211 @@
+"""Reading packs of real driving data (schema ``realdata-pack-1``): one LiDAR, rectified pinhole cameras, boxes.
+
+Their conventions: seconds; ``T_a_b`` takes b to a; the ego frame's height over the road is ``-ground_z_in_ego_m``;
+pixel centres are whole numbers (ours lie at +0.5).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from nurec_sim import geometry, sensors
+from nurec_sim.errors import ClipError
+from nurec_sim.logs import calibration, fields
+from nurec_sim.logs.clip import Clip, ImageRecord
+from nurec_sim.logs.labels import IGNORED, is_movable, our_label
+from nurec_sim.logs.storage import Storage, checked_name
+from nurec_sim.logs.sweeps import SweepRecord
+from nurec_sim.types import CameraModel, LidarModel, Matrix4, Pinhole, Rig, Spin, Track, Trajectory
+
+SCHEMA = "realdata-pack-1"
+LIDAR_ID = "lidar"
+FULL_BYTE = 255.0
+STAND_IN_TABLE = "PANDAR128"
+_TABLE_OF_WORDS = {
+    "hdl-64": "HDL-64",
+    "hdl-32": "HDL-32",
+    "vlp-16": "VLP-16",
+    "pandar128": "PANDAR128",
+    "at128": "AT128",
+}
+
+
+def read_pack(storage: Storage, meta: dict[str, Any]) -> Clip:
+    """A pack as a clip, its rig frame moved to the ground.
+
+    Raises:
+        ClipError: a file or a field is missing or wrong.
+    """
+    calib = storage.read_json(calibration.CALIBRATION_FILE)
+    rig_from_ego = calibration.ground_shift(calib)
+    ego_from_rig = geometry.inverse(rig_from_ego)
+    frames = fields.of_kind("frames.json", storage.read_json("frames.json"), "frames", list)
+    if not frames:
+        raise ClipError("frames.json: there are no frames")
+    cameras = {
+        name: _camera(name, row, rig_from_ego)
+        for name, row in fields.of_kind(calibration.CALIBRATION_FILE, calib, "cameras", dict).items()
+    }
+    facts = {key: value for key, value in meta.items() if key != "schema"}
+    lidars: dict[str, LidarModel] = {}
+    sweeps: list[SweepRecord] = []
+    if calib.get("lidar") is not None:
+        rate = fields.number("meta.json", meta, "rate_hz", default=10.0)
+        lidar, lidar_from_file, note = _lidar(calib["lidar"], rig_from_ego, rate)
+        lidars[LIDAR_ID] = lidar
+        facts["lidar_note"] = note
+        scale = calibration.positive_scale(f"{calibration.CALIBRATION_FILE}: lidar", calib["lidar"])
+        if scale == 1:
+            scale = FULL_BYTE  # "as in the source": bytes over their full range
+        sweeps = list(_sweeps(frames, lidar_from_file, scale, lidar.spin))
+    times = [_microseconds(f"frames.json: frame {i}", frame, "timestamp_s") for i, frame in enumerate(frames)]
+    for index in range(1, len(times)):
+        if times[index] <= times[index - 1]:
+            raise ClipError(
+                f"frames.json: frame {index}: time goes back or stands still, "
+                f"{times[index]} us after {times[index - 1]} us"
+            )
+    world_from_ego = [
+        fields.transform(f"frames.json: frame {i}", frame, "T_world_ego") for i, frame in enumerate(frames)
+    ]
+    return Clip(
+        id=fields.of_kind("meta.json", meta, "name", str),
+        rig=Rig(cameras, lidars),
+        ego=Trajectory(np.array(times, np.int64), np.array(world_from_ego) @ ego_from_rig),
+        tracks=_tracks(frames, times, world_from_ego),
+        road_map=None,
+        images={name: list(_images(frames, name)) for name in cameras},
+        sweeps={name: sweeps for name in lidars},
+        storage=storage,
+        facts=facts,
+    )
+
+
+def _microseconds(where: str, row: Any, key: str) -> int:
+    return round(fields.number(where, row, key) * 1e6)
+
+
+def _camera(name: str, row: Any, rig_from_ego: Matrix4) -> CameraModel:
+    where = f"{calibration.CALIBRATION_FILE}: camera {name!r}"
+    model = fields.of_kind(where, row, "model", str, default="pinhole_rectified")
+    if model != "pinhole_rectified":
+        raise ClipError(f"{where}: model {model!r} is unknown; packs have 'pinhole_rectified'")
+    if fields.of_kind(where, row, "distortion", list, default=[]):
+        raise ClipError(f"{where}: a rectified camera has no distortion, got {row['distortion']}")
+    k = fields.array(where, row, "K", (3, 3))
+    if k[0, 1] != 0:
+        raise ClipError(f"{where}: K has a skew of {k[0, 1]}, which is not supported")
+    return calibration.checked_camera(
+        CameraModel(
+            id=name,
+            width_px=fields.integer(where, row, "width"),
+            height_px=fields.integer(where, row, "height"),
+            lens=Pinhole(k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5),
+            rig_from_camera=rig_from_ego @ fields.transform(where, row, "T_ego_cam"),
+        )
+    )
+
+
+def _lidar(row: Any, rig_from_ego: Matrix4, rate_hz: float) -> tuple[LidarModel, Matrix4, str]:
+    """The LiDAR, the turn that points its x axis forward, and a note on the table that was chosen."""
+    where = f"{calibration.CALIBRATION_FILE}: lidar"
+    model = fields.of_kind(where, row, "model", str)
+    rig_from_file = rig_from_ego @ fields.transform(where, row, "T_ego_lidar")
+    forward = rig_from_file[0, :2]  # the car's x axis in the axes of the file
+    quarters = round(float(np.arctan2(forward[1], forward[0])) / (np.pi / 2))
+    lidar_from_file = np.rint(geometry.pose(geometry.rotation_from_yaw(-quarters * np.pi / 2), np.zeros(3)))
+    table = next((table for word, table in _TABLE_OF_WORDS.items() if word in model.lower()), None)
+    note = f"{model}: nominal {table} table"
+    if table is None:
+        note = f"{model}: no table of its beams is known; {STAND_IN_TABLE} stands in"
+    rig_from_lidar = rig_from_file @ geometry.inverse(lidar_from_file)
+    lidar = sensors.lidar_model(table or STAND_IN_TABLE, rig_from_lidar, id=LIDAR_ID)
+    return dataclasses.replace(lidar, frequency_hz=rate_hz), lidar_from_file, note
+
+
+def _sweeps(frames: list[Any], lidar_from_file: Matrix4, scale: float, spin: Spin) -> Iterator[SweepRecord]:
+    file_from_lidar = geometry.inverse(lidar_from_file)
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict) or frame.get("lidar") is None:
+            continue
+        row, where = frame["lidar"], f"frames.json: frame {index}: lidar"
+        t_us = _microseconds(where, row, "timestamp_s")
+        turn = "t_start_s" in row and "t_end_s" in row
+        start_us = _microseconds(where, row, "t_start_s") if turn else t_us
+        end_us = _microseconds(where, row, "t_end_s") if turn else t_us
+        if not start_us <= t_us <= end_us:
+            raise ClipError(f"{where}: needs t_start_s <= timestamp_s <= t_end_s, got {start_us}, {t_us}, {end_us} us")
+        yield SweepRecord(
+            file=checked_name(fields.of_kind(where, row, "file", str)),
+            t_us=t_us,
+            start_us=start_us,
+            end_us=end_us,
+            world_from_lidar=fields.transform(where, row, "T_world_lidar") @ file_from_lidar,
+            intensity_scale=scale,
+            compensated=fields.of_kind(where, row, "motion_compensated", bool),
+            lidar_from_file=lidar_from_file,
+        )
+
+
+def _images(frames: list[Any], camera_id: str) -> Iterator[ImageRecord]:
+    for index, frame in enumerate(frames):
+        rows = fields.of_kind(f"frames.json: frame {index}", frame, "cameras", dict)
+        if camera_id not in rows:
+            continue
+        row, where = rows[camera_id], f"frames.json: frame {index}: camera {camera_id!r}"
+        t_us = _microseconds(where, row, "timestamp_s")
+        pose = fields.transform(where, row, "T_world_cam")
+        yield ImageRecord(checked_name(fields.of_kind(where, row, "file", str)), t_us, t_us, np.stack([pose, pose]))
+
+
+def _tracks(frames: list[Any], times: list[int], world_from_ego: list[Matrix4]) -> list[Track]:
+    """Boxes joined by their ``track_id``; a box without one is a track of a single pose."""
+    seen: dict[str, dict[str, Any]] = {}
+    for index, frame in enumerate(frames):
+        for number, box in enumerate(frame.get("boxes") or ()):
+            where = f"frames.json: frame {index}: box {number}"
+            given = fields.of_kind(where, box, "type", str)
+            if given.lower() in IGNORED:
+                continue
+            label = our_label(given)
+            known = box.get("track_id")
+            name = f"{label}-{index}-{number}" if known is None else str(known)
+            track = seen.setdefault(name, {"label": label, "times": [], "poses": [], "sizes": []})
+            if track["times"] and track["times"][-1] == times[index]:
+                raise ClipError(f"{where}: track_id {known} appears twice in the frame")
+            size = fields.array(where, box, "size_lwh", (3,))
+            if (size <= 0).any():
+                raise ClipError(f"{where}: size_lwh must be positive, got {size.tolist()}")
+            track["times"].append(times[index])
+            track["poses"].append(world_from_ego[index] @ _ego_from_box(where, box))
+            track["sizes"].append(size)
+    return [
+        Track(
+            id=name,
+            label=track["label"],
+            size_m=_median_size(track["sizes"]),
+            path=Trajectory(np.array(track["times"], np.int64), np.array(track["poses"])),
+            controllable=is_movable(track["label"]),
+        )
+        for name, track in seen.items()
+    ]
+
+
+def _median_size(sizes: list[np.ndarray]) -> tuple[float, float, float]:
+    length, width, height = np.median(sizes, axis=0)
+    return float(length), float(width), float(height)
+
+
+def _ego_from_box(where: str, box: Any) -> Matrix4:
+    """Pose of a box centre in the log's ego frame: with its full rotation where known, else its yaw."""
+    if box.get("R_ego_box") is not None:
+        rotation = fields.array(where, box, "R_ego_box", (3, 3))
+        if not geometry.is_rotation(rotation):
+            raise ClipError(f"{where}: R_ego_box is not a rotation")
+    else:
+        rotation = geometry.rotation_from_yaw(fields.number(where, box, "yaw_ego"))
+    return geometry.pose(rotation, fields.array(where, box, "center_ego", (3,)))

@@ -1,0 +1,48 @@
+"""Opening a clip: which format it is, and the checks that every clip passes before it is used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from nurec_sim.errors import ClipError
+from nurec_sim.logs import fields, native, pack, write
+from nurec_sim.logs.clip import Clip
+from nurec_sim.logs.consistency import table_faults
+from nurec_sim.logs.storage import META_FILE, Storage
+
+_READERS = {pack.SCHEMA: pack.read_pack, write.SCHEMA: native.read_native}
+
+
+def open_clip(path: str | Path) -> Clip:
+    """Open a driving log: a clip folder, or a zip file of one. Images and sweeps are read when asked for.
+
+    Raises:
+        ClipError: nothing there, an unknown schema, a broken file, or poses and times that contradict themselves; the
+            text names the file and the place. ``check_clip`` lists all faults of a clip.
+    """
+    clip = read_tables(path)
+    faults = table_faults(clip)
+    if faults:
+        raise ClipError(f"{clip.storage.path.name}: {faults[0]}")
+    return clip
+
+
+def read_tables(path: str | Path) -> Clip:
+    """A clip whose poses and times are read but not yet checked against each other.
+
+    Raises:
+        ClipError: nothing there, an unknown schema, or a broken file.
+    """
+    storage = Storage(path)
+    if not storage.exists(META_FILE):
+        raise ClipError(f"{str(storage.path)!r} has no {META_FILE}; this is not a clip folder")
+    meta = storage.read_json(META_FILE)
+    schema = fields.required(META_FILE, meta, "schema")
+    reader = _READERS.get(schema) if isinstance(schema, str) else None
+    if reader is None:
+        raise ClipError(f"{storage.path.name}: unknown clip schema {schema!r}; known are {sorted(_READERS)}")
+    try:
+        return reader(storage, meta)
+    except ClipError as error:
+        name = storage.path.name
+        raise error if str(error).startswith(f"{name}:") else ClipError(f"{name}: {error}") from None

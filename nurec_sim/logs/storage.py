@@ -1,0 +1,161 @@
+"""Where the files of a clip lie: a folder, or a zip file read in place; every name and size is checked.
+
+Paths inside of a clip are relative, with forward slashes.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from nurec_sim.errors import ClipError
+
+MAX_FILE_BYTES = 1 << 30
+MAX_ZIP_FILES = 1_000_000
+META_FILE = "meta.json"
+
+
+def checked_name(name: str) -> str:
+    """A relative path that stays inside of the clip.
+
+    Raises:
+        ClipError: it is empty, absolute, or climbs out with '..'.
+    """
+    parts = PurePosixPath(name).parts
+    if not parts or name.startswith(("/", "\\")) or "\\" in name or ":" in parts[0] or ".." in parts:
+        raise ClipError(f"file name {name!r} is not allowed: a clip names its files by relative paths without '..'")
+    return name
+
+
+class Storage:
+    """The files of one clip, from a folder or a zip file (whose clip may lie in one folder at its root).
+
+    Raises:
+        ClipError: the path does not exist, is neither a folder nor a zip file, or the zip file is unsafe.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._archive: zipfile.ZipFile | None = None
+        self._prefix = ""
+        if self.path.is_dir():
+            return
+        if not self.path.exists():
+            raise ClipError(f"no clip at {str(self.path)!r}: give a clip folder or a .zip of one")
+        if not zipfile.is_zipfile(self.path):
+            raise ClipError(f"{str(self.path)!r} is neither a clip folder nor a zip file")
+        self._archive = zipfile.ZipFile(self.path)
+        self._prefix = self._check_archive(self._archive)
+
+    def _check_archive(self, archive: zipfile.ZipFile) -> str:
+        """Check all names and sizes; return the folder of the clip in the archive."""
+        infos = archive.infolist()
+        if len(infos) > MAX_ZIP_FILES:
+            raise ClipError(f"{self.path.name}: {len(infos)} files in the zip; at most {MAX_ZIP_FILES} are allowed")
+        for info in infos:
+            try:
+                checked_name(info.filename)
+            except ClipError as error:
+                raise ClipError(f"{self.path.name}: {error}") from None
+            if info.file_size > MAX_FILE_BYTES:
+                raise ClipError(
+                    f"{self.path.name}: {info.filename} unpacks to {info.file_size} bytes; "
+                    f"at most {MAX_FILE_BYTES} are allowed"
+                )
+        metas = [info.filename for info in infos if PurePosixPath(info.filename).name == META_FILE]
+        if not metas:
+            raise ClipError(f"{self.path.name}: no {META_FILE} in the zip; this is not a clip")
+        return min(metas, key=lambda name: (name.count("/"), name))[: -len(META_FILE)]
+
+    def exists(self, name: str) -> bool:
+        """Whether the clip has a file of that name."""
+        checked_name(name)
+        if self._archive is None:
+            return (self.path / name).is_file()
+        return self._prefix + name in self._archive.NameToInfo
+
+    def read(self, name: str) -> bytes:
+        """The bytes of a file.
+
+        Raises:
+            ClipError: it is missing, too large, or the zip is damaged there.
+        """
+        checked_name(name)
+        if not self.exists(name):
+            raise ClipError(f"{self.path.name}: file {name} is missing")
+        if self._archive is not None:
+            try:
+                return self._archive.read(self._prefix + name)
+            except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+                raise ClipError(f"{self.path.name}: file {name} in the zip is damaged: {error}") from error
+        file = self.path / name
+        size = file.stat().st_size
+        if size > MAX_FILE_BYTES:
+            raise ClipError(f"{self.path.name}: file {name} has {size} bytes; at most {MAX_FILE_BYTES} are allowed")
+        return file.read_bytes()
+
+    def read_json(self, name: str) -> dict[str, Any]:
+        """A JSON file that holds an object.
+
+        Raises:
+            ClipError: it is missing, not JSON, holds NaN or infinity, or is not an object.
+        """
+
+        def refuse(constant: str) -> None:
+            raise ValueError(f"{constant} is not a number that JSON knows")
+
+        try:
+            value = json.loads(self.read(name), parse_constant=refuse)
+        except (ValueError, RecursionError) as error:
+            raise ClipError(f"{self.path.name}: {name} is not valid JSON: {error}") from error
+        if not isinstance(value, dict):
+            raise ClipError(f"{self.path.name}: {name} must hold a JSON object, got {type(value).__name__}")
+        return value
+
+    def read_image(self, name: str) -> UInt8[np.ndarray, "h w 3"]:
+        """A JPEG or PNG file as RGB.
+
+        Raises:
+            ClipError: it is missing, truncated or not an image.
+        """
+        import cv2
+
+        data = self.read(name)
+        # A decoder fills the missing part of a truncated file with grey and says nothing: look for the end mark.
+        if data[:2] == b"\xff\xd8":
+            complete = b"\xff\xd9" in data[-64:]
+        elif data[:8] == b"\x89PNG\r\n\x1a\n":
+            complete = b"IEND" in data[-64:]
+        else:
+            raise ClipError(f"{self.path.name}: {name} is neither a JPEG nor a PNG image")
+        if not complete:
+            raise ClipError(f"{self.path.name}: image {name} is truncated ({len(data)} bytes, no end mark)")
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise ClipError(f"{self.path.name}: image {name} cannot be decoded")
+        return np.ascontiguousarray(bgr[:, :, ::-1])
+
+    def read_arrays(self, name: str) -> dict[str, np.ndarray]:
+        """The arrays of an .npz file; nothing in it is ever unpickled.
+
+        Raises:
+            ClipError: it is missing, truncated, holds objects, or is too large.
+        """
+        data = self.read(name)
+        try:
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                size = sum(info.file_size for info in archive.infolist())
+            if size > MAX_FILE_BYTES:
+                raise ClipError(
+                    f"{self.path.name}: {name} unpacks to {size} bytes; at most {MAX_FILE_BYTES} are allowed"
+                )
+            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+                return {key: arrays[key] for key in arrays.files}
+        except (zipfile.BadZipFile, ValueError, EOFError, OSError, KeyError, MemoryError) as error:
+            raise ClipError(f"{self.path.name}: {name} is not a readable .npz file: {error}") from error

@@ -1,0 +1,185 @@
+"""From the long table to one number per rollout, and to one row per policy with its interval.
+
+Truncation, both profiles: states after the first collision or off-road state do not count (what a car does after it
+crashed says nothing), so the two are competing risks. Profile ``alpasim`` also drops states after the ego is 4 m off
+the recorded path; ``strict`` never does, and counts how often it would have (``censored_4m``).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nurec_sim.metrics.collision import check_profile
+from nurec_sim.metrics.series import METRICS
+
+if TYPE_CHECKING:
+    import polars as pl
+
+CENSOR_M = 4.0
+MAX_UNKNOWN_FRAC = 0.2
+"""A scene with more unknown states than this is left out of ``offroad`` for every policy."""
+BOOTSTRAP = 10_000
+CONFIDENCE = 0.95
+ROLLOUT_KEYS = (
+    "clipgt_id", "world", "reconstruction", "policy", "trial", "seed", "rollout_id", "status", "error",
+)  # fmt: skip
+
+DERIVED: dict[str, tuple[str, str]] = {
+    "collision_offroad_mean": ("share", "mean of collision_any and offroad"),
+    "offroad_or_collision": ("bool", "collision_any or offroad"),
+    "scene_score": ("share", "0 after a collision at fault or off-road, else progress / 0.8, at most 1"),
+    "time_to_first_event_s": ("s", "from take-over to the first collision or off-road state; none if neither"),
+    "censored_4m": ("bool", "the ego was 4 m off the recorded path at some time"),
+}
+"""Metrics of whole rollouts, on top of ``METRICS``: unit and meaning."""
+
+
+def rollout_values(table: pl.DataFrame, profile: str = "strict") -> pl.DataFrame:
+    """One row per rollout and metric: ``ROLLOUT_KEYS``, ``name, unit, value`` (null if not valid), ``valid``.
+
+    A failed rollout keeps its rows, with null values and its error.
+    """
+    import polars as pl
+
+    check_profile(profile)
+    rows: list[dict[str, object]] = []
+    for part in table.partition_by("rollout_id", maintain_order=True):
+        keys = {name: part[name][0] for name in ROLLOUT_KEYS}
+        series = {
+            name[0]: (rows_["timestamps_us"].to_numpy(), rows_["values"].to_numpy(), rows_["valid"].to_numpy())
+            for name, rows_ in part.partition_by("name", as_dict=True).items()
+        }
+        values = _rollout_numbers(series, profile) if keys["status"] == "ok" else {}
+        units = {name: metric.unit for name, metric in METRICS.items()} | {name: u for name, (u, _) in DERIVED.items()}
+        for name, unit in units.items():
+            value = values.get(name, np.nan)
+            valid = bool(np.isfinite(value))
+            rows.append({**keys, "name": name, "unit": unit, "value": float(value) if valid else None, "valid": valid})
+    schema = {name: table.schema[name] for name in ROLLOUT_KEYS}
+    schema |= {"name": pl.String, "unit": pl.String, "value": pl.Float64, "valid": pl.Boolean}
+    return _without_unseen_scenes(pl.DataFrame(rows, schema=schema))
+
+
+def summarize(values: pl.DataFrame, seed: int = 0) -> pl.DataFrame:
+    """One row per reconstruction, policy and metric: ``n, n_failed, n_valid, scenes, mean, low, high``.
+
+    ``mean`` is the scene mean of trial means, over scenes with a valid trial. ``low``..``high`` is the 95 % interval of
+    a bootstrap that draws whole scenes; null with a single scene, which says nothing of others. All policies and
+    metrics share the draws, so that differences between them are paired.
+    """
+    import polars as pl
+
+    scenes = sorted(values["clipgt_id"].unique().to_list())
+    draws = np.random.default_rng(seed).multinomial(
+        len(scenes), np.full(len(scenes), 1 / max(len(scenes), 1)), BOOTSTRAP
+    )
+    rows = []
+    for (world, reconstruction, policy, name), part in values.group_by(
+        "world", "reconstruction", "policy", "name", maintain_order=True
+    ):
+        means = np.full(len(scenes), np.nan)
+        for (scene,), trials in part.filter(pl.col("valid")).group_by("clipgt_id"):
+            means[scenes.index(scene)] = trials["value"].sort().mean()
+        low, high = _interval(means, draws)
+        known = np.isfinite(means)
+        rows.append(
+            {
+                "world": world, "reconstruction": reconstruction, "policy": policy, "name": name,
+                "unit": part["unit"][0], "n": len(part), "n_failed": int((part["status"] != "ok").sum()),
+                "n_valid": int(part["valid"].sum()), "scenes": int(known.sum()),
+                "mean": float(means[known].mean()) if known.any() else None, "low": low, "high": high,
+            }
+        )  # fmt: skip
+    return pl.DataFrame(rows, schema=_summary_schema())
+
+
+def _summary_schema() -> dict[str, object]:
+    import polars as pl
+
+    text, whole, real = pl.String, pl.Int64, pl.Float64
+    return {
+        "world": text, "reconstruction": text, "policy": text, "name": text, "unit": text, "n": whole,
+        "n_failed": whole, "n_valid": whole, "scenes": whole, "mean": real, "low": real, "high": real,
+    }  # fmt: skip
+
+
+def _interval(means: np.ndarray, draws: np.ndarray) -> tuple[float | None, float | None]:
+    """Percentile interval over draws of scenes; draws without a valid scene do not count."""
+    known = np.isfinite(means)
+    if known.sum() < 2:
+        return None, None
+    weight = draws[:, known]
+    total = weight.sum(axis=1)
+    drawn = (weight @ means[known])[total > 0] / total[total > 0]
+    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+def _rollout_numbers(series: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]], profile: str) -> dict[str, float]:
+    """Every metric of one rollout as a number, NaN where it has none."""
+    event_us = min(_first_us(series.get("collision_any"), 0.5), _first_us(series.get("offroad"), 0.5))
+    censor_us = _first_us(series.get("dist_to_gt_trajectory"), CENSOR_M)
+    end_us = min(event_us, censor_us) if profile == "alpasim" else event_us
+    numbers = {name: _reduce(series[name], METRICS[name].reduce.value, end_us) for name in METRICS if name in series}
+    collision, offroad = numbers["collision_any"], numbers["offroad"]
+    numbers["collision_offroad_mean"] = (collision + offroad) / 2
+    numbers["offroad_or_collision"] = np.nan
+    if collision == 1 or offroad == 1:
+        numbers["offroad_or_collision"] = 1.0
+    elif np.isfinite(collision) and np.isfinite(offroad):
+        numbers["offroad_or_collision"] = 0.0
+    numbers["scene_score"] = _scene_score(numbers)
+    numbers["censored_4m"] = float(np.isfinite(censor_us)) if np.isfinite(numbers["dist_to_gt_trajectory"]) else np.nan
+    numbers["time_to_first_event_s"] = np.nan
+    if np.isfinite(event_us):
+        t_us, relevant, _ = series["eval_relevant"]
+        numbers["time_to_first_event_s"] = (event_us - t_us[np.argmax(relevant > 0)]) / 1e6
+    return numbers
+
+
+def _scene_score(numbers: dict[str, float]) -> float:
+    """AlpaSim's scene score; NaN where one of its parts is not known."""
+    at_fault, offroad = numbers["collision_at_fault"], numbers["offroad"]
+    if at_fault == 1 or offroad == 1:
+        return 0.0
+    if not np.isfinite([at_fault, offroad, numbers["gt_dist_traveled_m"]]).all():
+        return float("nan")
+    if numbers["gt_dist_traveled_m"] < 5:
+        return 1.0
+    return float(min(np.clip(numbers["progress"], 0, 1) / 0.8, 1))
+
+
+def _first_us(series: tuple[np.ndarray, np.ndarray, np.ndarray] | None, at_least: float) -> float:
+    """First valid time with a value of at least so much; infinite if there is none."""
+    if series is None:
+        return float("inf")
+    t_us, values, valid = series
+    hit = valid & (np.where(valid, values, -np.inf) >= at_least)
+    return float(t_us[np.argmax(hit)]) if hit.any() else float("inf")
+
+
+def _reduce(series: tuple[np.ndarray, np.ndarray, np.ndarray], how: str, end_us: float) -> float:
+    t_us, values, valid = series
+    kept = values[valid & (t_us <= end_us)]
+    if len(kept) == 0:
+        return float("nan")
+    return float(kept[-1] if how == "last" else getattr(np, how)(kept))
+
+
+def _without_unseen_scenes(values: pl.DataFrame) -> pl.DataFrame:
+    """Take ``offroad`` and what builds on it out of scenes where too many states are unknown, for all policies."""
+    import polars as pl
+
+    unknown = values.filter((pl.col("name") == "offroad_unknown_frac") & pl.col("valid"))
+    unseen = (
+        unknown.group_by("clipgt_id", "reconstruction").agg(pl.col("value").mean())
+        .filter(pl.col("value") > MAX_UNKNOWN_FRAC).select("clipgt_id", "reconstruction", unseen=True)
+    )  # fmt: skip
+    marked = values.join(unseen, on=["clipgt_id", "reconstruction"], how="left", maintain_order="left")
+    builds_on = pl.col("name").is_in(["offroad", "collision_offroad_mean", "offroad_or_collision", "scene_score"])
+    hit = pl.col("unseen").fill_null(False) & builds_on
+    return marked.with_columns(
+        value=pl.when(hit).then(None).otherwise(pl.col("value")), valid=pl.col("valid") & ~hit
+    ).drop("unseen")

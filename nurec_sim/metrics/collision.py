@@ -1,0 +1,165 @@
+"""Contacts between the ego and actors: who, when, on which side, how hard.
+
+Profiles: ``strict`` keeps the class of an actor's first contact for as long as that actor exists, joins the classes of
+actors that touch at once, and ignores an actor that appears inside the ego until the two have been apart once.
+``alpasim`` follows AlpaSim: every frame is classified anew, the last touching actor decides the class of the frame,
+overlaps at the start count. Both shrink and round the boxes; only ours also asks that the heights overlap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nurec_sim import geometry
+from nurec_sim.metrics.boxes import BoxPath, actor_boxes, ego_boxes, heights_overlap, outline_gap
+from nurec_sim.metrics.series import make_series, speed_of, times_of, unknown_series
+from nurec_sim.types import Rollout, Series
+
+PROFILES = ("strict", "alpasim")
+SIDES = ("front", "rear", "lateral")
+AT_FAULT_RULE = "front_or_lateral"
+"""Name of the rule behind ``collision_at_fault``: front and lateral contacts are the ego's, rear ones are not."""
+
+_ARC_TOLERANCE_M = 2e-3  # shapely's arcs are inscribed polygons, up to 0.6 mm inside the true outline
+
+
+@dataclass(frozen=True)
+class Contact:
+    """The first counted touch between the ego and one actor."""
+
+    actor: str
+    label: str
+    t_us: int
+    side: str
+    at_fault: bool
+    rule: str
+    ego_speed_mps: float
+    delta_v_mps: float
+
+
+def check_profile(profile: str) -> None:
+    """Refuse an unknown profile.
+
+    Raises:
+        ValueError: the name is none of ``PROFILES``.
+    """
+    if profile not in PROFILES:
+        raise ValueError(f"unknown metric profile '{profile}'; have {list(PROFILES)}")
+
+
+def collision_series(rollout: Rollout, profile: str = "strict", actors_known: bool | None = None) -> list[Series]:
+    """``collision_any/front/lateral/rear/at_fault`` and ``collision_delta_v_mps`` over time.
+
+    Args:
+        rollout: states and actors.
+        profile: ``strict`` or ``alpasim``.
+        actors_known: whether the log knows its actors; None means that it does if the rollout has any. Where they are
+            not known nothing can be said, and every series is invalid.
+    """
+    check_profile(profile)
+    t_us = times_of(rollout)
+    names = ("collision_any", *(f"collision_{side}" for side in ("front", "lateral", "rear")), "collision_at_fault")
+    known = bool(rollout.actors) if actors_known is None else actors_known
+    if not known or not rollout.states:
+        return [unknown_series(name, t_us) for name in (*names, "collision_delta_v_mps")]
+    sides = _side_flags(rollout, profile)
+    flags = {f"collision_{side}": sides[side] for side in SIDES}
+    flags["collision_any"] = np.logical_or.reduce([sides[side] for side in SIDES])
+    flags["collision_at_fault"] = sides["front"] | sides["lateral"]
+    series = [make_series(name, t_us, flags[name]) for name in names]
+    delta_v = np.full(len(t_us), np.nan)
+    for contact in find_contacts(rollout, profile):
+        index = int(np.searchsorted(t_us, contact.t_us))
+        delta_v[index] = np.fmax(delta_v[index], contact.delta_v_mps)
+    return [*series, make_series("collision_delta_v_mps", t_us, delta_v)]
+
+
+def find_contacts(rollout: Rollout, profile: str = "strict") -> list[Contact]:
+    """One contact per actor that the ego touched once the policy drove, in the order of time."""
+    check_profile(profile)
+    if not rollout.states:
+        return []
+    t_us = rollout.t_us
+    ego, found = ego_boxes(rollout), []
+    ego_velocity = speed_of(rollout.world_from_rig, t_us)
+    for actor, box in actor_boxes(rollout).items():
+        counted = np.flatnonzero(_counted(ego, box, profile, t_us >= rollout.first_closed_loop_us))
+        if len(counted) == 0:
+            continue
+        index = int(counted[0])
+        side = contact_side(ego.at([index]), box.at([index]))
+        relative = ego_velocity[index] - speed_of(box.world_from_box, t_us)[index]
+        found.append(
+            Contact(
+                actor, rollout.actor_labels.get(actor, ""), int(t_us[index]), side, side != "rear", AT_FAULT_RULE,
+                float(np.linalg.norm(ego_velocity[index])), float(np.linalg.norm(relative)) / 2,
+            )
+        )  # fmt: skip
+    return sorted(found, key=lambda contact: (contact.t_us, contact.actor))
+
+
+def touching(ego: BoxPath, actor: BoxPath) -> np.ndarray:
+    """[t] bool: outlines touch and heights overlap; False while the actor is absent."""
+    return (outline_gap(ego, actor) <= 0.0) & heights_overlap(ego, actor)
+
+
+def contact_side(ego: BoxPath, actor: BoxPath) -> str:
+    """Side of the ego on which an actor touches it, for boxes at one time: ``front``, ``rear`` or ``lateral``.
+
+    The bumper regions are the front and the rear edge of the box grown by the corner radius, cut to the outline; a
+    contact that meets the front one is ``front`` whatever else it meets.
+    """
+    import shapely
+
+    outline, other = _outline(ego), _outline(actor)
+    corners = geometry.box_corners_xy(ego.world_from_box[0], *ego.length_width_m)
+    for side, edge in (("front", corners[[0, 3]]), ("rear", corners[[1, 2]])):
+        bumper = shapely.intersection(shapely.buffer(shapely.linestrings(edge), ego.radius_m), outline)
+        if shapely.distance(bumper, other) <= _ARC_TOLERANCE_M:
+            return side
+    return "lateral"
+
+
+def _outline(box: BoxPath):
+    """Rounded outline of a box at its first time as a shapely polygon."""
+    import shapely
+
+    core = shapely.polygons(geometry.box_corners_xy(box.world_from_box[0], *box.core_m))
+    return shapely.buffer(core, box.radius_m)
+
+
+def _counted(ego: BoxPath, actor: BoxPath, profile: str, relevant: np.ndarray) -> np.ndarray:
+    """[t] touches that count once the policy drives.
+
+    ``strict`` leaves out a touch that an actor was born with or brought along from the forced replay of the log
+    (where the ego was where it really was: the boxes are wrong, not the policy) until the two have been apart.
+    """
+    touches = touching(ego, actor)
+    if profile == "alpasim":
+        return touches & relevant
+    present, counted, armed = actor.present, np.zeros(len(touches), bool), False
+    for index in range(len(touches)):
+        armed = bool(present[index]) and ((armed and bool(relevant[index])) or not touches[index])
+        counted[index] = armed and touches[index]
+    return counted
+
+
+def _side_flags(rollout: Rollout, profile: str) -> dict[str, np.ndarray]:
+    """Per side, [t] whether an actor touches there."""
+    ego = ego_boxes(rollout)
+    flags = {side: np.zeros(len(rollout.states), bool) for side in SIDES}
+    relevant = rollout.t_us >= rollout.first_closed_loop_us
+    for box in actor_boxes(rollout).values():
+        times: Sequence[int] = np.flatnonzero(_counted(ego, box, profile, relevant)).tolist()
+        first_side = contact_side(ego.at([times[0]]), box.at([times[0]])) if times else ""
+        for index in times:
+            if profile == "strict":
+                flags[first_side][index] = True
+                continue
+            for side in SIDES:  # AlpaSim resets the flags for every touching actor: the last one wins
+                flags[side][index] = False
+            flags[contact_side(ego.at([index]), box.at([index]))][index] = True
+    return flags

@@ -1,0 +1,145 @@
+"""Ground heights around a recorded path, grown outward from the wheels over road-class Gaussians.
+
+Growing by small height steps keeps to the deck that was driven: a bridge above, or a road below, is never reached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+PITCH_M = 0.5
+STEP_M = 0.15
+"""Height difference that a neighbour may always have ..."""
+STEP_PER_M = 0.08
+"""... and what it may have on top for each metre: roads bend and bank, kerbs are 0.10 to 0.20 m."""
+SEED_STEP_M = 0.5
+"""Height difference allowed under the wheels, where the recorded pose, not a neighbour, is the reference."""
+QUANTILE = 0.2
+PLANE_SIGMA_M = 3.0
+MAX_SLOPE = 0.15
+
+
+@dataclass(frozen=True)
+class GroundHeights:
+    """Height of the ground in cells of ``PITCH_M``; ``observed`` marks the cells that have road Gaussians."""
+
+    origin_m: tuple[float, float]
+    height_m: Float64[np.ndarray, "rows columns"]
+    observed: np.ndarray
+
+    def at(self, xy_m: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, " n"]:
+        """Heights at points, bilinear between cell centres; held beyond the border."""
+        from scipy.ndimage import map_coordinates
+
+        place = (np.asarray(xy_m, np.float64) - np.asarray(self.origin_m)) / PITCH_M - 0.5
+        return map_coordinates(self.height_m, [place[:, 1], place[:, 0]], order=1, mode="nearest")
+
+
+def fit_ground(
+    road_m: Float64[np.ndarray, "n 3"],
+    path_m: Float64[np.ndarray, "k 3"],
+    low_m: tuple[float, float],
+    high_m: tuple[float, float],
+) -> GroundHeights:
+    """Ground heights over a rectangle.
+
+    Args:
+        road_m: centres of road-class Gaussians.
+        path_m: points where the wheels touched the ground, closely spaced.
+        low_m: lower corner of the rectangle (x, y).
+        high_m: upper corner.
+    """
+    columns, rows = (int(np.ceil((high_m[axis] - low_m[axis]) / PITCH_M)) for axis in (0, 1))
+
+    def cell_of(xy: np.ndarray) -> np.ndarray:
+        index = np.floor((xy - np.asarray(low_m)) / PITCH_M).astype(np.int64)
+        return np.clip(index[:, 1], 0, rows - 1) * columns + np.clip(index[:, 0], 0, columns - 1)
+
+    heights = _CellHeights(cell_of(road_m[:, :2]), road_m[:, 2])
+    level = np.full(rows * columns, np.nan)
+    path_cells = cell_of(path_m[:, :2])
+    seeds, inverse, counts = np.unique(path_cells, return_inverse=True, return_counts=True)
+    wheels = np.bincount(inverse, path_m[:, 2]) / counts
+    found = heights.low_quantile(seeds, wheels, SEED_STEP_M)
+    level[seeds] = np.where(np.isnan(found), wheels, found)
+
+    level = level.reshape(rows, columns)
+    while _grow(level, heights):
+        pass
+    observed = np.isfinite(level)
+    return GroundHeights((float(low_m[0]), float(low_m[1])), _extrapolate(level, observed), observed)
+
+
+class _CellHeights:
+    """Heights grouped by cell and sorted, so that the quantile inside a gate is two binary searches."""
+
+    def __init__(self, cell: np.ndarray, height_m: np.ndarray) -> None:
+        order = np.lexsort((height_m, cell))
+        self.base = float(height_m.min()) - 1.0
+        self.span = float(height_m.max()) - self.base + 1.0
+        self.height = height_m[order]
+        self.key = cell[order] * self.span + (self.height - self.base)
+
+    def low_quantile(self, cell: np.ndarray, around_m: np.ndarray, gate_m: float) -> np.ndarray:
+        """The ``QUANTILE`` of the heights within ``gate_m`` of ``around_m`` in each cell; NaN where there is none."""
+        offset = np.clip(around_m - self.base, 0, self.span - 1e-6)
+        first = np.searchsorted(self.key, cell * self.span + np.maximum(offset - gate_m, 0))
+        last = np.searchsorted(self.key, cell * self.span + np.minimum(offset + gate_m, self.span - 1e-6), side="right")
+        at = np.minimum(first + np.floor(QUANTILE * (last - first)).astype(np.int64), len(self.height) - 1)
+        return np.where(last > first, self.height[at], np.nan)
+
+
+def _grow(level: np.ndarray, heights: _CellHeights) -> bool:
+    """Accept the neighbours of accepted cells whose heights fit; False when nothing was added."""
+    rows, columns = level.shape
+    total, count = np.zeros_like(level), np.zeros(level.shape, np.int64)
+    padded = np.pad(level, 1, constant_values=np.nan)
+    for dy in (0, 1, 2):
+        for dx in (0, 1, 2):
+            neighbour = padded[dy : dy + rows, dx : dx + columns]
+            known = np.isfinite(neighbour)
+            total[known] += neighbour[known]
+            count += known
+    front = np.flatnonzero(np.isnan(level) & (count > 0))
+    around = total.reshape(-1)[front] / count.reshape(-1)[front]
+    found = heights.low_quantile(front, around, STEP_M + STEP_PER_M * PITCH_M)
+    level.reshape(-1)[front] = found
+    return bool(np.isfinite(found).any())
+
+
+def _extrapolate(level: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """Fill unobserved cells from the plane fitted around the nearest observed one."""
+    from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+    rows, columns = np.indices(level.shape)
+    x, y = columns * PITCH_M, rows * PITCH_M
+    weight = observed.astype(np.float64)
+    z = np.where(observed, level, 0.0)
+    base = z.sum() / weight.sum()
+    z = np.where(observed, z - base, 0.0)
+
+    def smooth(values: np.ndarray) -> np.ndarray:
+        return gaussian_filter(values * weight, PLANE_SIGMA_M / PITCH_M, mode="constant", truncate=2.0)
+
+    mass = np.maximum(smooth(np.ones_like(z)), 1e-12)
+    mean_x, mean_y, mean_z = smooth(x) / mass, smooth(y) / mass, smooth(z) / mass
+    xx, yy, xy = (
+        smooth(x * x) / mass - mean_x**2,
+        smooth(y * y) / mass - mean_y**2,
+        smooth(x * y) / mass - mean_x * mean_y,
+    )
+    xz, yz = smooth(x * z) / mass - mean_x * mean_z, smooth(y * z) / mass - mean_y * mean_z
+    ridge = 0.05  # m^2: a strip seen edge-on has no cross slope; hold it level
+    xx, yy = xx + ridge, yy + ridge
+    determinant = np.maximum(xx * yy - xy**2, 1e-9)
+    slope_x = np.clip((xz * yy - yz * xy) / determinant, -MAX_SLOPE, MAX_SLOPE)
+    slope_y = np.clip((yz * xx - xz * xy) / determinant, -MAX_SLOPE, MAX_SLOPE)
+
+    nearest = distance_transform_edt(~observed, return_distances=False, return_indices=True)
+    row, column = nearest[0], nearest[1]
+    plane = mean_z[row, column] + slope_x[row, column] * (x - mean_x[row, column])
+    plane += slope_y[row, column] * (y - mean_y[row, column])
+    return np.where(observed, level, plane + base)

@@ -1,0 +1,194 @@
+"""Off-road, three-valued: the ego's footprint against the Gaussian road grid, and against the map where there is one.
+
+A footprint is *off* if it reaches more than ``TOLERANCE_M`` beyond everything that may be road, *unknown* if it does so
+only should the unseen not be road, else *on*. Off counts from the second state in a row. An unknown state is never
+counted as either (``spec/metrics.md`` 1.2).
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from nurec_sim import geometry
+from nurec_sim.metrics.boxes import body_boxes
+from nurec_sim.metrics.offroad_grid import OffroadGrid
+from nurec_sim.metrics.series import make_series, times_of, unknown_series
+from nurec_sim.types import Box, RoadMap, Rollout, Series, Trajectory
+
+TOLERANCE_M = 0.3
+SAMPLE_STEP_M = 0.1
+MAX_OUTSIDE_FRAC = 0.25
+
+
+class Verdict(enum.IntEnum):
+    """Where one footprint stands."""
+
+    ON = 0
+    OFF = 1
+    UNKNOWN = 2
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """The grid's answer for n footprints: verdict, deepest reach beyond possible road, share of area beyond it."""
+
+    verdict: UInt8[np.ndarray, " n"]
+    excursion_m: Float64[np.ndarray, " n"]
+    area_frac: Float64[np.ndarray, " n"]
+
+
+def judge_footprints(
+    grid: OffroadGrid,
+    world_from_rig: Float64[np.ndarray, "n 4 4"],
+    body: Box,
+    tolerance_m: float = TOLERANCE_M,
+) -> Footprints:
+    """Judge the whole outline of the body, sampled every 0.1 m, at n rig poses."""
+    centre = body_boxes(world_from_rig, body).world_from_box
+    along, across = (
+        np.linspace(-size / 2, size / 2, int(np.ceil(size / SAMPLE_STEP_M)) + 1) for size in body.size_m[:2]
+    )
+    offsets = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
+    yaw = geometry.yaw_of(centre)[:, None]
+    x = centre[:, None, 0, 3] + offsets[:, 0] * np.cos(yaw) - offsets[:, 1] * np.sin(yaw)
+    y = centre[:, None, 1, 3] + offsets[:, 0] * np.sin(yaw) + offsets[:, 1] * np.cos(yaw)
+    possible, known, inside = grid.look_up(np.stack([x, y], axis=-1))
+    possible, known = np.where(inside, possible, 0.0), np.where(inside, known, 0.0)
+    off = (possible > tolerance_m).any(axis=1)
+    unsure = (known > tolerance_m).any(axis=1) | ((~inside).mean(axis=1) > MAX_OUTSIDE_FRAC)
+    verdict = np.where(off, Verdict.OFF, np.where(unsure, Verdict.UNKNOWN, Verdict.ON)).astype(np.uint8)
+    return Footprints(verdict, possible.max(axis=1), (possible > 0).mean(axis=1))
+
+
+def debounced(verdict: UInt8[np.ndarray, " t"]) -> tuple[Float64[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
+    """Off-road values and their validity: 1 from the second ``OFF`` in a row, invalid where that cannot be decided."""
+    verdict = np.asarray(verdict)
+    before = np.concatenate([[Verdict.ON], verdict[:-1]])
+    off = verdict == Verdict.OFF
+    values = (off & (before == Verdict.OFF)).astype(np.float64)
+    valid = (verdict != Verdict.UNKNOWN) & ~(off & (before == Verdict.UNKNOWN))
+    return values, valid
+
+
+def offroad_series(rollout: Rollout, grid: OffroadGrid | None) -> list[Series]:
+    """``offroad`` and its excursion, area and unknown shares; all invalid without a grid.
+
+    Start rule: where the ego is off or unknown at the first state that counts, and the recorded ego was too, the grid
+    does not fit the scene and nothing is valid.
+    """
+    t_us = times_of(rollout)
+    names = ("offroad", "offroad_max_excursion_m", "offroad_area_frac", "offroad_unknown_frac")
+    if grid is None or not rollout.states:
+        return [unknown_series(name, t_us) for name in names]
+    found = judge_footprints(grid, rollout.world_from_rig, rollout.rig.body)
+    first = _first_relevant(rollout)
+    if found.verdict[first] != Verdict.ON:
+        recorded = rollout.recorded.at(np.array([t_us[first]]))
+        if judge_footprints(grid, recorded, rollout.rig.body).verdict[0] != Verdict.ON:
+            return [unknown_series(name, t_us) for name in names]
+    values, valid = debounced(found.verdict)
+    known = found.verdict != Verdict.UNKNOWN
+    return [
+        make_series("offroad", t_us, values, valid),
+        make_series("offroad_max_excursion_m", t_us, found.excursion_m, known),
+        make_series("offroad_area_frac", t_us, found.area_frac, known),
+        make_series("offroad_unknown_frac", t_us, ~known),
+    ]
+
+
+def true_offroad_series(rollout: Rollout, road_map: RoadMap | None) -> Series:
+    """``offroad_true`` against the drivable polygons of the map; invalid without one, or if it misfits the start."""
+    t_us = times_of(rollout)
+    if road_map is None or not road_map.drivable or not rollout.states:
+        return unknown_series("offroad_true", t_us)
+    area = drivable_area(road_map)
+    outside = corners_outside_m(area, rollout.world_from_rig, rollout.rig.body) > TOLERANCE_M
+    first = _first_relevant(rollout)
+    if outside[first]:
+        recorded = rollout.recorded.at(np.array([t_us[first]]))
+        if corners_outside_m(area, recorded, rollout.rig.body)[0] > TOLERANCE_M:
+            return unknown_series("offroad_true", t_us)
+    values, valid = debounced(np.where(outside, Verdict.OFF, Verdict.ON))
+    return make_series("offroad_true", t_us, values, valid)
+
+
+def drivable_area(road_map: RoadMap):
+    """The union of the map's drivable polygons as one shapely geometry."""
+    import shapely
+
+    polygons = [shapely.Polygon(rings[0], [ring for ring in rings[1:]]) for rings in road_map.drivable]
+    return shapely.union_all(shapely.make_valid(np.array(polygons, dtype=object)))
+
+
+def corners_outside_m(area, world_from_rig: Float64[np.ndarray, "n 4 4"], body: Box) -> Float64[np.ndarray, " n"]:
+    """How far the outermost corner of the body lies outside a shapely area, 0 if all are inside."""
+    import shapely
+
+    corners = geometry.box_corners_xy(body_boxes(world_from_rig, body).world_from_box, *body.size_m[:2])
+    return shapely.distance(area, shapely.points(corners)).max(axis=1)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """The Gaussian grid against the true polygon on random placements.
+
+    ``agreement`` counts placements with a verdict only. ``false_alarms`` are off in the grid but not in truth,
+    ``misses`` the other way round. ``error_margin_p95_m``: how far from the tolerance the true corner was, where the
+    two disagree (NaN if they never do).
+    """
+
+    placements: int
+    known: int
+    agreement: float
+    unknown_frac: float
+    false_alarms: int
+    misses: int
+    error_margin_p95_m: float
+
+
+def offroad_agreement(
+    grid: OffroadGrid,
+    road_map: RoadMap,
+    ego: Trajectory,
+    body: Box,
+    placements: int = 900,
+    seed: int = 0,
+    max_offset_m: float = 5.5,
+) -> Agreement:
+    """Compare the grid with the true drivable area on footprints beside the recorded path.
+
+    Places are uniform along the path and within ``max_offset_m`` to either side, headed along it.
+
+    Raises:
+        ValueError: the map has no drivable area, or the path is shorter than a metre.
+    """
+    if not road_map.drivable:
+        raise ValueError("the road map has no drivable area to compare with")
+    line = ego.position_m[:, :2]
+    length = geometry.arc_length(line)
+    if length[-1] < 1.0:
+        raise ValueError(f"the recorded path is {length[-1]:.2f} m long; at least 1 m is needed to place footprints")
+    draw = np.random.default_rng(seed)
+    at, offset = draw.uniform(0, length[-1], placements), draw.uniform(-max_offset_m, max_offset_m, placements)
+    t_us = np.interp(at, length, ego.t_us - ego.t_us[0]).astype(np.int64) + ego.t_us[0]
+    poses = ego.at(t_us)
+    poses[:, :3, 3] += offset[:, None] * poses[:, :3, 1]
+    verdict = judge_footprints(grid, poses, body).verdict
+    beyond = corners_outside_m(drivable_area(road_map), poses, body)
+    truth, known, said = beyond > TOLERANCE_M, verdict != Verdict.UNKNOWN, verdict == Verdict.OFF
+    wrong = known & (said != truth)
+    margin = float(np.quantile(np.abs(beyond[wrong] - TOLERANCE_M), 0.95)) if wrong.any() else float("nan")
+    count = int(known.sum())
+    return Agreement(
+        placements, count, 1 - float(wrong.sum()) / count if count else float("nan"), 1 - count / placements,
+        int((wrong & said).sum()), int((wrong & truth).sum()), margin,
+    )  # fmt: skip
+
+
+def _first_relevant(rollout: Rollout) -> int:
+    relevant = np.flatnonzero(rollout.t_us >= rollout.first_closed_loop_us)
+    return int(relevant[0]) if len(relevant) else 0

@@ -1,0 +1,239 @@
+"""Where the road is, read from road-class Gaussians: a grid seen from above with road, non-road and unknown cells.
+
+``build_offroad_grid`` follows ``spec/metrics.md`` 1.2.2 step by step: ground heights, evidence, adaptive bandwidth,
+specks, driven corridor, closing, holes, two distance fields. Cells are [row along y, column along x]; a cell's index is
+``floor((xy - origin) / cell)``.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from nurec_sim import geometry
+from nurec_sim.errors import ReconstructError
+from nurec_sim.metrics.ground import GroundHeights, fit_ground
+from nurec_sim.types import Box, Gaussians, GaussianScene, Label, Trajectory
+
+FAR_M = 1e6
+"""Distance to something that is nowhere on the grid."""
+
+
+class Cell(enum.IntEnum):
+    """What a cell is known to be."""
+
+    UNKNOWN = 0
+    ROAD = 1
+    NONROAD = 2
+
+
+@dataclass(frozen=True)
+class GridSettings:
+    """Parameters of the grid; the defaults are those of ``spec/metrics.md`` 1.2.2."""
+
+    cell_m: float = 0.1
+    coarse_cell_m: float = 0.2
+    max_fine_cells: int = 6_000_000
+    margin_m: float = 20.0
+    below_ground_m: float = 0.4
+    above_ground_m: float = 0.6
+    min_opacity: float = 0.05
+    bandwidth_m: tuple[float, float] = (0.1, 0.5)
+    bandwidth_factor: float = 0.7
+    density_band_m: float = 3.0
+    min_mass: float = 1.5
+    road_speck_m2: float = 1.0
+    nonroad_speck_m2: float = 0.3
+    corridor_m: float = 1.0
+    closing_m: float = 0.4
+    hole_m2: float = 12.0
+
+
+@dataclass(frozen=True)
+class OffroadGrid:
+    """The grid and its two distance fields, both 0 inside and growing outwards, in metres.
+
+    ``beyond_possible_m`` is the distance to the nearest cell that is road or unknown, ``beyond_known_m`` the distance
+    to the nearest road cell. ``overruled_frac`` is the share of the driven corridor whose labels said non-road: a
+    measure of label quality.
+    """
+
+    origin_m: tuple[float, float]
+    cell_m: float
+    state: UInt8[np.ndarray, "rows columns"]
+    beyond_possible_m: Float32[np.ndarray, "rows columns"]
+    beyond_known_m: Float32[np.ndarray, "rows columns"]
+    bandwidth_m: float
+    overruled_frac: float
+
+    @classmethod
+    def from_state(
+        cls, origin_m: tuple[float, float], cell_m: float, state: np.ndarray, bandwidth_m: float, overruled: float
+    ) -> OffroadGrid:
+        """A grid from its cells; the distance fields follow from them."""
+        possible = distance_to(state != Cell.NONROAD, cell_m)
+        known = distance_to(state == Cell.ROAD, cell_m)
+        return cls(origin_m, cell_m, state.astype(np.uint8), possible, known, bandwidth_m, overruled)
+
+    def look_up(
+        self, xy_m: Float64[np.ndarray, "*n 2"]
+    ) -> tuple[Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
+        """Both distances at points, bilinear between cell centres, and which points lie on the grid."""
+        rows, columns = self.state.shape
+        place = (np.asarray(xy_m, np.float64) - np.asarray(self.origin_m)) / self.cell_m
+        inside = np.all((place >= 0) & (place < np.array([columns, rows])), axis=-1)
+        column = np.clip(place[..., 0] - 0.5, 0, columns - 1)
+        row = np.clip(place[..., 1] - 0.5, 0, rows - 1)
+        column0, row0 = np.minimum(column.astype(np.int64), columns - 2), np.minimum(row.astype(np.int64), rows - 2)
+        fc, fr = column - column0, row - row0
+        corner = row0 * columns + column0
+
+        def sample(field: np.ndarray) -> np.ndarray:
+            flat = field.reshape(-1)
+            upper = flat[corner] * (1 - fc) + flat[corner + 1] * fc
+            return upper * (1 - fr) + (flat[corner + columns] * (1 - fc) + flat[corner + columns + 1] * fc) * fr
+
+        return sample(self.beyond_possible_m), sample(self.beyond_known_m), inside
+
+
+def build_offroad_grid(
+    static: Gaussians, ego: Trajectory, body: Box, settings: GridSettings | None = None
+) -> OffroadGrid:
+    """The grid around a recorded path.
+
+    Args:
+        static: the static layer; labels ROAD and OTHER are evidence, movable objects say nothing of the ground.
+        ego: recorded rig poses; the rig's origin lies on the ground.
+        body: outline of the car that was driven; its front and rear extend the driven corridor at the ends.
+        settings: parameters.
+
+    Raises:
+        ReconstructError: no Gaussian is labelled road, so nothing can be said.
+    """
+    settings = settings or GridSettings()
+    path = driven_path(ego, body)
+    low, high = path[:, :2].min(axis=0) - settings.margin_m, path[:, :2].max(axis=0) + settings.margin_m
+    fine = np.prod((high - low) / settings.cell_m) <= settings.max_fine_cells
+    cell = settings.cell_m if fine else settings.coarse_cell_m
+    columns, rows = (np.ceil((high - low) / cell)).astype(int)
+
+    mean = static.mean_m.astype(np.float64)
+    inside = np.all((mean[:, :2] >= low) & (mean[:, :2] < low + np.array([columns, rows]) * cell), axis=1)
+    usable = inside & (static.opacity > settings.min_opacity) & np.isin(static.label, (Label.ROAD, Label.OTHER))
+    mean, opacity, is_road = mean[usable], static.opacity[usable], static.label[usable] == Label.ROAD
+    if not is_road.any():
+        raise ReconstructError(
+            f"no Gaussian near the recorded path is labelled road ({len(static)} Gaussians, {int(usable.sum())} of "
+            "them opaque and within reach): off-road cannot be decided"
+        )
+    ground = fit_ground(mean[is_road], path, (low[0], low[1]), (high[0], high[1]))
+    layer = _near_ground(mean, ground, settings)
+    mean, opacity, is_road = mean[layer], opacity[layer], is_road[layer]
+
+    index = np.floor((mean[:, :2] - low) / cell).astype(np.int64)
+    flat = index[:, 1] * columns + index[:, 0]
+    evidence = [
+        np.bincount(flat[chosen], opacity[chosen], rows * columns).reshape(rows, columns).astype(np.float32)
+        for chosen in (is_road, ~is_road)
+    ]
+    path_cells = np.floor((path[:, :2] - low) / cell).astype(np.int64)
+    on_path = np.zeros((rows, columns), bool)
+    on_path[path_cells[:, 1], path_cells[:, 0]] = True
+    from_path = distance_to(on_path, cell)
+
+    band = from_path < settings.density_band_m
+    density = np.count_nonzero(band.reshape(-1)[flat]) / (np.count_nonzero(band) * cell**2)
+    bandwidth = float(np.clip(settings.bandwidth_factor / np.sqrt(max(density, 1e-6)), *settings.bandwidth_m))
+    state = _decide(evidence[0], evidence[1], cell, bandwidth, settings)
+    _drop_specks(state, cell, settings)
+    corridor = from_path <= settings.corridor_m
+    overruled = float(np.count_nonzero(state[corridor] == Cell.NONROAD) / max(np.count_nonzero(corridor), 1))
+    state[corridor] = Cell.ROAD
+    _close(state, cell, settings)
+    _fill_holes(state, cell, settings)
+    return OffroadGrid.from_state((float(low[0]), float(low[1])), cell, state, bandwidth, overruled)
+
+
+def scene_offroad_grid(scene: GaussianScene, settings: GridSettings | None = None) -> OffroadGrid:
+    """The grid of a reconstructed scene; see ``build_offroad_grid``."""
+    return build_offroad_grid(scene.static, scene.ego, scene.rig.body, settings)
+
+
+def driven_path(ego: Trajectory, body: Box, step_m: float = 0.05) -> Float64[np.ndarray, "k 3"]:
+    """Ground points under the middle of the car, from its tail at the first pose to its nose at the last one."""
+    nose = body.center_m[0] + body.size_m[0] / 2
+    tail = body.center_m[0] - body.size_m[0] / 2
+    poses = ego.world_from_body
+    ends = [poses[0] @ np.array([tail, 0, 0, 1.0]), poses[-1] @ np.array([nose, 0, 0, 1.0])]
+    points = np.concatenate([[ends[0][:3]], poses[:, :3, 3], [ends[1][:3]]])
+    length = geometry.arc_length(points)
+    moved = np.concatenate([[True], np.diff(length) > 1e-9])
+    points, length = points[moved], length[moved]
+    at = np.linspace(0.0, length[-1], max(int(np.ceil(length[-1] / step_m)), 1) + 1)
+    return np.stack([np.interp(at, length, points[:, axis]) for axis in range(3)], axis=1)
+
+
+def distance_to(mask: Bool[np.ndarray, "rows columns"], cell_m: float) -> Float32[np.ndarray, "rows columns"]:
+    """Distance in metres from every cell to the edge of a mask, 0 inside it; ``FAR_M`` where the mask is empty."""
+    import cv2
+
+    if not mask.any():
+        return np.full(mask.shape, FAR_M, np.float32)
+    cells = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # Cell centres are counted; the mask's edge lies half a cell this side of its nearest centre.
+    return np.maximum((cells - 0.5) * np.float32(cell_m), 0).astype(np.float32)
+
+
+def _near_ground(mean_m: np.ndarray, ground: GroundHeights, settings: GridSettings) -> np.ndarray:
+    height = mean_m[:, 2] - ground.at(mean_m[:, :2])
+    return (height > -settings.below_ground_m) & (height < settings.above_ground_m)
+
+
+def _decide(road: np.ndarray, other: np.ndarray, cell: float, bandwidth: float, settings: GridSettings) -> np.ndarray:
+    """Cells decided by the finest of two bands that holds enough opacity; the rest stays unknown."""
+    from scipy.ndimage import gaussian_filter
+
+    state = np.zeros(road.shape, np.uint8)
+    for sigma_m in (bandwidth, 1.5 * bandwidth):
+        sigma = sigma_m / cell
+        # The filter's kernel sums to one; times its area it peaks at one and so adds up the opacities around.
+        peak = 2 * np.pi * sigma**2
+        smooth_road = gaussian_filter(road, sigma, mode="constant", truncate=3.0) * peak
+        smooth_other = gaussian_filter(other, sigma, mode="constant", truncate=3.0) * peak
+        decided = (state == Cell.UNKNOWN) & (smooth_road + smooth_other > settings.min_mass)
+        state[decided] = np.where(smooth_road > smooth_other, Cell.ROAD, Cell.NONROAD)[decided]
+    return state
+
+
+def _drop_specks(state: np.ndarray, cell: float, settings: GridSettings) -> None:
+    """Small islands of a class become unknown, never the other class."""
+    from scipy.ndimage import label
+
+    for kind, area_m2 in ((Cell.ROAD, settings.road_speck_m2), (Cell.NONROAD, settings.nonroad_speck_m2)):
+        islands, count = label(state == kind)
+        small = np.bincount(islands.reshape(-1), minlength=count + 1) * cell**2 < area_m2
+        small[0] = False
+        state[small[islands]] = Cell.UNKNOWN
+
+
+def _close(state: np.ndarray, cell: float, settings: GridSettings) -> None:
+    """Morphological closing of the road; observed non-road is never overwritten."""
+    grown = distance_to(state == Cell.ROAD, cell) <= settings.closing_m
+    closed = distance_to(~grown, cell) > settings.closing_m
+    state[closed & (state == Cell.UNKNOWN)] = Cell.ROAD
+
+
+def _fill_holes(state: np.ndarray, cell: float, settings: GridSettings) -> None:
+    """Small unknown holes inside the road (the shadow of a parked car) become road."""
+    from scipy.ndimage import binary_dilation, label
+
+    holes, count = label(state == Cell.UNKNOWN)
+    fill = np.bincount(holes.reshape(-1), minlength=count + 1) * cell**2 < settings.hole_m2
+    fill[0] = False
+    fill[np.unique(holes[binary_dilation(state == Cell.NONROAD)])] = False
+    for border in (holes[0], holes[-1], holes[:, 0], holes[:, -1]):
+        fill[np.unique(border)] = False
+    state[fill[holes]] = Cell.ROAD

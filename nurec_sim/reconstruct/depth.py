@@ -1,0 +1,284 @@
+"""Dense depth of a working view: sweeps splatted into it, matched against neighbouring views, smoothed along 8 paths.
+
+Inverse depth (1/m, along the optical axis) everywhere; 0 is infinitely far. Compiled kernels run without the
+interpreter lock.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32, UInt8, UInt64
+from numba import njit
+
+PRIOR_COST, PRIOR_CAP = 40.0, 220.0
+SKY_COST, NOT_SKY_COST = 60.0, 40.0
+NEUTRAL_COST = 24.0
+SMOOTH_ONE, SMOOTH_MANY = 6.0, 48.0
+
+
+@njit(cache=True, nogil=True)
+def project_point(view, x, y, z):
+    """Pixel and depth of a point: (u, v, depth); depth <= 0 if behind. ``view`` is ``View.packed``."""
+    a = view[5] * x + view[6] * y + view[7] * z + view[14]
+    b = view[8] * x + view[9] * y + view[10] * z + view[15]
+    c = view[11] * x + view[12] * y + view[13] * z + view[16]
+    if c <= 1e-3:
+        return 0.0, 0.0, -1.0
+    u, v = view[0] * a / c + view[1], view[0] * b / c + view[2]
+    if view[17] != 0.0 or view[18] != 0.0 or view[19] != 0.0:
+        for _ in range(3):
+            f = min(max(view[20] * u + view[21] * v + view[22], -0.5), 0.5)
+            d = c - view[19] * f
+            if d <= 1e-3:
+                return 0.0, 0.0, -1.0
+            u, v = view[0] * (a - view[17] * f) / d + view[1], view[0] * (b - view[18] * f) / d + view[2]
+        c -= view[19] * f
+    return u, v, c
+
+
+@njit(cache=True, nogil=True)
+def splat(view, xyz, normal, spacing, offset, inverse_depth, index):
+    """Draw surfels into ``inverse_depth`` and ``index`` (``offset`` + row of the point); nearest wins.
+
+    Each surfel covers a disc of its spacing and takes at every pixel the depth of its tangent plane, bounded so that a
+    grazing plane does not run away.
+    """
+    width, height, focal = int(view[3]), int(view[4]), view[0]
+    for i in range(len(xyz)):
+        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        u, v, depth = project_point(view, x, y, z)
+        if depth < 0.3 or u < -8 or v < -8 or u > width + 8 or v > height + 8:
+            continue
+        radius = min(max(0.7 * spacing[i] * focal / depth, 0.6), 12.0)
+        n0 = view[5] * normal[i, 0] + view[6] * normal[i, 1] + view[7] * normal[i, 2]
+        n1 = view[8] * normal[i, 0] + view[9] * normal[i, 1] + view[10] * normal[i, 2]
+        n2 = view[11] * normal[i, 0] + view[12] * normal[i, 1] + view[13] * normal[i, 2]
+        along = n0 * (u - view[1]) / focal + n1 * (v - view[2]) / focal + n2
+        w = 1.0 / depth
+        limit = 1.5 * spacing[i] * w * w
+        if abs(along) > 1e-6:
+            limit = min(limit / max(abs(along), 0.05), 0.1 * w)
+        for row in range(max(int(v - radius), 0), min(int(v + radius) + 1, height)):
+            for column in range(max(int(u - radius), 0), min(int(u + radius) + 1, width)):
+                du, dv = column + 0.5 - u, row + 0.5 - v
+                if du * du + dv * dv > radius * radius:
+                    continue
+                here = w
+                if abs(along) > 1e-6:
+                    slant = w * (n0 * du + n1 * dv) / (focal * along)
+                    here = w + min(max(slant, -limit), limit)
+                if here > inverse_depth[row, column]:
+                    inverse_depth[row, column] = here
+                    index[row, column] = offset + i
+
+
+@njit(cache=True, nogil=True)
+def drop_shine_through(inverse_depth, index):
+    """Empty pixels that most of their 7x7 surroundings lie well in front of: seen through gaps of a surface."""
+    height, width = inverse_depth.shape
+    bad = np.zeros((height, width), np.bool_)
+    for row in range(height):
+        for column in range(width):
+            w = inverse_depth[row, column]
+            if w <= 0:
+                continue
+            front, total = 0, 0
+            for r in range(max(row - 3, 0), min(row + 4, height)):
+                for c in range(max(column - 3, 0), min(column + 4, width)):
+                    other = inverse_depth[r, c]
+                    if other > 0:
+                        total += 1
+                        front += other > 1.2 * w + 0.002
+            bad[row, column] = front * 2 > total + 4
+    for row in range(height):
+        for column in range(width):
+            if bad[row, column]:
+                inverse_depth[row, column] = 0
+                index[row, column] = -1
+
+
+def census(gray: UInt8[np.ndarray, "h w"]) -> UInt64[np.ndarray, "h w"]:
+    """48 bits per pixel: which of the 7x7 neighbours are darker."""
+    padded = np.pad(gray.astype(np.int16), 3, mode="edge")
+    bits = np.zeros(gray.shape, np.uint64)
+    for dy in range(7):
+        for dx in range(7):
+            if (dy, dx) != (3, 3):
+                darker = padded[dy : dy + gray.shape[0], dx : dx + gray.shape[1]] < gray.astype(np.int16) - 1
+                bits = (bits << np.uint64(1)) | darker.astype(np.uint64)
+    return bits
+
+
+@njit(cache=True, nogil=True)
+def _popcount(x):
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@njit(cache=True, nogil=True)
+def matching_cost(view, world_from_view, others, rgb, codes, other_rgb, other_codes, step, levels, cost):
+    """Fill ``cost[h, w, levels]`` (0..100): mean of the two best neighbours of census and colour differences.
+
+    ``others`` stacks packed views, ``other_rgb``/``other_codes`` their pictures, padded to one size.
+    """
+    height, width, _ = rgb.shape
+    count = len(others)
+    focal = view[0]
+    for row in range(height):
+        for column in range(width):
+            rx, ry = (column + 0.5 - view[1]) / focal, (row + 0.5 - view[2]) / focal
+            f = min(max(view[20] * (column + 0.5) + view[21] * (row + 0.5) + view[22], -0.5), 0.5)
+            ox, oy, oz = view[17] * f, view[18] * f, view[19] * f
+            m = world_from_view
+            dx, dy, dz = (m[k, 0] * rx + m[k, 1] * ry + m[k, 2] for k in range(3))
+            px, py, pz = (m[k, 0] * ox + m[k, 1] * oy + m[k, 2] * oz + m[k, 3] for k in range(3))
+            for level in range(levels):
+                w = level * step
+                first, second, seen = 1e9, 1e9, 0
+                for n in range(count):
+                    o = others[n]
+                    a = o[5] * dx + o[6] * dy + o[7] * dz + w * (o[5] * px + o[6] * py + o[7] * pz + o[14])
+                    b = o[8] * dx + o[9] * dy + o[10] * dz + w * (o[8] * px + o[9] * py + o[10] * pz + o[15])
+                    c = o[11] * dx + o[12] * dy + o[13] * dz + w * (o[11] * px + o[12] * py + o[13] * pz + o[16])
+                    if c <= 1e-6:
+                        continue
+                    u, v = o[0] * a / c + o[1], o[0] * b / c + o[2]
+                    if o[17] != 0.0 or o[18] != 0.0 or o[19] != 0.0:
+                        g = w * min(max(o[20] * u + o[21] * v + o[22], -0.5), 0.5)
+                        d = max(c - o[19] * g, 1e-6)
+                        u, v = o[0] * (a - o[17] * g) / d + o[1], o[0] * (b - o[18] * g) / d + o[2]
+                    u, v = u - 0.5, v - 0.5
+                    iu, iv = int(np.floor(u)), int(np.floor(v))
+                    if iu < 0 or iv < 0 or iu >= int(o[3]) - 1 or iv >= int(o[4]) - 1:
+                        continue
+                    fu, fv = u - iu, v - iv
+                    difference = 0.0
+                    for k in range(3):
+                        top = other_rgb[n, iv, iu, k] * (1 - fu) + other_rgb[n, iv, iu + 1, k] * fu
+                        low = other_rgb[n, iv + 1, iu, k] * (1 - fu) + other_rgb[n, iv + 1, iu + 1, k] * fu
+                        difference += abs(top * (1 - fv) + low * fv - rgb[row, column, k])
+                    bits = _popcount(codes[row, column] ^ other_codes[n, int(v + 0.5), int(u + 0.5)])
+                    value = min(difference * 0.6, 50.0) + min(bits * 2.0, 50.0)
+                    seen += 1
+                    if value < first:
+                        first, second = value, first
+                    elif value < second:
+                        second = value
+                if seen == 0:
+                    cost[row, column, level] = NEUTRAL_COST
+                elif seen == 1:
+                    cost[row, column, level] = first
+                else:
+                    cost[row, column, level] = 0.5 * (first + second)
+
+
+@njit(cache=True, nogil=True)
+def add_prior(cost, prior, sky, step):
+    """Bend the costs towards the measured inverse depth where there is one, and towards infinity in the sky."""
+    height, width, levels = cost.shape
+    for row in range(height):
+        for column in range(width):
+            w = prior[row, column]
+            if w > 0:
+                for level in range(levels):
+                    cost[row, column, level] = 0.3 * cost[row, column, level] + min(
+                        PRIOR_COST * abs(level - w / step), PRIOR_CAP
+                    )
+            elif sky[row, column]:
+                for level in range(1, levels):
+                    cost[row, column, level] += SKY_COST
+            else:
+                cost[row, column, 0] += NOT_SKY_COST
+
+
+@njit(cache=True, nogil=True)
+def _sweep_path(cost, gray, dy, dx, total, line, fresh):
+    height, width, levels = cost.shape
+    rows = range(height) if dy > 0 or (dy == 0 and dx > 0) else range(height - 1, -1, -1)
+    for row in rows:
+        for step in range(width):
+            column = step if (dx > 0 or (dx == 0)) else width - 1 - step
+            r, c = row - dy, column - dx
+            here = fresh[column] if dy != 0 else fresh[column]
+            if r < 0 or r >= height or c < 0 or c >= width:
+                for k in range(levels):
+                    here[k] = cost[row, column, k]
+            else:
+                before = line[c] if dy != 0 else fresh[c]
+                jump = abs(float(gray[row, column]) - float(gray[r, c]))
+                many = max(SMOOTH_MANY / (1.0 + jump / 8.0), SMOOTH_ONE + 1)
+                low = before[0]
+                for k in range(1, levels):
+                    low = min(low, before[k])
+                for k in range(levels):
+                    best = min(before[k], low + many)
+                    if k > 0:
+                        best = min(best, before[k - 1] + SMOOTH_ONE)
+                    if k < levels - 1:
+                        best = min(best, before[k + 1] + SMOOTH_ONE)
+                    here[k] = cost[row, column, k] + best - low
+            for k in range(levels):
+                total[row, column, k] += here[k]
+        line, fresh = fresh, line
+
+
+@njit(cache=True, nogil=True)
+def smooth_depth(cost, gray, step):
+    """Semi-global minimum over 8 paths; inverse depth with a parabola between levels [h, w] float32."""
+    height, width, levels = cost.shape
+    total = np.zeros((height, width, levels), np.float32)
+    line, fresh = np.zeros((width, levels), np.float32), np.zeros((width, levels), np.float32)
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+        _sweep_path(cost, gray, dy, dx, total, line, fresh)
+    result = np.zeros((height, width), np.float32)
+    for row in range(height):
+        for column in range(width):
+            best = np.argmin(total[row, column])
+            shift = 0.0
+            if 0 < best < levels - 1:
+                a, b, c = total[row, column, best - 1], total[row, column, best], total[row, column, best + 1]
+                curve = a - 2 * b + c
+                if curve > 1e-6:
+                    shift = min(max(0.5 * (a - c) / curve, -0.5), 0.5)
+            result[row, column] = (best + shift) * step if best > 0 else 0.0
+    return result
+
+
+def dense_inverse_depth(
+    packed: Float64[np.ndarray, " 23"],
+    world_from_view: Float64[np.ndarray, "4 4"],
+    rgb: UInt8[np.ndarray, "h w 3"],
+    prior: Float32[np.ndarray, "h w"],
+    sky: Bool[np.ndarray, "h w"],
+    neighbours: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    levels: int,
+    step: float,
+) -> Float32[np.ndarray, "h w"]:
+    """Inverse depth of every pixel: the prior where it holds, matching and smoothness elsewhere, 0 in the sky.
+
+    ``neighbours`` are (packed view, rgb, census) of the views to match against.
+    """
+    height, width = prior.shape
+    cost = np.full((height, width, levels), NEUTRAL_COST, np.float32)
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    if neighbours:
+        shape = tuple(max(item[1].shape[axis] for item in neighbours) for axis in (0, 1))
+        others = np.stack([item[0] for item in neighbours])
+        pictures = np.zeros((len(neighbours), *shape, 3), np.uint8)
+        codes = np.zeros((len(neighbours), *shape), np.uint64)
+        for n, (_, picture, code) in enumerate(neighbours):
+            pictures[n, : picture.shape[0], : picture.shape[1]] = picture
+            codes[n, : code.shape[0], : code.shape[1]] = code
+        matching_cost(packed, world_from_view, others, rgb, census(gray), pictures, codes, step, levels, cost)
+    add_prior(cost, prior, sky, step)
+    result = smooth_depth(cost, gray, step)
+    trusted = (prior > 0) & (np.abs(result - prior) < 1.5 * step + 0.1 * prior)
+    return np.where(trusted, prior, result).astype(np.float32)
+
+
+def unused_index(shape: tuple[int, int]) -> Int32[np.ndarray, "h w"]:
+    """An index picture in which no surfel was drawn yet."""
+    return np.full(shape, -1, np.int32)

@@ -1,0 +1,74 @@
+"""Settings of the `lift` reconstruction; every length in metres, every angle in degrees where the name says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class PointSettings:
+    """How sweeps are gathered, split by boxes and thinned."""
+
+    box_margin_m: float = 0.15
+    """Boxes grow by this on every side before points are taken out of the static world."""
+    standing_m: float = 0.3
+    """A track that moves less than this over its labelled life stands: it is kept over the whole clip."""
+    min_voxel_m: float = 0.05
+    max_voxel_m: float = 0.4
+    voxel_per_distance: float = 0.005
+    """Voxel edge per metre of distance to the driven path, rounded down to a power of two times ``min_voxel_m``."""
+    max_range_m: float = 120.0
+    carve: bool = True
+    """Drop points that at least ``carve_votes`` sweeps look through: ghosts of unlabelled movers."""
+    carve_votes: int = 3
+
+
+@dataclass(frozen=True)
+class GroundSettings:
+    """The ground height grid and the road grown in it from the driven path."""
+
+    cell_m: float = 0.1
+    reach_m: float = 30.0
+    """The grid ends this far from the driven path."""
+    step_m: float = 0.045
+    """A height step across 0.4 m above this, beyond the slope, is a kerb."""
+    slope: float = 0.06
+    opening_m: float = 0.35
+    """Gaps in kerbs narrower than twice this do not let the road through."""
+    road_reach_m: float = 14.0
+    """No road label farther than this from the driven path."""
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """The pinhole working views, their depth and the pixels lifted from them."""
+
+    width_px: int = 640
+    """Working views have at most this width, by a whole-number reduction of the image."""
+    max_field_deg: float = 110.0
+    """Wider lenses are cut into several views."""
+    max_views: int = 78
+    """Frames are skipped evenly until no more working views than this are left."""
+    levels: int = 96
+    """Inverse-depth hypotheses of the matching, from infinity to ``min_depth_m``."""
+    min_depth_m: float = 3.0
+    max_depth_m: float = 150.0
+    """Surfaces farther than this belong to the sky cubemap."""
+    neighbours: int = 4
+    """Views that each view is matched against; 0 turns matching off."""
+
+
+@dataclass(frozen=True)
+class LiftSettings:
+    """All settings of ``reconstruct(clip, "lift")``."""
+
+    points: PointSettings = field(default_factory=PointSettings)
+    ground: GroundSettings = field(default_factory=GroundSettings)
+    views: ViewSettings = field(default_factory=ViewSettings)
+    sky_px: int = 512
+    """Edge of a cubemap face."""
+    window_position_m: float = 0.03
+    """Largest error of the linear motion between the knots of an actor's window."""
+    window_rotation_deg: float = 2.0
+    """Largest turn of an actor within one window."""
+    opacity: float = 0.95

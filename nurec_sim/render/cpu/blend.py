@@ -1,0 +1,194 @@
+"""Kernel that blends a tile's records front to back with the exact response along every ray; float32."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from nurec_sim.render.cpu.binning import TILE
+from nurec_sim.render.cpu.bounds import JIT, f4
+from nurec_sim.render.cpu.projection import BALL, BOX, FADE, FEATURE, MAP, ORIGIN, RANGE, TAG
+
+SIDE = 8
+CELLS = SIDE * SIDE
+"""A block of rays that is blended at once; its sums stay in the first-level cache."""
+
+PLANES = 6
+"""Output planes: three features, distance, alpha, label."""
+
+# Sections of a block's buffer, CELLS values each.
+DX, DY, DZ, OX, OY, OZ, LIVE, SUM = 0, 1, 2, 3, 4, 5, 6, 7
+BEST = SUM + PLANES
+SECTIONS = BEST + 1
+
+CUT = math.log(255.0) / 8
+
+
+def _exponential() -> tuple[np.float32, ...]:
+    """Coefficients of the quartic nearest to exp(-x) on 0..CUT in relative terms (Chebyshev nodes)."""
+    x = (1 - np.cos((np.arange(64) + 0.5) * np.pi / 64)) / 2 * CUT
+    basis = np.stack([x**k for k in range(5)], axis=1) * np.exp(x)[:, None]
+    return tuple(np.float32(c) for c in np.linalg.lstsq(basis, np.ones(64), rcond=None)[0])
+
+
+E0, E1, E2, E3, E4 = _exponential()
+
+
+@njit(**JIT)
+def _load_rays(b, direction, valid, line, lines, x0, y0, width, height):
+    """Rays of a block in the reference frame; cells outside of the grid or without a ray are dead from the start."""
+    alive = 0
+    for k in range(CELLS):
+        x, y = x0 + k % SIDE, y0 + k // SIDE
+        b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k] = f4(0), f4(0), f4(1)
+        b[OX * CELLS + k], b[OY * CELLS + k], b[OZ * CELLS + k] = f4(0), f4(0), f4(0)
+        b[LIVE * CELLS + k] = f4(0)
+        for s in range(SUM, SECTIONS):
+            b[s * CELLS + k] = f4(0)
+        if x < width and y < height and valid[y, x] != 0:
+            dx, dy, dz = direction[y, x, 0], direction[y, x, 1], direction[y, x, 2]
+            if lines.shape[0] > 1:
+                m = lines[line[y, x]]
+                b[OX * CELLS + k], b[OY * CELLS + k], b[OZ * CELLS + k] = m[9], m[10], m[11]
+                dx, dy, dz = (m[0] * dx + m[1] * dy + m[2] * dz, m[3] * dx + m[4] * dy + m[5] * dz,
+                              m[6] * dx + m[7] * dy + m[8] * dz)  # fmt: skip
+            b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k] = dx, dy, dz
+            b[LIVE * CELLS + k] = f4(1)
+            alive += 1
+    return alive
+
+
+@njit(**JIT)
+def _blend_fixed(b, r, near):
+    """Blend one record into a block whose rays all start at the reference point."""
+    m00, m01, m02, m10, m11, m12 = r[MAP], r[MAP + 1], r[MAP + 2], r[MAP + 3], r[MAP + 4], r[MAP + 5]
+    m20, m21, m22 = r[MAP + 6], r[MAP + 7], r[MAP + 8]
+    ball, fade, far, tag = r[BALL], r[FADE], r[RANGE], r[TAG]
+    fa, fb, fc = r[FEATURE], r[FEATURE + 1], r[FEATURE + 2]
+    for k in range(CELLS):
+        dx, dy, dz = b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k]
+        x = m00 * dx + m01 * dy + m02 * dz
+        y = m10 * dx + m11 * dy + m12 * dz
+        w = m20 * dx + m21 * dy + m22 * dz
+        off = x * x + y * y
+        inverse = f4(1) / (off + w * w)
+        a = ball * off * inverse + fade
+        t = far * w * inverse
+        e = E0 + a * (E1 + a * (E2 + a * (E3 + a * E4)))
+        e = e * e
+        e = e * e
+        e = min(e * e, f4(0.99))
+        live = b[LIVE * CELLS + k]
+        weight = e * live
+        left = live - weight
+        hit = (a < f4(CUT)) & (t >= near)
+        ends = left <= f4(1e-4)
+        weight = weight if hit & (not ends) else f4(0)
+        left = f4(0) if ends else left
+        b[LIVE * CELLS + k] = left if hit else live
+        b[SUM * CELLS + k] += weight * fa
+        b[(SUM + 1) * CELLS + k] += weight * fb
+        b[(SUM + 2) * CELLS + k] += weight * fc
+        b[(SUM + 3) * CELLS + k] += weight * t
+        b[(SUM + 4) * CELLS + k] += weight
+        best = b[BEST * CELLS + k]
+        b[(SUM + 5) * CELLS + k] = tag if weight > best else b[(SUM + 5) * CELLS + k]
+        b[BEST * CELLS + k] = max(weight, best)
+
+
+@njit(**JIT)
+def _blend_moving(b, r, near):
+    """Blend one record into a block whose rays start anywhere: full cross product with the offset of the origin."""
+    m00, m01, m02, m10, m11, m12 = r[MAP], r[MAP + 1], r[MAP + 2], r[MAP + 3], r[MAP + 4], r[MAP + 5]
+    m20, m21, m22 = r[MAP + 6], r[MAP + 7], r[MAP + 8]
+    ball, fade, far, tag = r[BALL], r[FADE], r[RANGE], r[TAG]
+    fa, fb, fc = r[FEATURE], r[FEATURE + 1], r[FEATURE + 2]
+    ox, oy, oz = r[ORIGIN], r[ORIGIN + 1], r[ORIGIN + 2]
+    for k in range(CELLS):
+        dx, dy, dz = b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k]
+        px, py, pz = b[OX * CELLS + k] - ox, b[OY * CELLS + k] - oy, b[OZ * CELLS + k] - oz
+        x = m00 * dx + m01 * dy + m02 * dz
+        y = m10 * dx + m11 * dy + m12 * dz
+        w = m20 * dx + m21 * dy + m22 * dz
+        gx = m00 * px + m01 * py + m02 * pz
+        gy = m10 * px + m11 * py + m12 * pz
+        gw = m20 * px + m21 * py + m22 * pz - far
+        cx, cy, cw = y * gw - w * gy, w * gx - x * gw, x * gy - y * gx
+        inverse = f4(1) / (x * x + y * y + w * w)
+        a = ball * (cx * cx + cy * cy + cw * cw) * inverse + fade
+        t = -(x * gx + y * gy + w * gw) * inverse
+        e = E0 + a * (E1 + a * (E2 + a * (E3 + a * E4)))
+        e = e * e
+        e = e * e
+        e = min(e * e, f4(0.99))
+        live = b[LIVE * CELLS + k]
+        weight = e * live
+        left = live - weight
+        hit = (a < f4(CUT)) & (t >= near)
+        ends = left <= f4(1e-4)
+        weight = weight if hit & (not ends) else f4(0)
+        left = f4(0) if ends else left
+        b[LIVE * CELLS + k] = left if hit else live
+        b[SUM * CELLS + k] += weight * fa
+        b[(SUM + 1) * CELLS + k] += weight * fb
+        b[(SUM + 2) * CELLS + k] += weight * fc
+        b[(SUM + 3) * CELLS + k] += weight * t
+        b[(SUM + 4) * CELLS + k] += weight
+        best = b[BEST * CELLS + k]
+        b[(SUM + 5) * CELLS + k] = tag if weight > best else b[(SUM + 5) * CELLS + k]
+        b[BEST * CELLS + k] = max(weight, best)
+
+
+@njit(**JIT)
+def blend(tiles, starts, lists, records, direction, valid, line, lines, near, columns, planes):
+    """Blend the given tiles into ``planes`` [6,h,w]: three features, distance, alpha (weighted sums), label.
+
+    Args:
+        tiles: numbers of the tiles to do.
+        starts: [tiles+1] where each tile's list starts.
+        lists: rows of ``records`` front to back, tile after tile.
+        records: see projection.
+        direction: [h,w,3] rays in the sensor frame, with valid and line as in ``Grid``.
+        valid: [h,w].
+        line: [h,w].
+        lines: poses per line; a single one when nothing moves.
+        near: near plane.
+        columns: tiles per row of tiles.
+        planes: output; cells that see nothing hold 0.
+    """
+    height, width = valid.shape
+    b = np.empty(SECTIONS * CELLS, np.float32)
+    moving = lines.shape[0] > 1
+    for index in range(tiles.shape[0]):
+        tile = tiles[index]
+        ty, tx = tile // columns, tile % columns
+        for part in range((TILE // SIDE) ** 2):
+            x0, y0 = tx * TILE + part % 2 * SIDE, ty * TILE + part // 2 * SIDE
+            if x0 >= width or y0 >= height:
+                continue
+            if _load_rays(b, direction, valid, line, lines, x0, y0, width, height) > 0:
+                left, right = f4(x0) + f4(0.5), f4(x0) + f4(SIDE - 0.5)
+                top, bottom = f4(y0) + f4(0.5), f4(y0) + f4(SIDE - 0.5)
+                done = 0
+                for j in range(starts[tile], starts[tile + 1]):
+                    r = records[lists[j]]
+                    if r[BOX + 1] < left or r[BOX] > right or r[BOX + 3] < top or r[BOX + 2] > bottom:
+                        continue
+                    if moving:
+                        _blend_moving(b, r, near)
+                    else:
+                        _blend_fixed(b, r, near)
+                    done += 1
+                    if done % 16 == 0:
+                        live = f4(0)
+                        for k in range(CELLS):
+                            live += b[LIVE * CELLS + k]
+                        if live == f4(0):
+                            break
+            for k in range(CELLS):
+                x, y = x0 + k % SIDE, y0 + k // SIDE
+                if x < width and y < height:
+                    for p in range(PLANES):
+                        planes[p, y, x] = b[(SUM + p) * CELLS + k]

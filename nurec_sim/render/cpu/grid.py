@@ -1,0 +1,161 @@
+"""A sensor's ray grid as the kernels want it: float32 rays, lines of equal time, and tables from direction to place.
+
+A place is (column, row) with cell centres at +0.5. A *line* is a set of rays fired at one instant (an image row or
+column, a LiDAR column). Tables are only used to bound where a Gaussian can be seen, never to weigh it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int32
+
+from nurec_sim import sensors
+from nurec_sim.render.rays import ray_grid
+from nurec_sim.types import CameraModel, LidarModel, Pinhole, Shutter, Spin
+
+PINHOLE, LENS, LIDAR = 0, 1, 2
+LENS_TABLE_SIZE = 257
+LIDAR_TABLE_SIZE = 8193
+FIELD_MARGIN_RAD = 0.6
+"""How far outside its field a lens table goes on, so that Gaussians over the edge are bounded well."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """One sensor for the kernels; immutable, shared between threads.
+
+    ``params``: PINHOLE fx fy cx cy; LENS half-width of the table, cosine of its rim; LIDAR sign of the spin, azimuth
+    of column 0, half the gap behind the last column, columns per radian, whether full circle, smallest and largest
+    residual of the row offsets in columns.
+    ``table``: LENS place by stereographic direction [s,s,2]; LIDAR [2,t,1]: column by azimuth, row by sine of elevation.
+    ``row_shift``: LIDAR rows are rolled by whole columns so that a grid column looks in one azimuth.
+    """
+
+    kind: int
+    direction: Float32[np.ndarray, "h w 3"]
+    valid: np.ndarray
+    line: Int32[np.ndarray, "h w"]
+    line_fraction: np.ndarray
+    beam: Int32[np.ndarray, "h w"] | None
+    params: Float32[np.ndarray, " p"]
+    table: Float32[np.ndarray, "a b c"]
+    row_shift: Int32[np.ndarray, " h"]
+    reference: float
+    by_range: bool
+    near_m: float
+    field_cos: float
+    """Cosine of the largest angle between a ray and the z axis; -1 for LiDARs."""
+    line_axis: int
+    """0 where a line is a row, 1 where it is a column."""
+
+
+def make_grid(sensor: CameraModel | LidarModel) -> Grid:
+    """Tables of a sensor (a few to some hundred milliseconds; keep them)."""
+    return _lidar_grid(sensor) if isinstance(sensor, LidarModel) else _camera_grid(sensor)
+
+
+def grid_key(sensor: CameraModel | LidarModel) -> tuple:
+    """What a grid depends on, as something hashable."""
+    if isinstance(sensor, LidarModel):
+        arrays = (sensor.elevation_rad, sensor.azimuth_rad, sensor.row_azimuth_offset_rad)
+        return (sensor.spin, sensor.range_m, *(np.asarray(a, np.float64).tobytes() for a in arrays))
+    return (sensor.width_px, sensor.height_px, sensor.lens, sensor.shutter, sensor.windshield)
+
+
+def _camera_grid(camera: CameraModel) -> Grid:
+    rays = ray_grid(camera)
+    height, width = rays.valid.shape
+    direction = rays.direction.astype(np.float32)
+    by_column = camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
+    if camera.shutter is Shutter.GLOBAL:
+        line, fraction = np.zeros((height, width), np.int32), np.zeros(1)
+    else:
+        index = np.arange(width)[None, :] if by_column else np.arange(height)[:, None]
+        line = np.broadcast_to(index, (height, width)).astype(np.int32)
+        fraction = rays.fraction[0] if by_column else rays.fraction[:, 0]
+    field_cos = float(direction[rays.valid][:, 2].min()) if rays.valid.any() else 1.0
+    lens = camera.lens
+    if isinstance(lens, Pinhole) and not lens.distorted and camera.windshield is None:
+        kind, table = PINHOLE, np.zeros((1, 1, 2), np.float32)
+        params = np.array([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px], np.float32)
+    else:
+        rim = min(np.arccos(np.clip(field_cos, -1, 1)) + FIELD_MARGIN_RAD, 0.97 * np.pi)
+        kind, table = LENS, _lens_table(camera, np.tan(rim / 2))
+        params = np.array([np.tan(rim / 2), np.cos(rim)], np.float32)
+    return Grid(kind, direction, rays.valid.astype(np.uint8), np.ascontiguousarray(line), np.asarray(fraction), None,
+                params, table, np.zeros(height, np.int32), rays.reference, rays.by_range, rays.near_m, field_cos,
+                int(by_column))  # fmt: skip
+
+
+def _lens_table(camera: CameraModel, half_width: float) -> Float32[np.ndarray, "s s 2"]:
+    """Pixels by stereographic direction (x, y) / (1 + z), continued linearly outside of the lens' field."""
+    p = np.linspace(-half_width, half_width, LENS_TABLE_SIZE)
+    y, x = np.meshgrid(p, p, indexing="ij")
+    x, y = x.ravel(), y.ravel()
+    angle, azimuth = 2 * np.arctan(np.hypot(x, y)), np.arctan2(y, x)
+
+    def look(angle_rad: np.ndarray, azimuth_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        flat = np.sin(angle_rad)
+        xyz = np.stack([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.cos(angle_rad)], axis=-1)
+        return sensors.project(camera, xyz)
+
+    uv, valid = look(angle, azimuth)
+    # The first invalid angle along each outward line, by bisection; beyond it the image goes on with its last slope.
+    outside = np.flatnonzero(~valid)
+    low, high = np.zeros(len(outside)), angle[outside].copy()
+    for _ in range(24):
+        middle = (low + high) / 2
+        inside = look(middle, azimuth[outside])[1]
+        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+    step = 1e-3
+    rim_uv, _ = look(low, azimuth[outside])
+    inner_uv, _ = look(np.maximum(low - step, 0), azimuth[outside])
+    uv[outside] = rim_uv + (rim_uv - inner_uv) * ((angle[outside] - low) / step)[:, None]
+    return np.nan_to_num(uv, nan=-1e6).reshape(LENS_TABLE_SIZE, LENS_TABLE_SIZE, 2).astype(np.float32)
+
+
+def _lidar_grid(lidar: LidarModel) -> Grid:
+    rays = ray_grid(lidar)
+    rows, columns = rays.valid.shape
+    sign = -1.0 if lidar.spin is Spin.CLOCKWISE else 1.0
+    azimuth = sign * (np.asarray(lidar.azimuth_rad, np.float64) - lidar.azimuth_rad[0])
+    steps = np.diff(azimuth) if columns > 1 else np.array([np.radians(0.2)])
+    gap = max(2 * np.pi - azimuth[-1], 0.0)
+    full_circle = gap < 1.5 * steps.mean() and columns > 1
+    offset = sign * np.asarray(lidar.row_azimuth_offset_rad, np.float64) / steps.mean()
+    shift = np.rint(offset).astype(np.int32) if full_circle else np.zeros(rows, np.int32)
+    fired = (np.arange(columns)[None, :] - shift[:, None]) % columns
+    row = np.arange(rows)[:, None]
+    low, high = -gap / 2, 2 * np.pi - gap / 2
+    column_of = _extrapolated(np.linspace(low, high, LIDAR_TABLE_SIZE), azimuth, steps.mean())
+    sines = np.linspace(-1, 1, LIDAR_TABLE_SIZE)
+    down = -np.asarray(lidar.elevation_rad, np.float64)
+    row_of = _extrapolated(-np.arcsin(sines), down, steps.mean())
+    residual = offset - shift
+    params = [sign, lidar.azimuth_rad[0], gap / 2, 1 / steps.min(), full_circle, residual.min(), residual.max()]
+    return Grid(
+        kind=LIDAR,
+        direction=np.ascontiguousarray(rays.direction[row, fired], np.float32),
+        valid=np.ones((rows, columns), np.uint8),
+        line=fired.astype(np.int32),
+        line_fraction=np.asarray(sensors.column_fraction(lidar), np.float64),
+        beam=(row * columns + fired).astype(np.int32),
+        params=np.array(params, np.float32),
+        table=np.stack([column_of, row_of])[..., None].astype(np.float32) + np.float32(0.5),
+        row_shift=shift,
+        reference=rays.reference,
+        by_range=rays.by_range,
+        near_m=rays.near_m,
+        field_cos=-1.0,
+        line_axis=1,
+    )
+
+
+def _extrapolated(value: np.ndarray, grid: np.ndarray, default_step: float) -> np.ndarray:
+    """Fractional index of values in a rising grid, carried on linearly past its ends."""
+    if len(grid) == 1:
+        return (value - grid[0]) / default_step
+    low = np.clip(np.searchsorted(grid, value, side="right") - 1, 0, len(grid) - 2)
+    return low + (value - grid[low]) / (grid[low + 1] - grid[low])

@@ -1,0 +1,118 @@
+"""What of a scene is there at an instant: the moving Gaussians in place, and colours seen from a view point."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from nurec_sim import geometry
+from nurec_sim.types import DynamicGaussians, Gaussians, Track
+
+MIN_FADE = 1 / 255
+
+
+def moving_gaussians(
+    dynamic: DynamicGaussians,
+    tracks: Sequence[Track],
+    t_us: int,
+    actors: Mapping[str, Float64[np.ndarray, "4 4"]],
+    eye_m: Float64[np.ndarray, " 3"],
+) -> Gaussians:
+    """The dynamic layer at ``t_us`` (``types.DynamicGaussians``), only those that can still be seen.
+
+    Args:
+        dynamic: the layer.
+        tracks: what ``dynamic.track`` indexes.
+        t_us: instant.
+        actors: requested ``world_from_box`` at the instant by track id; ids that no track has are ignored.
+        eye_m: view point in the world. View-dependent colour is evaluated here, in the recorded frame of a
+            re-posed actor, so the result has no ``sh_rest``.
+
+    Returns:
+        Gaussians with their position, rotation and faded opacity of the instant.
+    """
+    knots = dynamic.knot_t_us
+    alive = np.flatnonzero((knots[:, 0] <= t_us) & (t_us <= knots[:, 2]))
+    after = t_us >= knots[alive, 1]
+    rows = np.arange(len(alive))
+    low = np.where(after, 1, 0)
+    start_us, end_us = knots[alive][rows, low], knots[alive][rows, low + 1]
+    fraction = (t_us - start_us) / np.maximum(end_us - start_us, 1)
+    fade = np.exp(-(np.where(after, fraction, 1 - fraction) ** 10))
+    opacity = dynamic.gaussians.opacity[alive] * fade
+    seen = opacity >= MIN_FADE
+    alive, rows, low, fraction, opacity = alive[seen], rows[seen], low[seen], fraction[seen], opacity[seen]
+
+    gaussians, knot_m = dynamic.gaussians[alive], dynamic.knot_m[alive].astype(np.float64)
+    rows = np.arange(len(alive))
+    mean = knot_m[rows, low] * (1 - fraction[:, None]) + knot_m[rows, low + 1] * fraction[:, None]
+    quat, normal = gaussians.quat_wxyz.astype(np.float64), gaussians.normal.astype(np.float64)
+    eye = np.broadcast_to(np.asarray(eye_m, np.float64), mean.shape).copy()
+    recorded_mean = mean.copy()
+    index_of = {track.id: k for k, track in enumerate(tracks)}
+    for name, world_from_box in actors.items():
+        index = index_of.get(name)
+        mine = np.flatnonzero(dynamic.track[alive] == index) if index is not None else ()
+        if len(mine) == 0:
+            continue
+        new_from_recorded = world_from_box @ geometry.inverse(tracks[index].path.at(t_us))
+        turn = geometry.quat_from_matrix(new_from_recorded[:3, :3])
+        mean[mine] = geometry.transform_points(new_from_recorded, mean[mine])
+        quat[mine] = geometry.quat_multiply(np.broadcast_to(turn, (len(mine), 4)), quat[mine])
+        normal[mine] = normal[mine] @ new_from_recorded[:3, :3].T
+        eye[mine] = geometry.transform_points(geometry.inverse(new_from_recorded), eye[mine])
+    rgb = gaussians.rgb
+    if gaussians.sh_rest is not None:
+        rgb = view_colour(rgb, gaussians.sh_rest, recorded_mean - eye).astype(np.float32)
+    return Gaussians(
+        mean_m=mean.astype(np.float32),
+        quat_wxyz=quat.astype(np.float32),
+        scale_m=gaussians.scale_m,
+        opacity=opacity.astype(np.float32),
+        rgb=rgb,
+        normal=normal.astype(np.float32),
+        label=gaussians.label,
+        intensity=gaussians.intensity,
+    )
+
+
+def view_colour(
+    rgb: Float64[np.ndarray, "n 3"], sh_rest: Float64[np.ndarray, "n k 3"], eye_to_mean: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 3"]:
+    """Colour of Gaussians seen along ``eye_to_mean`` (any length), not below 0."""
+    length = np.linalg.norm(eye_to_mean, axis=-1, keepdims=True)
+    basis = sh_basis(eye_to_mean / np.maximum(length, 1e-12), sh_rest.shape[1])
+    return np.maximum(rgb + np.einsum("nk,nkc->nc", basis, sh_rest.astype(np.float64)), 0.0)
+
+
+def sh_basis(direction: Float64[np.ndarray, "n 3"], k: int) -> Float64[np.ndarray, "n k"]:
+    """Real spherical harmonics of degree 1 and up at unit directions, in the order and with the signs of 3DGS files.
+
+    Args:
+        direction: unit vectors in the world.
+        k: 3, 8 or 15 functions (degree 1, 2 or 3).
+    """
+    x, y, z = np.moveaxis(np.asarray(direction, np.float64), -1, 0)
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if k > 3:
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if k > 8:
+        basis += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return np.stack(basis, axis=-1)

@@ -1,0 +1,70 @@
+"""The ray grid of any sensor: one unit ray, one firing time and one validity per pixel or beam; float64 NumPy.
+
+A camera's grid has a ray per pixel centre; a spinning LiDAR's has rows of beams by columns of firings. Everything a
+renderer does afterwards is the same for both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from nurec_sim import geometry, sensors
+from nurec_sim.types import CameraModel, LidarModel, Pinhole, SensorRequest, Shutter
+
+NEAR_M = 0.2
+"""Gaussians whose centre, and hits that, lie closer than this are not drawn (LiDARs: their own minimal range)."""
+
+
+@dataclass(frozen=True, eq=False)
+class RayGrid:
+    """Rays of a sensor in its own frame; those that are not valid point along z.
+
+    ``fraction`` is the place of each ray's instant in the exposure, 0 at its start and 1 at its end; ``reference``
+    the fraction at which Gaussians are sorted, culled and, where they move, placed (the middle; 0 for a global
+    shutter). ``by_range`` says whether Gaussians are ordered by the distance of their centre (LiDAR, fisheye and
+    F-theta lenses, which see sideways) or by its z (pinhole).
+    """
+
+    direction: Float64[np.ndarray, "h w 3"]
+    valid: Bool[np.ndarray, "h w"]
+    fraction: Float64[np.ndarray, "h w"]
+    reference: float
+    by_range: bool
+    near_m: float
+
+
+def ray_grid(sensor: CameraModel | LidarModel) -> RayGrid:
+    """The rays of a camera (pixel centres) or a LiDAR (rows x columns of beams)."""
+    if isinstance(sensor, LidarModel):
+        direction = np.asarray(sensors.beam_directions(sensor), np.float64)
+        fraction = np.broadcast_to(sensors.column_fraction(sensor), direction.shape[:2])
+        valid = np.ones(direction.shape[:2], bool)
+        return RayGrid(direction, valid, fraction, 0.5, True, max(NEAR_M, sensor.range_m[0]))
+    direction, valid = sensors.pixel_rays(sensor)
+    rows, columns = np.mgrid[0 : sensor.height_px, 0 : sensor.width_px] + 0.5
+    uv = np.stack([columns.ravel(), rows.ravel()], axis=-1)
+    fraction = np.asarray(sensors.shutter_fraction(sensor, uv)).reshape(valid.shape)
+    reference = 0.0 if sensor.shutter is Shutter.GLOBAL else 0.5
+    direction = np.where(valid[..., None], direction, (0.0, 0.0, 1.0))
+    return RayGrid(direction, valid, fraction, reference, not isinstance(sensor.lens, Pinhole), NEAR_M)
+
+
+def reference_pose(request: SensorRequest, reference: float) -> tuple[Float64[np.ndarray, "4 4"], int]:
+    """``world_from_sensor`` and time in microseconds at the fraction ``reference`` of the exposure."""
+    pose = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), np.float64(reference))
+    return pose, request.start_us + int(round(reference * (request.end_us - request.start_us)))
+
+
+def world_rays(
+    request: SensorRequest, grid: RayGrid
+) -> tuple[Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w 3"]]:
+    """Origins and directions in the world, each ray from the pose at its own instant."""
+    shape = grid.fraction.shape
+    fractions, index = np.unique(grid.fraction, return_inverse=True)
+    poses = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), fractions)
+    poses = poses[index.reshape(-1)]
+    direction = np.einsum("nij,nj->ni", poses[:, :3, :3], grid.direction.reshape(-1, 3))
+    return poses[:, :3, 3].reshape(*shape, 3), direction.reshape(*shape, 3)

@@ -1,0 +1,72 @@
+"""Checks of render requests, so that nothing malformed reaches a kernel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nurec_sim import geometry, sensors
+from nurec_sim.errors import OutOfRangeError, RequestError, TooLargeError
+from nurec_sim.types import CameraModel, GaussianScene, LidarModel, SensorRequest
+
+MAX_SIDE_PX = 8192
+MAX_RAYS = 16_777_216
+CAMERA_OUTPUTS = ("rgb", "depth", "alpha", "label")
+
+
+def check_request(request: SensorRequest, scene: GaussianScene) -> None:
+    """Check a request against a scene.
+
+    Raises:
+        RequestError: the sensor, a pose or the exposure is malformed.
+        TooLargeError: more pixels or beams than allowed.
+        OutOfRangeError: the exposure does not lie within ``scene.span_us``, its end included as an instant.
+    """
+    sensor = request.sensor
+    if not isinstance(sensor, (CameraModel, LidarModel)):
+        raise RequestError(f"the sensor must be a CameraModel or a LidarModel, got {type(sensor).__name__}")
+    try:
+        if isinstance(sensor, CameraModel):
+            sensors.check_camera(sensor)
+        else:
+            sensors.check_lidar(sensor)
+    except ValueError as error:
+        raise RequestError(str(error)) from None
+    if isinstance(sensor, CameraModel):
+        width, height, what = sensor.width_px, sensor.height_px, "pixels"
+    else:
+        width, height, what = len(sensor.azimuth_rad), len(sensor.elevation_rad), "beams"
+    if max(width, height) > MAX_SIDE_PX or width * height > MAX_RAYS:
+        raise TooLargeError(
+            f"sensor {sensor.id!r}: {width} x {height} {what} are too many; "
+            f"at most {MAX_SIDE_PX} a side and {MAX_RAYS} in all"
+        )
+    check_pose_pair(f"sensor {sensor.id!r}: world_from_sensor", request.world_from_sensor)
+    for name, pair in request.actors.items():
+        check_pose_pair(f"actor {name!r}: world_from_box", pair)
+    if request.end_us <= request.start_us:
+        raise RequestError(f"an exposure must end after it starts, got [{request.start_us}, {request.end_us}) us")
+    first, end = scene.span_us
+    if request.start_us < first or request.end_us > end + 1:
+        raise OutOfRangeError(
+            f"scene {scene.id!r} covers [{first}, {end}] us, the request asks for "
+            f"[{request.start_us}, {request.end_us})"
+        )
+
+
+def check_pose_pair(name: str, pair: np.ndarray) -> None:
+    """Check the two poses at the start and the end of an exposure.
+
+    Raises:
+        RequestError: they are not [2,4,4], not finite, or not rigid.
+    """
+    poses = np.asarray(pair)
+    if poses.shape != (2, 4, 4) or poses.dtype.kind not in "fiu":
+        raise RequestError(f"{name} must be two 4 x 4 poses [2,4,4], got {poses.dtype} {list(poses.shape)}")
+    if not np.isfinite(poses).all():
+        raise RequestError(f"{name} must be finite")
+    for pose in poses:
+        if not geometry.is_rotation(pose[:3, :3]):
+            determinant = np.linalg.det(pose[:3, :3])
+            raise RequestError(f"{name} has a 3 x 3 part that is not a rotation (determinant {determinant:.4f})")
+        if not np.array_equal(pose[3], (0.0, 0.0, 0.0, 1.0)):
+            raise RequestError(f"{name} must end in the row 0 0 0 1, got {pose[3].tolist()}")

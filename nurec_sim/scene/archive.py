@@ -1,0 +1,235 @@
+"""The scene archive: a ``.usdz`` that holds a GaussianScene without loss, opens in USD tools and feeds AlpaSim.
+
+Layout, see ``docs/scene_format.md``: USD layers are the truth for geometry and appearance; ``nurec_sim/`` holds what
+USD cannot say exactly; JSON, YAML, PLY and XODR files at the root are for other simulators. Nothing is pickled. The
+same scene gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nurec_sim.errors import ArchiveError
+from nurec_sim.scene import codec
+from nurec_sim.scene.checks import check_scene
+from nurec_sim.scene.describe import scene_facts, scene_hash
+from nurec_sim.scene.sidecars import ftheta_fits, sidecars
+from nurec_sim.scene.sky import latlong_exr
+from nurec_sim.scene.usd_actors import actors_layer, field_paths
+from nurec_sim.scene.usd_cameras import cameras_layer
+from nurec_sim.scene.usd_layers import (
+    ACTORS_LAYER,
+    CAMERAS_LAYER,
+    SKY_TEXTURE,
+    STATIC_LAYER,
+    gather,
+    open_crate,
+    read_field,
+    root_layer,
+    static_layer,
+)
+from nurec_sim.scene.zip_package import Package, write_package
+from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, Rig, RoadMap, Track, Trajectory
+
+FORMAT_VERSION = 1
+MANIFEST = "nurec_sim/manifest.json"
+FACTS, ISP, SKY = "nurec_sim/scene.json", "nurec_sim/isp.json", "nurec_sim/sky_cubemap.npy"
+KNOT_TIMES, KNOTS, OWNERS = (f"nurec_sim/dynamic_{name}.npy" for name in ("knot_t_us", "knot_m", "track"))
+TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY, KNOT_TIMES, KNOTS, OWNERS)
+"""The members that a scene is read from; all others are for other programs."""
+
+MAX_JSON_BYTES = 512 * 2**20
+_FACT_DECODERS = {
+    "id": codec.text,
+    "span_us": codec.array(np.int64, 2),
+    "rig": codec.record(Rig),
+    "ego": codec.record(Trajectory),
+    "tracks": codec.sequence(codec.record(Track)),
+    "road_map": codec.optional(codec.record(RoadMap)),
+    "camera_times_us": codec.mapping(codec.array(np.int64, -1, 2)),
+    "provenance": codec.mapping(lambda value: value),
+}
+
+
+def write_scene(scene: GaussianScene, path: Path | str, *, overwrite: bool = False) -> Path:
+    """Writes a scene archive; the file appears complete or not at all.
+
+    Args:
+        scene: what to write; checked first.
+        path: ends in ``.usdz``; its folder is made if need be.
+        overwrite: whether an existing file may be replaced.
+
+    Returns:
+        The path.
+
+    Raises:
+        ArchiveError: the file exists, the name does not end in ``.usdz``, or the scene is not sound.
+    """
+    path = Path(path)
+    if path.suffix != ".usdz":
+        raise ArchiveError(f"a scene archive's name must end in .usdz, got {path.name!r}")
+    if path.exists() and not overwrite:
+        raise ArchiveError(f"{path} exists; pass overwrite=True to replace it")
+    check_scene(scene)
+    digest = scene_hash(scene)
+    fits = ftheta_fits(scene)
+    members = {
+        "default.usda": root_layer(scene, FORMAT_VERSION),
+        STATIC_LAYER: static_layer(scene.static),
+        ACTORS_LAYER: actors_layer(scene),
+        CAMERAS_LAYER: cameras_layer(scene, fits),
+        SKY_TEXTURE: latlong_exr(scene.sky),
+        **sidecars(scene, digest, fits),
+        FACTS: codec.dump(scene_facts(scene), FACTS),
+        ISP: codec.dump(scene.isp, ISP, indent=2),
+        SKY: _npy(scene.sky),
+        KNOT_TIMES: _npy(scene.dynamic.knot_t_us),
+        KNOTS: _npy(scene.dynamic.knot_m),
+        OWNERS: _npy(scene.dynamic.track),
+    }
+    members[MANIFEST] = codec.dump(_manifest(scene, digest, members), MANIFEST, indent=2)
+    write_package(path, members)
+    return path
+
+
+def read_scene(path: Path | str) -> GaussianScene:
+    """Reads a scene archive written by ``write_scene``; every value comes back exactly.
+
+    Nothing is extracted, unpickled or run, and no file outside of the archive is opened.
+
+    Raises:
+        ArchiveError: not such an archive, damaged, changed since it was written, unsafe, or not a sound scene.
+    """
+    path = Path(path)
+    with Package(path) as package:
+        manifest = _read_manifest(package)
+        _check_hashes(package, manifest, TRUTH)
+        counts = manifest["counts"]
+        facts = _read_facts(package)
+        static_usd = open_crate(package.read(STATIC_LAYER), f"{path}: {STATIC_LAYER}")
+        static = _read_fields(static_usd, ["/Static/background", "/Static/road"], counts["static"], f"{path}: static")
+        actors_usd = open_crate(package.read(ACTORS_LAYER), f"{path}: {ACTORS_LAYER}")
+        moving = _read_fields(actors_usd, field_paths(actors_usd), counts["dynamic"], f"{path}: dynamic")
+        dynamic = DynamicGaussians(moving, *(_read_npy(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS)))
+        isp_json = codec.load(package.read(ISP, MAX_JSON_BYTES), f"{path}: {ISP}")
+        isp = codec.from_json(codec.mapping(codec.array(np.float64, 3, 4)), isp_json, f"{path}: {ISP}")
+        scene = GaussianScene(static=static, dynamic=dynamic, sky=_read_npy(package, SKY), isp=isp, **facts)
+    try:
+        check_scene(scene)
+    except ArchiveError as error:
+        raise ArchiveError(f"{path}: {error}") from error
+    return scene
+
+
+def archive_faults(path: Path | str) -> list[str]:
+    """Everything wrong with an archive, as texts; empty if it reads well and no member was changed."""
+    try:
+        with Package(Path(path)) as package:
+            manifest = _read_manifest(package)
+            faults = []
+            for name in manifest["sha256"]:
+                try:
+                    _check_hashes(package, manifest, (name,))
+                except ArchiveError as error:
+                    faults.append(str(error))
+        if not faults:
+            read_scene(path)
+        return faults
+    except ArchiveError as error:
+        return [str(error)]
+
+
+# -------------------------------------------------------------------------------------------------------- manifest
+
+
+def _manifest(scene: GaussianScene, digest: str, members: dict[str, bytes]) -> dict[str, Any]:
+    return {
+        "format": "nurec_sim scene archive",
+        "version": FORMAT_VERSION,
+        "scene_id": scene.id,
+        "scene_sha256": digest,
+        "units": {"length": "m", "time": "us", "angle": "rad", "axes": "z up", "colour": "display (sRGB)"},
+        "layers": {"static": STATIC_LAYER, "dynamic": ACTORS_LAYER, "sky": SKY, "isp": ISP, "facts": FACTS},
+        "classes": {label.name.lower(): int(label) for label in Label},
+        "counts": {"static": len(scene.static), "dynamic": len(scene.dynamic), "tracks": len(scene.tracks)},
+        "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},
+    }
+
+
+def _read_manifest(package: Package) -> dict[str, Any]:
+    if MANIFEST not in package.names:
+        raise ArchiveError(
+            f"{package.path}: {MANIFEST} is missing, so this is no scene archive of nurec_sim; "
+            "archives of other programs cannot be read"
+        )
+    where = f"{package.path}: {MANIFEST}"
+    manifest = codec.load(package.read(MANIFEST, MAX_JSON_BYTES), where)
+    if not isinstance(manifest, dict) or manifest.get("format") != "nurec_sim scene archive":
+        raise ArchiveError(f"{where}: not the manifest of a nurec_sim scene archive")
+    if manifest.get("version") != FORMAT_VERSION:
+        raise ArchiveError(
+            f"{where}: format version {manifest.get('version')!r}; this nurec_sim reads version {FORMAT_VERSION}"
+        )
+    for key, decoder in (("counts", codec.mapping(codec.integer)), ("sha256", codec.mapping(codec.text))):
+        codec.from_json(decoder, manifest.get(key), f"{where}: {key}")
+    missing = {"static", "dynamic"} - set(manifest["counts"])
+    if missing:
+        raise ArchiveError(f"{where}: counts lacks {sorted(missing)}")
+    return manifest
+
+
+def _check_hashes(package: Package, manifest: dict[str, Any], names: tuple[str, ...]) -> None:
+    for name in names:
+        promised = manifest["sha256"].get(name)
+        if promised is None:
+            raise ArchiveError(f"{package.path}: {MANIFEST} does not list {name}")
+        if package.sha256(name) != promised:
+            raise ArchiveError(f"{package.path}: {name} was changed or damaged: its hash differs from {MANIFEST}")
+
+
+# ----------------------------------------------------------------------------------------------------------- parts
+
+
+def _read_facts(package: Package) -> dict[str, Any]:
+    where = f"{package.path}: {FACTS}"
+    raw = codec.load(package.read(FACTS, MAX_JSON_BYTES), where)
+    if not isinstance(raw, dict) or set(raw) != set(_FACT_DECODERS):
+        given = sorted(raw) if isinstance(raw, dict) else type(raw).__name__
+        raise ArchiveError(f"{where}: needs the fields {sorted(_FACT_DECODERS)}, got {given}")
+    facts = {name: codec.from_json(decode, raw[name], f"{where}: {name}") for name, decode in _FACT_DECODERS.items()}
+    start_us, end_us = facts["span_us"].tolist()
+    return facts | {"span_us": (start_us, end_us)}
+
+
+def _read_fields(layer, paths: list[str], count: int, what: str) -> Gaussians:
+    return gather([read_field(layer, path, what) for path in paths], count, what)
+
+
+def _npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _read_npy(package: Package, name: str) -> np.ndarray:
+    """An array of plain numbers; its size is checked against the member before memory is taken."""
+    where = f"{package.path}: {name}"
+    data = package.read(name)
+    buffer = io.BytesIO(data)
+    try:
+        if np.lib.format.read_magic(buffer) != (1, 0):
+            raise ValueError("npy version 1.0 is needed")
+        shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(buffer)
+    except ValueError as error:
+        raise ArchiveError(f"{where} is no array file: {error}") from error
+    if dtype.hasobject or dtype.kind not in "iuf" or fortran_order:
+        raise ArchiveError(f"{where} must hold plain numbers in C order, got {dtype}")
+    body = data[buffer.tell() :]
+    if int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize != len(body):
+        raise ArchiveError(f"{where} promises {dtype} {shape} but holds {len(body):,} bytes")
+    return np.frombuffer(body, dtype).reshape(shape).copy()

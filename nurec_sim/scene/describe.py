@@ -1,0 +1,79 @@
+"""A scene's fingerprint and a table of what it holds."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+
+import numpy as np
+
+from nurec_sim.scene import codec
+from nurec_sim.types import GAUSSIAN_FIELDS, Gaussians, GaussianScene, Label
+
+
+def scene_facts(scene: GaussianScene) -> dict[str, object]:
+    """Everything of a scene but its large arrays, as JSON."""
+    return {
+        "id": scene.id,
+        "span_us": list(scene.span_us),
+        "rig": scene.rig,
+        "ego": scene.ego,
+        "tracks": list(scene.tracks),
+        "road_map": scene.road_map,
+        "camera_times_us": scene.camera_times_us,
+        "provenance": scene.provenance,
+    }
+
+
+def scene_arrays(scene: GaussianScene) -> dict[str, np.ndarray]:
+    """The large arrays of a scene by name."""
+    dynamic = scene.dynamic
+    arrays = {f"static.{name}": array for name, array in _columns(scene.static).items()}
+    arrays |= {f"dynamic.{name}": array for name, array in _columns(dynamic.gaussians).items()}
+    arrays |= {f"dynamic.{name}": getattr(dynamic, name) for name in ("knot_t_us", "knot_m", "track")}
+    return arrays | {"sky": scene.sky}
+
+
+def _columns(gaussians: Gaussians) -> Mapping[str, np.ndarray]:
+    columns = {name: getattr(gaussians, name) for name in GAUSSIAN_FIELDS}
+    return columns if gaussians.sh_rest is None else columns | {"sh_rest": gaussians.sh_rest}
+
+
+def scene_hash(scene: GaussianScene) -> str:
+    """SHA-256 of everything in a scene, hexadecimal; equal scenes have equal hashes."""
+    digest = hashlib.sha256()
+    digest.update(codec.dump({"facts": scene_facts(scene), "isp": scene.isp}, "the scene"))
+    for name, array in scene_arrays(scene).items():
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
+    return digest.hexdigest()
+
+
+def summary(scene: GaussianScene) -> list[tuple[str, str]]:
+    """(name, text) rows for a person: counts, sizes, sensors, times."""
+    start_us, end_us = scene.span_us
+    arrays = scene_arrays(scene)
+    counts = np.bincount(scene.static.label, minlength=len(Label))
+    labels = ", ".join(f"{label.name.lower()} {counts[label]:,}" for label in Label if counts[label])
+    degree = 0 if scene.static.sh_rest is None else int(np.sqrt(scene.static.sh_rest.shape[1] + 1)) - 1
+    owners = np.unique(scene.dynamic.track[scene.dynamic.track >= 0])
+    path_m = np.linalg.norm(np.diff(scene.ego.position_m, axis=0), axis=1).sum()
+    road = scene.road_map
+    map_text = "none" if road is None else f"{len(road.drivable)} drivable areas, {len(road.lanes)} lanes"
+    cameras = [f"{c.id} {c.width_px}x{c.height_px} {type(c.lens).__name__}" for c in scene.rig.cameras.values()]
+    lidars = [f"{x.id} {len(x.elevation_rad)}x{len(x.azimuth_rad)}" for x in scene.rig.lidars.values()]
+    return [
+        ("scene", scene.id),
+        ("time", f"{(end_us - start_us) / 1e6:.2f} s from {start_us} us"),
+        ("recorded path", f"{path_m:.1f} m, {len(scene.ego.t_us)} poses"),
+        ("static Gaussians", f"{len(scene.static):,} ({labels or 'none'}), harmonics degree {degree}"),
+        ("moving Gaussians", f"{len(scene.dynamic):,} of {len(owners)} tracks"),
+        ("tracks", f"{len(scene.tracks)}"),
+        ("sky", f"6 x {scene.sky.shape[1]} x {scene.sky.shape[2]}"),
+        ("colour correction", ", ".join(scene.isp) or "none"),
+        ("cameras", ", ".join(cameras) or "none"),
+        ("LiDARs", ", ".join(lidars) or "none"),
+        ("road map", map_text),
+        ("method", str(scene.provenance.get("method", "unknown"))),
+        ("in memory", f"{sum(array.nbytes for array in arrays.values()) / 2**20:.1f} MiB"),
+    ]

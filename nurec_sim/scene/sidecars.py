@@ -1,0 +1,230 @@
+"""Files at the archive's root that AlpaSim, CARLA and NuRec tools read; nothing of ours reads them back.
+
+Conventions of those tools: ``T_a_b`` maps a to b; track quaternions are ``xyzw``; f-theta principal points count pixel
+centres as whole numbers (ours minus 0.5); exposures end after they start. ``world_to_nre`` is the identity, so poses
+mean the same in every reading.
+"""
+
+from __future__ import annotations
+
+import datetime
+import uuid
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from nurec_sim import sensors
+from nurec_sim.geometry import quat_from_matrix
+from nurec_sim.scene import codec
+from nurec_sim.scene.ground_mesh import encode_ply, ground_mesh
+from nurec_sim.scene.opendrive import opendrive_map, world_to_ecef
+from nurec_sim.types import CameraModel, Fisheye, FTheta, GaussianScene, LidarModel, Pinhole, Shutter, Track
+
+CHUNK_ID = "dummy_chunk_id"  # CARLA's client looks for this very key
+_FTHETA_TERMS = 6
+_SHUTTER_NAMES = {
+    Shutter.GLOBAL: "GLOBAL",
+    Shutter.TOP_TO_BOTTOM: "ROLLING_TOP_TO_BOTTOM",
+    Shutter.LEFT_TO_RIGHT: "ROLLING_LEFT_TO_RIGHT",
+    Shutter.BOTTOM_TO_TOP: "ROLLING_BOTTOM_TO_TOP",
+    Shutter.RIGHT_TO_LEFT: "ROLLING_RIGHT_TO_LEFT",
+}
+
+
+def alpasim_id(scene_id: str) -> str:
+    """The ``scene_id`` that AlpaSim and CARLA send for a scene of ours."""
+    return scene_id if scene_id.startswith("clipgt-") else f"clipgt-{scene_id}"
+
+
+def ftheta_fits(scene: GaussianScene) -> dict[str, FTheta]:
+    """Every camera as an f-theta lens with both polynomials: the only model that CARLA's client reads."""
+    return {camera_id: sensors.fit_ftheta(camera) for camera_id, camera in scene.rig.cameras.items()}
+
+
+def sidecars(scene: GaussianScene, digest: str, fits: Mapping[str, FTheta]) -> dict[str, bytes]:
+    """All root files by name; ``digest`` is the scene's hash."""
+    ground = encode_ply(ground_mesh(scene))
+    return {
+        "metadata.yaml": _metadata(scene, digest),
+        "data_info.json": codec.dump(_data_info(scene), "data_info.json", indent=2),
+        "rig_trajectories.json": codec.dump(_rig_trajectories(scene, fits), "rig_trajectories.json"),
+        "sequence_tracks.json": codec.dump(_sequence_tracks(scene), "sequence_tracks.json"),
+        "map.xodr": opendrive_map(scene),
+        "mesh_ground.ply": ground,
+        # Physics may ask for either name; walls and vehicles are not meshed.
+        "mesh.ply": ground,
+    }
+
+
+def _metadata(scene: GaussianScene, digest: str) -> bytes:
+    import yaml
+
+    start_us, end_us = scene.span_us
+    epoch = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+    recorded = epoch + datetime.timedelta(seconds=start_us // 1_000_000)
+    metadata = {
+        "scene_id": alpasim_id(scene.id),
+        "version_string": "nurec_sim",
+        "training_date": recorded.strftime("%Y-%m-%d"),  # the recording's: archives hold no wall clock
+        "dataset_hash": digest,
+        "uuid": str(uuid.uuid5(uuid.NAMESPACE_URL, digest)),
+        "is_resumable": False,
+        "sensors": {"camera_ids": list(scene.rig.cameras), "lidar_ids": list(scene.rig.lidars)},
+        "logger": {"name": None, "run_id": None, "run_url": None},
+        "time_range": {"start": float(start_us), "end": float(end_us)},
+        "training_step_outputs": None,
+    }
+    return yaml.safe_dump(metadata, sort_keys=False, allow_unicode=True).encode()
+
+
+def _data_info(scene: GaussianScene) -> dict[str, Any]:
+    start_us, end_us = scene.span_us
+    return {
+        "sequence_id": scene.id,
+        "pose-range": {"start-timestamp_us": scene.ego.start_us, "end-timestamp_us": scene.ego.end_us},
+        "sequence_timestamp_interval_us": {"start": start_us, "stop": end_us},
+    }
+
+
+def _rig_trajectories(scene: GaussianScene, fits: Mapping[str, FTheta]) -> dict[str, Any]:
+    frames = {key: _exposures(times) for key, times in scene.camera_times_us.items()}
+    cameras, lidars = list(scene.rig.cameras), list(scene.rig.lidars)
+    body = scene.rig.body
+    no_frames = np.zeros((0, 2), np.int64)
+    trajectory = {
+        "sequence_id": scene.id,
+        "T_rig_worlds": scene.ego.world_from_body,
+        "T_rig_world_timestamps_us": scene.ego.t_us,
+        "cameras_frame_timestamps_us": {_uid(scene, key): frames.get(key, no_frames) for key in cameras},
+        "cameras_frame_T_rig_worlds": {
+            _uid(scene, key): scene.ego.at(frames[key]) if len(frames.get(key, no_frames)) else [] for key in cameras
+        },
+        "lidars_frame_timestamps_us": {_uid(scene, key): frames.get(key, no_frames) for key in lidars},
+        "rig_bbox": {"centroid": body.center_m, "dim": body.size_m, "rot": [0.0, 0.0, 0.0]},
+    }
+    return {
+        "T_world_base": world_to_ecef(),
+        "world_to_nre": {"matrix": np.eye(4)},
+        "camera_calibrations": {
+            _uid(scene, key): _camera_calibration(scene, index, camera, fits[key])
+            for index, (key, camera) in enumerate(scene.rig.cameras.items())
+        },
+        "lidar_calibrations": {
+            _uid(scene, key): _lidar_calibration(scene, index, lidar)
+            for index, (key, lidar) in enumerate(scene.rig.lidars.items())
+        },
+        "rig_trajectories": [trajectory],
+    }
+
+
+def _uid(scene: GaussianScene, sensor_id: str) -> str:
+    return f"{sensor_id}@{scene.id}"
+
+
+def _exposures(times_us: np.ndarray) -> np.ndarray:
+    """Exposures of at least one microsecond: clients refuse empty ones."""
+    return np.column_stack([times_us[:, 0], np.maximum(times_us[:, 1], times_us[:, 0] + 1)])
+
+
+def _camera_calibration(scene: GaussianScene, index: int, camera: CameraModel, fit: FTheta) -> dict[str, Any]:
+    calibration = {
+        "sequence_id": scene.id,
+        "logical_sensor_name": camera.id,
+        "unique_sensor_idx": index,
+        "T_sensor_rig": camera.rig_from_camera,
+        "camera_model": {"type": "ftheta", "parameters": _common_parameters(camera) | _ftheta_parameters(fit)},
+    }
+    if not isinstance(camera.lens, FTheta):
+        calibration["exact_camera_model"] = _exact_model(camera)
+    return calibration
+
+
+def _common_parameters(camera: CameraModel) -> dict[str, Any]:
+    glass = camera.windshield
+    distortion = glass and {
+        "type": "bivariate-windshield",
+        "reference_poly": glass.reference.name,
+        "horizontal_poly": glass.horizontal,
+        "vertical_poly": glass.vertical,
+        "horizontal_poly_inverse": glass.horizontal_inverse,
+        "vertical_poly_inverse": glass.vertical_inverse,
+    }
+    return {
+        "resolution": [camera.width_px, camera.height_px],
+        "shutter_type": _SHUTTER_NAMES[camera.shutter],
+        "external_distortion_parameters": distortion,
+    }
+
+
+def _ftheta_parameters(fit: FTheta) -> dict[str, Any]:
+    def padded(polynomial: tuple[float, ...]) -> list[float]:
+        return [float(c) for c in polynomial] + [0.0] * (_FTHETA_TERMS - len(polynomial))
+
+    return {
+        "principal_point": [fit.cx_px - 0.5, fit.cy_px - 0.5],
+        "reference_poly": fit.reference.name,
+        "pixeldist_to_angle_poly": padded(fit.pixeldist_to_angle),
+        "angle_to_pixeldist_poly": padded(fit.angle_to_pixeldist),
+        "max_angle": fit.max_angle_rad,
+        "linear_cde": fit.linear_cde,
+    }
+
+
+def _exact_model(camera: CameraModel) -> dict[str, Any]:
+    """The lens itself, in NCore's names."""
+    lens = camera.lens
+    assert isinstance(lens, (Pinhole, Fisheye))
+    parameters = _common_parameters(camera) | {
+        "principal_point": [lens.cx_px, lens.cy_px],
+        "focal_length": [lens.fx_px, lens.fy_px],
+        "radial_coeffs": lens.radial,
+    }
+    if isinstance(lens, Fisheye):
+        return {"type": "opencv-fisheye", "parameters": parameters | {"max_angle": lens.max_angle_rad}}
+    parameters |= {"tangential_coeffs": lens.tangential, "thin_prism_coeffs": lens.thin_prism}
+    return {"type": "opencv-pinhole", "parameters": parameters}
+
+
+def _lidar_calibration(scene: GaussianScene, index: int, lidar: LidarModel) -> dict[str, Any]:
+    return {
+        "sequence_id": scene.id,
+        "logical_sensor_name": lidar.id,
+        "unique_sensor_idx": index,
+        "T_sensor_rig": lidar.rig_from_lidar,
+        "lidar_model": {
+            "type": "row-offset-spinning",
+            "parameters": {
+                "row_elevations_rad": lidar.elevation_rad,
+                "column_azimuths_rad": lidar.azimuth_rad,
+                "row_azimuth_offsets_rad": lidar.row_azimuth_offset_rad,
+                "spinning_direction": lidar.spin.value,
+                "spinning_frequency_hz": lidar.frequency_hz,
+            },
+        },
+    }
+
+
+def _sequence_tracks(scene: GaussianScene) -> dict[str, Any]:
+    samples = [_track_samples(track) for track in scene.tracks]
+    return {
+        CHUNK_ID: {
+            "tracks_data": {
+                "tracks_id": [track.id for track in scene.tracks],
+                "tracks_label_class": [track.label for track in scene.tracks],
+                "tracks_flags": ["CONTROLLABLE|DYNAMIC" if track.controllable else "NONE" for track in scene.tracks],
+                "tracks_timestamps_us": [t_us for t_us, _ in samples],
+                "tracks_poses": [poses for _, poses in samples],
+            },
+            "cuboidtracks_data": {"cuboids_dims": [track.size_m for track in scene.tracks]},
+        }
+    }
+
+
+def _track_samples(track: Track) -> tuple[np.ndarray, np.ndarray]:
+    """Times and poses ``x y z qx qy qz qw`` of a track; a single sample is repeated, for the clients' splines."""
+    t_us, poses = track.path.t_us, track.path.world_from_body
+    if len(t_us) == 1:
+        t_us, poses = np.array([t_us[0], t_us[0] + 100_000]), np.repeat(poses, 2, axis=0)
+    quat = quat_from_matrix(poses[:, :3, :3])
+    return t_us, np.column_stack([poses[:, :3, 3], quat[:, [1, 2, 3, 0]]])

@@ -1,0 +1,130 @@
+"""The OpenCV pinhole camera with rational, tangential and thin-prism distortion.
+
+With a = x/z, b = y/z, r2 = a*a + b*b and g = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)::
+
+    a' = a g + 2 p1 a b + p2 (r2 + 2 a^2) + s1 r2 + s2 r2^2        u = fx a' + cx
+    b' = b g + p1 (r2 + 2 b^2) + 2 p2 a b + s3 r2 + s4 r2^2        v = fy b' + cy
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from numpy.polynomial import polynomial
+
+from nurec_sim.sensors import radial
+from nurec_sim.types import Pinhole
+
+# A distorted lens is not trusted beyond this tangent of the angle off the axis (87 degrees).
+WIDEST_TANGENT = 20.0
+NEAREST_Z_M = 1e-6
+
+Points2 = Float64[np.ndarray, "n 2"]
+
+
+def project(lens: Pinhole, xyz: Float64[np.ndarray, "n 3"]) -> tuple[Points2, Bool[np.ndarray, " n"]]:
+    """Pixels of points, and whether each is in front and inside the field where the lens is one-to-one."""
+    z = xyz[:, 2]
+    valid = z > NEAREST_Z_M
+    flat = xyz[:, :2] / np.where(valid, z, 1.0)[:, None]
+    if lens.distorted:
+        inside = np.hypot(flat[:, 0], flat[:, 1]) <= _field(lens)
+        flat = np.where((valid & inside)[:, None], flat, 0.0)
+        flat, jacobian = _distort(lens, flat)
+        valid = valid & inside & _one_to_one(jacobian)
+    return flat * (lens.fx_px, lens.fy_px) + (lens.cx_px, lens.cy_px), valid
+
+
+def unproject(lens: Pinhole, uv: Points2) -> tuple[Float64[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Unit rays of pixels, and whether the lens sees anything there."""
+    flat = (uv - (lens.cx_px, lens.cy_px)) / (lens.fx_px, lens.fy_px)
+    valid = np.ones(len(uv), bool)
+    if lens.distorted:
+        flat, valid = _undistort(lens, flat)
+    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True), valid
+
+
+def _radial_parts(lens: Pinhole) -> tuple[np.ndarray, np.ndarray]:
+    """Numerator and denominator of g as polynomials in r2."""
+    k1, k2, k3, k4, k5, k6 = lens.radial
+    return np.array([1.0, k1, k2, k3]), np.array([1.0, k4, k5, k6])
+
+
+@functools.lru_cache(maxsize=64)
+def _field(lens: Pinhole) -> float:
+    """Largest r up to which r g(r2) rises (by ``radial.MINIMUM_SLOPE`` at least)."""
+    top, bottom = _radial_parts(lens)
+    # d(r N/D)/dr = (N D + 2 r2 (N' D - N D')) / D^2; a limit is where this falls to the smallest slope.
+    turn = polynomial.polysub(
+        polynomial.polymul(polynomial.polyder(top), bottom), polynomial.polymul(top, polynomial.polyder(bottom))
+    )
+    slope = polynomial.polyadd(polynomial.polymul(top, bottom), polynomial.polymul([0.0, 2.0], turn))
+    excess = polynomial.polysub(slope, radial.MINIMUM_SLOPE * polynomial.polymul(bottom, bottom))
+    limit = min(radial.first_positive_root(excess), radial.first_positive_root(bottom))
+    return min(float(np.sqrt(limit)), WIDEST_TANGENT)
+
+
+def _distort(lens: Pinhole, flat: Points2) -> tuple[Points2, Float64[np.ndarray, "n 2 2"]]:
+    """Distorted points of the plane z = 1, and the derivative of the map."""
+    a, b = flat[:, 0], flat[:, 1]
+    r2 = a * a + b * b
+    top, bottom = (polynomial.polyval(r2, part) for part in _radial_parts(lens))
+    top_slope, bottom_slope = (polynomial.polyval(r2, polynomial.polyder(part)) for part in _radial_parts(lens))
+    gain = top / bottom
+    gain_slope = (top_slope - gain * bottom_slope) / bottom  # by r2
+    (p1, p2), (s1, s2, s3, s4) = lens.tangential, lens.thin_prism
+    prism_a, prism_b = s1 + 2 * s2 * r2, s3 + 2 * s4 * r2  # slopes by r2
+    distorted = np.stack(
+        [
+            a * gain + 2 * p1 * a * b + p2 * (r2 + 2 * a * a) + r2 * (s1 + s2 * r2),
+            b * gain + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b + r2 * (s3 + s4 * r2),
+        ],
+        axis=1,
+    )
+    cross = 2 * a * b * gain_slope
+    jacobian = np.empty((len(flat), 2, 2))
+    jacobian[:, 0, 0] = gain + 2 * a * a * gain_slope + 2 * p1 * b + 6 * p2 * a + 2 * a * prism_a
+    jacobian[:, 0, 1] = cross + 2 * p1 * a + 2 * p2 * b + 2 * b * prism_a
+    jacobian[:, 1, 0] = cross + 2 * p1 * a + 2 * p2 * b + 2 * a * prism_b
+    jacobian[:, 1, 1] = gain + 2 * b * b * gain_slope + 6 * p1 * b + 2 * p2 * a + 2 * b * prism_b
+    return distorted, jacobian
+
+
+def _one_to_one(jacobian: Float64[np.ndarray, "n 2 2"]) -> Bool[np.ndarray, " n"]:
+    """Where the map keeps its orientation with a margin: both stretch factors stay above the smallest slope."""
+    determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+    size = np.sqrt(np.sum(jacobian**2, axis=(1, 2)))
+    return determinant > 0.5 * radial.MINIMUM_SLOPE * size
+
+
+def _undistort(lens: Pinhole, target: Points2) -> tuple[Points2, Bool[np.ndarray, " n"]]:
+    """Inverse of ``_distort`` by Newton: a radial solution first, which the small other terms then correct."""
+    limit = _field(lens)
+    radius = np.hypot(target[:, 0], target[:, 1])
+    grid = np.linspace(0.0, limit, radial.TABLE_SIZE)
+    top, bottom = (polynomial.polyval(grid * grid, part) for part in _radial_parts(lens))
+    guess = np.interp(radius, grid * top / bottom, grid)
+    flat = target * (guess / np.where(radius > 0, radius, 1.0))[:, None]
+    for _ in range(2 * radial.NEWTON_STEPS):
+        value, jacobian = _distort(lens, flat)
+        error = value - target
+        determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+        safe = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
+        step = np.stack(
+            [
+                (jacobian[:, 1, 1] * error[:, 0] - jacobian[:, 0, 1] * error[:, 1]) / safe,
+                (jacobian[:, 0, 0] * error[:, 1] - jacobian[:, 1, 0] * error[:, 0]) / safe,
+            ],
+            axis=1,
+        )
+        flat = flat - step
+        # Outside the field the polynomials say nothing: come back to its rim and try on from there.
+        flat *= np.minimum(1.0, limit / np.maximum(np.hypot(flat[:, 0], flat[:, 1]), 1e-12))[:, None]
+        if len(flat) == 0 or np.abs(step).max() < 1e-13:
+            break
+    value, jacobian = _distort(lens, flat)
+    found = np.abs(value - target).max(axis=1) < 1e-9 * np.maximum(1.0, radius)
+    return flat, found & _one_to_one(jacobian)

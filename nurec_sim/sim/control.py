@@ -1,0 +1,108 @@
+"""Drives the car along a plan: pure pursuit with PI speed control, or perfectly.
+
+A plan is anchored at the car's pose when it was made. Its stations count metres along it from there, so that the
+distance driven since then, compared with the station the plan wants by now, is the integral of the speed error: the
+"I" of the speed control, without wind-up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from nurec_sim.sim.vehicle import TICK_US, Limits, VehicleState, step
+from nurec_sim.types import Plan
+
+SPEED_GAIN, STATION_GAIN = 2.5, 2.0
+LOOKAHEAD_S, LOOKAHEAD_M = 0.5, (3.0, 12.0)
+PREVIEW_S = 0.2
+
+
+class PlannedPath:
+    """A checked plan in the world, anchored at the state it starts from."""
+
+    def __init__(self, plan: Plan, start: VehicleState, start_us: int) -> None:
+        future = plan.t_us > start_us
+        local = plan.pose[future]
+        c, s = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
+        x = start.x_m + c * local[:, 0] - s * local[:, 1]
+        y = start.y_m + s * local[:, 0] + c * local[:, 1]
+        self.t_s = np.concatenate([[0.0], (plan.t_us[future] - start_us) / 1e6])
+        self.x_m, self.y_m = np.concatenate([[start.x_m], x]), np.concatenate([[start.y_m], y])
+        self.yaw_rad = np.unwrap(np.concatenate([[start.yaw_rad], start.yaw_rad + local[:, 2]]))
+        # The first pose may lie behind the car, when it is ahead of its schedule; later ones only add up.
+        steps = np.hypot(np.diff(self.x_m), np.diff(self.y_m))
+        backwards = np.diff(self.x_m) * np.cos(self.yaw_rad[1:]) + np.diff(self.y_m) * np.sin(self.yaw_rad[1:]) < 0
+        steps = np.where(backwards, 0.0, steps)
+        steps[0] = local[0, 0] if local[0, 0] < 0 else math.hypot(local[0, 0], local[0, 1])
+        self.station_m = np.concatenate([[0.0], np.cumsum(steps)])
+        if len(steps) > 1:  # the first step also corrects the car's place, so it says nothing of the speed wanted
+            self._speed_t_s = (self.t_s[1:-1] + self.t_s[2:]) / 2
+            self._speed_mps = steps[1:] / np.diff(self.t_s)[1:]
+        else:
+            self._speed_t_s, self._speed_mps = self.t_s[1:], np.maximum(steps / self.t_s[1:], 0.0)
+        first = 1 if steps[0] <= 0 else 0
+        self._line = (self.station_m[first:], self.x_m[first:], self.y_m[first:])
+
+    def speed_at(self, t_s: float) -> float:
+        """Speed wanted ``t_s`` after the anchor."""
+        return float(np.interp(t_s, self._speed_t_s, self._speed_mps))
+
+    def station_at(self, t_s: float) -> float:
+        """Metres along the plan wanted ``t_s`` after the anchor."""
+        return float(np.interp(t_s, self.t_s, self.station_m))
+
+    def point_at(self, station_m: float) -> tuple[float, float]:
+        """Place on the plan; beyond its end straight on."""
+        station, x, y = self._line
+        beyond = max(0.0, station_m - float(station[-1]))
+        yaw = float(self.yaw_rad[-1])
+        return (
+            float(np.interp(station_m, station, x)) + beyond * math.cos(yaw),
+            float(np.interp(station_m, station, y)) + beyond * math.sin(yaw),
+        )
+
+
+Controller = Callable[[PlannedPath, VehicleState, int, int, Limits], VehicleState]
+
+
+def pursuit_pi(path: PlannedPath, state: VehicleState, since_us: int, driven_m: float, limits: Limits) -> VehicleState:
+    """One tick of pure pursuit (rear axle, lookahead 0.5 s in 3..12 m) and PI speed control with feed-forward.
+
+    ``since_us`` is the time and ``driven_m`` the distance since the plan was made.
+    """
+    now_s = since_us / 1e6
+    wanted, soon = path.speed_at(now_s), path.speed_at(now_s + PREVIEW_S)
+    behind_m = path.station_at(now_s) - driven_m
+    accel = (soon - wanted) / PREVIEW_S + SPEED_GAIN * (wanted - state.speed_mps) + STATION_GAIN * behind_m
+    if soon < 0.05 and wanted < 0.05 and behind_m < 0.1:
+        accel = min(accel, -2.0)  # at a standstill the brake stays on
+    lookahead = min(max(LOOKAHEAD_S * state.speed_mps, LOOKAHEAD_M[0]), LOOKAHEAD_M[1])
+    x, y = path.point_at(driven_m + lookahead)
+    dx, dy = x - state.x_m, y - state.y_m
+    left = -math.sin(state.yaw_rad) * dx + math.cos(state.yaw_rad) * dy
+    steering = math.atan(2 * left * limits.wheelbase_m / max(dx * dx + dy * dy, 1.0))
+    return step(state, steering, accel, limits)
+
+
+def perfect(path: PlannedPath, state: VehicleState, since_us: int, driven_m: float, limits: Limits) -> VehicleState:
+    """One tick of teleporting along the plan: isolates the policy from the car."""
+    del driven_m
+    t_s = (since_us + TICK_US) / 1e6
+    speed, before = path.speed_at(t_s), path.speed_at(t_s - 0.1)
+    yaw = float(np.interp(t_s, path.t_s, path.yaw_rad))
+    yaw_rate = (yaw - state.yaw_rad) / (TICK_US / 1e6)
+    steering = math.atan(limits.wheelbase_m * yaw_rate / speed) if speed > 0.5 else 0.0
+    return VehicleState(
+        float(np.interp(t_s, path.t_s, path.x_m)),
+        float(np.interp(t_s, path.t_s, path.y_m)),
+        yaw,
+        speed,
+        (speed - before) / 0.1,
+        steering,
+    )
+
+
+CONTROLLERS: dict[str, Controller] = {"pursuit_pi": pursuit_pi, "perfect": perfect}

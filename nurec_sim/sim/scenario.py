@@ -1,0 +1,141 @@
+"""Scenario files: what the closed loop runs, as YAML checked key by key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import yaml
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from nurec_sim.errors import ScenarioError
+
+STATE_S = 0.1
+"""Interval of the recorded states; every duration of a scenario is a multiple of it."""
+MAX_DURATION_S = 20.0
+
+
+def _whole_states(value: float) -> float:
+    if abs(value / STATE_S - round(value / STATE_S)) > 1e-6:
+        raise ValueError(f"must be a multiple of {STATE_S} s")
+    return value
+
+
+Seconds = Annotated[float, AfterValidator(_whole_states)]
+
+
+class _Strict(BaseModel):
+    """A part of a scenario: frozen, and unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Perturbation(_Strict):
+    """Standard deviations of the ego's start, drawn once per scene and seed whatever the policy; 0 by default."""
+
+    lateral_m: float = Field(0.0, ge=0, le=3)
+    yaw_deg: float = Field(0.0, ge=0, le=30)
+    speed_fraction: float = Field(0.0, ge=0, le=0.5)
+
+
+class SensorSettings(_Strict):
+    """What is rendered beside or instead of what a policy asks for.
+
+    ``image_width_px`` replaces the policies' own. ``record_cameras`` and ``record_lidars`` are rendered at every plan
+    time for ``on_frames`` whatever the policy needs; ``interval_s`` renders them more often than the plans.
+    """
+
+    image_width_px: int | None = Field(None, ge=16, le=4096)
+    record_cameras: tuple[str, ...] = ()
+    record_lidars: tuple[str, ...] = ()
+    interval_s: Seconds | None = Field(None, ge=STATE_S, le=2)
+
+
+class ActorEdit(_Strict):
+    """A recorded actor moved from where the log had it: shifted along its own axes, delayed, or hidden."""
+
+    shift_m: tuple[float, float] = (0.0, 0.0)
+    delay_s: float = Field(0.0, ge=-20, le=20)
+    hide: bool = False
+
+
+class Scenario(_Strict):
+    """One scenario. Every key but ``name`` has a default; durations are multiples of 0.1 s.
+
+    ``clip`` is a clip or scene (path or name), left out where the command line gives it. ``warm_up_s`` of
+    ``duration_s`` follow the log before the policy drives. ``thresholds`` belong to the metrics.
+    """
+
+    name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")
+    clip: str | None = None
+    start_s: Seconds = Field(0.0, ge=0)
+    duration_s: Seconds = Field(MAX_DURATION_S, gt=0, le=MAX_DURATION_S)
+    warm_up_s: Seconds = Field(0.5, ge=0, le=MAX_DURATION_S)
+    replan_s: Seconds = Field(0.5, ge=STATE_S, le=2.0)
+    controller: Literal["pursuit_pi", "perfect"] = "pursuit_pi"
+    seeds: tuple[Annotated[int, Field(ge=0, lt=2**32)], ...] = Field((0,), min_length=1)
+    policies: tuple[str, ...] = ()
+    sensors: SensorSettings = SensorSettings()
+    perturbation: Perturbation = Perturbation()
+    actors: dict[str, ActorEdit] = {}
+    thresholds: dict[str, float] = {}
+
+    @field_validator("seeds")
+    @classmethod
+    def _distinct(cls, value: tuple[int, ...]) -> tuple[int, ...]:
+        if len(set(value)) != len(value):
+            raise ValueError("seeds must differ from each other")
+        return value
+
+
+def load_scenario(path: str | Path) -> Scenario:
+    """Read a scenario file.
+
+    Raises:
+        ScenarioError: the file cannot be read, is no YAML mapping, or a key is unknown or wrong; the text names the
+            file, every wrong key, and what is allowed there.
+    """
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ScenarioError(f"scenario file '{path}' does not exist") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"scenario file '{path}' cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        raise ScenarioError(f"scenario file '{path}' is not YAML: {error}") from error
+    if not isinstance(content, dict):
+        raise ScenarioError(f"scenario file '{path}' must hold keys and values, got {type(content).__name__}")
+    return make_scenario(content, source=f"scenario file '{path}'")
+
+
+def make_scenario(content: dict, source: str = "scenario") -> Scenario:
+    """A scenario of plain values; ``source`` starts the error text.
+
+    Raises:
+        ScenarioError: a key is unknown or its value wrong.
+    """
+    try:
+        return Scenario.model_validate(content)
+    except ValidationError as error:
+        raise ScenarioError(f"{source}: " + "; ".join(_fault(item) for item in error.errors())) from None
+
+
+def _fault(item: dict) -> str:
+    """One pydantic complaint as a sentence: key, what is allowed, what was given."""
+    location = [str(part) for part in item["loc"]]
+    key = ".".join(location) or "(top level)"
+    if item["type"] == "extra_forbidden":
+        allowed = ", ".join(_fields_at(location[:-1]))
+        return f"unknown key '{key}'; allowed: {allowed}"
+    if item["type"] == "missing":
+        return f"key '{key}' is missing"
+    text = item["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    return f"key '{key}': {text}, got {item['input']!r}"
+
+
+def _fields_at(location: list[str]) -> list[str]:
+    """Names allowed at a place of the file."""
+    parts = {"sensors": SensorSettings, "perturbation": Perturbation, "actors": ActorEdit}
+    model: type[BaseModel] = parts.get(location[0], Scenario) if location else Scenario
+    return sorted(model.model_fields)

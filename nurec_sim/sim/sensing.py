@@ -1,0 +1,196 @@
+"""Which sensors a policy gets, and the requests that fill them.
+
+Policies only ever meet ideal pinhole images: where the rig's camera has a fisheye, F-theta, distorted or behind-glass
+lens, the renderer is asked for a virtual ideal pinhole at the same pose, with the same horizontal field of view up to
+100 degrees. Exposures and sweeps end at the time of the plan, so that nothing is old when it is used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float64
+
+from nurec_sim.errors import RequestError, ScenarioError
+from nurec_sim.sim.scenario import SensorSettings
+from nurec_sim.types import (
+    CameraFrame,
+    CameraModel,
+    LidarFrame,
+    LidarModel,
+    Needs,
+    Pinhole,
+    Rig,
+    Sense,
+    SensorFrame,
+    SensorRequest,
+    Shutter,
+    Track,
+    Trajectory,
+)
+
+MAX_VIRTUAL_FOV_RAD = math.radians(100.0)
+FRONT_TOLERANCE_RAD = math.radians(10.0)
+PoseAt = Callable[[int], Float64[np.ndarray, "4 4"]]
+
+
+class SceneFacts(Protocol):
+    """What the loop knows of a scene: a ``types.Clip`` and a ``types.GaussianScene`` both fit."""
+
+    @property
+    def id(self) -> str: ...  # noqa: D102
+
+    @property
+    def rig(self) -> Rig: ...  # noqa: D102
+
+    @property
+    def ego(self) -> Trajectory: ...  # noqa: D102
+
+    @property
+    def tracks(self) -> Sequence[Track]: ...  # noqa: D102
+
+    @property
+    def span_us(self) -> tuple[int, int]: ...  # noqa: D102
+
+
+class SensorSuite:
+    """The sensors of one rollout, by the name that the policy or the scenario used for them.
+
+    Raises:
+        ScenarioError: a sensor is asked for that the rig does not have.
+    """
+
+    def __init__(self, needs: Needs, settings: SensorSettings, facts: SceneFacts) -> None:
+        width = settings.image_width_px or needs.image_width_px
+        self._scene_id = facts.id
+        self._span_us = facts.span_us
+        self._policy_names = {*needs.cameras, *needs.lidars}
+        self.cameras = {
+            name: policy_camera(find_camera(facts.rig, name), width)
+            for name in dict.fromkeys((*needs.cameras, *settings.record_cameras))
+        }
+        self.lidars = {
+            name: find_lidar(facts.rig, name) for name in dict.fromkeys((*needs.lidars, *settings.record_lidars))
+        }
+        self._exposure_us = {name: exposure_us(facts, camera) for name, camera in self.cameras.items()}
+
+    def sense(
+        self,
+        sense: Sense,
+        t_us: int,
+        pose_at: PoseAt,
+        actors: Callable[[int, int], Mapping[str, Float64[np.ndarray, "2 4 4"]]],
+    ) -> dict[str, SensorFrame]:
+        """All frames that end at ``t_us``, by name; one call of ``sense``, none where nothing is needed.
+
+        Raises:
+            RequestError: the renderer answered with other frames than were asked for.
+        """
+        sensors: dict[str, CameraModel | LidarModel] = {**self.cameras, **self.lidars}
+        requests = [self._request(name, sensor, t_us, pose_at, actors) for name, sensor in sensors.items()]
+        if not requests:
+            return {}
+        frames = list(sense(requests))
+        if len(frames) != len(requests):
+            raise RequestError(f"the renderer answered {len(frames)} frames to {len(requests)} requests")
+        for (name, sensor), frame in zip(sensors.items(), frames, strict=True):
+            wanted = CameraFrame if isinstance(sensor, CameraModel) else LidarFrame
+            if not isinstance(frame, wanted):
+                raise RequestError(f"sensor '{name}': wanted a {wanted.__name__}, got {type(frame).__name__}")
+        return dict(zip(sensors, frames, strict=True))
+
+    def for_policy(self, frames: Mapping[str, SensorFrame]) -> tuple[dict[str, CameraFrame], dict[str, LidarFrame]]:
+        """The cameras and LiDARs that the policy asked for; frames only recorded for videos stay out."""
+        mine = {name: frame for name, frame in frames.items() if name in self._policy_names}
+        cameras = {name: frame for name, frame in mine.items() if isinstance(frame, CameraFrame)}
+        return cameras, {name: frame for name, frame in mine.items() if isinstance(frame, LidarFrame)}
+
+    def _request(
+        self, name: str, sensor: CameraModel | LidarModel, t_us: int, pose_at: PoseAt, actors: Callable
+    ) -> SensorRequest:
+        if isinstance(sensor, LidarModel):
+            rig_from_sensor, lasts_us = sensor.rig_from_lidar, int(round(1e6 / sensor.frequency_hz))
+        else:
+            rig_from_sensor, lasts_us = sensor.rig_from_camera, self._exposure_us[name]
+        start_us = max(t_us - lasts_us, self._span_us[0])
+        # An instant is [t, t + 1), as clients of NuRec write it; both ends lie inside the half-open span.
+        end_us = max(t_us, start_us + 1)
+        poses = np.stack([pose_at(start_us), pose_at(t_us)]) @ rig_from_sensor
+        return SensorRequest(self._scene_id, sensor, start_us, end_us, poses, actors(start_us, t_us))
+
+
+def find_camera(rig: Rig, name: str) -> CameraModel:
+    """A camera by id, or the most forward one for ``front``.
+
+    Of the cameras that look forward within 10 degrees of the best one, ``front`` is the one with the widest view, and
+    of these the first in the rig: so a tele camera or the right eye of a stereo pair is not picked.
+
+    Raises:
+        ScenarioError: no such camera; the text lists the rig's.
+    """
+    if name in rig.cameras:
+        return rig.cameras[name]
+    if name == "front" and rig.cameras:
+        off_axis = {c.id: math.acos(min(1.0, float(c.rig_from_camera[0, 2]))) for c in rig.cameras.values()}
+        best = min(off_axis.values())
+        forward = [c for c in rig.cameras.values() if off_axis[c.id] <= best + FRONT_TOLERANCE_RAD]
+        return max(forward, key=lambda c: round(horizontal_fov_rad(c), 3))
+    raise ScenarioError(f"camera '{name}' is needed but the rig has no such camera; have {list(rig.cameras)}")
+
+
+def find_lidar(rig: Rig, name: str) -> LidarModel:
+    """A LiDAR by id, or the first one for ``any``.
+
+    Raises:
+        ScenarioError: no such LiDAR; the text lists the rig's.
+    """
+    if name in rig.lidars:
+        return rig.lidars[name]
+    if name == "any" and rig.lidars:
+        return next(iter(rig.lidars.values()))
+    raise ScenarioError(f"LiDAR '{name}' is needed but the rig has no such LiDAR; have {list(rig.lidars)}")
+
+
+def horizontal_fov_rad(camera: CameraModel) -> float:
+    """Angle between the rays at the middle of the left and right image borders, or as far as the lens is valid."""
+    from nurec_sim.sensors import unproject
+
+    columns = np.linspace(0.0, camera.width_px, 33)
+    rays, valid = unproject(camera, np.column_stack([columns, np.full(33, camera.height_px / 2)]))
+    if np.count_nonzero(valid) < 2:
+        return MAX_VIRTUAL_FOV_RAD
+    azimuth = np.arctan2(rays[valid, 0], rays[valid, 2])
+    return float(azimuth[-1] - azimuth[0])
+
+
+def policy_camera(camera: CameraModel, width_px: int) -> CameraModel:
+    """The ideal pinhole that a policy gets for a camera of the rig: same id, pose and shutter, ``width_px`` wide."""
+    from nurec_sim.sensors import scaled_camera
+
+    height_px = max(8, round(width_px * camera.height_px / camera.width_px))
+    ideal = isinstance(camera.lens, Pinhole) and not camera.lens.distorted and camera.windshield is None
+    if ideal:
+        return scaled_camera(camera, width_px, height_px)
+    half = min(horizontal_fov_rad(camera), MAX_VIRTUAL_FOV_RAD) / 2
+    focal = width_px / 2 / math.tan(half)
+    lens = Pinhole(focal, focal, width_px / 2, height_px / 2)
+    return replace(camera, width_px=width_px, height_px=height_px, lens=lens, windshield=None)
+
+
+def exposure_us(facts: SceneFacts, camera: CameraModel) -> int:
+    """Usual duration of this camera's exposures in the log; 0 for a global shutter or where the log does not say."""
+    if camera.shutter is Shutter.GLOBAL:
+        return 0
+    times = getattr(facts, "camera_times_us", None)
+    if isinstance(times, Mapping):
+        frames = times.get(camera.id)
+    else:
+        frames = times(camera.id) if callable(times) else None
+    if frames is None or len(frames) == 0:
+        return 0
+    frames = np.asarray(frames, np.int64)
+    return int(np.median(frames[:, 1] - frames[:, 0]))

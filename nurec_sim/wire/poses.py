@@ -1,0 +1,129 @@
+"""Poses, trajectories and tracks <-> messages.
+
+The wire's poses are float32 position and ``wxyz`` quaternion; ours travel beside them in double precision
+(``Pose.exact``), so that a remote rollout equals a local one bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from nurec_sim import geometry
+from nurec_sim.errors import RequestError
+from nurec_sim.types import Matrix4, Track, Trajectory
+
+QUAT_TOLERANCE = 1e-3
+"""How far a quaternion's squared norm may be from 1; clients round to float32, AlpaSim itself allows 1e-4."""
+
+MAX_TIME_US = 2**62
+"""Times beyond this are rejected, so that sums of two still fit int64."""
+
+
+def write_poses(poses: Float64[np.ndarray, "n 4 4"], messages: Sequence) -> None:
+    """Fills one ``common.Pose`` message per pose."""
+    quats = geometry.quat_from_matrix(poses[:, :3, :3]).tolist()
+    for pose, (w, x, y, z), message in zip(poses, quats, messages, strict=True):
+        message.vec.x, message.vec.y, message.vec.z = pose[:3, 3].tolist()
+        message.quat.w, message.quat.x, message.quat.y, message.quat.z = w, x, y, z
+        message.exact.extend(pose.ravel().tolist())
+
+
+def read_poses(messages: Sequence, names: Sequence[str]) -> Float64[np.ndarray, "n 4 4"]:
+    """Poses of ``common.Pose`` messages; ``names`` say in an error which one was wrong.
+
+    Raises:
+        RequestError: a value is not finite, a quaternion is not a unit one, or ``exact`` is not a rigid transform.
+    """
+    position = np.array([(m.vec.x, m.vec.y, m.vec.z) for m in messages], np.float64).reshape(-1, 3)
+    quat = np.array([(m.quat.w, m.quat.x, m.quat.y, m.quat.z) for m in messages], np.float64).reshape(-1, 4)
+    norm2 = np.sum(quat * quat, axis=1)
+    finite = np.isfinite(position).all(axis=1) & np.isfinite(quat).all(axis=1)
+    bad = ~finite | ~(np.abs(norm2 - 1) <= QUAT_TOLERANCE)
+    if bad.any():
+        i = int(np.argmax(bad))
+        values = f"vec (x, y, z) = {_text(position[i])}, quat (w, x, y, z) = {_text(quat[i])}"
+        if not finite[i]:
+            raise RequestError(f"{names[i]} must be finite, got {values}")
+        raise RequestError(
+            f"{names[i]} must have a unit quaternion (squared norm 1 within {QUAT_TOLERANCE}), "
+            f"got squared norm {norm2[i]:.6g}: {values}"
+        )
+    result = np.tile(np.eye(4), (len(messages), 1, 1))
+    result[:, :3, 3] = position
+    result[:, :3, :3] = geometry.matrix_from_quat(quat)
+    for i, message in enumerate(messages):
+        if len(message.exact):
+            exact = _read_exact(message.exact, names[i])
+            # A client that copied a message of ours and edited `vec` or `quat` leaves a stale `exact` behind.
+            if np.abs(exact - result[i]).max() <= 1e-6 * max(1.0, float(np.abs(position[i]).max())):
+                result[i] = exact
+    return result
+
+
+def _read_exact(values: Iterable[float], name: str) -> Matrix4:
+    matrix = np.array(values, np.float64)
+    if matrix.shape != (16,):
+        raise RequestError(f"{name}.exact must have 16 values (a row-major 4x4) or none, got {len(matrix)}")
+    matrix = matrix.reshape(4, 4)
+    if not geometry.is_rotation(matrix[:3, :3]) or not np.isfinite(matrix).all() or (matrix[3] != (0, 0, 0, 1)).any():
+        raise RequestError(f"{name}.exact must be a rigid transform with last row 0 0 0 1, got {_text(matrix.ravel())}")
+    return matrix
+
+
+def _text(values: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.6g}" for value in values) + ")"
+
+
+def write_trajectory(trajectory: Trajectory, message) -> None:
+    """Fills a ``common.Trajectory`` message."""
+    samples = [message.poses.add(timestamp_us=t) for t in trajectory.t_us.tolist()]
+    write_poses(trajectory.world_from_body, [sample.pose for sample in samples])
+
+
+def read_trajectory(message, name: str) -> Trajectory:
+    """The trajectory of a ``common.Trajectory`` message.
+
+    Raises:
+        RequestError: it is empty, a pose is malformed, or times do not increase.
+    """
+    poses = read_poses([s.pose for s in message.poses], [f"{name}[{i}]" for i in range(len(message.poses))])
+    try:
+        return Trajectory(np.array([s.timestamp_us for s in message.poses], np.int64), poses)
+    except (ValueError, OverflowError) as error:
+        raise RequestError(f"{name}: {error}") from error
+
+
+def write_track(track: Track, message) -> None:
+    """Fills a ``DynamicObjectTrack`` message."""
+    message.id, message.semantic_class, message.asset_id = track.id, track.label, track.id
+    message.object_size.size_x, message.object_size.size_y, message.object_size.size_z = track.size_m
+    write_trajectory(track.path, message.trajectory)
+
+
+def read_track(message) -> Track:
+    """The track of a ``DynamicObjectTrack`` message.
+
+    Raises:
+        RequestError: its trajectory is malformed.
+    """
+    size = message.object_size
+    path = read_trajectory(message.trajectory, f"track {message.id!r}")
+    return Track(message.id, message.semantic_class, (size.size_x, size.size_y, size.size_z), path)
+
+
+def check_interval(start_us: int, end_us: int) -> None:
+    """Whether [start, end) is a valid frame.
+
+    Raises:
+        RequestError: it is empty or reversed, or a time is beyond any clock.
+    """
+    if end_us > MAX_TIME_US or start_us > MAX_TIME_US:
+        raise RequestError(f"frame_start_us {start_us} and frame_end_us {end_us} must be microseconds below 2**62")
+    if start_us >= end_us:
+        raise RequestError(
+            f"a frame is the half-open interval [frame_start_us, frame_end_us) and needs start < end, "
+            f"got [{start_us}, {end_us}); an instant t is [t, t + 1)"
+        )

@@ -1,0 +1,188 @@
+"""Render requests, images and sweeps <-> messages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from nurec_sim.errors import RequestError
+from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, SensorRequest
+from nurec_sim.wire.messages import ImageFormat
+from nurec_sim.wire.poses import check_interval, read_poses, write_poses
+from nurec_sim.wire.sensors import read_camera, read_lidar, write_camera, write_lidar
+
+IMAGE_FORMATS = (ImageFormat.PNG, ImageFormat.JPEG, ImageFormat.RGB_UINT8_PLANAR)
+DEFAULT_JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """How a camera image is finished: file format, JPEG quality, colour correction, and the ego mask laid over it."""
+
+    format: int = ImageFormat.PNG
+    jpeg_quality: int = DEFAULT_JPEG_QUALITY
+    apply_isp: bool = True
+    ego_mask: tuple[str, str] | None = None
+    """(rig, camera) of the mask, or None."""
+
+
+# ------------------------------------------------------------------------------------------------------------ requests
+
+
+def write_camera_request(request: SensorRequest, message, *, scene_id: str, apply_isp: bool = True) -> None:
+    """Fills an ``RGBRenderRequest`` that asks for lossless pixels (``RGB_UINT8_PLANAR``)."""
+    message.resolution_w, message.resolution_h = request.sensor.width_px, request.sensor.height_px
+    write_camera(request.sensor, message.camera_intrinsics)
+    message.image_format = ImageFormat.RGB_UINT8_PLANAR
+    if not apply_isp:
+        message.apply_isp = False
+    _write_frame(request, message, scene_id)
+
+
+def write_lidar_request(request: SensorRequest, message, *, scene_id: str) -> None:
+    """Fills a ``LidarRenderRequest``."""
+    write_lidar(request.sensor, message.lidar_config)
+    _write_frame(request, message, scene_id)
+
+
+def _write_frame(request: SensorRequest, message, scene_id: str) -> None:
+    message.scene_id = scene_id
+    check_interval(request.start_us, request.end_us)
+    message.frame_start_us, message.frame_end_us = request.start_us, request.end_us
+    _write_pair(request.world_from_sensor, message.sensor_pose)
+    for track_id, pair in request.actors.items():
+        _write_pair(pair, message.dynamic_objects.add(track_id=track_id).pose_pair)
+
+
+def _write_pair(pair: Float64[np.ndarray, "2 4 4"], message) -> None:
+    write_poses(np.asarray(pair, np.float64), [message.start_pose, message.end_pose])
+
+
+def read_camera_request(message, cameras: Mapping[str, CameraModel]) -> tuple[SensorRequest, ImageOptions]:
+    """The request and the options of an ``RGBRenderRequest``; ``cameras`` are the scene's own.
+
+    Raises:
+        RequestError: a field is missing or malformed; the text names it.
+    """
+    options = _read_image_options(message)
+    camera = read_camera(message.camera_intrinsics, message.resolution_w, message.resolution_h, cameras)
+    return _read_frame(message, camera), options
+
+
+def read_lidar_request(message) -> tuple[SensorRequest, float | None]:
+    """The request of a ``LidarRenderRequest``, and its opacity threshold if it has one.
+
+    Raises:
+        RequestError: a field is missing or malformed; the text names it.
+    """
+    threshold = None
+    if message.render_filter.HasField("opacity_threshold"):
+        threshold = message.render_filter.opacity_threshold
+        if not 0 <= threshold <= 1:
+            raise RequestError(f"render_filter.opacity_threshold must lie in 0..1, got {threshold}")
+    return _read_frame(message, read_lidar(message.lidar_config)), threshold
+
+
+def _read_frame(message, sensor) -> SensorRequest:
+    check_interval(message.frame_start_us, message.frame_end_us)
+    pairs = {"sensor_pose": message.sensor_pose} if message.HasField("sensor_pose") else {}
+    pairs |= {f"dynamic_objects[{d.track_id!r}].pose_pair": d.pose_pair for d in message.dynamic_objects}
+    if "sensor_pose" not in pairs:
+        raise RequestError("sensor_pose is missing: the sensor's poses in the world at the frame's start and end")
+    names = [f"{name}.{end}" for name in pairs for end in ("start_pose", "end_pose")]
+    poses = read_poses([pose for pair in pairs.values() for pose in (pair.start_pose, pair.end_pose)], names)
+    first, *others = poses.reshape(-1, 2, 4, 4)
+    track_ids = dict.fromkeys(d.track_id for d in message.dynamic_objects)
+    actors = dict(zip(track_ids, others, strict=True))
+    return SensorRequest(message.scene_id, sensor, message.frame_start_us, message.frame_end_us, first, actors)
+
+
+def _read_image_options(message) -> ImageOptions:
+    if message.image_format not in IMAGE_FORMATS:
+        allowed = ", ".join(f"{number.name} ({number.value})" for number in IMAGE_FORMATS)
+        given = ImageFormat(message.image_format).name if message.image_format in list(ImageFormat) else "unknown"
+        raise RequestError(f"image_format must be one of {allowed}; got {given} ({message.image_format})")
+    quality = message.image_quality or DEFAULT_JPEG_QUALITY
+    if message.image_format == ImageFormat.JPEG and not 1 <= quality <= 100:
+        raise RequestError(f"image_quality of a JPEG must lie in 1..100 (0 means 95), got {quality}")
+    mask = (message.ego_mask_id.rig_config_id, message.ego_mask_id.camera_logical_id)
+    return ImageOptions(
+        message.image_format,
+        int(quality) if message.image_format == ImageFormat.JPEG else DEFAULT_JPEG_QUALITY,
+        message.apply_isp if message.HasField("apply_isp") else True,
+        mask if message.insert_ego_mask else None,
+    )
+
+
+# -------------------------------------------------------------------------------------------------------------- frames
+
+
+def encode_image(rgb: UInt8[np.ndarray, "h w 3"], options: ImageOptions) -> bytes:
+    """An image in the requested format; planar means all red, then all green, then all blue."""
+    if options.format == ImageFormat.RGB_UINT8_PLANAR:
+        return np.ascontiguousarray(np.moveaxis(rgb, 2, 0)).tobytes()
+    import cv2
+
+    bgr = np.ascontiguousarray(rgb[:, :, ::-1])
+    if options.format == ImageFormat.JPEG:
+        done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, options.jpeg_quality])
+    else:
+        done, data = cv2.imencode(".png", bgr)
+    if not done:
+        raise RuntimeError(f"OpenCV could not encode an image of shape {rgb.shape}")
+    return data.tobytes()
+
+
+def read_camera_frame(message, request: SensorRequest) -> CameraFrame:
+    """The frame of an ``RGBRenderReturn`` to a request made by ``write_camera_request``.
+
+    Raises:
+        RequestError: the reply has another size than asked for.
+    """
+    camera = request.sensor
+    shape = (3, camera.height_px, camera.width_px)
+    if len(message.image_bytes) != int(np.prod(shape)):
+        raise RequestError(
+            f"camera {camera.id!r}: asked for {camera.width_px}x{camera.height_px} planar RGB, "
+            f"got {len(message.image_bytes)} bytes"
+        )
+    planar = np.frombuffer(message.image_bytes, np.uint8).reshape(shape)
+    rgb = np.ascontiguousarray(np.moveaxis(planar, 0, 2))
+    return CameraFrame(camera, request.start_us, request.end_us, rgb)
+
+
+def write_lidar_frame(frame: LidarFrame, message) -> None:
+    """Fills a ``LidarRenderReturn``; only the buffers, not the repeated fields."""
+    message.num_points = len(frame.xyz_m)
+    message.point_xyzs_buffer = np.ascontiguousarray(frame.xyz_m, "<f4").tobytes()
+    message.point_intensities_buffer = np.ascontiguousarray(frame.intensity, "<f4").tobytes()
+    message.point_ranges_buffer = np.ascontiguousarray(frame.range_m, "<f4").tobytes()
+    message.point_beams_buffer = np.ascontiguousarray(frame.beam, "<i4").tobytes()
+
+
+def read_lidar_frame(message, request: SensorRequest) -> LidarFrame:
+    """The sweep of a ``LidarRenderReturn``.
+
+    From servers without our additions, ranges are the points' norms and beams are -1.
+
+    Raises:
+        RequestError: the buffers have different lengths.
+    """
+    xyz = np.frombuffer(message.point_xyzs_buffer, "<f4")
+    intensity = np.frombuffer(message.point_intensities_buffer, "<f4")
+    if not len(xyz):
+        xyz, intensity = np.array(message.point_xyzs, "<f4"), np.array(message.point_intensities, "<f4")
+    n = message.num_points
+    ranges, beam = np.frombuffer(message.point_ranges_buffer, "<f4"), np.frombuffer(message.point_beams_buffer, "<i4")
+    if len(xyz) != 3 * n or len(intensity) != n or len(ranges) not in (0, n) or len(beam) not in (0, n):
+        raise RequestError(
+            f"lidar {request.sensor.id!r}: the reply says {n} points but holds {len(xyz)} coordinates, "
+            f"{len(intensity)} intensities, {len(ranges)} ranges and {len(beam)} beams"
+        )
+    xyz = xyz.reshape(n, 3).astype(np.float32)
+    ranges = ranges.astype(np.float32) if len(ranges) else np.linalg.norm(xyz, axis=1)
+    beam = beam.astype(np.int32) if len(beam) else np.full(n, -1, np.int32)
+    return LidarFrame(request.sensor, request.start_us, request.end_us, xyz, ranges, intensity.astype(np.float32), beam)

@@ -1,0 +1,36 @@
+"""Which gRPC status an error of ours becomes on the wire, and back."""
+
+from __future__ import annotations
+
+import grpc
+
+from nurec_sim import errors
+
+_CODES: tuple[tuple[type[errors.NurecSimError], grpc.StatusCode], ...] = (
+    (errors.UnknownSceneError, grpc.StatusCode.NOT_FOUND),
+    (errors.OutOfRangeError, grpc.StatusCode.OUT_OF_RANGE),
+    (errors.TooLargeError, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    (errors.RequestError, grpc.StatusCode.INVALID_ARGUMENT),
+    (errors.ArchiveError, grpc.StatusCode.FAILED_PRECONDITION),
+    (errors.ClipError, grpc.StatusCode.FAILED_PRECONDITION),
+    (errors.ReconstructError, grpc.StatusCode.FAILED_PRECONDITION),
+)
+_CODE_OF_NUMBER = {code.value[0]: code for code in grpc.StatusCode}
+
+
+def code_of(error: Exception) -> grpc.StatusCode:
+    """Status of an error; INTERNAL for what was not raised on purpose."""
+    return next((code for kind, code in _CODES if isinstance(error, kind)), grpc.StatusCode.INTERNAL)
+
+
+def number_of(error: Exception) -> int:
+    """The same status as the number that travels on the wire."""
+    return code_of(error).value[0]
+
+
+def error_of(code: grpc.StatusCode | int, text: str) -> errors.NurecSimError:
+    """The error that a status stands for; ``ServerError`` where it stands for none of ours."""
+    if isinstance(code, int):
+        code = _CODE_OF_NUMBER.get(code, grpc.StatusCode.UNKNOWN)
+    kind = next((kind for kind, known in _CODES if known is code), None)
+    return kind(text) if kind else errors.ServerError(f"{code.name}: {text}")

@@ -1,0 +1,83 @@
+"""Which way images are drawn: OpenGL through EGL, OpenGL through OSMesa, or ray casting without any OpenGL.
+
+A GL library that does not work may end the process, so it is tried in a process of its own, once.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+from typing import Any
+
+BACKENDS = ("egl", "osmesa", "rays")
+ENVIRONMENT = "NUREC_SIM_GL"
+PROBE_TIMEOUT_S = 60
+
+_PROBE = """
+import sys, mujoco
+from mujoco.{name} import GLContext
+context = GLContext(64, 64)
+context.make_current()
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
+mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, renderer)
+if renderer.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value:
+    raise SystemExit("no offscreen buffer")
+renderer.free()
+context.free()
+"""
+
+
+@functools.cache
+def why_not(name: str) -> str:
+    """Why a back end does not work on this machine; empty where it does."""
+    if name == "rays":
+        return ""
+    environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE.format(name=name)],
+            capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, env=environment, check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return f"no answer within {PROBE_TIMEOUT_S} seconds"
+    if done.returncode == 0:
+        return ""
+    lines = done.stderr.strip().splitlines()
+    return lines[-1] if lines else f"the trial ended with status {done.returncode}"
+
+
+def pick_backend(wanted: str | None = None) -> str:
+    """The back end to use: ``wanted``, else what NUREC_SIM_GL says, else the first of egl, osmesa, rays that works.
+
+    Raises:
+        ValueError: no back end has that name.
+        RuntimeError: the one asked for does not work here.
+    """
+    wanted = wanted or os.environ.get(ENVIRONMENT) or None
+    if wanted is None:
+        return next(name for name in BACKENDS if not why_not(name))
+    if wanted not in BACKENDS:
+        raise ValueError(f"no drawing back end {wanted!r}; have {', '.join(BACKENDS)} ({ENVIRONMENT} sets it)")
+    if reason := why_not(wanted):
+        raise RuntimeError(f"the drawing back end {wanted!r} does not work here: {reason}; 'rays' always does")
+    return wanted
+
+
+def gl_context(name: str) -> Any:
+    """An OpenGL context of back end ``egl`` or ``osmesa``; current in no thread yet. The caller frees it.
+
+    Raises:
+        RuntimeError: this process already uses the other one, and PyOpenGL binds to one only.
+    """
+    other = {"egl": "osmesa", "osmesa": "egl"}[name]
+    if f"mujoco.{other}" in sys.modules:
+        raise RuntimeError(f"this process already draws with {other!r} and cannot use {name!r} as well")
+    os.environ["PYOPENGL_PLATFORM"] = name
+    if name == "egl":
+        from mujoco.egl import GLContext
+    else:
+        from mujoco.osmesa import GLContext
+    return GLContext(64, 64)

@@ -1,0 +1,160 @@
+"""A small triangle-mesh builder: quads, lattices, boxes, cylinders, walls and blobs with texture coordinates.
+
+Front faces wind counter-clockwise; OpenGL culls back faces, so a wrong winding shows as a hole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from jaxtyping import Float64, Int64
+
+UNIT_SQUARE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
+
+
+class MeshBuilder:
+    """Gathers triangles; ``corners`` gives them with normals smoothed below a crease angle."""
+
+    def __init__(self) -> None:
+        self._points: list[np.ndarray] = []
+        self._uv: list[np.ndarray] = []
+        self._faces: list[np.ndarray] = []
+        self._count = 0
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing was added."""
+        return self._count == 0
+
+    @property
+    def points(self) -> Float64[np.ndarray, "n 3"]:
+        """All vertices."""
+        return np.concatenate(self._points)
+
+    def transform(self, scale: np.ndarray, shift: np.ndarray) -> None:
+        """Scales about the origin, then shifts, everything gathered so far."""
+        self._points = [points * scale + shift for points in self._points]
+
+    def add(self, points: Sequence, faces: Sequence, uv: Sequence) -> None:
+        """Triangles ``faces [m,3]`` over ``points [n,3]`` with ``uv [n,2]``."""
+        points = np.asarray(points, np.float64)
+        self._points.append(points)
+        self._uv.append(np.asarray(uv, np.float64))
+        self._faces.append(np.asarray(faces, np.int64) + self._count)
+        self._count += len(points)
+
+    def quad(self, a: Sequence, b: Sequence, c: Sequence, d: Sequence, uv: Sequence = UNIT_SQUARE) -> None:
+        """One quad, counter-clockwise seen from its front."""
+        self.add([a, b, c, d], [[0, 1, 2], [0, 2, 3]], uv)
+
+    def grid(self, lattice: Float64[np.ndarray, "n m 3"], uv: Float64[np.ndarray, "n m 2"] | None = None) -> None:
+        """A lattice of quads whose front is along d/dn x d/dm."""
+        n, m = lattice.shape[:2]
+        if uv is None:
+            uv = np.stack(np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, m), indexing="ij"), axis=-1)
+        index = np.arange(n * m).reshape(n, m)
+        a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+        faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+        self.add(lattice.reshape(-1, 3), faces, uv.reshape(-1, 2))
+
+    def box(self, center: Sequence, half: Sequence, uv_per_m: float = 1.0) -> None:
+        """An axis-aligned box."""
+        center, half = np.asarray(center, np.float64), np.asarray(half, np.float64)
+        for axis in range(3):
+            for sign in (-1, 1):
+                u, w = (axis + 1) % 3, (axis + 2) % 3
+                middle = center + sign * half[axis] * np.eye(3)[axis]
+                along_u, along_w = sign * half[u] * np.eye(3)[u], half[w] * np.eye(3)[w]
+                uv = np.array(UNIT_SQUARE) * 2 * np.array([half[u], half[w]]) * uv_per_m
+                self.quad(middle - along_u - along_w, middle + along_u - along_w,
+                          middle + along_u + along_w, middle - along_u + along_w, uv)  # fmt: skip
+
+    def cylinder(self, start: Sequence, end: Sequence, radius: float, end_radius: float | None = None, sides: int = 12,
+                 capped: bool = True) -> None:  # fmt: skip
+        """A cylinder or cone between two points."""
+        start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
+        radii = (radius, radius if end_radius is None else end_radius)
+        axis = (end - start) / np.linalg.norm(end - start)
+        side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
+        side /= np.linalg.norm(side)
+        angle = np.linspace(0, 2 * np.pi, sides + 1)
+        ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(axis, side)
+        self.grid(np.stack([start + radii[0] * ring, end + radii[1] * ring], axis=1))
+        for center, r, sign in ((start, radii[0], -1), (end, radii[1], 1)):
+            if capped and r > 1e-4:
+                fan = [[0, i, i + 1][::sign] if sign < 0 else [0, i, i + 1] for i in range(1, sides - 1)]
+                self.add(center + r * ring[:-1], fan, ring[:-1, :2] * 0.5 + 0.5)
+
+    def wall(self, outline: Sequence, low_m: float, high_m: float, u_per_m: float, v_low: float, v_high: float) -> None:
+        """Vertical quads along a 2D polyline; their front is on its right (outside of a counter-clockwise ring)."""
+        outline = np.asarray(outline, np.float64)
+        u = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))]) * u_per_m
+        for (a, b), (ua, ub) in zip(zip(outline[:-1], outline[1:], strict=True), zip(u[:-1], u[1:], strict=True),
+                                    strict=True):  # fmt: skip
+            self.quad([*a, low_m], [*b, low_m], [*b, high_m], [*a, high_m],
+                      [[ua, v_low], [ub, v_low], [ub, v_high], [ua, v_high]])  # fmt: skip
+
+    def flat(self, polygon: shapely.Geometry, z_m: float, uv_per_m: float) -> None:
+        """A polygon, holes included, as a horizontal surface that faces up; its texture lies in world axes."""
+        triangles = [t for t in shapely.constrained_delaunay_triangles(polygon).geoms if t.area > 1e-6]
+        corners = np.array([np.asarray(t.exterior.coords)[:3] for t in triangles])
+        side = corners[:, 1:] - corners[:, :1]
+        clockwise = side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0] < 0
+        corners[clockwise] = corners[clockwise][:, ::-1]
+        xy = corners.reshape(-1, 2)
+        points = np.concatenate([xy, np.full((len(xy), 1), z_m)], axis=1)
+        self.add(points, np.arange(len(xy)).reshape(-1, 3), xy * uv_per_m)
+
+    def blob(self, rng: np.random.Generator, center: Sequence, radius: float, rough: float = 0.2) -> None:
+        """A lumpy ball, as for the crown of a tree."""
+        points, faces = icosphere(2)
+        lumps = sum(np.sin(points @ (rng.normal(size=3) * rng.uniform(2, 6)) + 6 * rng.random()) for _ in range(4)) / 4
+        lumps = lumps + rng.normal(0, 0.28, len(points))
+        uv = np.stack([np.arctan2(points[:, 1], points[:, 0]) / np.pi, points[:, 2]], axis=1) * radius
+        self.add(points * radius * (1 + rough * lumps)[:, None] + np.asarray(center), faces, uv)
+
+    def corners(
+        self, crease_deg: float
+    ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"]]:
+        """Positions, unit normals and texture coordinates of every triangle corner, three per triangle.
+
+        A corner's normal averages the faces at its position that bend less than ``crease_deg`` from its own.
+        """
+        points, uv, faces = np.concatenate(self._points), np.concatenate(self._uv), np.concatenate(self._faces)
+        normal = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
+        area = np.linalg.norm(normal, axis=1)
+        faces, normal, area = faces[area > 1e-9], normal[area > 1e-9], area[area > 1e-9]
+        weighted = np.repeat(normal, 3, axis=0)
+        own = np.repeat(normal / area[:, None], 3, axis=0)
+        place = points[faces].reshape(-1, 3)
+        key = np.unique(np.round(place, 4), axis=0, return_inverse=True)[1].ravel()
+        order = np.argsort(key, kind="stable")
+        limit, smooth = np.cos(np.deg2rad(crease_deg)), own.copy()
+        for group in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+            if len(group) > 1:
+                total = ((own[group] @ own[group].T) > limit) @ weighted[group]
+                smooth[group] = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
+        return place, smooth, uv[faces].reshape(-1, 2)
+
+
+def icosphere(subdivisions: int) -> tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, "m 3"]]:
+    """A unit sphere of near-equal triangles."""
+    t = (1 + 5**0.5) / 2
+    points = np.array([[-1, t, 0], [1, t, 0], [-1, -t, 0], [1, -t, 0], [0, -1, t], [0, 1, t],
+                       [0, -1, -t], [0, 1, -t], [t, 0, -1], [t, 0, 1], [-t, 0, -1], [-t, 0, 1]])  # fmt: skip
+    faces = np.array([[0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11], [1, 5, 9], [5, 11, 4], [11, 10, 2],
+                      [10, 7, 6], [7, 1, 8], [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8], [3, 8, 9], [4, 9, 5],
+                      [2, 4, 11], [6, 2, 10], [8, 6, 7], [9, 8, 1]])  # fmt: skip
+    points = points / np.linalg.norm(points[0])
+    for _ in range(subdivisions):
+        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        unique, index = np.unique(edges, axis=0, return_inverse=True)
+        middle = points[unique].mean(axis=1)
+        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+        ab, bc, ca = np.split(index.ravel() + len(points), 3)
+        a, b, c = faces.T
+        faces = np.concatenate([np.stack(f, axis=1) for f in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
+        points = np.concatenate([points, middle])
+    return points, faces

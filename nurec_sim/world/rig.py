@@ -1,0 +1,49 @@
+"""The car that drives through the street: three cameras and one spinning LiDAR."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nurec_sim import geometry
+from nurec_sim.types import CameraModel, LidarModel, Pinhole, Rig, Spin
+
+CAMERAS = {  # yaw (deg), horizontal field of view (deg), position in the rig (m)
+    "camera_front": (0.0, 82.0, (1.75, 0.0, 1.45)),
+    "camera_front_left": (58.0, 74.0, (1.55, 0.5, 1.45)),
+    "camera_front_right": (-58.0, 74.0, (1.55, -0.5, 1.45)),
+}
+LIDAR_ID = "lidar_top"
+CAMERA_FROM_RIG_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def street_rig(width_px: int = 448, height_px: int = 256, lidar_rows: int = 48, lidar_columns: int = 720) -> Rig:
+    """The rig of the demonstration clip, in any resolution.
+
+    Raises:
+        ValueError: images smaller than 16 pixels, or a LiDAR with fewer than 2 rows or 8 columns.
+    """
+    if min(width_px, height_px) < 16 or lidar_rows < 2 or lidar_columns < 8:
+        raise ValueError(
+            "a rig needs images of at least 16 x 16 pixels and a LiDAR of at least 2 rows and 8 columns, "
+            f"got {width_px} x {height_px} and {lidar_rows} x {lidar_columns}"
+        )
+    cameras = {}
+    for name, (yaw_deg, view_deg, place) in CAMERAS.items():
+        focal = width_px / 2 / np.tan(np.deg2rad(view_deg) / 2)
+        # The horizon lies above the middle: a driver needs the road more than the sky.
+        lens = Pinhole(focal, focal, width_px / 2, 0.44 * height_px)
+        rotation = geometry.rotation_from_yaw(np.deg2rad(yaw_deg)) @ CAMERA_FROM_RIG_AXES
+        cameras[name] = CameraModel(name, width_px, height_px, lens, geometry.pose(rotation, np.array(place)))
+    steep = np.linspace(-26.0, -9.0, lidar_rows // 3, endpoint=False)
+    flat = np.linspace(-9.0, 12.0, lidar_rows - len(steep))
+    lidar = LidarModel(
+        id=LIDAR_ID,
+        elevation_rad=np.deg2rad(np.concatenate([steep, flat])[::-1]),
+        azimuth_rad=np.pi - 2 * np.pi * (np.arange(lidar_columns) + 0.5) / lidar_columns,
+        row_azimuth_offset_rad=np.zeros(lidar_rows),
+        rig_from_lidar=geometry.pose(np.eye(3), np.array([1.1, 0.0, 1.9])),
+        spin=Spin.CLOCKWISE,
+        frequency_hz=10.0,
+        range_m=(0.8, 120.0),
+    )
+    return Rig(cameras, {LIDAR_ID: lidar})

@@ -1,0 +1,106 @@
+"""Follows the recorded route and brakes for what the rendered LiDAR shows in its way: automatic emergency braking."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+
+from nurec_sim import geometry
+from nurec_sim.policies._paths import (
+    FRONT_M,
+    HALF_WIDTH_M,
+    extended,
+    make_plan,
+    pursue,
+    route_speed,
+    toward_speed,
+)
+from nurec_sim.types import LidarFrame, Needs, Observation, Plan, Rig
+
+CELL_M, RANGE_M, SIDE_M = 1.0, 60.0, 12.0
+MIN_HEIGHT_M, MAX_HEIGHT_M = 0.4, 2.2
+CORRIDOR_MARGIN_M = 0.25
+MIN_POINTS = 3
+TTC_S, BRAKE_MPS2, STOP_GAP_M = 2.0, 4.0, 2.0
+"""Brake when the time to collision falls below 2 s, or the distance below v^2 / (2 * 4) + 2 m."""
+
+
+class LidarAeb:
+    """Blind to all but the LiDAR points in its own corridor."""
+
+    name = "lidar_aeb"
+    needs = Needs(lidars=("any",))
+
+    def __init__(self) -> None:
+        self.reset(Rig({}, {}), 0)
+
+    def reset(self, rig: Rig, seed: int) -> None:
+        """Forget the obstacle of the last plan."""
+        self.front_m = rig.body.center_m[0] + rig.body.size_m[0] / 2 if rig.lidars else FRONT_M
+        self.half_width_m = rig.body.size_m[1] / 2 if rig.lidars else HALF_WIDTH_M
+        self.last: tuple[int, float] | None = None
+
+    def plan(self, observation: Observation) -> Plan:
+        """Five seconds along the route, braking where something stands in the way."""
+        speed = observation.ego.speed_mps
+        points = points_in_rig(observation.lidars["any"])
+        distance = self.free_distance(points, extended(observation.route_m))
+        lead_speed = self.speed_of_obstacle(observation, distance)
+        self.last = None if distance is None else (observation.t_us, distance)
+        brake = 0.0
+        if distance is not None:
+            closing = speed - lead_speed
+            too_soon = closing > 0.1 and distance / closing < TTC_S
+            braking_m = max(0.0, speed**2 - lead_speed**2) / (2 * BRAKE_MPS2) + STOP_GAP_M
+            if too_soon or distance < braking_m:
+                brake = min(max(speed**2 / (2 * max(distance - STOP_GAP_M / 2, 0.5)), BRAKE_MPS2), 8.0)
+
+        def accel_of(t_s: float, driven_m: float, now: float) -> float:
+            return -brake if brake else toward_speed(route_speed(observation, driven_m), now)
+
+        return make_plan(observation, pursue(observation.route_m, speed, accel_of))
+
+    def free_distance(self, points: Float64[np.ndarray, "n 3"], line: Float64[np.ndarray, "k 2"]) -> float | None:
+        """Metres from the front bumper to the nearest obstacle in the corridor along ``line``; None when free."""
+        obstacles = points[above_ground(points)]
+        if len(obstacles) == 0:
+            return None
+        station, lateral = geometry.project_to_polyline(obstacles[:, :2], line)
+        inside = (np.abs(lateral) < self.half_width_m + CORRIDOR_MARGIN_M) & (station > self.front_m + 0.2)
+        nearest = np.sort(station[inside & (station < RANGE_M)])
+        if len(nearest) < MIN_POINTS:
+            return None
+        # A lone point is noise; an obstacle is where three lie within a metre.
+        solid = nearest[MIN_POINTS - 1 :] - nearest[: len(nearest) - MIN_POINTS + 1] < 1.0
+        return float(nearest[np.argmax(solid)]) - self.front_m if solid.any() else None
+
+    def speed_of_obstacle(self, observation: Observation, distance: float | None) -> float:
+        """Its speed along the path from the last two sweeps; 0 (standing) when it was not there before."""
+        if distance is None or self.last is None:
+            return 0.0
+        elapsed_s = (observation.t_us - self.last[0]) / 1e6
+        past = [state for state in observation.history if state.t_us >= self.last[0]]
+        driven = float(np.linalg.norm(past[-1].world_from_rig[:2, 3] - past[0].world_from_rig[:2, 3])) if past else 0.0
+        speed = (distance + driven - self.last[1]) / elapsed_s
+        return speed if 0.5 < speed < 40.0 else 0.0
+
+
+def points_in_rig(frame: LidarFrame) -> Float64[np.ndarray, "n 3"]:
+    """Returns in the rig frame, of the region ahead that matters."""
+    points = geometry.transform_points(frame.lidar.rig_from_lidar, frame.xyz_m)
+    ahead = (points[:, 0] > 0) & (points[:, 0] < RANGE_M) & (np.abs(points[:, 1]) < SIDE_M)
+    return points[ahead]
+
+
+def above_ground(points: Float64[np.ndarray, "n 3"]) -> np.ndarray:
+    """Which points stand on the ground: their height above the lowest point of their and the eight next 1 m cells."""
+    columns = int(2 * SIDE_M / CELL_M) + 2
+    rows = int(RANGE_M / CELL_M) + 2
+    # Far cells may hold no ground at all: there the road is taken to rise by at most 3 % from the wheels on.
+    row = (points[:, 0] / CELL_M).astype(np.int64) + 1
+    column = ((points[:, 1] + SIDE_M) / CELL_M).astype(np.int64) + 1
+    ground = np.repeat(0.03 * CELL_M * np.arange(rows + 1)[:, None], columns + 1, axis=1)
+    np.minimum.at(ground, (row, column), points[:, 2])
+    around = [np.roll(ground, (i, j), axis=(0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    height = points[:, 2] - np.minimum.reduce(around)[row, column]
+    return (height > MIN_HEIGHT_M) & (height < MAX_HEIGHT_M)

@@ -1,0 +1,95 @@
+"""Follows the recorded route and keeps its distance to the true actors: the best that a scripted driver can do.
+
+Privileged: it reads actors that no sensor showed. Steering is pure pursuit, speed the Intelligent Driver Model
+(Treiber et al. 2000) behind the nearest actor that is, or by constant velocity will be, in the corridor to be driven.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from nurec_sim import geometry
+from nurec_sim.policies._paths import FRONT_M, HALF_WIDTH_M, extended, make_plan, pursue, route_speed
+from nurec_sim.types import ActorState, Needs, Observation, Plan, Rig
+
+TIME_GAP_S, STANDSTILL_GAP_M, ACCEL_MPS2, COMFORT_BRAKE_MPS2, HARDEST_BRAKE_MPS2 = 1.5, 2.0, 1.5, 3.0, 8.0
+CORRIDOR_MARGIN_M = 0.3
+FORESIGHT_S = np.arange(0.0, 3.1, 0.5)
+REACH_MARGIN_M = 3.0
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Something in the corridor: free metres to it from the front bumper now, and its speed along the path."""
+
+    gap_m: float
+    speed_mps: float
+
+
+class RouteFollower:
+    """Pure pursuit on the route, IDM behind true actors."""
+
+    name = "route_follower"
+    needs = Needs(privileged=True)
+
+    def __init__(self) -> None:
+        self.front_m, self.half_width_m = FRONT_M, HALF_WIDTH_M
+
+    def reset(self, rig: Rig, seed: int) -> None:
+        """Learn the outline of the car."""
+        self.front_m = rig.body.center_m[0] + rig.body.size_m[0] / 2
+        self.half_width_m = rig.body.size_m[1] / 2
+
+    def plan(self, observation: Observation) -> Plan:
+        """Five seconds along the route."""
+        line = extended(observation.route_m)
+        ego_speed = observation.ego.speed_mps
+        found = (self.obstacle(actor, line, ego_speed) for actor in observation.actors or ())
+        obstacles = [obstacle for obstacle in found if obstacle is not None]
+
+        def accel_of(t_s: float, driven_m: float, speed: float) -> float:
+            wanted = route_speed(observation, driven_m)
+            gaps = [(max(o.gap_m + o.speed_mps * t_s - driven_m, 0.01), o.speed_mps) for o in obstacles]
+            return min([_free(wanted, speed)] + [idm(speed, wanted, gap, lead) for gap, lead in gaps])
+
+        return make_plan(observation, pursue(observation.route_m, ego_speed, accel_of))
+
+    def obstacle(self, actor: ActorState, line: np.ndarray, ego_speed: float) -> Obstacle | None:
+        """An actor as an obstacle on the path, at the earliest time when it is in the way of the ego."""
+        if actor.rig_from_box[0, 3] + actor.size_m[0] / 2 < 0:
+            return None  # behind: it must keep its own distance
+        corners = geometry.box_corners_xy(actor.rig_from_box, actor.size_m[0], actor.size_m[1])
+        outline = np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2])
+        for t_s in FORESIGHT_S:
+            moved = outline + actor.velocity_mps * t_s
+            station, lateral = geometry.project_to_polyline(moved, line)
+            crosses = (lateral.min() < 0 < lateral.max()) or np.abs(
+                lateral
+            ).min() < self.half_width_m + CORRIDOR_MARGIN_M
+            gap = float(station.min()) - self.front_m
+            if not crosses or gap < -self.front_m / 2:
+                continue
+            if t_s > 0 and gap > ego_speed * t_s + REACH_MARGIN_M:
+                continue  # gone, or still far, by the time the ego is there
+            ahead = geometry.project_to_polyline(moved + 0.1 * actor.velocity_mps, line)[0]
+            along = max(0.0, float((ahead - station).mean()) / 0.1)
+            return Obstacle(gap - along * t_s, along)
+        return None
+
+
+def _free(wanted: float, speed: float) -> float:
+    """Acceleration on a free road."""
+    if speed > wanted:
+        return max(-COMFORT_BRAKE_MPS2, wanted - speed)
+    return ACCEL_MPS2 * (1 - (speed / max(wanted, 0.1)) ** 4)
+
+
+def idm(speed: float, wanted: float, gap: float, lead_speed: float) -> float:
+    """The Intelligent Driver Model's acceleration behind a car at ``gap`` metres."""
+    approach = speed * (speed - lead_speed) / (2 * math.sqrt(ACCEL_MPS2 * COMFORT_BRAKE_MPS2))
+    desired = STANDSTILL_GAP_M + max(0.0, speed * TIME_GAP_S + approach)
+    free = _free(wanted, speed)
+    return max(-HARDEST_BRAKE_MPS2, min(free, free - ACCEL_MPS2 * (desired / gap) ** 2))

@@ -1,0 +1,60 @@
+"""The command line as a stranger meets it: help, mistakes, exit codes."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from nurec_sim import cli
+
+REPO = Path(__file__).parent.parent
+VERBS = ("inspect", "world", "reconstruct", "render", "serve", "run", "demo", "evaluate", "report", "policies")
+
+
+def run_cli(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "nurec_sim.cli", *arguments], capture_output=True, text=True, timeout=120
+    )
+
+
+def test_help_names_every_verb_and_loads_nothing_heavy() -> None:
+    text = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "nurec_sim.cli", "--help"], capture_output=True, text=True
+    )
+    assert text.returncode == 0
+    for verb in VERBS:
+        assert re.search(rf"\b{verb}\b", text.stdout), verb
+    loaded = {line.split("|")[-1].strip() for line in text.stderr.splitlines()}
+    assert not loaded & {"torch", "numba", "mujoco", "pxr", "plotly", "cv2", "polars", "grpc", "scipy"}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_every_option(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main([verb, "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert "usage: nurec-sim" in text
+
+
+def test_an_unknown_option_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["serve", "scene.usdz", "--prot", "1"])
+    assert stop.value.code == 2
+    assert "--prot" in capsys.readouterr().err
+
+
+def test_a_missing_clip_is_one_clear_line(tmp_path: Path) -> None:
+    missing = tmp_path / "nowhere"
+    result = run_cli("inspect", str(missing))
+    assert result.returncode == 1
+    assert "nowhere" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_readme_uses_only_verbs_that_exist() -> None:
+    used = set(re.findall(r"^nurec-sim (\w+)", (REPO / "README.md").read_text(), flags=re.MULTILINE))
+    assert used
+    assert used <= set(VERBS)
