@@ -9,14 +9,18 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from nurec_sim.errors import NurecSimError
+
+if TYPE_CHECKING:
+    from nurec_sim.types import GaussianScene
 
 app = tyro.extras.SubcommandApp()
 out = Console()
@@ -32,8 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         app.cli(
             prog="nurec-sim",
-            description="An open closed-loop sensor simulator for driving. A log becomes a Gaussian world, a gRPC server "
-            "renders it, policies drive through it, a report says which is better. Start with: nurec-sim demo",
+            description="An open closed-loop sensor simulator for driving. A log becomes a Gaussian world, a gRPC "
+            "server renders it, policies drive through it, a report says which is better. Start with: nurec-sim demo",
             args=None if arguments is None else list(arguments),
         )
     except NurecSimError as error:
@@ -54,11 +58,14 @@ def inspect(clip: OnePath) -> None:
         clip: a clip folder, or a .zip of one (docs/clip_format.md).
     """
     from nurec_sim import logs
+    from nurec_sim.logs.describe import SENSOR_COLUMNS
 
     log = logs.open_clip(clip)
-    print_table(f"clip {log.id}", logs.describe_clip(log))
-    with progress("checking") as report:
-        faults = logs.check_clip(log, progress=report)
+    summary = logs.describe_clip(log)
+    print_table(f"clip {log.id}", summary.facts)
+    print_table("sensors", summary.sensors, SENSOR_COLUMNS)
+    with err.status("reading every image and sweep"):
+        faults = logs.check_clip(log)
     for fault in faults:
         out.print(f"fault: {fault}", style="red", markup=False, highlight=False, soft_wrap=True)
     if faults:
@@ -67,18 +74,30 @@ def inspect(clip: OnePath) -> None:
 
 
 @app.command
-def world(out_path: Annotated[Path, tyro.conf.arg(name="out")], *, seed: int = 7, truth: Path | None = None) -> None:
+def world(
+    *,
+    out_path: Annotated[Path, tyro.conf.arg(name="out")],
+    seed: int = 7,
+    seconds: float = 12.0,
+    truth: Path | None = None,
+    overwrite: bool = False,
+) -> None:
     """Draw a small MuJoCo street and write it as a driving log.
 
     Args:
         out_path: the clip to write: a folder, or a .zip.
-        seed: same seed, same street, same bytes.
+        seed: same seed, same street, same log.
+        seconds: length of the log, 1 to 20.
         truth: also write exact depth and labels into this folder, apart from the log.
+        overwrite: replace a clip that is there.
     """
-    from nurec_sim.world import StreetPlan, write_street_clip
+    from nurec_sim.world import street_plan, write_street_clip
 
-    with progress("drawing the street") as report:
-        path = write_street_clip(StreetPlan(seed=seed), out_path, truth=truth, progress=report)
+    command = f"nurec-sim world --seed {seed} --seconds {seconds:g} --out {out_path.name}"
+    with progress("drawing the street") as advance:
+        path = write_street_clip(
+            street_plan(seed, seconds), out_path, truth=truth, command=command, progress=advance, overwrite=overwrite
+        )
     out.print(f"wrote {path}", soft_wrap=True)
 
 
@@ -107,8 +126,8 @@ def reconstruct(
     target = out_path or Path(f"{log.id}.usdz")
     if target.exists() and not overwrite:
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
-    with progress("reconstructing") as report:
-        world_scene = run_method(log, method, cameras=cameras or None, progress=report)
+    with progress("reconstructing") as advance:
+        world_scene = run_method(log, method, cameras=cameras or None, progress=advance)
     scene.write_scene(world_scene, target, overwrite=overwrite)
     print_table(f"scene {world_scene.id}", scene.summary(world_scene))
     for text in world_scene.provenance.get("unknown", ()):
@@ -154,7 +173,7 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8080,
     threads: int | None = None,
-    cache: Path = Path.home() / ".cache" / "nurec_sim",
+    cache: Path | None = None,
 ) -> None:
     """Serve scenes over gRPC, for AlpaSim, CARLA and NuRec clients. Ctrl-C stops.
 
@@ -165,12 +184,16 @@ def serve(
         host: address to listen on; only this machine unless said otherwise.
         port: 0 takes a free one.
         threads: render threads; the number of cores if not given.
-        cache: where reconstructed clips are kept.
+        cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
     """
     from nurec_sim.scene_store import SceneStore
     from nurec_sim.server import serve as run_server
 
-    run_server(SceneStore(sources, cache_dir=cache, render_threads=threads), host=host, port=port)
+    store = SceneStore(sources, cache_dir=cache, threads=threads, on_progress=err.print)
+    try:
+        run_server(store, host=host, port=port)
+    except OSError as error:
+        raise NurecSimError(str(error)) from None
 
 
 @app.command
@@ -183,7 +206,7 @@ def run(
     out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs"),
     resume: Path | None = None,
     address: str | None = None,
-    cache: Path = Path.home() / ".cache" / "nurec_sim",
+    cache: Path | None = None,
     video: bool = True,
 ) -> None:
     """Drive policies closed-loop through scenes, measure, and write a report.
@@ -199,7 +222,7 @@ def run(
         out_path: folder that collects run folders.
         resume: go on with this run folder; finished rollouts are kept.
         address: host:port of a running server that serves the same scenes.
-        cache: where reconstructed clips are kept.
+        cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
         video: also record the front camera of every rollout.
     """
     drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video)
@@ -209,13 +232,13 @@ def run(
 def demo(
     *,
     out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs"),
-    cache: Path = Path.home() / ".cache" / "nurec_sim",
+    cache: Path | None = None,
 ) -> None:
     """Run the whole chain on the log that ships with the package: about five minutes on two cores.
 
     Args:
         out_path: folder that collects run folders.
-        cache: where the reconstructed scene is kept.
+        cache: where the reconstructed scene is kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
     """
     clip = resources.files("nurec_sim.scenarios") / "demo_clip.zip"
     with resources.as_file(clip) as path:
@@ -250,7 +273,7 @@ def evaluate(
     from nurec_sim.evaluate import evaluate as run_evaluation
 
     log = logs.open_clip(clip)
-    with progress("evaluating") as report:
+    with progress("evaluating") as advance:
         figures = run_evaluation(
             log,
             method,
@@ -259,7 +282,7 @@ def evaluate(
             hold_out_every=hold_out_sweeps,
             via_grpc=not local,
             images_dir=images,
-            progress=report,
+            progress=advance,
         )
     if json_path is not None:
         json_path.write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
@@ -308,7 +331,7 @@ def drive(
     out_dir: Path,
     resume: Path | None,
     address: str | None,
-    cache: Path,
+    cache: Path | None,
     video: bool,
 ) -> None:
     """Scenes, server, rollouts, report: what `run` and `demo` share."""
@@ -321,10 +344,10 @@ def drive(
     scenario = sim.load_scenario(scenario_name)
     store = SceneStore(sources, cache_dir=cache)
     with progress("reconstructing") as advance:
-        scenes = [store.load(scene_id, progress=advance) for scene_id in store.scene_ids()]
+        scenes = [store.get(scene_id, progress=advance).scene for scene_id in store.ids]
     with contextlib.ExitStack() as stack:
         if address is None:
-            address = stack.enter_context(SensorServer(store)).address
+            address = stack.enter_context(SensorServer(store, port=0))
         out.print(f"sensors from {address}; {len(scenes)} scene(s), scenario {scenario.name}")
         with progress("driving") as advance:
             folder = runs.execute(
@@ -342,19 +365,26 @@ def drive(
     out.print(f"{time.monotonic() - started:.0f} s. Report: {(folder / 'report.html').resolve()}", soft_wrap=True)
 
 
-def load_scene(source: Path):  # noqa: ANN201  (the return type would import the heavy modules)
+def load_scene(source: Path) -> GaussianScene:
     """A scene from an archive, or from a clip that is reconstructed now."""
     from nurec_sim.scene_store import SceneStore
 
     store = SceneStore([source])
+    for fault in store.faults.values():
+        raise NurecSimError(fault)
     with progress("loading") as advance:
-        return store.load(store.scene_ids()[0], progress=advance)
+        return store.get(store.ids[0], progress=advance).scene
 
 
 @contextlib.contextmanager
 def progress(title: str) -> Iterator[Report]:
     """A progress bar on stderr, fed with (what is being done, fraction 0..1)."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f}%"), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f}%"),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=err, transient=True) as bar:
         task = bar.add_task(title, total=1.0)
 
@@ -364,14 +394,13 @@ def progress(title: str) -> Iterator[Report]:
         yield advance
 
 
-def print_table(title: str, rows: Sequence[Sequence[object]]) -> None:
-    """Rows as a table; the first row holds the headings where its cells are all text and rows have over two columns."""
-    table = Table(title=title, title_justify="left", show_header=bool(rows) and len(rows[0]) > 2)
-    heading, body = (rows[0], rows[1:]) if table.show_header else (("", ""), rows)
-    for cell in heading:
-        table.add_column(str(cell))
-    for row in body:
-        table.add_row(*(str(cell) for cell in row))
+def print_table(title: str, rows: Sequence[Sequence[object]], heading: Sequence[str] = ()) -> None:
+    """Rows as a table, with or without a heading."""
+    table = Table(title=title, title_justify="left", show_header=bool(heading))
+    for name in heading or [""] * max((len(row) for row in rows), default=0):
+        table.add_column(name)
+    for row in rows:
+        table.add_row(*(escape(str(cell)) for cell in row))
     out.print(table)
 
 

@@ -12,7 +12,8 @@
     │   └── TooLargeError      more pixels or items than allowed      (gRPC RESOURCE_EXHAUSTED)
     ├── PlanError        a policy answered something that cannot be driven
     ├── ScenarioError    a scenario file is wrong
-    └── ServerError      a sensor server cannot be reached, or failed
+    ├── ServerError      a sensor server cannot be reached, or failed
+    └── RunError         a run folder or a file in it cannot be read or written
 
 Texts say what was wrong, what was given and what is allowed.
 """
@@ -60,3 +61,7 @@ class ScenarioError(NurecSimError):
 
 class ServerError(NurecSimError):
     """A sensor server cannot be reached, or failed."""
+
+
+class RunError(NurecSimError):
+    """A run folder, or a file in it, cannot be read or written."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import os
 import threading
-import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
@@ -21,7 +21,7 @@ from nurec_sim.types import CameraFrame, GaussianScene, LidarFrame, SensorReques
 log = logging.getLogger(__name__)
 
 MAX_NAMES_IN_TEXT = 20
-_MAX_METADATA_BYTES = 1 << 20
+_MAX_SIDECAR_BYTES = 1 << 20
 
 
 class SceneRenderer(Protocol):
@@ -63,8 +63,9 @@ def default_cache_dir() -> Path:
 class SceneStore:
     """Scenes by id, from ``GaussianScene`` objects, ``.usdz`` archives and clips; safe to use from many threads.
 
-    A scene answers to its id, to ``clipgt-<file stem>`` and to its file stem. A source that cannot be opened is kept
-    as a fault, under the same names, and does not disturb the others.
+    Ids are spelt ``clipgt-<id>``, as AlpaSim knows them from the archive; a scene also answers to its plain id, its
+    file stem and ``clipgt-<file stem>``. A source that cannot be opened is kept as a fault, under its stem, and does
+    not disturb the others.
 
     Args:
         sources: objects, or paths of archives (``.usdz``) and clips.
@@ -219,7 +220,7 @@ class SceneStore:
         scene = reconstruct(open_clip(clip_path), self._method)
         try:
             kept.parent.mkdir(parents=True, exist_ok=True)
-            write_scene(scene, kept)
+            write_scene(scene, kept, overwrite=True)
         except OSError as error:
             log.warning("a reconstruction could not be kept at %s: %s", kept, error)
             return scene
@@ -255,39 +256,31 @@ def _describe(source: GaussianScene | str | Path) -> str:
 
 def _identify(source: GaussianScene | str | Path) -> _Source:
     """A source with its id and aliases, without loading it."""
+    from nurec_sim.scene import alpasim_id
+
     if isinstance(source, GaussianScene):
-        return _Source(source.id, source, (f"clipgt-{source.id}",))
+        return _Source(alpasim_id(source.id), source, (source.id,))
     path = Path(source)
     if not path.exists():
         raise ArchiveError(f"{path} does not exist")
-    aliases = [f"clipgt-{path.stem}", path.stem]
     if _is_archive(path):
-        scene_id, *others = _archive_names(path)
-        return _Source(scene_id, path, (*aliases, *others, f"clipgt-{scene_id}"))
-    from nurec_sim.logs import open_clip
+        own_id = _archive_id(path)
+    else:
+        from nurec_sim.logs import open_clip
 
-    clip_id = open_clip(path).id
-    return _Source(clip_id, path, (*aliases, f"clipgt-{clip_id}"))
+        own_id = open_clip(path).id
+    return _Source(alpasim_id(own_id), path, (own_id, path.stem, alpasim_id(path.stem)))
 
 
-def _archive_names(path: Path) -> list[str]:
-    """Scene id and sequence id as an archive's sidecars give them; the file stem where there are none."""
-    import json
+def _archive_id(path: Path) -> str:
+    """The id of the scene in an archive, from a sidecar."""
+    from nurec_sim.scene.zip_package import Package
 
-    import yaml
-
-    names = []
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = {info.filename: info.file_size for info in archive.infolist()}
-            for member, key, parse in (
-                ("metadata.yaml", "scene_id", yaml.safe_load),
-                ("data_info.json", "sequence_id", json.loads),
-            ):
-                if members.get(member, _MAX_METADATA_BYTES + 1) <= _MAX_METADATA_BYTES:
-                    content = parse(archive.read(member))
-                    if isinstance(content, dict) and isinstance(content.get(key), str) and content[key]:
-                        names.append(content[key])
-    except (zipfile.BadZipFile, yaml.YAMLError, ValueError, KeyError, NotImplementedError) as error:
-        raise ArchiveError(f"{path} is not a readable scene archive: {error}") from error
-    return names or [path.stem]
+    with Package(path) as package:
+        try:
+            own_id = json.loads(bytes(package.read("data_info.json", _MAX_SIDECAR_BYTES)))["sequence_id"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ArchiveError(f"{path}: data_info.json does not say a sequence_id ({error})") from error
+    if not isinstance(own_id, str) or not own_id:
+        raise ArchiveError(f"{path}: the sequence_id in data_info.json must be a text, got {own_id!r}")
+    return own_id

@@ -1,7 +1,8 @@
 """What every procedure of the sensor interface does; ``server`` puts it on the network.
 
-Semantics (public NuRec and AlpaSim behaviour): a frame [start, end) renders if it overlaps the scene's time, so the
-last recorded instant [t, t + 1) does; actors listed in a request are drawn where it says, unknown ids are ignored, and
+Semantics (public NuRec and AlpaSim behaviour): a frame [start, end) renders if it overlaps the scene's time, for
+AlpaSim's first exposure may begin before the recording and a client's last instant [t, t + 1) end after it; what sticks
+out is clamped in time, poses stay as they are. Actors listed in a request are drawn where it says, unknown ids are ignored, and
 all others, static ones always, as recorded.
 """
 
@@ -171,16 +172,18 @@ class SensorService:
             rgb = job.loaded.renderer.render_camera(request, outputs=("rgb",)).rgb
             if job.options.ego_mask:
                 rgb = self._masks.lay_over(rgb, job.options.ego_mask)
-            return sensorsim.RGBRenderReturn(image_bytes=wire.encode_image(rgb, job.options))
+            reply = sensorsim.RGBRenderReturn()
+            wire.write_image(rgb, job.options, reply)
+            return reply
 
         return await self._run(self._rendering, render)
 
     def _admit(self, request: SensorRequest, scene: GaussianScene) -> SensorRequest:
-        first, last = scene.span_us[0], max(scene.span_us[1] - 1, scene.ego.end_us)
+        first, last = scene.span_us  # the renderer takes the last instant [last, last + 1) too
         if request.start_us > last or request.end_us <= first:
             raise OutOfRangeError(
                 f"the frame [{request.start_us}, {request.end_us}) us lies outside of scene {scene.id!r}, "
-                f"which covers [{first}, {last + 1})"
+                f"which covers [{first}, {last}]"
             )
         known = {track.id: track for track in scene.tracks}
         actors = {track_id: pair for track_id, pair in request.actors.items() if track_id in known}
@@ -188,7 +191,8 @@ class SensorService:
             buried = np.tile(np.eye(4), (2, 1, 1))
             buried[:, 2, 3] = -_BURIED_M
             actors |= {t.id: buried for t in scene.tracks if t.controllable and t.id not in actors}
-        return replace(request, actors=actors)
+        start_us, end_us = max(request.start_us, first), min(request.end_us, last + 1)
+        return replace(request, start_us=start_us, end_us=end_us, actors=actors)
 
     def _check_pixels(self, count: int, text: str) -> None:
         if count > self._options.max_pixels:

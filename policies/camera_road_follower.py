@@ -17,8 +17,10 @@ from nurec_sim.types import CameraFrame, CameraModel, Needs, Observation, Plan, 
 
 CELL_M, AHEAD_M, SIDE_M = 0.25, 32.0, 10.0
 SEED_LENGTH_M, SEED_HALF_WIDTH_M = 4.0, 1.0
-CHROMA_TOLERANCE, DARKER, BRIGHTER = 0.09, -0.9, 0.28
-"""Road differs from the seed by at most this in log colour ratios, and by this in log brightness (shadow, sun)."""
+TINT_TOLERANCE, DARKER, BRIGHTER = 0.09, -0.9, 0.28
+"""Road differs from the seed by at most this in log colour ratios, and by this in log brightness."""
+SUNLIGHT, SUN_TOLERANCE, SUN_RANGE = (0.16, -0.17), 0.055, 2.0
+"""Out of a shadow, lit by the sky, into the sun, log r/g and log b/g of asphalt change in this ratio to brightness."""
 CAR_HALF_WIDTH_M, ROOM_WANTED_M = 1.15, 1.0
 CURVATURES = np.array([-0.12, -0.08, -0.05, -0.03, -0.015, -0.006, 0.0, 0.006, 0.015, 0.03, 0.05, 0.08, 0.12])
 FIRST_ARC_M = 10.0
@@ -136,8 +138,11 @@ def smoothed(rgb: UInt8[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"]:
 def looks_like(colours: Float64[np.ndarray, "*n 3"], road: Float64[np.ndarray, " 3"]) -> Bool[np.ndarray, "*n"]:
     """Whether log colours are the road's: same tint, and not much darker or brighter."""
     difference = colours - road
-    tint = np.maximum(np.abs(difference[..., 0]), np.abs(difference[..., 1]))
-    return (tint < CHROMA_TOLERANCE) & (difference[..., 2] > DARKER) & (difference[..., 2] < BRIGHTER)
+    brighter = difference[..., 2]
+    tint = np.abs(difference[..., :2]).max(axis=-1)
+    alike = (tint < TINT_TOLERANCE) & (brighter > DARKER) & (brighter < BRIGHTER)
+    unsunned = np.abs(difference[..., :2] - brighter[..., None] * SUNLIGHT).max(axis=-1)
+    return alike | ((unsunned < SUN_TOLERANCE) & (np.abs(brighter) < SUN_RANGE))
 
 
 def grown(mask: Bool[np.ndarray, "x y"], cells: int) -> Bool[np.ndarray, "x y"]:

@@ -89,9 +89,7 @@ def scene(scene_id: str = "street", *, seed: int = 0) -> GaussianScene:
     local = random.uniform(-0.9, 0.9, (60, 3)) * (2, 0.8, 0.7)
     knots = np.stack([geometry.transform_points(pose, local) for pose in path], axis=1)
     moving = _blobs(knots[:, 1], np.tile([0.9, 0.1, 0.1], (60, 1)), 0.3, Label.MOVABLE)
-    dynamic = DynamicGaussians(
-        moving, np.tile(times, (60, 1)), knots.astype(np.float32), np.zeros(60, np.int32)
-    )
+    dynamic = DynamicGaussians(moving, np.tile(times, (60, 1)), knots.astype(np.float32), np.zeros(60, np.int32))
     sky = np.zeros((6, 8, 8, 3), np.float32) + np.array([0.5, 0.7, 0.95], np.float32)
     tint = np.array([[0.9, 0.05, 0, 0.02], [0, 0.95, 0, 0.0], [0.03, 0, 1.05, -0.01]])
     still = Trajectory(np.array([START_US, LAST_US]), np.tile(geometry.pose_from_xyyaw(14, 3.5, 0.0, 0.8), (2, 1, 1)))

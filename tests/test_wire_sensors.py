@@ -12,7 +12,15 @@ from nurec_sim import geometry, wire
 from nurec_sim.errors import RequestError
 from nurec_sim.sensors import lidar_model
 from nurec_sim.types import (
-    CameraModel, Fisheye, FTheta, FThetaReference, Pinhole, Shutter, Trajectory, Windshield, WindshieldReference,
+    CameraModel,
+    Fisheye,
+    FTheta,
+    FThetaReference,
+    Pinhole,
+    Shutter,
+    Trajectory,
+    Windshield,
+    WindshieldReference,
 )  # fmt: skip
 from nurec_sim.wire import common, sensorsim
 from nurec_sim.wire.poses import read_poses, write_poses

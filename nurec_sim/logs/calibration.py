@@ -14,6 +14,7 @@ import numpy as np
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import ClipError
 from nurec_sim.logs import fields
+from nurec_sim.logs.labels import is_movable, our_label
 from nurec_sim.types import (
     Box,
     CameraModel,
@@ -260,12 +261,13 @@ def track_from_json(index: int, row: Any) -> Track:
     size = fields.array(where, row, "size_lwh", (3,))
     if (size <= 0).any():
         raise ClipError(f"{where}: size_lwh must be positive, got {size.tolist()}")
+    label = our_label(fields.of_kind(where, row, "label", str))
     return Track(
         id=fields.of_kind(where, row, "id", str),
-        label=fields.of_kind(where, row, "label", str),
+        label=label,
         size_m=(float(size[0]), float(size[1]), float(size[2])),
         path=trajectory_from_json(where, row, "T_world_box"),
-        controllable=fields.of_kind(where, row, "controllable", bool, default=True),
+        controllable=fields.of_kind(where, row, "controllable", bool, default=is_movable(label)),
     )
 
 

@@ -86,6 +86,10 @@ class Clip:
         self.storage = storage
         self._images = {name: tuple(records) for name, records in images.items()}
         self._sweeps = {name: tuple(records) for name, records in sweeps.items()}
+        records = [record for group in (self._images, self._sweeps) for rows in group.values() for record in rows]
+        starts = [ego.start_us, *(record.start_us for record in records)]
+        ends = [ego.end_us, *(record.end_us for record in records)]
+        self._span_us = (min(starts), max(ends) + 1)
         self._recent_images = _Recent(IMAGES_KEPT)
         self._recent_sweeps = _Recent(SWEEPS_KEPT)
 
@@ -95,10 +99,7 @@ class Clip:
     @property
     def span_us(self) -> tuple[int, int]:
         """[start, end) of everything recorded: ego poses, exposures and sweeps."""
-        records = [r for group in (self._images, self._sweeps) for records in group.values() for r in records]
-        starts = [self.ego.start_us, *(record.start_us for record in records)]
-        ends = [self.ego.end_us, *(record.end_us for record in records)]
-        return min(starts), max(ends) + 1
+        return self._span_us
 
     def camera(self, camera_id: str) -> CameraModel:
         """A camera of the rig.

@@ -238,9 +238,15 @@ def _move_into_place(folder: Path, path: Path, work: Path) -> None:
     if path.suffix == ".zip":
         ready = work / "clip.zip"
         _zip_folder(folder, ready)
+    replaced = work / "replaced"
     if path.exists():
-        os.replace(path, work / "replaced")
-    os.replace(ready, path)
+        os.replace(path, replaced)
+    try:
+        os.replace(ready, path)
+    except OSError:
+        if replaced.exists():
+            os.replace(replaced, path)
+        raise
 
 
 def _zip_folder(folder: Path, target: Path) -> None:

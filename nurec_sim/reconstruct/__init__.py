@@ -1,1 +1,55 @@
+"""Reconstruction methods: a driving log in, a layered Gaussian world out."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from nurec_sim.errors import ReconstructError
+from nurec_sim.reconstruct.settings import GroundSettings, LiftSettings, PointSettings, ViewSettings
+
+if TYPE_CHECKING:
+    from nurec_sim.types import Clip, GaussianScene
+
+METHODS = ("lift",)
+
+__all__ = ["METHODS", "GroundSettings", "LiftSettings", "PointSettings", "ViewSettings", "reconstruct"]
+
+
+def reconstruct(
+    clip: Clip,
+    method: str = "lift",
+    *,
+    cameras: Sequence[str] | None = None,
+    hold_out_sweeps: Sequence[int] = (),
+    progress: Callable[[str, float], None] | None = None,
+    settings: LiftSettings | None = None,
+) -> GaussianScene:
+    """Build a Gaussian scene from a clip.
+
+    Args:
+        clip: the driving log.
+        method: one of ``METHODS``.
+        cameras: ids of the cameras to use; all if None.
+        hold_out_sweeps: indices of sweeps that must not be read, of every LiDAR.
+        progress: called with the stage's name and the fraction of it that is done.
+        settings: settings of the method; its defaults if None.
+
+    Raises:
+        ReconstructError: no such method, camera or sweep, or the clip lacks what the method needs.
+    """
+    if method not in METHODS:
+        raise ReconstructError(f"no reconstruction method {method!r}; have {list(METHODS)}")
+    chosen = list(clip.rig.cameras) if cameras is None else list(cameras)
+    unknown = [camera for camera in chosen if camera not in clip.rig.cameras]
+    if unknown:
+        raise ReconstructError(f"clip {clip.id!r} has no camera {unknown}; have {list(clip.rig.cameras)}")
+    most = max((len(clip.sweep_times_us(lidar)) for lidar in clip.rig.lidars), default=0)
+    wrong = [index for index in hold_out_sweeps if not 0 <= index < most]
+    if wrong:
+        raise ReconstructError(f"clip {clip.id!r} has no sweeps {wrong} to hold out; have 0..{most - 1}")
+
+    from nurec_sim.reconstruct.lift import lift
+
+    held = {int(index) for index in hold_out_sweeps}
+    return lift(clip, chosen, held, progress or (lambda stage, fraction: None), settings or LiftSettings())

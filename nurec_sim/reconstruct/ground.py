@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
+from nurec_sim.reconstruct.points import Cloud
 from nurec_sim.reconstruct.settings import GroundSettings
 
 MAX_CELLS = 16_000_000
@@ -51,6 +52,30 @@ class Ground:
         row, column, inside = self.cells(xyz_m)
         flat = np.abs(np.asarray(xyz_m)[:, 2] - self.height_m[row, column]) < tolerance_m
         return inside & flat & self.road[row, column]
+
+    def sheet(self, static: Cloud) -> Cloud:
+        """The ground as one regular cloud: a point per cell wherever it is known or filled over a short distance.
+
+        Intensity is the mean of the points in the cell, or in its surroundings; NaN where there are none.
+        """
+        row, column = np.nonzero(self.near)
+        xyz = np.column_stack([self.corner_m + (np.column_stack([column, row]) + 0.5) * self.cell_m,
+                               self.height_m[row, column]])  # fmt: skip
+        source = static[np.abs(self.above(static.xyz_m)) < 0.1]
+        known = np.isfinite(source.intensity)
+        r, c, _ = self.cells(source.xyz_m[known])
+        total, count = np.zeros(self.height_m.shape, np.float32), np.zeros(self.height_m.shape, np.float32)
+        np.add.at(total, (r, c), source.intensity[known])
+        np.add.at(count, (r, c), 1)
+        for size in (5, 21, 61):
+            soft_total, soft_count = cv2.blur(total, (size, size)), cv2.blur(count, (size, size))
+            empty = count == 0
+            total, count = np.where(empty, soft_total, total), np.where(empty, soft_count, count)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            intensity = np.where(count > 1e-6, total / count, np.nan)[row, column]
+        spacing = np.full(len(xyz), self.cell_m, np.float32)
+        eye = xyz + (0, 0, 2.0)
+        return Cloud(xyz, eye, spacing, intensity.astype(np.float32), np.ones(len(xyz), np.int32))
 
     def normals(self) -> Float64[np.ndarray, "rows columns 3"]:
         """Upward unit normals of the smoothed surface."""

@@ -74,7 +74,11 @@ def actors_of(clip: Clip, settings: PointSettings) -> list[Actor]:
         if track.label not in MOVABLE_LABELS:
             continue
         moved = np.linalg.norm(track.path.position_m - np.median(track.path.position_m, axis=0), axis=1).max()
-        standing = bool(moved < settings.standing_m) and len(track.path.t_us) > 1
+        third = max(len(track.path.t_us) // 3, 1)
+        shift = np.median(track.path.position_m[-third:], axis=0) - np.median(track.path.position_m[:third], axis=0)
+        # Labels of far objects jitter: without a net shift they stand even if single labels are farther off.
+        standing = bool(moved < settings.standing_m or (moved < 1.0 and np.linalg.norm(shift) < settings.standing_m))
+        standing &= len(track.path.t_us) > 1
         path = track.path
         if standing:
             middle = int(np.argmin(np.linalg.norm(path.position_m - np.median(path.position_m, axis=0), axis=1)))
@@ -96,7 +100,7 @@ class _Voxels:
         if not len(xyz):
             return
         cell = np.floor(xyz / edge[:, None]).astype(np.int64) + (1 << 18)
-        level = np.round(np.log2(edge / edge.min() * 8)).astype(np.int64) if False else self._level(edge)
+        level = np.clip(np.round(np.log2(edge / 0.001)).astype(np.int64), 0, 31)
         key = ((level << 57) | (cell[:, 0] << 38) | (cell[:, 1] << 19) | cell[:, 2]).astype(np.int64)
         known = np.isfinite(intensity)
         ones = np.ones(len(xyz))
@@ -108,10 +112,6 @@ class _Voxels:
         self.pending += len(key)
         if self.pending > 3_000_000:
             self._merge()
-
-    @staticmethod
-    def _level(edge: np.ndarray) -> np.ndarray:
-        return np.clip(np.round(np.log2(edge / 0.0125)).astype(np.int64), 0, 31)
 
     def _merge(self) -> None:
         if len(self.keys) > 1:
@@ -132,6 +132,17 @@ class _Voxels:
                      sums[:, 10].astype(np.int32))  # fmt: skip
 
 
+def _unthinned(xyz: np.ndarray, eye: np.ndarray, edge: np.ndarray, intensity: np.ndarray) -> Cloud:
+    return Cloud(xyz, eye, edge.astype(np.float32), intensity.astype(np.float32), np.ones(len(xyz), np.int32))
+
+
+def thinned(cloud: Cloud) -> Cloud:
+    """One point per voxel of the cloud's own spacing."""
+    voxels = _Voxels()
+    voxels.add(cloud.xyz_m, cloud.eye_m, cloud.spacing_m.astype(np.float64), cloud.intensity.astype(np.float64))
+    return voxels.cloud()
+
+
 def _sum_by_key(key: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(key, kind="stable")
     key = key[order]
@@ -143,13 +154,13 @@ def _sum_by_key(key: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
 class Gathered:
     """What the sweeps gave: the static cloud, one cloud per actor (box frame), and the undecided feet of boxes.
 
-    ``feet`` holds (actor, cloud in the box frame, cloud in the world) of points near a box's bottom. ``depth_images``
-    are coarse spherical range images of the sweeps, with their poses, for carving.
+    ``feet`` holds, per actor, the points near its box's bottom in the box frame, and their world positions.
+    ``range_images`` are (lidar_from_world, coarse spherical range image) of the sweeps, for carving.
     """
 
     static: Cloud
     actors: dict[int, Cloud]
-    feet: dict[int, tuple[Cloud, Cloud]]
+    feet: dict[int, tuple[Cloud, Float64[np.ndarray, "n 3"]]]
     range_images: list[tuple[Float64[np.ndarray, "4 4"], Float32[np.ndarray, "e a"]]]
     sweep_count: int
     point_count: int
@@ -177,7 +188,8 @@ def gather(
     """Read all sweeps but the held out ones, take out the ego car and the boxes, and thin the rest."""
     path = clip.ego.position_m
     static, clouds = _Voxels(), {actor.index: _Voxels() for actor in actors}
-    feet = {actor.index: (_Voxels(), _Voxels()) for actor in actors}
+    feet: dict[int, list[Cloud]] = {actor.index: [] for actor in actors}
+    feet_world: dict[int, list[np.ndarray]] = {actor.index: [] for actor in actors}
     range_images, sweeps, points, known = [], 0, 0, False
     jobs = [(lidar, i) for lidar in clip.rig.lidars for i in range(len(clip.sweep_times_us(lidar)))]
     for done, (lidar, i) in enumerate(jobs):
@@ -206,13 +218,13 @@ def gather(
             edge = np.full(len(inside), settings.min_voxel_m)
             up = ~foot
             clouds[actor.index].add(box_xyz[up], box_eye[up], edge[up], intensity[inside][up])
-            feet[actor.index][0].add(box_xyz[foot], box_eye[foot], edge[foot], intensity[inside][foot])
-            feet[actor.index][1].add(xyz[inside][foot], eye[inside][foot], edge[foot], intensity[inside][foot])
+            feet[actor.index].append(_unthinned(box_xyz[foot], box_eye[foot], edge[foot], intensity[inside][foot]))
+            feet_world[actor.index].append(xyz[inside][foot])
         static.add(xyz[free], eye[free], voxel_edge_m(xyz[free], path, settings), intensity[free])
     return Gathered(
         static.cloud(),
         {index: voxels.cloud() for index, voxels in clouds.items()},
-        {index: (a.cloud(), b.cloud()) for index, (a, b) in feet.items()},
+        {i: (Cloud.concatenate(feet[i]), np.concatenate(feet_world[i])) for i in feet if feet[i]},
         range_images,
         sweeps,
         points,

@@ -70,7 +70,8 @@ def _by_direction(colour: np.ndarray, known: np.ndarray, direction: np.ndarray) 
     points, values = direction[source] * (1, 1, 2), colour[source]
     coarse = np.s_[:, step // 2 :: step, step // 2 :: step]
     wanted = direction[coarse].reshape(-1, 3) * (1, 1, 2)
-    distance = np.linalg.norm(wanted[:, None] - points[None], axis=2)
+    square = np.sum(wanted**2, axis=1)[:, None] + np.sum(points**2, axis=1)[None] - 2 * wanted @ points.T
+    distance = np.sqrt(np.maximum(square, 0))
     weight = 1 / (distance + 0.05) ** 4
     mixed = (weight @ values / weight.sum(axis=1, keepdims=True)).reshape(*direction[coarse].shape[:3], 3)
     for face in range(6):

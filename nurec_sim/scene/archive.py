@@ -17,7 +17,8 @@ import numpy as np
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene import codec
 from nurec_sim.scene.checks import check_scene
-from nurec_sim.scene.describe import scene_facts, scene_hash
+from nurec_sim.scene.describe import scene_hash
+from nurec_sim.scene.facts import facts_from_json, scene_facts
 from nurec_sim.scene.sidecars import ftheta_fits, sidecars
 from nurec_sim.scene.sky import latlong_exr
 from nurec_sim.scene.usd_actors import actors_layer, field_paths
@@ -28,13 +29,13 @@ from nurec_sim.scene.usd_layers import (
     SKY_TEXTURE,
     STATIC_LAYER,
     gather,
-    open_crate,
+    open_member,
     read_field,
     root_layer,
     static_layer,
 )
 from nurec_sim.scene.zip_package import Package, write_package
-from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, Rig, RoadMap, Track, Trajectory
+from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label
 
 FORMAT_VERSION = 1
 MANIFEST = "nurec_sim/manifest.json"
@@ -44,16 +45,6 @@ TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY, KNOT_TIMES, KNOTS, OWNERS)
 """The members that a scene is read from; all others are for other programs."""
 
 MAX_JSON_BYTES = 512 * 2**20
-_FACT_DECODERS = {
-    "id": codec.text,
-    "span_us": codec.array(np.int64, 2),
-    "rig": codec.record(Rig),
-    "ego": codec.record(Trajectory),
-    "tracks": codec.sequence(codec.record(Track)),
-    "road_map": codec.optional(codec.record(RoadMap)),
-    "camera_times_us": codec.mapping(codec.array(np.int64, -1, 2)),
-    "provenance": codec.mapping(lambda value: value),
-}
 
 
 def write_scene(scene: GaussianScene, path: Path | str, *, overwrite: bool = False) -> Path:
@@ -110,10 +101,11 @@ def read_scene(path: Path | str) -> GaussianScene:
         manifest = _read_manifest(package)
         _check_hashes(package, manifest, TRUTH)
         counts = manifest["counts"]
-        facts = _read_facts(package)
-        static_usd = open_crate(package.read(STATIC_LAYER), f"{path}: {STATIC_LAYER}")
+        facts_json = codec.load(package.read(FACTS, MAX_JSON_BYTES), f"{path}: {FACTS}")
+        facts = facts_from_json(facts_json, f"{path}: {FACTS}")
+        static_usd = open_member(path, STATIC_LAYER)
         static = _read_fields(static_usd, ["/Static/background", "/Static/road"], counts["static"], f"{path}: static")
-        actors_usd = open_crate(package.read(ACTORS_LAYER), f"{path}: {ACTORS_LAYER}")
+        actors_usd = open_member(path, ACTORS_LAYER)
         moving = _read_fields(actors_usd, field_paths(actors_usd), counts["dynamic"], f"{path}: dynamic")
         dynamic = DynamicGaussians(moving, *(_read_npy(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS)))
         isp_json = codec.load(package.read(ISP, MAX_JSON_BYTES), f"{path}: {ISP}")
@@ -193,17 +185,6 @@ def _check_hashes(package: Package, manifest: dict[str, Any], names: tuple[str, 
 
 
 # ----------------------------------------------------------------------------------------------------------- parts
-
-
-def _read_facts(package: Package) -> dict[str, Any]:
-    where = f"{package.path}: {FACTS}"
-    raw = codec.load(package.read(FACTS, MAX_JSON_BYTES), where)
-    if not isinstance(raw, dict) or set(raw) != set(_FACT_DECODERS):
-        given = sorted(raw) if isinstance(raw, dict) else type(raw).__name__
-        raise ArchiveError(f"{where}: needs the fields {sorted(_FACT_DECODERS)}, got {given}")
-    facts = {name: codec.from_json(decode, raw[name], f"{where}: {name}") for name, decode in _FACT_DECODERS.items()}
-    start_us, end_us = facts["span_us"].tolist()
-    return facts | {"span_us": (start_us, end_us)}
 
 
 def _read_fields(layer, paths: list[str], count: int, what: str) -> Gaussians:

@@ -87,7 +87,7 @@ def check_gaussians(gaussians: Gaussians, what: str) -> None:
         values = getattr(gaussians, name)
         if values is not None and not np.isfinite(values).all():
             _refuse(~np.isfinite(values.reshape(n, -1)).all(axis=1), what, name, "not finite")
-    _refuse((gaussians.scale_m < 0).any(axis=1), what, "scale_m", "negative")
+    _refuse(np.any(gaussians.scale_m < 0, axis=1), what, "scale_m", "negative")
     _refuse((gaussians.opacity < 0) | (gaussians.opacity > 1), what, "opacity", "outside 0..1")
     _refuse((gaussians.intensity < 0) | (gaussians.intensity > 1), what, "intensity", "outside 0..1 (NaN is unknown)")
     _refuse(~np.isin(gaussians.label, [int(label) for label in Label]), what, "label", "not a Label")

@@ -8,21 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from nurec_sim.scene import codec
+from nurec_sim.scene.facts import scene_facts
 from nurec_sim.types import GAUSSIAN_FIELDS, Gaussians, GaussianScene, Label
-
-
-def scene_facts(scene: GaussianScene) -> dict[str, object]:
-    """Everything of a scene but its large arrays, as JSON."""
-    return {
-        "id": scene.id,
-        "span_us": list(scene.span_us),
-        "rig": scene.rig,
-        "ego": scene.ego,
-        "tracks": list(scene.tracks),
-        "road_map": scene.road_map,
-        "camera_times_us": scene.camera_times_us,
-        "provenance": scene.provenance,
-    }
 
 
 def scene_arrays(scene: GaussianScene) -> dict[str, np.ndarray]:

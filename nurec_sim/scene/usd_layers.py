@@ -107,23 +107,20 @@ def crate_bytes(stage) -> bytes:
         return path.read_bytes()
 
 
-def open_crate(data: bytes, what: str):
-    """A binary layer from memory, without composing: nothing that it refers to is opened.
+def open_member(package: Path, name: str):
+    """A USD layer inside a package, without composing: nothing that it refers to is opened.
 
     Raises:
         ArchiveError: OpenUSD cannot read it.
     """
-    from pxr import Sdf, Tf
+    from pxr import Ar, Sdf, Tf
 
-    with tempfile.TemporaryDirectory(prefix="nurec_sim_") as folder:
-        path = Path(folder) / "layer.usdc"
-        path.write_bytes(data)
-        try:
-            layer = Sdf.Layer.OpenAsAnonymous(str(path))
-        except Tf.ErrorException as error:
-            raise ArchiveError(f"{what} is no readable USD layer") from error
+    try:
+        layer = Sdf.Layer.OpenAsAnonymous(Ar.JoinPackageRelativePath(str(package.resolve()), name))
+    except Tf.ErrorException as error:
+        raise ArchiveError(f"{package}: {name} is no readable USD layer") from error
     if layer is None:
-        raise ArchiveError(f"{what} is no readable USD layer")
+        raise ArchiveError(f"{package}: {name} is no readable USD layer")
     return layer
 
 

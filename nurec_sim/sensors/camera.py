@@ -31,7 +31,7 @@ def project(camera: CameraModel, xyz_camera: Points3) -> tuple[Points2, Mask]:
         are not cut at the image border (see ``in_image``).
     """
     xyz = np.asarray(xyz_camera, np.float64).reshape(-1, 3)
-    finite = np.isfinite(xyz).all(axis=1)
+    finite: Mask = np.asarray(np.isfinite(xyz).all(axis=1))
     xyz = np.where(finite[:, None], xyz, 0.0)
     valid = finite
     if camera.windshield is not None:
@@ -50,7 +50,7 @@ def unproject(camera: CameraModel, uv_px: Points2) -> tuple[Points3, Mask]:
         ray_camera [n,3], and valid [n].
     """
     uv = np.asarray(uv_px, np.float64).reshape(-1, 2)
-    finite = np.isfinite(uv).all(axis=1)
+    finite: Mask = np.asarray(np.isfinite(uv).all(axis=1))
     rays, valid = unproject_lens(camera.lens, np.where(finite[:, None], uv, 0.0))
     valid = valid & finite
     if camera.windshield is not None:

@@ -7,12 +7,12 @@ from nurec_sim.wire.messages import METHODS, SERVICE, SERVICE_PATHS, ImageFormat
 from nurec_sim.wire.poses import read_track, read_trajectory, write_track, write_trajectory
 from nurec_sim.wire.requests import (
     ImageOptions,
-    encode_image,
     read_camera_frame,
     read_camera_request,
     read_lidar_frame,
     read_lidar_request,
     write_camera_request,
+    write_image,
     write_lidar_frame,
     write_lidar_request,
 )
@@ -35,7 +35,6 @@ __all__ = [
     "code_of",
     "common",
     "egodriver",
-    "encode_image",
     "error_of",
     "number_of",
     "pool",
@@ -51,6 +50,7 @@ __all__ = [
     "sensorsim",
     "write_camera",
     "write_camera_request",
+    "write_image",
     "write_lidar",
     "write_lidar_frame",
     "write_lidar_request",

@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from nurec_sim.errors import RequestError
+from nurec_sim.render.encode import encode_image
 from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, SensorRequest
 from nurec_sim.wire.messages import ImageFormat
 from nurec_sim.wire.poses import check_interval, read_poses, write_poses
 from nurec_sim.wire.sensors import read_camera, read_lidar, write_camera, write_lidar
 
-IMAGE_FORMATS = (ImageFormat.PNG, ImageFormat.JPEG, ImageFormat.RGB_UINT8_PLANAR)
+_ENCODER = {ImageFormat.PNG: "png", ImageFormat.JPEG: "jpeg", ImageFormat.RGB_UINT8_PLANAR: "rgb_planar"}
 DEFAULT_JPEG_QUALITY = 95
 
 
@@ -101,8 +102,8 @@ def _read_frame(message, sensor) -> SensorRequest:
 
 
 def _read_image_options(message) -> ImageOptions:
-    if message.image_format not in IMAGE_FORMATS:
-        allowed = ", ".join(f"{number.name} ({number.value})" for number in IMAGE_FORMATS)
+    if message.image_format not in _ENCODER:
+        allowed = ", ".join(f"{number.name} ({number.value})" for number in _ENCODER)
         given = ImageFormat(message.image_format).name if message.image_format in list(ImageFormat) else "unknown"
         raise RequestError(f"image_format must be one of {allowed}; got {given} ({message.image_format})")
     quality = message.image_quality or DEFAULT_JPEG_QUALITY
@@ -120,20 +121,9 @@ def _read_image_options(message) -> ImageOptions:
 # -------------------------------------------------------------------------------------------------------------- frames
 
 
-def encode_image(rgb: UInt8[np.ndarray, "h w 3"], options: ImageOptions) -> bytes:
-    """An image in the requested format; planar means all red, then all green, then all blue."""
-    if options.format == ImageFormat.RGB_UINT8_PLANAR:
-        return np.ascontiguousarray(np.moveaxis(rgb, 2, 0)).tobytes()
-    import cv2
-
-    bgr = np.ascontiguousarray(rgb[:, :, ::-1])
-    if options.format == ImageFormat.JPEG:
-        done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, options.jpeg_quality])
-    else:
-        done, data = cv2.imencode(".png", bgr)
-    if not done:
-        raise RuntimeError(f"OpenCV could not encode an image of shape {rgb.shape}")
-    return data.tobytes()
+def write_image(rgb: UInt8[np.ndarray, "h w 3"], options: ImageOptions, message) -> None:
+    """Fills an ``RGBRenderReturn``."""
+    message.image_bytes = encode_image(rgb, _ENCODER[options.format], options.jpeg_quality)
 
 
 def read_camera_frame(message, request: SensorRequest) -> CameraFrame:

@@ -1,6 +1,7 @@
-"""A small MuJoCo street: a seeded plan, true sensors for any pose, and driving logs with exact boxes and maps.
+"""A small MuJoCo street: a seeded plan, true sensors for any pose, and driving logs.
 
-``street_plan(seed)`` decides everything as plain data, ``TrueWorld(plan)`` draws it, ``write_street_clip`` writes a log.
+``street_plan(seed)`` decides everything as plain data, ``TrueWorld(plan)`` draws it, ``write_street_clip`` writes
+a log of it with exact boxes and map.
 Names are loaded on first use, so that importing this package does not load MuJoCo.
 """
 
@@ -43,7 +44,28 @@ _MODULE_OF = {
     "write_street_clip": "write",
 }
 
-__all__ = sorted(_MODULE_OF)
+__all__ = [
+    "Actor",
+    "BACKENDS",
+    "Building",
+    "LABEL_OF_CLASS",
+    "LIDAR_ID",
+    "Prop",
+    "Road",
+    "RoadLine",
+    "RoadPiece",
+    "Street",
+    "StreetPlan",
+    "SurfaceClass",
+    "TrueScan",
+    "TrueView",
+    "TrueWorld",
+    "build_street",
+    "pick_backend",
+    "street_plan",
+    "street_rig",
+    "write_street_clip",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -20,7 +20,12 @@ from nurec_sim.world.vehicles import car_parts
 EXTENT_M = 100.0
 NEAR_M, FAR_M = 0.1, 1400.0
 GAIT_HZ = 0.9
+LIMB_SWING = np.array([1.0, -0.6, -1.0, 0.6])
 LASER_OF_PART = {"taillight": 0.9, "headlight": 0.8, "rim": 0.8, "glass": 0.1}
+
+
+ActorPlaces = tuple[Float64[np.ndarray, "n actors 3"], Float64[np.ndarray, "n actors 4"]]
+"""Positions and quaternions of all actors at n instants, in MuJoCo's order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,17 +43,21 @@ class Street:
     sun: Float64[np.ndarray, " 3"]
     sky: Sky
 
-    def pose(self, data: Any, t_us: float, actors: dict[str, Float64[np.ndarray, "4 4"]]) -> None:
-        """Puts every actor named into its ``world_from_box`` and moves limbs, then updates the kinematics."""
+    def actor_places(self, actors: dict[str, Float64[np.ndarray, "n 4 4"]], count: int) -> ActorPlaces:
+        """Where MuJoCo wants the actors at ``count`` instants, from the ``world_from_box`` of every one of them."""
+        places = np.zeros((count, self.model.nmocap, 3)), np.zeros((count, self.model.nmocap, 4))
         for name, world_from_box in actors.items():
-            index = self.actor_mocap[name]
-            data.mocap_pos[index] = world_from_box[:3, 3]
-            data.mocap_quat[index] = geometry.quat_from_matrix(world_from_box[:3, :3])
+            places[0][:, self.actor_mocap[name]] = world_from_box[:, :3, 3]
+            places[1][:, self.actor_mocap[name]] = geometry.quat_from_matrix(world_from_box[:, :3, :3])
+        return places
+
+    def pose(self, data: Any, t_us: float, places: ActorPlaces, instant: int = 0) -> None:
+        """Puts all actors where ``places`` says for an instant, swings limbs, and updates the kinematics."""
+        data.mocap_pos[:], data.mocap_quat[:] = places[0][instant], places[1][instant]
         swing = 0.42 * np.sin(2 * np.pi * GAIT_HZ * t_us * 1e-6)
         for limbs in self.actor_limbs.values():
-            data.qpos[list(limbs)] = swing * np.array([1.0, -0.6, -1.0, 0.6])
+            data.qpos[list(limbs)] = swing * LIMB_SWING
         mujoco.mj_kinematics(self.model, data)
-        mujoco.mj_camlight(self.model, data)
 
 
 def build_street(plan: StreetPlan) -> Street:

@@ -16,7 +16,7 @@ LIDAR_ID = "lidar_top"
 CAMERA_FROM_RIG_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def street_rig(width_px: int = 448, height_px: int = 256, lidar_rows: int = 48, lidar_columns: int = 720) -> Rig:
+def street_rig(width_px: int = 448, height_px: int = 256, lidar_rows: int = 48, lidar_columns: int = 600) -> Rig:
     """The rig of the demonstration clip, in any resolution.
 
     Raises:

@@ -16,7 +16,7 @@ from nurec_sim.errors import RequestError, TooLargeError
 from nurec_sim.types import CameraFrame, LidarFrame, LidarModel, Pinhole, SensorFrame, SensorRequest, Shutter
 from nurec_sim.world import rays
 from nurec_sim.world.backend import pick_backend
-from nurec_sim.world.build import Street, build_street
+from nurec_sim.world.build import ActorPlaces, Street, build_street
 from nurec_sim.world.plan import StreetPlan
 from nurec_sim.world.surface import LABEL_OF_CLASS, SurfaceClass
 
@@ -119,16 +119,16 @@ class TrueWorld:
             self._painter.close()
             self._painter = None
 
-    def _pose(self, request: SensorRequest, fraction: float) -> None:
-        """Puts all actors where they are at a fraction of the request's time."""
-        t_us = request.start_us + round(fraction * (request.end_us - request.start_us))
-        actors = {name: path.at(t_us) for name, path in self._recorded.items() if name not in request.actors}
+    def _places(self, request: SensorRequest, fractions: Float64[np.ndarray, " n"]) -> ActorPlaces:
+        """All actors at fractions of the request's time: as asked for, else as recorded."""
+        times = request.start_us + np.rint(fractions * (request.end_us - request.start_us)).astype(np.int64)
+        actors = {name: path.at(times) for name, path in self._recorded.items() if name not in request.actors}
         for name, pair in request.actors.items():
-            actors[name] = geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(fraction))
-        self.street.pose(self._data, t_us, actors)
+            actors[name] = geometry.interpolate_pose_pair(np.asarray(pair, np.float64), fractions)
+        return self.street.actor_places(actors, len(fractions))
 
     def _view(self, request: SensorRequest) -> TrueView:
-        self._pose(request, 0.0)
+        self.street.pose(self._data, request.start_us, self._places(request, np.zeros(1)))
         pose = np.asarray(request.world_from_sensor, np.float64)[0]
         if self._painter is not None:
             rgb, geom, depth = self._painter.view(self._data, request.sensor, pose)
@@ -148,8 +148,9 @@ class TrueWorld:
         poses = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), fractions)
         shape = beams.shape[:2]
         range_m, intensity, geom = np.zeros(shape), np.zeros(shape, np.float32), np.zeros(shape, np.int32)
+        places, span_us = self._places(request, fractions), request.end_us - request.start_us
         for column, fraction in enumerate(fractions):
-            self._pose(request, float(fraction))
+            self.street.pose(self._data, request.start_us + fraction * span_us, places, column)
             range_m[:, column], intensity[:, column], geom[:, column] = rays.fire_column(
                 self.street, self._data, lidar, poses[column], beams[:, column]
             )

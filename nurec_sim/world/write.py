@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from nurec_sim import geometry, logs, sensors
 from nurec_sim.errors import ClipError
@@ -30,7 +32,8 @@ def write_street_clip(
     *,
     rig: Rig | None = None,
     period_us: int = 200_000,
-    jpeg_quality: int = 88,
+    jpeg_quality: int = 84,
+    point_step_m: float = 0.01,
     backend: str | None = None,
     truth: str | Path | None = None,
     command: str = "",
@@ -47,7 +50,8 @@ def write_street_clip(
         path: what to write.
         rig: sensors; ``street_rig()`` by default.
         period_us: time from one set of frames to the next, at least one turn.
-        jpeg_quality: 1..100.
+        jpeg_quality: 1..100; colours are stored at half resolution, as by real cameras.
+        point_step_m: LiDAR coordinates are rounded to multiples of it (a centimetre halves the size of the file).
         backend: see ``TrueWorld``.
         truth: a folder that does not exist yet, for ``plan.json`` and ``<camera>/<frame>.npz`` with depth_m [h,w],
             surface [h,w] (``SurfaceClass``) and instance [h,w].
@@ -88,17 +92,22 @@ def write_street_clip(
             id=f"street-{plan.seed}",
             rig=rig,
             ego=plan.ego_trajectory(),
-            frames=_frames(world, rig, period_us, truth, progress),
+            frames=_frames(world, rig, period_us, jpeg_quality, point_step_m, truth, progress),
             tracks=plan.tracks(),
             road_map=RoadLine(plan.road).road_map(),
             facts=facts,
-            jpeg_quality=jpeg_quality,
             overwrite=overwrite,
         )
 
 
 def _frames(
-    world: TrueWorld, rig: Rig, period_us: int, truth: Path | None, progress: Progress | None
+    world: TrueWorld,
+    rig: Rig,
+    period_us: int,
+    jpeg_quality: int,
+    point_step_m: float,
+    truth: Path | None,
+    progress: Progress | None,
 ) -> Iterator[logs.CameraEntry | logs.LidarEntry]:
     start_us, end_us = world.plan.span_us
     ego = world.plan.ego_trajectory()
@@ -106,7 +115,7 @@ def _frames(
     total, done = len(turns) * (len(rig.lidars) + len(rig.cameras)), 0
     for index, turn_us in enumerate(turns):
         for lidar in rig.lidars.values():
-            yield logs.LidarEntry(lidar.id, _sweep(world, ego, lidar, turn_us))
+            yield logs.LidarEntry(lidar.id, _sweep(world, ego, lidar, turn_us, point_step_m))
             done += 1
             _tell(progress, done, total)
         now_us = turn_us + SPIN_US // 2
@@ -115,7 +124,7 @@ def _frames(
             view = world.view(SensorRequest("", camera, now_us, now_us, np.stack([pose, pose])))
             if truth is not None:
                 _write_truth(truth / camera.id / f"{index:04d}.npz", view)
-            yield logs.CameraEntry(camera.id, now_us, now_us, view.rgb, np.stack([pose, pose]))
+            yield logs.CameraEntry(camera.id, now_us, now_us, _jpeg(view.rgb, jpeg_quality), np.stack([pose, pose]))
             done += 1
             _tell(progress, done, total)
 
@@ -125,7 +134,7 @@ def _tell(progress: Progress | None, done: int, total: int) -> None:
         progress(done, total)
 
 
-def _sweep(world: TrueWorld, ego: Trajectory, lidar: LidarModel, start_us: int) -> Sweep:
+def _sweep(world: TrueWorld, ego: Trajectory, lidar: LidarModel, start_us: int, point_step_m: float) -> Sweep:
     """One turn, compensated with the car's own motion to the middle of the turn."""
     end_us, middle_us = start_us + SPIN_US, start_us + SPIN_US // 2
     pair = ego.at(np.array([start_us, end_us])) @ lidar.rig_from_lidar

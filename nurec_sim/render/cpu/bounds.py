@@ -12,9 +12,9 @@ from nurec_sim.render.cpu.grid import LENS, LIDAR, PINHOLE
 JIT = {"nogil": True, "cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp"}}
 f4 = np.float32
 EVERYWHERE = (f4(-1e9), f4(1e9), f4(-1e9), f4(1e9))
-NOWHERE = (f4(1), f4(0), f4(1), f4(0))
-WIDE_RAD = f4(0.5)
-"""Angular radius from which a Gaussian is taken to cover the whole grid."""
+NOWHERE = (f4(-1e9), f4(-1e9), f4(-1e9), f4(-1e9))
+WIDE = f4(1.5)
+"""Tangent of the angular radius from which a Gaussian is taken to cover the whole grid of a lens or a LiDAR."""
 
 
 @njit(inline="always")
@@ -81,7 +81,7 @@ def place(kind, x, y, z, params, table):
 
 
 @njit(**JIT)
-def pinhole_bounds(x, y, z, axes, k2, params):
+def pinhole_bounds(x, y, z, axes, k2, params, cells):
     """Exact box around the image of the ellipsoid of squared radius k2: tangents of its dual conic k2 Sigma - m m^T.
 
     ``axes`` [3,3] holds the principal axes, times their standard deviations, as columns.
@@ -94,9 +94,19 @@ def pinhole_bounds(x, y, z, axes, k2, params):
         szz += az * az
         sxz += ax * az
         syz += ay * az
-    czz = k2 * szz - z * z
-    if czz > f4(-1e-6) * z * z:
-        return EVERYWHERE  # it reaches the camera plane
+    if k2 * szz > f4(0.999) * z * z:
+        # It reaches the camera plane: everywhere, unless it lies behind a side of the image.
+        for side in range(4):
+            sign = f4(1) if side % 2 == 0 else f4(-1)
+            if side < 2:
+                edge = (f4(0) if side == 0 else cells[0]) / params[0] - params[2] / params[0]
+                height, spread = sign * (x - edge * z), sxx - f4(2) * edge * sxz + edge * edge * szz
+            else:
+                edge = (f4(0) if side == 2 else cells[1]) / params[1] - params[3] / params[1]
+                height, spread = sign * (y - edge * z), syy - f4(2) * edge * syz + edge * edge * szz
+            if height < f4(0) and height * height > k2 * spread:
+                return NOWHERE
+        return EVERYWHERE
     inverse_z2 = f4(1) / (z * z)
     # With x = u z the discriminant is free of the cancelling m m^T products.
     u, v = x / z, y / z
@@ -131,7 +141,7 @@ def outline_bounds(kind, x, y, z, axes, e1, e2, squeeze, radius, params, table):
     cx, cy, cz = x * squeeze, y * squeeze, z * squeeze
     distance = math.sqrt(cx * cx + cy * cy + cz * cz)
     angle = math.sqrt(ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz) / max(distance, f4(1e-20))
-    if angle > WIDE_RAD:
+    if angle > WIDE:
         return EVERYWHERE
     column, row = place(kind, x, y, z, params, table)
     around = False
@@ -141,7 +151,7 @@ def outline_bounds(kind, x, y, z, axes, e1, e2, squeeze, radius, params, table):
     u0 = u1 = column
     v0 = v1 = row
     su = suu = sv = svv = f4(0)
-    points = 4 if angle < f4(0.02) else 8
+    points = 4 if angle < f4(0.02) else (8 if angle < f4(0.2) else 16)
     for k in range(points):
         turn = f4(2 * math.pi) * f4(k) / f4(points)
         a, b = math.cos(turn), math.sin(turn)
@@ -159,7 +169,7 @@ def outline_bounds(kind, x, y, z, axes, e1, e2, squeeze, radius, params, table):
     inverse = f4(1) / f4(points)
     mu, mv = su * inverse, sv * inverse
     pad = f4(0.3) if kind == LENS else f4(0.15)
-    bend = f4(1.02) + f4(0.5) * angle
+    bend = f4(1.02) + f4(0.2) * angle
     hu = bend * math.sqrt(f4(2) * max(suu * inverse - mu * mu, f4(0))) + pad
     hv = bend * math.sqrt(f4(2) * max(svv * inverse - mv * mv, f4(0))) + pad
     u0, u1 = min(u0 - pad, column + mu - hu), max(u1 + pad, column + mu + hu)

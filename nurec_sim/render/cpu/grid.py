@@ -18,6 +18,7 @@ from nurec_sim.types import CameraModel, LidarModel, Pinhole, Shutter, Spin
 PINHOLE, LENS, LIDAR = 0, 1, 2
 LENS_TABLE_SIZE = 257
 LIDAR_TABLE_SIZE = 8193
+IMAGE_MARGIN_RAD = 0.05
 FIELD_MARGIN_RAD = 0.6
 """How far outside its field a lens table goes on, so that Gaussians over the edge are bounded well."""
 
@@ -81,16 +82,20 @@ def _camera_grid(camera: CameraModel) -> Grid:
         kind, table = PINHOLE, np.zeros((1, 1, 2), np.float32)
         params = np.array([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px], np.float32)
     else:
-        rim = min(np.arccos(np.clip(field_cos, -1, 1)) + FIELD_MARGIN_RAD, 0.97 * np.pi)
-        kind, table = LENS, _lens_table(camera, np.tan(rim / 2))
+        field = np.arccos(np.clip(field_cos, -1, 1))
+        rim = min(field + FIELD_MARGIN_RAD, 0.97 * np.pi)
+        kind, table = LENS, _lens_table(camera, np.tan(rim / 2), field + IMAGE_MARGIN_RAD)
         params = np.array([np.tan(rim / 2), np.cos(rim)], np.float32)
     return Grid(kind, direction, rays.valid.astype(np.uint8), np.ascontiguousarray(line), np.asarray(fraction), None,
                 params, table, np.zeros(height, np.int32), rays.reference, rays.by_range, rays.near_m, field_cos,
                 int(by_column))  # fmt: skip
 
 
-def _lens_table(camera: CameraModel, half_width: float) -> Float32[np.ndarray, "s s 2"]:
-    """Pixels by stereographic direction (x, y) / (1 + z), continued linearly outside of the lens' field."""
+def _lens_table(camera: CameraModel, half_width: float, field_rad: float) -> Float32[np.ndarray, "s s 2"]:
+    """Pixels by stereographic direction (x, y) / (1 + z), continued linearly outside of ``field_rad`` and of the lens.
+
+    Distortion polynomials may run away outside of the image, where nobody fitted them.
+    """
     p = np.linspace(-half_width, half_width, LENS_TABLE_SIZE)
     y, x = np.meshgrid(p, p, indexing="ij")
     x, y = x.ravel(), y.ravel()
@@ -99,7 +104,8 @@ def _lens_table(camera: CameraModel, half_width: float) -> Float32[np.ndarray, "
     def look(angle_rad: np.ndarray, azimuth_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         flat = np.sin(angle_rad)
         xyz = np.stack([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.cos(angle_rad)], axis=-1)
-        return sensors.project(camera, xyz)
+        uv, valid = sensors.project(camera, xyz)
+        return uv, valid & (angle_rad <= field_rad)
 
     uv, valid = look(angle, azimuth)
     # The first invalid angle along each outward line, by bisection; beyond it the image goes on with its last slope.

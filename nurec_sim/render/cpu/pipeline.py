@@ -131,7 +131,7 @@ def _visible(
     eye = view.world_from_reference[:3, 3].copy()
     rotation = view.world_from_reference[:3, :3].T
     quat = geometry.quat_from_matrix(rotation).astype(np.float32)
-    cells = np.array([grid.valid.shape[1], grid.valid.shape[0]], np.int64)
+    cells = np.array([grid.valid.shape[1], grid.valid.shape[0]], np.float32)
     chosen = [_blocks_in_view(grid, view, layer) for layer in layers]
     capacity = 2 * BLOCK * sum(len(blocks) for blocks in chosen)
     records, keys = array("records", (capacity, RECORD), np.float32), array("keys", (capacity,), np.float32)

@@ -89,7 +89,7 @@ def project(
         line_axis: see ``Grid``.
         lines: [l,24] per line: rotation and translation of reference_from_line, then of line_from_reference; a
             single line when nothing moves.
-        cells: (columns, rows) of the grid.
+        cells: (columns, rows) of the grid, float32.
         by_range: order by distance instead of z.
         near: near plane.
         records: [.., 24] output, from row ``base`` on.
@@ -104,7 +104,7 @@ def project(
     turned = np.empty((3, 3), np.float32)
     e1, e2 = np.empty(3, np.float32), np.empty(3, np.float32)
     map_ = np.empty((3, 3), np.float32)
-    wide, high = f4(cells[0]), f4(cells[1])
+    wide, high = cells[0], cells[1]
     moving = lines.shape[0] > 1
     qw, qx, qy, qz = frame_quat[0], frame_quat[1], frame_quat[2], frame_quat[3]
     w_ = world_direction_rows
@@ -163,7 +163,7 @@ def project(
                     for b in range(3):
                         axes[a, b] = turned[a, b] * g[SCALE + b]
                 if kind == PINHOLE:
-                    box = pinhole_bounds(lx, ly, lz, axes, k2, params) if lz > f4(1e-3) else EVERYWHERE
+                    box = pinhole_bounds(lx, ly, lz, axes, k2, params, cells) if lz > f4(1e-3) else EVERYWHERE
                 else:
                     bx = (turned[0, 0] * lx + turned[1, 0] * ly + turned[2, 0] * lz) / g[SCALE]
                     by = (turned[0, 1] * lx + turned[1, 1] * ly + turned[2, 1] * lz) / g[SCALE + 1]
