@@ -91,7 +91,7 @@ class RemoteSensors:
         frames: dict[int, SensorFrame] = {}
         try:
             for indices, call in calls:
-                reply = _outcome(call)
+                reply = self._outcome(call)
                 if isinstance(reply, sensorsim.LidarRenderReturn):
                     frames[indices[0]] = wire.read_lidar_frame(reply, requests[indices[0]])
                 else:
@@ -154,14 +154,14 @@ class RemoteSensors:
         return self._procedures[name].future(request, timeout=self._timeout_s, wait_for_ready=True)
 
     def _call(self, name: str, request):
-        return _outcome(self._begin(name, request))
+        return self._outcome(self._begin(name, request))
 
-
-def _outcome(call: grpc.Future):
-    try:
-        return call.result()
-    except grpc.RpcError as error:
-        raise wire.error_of(error.code(), error.details() or "no reason given") from error
+    def _outcome(self, call: grpc.Future):
+        try:
+            return call.result()
+        except grpc.RpcError as error:
+            ours = wire.error_of(error.code(), error.details() or "no reason given")
+            raise (ServerError(f"{self.address}: {ours}") if isinstance(ours, ServerError) else ours) from error
 
 
 def _batches(requests: Sequence[SensorRequest]) -> Iterator[list[int]]:

@@ -176,9 +176,7 @@ def _stop_once(loop: asyncio.AbstractEventLoop, number: int, stopping: asyncio.E
 async def _register(server: grpc.aio.Server, service: SensorService) -> health.HealthServicer:
     handlers = {
         name: grpc.unary_unary_rpc_method_handler(
-            _answering(getattr(service, name)),
-            request_deserializer=method.request.FromString,
-            response_serializer=method.reply.SerializeToString,
+            _answering(getattr(service, name), method), response_serializer=method.reply.SerializeToString
         )
         for name, method in wire.METHODS.items()
     }
@@ -193,12 +191,12 @@ async def _register(server: grpc.aio.Server, service: SensorService) -> health.H
     return monitor
 
 
-def _answering(procedure: Callable) -> Callable:
-    """A gRPC handler that turns what the procedure raises into a status."""
+def _answering(procedure: Callable, method: wire.Method) -> Callable:
+    """A gRPC handler of raw request bytes that turns what the procedure raises into a status."""
 
-    async def handler(request, context: grpc.aio.ServicerContext):
+    async def handler(data: bytes, context: grpc.aio.ServicerContext):
         try:
-            return await procedure(request)
+            return await procedure(wire.parse(method.request, data))
         except Unsupported as error:
             code, text = grpc.StatusCode.UNIMPLEMENTED, str(error)
         except NurecSimError as error:

@@ -2,8 +2,8 @@
 
 Semantics (public NuRec and AlpaSim behaviour): a frame [start, end) renders if it overlaps the scene's time, for
 AlpaSim's first exposure may begin before the recording and a client's last instant [t, t + 1) end after it; what sticks
-out is clamped in time, poses stay as they are. Actors listed in a request are drawn where it says, unknown ids are ignored, and
-all others, static ones always, as recorded.
+out is clamped in time, poses stay as they are. Actors listed in a request are drawn where it says, unknown ids are
+ignored, and all others, static ones always, are drawn as recorded.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import nurec_sim
 from nurec_sim import wire
 from nurec_sim.ego_masks import EgoMasks
 from nurec_sim.errors import NurecSimError, OutOfRangeError, RequestError, TooLargeError
+from nurec_sim.render.requests import MAX_RAYS
 from nurec_sim.scene_store import LoadedScene, SceneStore
 from nurec_sim.sensors import fill_ftheta
 from nurec_sim.types import CameraModel, FTheta, GaussianScene, SensorRequest
@@ -41,8 +42,8 @@ class ServiceOptions:
 
     render_workers: int = 1
     """Frames rendered at the same time; each uses the renderer's threads."""
-    max_pixels: int = 32_000_000
-    """Pixels, or beams, of one frame."""
+    max_pixels: int = MAX_RAYS
+    """Pixels, or beams, of one frame; the renderer takes no more than the default."""
     max_batch_items: int = 64
     max_message_bytes: int = 64 << 20
     """Of a request or a reply; AlpaSim's clients take no more."""

@@ -80,7 +80,7 @@ def scene(scene_id: str = "street", *, seed: int = 0) -> GaussianScene:
     static = Gaussians.concatenate(
         [
             _blobs(road, np.full((len(road), 3), 0.35), 0.7, Label.ROAD),
-            _blobs(wall, random.uniform(0, 1, (len(wall), 3)), 0.5, Label.OTHER),
+            _blobs(wall, random.uniform((0.4, 0.45, 0.1), (0.8, 0.9, 0.4), (len(wall), 3)), 0.5, Label.OTHER),
             _blobs(parked, np.tile([0.1, 0.2, 0.8], (40, 1)), 0.3, Label.MOVABLE),
         ]
     )

@@ -1,4 +1,4 @@
-"""The wire contract: numbers of the public interface, the compiled descriptors, and life beside other generated code."""
+"""The wire contract: numbers of the public interface, compiled descriptors, and life beside other generated code."""
 
 import importlib
 import re

@@ -133,8 +133,11 @@ def matching_cost(view, world_from_view, others, rgb, codes, other_rgb, other_co
             f = min(max(view[20] * (column + 0.5) + view[21] * (row + 0.5) + view[22], -0.5), 0.5)
             ox, oy, oz = view[17] * f, view[18] * f, view[19] * f
             m = world_from_view
-            dx, dy, dz = (m[k, 0] * rx + m[k, 1] * ry + m[k, 2] for k in range(3))
-            px, py, pz = (m[k, 0] * ox + m[k, 1] * oy + m[k, 2] * oz + m[k, 3] for k in range(3))
+            dx, dy = m[0, 0] * rx + m[0, 1] * ry + m[0, 2], m[1, 0] * rx + m[1, 1] * ry + m[1, 2]
+            dz = m[2, 0] * rx + m[2, 1] * ry + m[2, 2]
+            px = m[0, 0] * ox + m[0, 1] * oy + m[0, 2] * oz + m[0, 3]
+            py = m[1, 0] * ox + m[1, 1] * oy + m[1, 2] * oz + m[1, 3]
+            pz = m[2, 0] * ox + m[2, 1] * oy + m[2, 2] * oz + m[2, 3]
             for level in range(levels):
                 w = level * step
                 first, second, seen = 1e9, 1e9, 0

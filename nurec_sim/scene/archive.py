@@ -188,7 +188,12 @@ def _check_hashes(package: Package, manifest: dict[str, Any], names: tuple[str, 
 
 
 def _read_fields(layer, paths: list[str], count: int, what: str) -> Gaussians:
-    return gather([read_field(layer, path, what) for path in paths], count, what)
+    from pxr import Tf
+
+    try:
+        return gather([read_field(layer, path, what) for path in paths], count, what)
+    except Tf.ErrorException as error:
+        raise ArchiveError(f"{what}: the USD layer is damaged") from error
 
 
 def _npy(array: np.ndarray) -> bytes:

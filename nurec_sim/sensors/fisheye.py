@@ -25,7 +25,7 @@ def _polynomial(lens: Fisheye) -> np.ndarray:
 @functools.lru_cache(maxsize=64)
 def _field(lens: Fisheye) -> float:
     """Largest angle that the lens sees."""
-    return min(lens.max_angle_rad, radial.rising_limit(_polynomial(lens)))
+    return radial.rising_limit(_polynomial(lens), lens.max_angle_rad)
 
 
 def project(lens: Fisheye, xyz: Float64[np.ndarray, "n 3"]) -> tuple[Points2, Bool[np.ndarray, " n"]]:

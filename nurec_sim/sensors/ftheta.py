@@ -40,13 +40,13 @@ def exact_polynomial(lens: FTheta) -> tuple[FThetaReference, tuple[float, ...]]:
 def field(lens: FTheta) -> tuple[float, float]:
     """Largest angle and largest pixel distance that the lens sees."""
     reference, coefficients = exact_polynomial(lens)
-    rising = radial.rising_limit(coefficients)
     if reference is FThetaReference.ANGLE_TO_PIXELDIST:
-        angle = min(lens.max_angle_rad, rising)
+        angle = radial.rising_limit(coefficients, lens.max_angle_rad)
         return angle, float(polynomial.polyval(angle, coefficients))
-    reach = np.array(coefficients, np.float64)
-    reach[0] -= lens.max_angle_rad
-    distance = min(rising, radial.first_positive_root(reach))
+    # Rising at the smallest slope all the way, the angle would reach its maximum here.
+    furthest = lens.max_angle_rad / (radial.MINIMUM_SLOPE * coefficients[1])
+    rising = radial.rising_limit(coefficients, furthest)
+    distance = radial.first_below_zero(lambda x: lens.max_angle_rad - polynomial.polyval(x, coefficients), rising)
     return float(polynomial.polyval(distance, coefficients)), distance
 
 

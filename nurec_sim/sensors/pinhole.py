@@ -63,8 +63,9 @@ def _field(lens: Pinhole) -> float:
     )
     slope = polynomial.polyadd(polynomial.polymul(top, bottom), polynomial.polymul([0.0, 2.0], turn))
     excess = polynomial.polysub(slope, radial.MINIMUM_SLOPE * polynomial.polymul(bottom, bottom))
-    limit = min(radial.first_positive_root(excess), radial.first_positive_root(bottom))
-    return min(float(np.sqrt(limit)), WIDEST_TANGENT)
+    return radial.first_below_zero(
+        lambda r: np.minimum(polynomial.polyval(r * r, excess), polynomial.polyval(r * r, bottom)), WIDEST_TANGENT
+    )
 
 
 def _distort(lens: Pinhole, flat: Points2) -> tuple[Points2, Float64[np.ndarray, "n 2 2"]]:

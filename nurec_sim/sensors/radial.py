@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from numpy.polynomial import polynomial
 
 MINIMUM_SLOPE = 0.05
+SCAN_SIZE = 4097
 TABLE_SIZE = 1025
 NEWTON_STEPS = 8
 
@@ -32,22 +33,29 @@ def rays_at(angle_rad: Values, direction: Float64[np.ndarray, "n 2"]) -> Float64
     return rays
 
 
-def first_positive_root(coefficients: Sequence[float] | np.ndarray) -> float:
-    """Smallest real root above zero of a polynomial (coefficients from power 0 up); infinity where there is none."""
-    trimmed = polynomial.polytrim(np.asarray(coefficients, np.float64))
-    if len(trimmed) < 2:
-        return np.inf
-    roots = polynomial.polyroots(trimmed)
-    scale = np.maximum(np.abs(roots), 1e-12)
-    real = roots.real[(np.abs(roots.imag) < 1e-7 * scale) & (roots.real > 1e-9)]
-    return float(real.min()) if len(real) else np.inf
+def first_below_zero(function: Callable[[Values], Values], upper: float) -> float:
+    """Smallest x in [0, upper] from which on a function is negative; ``upper`` where it never is.
+
+    A scan and a bisection: unlike the roots of a polynomial this does not care for vanishing leading coefficients.
+    """
+    grid = np.linspace(0.0, upper, SCAN_SIZE)
+    below = np.flatnonzero(function(grid) < 0)
+    if len(below) == 0:
+        return upper
+    if below[0] == 0:
+        return 0.0
+    low, high = grid[below[0] - 1], grid[below[0]]
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (low, middle) if function(np.array([middle]))[0] < 0 else (middle, high)
+    return float(low)
 
 
-def rising_limit(coefficients: Sequence[float] | np.ndarray) -> float:
-    """Up to where a polynomial of slope above zero at 0 keeps ``MINIMUM_SLOPE`` of that slope."""
+def rising_limit(coefficients: Sequence[float] | np.ndarray, upper: float) -> float:
+    """Up to where, at most ``upper``, a polynomial keeps ``MINIMUM_SLOPE`` of its slope at 0."""
     slope = polynomial.polyder(np.asarray(coefficients, np.float64))
     slope[0] *= 1 - MINIMUM_SLOPE
-    return first_positive_root(slope)
+    return first_below_zero(lambda x: polynomial.polyval(x, slope), upper)
 
 
 def invert_rising(

@@ -3,7 +3,18 @@
 Nothing outside this folder knows what a message looks like, except for the field copying of ``server`` and ``client``.
 """
 
-from nurec_sim.wire.messages import METHODS, SERVICE, SERVICE_PATHS, ImageFormat, common, egodriver, pool, sensorsim
+from nurec_sim.wire.messages import (
+    METHODS,
+    SERVICE,
+    SERVICE_PATHS,
+    ImageFormat,
+    Method,
+    common,
+    egodriver,
+    parse,
+    pool,
+    sensorsim,
+)
 from nurec_sim.wire.poses import read_track, read_trajectory, write_track, write_trajectory
 from nurec_sim.wire.requests import (
     ImageOptions,
@@ -32,11 +43,13 @@ __all__ = [
     "SERVICE_PATHS",
     "ImageFormat",
     "ImageOptions",
+    "Method",
     "code_of",
     "common",
     "egodriver",
     "error_of",
     "number_of",
+    "parse",
     "pool",
     "read_camera",
     "read_camera_frame",

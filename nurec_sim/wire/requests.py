@@ -10,6 +10,7 @@ from jaxtyping import Float64, UInt8
 
 from nurec_sim.errors import RequestError
 from nurec_sim.render.encode import encode_image
+from nurec_sim.render.requests import check_pose_pair
 from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, SensorRequest
 from nurec_sim.wire.messages import ImageFormat
 from nurec_sim.wire.poses import check_interval, read_poses, write_poses
@@ -34,7 +35,11 @@ class ImageOptions:
 
 
 def write_camera_request(request: SensorRequest, message, *, scene_id: str, apply_isp: bool = True) -> None:
-    """Fills an ``RGBRenderRequest`` that asks for lossless pixels (``RGB_UINT8_PLANAR``)."""
+    """Fills an ``RGBRenderRequest`` that asks for lossless pixels (``RGB_UINT8_PLANAR``).
+
+    Raises:
+        RequestError: the frame is empty, or a pose is not finite or not rigid.
+    """
     message.resolution_w, message.resolution_h = request.sensor.width_px, request.sensor.height_px
     write_camera(request.sensor, message.camera_intrinsics)
     message.image_format = ImageFormat.RGB_UINT8_PLANAR
@@ -44,7 +49,11 @@ def write_camera_request(request: SensorRequest, message, *, scene_id: str, appl
 
 
 def write_lidar_request(request: SensorRequest, message, *, scene_id: str) -> None:
-    """Fills a ``LidarRenderRequest``."""
+    """Fills a ``LidarRenderRequest``.
+
+    Raises:
+        RequestError: the frame is empty, or a pose is not finite or not rigid.
+    """
     write_lidar(request.sensor, message.lidar_config)
     _write_frame(request, message, scene_id)
 
@@ -53,12 +62,14 @@ def _write_frame(request: SensorRequest, message, scene_id: str) -> None:
     message.scene_id = scene_id
     check_interval(request.start_us, request.end_us)
     message.frame_start_us, message.frame_end_us = request.start_us, request.end_us
-    _write_pair(request.world_from_sensor, message.sensor_pose)
+    _write_pair(f"sensor {request.sensor.id!r}: world_from_sensor", request.world_from_sensor, message.sensor_pose)
     for track_id, pair in request.actors.items():
-        _write_pair(pair, message.dynamic_objects.add(track_id=track_id).pose_pair)
+        added = message.dynamic_objects.add(track_id=track_id)
+        _write_pair(f"actor {track_id!r}: world_from_box", pair, added.pose_pair)
 
 
-def _write_pair(pair: Float64[np.ndarray, "2 4 4"], message) -> None:
+def _write_pair(name: str, pair: Float64[np.ndarray, "2 4 4"], message) -> None:
+    check_pose_pair(name, pair)
     write_poses(np.asarray(pair, np.float64), [message.start_pose, message.end_pose])
 
 

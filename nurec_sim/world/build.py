@@ -58,6 +58,7 @@ class Street:
         for limbs in self.actor_limbs.values():
             data.qpos[list(limbs)] = swing * LIMB_SWING
         mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_camlight(self.model, data)
 
 
 def build_street(plan: StreetPlan) -> Street:

@@ -87,7 +87,7 @@ def facade(rng: np.random.Generator, size: int = 448) -> Image:
     image, cell = _wall(rng, size), size // 4
     frame = ((232, 232, 226), (62, 56, 52), (112, 84, 64), (202, 202, 206))[rng.integers(4)]
     width, height = rng.uniform(0.4, 0.72) * cell, rng.uniform(0.5, 0.72) * cell
-    glass = np.array([rng.uniform(45, 85), rng.uniform(60, 100), rng.uniform(75, 125)])
+    glass = np.array([0.66, 0.82, 1.0]) * rng.uniform(72, 118)
     band, bars = rng.random() < 0.4, int(rng.integers(3))
     for floor in range(4):
         if band:

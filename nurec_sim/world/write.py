@@ -144,9 +144,13 @@ def _sweep(world: TrueWorld, ego: Trajectory, lidar: LidarModel, start_us: int, 
     fired = geometry.interpolate_pose_pair(pair, fraction)
     middle = ego.at(middle_us) @ lidar.rig_from_lidar
     point_t_us = start_us + np.rint(fraction * SPIN_US).astype(np.int64)
-    return Sweep(
-        middle_us, start_us, end_us, middle, sensors.compensate_sweep(xyz, fired, middle), intensity, point_t_us
-    )
+    xyz = np.rint(sensors.compensate_sweep(xyz, fired, middle) / point_step_m) * point_step_m
+    return Sweep(middle_us, start_us, end_us, middle, xyz, intensity, point_t_us)
+
+
+def _jpeg(rgb: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    return cv2.imencode(".jpg", np.ascontiguousarray(rgb[:, :, ::-1]), options)[1].tobytes()
 
 
 def _write_truth(file: Path, view: TrueView) -> None:

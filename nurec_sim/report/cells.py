@@ -1,0 +1,80 @@
+"""Small pieces of the report's HTML: escaped texts, table cells, lists."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from nurec_sim.metrics.aggregate import DERIVED
+from nurec_sim.metrics.series import METRICS
+from nurec_sim.report.data import ReportRollout
+
+if TYPE_CHECKING:
+    import polars as pl
+
+Row = dict[str, object]
+
+
+def by_policy(summary: pl.DataFrame) -> Iterator[tuple[tuple[str, str], dict[str, Row]]]:
+    """(reconstruction, policy) and its summary rows by metric, in the order of the table."""
+    for key, part in summary.group_by("reconstruction", "policy", maintain_order=True):
+        yield key, {row["name"]: row for row in part.iter_rows(named=True)}
+
+
+def summary_cell(row: Mapping[str, object]) -> str:
+    """A table cell: mean, interval, and in how many rollouts it could be computed."""
+    if row["mean"] is None:
+        return f'<td class="n"><span class="none">not known</span><small>0 of {row["n"]}</small></td>'
+    interval = ""
+    if row["low"] is not None:
+        low, high = (shown(row[end], row["unit"]) for end in ("low", "high"))
+        interval = f"<small>[{low}, {high}]</small>"
+    return (
+        f'<td class="n">{shown(row["mean"], row["unit"])}{interval}<small>{row["n_valid"]} of {row["n"]}</small></td>'
+    )
+
+
+def shown(value: object, unit: object) -> str:
+    """A value with its unit; shares in percent."""
+    if not isinstance(value, float):
+        return '<span class="none">not known</span>'
+    if unit in ("bool", "share"):
+        return f"{100 * value:.0f} %"
+    return f"{value:.2f} {escape(str(unit))}"
+
+
+def fact_list(facts: Mapping[str, object]) -> str:
+    """Names and values side by side."""
+    rows = []
+    for key, value in facts.items():
+        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        rows.append(f"<dt>{escape(str(key))}</dt><dd>{escape(str(text)[:2000])}</dd>")
+    return f"<dl>{''.join(rows)}</dl>"
+
+
+def meaning(name: str) -> str:
+    """What a metric means, in a phrase."""
+    return METRICS[name].meaning if name in METRICS else DERIVED[name][1]
+
+
+def full_name(entry: ReportRollout) -> str:
+    """A rollout in words."""
+    rollout = entry.rollout
+    return f"{rollout.policy} in {rollout.scene_id} ({rollout.reconstruction}), seed {rollout.seed}"
+
+
+def list_items(items: Sequence[str]) -> str:
+    """HTML list items of texts that are HTML already."""
+    return "".join(f"<li>{item}</li>" for item in items)
+
+
+def count_of(number: int, one: str, many: str = "") -> str:
+    """A number with its noun."""
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def escape(text: str) -> str:
+    """Text made safe for HTML and attributes."""
+    return html.escape(text)

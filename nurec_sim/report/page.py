@@ -1,0 +1,235 @@
+"""The report's HTML: headline first, then what is not known, what failed, and every rollout."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import polars as pl
+
+from nurec_sim.metrics.aggregate import CENSOR_M, DERIVED, MAX_UNKNOWN_FRAC
+from nurec_sim.metrics.collision import AT_FAULT_RULE
+from nurec_sim.metrics.series import METRICS
+from nurec_sim.report.cells import by_policy, count_of, escape, fact_list, full_name, list_items, meaning, summary_cell
+from nurec_sim.report.data import ReportScene, RunReport
+from nurec_sim.report.plots import View, collision_bars, plan_view, time_view
+from nurec_sim.report.rollout_card import rollout_card
+from nurec_sim.report.template import SCRIPT, STYLE
+
+MAX_EMBEDDED_BYTES = 40_000_000
+HEADLINE = {
+    "collision_any": "Collision C",
+    "offroad": "Off-road O",
+    "collision_offroad_mean": "(C+O)/2",
+    "collision_at_fault": "At fault",
+    "offroad_unknown_frac": "Road unknown",
+    "progress": "Progress",
+    "scene_score": "Scene score",
+    "min_distance_to_obstacle_m": "Least gap",
+    "comfort": "Comfortable",
+}
+
+
+def render_report(report: RunReport) -> str:
+    """The whole report as one HTML text. The same report gives the same text."""
+    from plotly.offline import get_plotlyjs
+
+    figures: dict[str, object] = {"collisions": collision_bars(report.summary)}
+    images: dict[str, object] = {}
+    embed = sum(e.video.stat().st_size for e in report.rollouts if e.video is not None) < MAX_EMBEDDED_BYTES
+    scenes = {(scene.id, scene.reconstruction): scene for scene in report.scenes}
+    views: dict[tuple[str, str], View] = {}
+    cards = []
+    for index, entry in enumerate(report.rollouts):
+        key = (entry.rollout.scene_id, entry.rollout.reconstruction)
+        scene = scenes.get(key, ReportScene(*key))
+        if entry.rollout.states:
+            view = views.setdefault(key, View(entry.rollout.recorded))
+            image_key = "/".join(key) if scene.grid is not None else None
+            if scene.grid is not None and image_key not in images:
+                images["/".join(key)] = view.grid_image(scene.grid)
+            figures[f"plan{index}"] = plan_view(entry, view, image_key, scene.road_map)
+            figures[f"time{index}"] = time_view(entry)
+        cards.append(rollout_card(index, entry, report, embed))
+    stored = json.dumps({"figures": figures, "images": images}, separators=(",", ":"), allow_nan=False)
+    stored = stored.replace("</", "<\\/")  # text of an event must not end the script
+    body = [
+        _header(report),
+        _headline(report),
+        _collisions(),
+        _unknown(report),
+        _failures(report),
+        "<h2>Rollouts</h2>",
+        '<p class="soft">Click one to open it. Plans are turned so that the recorded drive goes to the right.</p>',
+        *cards,
+        _all_metrics(report.summary),
+        _reconstructions(report.scenes),
+        _definitions(report),
+        _versions(report),
+    ]
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(report.title)} · nurec_sim</title><style>{STYLE}</style></head>\n<body><main>\n"
+        + "\n".join(part for part in body if part)
+        + f'\n</main><script type="application/json" id="figures">{stored}</script>\n'
+        f"<script>{get_plotlyjs()}</script>\n<script>{SCRIPT}</script></body></html>\n"
+    )
+
+
+def _header(report: RunReport) -> str:
+    rollouts = [entry.rollout for entry in report.rollouts]
+    failed = sum(rollout.status != "ok" for rollout in rollouts)
+    counts = [
+        count_of(len({r.scene_id for r in rollouts}), "scene"),
+        count_of(len({r.reconstruction for r in rollouts}), "reconstruction"),
+        count_of(len({r.policy for r in rollouts}), "policy", "policies"),
+        count_of(len({r.seed for r in rollouts}), "seed"),
+        count_of(len(rollouts), "rollout"),
+    ]
+    scenarios = ", ".join(sorted({rollout.scenario for rollout in rollouts}))
+    tag = f'<span class="tag bad">{failed} failed</span>' if failed else '<span class="tag good">none failed</span>'
+    return (
+        f'<h1>Closed-loop report</h1><p class="soft">{escape(report.title)} · scenario {escape(scenarios)} · '
+        f"traffic: log replay · profile {escape(report.profile)}</p><p>{' · '.join(counts)}{tag}</p>"
+    )
+
+
+def _headline(report: RunReport) -> str:
+    heads = "".join(
+        f'<th class="n" title="{escape(meaning(name))}">{escape(text)}</th>' for name, text in HEADLINE.items()
+    )
+    many = report.summary["reconstruction"].n_unique() > 1
+    rows = []
+    for (reconstruction, policy), cells in by_policy(report.summary):
+        first = next(iter(cells.values()))
+        failed = f'<small class="bad">{first["n_failed"]} failed</small>' if first["n_failed"] else ""
+        where = f"<small>{escape(reconstruction)}</small>" if many else ""
+        values = "".join(summary_cell(cells[name]) for name in HEADLINE)
+        rows.append(f'<tr><td><b>{escape(policy)}</b>{where}</td><td class="n">{first["n"]}{failed}</td>{values}</tr>')
+    one_scene = report.values["clipgt_id"].n_unique() < 2
+    interval = (
+        "One scene only, so there are no intervals: they would say nothing of other scenes."
+        if one_scene
+        else "Brackets: 95 % interval of a bootstrap over scenes, the same draws for every policy."
+    )
+    return (
+        '<h2>Headline</h2><div class="card scroll"><table><thead><tr><th>Policy</th><th class="n">Rollouts</th>'
+        f"{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+        f'<p class="key">Small print under a value: rollouts in which it could be computed, of all. {interval} '
+        "A value that cannot be computed is <i>not known</i>, never 0. States after a rollout's first collision or "
+        "off-road state do not count, so the two compete.</p>"
+    )
+
+
+def _collisions() -> str:
+    return (
+        '<h2>Collision classes</h2><div class="card"><div class="plot" id="collisions"></div>'
+        '<p class="key">Actors replay the log, so a car that is slower than the log is hit from behind: a timid policy '
+        f"shows as <i>rear</i>. At fault: {escape(AT_FAULT_RULE.replace('_', ' '))}.</p></div>"
+    )
+
+
+def _unknown(report: RunReport) -> str:
+    """Everything that limits what this report can say."""
+    items = []
+    for scene in report.scenes:
+        items += [f"{escape(scene.id)} ({escape(scene.reconstruction)}): {escape(text)}" for text in scene.unknown]
+    for (reconstruction, policy), cells in by_policy(report.summary):
+        dead = [
+            name for name, row in cells.items()
+            if row["n_valid"] == 0 and name not in ("time_to_first_event_s", "collision_delta_v_mps")
+        ]  # fmt: skip
+        if dead:
+            items.append(f"{escape(policy)} ({escape(reconstruction)}): never computed: {escape(', '.join(dead))}")
+        share = cells["offroad_unknown_frac"]["mean"]
+        if share is not None and share > 0:
+            items.append(
+                f"{escape(policy)} ({escape(reconstruction)}): the road under the car was unknown in "
+                f"{100 * share:.1f} % of the states; a scene above {100 * MAX_UNKNOWN_FRAC:.0f} % is left out of off-road"
+            )
+    items += [
+        f"{escape(full_name(entry))}: no video: {escape(entry.video_error)}"
+        for entry in report.rollouts
+        if entry.video_error
+    ]
+    items.append("Actors follow their recording and do not react to the ego; after a contact they drive on through it.")
+    return f'<h2>What this report could not know</h2><div class="card"><ul>{list_items(items)}</ul></div>'
+
+
+def _failures(report: RunReport) -> str:
+    failed = [entry for entry in report.rollouts if entry.rollout.status != "ok"]
+    if not failed:
+        return '<h2>Failures</h2><div class="card">No rollout failed.</div>'
+    items = [
+        f"<h3>{escape(full_name(entry))}</h3><pre>{escape(entry.rollout.error or 'no error text')}</pre>"
+        f'<p class="key">{len(entry.rollout.states)} states were driven before. It counts as a rollout; its metrics '
+        "do not count.</p>"
+        for entry in failed
+    ]
+    return f'<h2>Failures</h2><div class="card">{"".join(items)}</div>'
+
+
+def _all_metrics(summary: pl.DataFrame) -> str:
+    policies = list(by_policy(summary))
+    heads = "".join(f'<th class="n">{escape(policy)}<small>{escape(rec)}</small></th>' for (rec, policy), _ in policies)
+    rows = [
+        f'<tr><td title="{escape(meaning(name))}">{escape(name)}</td>'
+        + "".join(summary_cell(cells[name]) for _, cells in policies)
+        + "</tr>"
+        for name in (*METRICS, *DERIVED)
+    ]
+    return (
+        '<h2>All metrics</h2><details class="card"><summary>Every metric for every policy</summary><div class="scroll">'
+        f"<table><thead><tr><th>Metric</th>{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table></div></details>"
+    )
+
+
+def _reconstructions(scenes: Sequence[ReportScene]) -> str:
+    cards = []
+    for scene in scenes:
+        facts: dict[str, object] = {f"{name} Gaussians": f"{count:,}" for name, count in scene.counts.items()}
+        if "tracks Gaussians" in facts:
+            facts["tracks"] = facts.pop("tracks Gaussians")
+        if scene.grid is not None:
+            rows, columns = scene.grid.state.shape
+            facts["road grid"] = (
+                f"{columns * scene.grid.cell_m:.0f} x {rows * scene.grid.cell_m:.0f} m, "
+                f"cells of {scene.grid.cell_m:g} m, bandwidth {scene.grid.bandwidth_m:.2f} m"
+            )
+            facts["driven corridor not labelled road"] = f"{100 * scene.grid.overruled_frac:.1f} %"
+        facts |= {key: value for key, value in scene.provenance.items() if key != "unknown"}
+        if scene.sha256:
+            facts["fingerprint"] = scene.sha256[:16]
+        cards.append(
+            f'<div class="card"><h3>{escape(scene.id)} · {escape(scene.reconstruction)}</h3>{fact_list(facts)}</div>'
+        )
+    return f"<h2>Reconstructions</h2>{''.join(cards)}" if cards else ""
+
+
+def _definitions(report: RunReport) -> str:
+    rows = [
+        f"<tr><td>{escape(name)}</td><td>{escape(metric.meaning)}</td><td>{escape(metric.unit)}</td><td>{metric.reduce.value}</td></tr>"
+        for name, metric in METRICS.items()
+    ]
+    rows += [
+        f"<tr><td>{escape(n)}</td><td>{escape(m)}</td><td>{escape(u)}</td><td></td></tr>"
+        for n, (u, m) in DERIVED.items()
+    ]
+    censoring = (
+        f"States after the ego is {CENSOR_M:g} m off the recorded path are dropped."
+        if report.profile == "alpasim"
+        else f"Nothing is dropped for being {CENSOR_M:g} m off the recorded path; censored_4m says how often."
+    )
+    return (
+        '<h2>Definitions</h2><details class="card"><summary>What each metric means</summary>'
+        f'<p class="key">{censoring}</p><div class="scroll"><table><thead><tr><th>Metric</th><th>Meaning</th>'
+        f"<th>Unit</th><th>Over time</th></tr></thead><tbody>{''.join(rows)}</tbody></table></div></details>"
+    )
+
+
+def _versions(report: RunReport) -> str:
+    cards = [fact_list(versions) for versions in report.versions]
+    if not cards:
+        return ""
+    return f'<h2>Versions</h2><details class="card"><summary>Software</summary>{"".join(cards)}</details>'

@@ -1,0 +1,123 @@
+"""Score everything that a run folder holds; write its tables and its report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from nurec_sim.errors import RunError
+from nurec_sim.metrics.aggregate import rollout_values, summarize
+from nurec_sim.metrics.collision import find_contacts
+from nurec_sim.metrics.score import score_rollout
+from nurec_sim.metrics.table import metric_table, read_table, write_table
+from nurec_sim.report import ReportRollout, ReportScene, RunReport, render_report
+from nurec_sim.runs import folder as layout
+from nurec_sim.runs.rollout_file import load_rollout
+from nurec_sim.runs.scene_file import SceneRecord, load_scene_record
+
+PROFILE = "strict"
+
+
+def finish(run: Path | str, progress: Callable[[str, float], None] | None = None) -> Path:
+    """Write ``metrics.parquet``, ``metrics.csv`` and ``report.html`` from the rollouts and scenes in a run folder.
+
+    Returns:
+        The report.
+
+    Raises:
+        RunError: no such folder, it holds no rollout, or a file in it is broken.
+    """
+    say = progress or (lambda stage, share: None)
+    run = layout.existing_run_folder(Path(run))
+    places = layout.rollout_folders(run)
+    if not places:
+        raise RunError(f"run folder {run} holds no rollout")
+    records = {place: load_scene_record(place) for place in layout.scene_folders(run)}
+    scored, entries = [], []
+    for index, place in enumerate(places):
+        say("scoring", 0.6 * index / len(places))
+        record = records.get(place.parent.parent)
+        if record is None:
+            raise RunError(f"{place.parent.parent} lacks {layout.SCENE}; run again with --resume")
+        rollout = load_rollout(place / layout.ROLLOUT)
+        series = score_rollout(rollout, record.grid, record.road_map, profile=PROFILE, actors_known=record.actors_known)
+        scored.append((rollout, series))
+        entries.append(_report_entry(run, place, rollout, series))
+    table = metric_table(scored, run.name)
+    write_table(table, run)
+    values = rollout_values(table, PROFILE)
+    say("writing the report", 0.7)
+    report = RunReport(
+        title=run.name,
+        profile=PROFILE,
+        scenes=tuple(_report_scene(record) for record in records.values()),
+        rollouts=tuple(entries),
+        values=values,
+        summary=summarize(values),
+        versions=_versions(places),
+    )
+    path = run / layout.REPORT
+    layout.write_text(path, render_report(report))
+    return path
+
+
+write_report = finish
+"""The command line's name for ``finish``."""
+
+
+def headline(run: Path | str) -> list[tuple[str, ...]]:
+    """The headline table of a finished run as rows of text, headings first."""
+    run = layout.existing_run_folder(Path(run))
+    path = run / "metrics.parquet"
+    if not path.exists():
+        raise RunError(f"run folder {run} has no metrics.parquet; it was not finished")
+    columns = {
+        "collision_any": "collision",
+        "offroad": "off-road",
+        "collision_offroad_mean": "(C+O)/2",
+        "offroad_unknown_frac": "road unknown",
+        "progress": "progress",
+        "scene_score": "scene score",
+    }
+    rows = [("policy", "reconstruction", "rollouts", "failed", *columns.values())]
+    for (reconstruction, policy), part in (
+        summarize(rollout_values(read_table(path), PROFILE)).group_by("reconstruction", "policy", maintain_order=True)
+    ):  # fmt: skip
+        cells = {row["name"]: row for row in part.iter_rows(named=True)}
+        first = next(iter(cells.values()))
+        shown = ["not known" if cells[name]["mean"] is None else f"{cells[name]['mean']:.2f}" for name in columns]
+        rows.append((policy, reconstruction, str(first["n"]), str(first["n_failed"]), *shown))
+    return rows
+
+
+def _report_entry(run: Path, place: Path, rollout, series) -> ReportRollout:
+    video, video_error = place / layout.VIDEO, place / layout.VIDEO_ERROR
+    return ReportRollout(
+        rollout=rollout,
+        series={one.name: one for one in series},
+        contacts=tuple(find_contacts(rollout, PROFILE)),
+        video=video if video.exists() else None,
+        video_link=video.relative_to(run).as_posix(),
+        video_error=video_error.read_text(encoding="utf-8").strip() if video_error.exists() else "",
+        scenario=(place / layout.SCENARIO).read_text(encoding="utf-8") if (place / layout.SCENARIO).exists() else "",
+    )
+
+
+def _report_scene(record: SceneRecord) -> ReportScene:
+    return ReportScene(
+        id=record.id, reconstruction=record.reconstruction, sha256=record.sha256, counts=record.counts,
+        provenance=record.provenance, unknown=record.unknown, road_map=record.road_map, grid=record.grid,
+    )  # fmt: skip
+
+
+def _versions(places: list[Path]) -> tuple[dict[str, object], ...]:
+    """The different sets of versions that the rollouts were driven with."""
+    found = []
+    for place in places:
+        path = place / layout.VERSIONS
+        facts = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        facts.pop("scene_sha256", None)
+        if facts and facts not in found:
+            found.append(facts)
+    return tuple(found)

@@ -1,0 +1,116 @@
+"""What a run keeps of each scene: facts for the report (``scene.json``) and the road grid (``road.npz``)."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from nurec_sim.errors import ArchiveError, ReconstructError, RunError
+from nurec_sim.metrics.offroad_grid import OffroadGrid, scene_offroad_grid
+from nurec_sim.runs.folder import ROAD, SCENE, write_text
+from nurec_sim.scene import codec
+from nurec_sim.scene.summary import scene_hash
+from nurec_sim.types import GaussianScene, Label, RoadMap
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """A scene as the metrics and the report see it.
+
+    ``unknown`` lists in words what the log or the reconstruction does not tell; ``road_error`` says why there is no
+    grid. ``sha256`` is the fingerprint of the whole scene.
+    """
+
+    id: str
+    reconstruction: str
+    sha256: str
+    counts: Mapping[str, int]
+    provenance: Mapping[str, object]
+    unknown: tuple[str, ...]
+    actors_known: bool
+    road_map: RoadMap | None = None
+    grid: OffroadGrid | None = field(default=None, compare=False)
+    road_error: str = ""
+
+
+def reconstruction_of(scene: GaussianScene) -> str:
+    """Name of the method that made a scene."""
+    return str(scene.provenance.get("method", "unknown"))
+
+
+def record_scene(scene: GaussianScene) -> SceneRecord:
+    """Fingerprint a scene, count what it holds and find its road."""
+    listed = scene.provenance.get("unknown", ())
+    unknown = tuple(str(text) for text in listed) if isinstance(listed, (list, tuple)) else (str(listed),)
+    no_boxes = any(word in text.lower() for text in unknown for word in ("box", "actor", "track"))
+    actors_known = bool(scene.tracks) or ("unknown" in scene.provenance and not no_boxes)
+    if not actors_known and not no_boxes:
+        unknown += ("the scene has no actor boxes: collisions cannot be measured",)
+    if (scene.road_map is None or not scene.road_map.drivable) and not any("map" in text.lower() for text in unknown):
+        unknown += ("the scene has no road map: off-road is measured on the road-class Gaussians only",)
+    labels = np.bincount(scene.static.label, minlength=len(Label))
+    counts = {"static": len(scene.static), "dynamic": len(scene.dynamic), "tracks": len(scene.tracks)}
+    counts |= {f"static {label.name.lower()}": int(labels[label]) for label in Label if labels[label]}
+    grid, road_error = None, ""
+    try:
+        grid = scene_offroad_grid(scene)
+    except ReconstructError as error:
+        road_error = str(error)
+        unknown += (road_error,)
+    provenance = json.loads(codec.dump(dict(scene.provenance), "provenance"))
+    return SceneRecord(
+        scene.id, reconstruction_of(scene), scene_hash(scene), counts, provenance, unknown, actors_known,
+        scene.road_map, grid, road_error,
+    )  # fmt: skip
+
+
+def save_scene_record(record: SceneRecord, folder: Path) -> None:
+    """Write ``scene.json`` and, where there is a grid, ``road.npz``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    road = folder / ROAD
+    if record.grid is None:
+        road.unlink(missing_ok=True)
+    else:
+        part = folder / f".{ROAD}.{os.getpid()}"
+        grid = record.grid
+        place = np.array([*grid.origin_m, grid.cell_m, grid.bandwidth_m, grid.overruled_frac], np.float64)
+        with part.open("wb") as file:
+            np.savez_compressed(file, state=grid.state, place=place)
+        os.replace(part, road)
+    facts = {name: value for name, value in vars(record).items() if name != "grid"}
+    write_text(folder / SCENE, codec.dump(facts, "the scene record", indent=1).decode())
+
+
+def load_scene_record(folder: Path) -> SceneRecord:
+    """Read what ``save_scene_record`` wrote.
+
+    Raises:
+        RunError: a file is missing or broken.
+    """
+    path = folder / SCENE
+    try:
+        facts = codec.load(path.read_bytes(), str(path))
+        facts["unknown"] = tuple(facts["unknown"])
+        if facts["road_map"] is not None:
+            facts["road_map"] = codec.from_json(codec.record(RoadMap), facts["road_map"], "road_map")
+        grid = _load_grid(folder / ROAD) if (folder / ROAD).exists() else None
+        return SceneRecord(**facts, grid=grid)
+    except FileNotFoundError:
+        raise RunError(f"{path} does not exist: the run folder is incomplete; run again with --resume") from None
+    except (OSError, TypeError, ValueError, KeyError, zipfile.BadZipFile, ArchiveError) as error:
+        raise RunError(f"{path} is no readable scene record: {type(error).__name__}: {error}") from error
+
+
+def _load_grid(path: Path) -> OffroadGrid:
+    with np.load(path, allow_pickle=False) as file:
+        state, place = file["state"], file["place"]
+    if state.ndim != 2 or min(state.shape) < 2 or place.shape != (5,) or place[2] <= 0:
+        raise ValueError(f"{path.name}: a grid needs cells [rows, columns] and 5 numbers, got {state.shape}")
+    x, y, cell, bandwidth, overruled = (float(value) for value in place)
+    return OffroadGrid.from_state((x, y), cell, state, bandwidth, overruled)

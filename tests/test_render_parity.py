@@ -1,0 +1,112 @@
+"""The CPU renderer against its float64 reference."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from render_scenes import START_US, camera, cloud, moved, moving_cloud, psnr_db, request, scene, track
+
+from nurec_sim import geometry, sensors
+from nurec_sim.render import Renderer, spec
+from nurec_sim.types import Fisheye, FTheta, FThetaReference, Pinhole, Shutter, Spin, Windshield, WindshieldReference
+
+LENSES = {
+    "pinhole": Pinhole(47.0, 49.0, 35.0, 25.0),
+    "wide pinhole": Pinhole(20.0, 20.0, 36.0, 24.0),
+    "distorted": Pinhole(47.0, 47.0, 36.0, 24.0, (-0.2, 0.05, 0, 0, 0, 0), (0.002, -0.003), (0.001, 0, 0.002, 0)),
+    "fisheye": Fisheye(24.0, 24.0, 36.0, 24.0, (0.02, -0.005, 0, 0), max_angle_rad=1.7),
+    "f-theta": FTheta(36.0, 24.0, FThetaReference.PIXELDIST_TO_ANGLE, (0.0, 0.04, 0.0, 2e-6), max_angle_rad=1.6),
+}
+
+
+def assert_same_image(world, asked, least_db=60.0):
+    got, expected = Renderer(world, threads=2).render_camera(asked), spec.render_camera(world, asked)
+    assert psnr_db(got.rgb, expected.rgb) >= least_db
+    assert np.abs(got.alpha - expected.alpha).max() < 2e-3
+    assert (got.label != expected.label).mean() < 2e-3
+    both = (got.depth_m > 0) & (expected.depth_m > 0)
+    assert (got.depth_m > 0).mean() == pytest.approx((expected.depth_m > 0).mean(), abs=2e-3)
+    if both.any():
+        assert np.median(np.abs(got.depth_m - expected.depth_m)[both]) < 1e-3
+
+
+@pytest.mark.parametrize("shutter", list(Shutter))
+@pytest.mark.parametrize("lens", list(LENSES))
+def test_every_lens_and_shutter(lens, shutter):
+    sky = np.random.default_rng(1).random((6, 4, 4, 3))
+    asked = request(camera(lens=LENSES[lens], shutter=shutter), moved(0.02, 0.1, 0.0), moved(0.09, 0.7, 0.2))
+    assert_same_image(scene(cloud(), sky=sky), asked)
+
+
+def test_windshield():
+    glass = Windshield(
+        WindshieldReference.FORWARD, (0.002, 1.01, 0.0, 0.003, 0.0, 0.0), (-0.001, 0.0, 0.002, 0.99, 0.0, 0.0)
+    )
+    assert_same_image(scene(cloud()), request(camera(windshield=glass)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_large_gaussians_around_the_camera(seed):
+    static = cloud(60, seed, low=(-3, -3, -3), high=(3, 3, 3))
+    static = dataclasses.replace(static, scale_m=static.scale_m * 2)
+    for lens in ("pinhole", "wide pinhole", "fisheye"):
+        assert_same_image(scene(static), request(camera(lens=LENSES[lens]), moved(seed * 1.3)))
+
+
+@pytest.mark.parametrize("k", [3, 8, 15])
+def test_spherical_harmonics(k):
+    assert_same_image(scene(cloud(sh=k)), request(camera(), moved(0.5, 1.0, -1.0)))
+
+
+def test_isp_and_its_switch():
+    isp = {"front": np.array([[0.8, 0.1, 0, 0.05], [0, 0.7, 0.1, 0], [0.1, 0, 0.9, -0.1]])}
+    world, asked = scene(cloud(), isp=isp), request(camera())
+    assert_same_image(world, asked)
+    plain = Renderer(world, apply_isp=False).render_camera(asked)
+    assert psnr_db(plain.rgb, spec.render_camera(world, asked, apply_isp=False).rgb) >= 60
+    assert psnr_db(plain.rgb, Renderer(world).render_camera(asked).rgb) < 30
+    other = Renderer(world).render_camera(request(camera(id="rear")))
+    assert np.array_equal(other.rgb, plain.rgb)
+
+
+@pytest.mark.parametrize("actors", [{}, {"car": geometry.pose_from_xyyaw(5.0, 1.0, 1.2)}, {"unknown": np.eye(4)}])
+def test_moving_actors(actors):
+    world = scene(cloud(), moving_cloud(), [track()])
+    pairs = {name: np.stack([pose, moved() @ pose]) for name, pose in actors.items()}
+    asked = request(camera(shutter=Shutter.TOP_TO_BOTTOM), end_from_rig=moved(), actors=pairs)
+    assert_same_image(world, asked)
+    without = Renderer(scene(cloud())).render_camera(asked)
+    assert psnr_db(without.rgb, Renderer(world).render_camera(asked).rgb) < 40
+
+
+LIDARS = {
+    "full": sensors.lidar_model("VLP-16", np.eye(4), columns=240),
+    "sector": sensors.lidar_model("AT128", np.eye(4), columns=100),
+    "offsets": dataclasses.replace(
+        sensors.lidar_model("HDL-32", np.eye(4), columns=200), row_azimuth_offset_rad=np.tile([0.07, -0.05], 16)
+    ),
+    "other way": dataclasses.replace(
+        sensors.lidar_model("HDL-32", np.eye(4), columns=200),
+        azimuth_rad=np.linspace(-1, 2 * np.pi - 1, 200, endpoint=False),
+        spin=Spin.COUNTERCLOCKWISE,
+    ),
+    "sector with offsets": dataclasses.replace(
+        sensors.lidar_model("AT128", np.eye(4), columns=100), row_azimuth_offset_rad=np.tile([0.02, -0.03], 64)
+    ),
+}
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("name", list(LIDARS))
+def test_lidar(name, moving):
+    static = cloud(400, 3, low=(-12, -12, -3), high=(12, 12, 3))
+    world = scene(static, moving_cloud(), [track()])
+    asked = request(LIDARS[name], moved(0.3), moved(0.42, 1.2, 0.3) if moving else moved(0.3), end_us=START_US + 100_000)
+    got, expected = Renderer(world, threads=2).render_lidar(asked), spec.render_lidar(world, asked)
+    _, mine, theirs = np.intersect1d(got.beam, expected.beam, return_indices=True)
+    assert len(mine) > 300
+    assert len(mine) >= 0.998 * max(len(got.beam), len(expected.beam))
+    error = np.abs(got.range_m[mine] - expected.range_m[theirs])
+    assert np.median(error) < 1e-3 and np.quantile(error, 0.99) < 1e-2
+    assert np.median(np.abs(got.xyz_m[mine] - expected.xyz_m[theirs])) < 1e-3
+    assert np.quantile(np.abs(got.intensity[mine] - expected.intensity[theirs]), 0.99) < 1e-2
