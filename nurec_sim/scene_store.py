@@ -157,10 +157,25 @@ class SceneStore:
         more = f" and {len(have) - MAX_NAMES_IN_TEXT} more" if len(have) > MAX_NAMES_IN_TEXT else ""
         raise UnknownSceneError(f"scene {name!r} is not served; have {have[:MAX_NAMES_IN_TEXT]}{more}")
 
-    def get(self, name: str) -> LoadedScene:
+    def in_memory(self, name: str) -> LoadedScene | None:
+        """The scene that answers to ``name`` if that takes no waiting, else None.
+
+        Raises:
+            UnknownSceneError, ArchiveError: see ``resolve``.
+        """
+        scene_id = self.resolve(name)
+        with self._lock:
+            future = self._loaded.get(scene_id)
+            if future is None or not future.done() or future.exception() is not None:
+                return None
+            self._loaded.move_to_end(scene_id)
+            return future.result()
+
+    def get(self, name: str, progress: Callable[[str, float], None] | None = None) -> LoadedScene:
         """The scene that answers to ``name``, loaded or reconstructed if it is not in memory.
 
-        Callers that come while it loads wait for the same load.
+        Callers that come while it loads wait for the same load. ``progress`` hears of a reconstruction: what is being
+        done, and the fraction of it that is.
 
         Raises:
             UnknownSceneError: there is no such scene.
@@ -175,7 +190,7 @@ class SceneStore:
             self._loaded.move_to_end(scene_id)
         if first:
             try:
-                future.set_result(self._load(self._sources[scene_id]))
+                future.set_result(self._load(self._sources[scene_id], progress))
             except BaseException as error:
                 with self._lock:
                     del self._loaded[scene_id]
@@ -189,7 +204,7 @@ class SceneStore:
             for scene_id in done[: max(0, len(self._loaded) - self.capacity)]:
                 del self._loaded[scene_id]
 
-    def _load(self, source: _Source) -> LoadedScene:
+    def _load(self, source: _Source, progress: Callable[[str, float], None] | None) -> LoadedScene:
         if isinstance(source.origin, GaussianScene):
             scene = source.origin
         elif _is_archive(source.origin):
@@ -197,14 +212,14 @@ class SceneStore:
 
             scene = read_scene(source.origin)
         else:
-            scene = self._reconstructed(source.origin)
+            scene = self._reconstructed(source.origin, progress)
         if self._make_renderer is not None:
             return LoadedScene(scene, self._make_renderer(scene))
-        from nurec_sim.render import Renderer
+        from nurec_sim.render.renderer import Renderer
 
         return LoadedScene(scene, Renderer(scene, threads=self._threads))
 
-    def _reconstructed(self, clip_path: Path) -> GaussianScene:
+    def _reconstructed(self, clip_path: Path, progress: Callable[[str, float], None] | None) -> GaussianScene:
         """The reconstruction of a clip, from the cache or made now; the same bits either way."""
         from nurec_sim.logs import open_clip
         from nurec_sim.reconstruct import reconstruct
@@ -217,7 +232,7 @@ class SceneStore:
             except ArchiveError as error:
                 log.warning("made again, its kept reconstruction is damaged: %s", error)
         self._on_progress(f"reconstructing {clip_path} ({self._method}) ...")
-        scene = reconstruct(open_clip(clip_path), self._method)
+        scene = reconstruct(open_clip(clip_path), self._method, progress=progress)
         try:
             kept.parent.mkdir(parents=True, exist_ok=True)
             write_scene(scene, kept, overwrite=True)

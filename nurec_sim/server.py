@@ -21,7 +21,7 @@ from grpc_reflection.v1alpha import reflection
 from nurec_sim import wire
 from nurec_sim.errors import NurecSimError
 from nurec_sim.scene_store import SceneStore
-from nurec_sim.service import SensorService, ServiceOptions, Unsupported, describe
+from nurec_sim.service import SensorService, ServiceOptions, UnsupportedError, describe
 
 log = logging.getLogger(__name__)
 
@@ -134,7 +134,10 @@ class SensorServer:
                 for number in (signal.SIGINT, signal.SIGTERM):
                     loop.add_signal_handler(number, _stop_once, loop, number, stopping)
             on_ready(f"{self._host}:{port}")
+            warming = asyncio.create_task(service.warm_up()) if self._options.warm_up and self._store.ids else None
             await stopping.wait()
+            if warming:
+                warming.cancel()
             await monitor.enter_graceful_shutdown()
             await server.stop(self._stop_grace_s)
         finally:
@@ -197,7 +200,7 @@ def _answering(procedure: Callable, method: wire.Method) -> Callable:
     async def handler(data: bytes, context: grpc.aio.ServicerContext):
         try:
             return await procedure(wire.parse(method.request, data))
-        except Unsupported as error:
+        except UnsupportedError as error:
             code, text = grpc.StatusCode.UNIMPLEMENTED, str(error)
         except NurecSimError as error:
             code, text = wire.code_of(error), str(error)

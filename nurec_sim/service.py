@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from nurec_sim.errors import NurecSimError, OutOfRangeError, RequestError, TooLa
 from nurec_sim.render.requests import MAX_RAYS
 from nurec_sim.scene_store import LoadedScene, SceneStore
 from nurec_sim.sensors import fill_ftheta
-from nurec_sim.types import CameraModel, FTheta, GaussianScene, SensorRequest
+from nurec_sim.types import CameraModel, FTheta, GaussianScene, LidarModel, SensorRequest
 from nurec_sim.wire import common, sensorsim
 
 log = logging.getLogger(__name__)
@@ -34,6 +34,7 @@ API_VERSION = (0, 54, 0)
 
 _BURIED_M = 10_000.0
 _LOADING_THREADS = 4
+_BYTES_A_POINT = 24  # xyz, intensity, range, beam
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,8 @@ class ServiceOptions:
     """Whether a request that lists actors hides the controllable ones that it does not list."""
     ego_mask_dir: Path | None = None
     allow_shut_down: bool = False
+    warm_up: bool = False
+    """Whether the first scene is loaded, and kernels are compiled, before somebody asks."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +63,15 @@ class _CameraJob:
     loaded: LoadedScene
     request: SensorRequest
     options: wire.ImageOptions
+    pixels: int
 
     @property
     def planar_bytes(self) -> int:
         """Size of the reply if it is raw pixels, else 0: compressed images are small."""
-        pixels = self.request.sensor.width_px * self.request.sensor.height_px
-        return 3 * pixels if self.options.format == wire.ImageFormat.RGB_UINT8_PLANAR else 0
+        return 3 * self.pixels if self.options.format == wire.ImageFormat.RGB_UINT8_PLANAR else 0
 
 
-class Unsupported(RequestError):
+class UnsupportedError(RequestError):
     """A procedure that the interface knows and this server does not offer."""
 
 
@@ -86,20 +89,41 @@ class SensorService:
         self._options = options
         self._request_stop = request_stop
         self._masks = EgoMasks(options.ego_mask_dir)
+        self._loads: dict[str, asyncio.Future[LoadedScene]] = {}
         self._loading = ThreadPoolExecutor(_LOADING_THREADS, thread_name_prefix="scene")
+        self._reading = ThreadPoolExecutor(1, thread_name_prefix="request")
         self._rendering = ThreadPoolExecutor(options.render_workers, thread_name_prefix="render")
 
     def close(self) -> None:
         """Drops what has not begun and waits for the rest."""
-        for executor in (self._rendering, self._loading):
+        for executor in (self._rendering, self._reading, self._loading):
             executor.shutdown(wait=True, cancel_futures=True)
+
+    async def warm_up(self) -> None:
+        """Loads the first scene and draws one image and one sweep of it; what fails is logged only."""
+        try:
+            loaded = await self._scene(self._store.ids[0])
+            rig, ego = loaded.scene.rig, loaded.scene.ego
+            start_us = max(loaded.scene.span_us[0], ego.start_us)
+
+            def look(sensor: CameraModel | LidarModel, rig_from_sensor: np.ndarray) -> SensorRequest:
+                pose = ego.at(start_us) @ rig_from_sensor
+                return SensorRequest(loaded.scene.id, sensor, start_us, start_us + 1, np.stack([pose, pose]))
+
+            for camera in list(rig.cameras.values())[:1]:
+                request = look(camera, camera.rig_from_camera)
+                await self._run(self._rendering, loaded.renderer.render_camera, request, ("rgb",))
+            for lidar in list(rig.lidars.values())[:1]:
+                await self._run(self._rendering, loaded.renderer.render_lidar, look(lidar, lidar.rig_from_lidar))
+        except Exception as error:
+            log.warning("the server could not warm up: %s", error)
 
     # ------------------------------------------------------------------------------------------------------ rendering
 
     async def render_rgb(self, request):
         """One image."""
         job = await self._admit_camera(request)
-        self._check_reply_size([job])
+        self._check_images([job])
         return await self._render_camera(job)
 
     async def batch_render_rgb(self, batch):
@@ -109,7 +133,7 @@ class SensorService:
         admitted = await asyncio.gather(
             *(self._admit_camera(item.request) for item in batch.items), return_exceptions=True
         )
-        self._check_reply_size([job for job in admitted if isinstance(job, _CameraJob)])
+        self._check_images(job for job in admitted if isinstance(job, _CameraJob))
         results = await asyncio.gather(*(self._finish(job) for job in admitted), return_exceptions=True)
         reply = sensorsim.BatchRGBRenderReturn()
         for item, result in zip(batch.items, results, strict=True):
@@ -126,10 +150,11 @@ class SensorService:
     async def render_lidar(self, request):
         """One sweep."""
         loaded = await self._scene(request.scene_id)
-        sensing, threshold = await self._run(self._loading, wire.read_lidar_request, request)
+        sensing, threshold = await self._run(self._reading, wire.read_lidar_request, request)
         sensing = self._admit(sensing, loaded.scene)
         beams = len(sensing.sensor.elevation_rad) * len(sensing.sensor.azimuth_rad)
         self._check_pixels(beams, f"{len(sensing.sensor.elevation_rad)}x{len(sensing.sensor.azimuth_rad)} beams")
+        self._check_reply(_BYTES_A_POINT * beams, "points", "beams")
         choice = {} if threshold is None else {"opacity_threshold": threshold}
 
         def render():
@@ -145,19 +170,20 @@ class SensorService:
         if count > self._options.max_batch_items:
             raise TooLargeError(f"a batch may have {self._options.max_batch_items} items, got {count}")
         jobs = await asyncio.gather(*(self._admit_camera(item) for item in request.rgb_requests))
-        self._check_reply_size(jobs)
+        self._check_images(jobs)
         images = await asyncio.gather(*(self._render_camera(job) for job in jobs))
         sweeps = await asyncio.gather(*(self.render_lidar(item) for item in request.lidar_requests))
         return sensorsim.AggregatedRenderReturn(rgb_returns=images, lidar_returns=sweeps)
 
     async def _admit_camera(self, message) -> _CameraJob:
         loaded = await self._scene(message.scene_id)
-        request, options = await self._run(self._loading, wire.read_camera_request, message, loaded.scene.rig.cameras)
+        request, options = await self._run(self._reading, wire.read_camera_request, message, loaded.scene.rig.cameras)
         if options.ego_mask:
             self._masks.check(options.ego_mask)
         camera = request.sensor
-        self._check_pixels(camera.width_px * camera.height_px, f"{camera.width_px}x{camera.height_px} pixels")
-        return _CameraJob(loaded, self._admit(request, loaded.scene), options)
+        pixels = camera.width_px * camera.height_px
+        self._check_pixels(pixels, f"{camera.width_px}x{camera.height_px} pixels")
+        return _CameraJob(loaded, self._admit(request, loaded.scene), options, pixels)
 
     async def _finish(self, job: _CameraJob | Exception):
         if isinstance(job, BaseException):
@@ -201,17 +227,27 @@ class SensorService:
                 f"a frame may have {self._options.max_pixels:,} pixels or beams, got {text} = {count:,}"
             )
 
-    def _check_reply_size(self, jobs: list[_CameraJob]) -> None:
-        total = sum(job.planar_bytes for job in jobs)
-        if total > self._options.max_message_bytes:
+    def _check_reply(self, size: int, what: str, fewer: str) -> None:
+        if size > self._options.max_message_bytes:
             raise TooLargeError(
-                f"the raw pixels of this reply would take {total:,} bytes of {self._options.max_message_bytes:,}; "
-                "ask for fewer or smaller images, or for PNG or JPEG"
+                f"the raw {what} of this reply may take {size:,} bytes of {self._options.max_message_bytes:,}; "
+                f"ask for fewer {fewer}"
             )
 
+    def _check_images(self, jobs: Iterable[_CameraJob]) -> None:
+        self._check_reply(sum(job.planar_bytes for job in jobs), "pixels", "or smaller images, or for PNG or JPEG")
+
     async def _scene(self, name: str) -> LoadedScene:
-        self._store.resolve(name)
-        return await self._run(self._loading, self._store.get, name)
+        loaded = self._store.in_memory(name)
+        if loaded is not None:
+            return loaded
+        # One thread a scene, however many clients wait; shielded, so that one who leaves does not end it for the rest.
+        scene_id = self._store.resolve(name)
+        if scene_id not in self._loads:
+            load = asyncio.ensure_future(self._run(self._loading, self._store.get, scene_id))
+            load.add_done_callback(lambda _: self._loads.pop(scene_id, None))
+            self._loads[scene_id] = load
+        return await asyncio.shield(self._loads[scene_id])
 
     @staticmethod
     async def _run(executor: ThreadPoolExecutor, function: Callable, *arguments):
@@ -294,16 +330,16 @@ class SensorService:
 
     async def edit_assets(self, request):
         """Not offered."""
-        raise Unsupported("assets cannot be replaced or inserted; move actors with a request's dynamic_objects")
+        raise UnsupportedError("assets cannot be replaced or inserted; move actors with a request's dynamic_objects")
 
     async def restore_model_parameters(self, request):
         """Not offered: nothing can be edited."""
-        raise Unsupported("there is nothing to restore, since scenes cannot be edited")
+        raise UnsupportedError("there is nothing to restore, since scenes cannot be edited")
 
     async def shut_down(self, request):
         """Stops the server, if it was started so that clients may."""
         if not self._options.allow_shut_down:
-            raise Unsupported("this server was not started with permission to be shut down by clients")
+            raise UnsupportedError("this server was not started with permission to be shut down by clients")
         self._request_stop()
         return common.Empty()
 

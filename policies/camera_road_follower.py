@@ -1,7 +1,8 @@
 """Sees one front image, calls road what looks like the road under its bonnet, and drives where it is free.
 
-The image is laid out on the ground (z = 0 of the rig) as a grid, colours are compared with those just ahead of the
-car, and of a fan of two-arc paths the one with the most room is driven. No route, no map, no actors, no depth.
+The image is laid out on the ground, colours are compared with those just ahead of the car, and of a fan of two-arc
+paths the one with the most room is driven that keeps the car's place between the borders of the road. No route, no
+map, no actors, no depth.
 """
 
 from __future__ import annotations
@@ -9,22 +10,32 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float64
 
-from nurec_sim import geometry
+from nurec_sim.policies._ground_view import (
+    AHEAD_M,
+    CELL_M,
+    SIDE_M,
+    borders,
+    distance_to,
+    ground_view,
+    looks_like,
+    room_beside,
+    without_paint,
+)
 from nurec_sim.policies._paths import make_plan, pursue, toward_speed
-from nurec_sim.types import CameraFrame, CameraModel, Needs, Observation, Plan, Rig
+from nurec_sim.types import Needs, Observation, Plan, Rig
 
-CELL_M, AHEAD_M, SIDE_M = 0.25, 32.0, 10.0
 SEED_LENGTH_M, SEED_HALF_WIDTH_M = 4.0, 1.0
-TINT_TOLERANCE, DARKER, BRIGHTER = 0.09, -0.9, 0.28
-"""Road differs from the seed by at most this in log colour ratios, and by this in log brightness."""
-SUNLIGHT, SUN_TOLERANCE, SUN_RANGE = (0.16, -0.17), 0.055, 2.0
-"""Out of a shadow, lit by the sky, into the sun, log r/g and log b/g of asphalt change in this ratio to brightness."""
-CAR_HALF_WIDTH_M, ROOM_WANTED_M = 1.15, 1.0
+SHADE = 0.4
+"""Sun and shade differ by at least this in log brightness."""
+CAR_HALF_WIDTH_M, SPARE_M = 1.15, 1.0
 CURVATURES = np.array([-0.12, -0.08, -0.05, -0.03, -0.015, -0.006, 0.0, 0.006, 0.015, 0.03, 0.05, 0.08, 0.12])
-FIRST_ARC_M = 10.0
+FIRST_ARC_M, STEP_M = 10.0, 0.5
+BORDER_LIMIT_M, BORDER_SLACK_M, NEARER, PLACE_M = 6.0, 0.5, 0.5, (8.0, 22.0)
 BRAKE_MPS2, STOP_GAP_M, START_SPEED_MPS = 3.0, 3.0, 4.0
+FREE_WEIGHT, SPARE_WEIGHT, PLACE_WEIGHT, BEND_WEIGHT, S_BEND_WEIGHT, CHANGE_WEIGHT = 0.3, 6.0, 6.0, 25.0, 12.0, 20.0
+"""Worth of a metre of way without cars, of spare room, out of place, and of curvature, in metres of road ahead."""
 
 
 class CameraRoadFollower:
@@ -37,131 +48,108 @@ class CameraRoadFollower:
         self.reset(Rig({}, {}), 0)
 
     def reset(self, rig: Rig, seed: int) -> None:
-        """Forget the road's colour and the speed at the start."""
+        """Forget the road's colour, the place on it, and the speed at the start."""
         self.front_m = rig.body.center_m[0] + rig.body.size_m[0] / 2
-        self.road_colour: Float64[np.ndarray, " 3"] | None = None
-        self.cruise_mps: float | None = None
+        self.road: Float64[np.ndarray, " 3"] | None = None
+        self.sunlit = False
+        self.place_m: Float64[np.ndarray, " 2"] | None = None
+        self.cruise_mps = 0.0
         self.curvature = 0.0
 
     def plan(self, observation: Observation) -> Plan:
         """Five seconds along the roomiest path."""
-        if self.cruise_mps is None:
+        if self.cruise_mps == 0.0:
             self.cruise_mps = max(observation.ego.speed_mps, START_SPEED_MPS)
-        frame = observation.cameras["front"]
-        seen, colours = ground_view(frame)
+        seen, colours = ground_view(observation.cameras["front"])
         path, free_m = self.roomiest(self.blocked(seen, colours), seen)
-        to_bumper = max(0.0, free_m - self.front_m - STOP_GAP_M)
+        to_stop = max(0.0, free_m - self.front_m - STOP_GAP_M)
 
         def accel_of(t_s: float, driven_m: float, speed: float) -> float:
-            safe = math.sqrt(2 * BRAKE_MPS2 * max(0.0, to_bumper - driven_m))
-            wanted = min(self.cruise_mps or 0.0, safe)
-            return max(-6.0, 4 * (wanted - speed)) if safe < speed else toward_speed(wanted, speed)
+            safe = math.sqrt(2 * BRAKE_MPS2 * max(0.0, to_stop - driven_m))
+            return max(-6.0, 4 * (safe - speed)) if safe < speed else toward_speed(min(self.cruise_mps, safe), speed)
 
         return make_plan(observation, pursue(path, observation.ego.speed_mps, accel_of))
 
     def blocked(self, seen: Bool[np.ndarray, "x y"], colours: Float64[np.ndarray, "x y 3"]) -> Bool[np.ndarray, "x y"]:
-        """Seen ground cells that do not look like road; learns the road's colour from the seed ahead of the car."""
-        first = int(np.argmax(seen[:, seen.shape[1] // 2]))
-        rows, half = int(SEED_LENGTH_M / CELL_M), int(SEED_HALF_WIDTH_M / CELL_M)
-        middle = seen.shape[1] // 2
-        seed = np.zeros_like(seen)
-        seed[first : first + rows, middle - half : middle + half] = True
-        seed &= seen
-        if seed.any():
-            here = np.median(colours[seed], axis=0)
-            if self.road_colour is None:
-                self.road_colour = here
-            elif looks_like(colours[seed], self.road_colour).mean() > 0.5:
-                # The road's colour drifts; a car right ahead must not become "road".
-                self.road_colour = 0.7 * self.road_colour + 0.3 * here
-        if self.road_colour is None:
+        """Seen ground cells that do not look like road."""
+        self.learn(seen, colours)
+        if self.road is None:
             return seen
-        road = looks_like(colours, self.road_colour) | ~seen
-        # Markings, cracks and single pixels are thinner than half a metre: opening the blocked cells removes them.
-        return grown(~grown(road, 1), 1) & seen
+        return without_paint(seen & ~looks_like(colours, self.road, self.sunlit), colours, self.road) & seen
+
+    def learn(self, seen: Bool[np.ndarray, "x y"], colours: Float64[np.ndarray, "x y 3"]) -> None:
+        """Keep the colour of the road, in the sun where there is one, from the seed ahead of the car."""
+        middle = seen.shape[1] // 2
+        first = int(np.argmax(seen[:, middle]))
+        half = int(SEED_HALF_WIDTH_M / CELL_M)
+        ahead = np.zeros_like(seen)
+        ahead[first : first + int(SEED_LENGTH_M / CELL_M), middle - half : middle + half] = True
+        seed = colours[ahead & seen]
+        if len(seed) == 0:
+            return
+        here = np.median(seed, axis=0)
+        if self.road is None:
+            self.road = here
+        brighter = here[2] - self.road[2]
+        if looks_like(seed, self.road, sunlit=False).mean() > 0.5 and brighter > -SHADE:
+            # A car right ahead must not become "road", nor shade the measure of sunlit road.
+            self.sunlit |= brighter > SHADE
+            self.road = self.road + (1.0 if brighter > SHADE else 0.3) * (here - self.road)
+        around = colours[seen] - self.road
+        bluish = (around[:, 0] < 0.1 * around[:, 2] / 2) & (around[:, 1] > -0.1 * around[:, 2] / 2)
+        shaded = looks_like(colours[seen], self.road, sunlit=True) & (around[:, 2] < -SHADE) & bluish
+        self.sunlit |= bool(shaded.mean() > 0.05)
 
     def roomiest(
         self, blocked: Bool[np.ndarray, "x y"], seen: Bool[np.ndarray, "x y"]
     ) -> tuple[Float64[np.ndarray, "k 2"], float]:
-        """The best two-arc path and how far it is free: room and distance for it, bends against it."""
+        """The best two-arc path and how far it is free."""
         first, second = (c.ravel() for c in np.meshgrid(CURVATURES, CURVATURES, indexing="ij"))
-        station = np.arange(0.0, AHEAD_M, 0.5)
+        station = np.arange(0.0, AHEAD_M, STEP_M)
         paths = two_arcs(first, second, station)
         row = np.clip((paths[..., 0] / CELL_M).astype(np.int64), 0, blocked.shape[0] - 1)
         column = np.floor((paths[..., 1] + SIDE_M) / CELL_M).astype(np.int64)
         outside = (column < 0) | (column >= blocked.shape[1])
         column = np.clip(column, 0, blocked.shape[1] - 1)
-        room = distance_to(blocked)[row, column]
         near = paths[..., 0] < np.argmax(seen.any(axis=1)) * CELL_M  # below the image's lower edge
         hidden = outside | (~seen[row, column] & ~near)
-        stops = (room < CAR_HALF_WIDTH_M) | hidden
-        free = np.where(stops.any(axis=1), station[np.argmax(stops, axis=1)], AHEAD_M)
-        reached = station[None] < free[:, None]
-        spare = np.clip(room - CAR_HALF_WIDTH_M, 0.0, ROOM_WANTED_M)
-        mean_spare = (spare * reached).sum(axis=1) / np.maximum(reached.sum(axis=1), 1)
-        bends = 25 * np.abs(first) + 12 * np.abs(second - first) + 20 * np.abs(first - self.curvature)
-        best = int(np.argmax(free + 6 * mean_spare - bends))
+        room = distance_to(blocked, CAR_HALF_WIDTH_M + SPARE_M)[row, column]
+        free = free_along(station, hidden | (room < CAR_HALF_WIDTH_M))
+        edges = borders(seen, blocked)
+        room_to_edges = distance_to(edges, CAR_HALF_WIDTH_M + SPARE_M)[row, column]
+        road = free_along(station, hidden | (room_to_edges < CAR_HALF_WIDTH_M))
+        spare = mean_where(station < free[:, None], np.clip(room - CAR_HALF_WIDTH_M, 0.0, SPARE_M))
+        # More way than it takes to stop from cruising speed is worth nothing: else every car is overtaken.
+        enough = self.front_m + STOP_GAP_M + self.cruise_mps**2 / (2 * BRAKE_MPS2) + 4.0
+        counted = (station < road[:, None]) & (station >= PLACE_M[0]) & (station < PLACE_M[1])
+        gain = np.minimum(road, enough) + FREE_WEIGHT * np.minimum(free, enough) + SPARE_WEIGHT * spare
+        cost = PLACE_WEIGHT * self.displaced(edges, row, column, counted) + BEND_WEIGHT * np.abs(first)
+        cost += S_BEND_WEIGHT * np.abs(second - first) + CHANGE_WEIGHT * np.abs(first - self.curvature)
+        best = int(np.argmax(gain - cost))
         self.curvature = float(first[best])
-        return paths[best, : max(2, int(free[best] / 0.5))], float(free[best])
+        return paths[best, : max(2, int(free[best] / STEP_M))], float(free[best])
+
+    def displaced(
+        self, edges: Bool[np.ndarray, "x y"], row: np.ndarray, column: np.ndarray, counted: Bool[np.ndarray, "p s"]
+    ) -> Float64[np.ndarray, " p"]:
+        """Metres by which each path is farther from a border of the road than the car was at the start, or nearer."""
+        beside = room_beside(edges, BORDER_LIMIT_M)[:, row, column]
+        rooms = np.stack([mean_where(counted, side) for side in beside])
+        if self.place_m is None:
+            self.place_m = rooms[:, len(CURVATURES) ** 2 // 2]  # the straight path is the middle one
+        farther = rooms - self.place_m[:, None]
+        cost = np.clip(farther - BORDER_SLACK_M, 0.0, None) + NEARER * np.clip(-farther - BORDER_SLACK_M, 0.0, None)
+        return cost.sum(axis=0)
 
 
-def ground_view(frame: CameraFrame) -> tuple[Bool[np.ndarray, "x y"], Float64[np.ndarray, "x y 3"]]:
-    """The image laid on the ground: which cells it shows, and their (log r/g, log b/g, log brightness)."""
-    pixels = ground_pixels(frame.camera)
-    seen = pixels[..., 0] >= 0
-    rgb = smoothed(frame.rgb)[pixels[..., 1], pixels[..., 0]]
-    logs = np.log(rgb + 4.0)
-    return seen, np.stack([logs[..., 0] - logs[..., 1], logs[..., 2] - logs[..., 1], logs.mean(axis=-1)], axis=-1)
+def free_along(station: Float64[np.ndarray, " s"], stops: Bool[np.ndarray, "p s"]) -> Float64[np.ndarray, " p"]:
+    """Metres along each path to its first stop."""
+    return np.where(stops.any(axis=1), station[np.argmax(stops, axis=1)], AHEAD_M)
 
 
-def ground_pixels(camera: CameraModel) -> np.ndarray:
-    """Image column and row [x, y, 2] at which an ideal pinhole sees each ground cell; -1 where it does not."""
-    x = (np.arange(int(AHEAD_M / CELL_M)) + 0.5) * CELL_M
-    y = (np.arange(int(2 * SIDE_M / CELL_M)) + 0.5) * CELL_M - SIDE_M
-    ground = np.stack(np.broadcast_arrays(x[:, None], y[None, :], 0.0), axis=-1)
-    inside_camera = geometry.transform_points(geometry.inverse(camera.rig_from_camera), ground)
-    depth = np.maximum(inside_camera[..., 2], 0.1)
-    lens = camera.lens
-    u = np.floor(lens.fx_px * inside_camera[..., 0] / depth + lens.cx_px)
-    v = np.floor(lens.fy_px * inside_camera[..., 1] / depth + lens.cy_px)
-    good = (inside_camera[..., 2] > 0.5) & (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
-    return np.where(good[..., None], np.stack([u, v], axis=-1), -1).astype(np.int64)
-
-
-def smoothed(rgb: UInt8[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"]:
-    """Mean over 3 x 3 pixels."""
-    padded = np.pad(rgb.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="edge")
-    rows = padded[:-2] + padded[1:-1] + padded[2:]
-    return (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9
-
-
-def looks_like(colours: Float64[np.ndarray, "*n 3"], road: Float64[np.ndarray, " 3"]) -> Bool[np.ndarray, "*n"]:
-    """Whether log colours are the road's: same tint, and not much darker or brighter."""
-    difference = colours - road
-    brighter = difference[..., 2]
-    tint = np.abs(difference[..., :2]).max(axis=-1)
-    alike = (tint < TINT_TOLERANCE) & (brighter > DARKER) & (brighter < BRIGHTER)
-    unsunned = np.abs(difference[..., :2] - brighter[..., None] * SUNLIGHT).max(axis=-1)
-    return alike | ((unsunned < SUN_TOLERANCE) & (np.abs(brighter) < SUN_RANGE))
-
-
-def grown(mask: Bool[np.ndarray, "x y"], cells: int) -> Bool[np.ndarray, "x y"]:
-    """A mask widened by ``cells`` on every side."""
-    padded = np.pad(mask, cells)
-    n, m = mask.shape
-    across = np.logical_or.reduce([padded[:, j : j + m] for j in range(2 * cells + 1)])
-    return np.logical_or.reduce([across[i : i + n] for i in range(2 * cells + 1)])
-
-
-def distance_to(blocked: Bool[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
-    """Metres to the next blocked cell, up to what matters, in steps of one cell (octagonal neighbourhoods)."""
-    near, distance = blocked, np.zeros(blocked.shape)
-    for i in range(int((CAR_HALF_WIDTH_M + ROOM_WANTED_M) / CELL_M) + 1):
-        distance += ~near * CELL_M
-        padded = np.pad(near, 1)
-        cross = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:] | near
-        near = grown(near, 1) if i % 2 else cross
-    return distance
+def mean_where(mask: Bool[np.ndarray, "p s"], values: Float64[np.ndarray, "p s"]) -> Float64[np.ndarray, " p"]:
+    """Mean of each row over its marked values; 0 where none is."""
+    return (values * mask).sum(axis=1) / np.maximum(mask.sum(axis=1), 1)
 
 
 def two_arcs(

@@ -63,20 +63,20 @@ class RouteFollower:
             return None  # behind: it must keep its own distance
         corners = geometry.box_corners_xy(actor.rig_from_box, actor.size_m[0], actor.size_m[1])
         outline = np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2])
+        # Speeds along and across the path, so that who drives along a curving road is not taken to leave it.
+        station, lateral = geometry.project_to_polyline(outline, line)
+        soon = geometry.project_to_polyline(outline + 0.1 * actor.velocity_mps, line)
+        along, across = float((soon[0] - station).mean()) / 0.1, float((soon[1] - lateral).mean()) / 0.1
         for t_s in FORESIGHT_S:
-            moved = outline + actor.velocity_mps * t_s
-            station, lateral = geometry.project_to_polyline(moved, line)
-            crosses = (lateral.min() < 0 < lateral.max()) or np.abs(
-                lateral
-            ).min() < self.half_width_m + CORRIDOR_MARGIN_M
-            gap = float(station.min()) - self.front_m
-            if not crosses or gap < -self.front_m / 2:
+            beside = lateral + across * t_s
+            crosses = beside.min() < 0 < beside.max()
+            gap = float(station.min()) + along * t_s - self.front_m
+            if not crosses and np.abs(beside).min() > self.half_width_m + CORRIDOR_MARGIN_M:
                 continue
-            if t_s > 0 and gap > ego_speed * t_s + REACH_MARGIN_M:
-                continue  # gone, or still far, by the time the ego is there
-            ahead = geometry.project_to_polyline(moved + 0.1 * actor.velocity_mps, line)[0]
-            along = max(0.0, float((ahead - station).mean()) / 0.1)
-            return Obstacle(gap - along * t_s, along)
+            if gap < -self.front_m / 2 or (t_s > 0 and gap > ego_speed * t_s + REACH_MARGIN_M):
+                continue  # passed, or still out of reach, by then
+            lead_speed = max(0.0, along)
+            return Obstacle(gap - lead_speed * t_s, lead_speed)
         return None
 
 

@@ -18,6 +18,7 @@ from nurec_sim.types import (
     Rig,
     RoadMap,
     Rollout,
+    Track,
     Trajectory,
 )
 
@@ -184,3 +185,27 @@ def scene(static: Gaussians, ego: Trajectory, road_map: RoadMap | None = None, *
     return GaussianScene(
         "street", static, DynamicGaussians.empty(), sky, {}, rig(), ego, (), road_map, span, {}, provenance
     )
+
+
+# ------------------------------------------------------------------------------------------------ flat closed loop
+
+
+def flat_street(world_id: str = "street", duration_s: float = 3.0):
+    """A flat hand-made world with a parked car, and a Gaussian scene that fits it."""
+    from nurec_sim.sim.flat_world import flat_world
+
+    line = np.column_stack([np.linspace(-20, 90, 60), np.zeros(60)])
+    path = Trajectory(np.array([1_000_000, 60_000_000]), standing(2, 60.0, -1.75))
+    parked = Track("parked", "automobile", CAR_M, path)
+    world = flat_world(world_id, line, 8.0, duration_s=duration_s, tracks=(parked,))
+    draw = np.random.default_rng(3)
+    count = int(30 * 110 * 14)
+    mean = np.column_stack([draw.uniform(-20, 90, count), draw.uniform(-7, 7, count), draw.normal(0, 0.02, count)])
+    static = gaussians(mean, np.where(np.abs(mean[:, 1]) < world.road_width_m / 2, Label.ROAD, Label.OTHER))
+    sky = np.zeros((6, 2, 2, 3), np.float32)
+    facts = {"method": "lift", "unknown": ["no road map in the log"]}
+    built = GaussianScene(
+        world.id, static, DynamicGaussians.empty(), sky, {}, world.rig, world.ego, tuple(world.tracks), None,
+        world.span_us, {}, facts,
+    )  # fmt: skip
+    return built, world

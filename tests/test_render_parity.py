@@ -22,7 +22,9 @@ LENSES = {
 def assert_same_image(world, asked, least_db=60.0):
     got, expected = Renderer(world, threads=2).render_camera(asked), spec.render_camera(world, asked)
     assert psnr_db(got.rgb, expected.rgb) >= least_db
-    assert np.abs(got.alpha - expected.alpha).max() < 2e-3
+    # A hit right at the cut of 1/255 may fall to either side.
+    error = np.abs(got.alpha - expected.alpha)
+    assert error.max() < 0.006 and (error > 5e-4).mean() < 2e-3
     assert (got.label != expected.label).mean() < 2e-3
     both = (got.depth_m > 0) & (expected.depth_m > 0)
     assert (got.depth_m > 0).mean() == pytest.approx((expected.depth_m > 0).mean(), abs=2e-3)
@@ -101,7 +103,9 @@ LIDARS = {
 def test_lidar(name, moving):
     static = cloud(400, 3, low=(-12, -12, -3), high=(12, 12, 3))
     world = scene(static, moving_cloud(), [track()])
-    asked = request(LIDARS[name], moved(0.3), moved(0.42, 1.2, 0.3) if moving else moved(0.3), end_us=START_US + 100_000)
+    asked = request(
+        LIDARS[name], moved(0.3), moved(0.42, 1.2, 0.3) if moving else moved(0.3), end_us=START_US + 100_000
+    )
     got, expected = Renderer(world, threads=2).render_lidar(asked), spec.render_lidar(world, asked)
     _, mine, theirs = np.intersect1d(got.beam, expected.beam, return_indices=True)
     assert len(mine) > 300

@@ -21,7 +21,9 @@ def refused(error, text, **changes):
 
 def test_poses():
     pair = GOOD.world_from_sensor.copy()
-    refused(RequestError, r"world_from_sensor must be two 4 x 4 poses .* got float64 \[4, 4\]", world_from_sensor=pair[0])
+    refused(
+        RequestError, r"world_from_sensor must be two 4 x 4 poses .* got float64 \[4, 4\]", world_from_sensor=pair[0]
+    )
     pair[1, 0, 3] = np.nan
     refused(RequestError, "sensor 'front': world_from_sensor must be finite", world_from_sensor=pair)
     pair = GOOD.world_from_sensor.copy()
@@ -42,7 +44,11 @@ def test_times():
 
 
 def test_sensors():
-    refused(RequestError, "focal lengths must be positive", sensor=camera(lens=dataclasses.replace(GOOD.sensor.lens, fx_px=0)))
+    refused(
+        RequestError,
+        "focal lengths must be positive",
+        sensor=camera(lens=dataclasses.replace(GOOD.sensor.lens, fx_px=0)),
+    )
     refused(TooLargeError, "9000 x 10 pixels are too many; at most 8192 a side", sensor=camera(9000, 10))
     refused(TooLargeError, "16777216 in all", sensor=camera(8000, 8000))
     lidar = sensors.lidar_model("VLP-16", np.eye(4), columns=8)

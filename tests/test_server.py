@@ -19,7 +19,6 @@ from nurec_sim.render import Renderer
 from nurec_sim.scene_store import SceneStore
 from nurec_sim.server import SensorServer
 from nurec_sim.service import ServiceOptions
-from nurec_sim.types import LidarModel
 from nurec_sim.wire import ImageFormat, common, sensorsim
 from nurec_sim.wire.poses import write_poses
 
@@ -344,13 +343,19 @@ def test_a_bad_lidar_request_is_explained_and_the_server_goes_on(stub, case):
     assert stub.render_lidar(lidar_message()).num_points > 100
 
 
-def test_too_many_beams_are_refused(stub):
-    lidar = rig().lidars["roof"]
-    request = replace(lidar_request(), sensor=replace(lidar, azimuth_rad=np.linspace(0, 6, 100_000)))
-    tall = replace(request.sensor, elevation_rad=np.linspace(0.1, 0, 300), row_azimuth_offset_rad=np.zeros(300))
-    assert isinstance(tall, LidarModel)
-    code, text = refusal(stub.render_lidar, lidar_message(replace(request, sensor=tall)))
-    assert code == Code.RESOURCE_EXHAUSTED and "got 300x100000 beams = 30,000,000" in text
+@pytest.mark.parametrize(
+    ("rows", "columns", "text"),
+    [(300, 100_000, "got 300x100000 beams = 30,000,000"), (40, 100_000, "may take 96,000,000 bytes of 67,108,864")],
+)
+def test_too_many_beams_are_refused(stub, rows, columns, text):
+    lidar = replace(
+        rig().lidars["roof"],
+        elevation_rad=np.linspace(0.1, -0.3, rows),
+        azimuth_rad=np.linspace(3, -3, columns),
+        row_azimuth_offset_rad=np.zeros(rows),
+    )
+    code, details = refusal(stub.render_lidar, lidar_message(replace(lidar_request(), sensor=lidar)))
+    assert code == Code.RESOURCE_EXHAUSTED and text in details
 
 
 def test_raw_pixels_beyond_a_message_are_refused_before_they_are_drawn(stub):
@@ -362,7 +367,7 @@ def test_raw_pixels_beyond_a_message_are_refused_before_they_are_drawn(stub):
         batch.items.add(camera_name=name, request=with_change(ask))
     begin = time.perf_counter()
     code, text = refusal(stub.batch_render_rgb, batch)
-    assert code == Code.RESOURCE_EXHAUSTED and "would take 96,000,000 bytes of 67,108,864" in text
+    assert code == Code.RESOURCE_EXHAUSTED and "may take 96,000,000 bytes of 67,108,864" in text
     assert time.perf_counter() - begin < 2
 
 
@@ -605,6 +610,40 @@ def test_what_a_client_gave_up_is_not_rendered(world):
         assert first.result().image_bytes
         assert stub.render_rgb(camera_message(camera_request(t_us=5_400_000))).image_bytes
     assert gated.begun == [5_100_000, 5_400_000]
+
+
+def test_a_scene_that_loads_does_not_hold_up_the_others(world):
+    gate, begun = threading.Event(), []
+
+    def make_renderer(loading):
+        begun.append(loading.id)
+        assert loading.id == "street" or gate.wait(30)
+        return Renderer(loading, threads=2)
+
+    store = SceneStore([world, scene("slow")], make_renderer=make_renderer)
+    with SensorServer(store, port=0) as address, Stub(address) as stub:
+        waiting = [stub.render_rgb.future(camera_message(scene_id="slow")) for _ in range(8)]
+        waiting[0].cancel()
+        assert stub.render_rgb(camera_message(), timeout=20).image_bytes
+        assert stub.get_loaded_scenes(common.Empty(), timeout=2).scenes[0].scene_id == "clipgt-street"
+        gate.set()
+        assert all(call.result().image_bytes for call in waiting[1:])
+    assert sorted(begun) == ["slow", "street"]
+
+
+def test_a_frame_in_progress_is_finished_before_the_server_stops(world):
+    gated = Gated(world)
+    server = SensorServer(SceneStore([world], make_renderer=lambda scene: gated), port=0)
+    with Stub(server.start()) as stub:
+        call = stub.render_rgb.future(camera_message())
+        wait_until(lambda: gated.begun)
+        stopping = threading.Thread(target=server.stop)
+        stopping.start()
+        time.sleep(0.2)
+        gated.gate.set()
+        assert call.result(timeout=20).image_bytes
+        stopping.join(20)
+        assert not stopping.is_alive()
 
 
 def wait_until(condition, seconds=20):

@@ -104,6 +104,46 @@ def test_a_client_may_shut_the_server_down_if_allowed():
     server.stop()
 
 
+class Counting:
+    """A renderer that notes what it is asked for."""
+
+    def __init__(self, world):
+        self.inner, self.drawn = one_thread(world), []
+
+    def render_camera(self, request, outputs=()):
+        self.drawn.append(request.sensor.id)
+        return self.inner.render_camera(request, outputs)
+
+    def render_lidar(self, request):
+        self.drawn.append(request.sensor.id)
+        return self.inner.render_lidar(request)
+
+
+def test_a_server_can_warm_up_before_somebody_asks(caplog):
+    made = []
+    store = SceneStore([scene()], make_renderer=lambda s: made.append(Counting(s)) or made[0])
+    with SensorServer(store, port=0, options=ServiceOptions(warm_up=True)):
+        end = time.monotonic() + 20
+        while not (made and made[0].drawn == ["front", "roof"]):
+            assert time.monotonic() < end
+            time.sleep(0.01)
+    assert not caplog.records
+
+
+def test_a_warm_up_that_fails_is_a_line_in_the_log(caplog):
+    def refuse(world):
+        raise ArchiveError("no such luck")
+
+    store = SceneStore([scene()], make_renderer=refuse)
+    with SensorServer(store, port=0, options=ServiceOptions(warm_up=True)) as address:
+        with (
+            RemoteSensors(address, "street", timeout_s=10) as remote,
+            pytest.raises(ArchiveError, match="no such luck"),
+        ):
+            remote.cameras()
+    assert "could not warm up: no such luck" in caplog.text
+
+
 # --------------------------------------------------------------------------------------------------------------- store
 
 

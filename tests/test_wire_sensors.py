@@ -73,6 +73,13 @@ def test_the_quaternion_is_wxyz_of_the_pose_of_b_in_a():
     assert message.quat.x == message.quat.y == 0
 
 
+def test_a_stale_exact_rotation_is_ignored_however_far_away():
+    message = common.Pose()
+    write_poses(geometry.pose_from_xyyaw(1e6, 0, 0.2)[None], [message])
+    message.quat.w, message.quat.z = np.cos(0.15), np.sin(0.15)
+    assert geometry.yaw_of(read_poses([message], ["p"])[0]) == pytest.approx(0.3)
+
+
 def test_a_stale_exact_pose_is_ignored():
     message = common.Pose()
     write_poses(POSE[None], [message])
@@ -238,15 +245,25 @@ def test_device_types_are_our_tables(number, name):
     assert np.array_equal(lidar.azimuth_rad, table.azimuth_rad)
 
 
+def test_a_custom_lidar_may_leave_out_what_is_usual():
+    message = sensorsim.LidarSpec()
+    wire.write_lidar(rig().lidars["roof"], message)
+    for name in ("row_azimuth_offset_rad", "frequency_hz", "max_range_m"):
+        message.custom_model.ClearField(name)
+    lidar = wire.read_lidar(message)
+    assert not lidar.row_azimuth_offset_rad.any() and len(lidar.row_azimuth_offset_rad) == 16
+    assert (lidar.frequency_hz, lidar.range_m) == (10.0, (0.5, 200.0))
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (lambda m: m.custom_model.ClearField("elevation_rad"), "needs 1 to 100000 elevations .* got 0 and 180"),
-        (lambda m: m.custom_model.row_azimuth_offset_rad.pop(), "needs 16 values .one a row. or none, got 15"),
-        (lambda m: m.custom_model.azimuth_rad.__setitem__(3, float("nan")), "finite angles in radians"),
-        (lambda m: m.custom_model.elevation_rad.__setitem__(3, -20.0), "elevations within -pi/2..pi/2"),
-        (lambda m: setattr(m.custom_model, "min_range_m", 300.0), "0 <= min_range_m < max_range_m"),
-        (lambda m: setattr(m.custom_model, "frequency_hz", -1.0), "frequency_hz > 0"),
+        (lambda m: m.custom_model.ClearField("elevation_rad"), "custom_model: .* elevation_rad must be a list of at"),
+        (lambda m: m.custom_model.row_azimuth_offset_rad.pop(), "16 rows but 15 row_azimuth_offset_rad"),
+        (lambda m: m.custom_model.azimuth_rad.__setitem__(3, float("nan")), "azimuth_rad must be .* finite"),
+        (lambda m: m.custom_model.elevation_rad.__setitem__(3, -20.0), "stay within .-pi/2, pi/2"),
+        (lambda m: setattr(m.custom_model, "min_range_m", 300.0), "0 <= near < far"),
+        (lambda m: setattr(m.custom_model, "frequency_hz", -1.0), "frequency_hz must be positive, got -1"),
         (lambda m: setattr(m.custom_model, "spin", 4), "spin must be one of"),
         (lambda m: (m.ClearField("custom_model"), setattr(m, "lidar_type", 8)), "lidar_type must be one of .* got 8"),
     ],

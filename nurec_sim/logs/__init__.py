@@ -2,11 +2,12 @@
 
 from nurec_sim.logs.check import check_clip
 from nurec_sim.logs.clip import Clip
-from nurec_sim.logs.describe import ClipSummary, describe_clip
+from nurec_sim.logs.describe import SENSOR_COLUMNS, ClipSummary, describe_clip
 from nurec_sim.logs.reader import open_clip
 from nurec_sim.logs.write import CameraEntry, LidarEntry, write_clip
 
 __all__ = [
+    "SENSOR_COLUMNS",
     "CameraEntry",
     "Clip",
     "ClipSummary",

@@ -9,6 +9,10 @@ import numpy as np
 from nurec_sim.errors import ClipError
 from nurec_sim.types import Matrix4
 
+# Larger numbers mean nothing here, and their squares would overflow.
+LARGEST = 1e60
+LARGEST_INTEGER = 1 << 62
+
 
 def required(where: str, row: Any, key: str) -> Any:
     """A field that must be there.
@@ -46,7 +50,7 @@ def number(where: str, row: Any, key: str, default: float | None = None) -> floa
     if default is not None and isinstance(row, dict) and row.get(key) is None:
         return default
     value = required(where, row, key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(float(value)):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < LARGEST:
         raise ClipError(f"{where}: {key!r} must be a finite number, got {value!r}")
     return float(value)
 
@@ -58,7 +62,7 @@ def integer(where: str, row: Any, key: str) -> int:
         ClipError: it is missing or not a whole number.
     """
     value = required(where, row, key)
-    if isinstance(value, bool) or not isinstance(value, int):
+    if isinstance(value, bool) or not isinstance(value, int) or abs(value) > LARGEST_INTEGER:
         raise ClipError(f"{where}: {key!r} must be a whole number, got {value!r}")
     return value
 
@@ -72,14 +76,14 @@ def array(where: str, row: Any, key: str, shape: tuple[int | None, ...]) -> np.n
     value = required(where, row, key)
     try:
         result = np.array(value, np.float64)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise ClipError(f"{where}: {key!r} must be lists of numbers: {error}") from error
     fits = result.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, result.shape, strict=True))
     if not fits:
         wanted = " x ".join("n" if n is None else str(n) for n in shape)
         raise ClipError(f"{where}: {key!r} must have the shape {wanted}, got {result.shape}")
-    if not np.isfinite(result).all():
-        raise ClipError(f"{where}: {key!r} must be finite")
+    if not (np.abs(result) < LARGEST).all():
+        raise ClipError(f"{where}: {key!r} must be finite, and below {LARGEST:g}")
     return result
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from nurec_sim import geometry
 from nurec_sim.errors import ClipError
-from nurec_sim.logs import calibration, fields
+from nurec_sim.logs import calibration, fields, tables
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.storage import Storage, checked_name
 from nurec_sim.logs.sweeps import SweepRecord
@@ -27,7 +27,7 @@ def read_native(storage: Storage, meta: dict[str, Any]) -> Clip:
     rig, scales = calibration.rig_from_json(calib)
     ego_from_rig = geometry.inverse(calibration.ground_shift(calib))
     frames = storage.read_json("frames.json")
-    recorded = calibration.trajectory_from_json(
+    recorded = tables.trajectory_from_json(
         "frames.json: ego", fields.required("frames.json", frames, "ego"), "T_world_ego"
     )
     ego = Trajectory(recorded.t_us, recorded.world_from_body @ ego_from_rig)
@@ -36,7 +36,7 @@ def read_native(storage: Storage, meta: dict[str, Any]) -> Clip:
     tracks: list[Any] = []
     if storage.exists("tracks.json"):
         tracks = fields.of_kind("tracks.json", storage.read_json("tracks.json"), "tracks", list)
-    parsed = [calibration.track_from_json(index, row) for index, row in enumerate(tracks)]
+    parsed = [tables.track_from_json(index, row) for index, row in enumerate(tracks)]
     names = [track.id for track in parsed]
     if doubles := sorted({name for name in names if names.count(name) > 1}):
         raise ClipError(f"tracks.json: track id {doubles[0]!r} appears twice")
@@ -45,7 +45,7 @@ def read_native(storage: Storage, meta: dict[str, Any]) -> Clip:
         rig=rig,
         ego=ego,
         tracks=parsed,
-        road_map=calibration.map_from_json(storage.read_json("map.json")) if storage.exists("map.json") else None,
+        road_map=tables.map_from_json(storage.read_json("map.json")) if storage.exists("map.json") else None,
         images={name: list(_images(rows, rig.cameras[name], ego)) for name, rows in images.items()},
         sweeps={name: list(_sweeps(rows, rig.lidars[name], ego, scales[name])) for name, rows in sweeps.items()},
         storage=storage,

@@ -24,6 +24,7 @@ from nurec_sim.types import CameraModel, LidarModel, Matrix4, Pinhole, Rig, Spin
 SCHEMA = "realdata-pack-1"
 LIDAR_ID = "lidar"
 FULL_BYTE = 255.0
+LATEST_S = 1e12
 STAND_IN_TABLE = "PANDAR128"
 _TABLE_OF_WORDS = {
     "hdl-64": "HDL-64",
@@ -86,7 +87,10 @@ def read_pack(storage: Storage, meta: dict[str, Any]) -> Clip:
 
 
 def _microseconds(where: str, row: Any, key: str) -> int:
-    return round(fields.number(where, row, key) * 1e6)
+    seconds = fields.number(where, row, key)
+    if not 1 <= seconds <= LATEST_S:
+        raise ClipError(f"{where}: {key!r} must lie between 1 and {LATEST_S:g} seconds, got {seconds}")
+    return round(seconds * 1e6)
 
 
 def _camera(name: str, row: Any, rig_from_ego: Matrix4) -> CameraModel:
@@ -166,7 +170,7 @@ def _tracks(frames: list[Any], times: list[int], world_from_ego: list[Matrix4]) 
     """Boxes joined by their ``track_id``; a box without one is a track of a single pose."""
     seen: dict[str, dict[str, Any]] = {}
     for index, frame in enumerate(frames):
-        for number, box in enumerate(frame.get("boxes") or ()):
+        for number, box in enumerate(fields.of_kind(f"frames.json: frame {index}", frame, "boxes", list, default=[])):
             where = f"frames.json: frame {index}: box {number}"
             given = fields.of_kind(where, box, "type", str)
             if given.lower() in IGNORED:

@@ -37,12 +37,12 @@ def read_tables(path: str | Path) -> Clip:
     if not storage.exists(META_FILE):
         raise ClipError(f"{str(storage.path)!r} has no {META_FILE}; this is not a clip folder")
     meta = storage.read_json(META_FILE)
-    schema = fields.required(META_FILE, meta, "schema")
-    reader = _READERS.get(schema) if isinstance(schema, str) else None
-    if reader is None:
-        raise ClipError(f"{storage.path.name}: unknown clip schema {schema!r}; known are {sorted(_READERS)}")
+    name = storage.path.name
     try:
-        return reader(storage, meta)
+        schema = fields.of_kind(META_FILE, meta, "schema", str)
+        if schema not in _READERS:
+            raise ClipError(f"unknown clip schema {schema!r}; known are {sorted(_READERS)}")
+        return _READERS[schema](storage, meta)
     except ClipError as error:
-        name = storage.path.name
-        raise error if str(error).startswith(f"{name}:") else ClipError(f"{name}: {error}") from None
+        # What the storage says begins with the clip's name already.
+        raise error if str(error).startswith(f"{name}: ") else ClipError(f"{name}: {error}") from None

@@ -7,8 +7,12 @@ from __future__ import annotations
 
 import io
 import json
+import lzma
+import struct
 import zipfile
+import zlib
 from pathlib import Path, PurePosixPath
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -19,6 +23,9 @@ from nurec_sim.errors import ClipError
 MAX_FILE_BYTES = 1 << 30
 MAX_ZIP_FILES = 1_000_000
 META_FILE = "meta.json"
+# What the zip and numpy readers raise for broken bytes.
+_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, ValueError, EOFError, OSError, KeyError,
+           MemoryError, NotImplementedError, RuntimeError, SyntaxError, TokenError)  # fmt: skip
 
 
 def checked_name(name: str) -> str:
@@ -50,7 +57,10 @@ class Storage:
             raise ClipError(f"no clip at {str(self.path)!r}: give a clip folder or a .zip of one")
         if not zipfile.is_zipfile(self.path):
             raise ClipError(f"{str(self.path)!r} is neither a clip folder nor a zip file")
-        self._archive = zipfile.ZipFile(self.path)
+        try:
+            self._archive = zipfile.ZipFile(self.path)
+        except _DAMAGE as error:
+            raise ClipError(f"{self.path.name}: the zip file is damaged: {error}") from error
         self._prefix = self._check_archive(self._archive)
 
     def _check_archive(self, archive: zipfile.ZipFile) -> str:
@@ -92,7 +102,7 @@ class Storage:
         if self._archive is not None:
             try:
                 return self._archive.read(self._prefix + name)
-            except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+            except _DAMAGE as error:
                 raise ClipError(f"{self.path.name}: file {name} in the zip is damaged: {error}") from error
         file = self.path / name
         size = file.stat().st_size
@@ -136,7 +146,10 @@ class Storage:
             raise ClipError(f"{self.path.name}: {name} is neither a JPEG nor a PNG image")
         if not complete:
             raise ClipError(f"{self.path.name}: image {name} is truncated ({len(data)} bytes, no end mark)")
-        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        try:
+            bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        except cv2.error:
+            bgr = None
         if bgr is None:
             raise ClipError(f"{self.path.name}: image {name} cannot be decoded")
         return np.ascontiguousarray(bgr[:, :, ::-1])
@@ -157,5 +170,5 @@ class Storage:
                 )
             with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
                 return {key: arrays[key] for key in arrays.files}
-        except (zipfile.BadZipFile, ValueError, EOFError, OSError, KeyError, MemoryError) as error:
+        except _DAMAGE as error:
             raise ClipError(f"{self.path.name}: {name} is not a readable .npz file: {error}") from error

@@ -94,18 +94,18 @@ def _compensated(
     ego: Trajectory, record: SweepRecord, xyz: Float64[np.ndarray, "n 3"], point_t_us: Int64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 3"]:
     """Points at the reference time, by the ego's own motion; unchanged where the log knows no motion."""
-    prolonged = _prolonged(ego, record.end_us - record.start_us)
-    if prolonged is None or (point_t_us == record.t_us).all():
+    longer = prolonged(ego, record.end_us - record.start_us)
+    if longer is None or (point_t_us == record.t_us).all():
         return xyz
     lidar_from_rig = geometry.inverse(ego.at(record.t_us)) @ record.world_from_lidar
     # Poses at instants 20 us apart: at 50 m/s that errs by half a millimetre, the grain of the files, and costs a
     # twentieth of a pose for each point.
     instants, place = np.unique(point_t_us // INSTANT_US, return_inverse=True)
-    poses = prolonged.at(instants * INSTANT_US + INSTANT_US // 2) @ lidar_from_rig
+    poses = longer.at(instants * INSTANT_US + INSTANT_US // 2) @ lidar_from_rig
     return sensors.compensate_sweep(xyz, poses[place], record.world_from_lidar)
 
 
-def _prolonged(ego: Trajectory, margin_us: int) -> Trajectory | None:
+def prolonged(ego: Trajectory, margin_us: int) -> Trajectory | None:
     """A trajectory carried on at constant velocity before its first and after its last pose; None of a single pose."""
     if len(ego.t_us) < 2:
         return None

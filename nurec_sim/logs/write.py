@@ -19,7 +19,7 @@ from jaxtyping import Float64, UInt8
 
 from nurec_sim import sensors
 from nurec_sim.errors import ClipError
-from nurec_sim.logs import calibration, sweeps
+from nurec_sim.logs import calibration, sweeps, tables
 from nurec_sim.logs.consistency import EARLIEST_US
 from nurec_sim.logs.storage import META_FILE
 from nurec_sim.types import Rig, RoadMap, Sweep, Track, Trajectory
@@ -112,9 +112,9 @@ def write_clip(
         _write_json(folder / "calib.json", calibration.rig_to_json(rig, INTENSITY_SCALE))
         _write_json(folder / "frames.json", records)
         if tracks:
-            _write_json(folder / "tracks.json", {"tracks": [calibration.track_to_json(track) for track in tracks]})
+            _write_json(folder / "tracks.json", {"tracks": [tables.track_to_json(track) for track in tracks]})
         if road_map is not None:
-            _write_json(folder / "map.json", calibration.map_to_json(road_map))
+            _write_json(folder / "map.json", tables.map_to_json(road_map))
         _move_into_place(folder, path, work)
     finally:
         shutil.rmtree(work, ignore_errors=True)

@@ -23,10 +23,12 @@ def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, toleranc
     ``tolerance`` (1/m) plus 8 %. Nearer views and views that face the surface weigh more.
 
     Returns:
-        rgb [n,3] (0..255), and the smallest length of a pixel along the surface in metres [n], infinite if unseen.
+        rgb [n,3] (0..255); the smallest length of a pixel along the surface in metres [n], infinite if unseen; and
+        the number of views that look through the point [n].
     """
     n = len(xyz)
     rgb, pixel = np.zeros((n, 3), np.float32), np.full(n, np.inf, np.float32)
+    through = np.zeros(n, np.int32)
     for i in range(n):
         weights = np.zeros(3)
         best = np.zeros((3, 3))
@@ -39,6 +41,7 @@ def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, toleranc
                 continue
             row, column = int(v), int(u)
             if abs(inverse_depth[k, row, column] - 1.0 / z) > tolerance + 0.08 / z:
+                through[i] += inverse_depth[k, row, column] < 1.0 / z
                 continue
             rx, ry = (u - view[1]) / view[0], (v - view[2]) / view[0]
             length = np.sqrt(rx * rx + ry * ry + 1)
@@ -59,7 +62,7 @@ def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, toleranc
         if total > 0:
             for j in range(3):
                 rgb[i, j] = (weights * best[:, j]).sum() / total
-    return rgb, pixel
+    return rgb, pixel, through
 
 
 def fill_unseen(

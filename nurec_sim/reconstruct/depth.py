@@ -50,7 +50,7 @@ def splat(view, xyz, normal, spacing, offset, inverse_depth, index):
         u, v, depth = project_point(view, x, y, z)
         if depth < 0.3 or u < -8 or v < -8 or u > width + 8 or v > height + 8:
             continue
-        radius = min(max(0.7 * spacing[i] * focal / depth, 0.6), 12.0)
+        radius = min(max(0.5 * spacing[i] * focal / depth, 0.6), 8.0)
         n0 = view[5] * normal[i, 0] + view[6] * normal[i, 1] + view[7] * normal[i, 2]
         n1 = view[8] * normal[i, 0] + view[9] * normal[i, 1] + view[10] * normal[i, 2]
         n2 = view[11] * normal[i, 0] + view[12] * normal[i, 1] + view[13] * normal[i, 2]
@@ -119,8 +119,10 @@ def _popcount(x):
 
 
 @njit(cache=True, nogil=True)
-def matching_cost(view, world_from_view, others, rgb, codes, other_rgb, other_codes, step, levels, cost):
+def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, other_codes, step, levels, cost):
     """Fill ``cost[h, w, levels]`` (0..100): mean of the two best neighbours of census and colour differences.
+
+    Pixels with a prior are left alone.
 
     ``others`` stacks packed views, ``other_rgb``/``other_codes`` their pictures, padded to one size.
     """
@@ -129,6 +131,8 @@ def matching_cost(view, world_from_view, others, rgb, codes, other_rgb, other_co
     focal = view[0]
     for row in range(height):
         for column in range(width):
+            if prior[row, column] > 0:
+                continue
             rx, ry = (column + 0.5 - view[1]) / focal, (row + 0.5 - view[2]) / focal
             f = min(max(view[20] * (column + 0.5) + view[21] * (row + 0.5) + view[22], -0.5), 0.5)
             ox, oy, oz = view[17] * f, view[18] * f, view[19] * f
@@ -187,9 +191,7 @@ def add_prior(cost, prior, sky, step):
             w = prior[row, column]
             if w > 0:
                 for level in range(levels):
-                    cost[row, column, level] = 0.3 * cost[row, column, level] + min(
-                        PRIOR_COST * abs(level - w / step), PRIOR_CAP
-                    )
+                    cost[row, column, level] = min(PRIOR_COST * abs(level - w / step), PRIOR_CAP)
             elif sky[row, column]:
                 for level in range(1, levels):
                     cost[row, column, level] += SKY_COST
@@ -275,7 +277,7 @@ def dense_inverse_depth(
         for n, (_, picture, code) in enumerate(neighbours):
             pictures[n, : picture.shape[0], : picture.shape[1]] = picture
             codes[n, : code.shape[0], : code.shape[1]] = code
-        matching_cost(packed, world_from_view, others, rgb, census(gray), pictures, codes, step, levels, cost)
+        matching_cost(packed, world_from_view, prior, others, rgb, census(gray), pictures, codes, step, levels, cost)
     add_prior(cost, prior, sky, step)
     result = smooth_depth(cost, gray, step)
     trusted = (prior > 0) & (np.abs(result - prior) < 1.5 * step + 0.1 * prior)

@@ -18,6 +18,9 @@ BAND_M, BAND_SLOPE = 0.4, 0.08
 FILL_M = 3.0
 """Holes are filled up to this far from measured ground."""
 
+SEEN_M = 0.4
+"""Ground this close to a measured cell counts as seen."""
+
 
 @dataclass(frozen=True)
 class Ground:
@@ -119,7 +122,8 @@ def find_ground(
     tall = _tall(points, flat, filled, rows, columns)
     near = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) * cell <= FILL_M
     free = ~steps & ~tall & near & (distance <= settings.road_reach_m)
-    road = _grow(free, filled, distance, cell, settings)
+    seen = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) * cell <= SEEN_M
+    road = _grow(free, seen | (distance < 1.2), filled, distance, cell, settings)
     return Ground(low, cell, filled, known, near | (distance < 1.2), road)
 
 
@@ -200,24 +204,49 @@ def _tall(points: np.ndarray, flat: np.ndarray, filled: np.ndarray, rows: int, c
 
 
 def _grow(
-    free: np.ndarray, height: np.ndarray, distance: np.ndarray, cell_m: float, settings: GroundSettings
+    free: np.ndarray,
+    seen: np.ndarray,
+    height: np.ndarray,
+    distance: np.ndarray,
+    cell_m: float,
+    settings: GroundSettings,
 ) -> np.ndarray:
-    """The part of the free cells that the path reaches through gaps wider than twice the opening, out to the kerb."""
+    """The part of the free cells that the path reaches, out to the kerb.
+
+    Through seen cells only, because interpolation under a parked car turns a kerb into a ramp; through gaps wider than
+    twice the opening; and no cell may lie far above or below the road beside it, which stops what leaks all the same.
+    """
     driven = distance < 0.9
-    room = cv2.distanceTransform((free | driven).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
-    _, part = cv2.connectedComponents(((room > settings.opening_m) | driven).astype(np.uint8), connectivity=4)
-    reached = np.isin(part, np.setdiff1d(np.unique(part[driven]), [0]))
-    away, nearest = cv2.distanceTransformWithLabels(
-        (~reached).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    road = reached | (free & (away * cell_m <= settings.opening_m + 1.5 * cell_m))
+    room = cv2.distanceTransform((free & seen | driven).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
+    wide = (room > settings.opening_m) | driven
+    reached = driven.copy()
+    ring = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(round(0.4 / cell_m), 1) + 1,) * 2)
+    for _ in range(round(settings.road_reach_m / 0.4)):
+        level = _beside(height, reached, 0.5 / cell_m)
+        grown = wide & (cv2.dilate(reached.astype(np.uint8), ring) > 0) & (np.abs(height - level) < settings.step_m)
+        if not (grown & ~reached).any():
+            break
+        reached |= grown
+    away = cv2.distanceTransform((~reached).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
+    road = reached | (free & seen & (away <= settings.opening_m + 1.5 * cell_m))
     # The step test reaches 0.2 m across the kerb: give back what still lies as low as the road beside it.
-    away, nearest = cv2.distanceTransformWithLabels(
-        (~road).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    away = cv2.distanceTransform((~road).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
+    road |= seen & (away <= 0.3) & (np.abs(height - _beside(height, road, 0.15 / cell_m)) < settings.step_m)
+    # What nobody saw belongs to whatever lies next to it.
+    unseen, nearest = cv2.distanceTransformWithLabels(
+        (~seen).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    heights = np.zeros(nearest.max() + 1, np.float32)
-    heights[nearest[road]] = height[road]
-    road |= (away * cell_m <= 0.3) & (np.abs(height - heights[nearest]) < settings.step_m)
+    is_road = np.zeros(nearest.max() + 1, bool)
+    is_road[nearest[seen & road]] = True
+    road |= ~seen & is_road[nearest] & (unseen * cell_m <= FILL_M)
     count, part, stats, _ = cv2.connectedComponentsWithStats((~road).astype(np.uint8), connectivity=4)
     small = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] * cell_m**2 < 1.0)
     return road | np.isin(part, small)
+
+
+def _beside(height: np.ndarray, part: np.ndarray, sigma: float) -> np.ndarray:
+    """Height of the nearest cells of a part: their mean under a Gaussian, infinite where none is near."""
+    weight = part.astype(np.float32)
+    total = cv2.GaussianBlur(np.where(part, height, 0).astype(np.float32), (0, 0), sigma)
+    mass = cv2.GaussianBlur(weight, (0, 0), sigma)
+    return np.where(mass > 1e-3, total / np.maximum(mass, 1e-3), np.inf)

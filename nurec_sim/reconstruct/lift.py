@@ -292,16 +292,16 @@ def _isp(
     colours = {}
     for camera in cameras:
         mine = [k for k, view in enumerate(views) if view.camera_id == camera]
-        rgb, pixel = _look_up(world.cloud.xyz_m[some], world.normal[some], [views[k] for k in mine],
+        rgb, pixel, _ = _look_up(world.cloud.xyz_m[some], world.normal[some], [views[k] for k in mine],
                               [pictures[k] for k in mine], [views[k].rgb for k in mine], None)  # fmt: skip
         colours[camera] = rgb / 255, np.isfinite(pixel)
     return colour.solve_isp(cameras, colours)
 
 
-def _look_up(xyz, normal, views, pictures, rgb, body: Surfels | None) -> tuple[np.ndarray, np.ndarray]:
-    """Colours of points of a body (None: the world) and the pixel size they were seen with."""
+def _look_up(xyz, normal, views, pictures, rgb, body: Surfels | None) -> tuple[np.ndarray, ...]:
+    """Colours of points of a body (None: the world), the pixel size they were seen with, views looking through."""
     if not views or not len(xyz):
-        return np.zeros((len(xyz), 3), np.float32), np.full(len(xyz), np.inf, np.float32)
+        return np.zeros((len(xyz), 3), np.float32), np.full(len(xyz), np.inf, np.float32), np.zeros(len(xyz), np.int32)
     packed, present = _packed(views, body)
     depths, stack = lifting.stacked([p.inverse_depth for p in pictures]), lifting.stacked(rgb)
     parts = np.array_split(np.arange(len(xyz)), THREADS)
@@ -311,7 +311,7 @@ def _look_up(xyz, normal, views, pictures, rgb, body: Surfels | None) -> tuple[n
                 lambda part: colour.seen_colours(xyz[part], normal[part], packed, depths, stack, present, 0.002), parts
             )
         )
-    return np.concatenate([r[0] for r in results]), np.concatenate([r[1] for r in results])
+    return tuple(np.concatenate(items) for items in zip(*results, strict=True))
 
 
 def _packed(views: Sequence[View], body: Surfels | None) -> tuple[np.ndarray, np.ndarray]:
@@ -332,10 +332,10 @@ def _body_gaussians(
 ) -> tuple[Gaussians, int]:
     """Gaussians of one body in its frame, and how many of them were lifted from pixels."""
     cloud = body.cloud
-    seen_rgb, pixel = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
+    seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
     shown = colour.fill_unseen(cloud.xyz_m, seen_rgb / 255, np.isfinite(pixel), cloud.intensity)
     # A view replaces surfels by its pixels unless it sees them so obliquely that surfels are the finer of the two.
-    keep = pixel > 3 * body.spacing_m
+    keep = (pixel > 3 * body.spacing_m) & (np.isfinite(pixel) | (through == 0))
     parts = [
         surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.spacing_m[keep], shown[keep], cloud.intensity[keep],
                        body.label[keep], settings.opacity)
@@ -376,7 +376,6 @@ def _lifted(
         return Lifted(*(np.zeros((0, 3)),) * 3, np.zeros(0), np.zeros((0, 3), np.float32), *(np.zeros(0, np.int32),) * 2)
     everything, z = Lifted.concatenate(parts), np.concatenate(depths)
     packed, present = _packed(views, body)
-    widths, heights = (np.array([getattr(view.tile, name) for view in views]) for name in ("width", "height"))
     step = 1 / settings.views.min_depth_m / (settings.views.levels - 1)
     stack = lifting.stacked([picture.inverse_depth for picture in pictures])
     chunks = np.array_split(np.arange(len(everything)), THREADS)
@@ -384,7 +383,7 @@ def _lifted(
         kept = list(
             pool.map(
                 lambda part: lifting.owned(
-                    everything.xyz_m[part], z[part], everything.view[part], packed, stack, widths, heights, present,
+                    everything.xyz_m[part], z[part], everything.view[part], packed, stack, present,
                     0.3 * step, lifting.OWNER_RATIO, lifting.OWNER_BORDER,
                 ),
                 chunks,

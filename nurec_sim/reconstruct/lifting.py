@@ -97,27 +97,35 @@ def normals_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64
 
 
 @njit(cache=True, nogil=True)
-def owned(xyz, depth, own_view, packed, inverse_depth, widths, heights, present, tolerance, ratio, border):
-    """Which points no other view sees from much nearer.
+def owned(xyz, depth, own_view, packed, inverse_depth, present, tolerance, ratio, border):
+    """Which points no other view sees from much nearer, and not more views look through than agree with.
 
-    A view sees a point that projects well inside it and whose inverse depth agrees with the picture's within
-    ``tolerance`` (1/m) plus 10 %. ``packed[k]`` projects from the points' frame into view k.
+    A view agrees with a point that projects well inside it if its inverse depth there is the same within ``tolerance``
+    (1/m) plus 10 %; it looks through the point if it is clearly smaller. ``packed[k]`` projects from the points' frame
+    into view k.
     """
     keep = np.ones(len(xyz), np.bool_)
     for i in range(len(xyz)):
+        agree, through = 0, 0
         for k in range(len(packed)):
             if k == own_view[i] or not present[k]:
                 continue
-            u, v, z = project_point(packed[k], xyz[i, 0], xyz[i, 1], xyz[i, 2])
-            if z <= 0.3 or z > ratio * depth[i]:
+            view = packed[k]
+            u, v, z = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+            if z <= 0.3 or z > 1.5 * depth[i] or u < 0 or v < 0 or u >= view[3] or v >= view[4]:
                 continue
-            margin = border * widths[k]
-            if u < margin or v < margin * 0.5 or u >= widths[k] - margin or v >= heights[k] - margin * 0.5:
-                continue
-            w = inverse_depth[k, int(v), int(u)]
-            if abs(w - 1.0 / z) < tolerance + 0.1 / z:
-                keep[i] = False
-                break
+            here, w = 1.0 / z, inverse_depth[k, int(v), int(u)]
+            if abs(w - here) < tolerance + 0.1 * here:
+                agree += 1
+                margin = border * view[3]
+                inside = margin < u < view[3] - margin and 0.5 * margin < v < view[4] - 0.5 * margin
+                if inside and z < ratio * depth[i]:
+                    keep[i] = False
+                    break
+            elif w < here:
+                through += 1
+        if through > agree:
+            keep[i] = False
     return keep
 
 

@@ -47,11 +47,11 @@ class ViewSettings:
     """Working views have at most this width, by a whole-number reduction of the image."""
     max_field_deg: float = 110.0
     """Wider lenses are cut into several views."""
-    max_views: int = 78
+    max_views: int = 36
     """Frames are skipped evenly until no more working views than this are left."""
-    levels: int = 96
+    levels: int = 72
     """Inverse-depth hypotheses of the matching, from infinity to ``min_depth_m``."""
-    min_depth_m: float = 3.0
+    min_depth_m: float = 3.5
     max_depth_m: float = 150.0
     """Surfaces farther than this belong to the sky cubemap."""
     neighbours: int = 4

@@ -54,7 +54,7 @@ def surface_of(
         normal = np.where(line[:, None], facing, normal)
         flip = np.sum(normal * to_eye[part], axis=1) < 0
         normals[part] = np.where(flip[:, None], -normal, normal)
-        spacing[part] = np.clip(distance[:, min(4, k)] * 0.8, cloud.spacing_m[part], 6 * cloud.spacing_m[part])
+        spacing[part] = np.clip(distance[:, min(4, k)] * 0.8, cloud.spacing_m[part], 3 * cloud.spacing_m[part])
     return normals, spacing
 
 

@@ -108,10 +108,8 @@ def sweep_frame(
     )
 
 
-def visible_gaussians(
-    scene: GaussianScene, request: SensorRequest, grid: RayGrid
-) -> tuple[Gaussians, np.ndarray]:
-    """Both layers at the reference instant, coloured for the view, and the order in which those in front are blended."""
+def visible_gaussians(scene: GaussianScene, request: SensorRequest, grid: RayGrid) -> tuple[Gaussians, np.ndarray]:
+    """Both layers at the reference instant, coloured for the view, and the order of those in front."""
     world_from_sensor, t_us = reference_pose(request, grid.reference)
     actors = {
         name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.float64(grid.reference))

@@ -146,7 +146,7 @@ def _unknown(report: RunReport) -> str:
         if share is not None and share > 0:
             items.append(
                 f"{escape(policy)} ({escape(reconstruction)}): the road under the car was unknown in "
-                f"{100 * share:.1f} % of the states; a scene above {100 * MAX_UNKNOWN_FRAC:.0f} % is left out of off-road"
+                f"{100 * share:.1f} % of the states; a scene above {100 * MAX_UNKNOWN_FRAC:.0f} % does not count"
             )
     items += [
         f"{escape(full_name(entry))}: no video: {escape(entry.video_error)}"

@@ -123,8 +123,9 @@ def time_view(entry: ReportRollout) -> dict[str, Any]:
     zero_us = int(t_us[0])
     seconds = (t_us - zero_us) / 1e6
     recorded_speed = _recorded_speed(rollout)
+    speed = np.array([state.speed_mps for state in rollout.states])
     rows = [
-        ("speed, m/s", [("ego", [s.speed_mps for s in rollout.states], EGO, None), ("recorded", recorded_speed, RECORDED, "dash")]),
+        ("speed, m/s", [("ego", speed, EGO, None), ("recorded", recorded_speed, RECORDED, "dash")]),
         ("acceleration, m/s2", [("ego", [s.accel_mps2 for s in rollout.states], EGO, None)]),
         ("beyond the road, m", [("ego", _values(entry.series.get("offroad_max_excursion_m")), EGO, None)]),
         ("gap to actors, m", [("ego", _values(entry.series.get("min_distance_to_obstacle_m")), EGO, None)]),
@@ -133,7 +134,7 @@ def time_view(entry: ReportRollout) -> dict[str, Any]:
     layout["xaxis"] |= {
         "title": {"text": "seconds since the start"},
         "anchor": "y4",
-        "range": _rounded([0, seconds[-1]]),
+        "range": _rounded([0, max(seconds[-1], 0.1)]),
     }
     layout["showlegend"] = False
     height, gap = 0.205, 0.06
@@ -258,7 +259,8 @@ def _event_marks(entry: ReportRollout, view: View) -> list[dict[str, Any]]:
         place = view.points(geometry.interpolate_poses(rollout.t_us, rollout.world_from_rig, t_us)[None, :2, 3])[0]
         at_s = (t_us - rollout.states[0].t_us) / 1e6
         traces.append(
-            {"type": "scatter", "mode": "markers", "name": text[:40], "x": _rounded(place[:1]), "y": _rounded(place[1:]),
+            {"type": "scatter", "mode": "markers", "name": text[:40],
+             "x": _rounded(place[:1]), "y": _rounded(place[1:]),
              "marker": {"color": colour, "symbol": symbol, "size": 11, "line": {"color": "#ffffff", "width": 1}},
              "text": [f"{at_s:.1f} s: {text}"], "hoverinfo": "text"}
         )  # fmt: skip
@@ -284,11 +286,11 @@ def _moments(entry: ReportRollout, zero_us: int) -> list[tuple[float, str, str]]
 def _spans(entry: ReportRollout, zero_us: int) -> list[dict[str, Any]]:
     """Shaded times behind the curves: off-road red, road unknown grey."""
     shapes = []
-    for name, level, colour in (("offroad", 0.5, "rgba(220,38,38,0.15)"), ("offroad_unknown_frac", 0.5, "rgba(100,116,139,0.18)")):  # fmt: skip
+    for name, colour in (("offroad", "rgba(220,38,38,0.15)"), ("offroad_unknown_frac", "rgba(100,116,139,0.18)")):
         series = entry.series.get(name)
         if series is None or not len(series.t_us):
             continue
-        marked = np.concatenate([[False], series.valid & (np.nan_to_num(series.values) > level), [False]])
+        marked = np.concatenate([[False], series.valid & (np.nan_to_num(series.values) > 0.5), [False]])
         edges = np.flatnonzero(np.diff(marked.astype(int)))
         for start, end in zip(edges[::2], edges[1::2], strict=True):
             x0, x1 = ((int(series.t_us[index]) - zero_us) / 1e6 for index in (start, end - 1))

@@ -17,8 +17,8 @@ def rollout_card(index: int, entry: ReportRollout, report: RunReport, embed: boo
     """The card of one rollout; figures are drawn into ``plan<index>`` and ``time<index>`` when it is opened."""
     rollout = entry.rollout
     summary = (
-        f"<summary>{escape(rollout.policy)} <span class='where'>· {escape(rollout.scene_id)} · {escape(rollout.reconstruction)} · "
-        f"seed {rollout.seed}</span>{_tags(entry)}</summary>"
+        f"<summary>{escape(rollout.policy)} <span class='where'>· {escape(rollout.scene_id)} · "
+        f"{escape(rollout.reconstruction)} · seed {rollout.seed}</span>{_tags(entry)}</summary>"
     )
     parts = []
     if rollout.status != "ok":

@@ -6,13 +6,13 @@ Public names load on first use, so that importing the package costs nothing.
 from importlib import import_module
 
 _HOMES = {
-    "execute": "execute",
-    "finish": "finish",
-    "headline": "finish",
+    "execute": "drive",
+    "finish": "results",
+    "headline": "results",
     "load_rollout": "rollout_file",
     "record_video": "video",
     "save_rollout": "rollout_file",
-    "write_report": "finish",
+    "write_report": "results",
 }
 __all__ = sorted(_HOMES)
 

@@ -15,7 +15,7 @@ from nurec_sim.errors import ArchiveError, ReconstructError, RunError
 from nurec_sim.metrics.offroad_grid import OffroadGrid, scene_offroad_grid
 from nurec_sim.runs.folder import ROAD, SCENE, write_text
 from nurec_sim.scene import codec
-from nurec_sim.scene.summary import scene_hash
+from nurec_sim.scene import scene_hash
 from nurec_sim.types import GaussianScene, Label, RoadMap
 
 

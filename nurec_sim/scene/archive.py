@@ -44,7 +44,7 @@ KNOT_TIMES, KNOTS, OWNERS = (f"nurec_sim/dynamic_{name}.npy" for name in ("knot_
 TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY, KNOT_TIMES, KNOTS, OWNERS)
 """The members that a scene is read from; all others are for other programs."""
 
-MAX_JSON_BYTES = 512 * 2**20
+MAX_JSON_BYTES = 256 * 2**20
 
 
 def write_scene(scene: GaussianScene, path: Path | str, *, overwrite: bool = False) -> Path:

@@ -7,7 +7,7 @@ from jaxtyping import Bool
 
 from nurec_sim import sensors
 from nurec_sim.errors import ArchiveError
-from nurec_sim.types import GAUSSIAN_FIELDS, DynamicGaussians, Gaussians, GaussianScene, Label
+from nurec_sim.types import GAUSSIAN_FIELDS, DynamicGaussians, Gaussians, GaussianScene, Label, Rig, Trajectory
 
 MIN_START_US = 1_000_000  # AlpaSim asks for times up to half a second before the start, as unsigned integers
 _GAUSSIAN_SHAPES = {
@@ -50,22 +50,34 @@ def _check_facts(scene: GaussianScene) -> None:
     ids = [track.id for track in scene.tracks]
     if len(set(ids)) != len(ids):
         raise ArchiveError(f"track ids must differ, got {sorted({i for i in ids if ids.count(i) > 1})} more than once")
-    for camera_id, camera in scene.rig.cameras.items():
-        if camera.id != camera_id:
-            raise ArchiveError(f"rig.cameras[{camera_id!r}] holds the camera {camera.id!r}; both must be the same")
-        try:
-            sensors.check_camera(camera)
-        except ValueError as error:
-            raise ArchiveError(f"camera {camera_id!r}: {error}") from error
-    for lidar_id, lidar in scene.rig.lidars.items():
-        if lidar.id != lidar_id:
-            raise ArchiveError(f"rig.lidars[{lidar_id!r}] holds the LiDAR {lidar.id!r}; both must be the same")
-        if lidar.elevation_rad.shape != lidar.row_azimuth_offset_rad.shape or lidar.rig_from_lidar.shape != (4, 4):
-            raise ArchiveError(f"LiDAR {lidar_id!r}: elevations and row offsets must have one length, the pose be 4x4")
+    _check_path("ego", scene.ego)
+    for track in scene.tracks:
+        _check_path(f"track {track.id!r}", track.path)
+    _check_rig(scene.rig)
     for camera_id, times in scene.camera_times_us.items():
         _check_array(times, f"camera_times_us[{camera_id!r}]", np.int64, (len(times), 2))
         if (times[:, 0] > times[:, 1]).any():
             raise ArchiveError(f"camera_times_us[{camera_id!r}]: an exposure ends before it starts")
+
+
+def _check_rig(rig: Rig) -> None:
+    own_ids = [camera.id for camera in rig.cameras.values()] + [lidar.id for lidar in rig.lidars.values()]
+    for key, own_id in zip([*rig.cameras, *rig.lidars], own_ids, strict=True):
+        if own_id != key:
+            raise ArchiveError(f"the rig lists the sensor {own_id!r} as {key!r}; both must be the same")
+    try:
+        for camera in rig.cameras.values():
+            sensors.check_camera(camera)
+        for lidar in rig.lidars.values():
+            sensors.check_lidar(lidar)
+    except ValueError as error:
+        raise ArchiveError(str(error)) from error
+
+
+def _check_path(what: str, path: Trajectory) -> None:
+    rotation = path.world_from_body[:, :3, :3]
+    skew = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    _refuse((skew > 1e-3) | (np.linalg.det(rotation) < 0), what, "poses", "not rotations")
 
 
 def check_gaussians(gaussians: Gaussians, what: str) -> None:

@@ -32,7 +32,8 @@ def scene_hash(scene: GaussianScene) -> str:
     digest.update(codec.dump({"facts": scene_facts(scene), "isp": scene.isp}, "the scene"))
     for name, array in scene_arrays(scene).items():
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        digest.update(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
+        canonical = array + array.dtype.type(0)  # -0 is 0: OpenUSD merges equal arrays, whatever their zeros' signs
+        digest.update(np.ascontiguousarray(canonical).data.cast("B") if array.size else b"")
     return digest.hexdigest()
 
 

@@ -17,7 +17,7 @@ CELL_M = 0.5
 REACH_M = 150.0  # how far from the recorded path the mesh may extend
 LEVEL_M = 4.0  # points higher above or lower below the path than this plus 15 % of their distance are another level
 CORRIDOR_M = 3.0  # ground is always made this far to each side of the path
-HOLE_CELLS = 4  # holes up to this many cells away from a known height are filled
+HOLE_CELLS = 8  # holes up to this many cells away from a known height are filled
 MAX_CELLS = 4_000_000
 
 

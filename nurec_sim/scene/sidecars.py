@@ -7,7 +7,6 @@ mean the same in every reading.
 
 from __future__ import annotations
 
-import datetime
 import uuid
 from collections.abc import Mapping
 from typing import Any
@@ -61,12 +60,11 @@ def _metadata(scene: GaussianScene, digest: str) -> bytes:
     import yaml
 
     start_us, end_us = scene.span_us
-    epoch = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
-    recorded = epoch + datetime.timedelta(seconds=start_us // 1_000_000)
+    recorded = np.datetime64(start_us // 1_000_000, "s")
     metadata = {
         "scene_id": alpasim_id(scene.id),
         "version_string": "nurec_sim",
-        "training_date": recorded.strftime("%Y-%m-%d"),  # the recording's: archives hold no wall clock
+        "training_date": str(np.datetime_as_string(recorded, unit="D")),  # the recording's: archives hold no wall clock
         "dataset_hash": digest,
         "uuid": str(uuid.uuid5(uuid.NAMESPACE_URL, digest)),
         "is_resumable": False,

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64
 
 from nurec_sim.geometry import cubemap_coordinates
 
-MAX_ROWS = 1024
+MAX_ROWS = 512
 
 
 def latlong_directions(rows: int) -> Float64[np.ndarray, "rows columns 3"]:

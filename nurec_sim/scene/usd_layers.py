@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Float64, Int32
 
 from nurec_sim.errors import ArchiveError
 from nurec_sim.types import Gaussians, GaussianScene, Label
@@ -138,10 +138,16 @@ def extent_of(positions: Sequence[Float32[np.ndarray, "n 3"]], scale_m: Float32[
     """Bounds [2,3] of Gaussians at any of several sets of positions, three standard deviations wide."""
     if len(scale_m) == 0:
         return np.zeros((2, 3), np.float32)
-    margin = 3 * scale_m.max(axis=1, keepdims=True)
+    margin = 3 * scale_m.max(axis=1, keepdims=True).astype(np.float64)
     low = np.min([(p - margin).min(axis=0) for p in positions], axis=0)
     high = np.max([(p + margin).max(axis=0) for p in positions], axis=0)
-    return np.stack([low, high]).astype(np.float32)
+    return _to_float32(np.stack([low, high]))
+
+
+def _to_float32(values: Float64[np.ndarray, "*n"]) -> Float32[np.ndarray, "*n"]:
+    """Nearest float32, the largest one instead of infinity."""
+    largest = np.finfo(np.float32).max
+    return np.clip(values, -largest, largest).astype(np.float32)
 
 
 def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray, " n"]):
@@ -150,7 +156,7 @@ def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray
 
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
     rest = gaussians.sh_rest
-    dc = ((gaussians.rgb.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)[:, None]
+    dc = _to_float32((gaussians.rgb.astype(np.float64) - 0.5) / SH_C0)[:, None]
     coefficients = dc if rest is None else np.concatenate([dc, rest], axis=1)
     terms = coefficients.shape[1]
 

@@ -20,6 +20,8 @@ from nurec_sim.types import Pinhole
 # A distorted lens is not trusted beyond this tangent of the angle off the axis (87 degrees).
 WIDEST_TANGENT = 20.0
 NEAREST_Z_M = 1e-6
+# Where the denominator of g falls below this, a pole is near and the model means nothing any more.
+FAR_FROM_POLE = 0.1
 
 Points2 = Float64[np.ndarray, "n 2"]
 
@@ -64,7 +66,8 @@ def _field(lens: Pinhole) -> float:
     slope = polynomial.polyadd(polynomial.polymul(top, bottom), polynomial.polymul([0.0, 2.0], turn))
     excess = polynomial.polysub(slope, radial.MINIMUM_SLOPE * polynomial.polymul(bottom, bottom))
     return radial.first_below_zero(
-        lambda r: np.minimum(polynomial.polyval(r * r, excess), polynomial.polyval(r * r, bottom)), WIDEST_TANGENT
+        lambda r: np.minimum(polynomial.polyval(r * r, excess), polynomial.polyval(r * r, bottom) - FAR_FROM_POLE),
+        WIDEST_TANGENT,
     )
 
 
@@ -109,23 +112,28 @@ def _undistort(lens: Pinhole, target: Points2) -> tuple[Points2, Bool[np.ndarray
     top, bottom = (polynomial.polyval(grid * grid, part) for part in _radial_parts(lens))
     guess = np.interp(radius, grid * top / bottom, grid)
     flat = target * (guess / np.where(radius > 0, radius, 1.0))[:, None]
+    moving = np.arange(len(target))
     for _ in range(2 * radial.NEWTON_STEPS):
-        value, jacobian = _distort(lens, flat)
-        error = value - target
-        determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
-        safe = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
-        step = np.stack(
-            [
-                (jacobian[:, 1, 1] * error[:, 0] - jacobian[:, 0, 1] * error[:, 1]) / safe,
-                (jacobian[:, 0, 0] * error[:, 1] - jacobian[:, 1, 0] * error[:, 0]) / safe,
-            ],
-            axis=1,
-        )
-        flat = flat - step
+        place = flat[moving]
+        value, jacobian = _distort(lens, place)
+        step = _solve(jacobian, value - target[moving])
+        place = place - step
         # Outside the field the polynomials say nothing: come back to its rim and try on from there.
-        flat *= np.minimum(1.0, limit / np.maximum(np.hypot(flat[:, 0], flat[:, 1]), 1e-12))[:, None]
-        if len(flat) == 0 or np.abs(step).max() < 1e-13:
+        place *= np.minimum(1.0, limit / np.maximum(np.hypot(place[:, 0], place[:, 1]), 1e-12))[:, None]
+        flat[moving] = place
+        moving = moving[np.abs(step).max(axis=1, initial=0.0) > 1e-13]
+        if len(moving) == 0:
             break
     value, jacobian = _distort(lens, flat)
     found = np.abs(value - target).max(axis=1) < 1e-9 * np.maximum(1.0, radius)
     return flat, found & _one_to_one(jacobian)
+
+
+def _solve(jacobian: Float64[np.ndarray, "n 2 2"], error: Points2) -> Points2:
+    """Newton steps; bounded where the matrix has no inverse, which is never in the field."""
+    (a, b), (c, d) = jacobian[:, 0].T, jacobian[:, 1].T
+    determinant = a * d - b * c
+    determinant = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
+    return (
+        np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], axis=1) / determinant[:, None]
+    )

@@ -10,7 +10,7 @@ import enum
 from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.descriptor import Descriptor
@@ -27,8 +27,8 @@ SERVICE_PATHS = (SERVICE, "nurec.grpc.protos.sensorsim.SensorsimService", "senso
 class Method(NamedTuple):
     """Request and reply class of one remote procedure."""
 
-    request: type
-    reply: type
+    request: Any
+    reply: Any
 
 
 def descriptor_bytes() -> bytes:
@@ -50,7 +50,7 @@ def _load_pool() -> descriptor_pool.DescriptorPool:
 pool = _load_pool()
 
 
-def _class(descriptor: Descriptor) -> type:
+def _class(descriptor: Descriptor) -> Any:
     return message_factory.GetMessageClass(descriptor)
 
 
@@ -59,7 +59,7 @@ def _messages(file_name: str) -> SimpleNamespace:
     return SimpleNamespace(**{name: _class(descriptor) for name, descriptor in types.items()})
 
 
-def _enum(full_name: str) -> type[enum.IntEnum]:
+def _enum(full_name: str) -> Any:
     descriptor = pool.FindEnumTypeByName(full_name)
     return enum.IntEnum(descriptor.name, {value.name: value.number for value in descriptor.values})
 
@@ -82,7 +82,7 @@ METHODS = {
 """Every procedure of the sensor service by name."""
 
 
-def parse(kind: type, data: bytes):
+def parse(kind: Any, data: bytes) -> Any:
     """The message of class ``kind`` in ``data``.
 
     Raises:

@@ -40,10 +40,10 @@ def read_poses(messages: Sequence, names: Sequence[str]) -> Float64[np.ndarray, 
     position = np.array([(m.vec.x, m.vec.y, m.vec.z) for m in messages], np.float64).reshape(-1, 3)
     quat = np.array([(m.quat.w, m.quat.x, m.quat.y, m.quat.z) for m in messages], np.float64).reshape(-1, 4)
     norm2 = np.sum(quat * quat, axis=1)
-    finite = np.isfinite(position).all(axis=1) & np.isfinite(quat).all(axis=1)
-    bad = ~finite | ~(np.abs(norm2 - 1) <= QUAT_TOLERANCE)
-    if bad.any():
-        i = int(np.argmax(bad))
+    finite = np.isfinite(norm2 + np.sum(position * position, axis=1))  # squares of float32 do not overflow
+    bad = np.flatnonzero(~(finite & (np.abs(norm2 - 1) <= QUAT_TOLERANCE)))
+    if len(bad):
+        i = int(bad[0])
         values = f"vec (x, y, z) = {_text(position[i])}, quat (w, x, y, z) = {_text(quat[i])}"
         if not finite[i]:
             raise RequestError(f"{names[i]} must be finite, got {values}")
@@ -58,7 +58,9 @@ def read_poses(messages: Sequence, names: Sequence[str]) -> Float64[np.ndarray, 
         if len(message.exact):
             exact = _read_exact(message.exact, names[i])
             # A client that copied a message of ours and edited `vec` or `quat` leaves a stale `exact` behind.
-            if np.abs(exact - result[i]).max() <= 1e-6 * max(1.0, float(np.abs(position[i]).max())):
+            turned = np.abs(exact[:3, :3] - result[i, :3, :3]).max()
+            moved = np.abs(exact[:3, 3] - position[i]).max()
+            if turned <= 1e-6 and moved <= 1e-6 * max(1.0, float(np.abs(position[i]).max())):
                 result[i] = exact
     return result
 
@@ -68,7 +70,9 @@ def _read_exact(values: Iterable[float], name: str) -> Matrix4:
     if matrix.shape != (16,):
         raise RequestError(f"{name}.exact must have 16 values (a row-major 4x4) or none, got {len(matrix)}")
     matrix = matrix.reshape(4, 4)
-    if not geometry.is_rotation(matrix[:3, :3]) or not np.isfinite(matrix).all() or (matrix[3] != (0, 0, 0, 1)).any():
+    # The bound spares `is_rotation` an overflow.
+    rigid = np.isfinite(matrix).all() and np.abs(matrix[:3, :3]).max() < 2 and geometry.is_rotation(matrix[:3, :3])
+    if not rigid or (matrix[3] != (0, 0, 0, 1)).any():
         raise RequestError(f"{name}.exact must be a rigid transform with last row 0 0 0 1, got {_text(matrix.ravel())}")
     return matrix
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -11,13 +12,15 @@ from jaxtyping import Float64, UInt8
 from nurec_sim.errors import RequestError
 from nurec_sim.render.encode import encode_image
 from nurec_sim.render.requests import check_pose_pair
-from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, SensorRequest
+from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, LidarModel, SensorRequest
 from nurec_sim.wire.messages import ImageFormat
 from nurec_sim.wire.poses import check_interval, read_poses, write_poses
 from nurec_sim.wire.sensors import read_camera, read_lidar, write_camera, write_lidar
 
 _ENCODER = {ImageFormat.PNG: "png", ImageFormat.JPEG: "jpeg", ImageFormat.RGB_UINT8_PLANAR: "rgb_planar"}
 DEFAULT_JPEG_QUALITY = 95
+
+Sensor = TypeVar("Sensor", CameraModel, LidarModel)
 
 
 @dataclass(frozen=True)
@@ -40,8 +43,9 @@ def write_camera_request(request: SensorRequest, message, *, scene_id: str, appl
     Raises:
         RequestError: the frame is empty, or a pose is not finite or not rigid.
     """
-    message.resolution_w, message.resolution_h = request.sensor.width_px, request.sensor.height_px
-    write_camera(request.sensor, message.camera_intrinsics)
+    camera = _sensor_of(request, CameraModel)
+    message.resolution_w, message.resolution_h = camera.width_px, camera.height_px
+    write_camera(camera, message.camera_intrinsics)
     message.image_format = ImageFormat.RGB_UINT8_PLANAR
     if not apply_isp:
         message.apply_isp = False
@@ -54,8 +58,14 @@ def write_lidar_request(request: SensorRequest, message, *, scene_id: str) -> No
     Raises:
         RequestError: the frame is empty, or a pose is not finite or not rigid.
     """
-    write_lidar(request.sensor, message.lidar_config)
+    write_lidar(_sensor_of(request, LidarModel), message.lidar_config)
     _write_frame(request, message, scene_id)
+
+
+def _sensor_of(request: SensorRequest, kind: type[Sensor]) -> Sensor:
+    if not isinstance(request.sensor, kind):
+        raise RequestError(f"the sensor must be a {kind.__name__}, got {type(request.sensor).__name__}")
+    return request.sensor
 
 
 def _write_frame(request: SensorRequest, message, scene_id: str) -> None:
@@ -143,7 +153,7 @@ def read_camera_frame(message, request: SensorRequest) -> CameraFrame:
     Raises:
         RequestError: the reply has another size than asked for.
     """
-    camera = request.sensor
+    camera = _sensor_of(request, CameraModel)
     shape = (3, camera.height_px, camera.width_px)
     if len(message.image_bytes) != int(np.prod(shape)):
         raise RequestError(
@@ -172,6 +182,7 @@ def read_lidar_frame(message, request: SensorRequest) -> LidarFrame:
     Raises:
         RequestError: the buffers have different lengths.
     """
+    lidar = _sensor_of(request, LidarModel)
     xyz = np.frombuffer(message.point_xyzs_buffer, "<f4")
     intensity = np.frombuffer(message.point_intensities_buffer, "<f4")
     if not len(xyz):
@@ -180,10 +191,10 @@ def read_lidar_frame(message, request: SensorRequest) -> LidarFrame:
     ranges, beam = np.frombuffer(message.point_ranges_buffer, "<f4"), np.frombuffer(message.point_beams_buffer, "<i4")
     if len(xyz) != 3 * n or len(intensity) != n or len(ranges) not in (0, n) or len(beam) not in (0, n):
         raise RequestError(
-            f"lidar {request.sensor.id!r}: the reply says {n} points but holds {len(xyz)} coordinates, "
+            f"lidar {lidar.id!r}: the reply says {n} points but holds {len(xyz)} coordinates, "
             f"{len(intensity)} intensities, {len(ranges)} ranges and {len(beam)} beams"
         )
     xyz = xyz.reshape(n, 3).astype(np.float32)
     ranges = ranges.astype(np.float32) if len(ranges) else np.linalg.norm(xyz, axis=1)
     beam = beam.astype(np.int32) if len(beam) else np.full(n, -1, np.int32)
-    return LidarFrame(request.sensor, request.start_us, request.end_us, xyz, ranges, intensity.astype(np.float32), beam)
+    return LidarFrame(lidar, request.start_us, request.end_us, xyz, ranges, intensity.astype(np.float32), beam)

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from nurec_sim.errors import RequestError
-from nurec_sim.sensors import check_camera, lidar_model, scaled_camera
+from nurec_sim.sensors import check_camera, check_lidar, lidar_model, scaled_camera
 from nurec_sim.types import (
     CameraModel,
     Fisheye,
@@ -39,7 +40,6 @@ _SHUTTER_TYPE = {
     Shutter.RIGHT_TO_LEFT: ShutterType.ROLLING_RIGHT_TO_LEFT,
 }
 _SHUTTER = {number: shutter for shutter, number in _SHUTTER_TYPE.items()} | {ShutterType.UNKNOWN: Shutter.GLOBAL}
-_MAX_BEAMS_A_SIDE = 100_000
 
 
 # ------------------------------------------------------------------------------------------------------------- cameras
@@ -114,12 +114,14 @@ def read_camera(message, width_px: int, height_px: int, known: Mapping[str, Came
         )
     try:
         check_camera(native)
+        width_px, height_px = _image_size(native, width_px, height_px)
+        if (width_px, height_px) == (native.width_px, native.height_px):
+            return native
+        camera = scaled_camera(native, width_px, height_px)
+        check_camera(camera)  # strange numbers may have overflowed
     except ValueError as error:
         raise RequestError(f"camera_intrinsics: {error}") from error
-    width_px, height_px = _image_size(native, width_px, height_px)
-    if (width_px, height_px) == (native.width_px, native.height_px):
-        return native
-    return scaled_camera(native, width_px, height_px)
+    return camera
 
 
 def _image_size(native: CameraModel, width_px: int, height_px: int) -> tuple[int, int]:
@@ -198,44 +200,29 @@ def read_lidar(message) -> LidarModel:
     """The LiDAR of a ``LidarSpec`` message: its custom model, else the named device.
 
     Raises:
-        RequestError: an unknown device, or a custom model without beams, not finite or with a contradiction.
+        RequestError: an unknown device, or a custom model that ``sensors.check_lidar`` refuses.
     """
     if not message.HasField("custom_model"):
         return lidar_model(_member(LidarDeviceType, message.lidar_type, "lidar_type").name, np.eye(4))
     model = message.custom_model
-    elevation, azimuth = np.array(model.elevation_rad, np.float64), np.array(model.azimuth_rad, np.float64)
-    offset = np.array(model.row_azimuth_offset_rad, np.float64)
-    if not 1 <= len(elevation) <= _MAX_BEAMS_A_SIDE or not 1 <= len(azimuth) <= _MAX_BEAMS_A_SIDE:
-        raise RequestError(
-            f"a custom_model needs 1 to {_MAX_BEAMS_A_SIDE} elevations and azimuths, "
-            f"got {len(elevation)} and {len(azimuth)}"
-        )
-    if len(offset) not in (0, len(elevation)):
-        raise RequestError(
-            f"row_azimuth_offset_rad needs {len(elevation)} values (one a row) or none, got {len(offset)}"
-        )
-    numbers = np.concatenate([elevation, azimuth, offset, (model.frequency_hz, model.min_range_m, model.max_range_m)])
-    if not np.isfinite(numbers).all() or (np.abs(elevation) > np.pi / 2).any():
-        raise RequestError("a custom_model needs finite angles in radians, elevations within -pi/2..pi/2")
-    range_m, frequency_hz = (model.min_range_m, model.max_range_m or 200.0), model.frequency_hz or 10.0
-    if not 0 <= range_m[0] < range_m[1] or frequency_hz <= 0:
-        raise RequestError(
-            "a custom_model needs 0 <= min_range_m < max_range_m and frequency_hz > 0, "
-            f"got {range_m[0]}, {range_m[1]} and {frequency_hz}"
-        )
-    return LidarModel(
+    lidar = LidarModel(
         model.name,
-        elevation,
-        azimuth,
-        offset if len(offset) else np.zeros(len(elevation)),
+        np.array(model.elevation_rad, np.float64),
+        np.array(model.azimuth_rad, np.float64),
+        np.array(model.row_azimuth_offset_rad or [0.0] * len(model.elevation_rad), np.float64),
         np.eye(4),
         Spin[_member(CustomSpin, model.spin, "spin").name],
-        frequency_hz,
-        range_m,
+        model.frequency_hz or 10.0,
+        (model.min_range_m, model.max_range_m or 200.0),
     )
+    try:
+        check_lidar(lidar)
+    except ValueError as error:
+        raise RequestError(f"custom_model: {error}") from error
+    return lidar
 
 
-def _member(kind: type[enum.IntEnum], number: int, name: str) -> enum.IntEnum:
+def _member(kind: Any, number: int, name: str) -> enum.IntEnum:
     if number not in list(kind):
         raise RequestError(f"{name} must be one of {[member.name for member in kind]}, got {number}")
     return kind(number)

@@ -27,7 +27,7 @@ def street_plan(seed: int, seconds: float = 12.0) -> StreetPlan:
     """
     if seed < 0 or not 1.0 <= seconds <= 20.0:
         raise ValueError(f"a street needs a seed >= 0 and 1..20 seconds, got seed {seed} and {seconds} seconds")
-    rng = np.random.default_rng([seed, 0x57])
+    rng = np.random.default_rng([seed, 0x52])
     road = _road(rng)
     line = RoadLine(road)
     span_us = (START_US, START_US + round(seconds * 1e6 / traffic.STEP_US) * traffic.STEP_US)
@@ -104,15 +104,15 @@ def _surroundings(rng: np.random.Generator, line: RoadLine) -> tuple[tuple[Build
     buildings: list[Building] = []
 
     def place(xy: np.ndarray, yaw: float, width: float, depth: float, floors: int) -> bool:
-        footprint = shapely.Polygon(box_corners_xy(pose_from_xyyaw(*xy, yaw), width, depth))
+        footprint = shapely.Polygon(box_corners_xy(pose_from_xyyaw(xy[0], xy[1], yaw), width, depth))
         if any(footprint.intersects(other) for other in taken):
             return False
         taken.append(footprint.buffer(0.4))
-        tint = tuple(float(v) for v in rng.uniform(0.85, 1.0, 3))
+        red, green, blue = (float(v) for v in rng.uniform(0.85, 1.0, 3))
         buildings.append(Building(
             float(xy[0]), float(xy[1]), float(yaw), width, depth, floors, float(rng.uniform(2.9, 3.4)),
             int(rng.integers(FACADES)), bool(floors > 2 and rng.random() < 0.45),
-            bool(floors <= 3 and rng.random() < 0.65), tint))  # fmt: skip
+            bool(floors <= 3 and rng.random() < 0.65), (red, green, blue)))  # fmt: skip
         return True
 
     for side in (-1, 1):

@@ -5,11 +5,10 @@ Front faces wind counter-clockwise; OpenGL culls back faces, so a wrong winding 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import shapely
 from jaxtyping import Float64, Int64
+from numpy.typing import ArrayLike
 
 UNIT_SQUARE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 
@@ -37,17 +36,17 @@ class MeshBuilder:
         """Scales about the origin, then shifts, everything gathered so far."""
         self._points = [points * scale + shift for points in self._points]
 
-    def add(self, points: Sequence, faces: Sequence, uv: Sequence) -> None:
+    def add(self, points: ArrayLike, faces: ArrayLike, uv: ArrayLike) -> None:
         """Triangles ``faces [m,3]`` over ``points [n,3]`` with ``uv [n,2]``."""
-        points = np.asarray(points, np.float64)
-        self._points.append(points)
+        vertices = np.asarray(points, np.float64)
+        self._points.append(vertices)
         self._uv.append(np.asarray(uv, np.float64))
         self._faces.append(np.asarray(faces, np.int64) + self._count)
-        self._count += len(points)
+        self._count += len(vertices)
 
-    def quad(self, a: Sequence, b: Sequence, c: Sequence, d: Sequence, uv: Sequence = UNIT_SQUARE) -> None:
+    def quad(self, a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike, uv: ArrayLike = UNIT_SQUARE) -> None:
         """One quad, counter-clockwise seen from its front."""
-        self.add([a, b, c, d], [[0, 1, 2], [0, 2, 3]], uv)
+        self.add(np.array([a, b, c, d], np.float64), [[0, 1, 2], [0, 2, 3]], uv)
 
     def grid(self, lattice: Float64[np.ndarray, "n m 3"], uv: Float64[np.ndarray, "n m 2"] | None = None) -> None:
         """A lattice of quads whose front is along d/dn x d/dm."""
@@ -59,7 +58,7 @@ class MeshBuilder:
         faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
         self.add(lattice.reshape(-1, 3), faces, uv.reshape(-1, 2))
 
-    def box(self, center: Sequence, half: Sequence, uv_per_m: float = 1.0) -> None:
+    def box(self, center: ArrayLike, half: ArrayLike, uv_per_m: float = 1.0) -> None:
         """An axis-aligned box."""
         center, half = np.asarray(center, np.float64), np.asarray(half, np.float64)
         for axis in range(3):
@@ -71,8 +70,15 @@ class MeshBuilder:
                 self.quad(middle - along_u - along_w, middle + along_u - along_w,
                           middle + along_u + along_w, middle - along_u + along_w, uv)  # fmt: skip
 
-    def cylinder(self, start: Sequence, end: Sequence, radius: float, end_radius: float | None = None, sides: int = 12,
-                 capped: bool = True) -> None:  # fmt: skip
+    def cylinder(
+        self,
+        start: ArrayLike,
+        end: ArrayLike,
+        radius: float,
+        end_radius: float | None = None,
+        sides: int = 12,
+        capped: bool = True,
+    ) -> None:
         """A cylinder or cone between two points."""
         start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
         radii = (radius, radius if end_radius is None else end_radius)
@@ -87,7 +93,9 @@ class MeshBuilder:
                 fan = [[0, i, i + 1][::sign] if sign < 0 else [0, i, i + 1] for i in range(1, sides - 1)]
                 self.add(center + r * ring[:-1], fan, ring[:-1, :2] * 0.5 + 0.5)
 
-    def wall(self, outline: Sequence, low_m: float, high_m: float, u_per_m: float, v_low: float, v_high: float) -> None:
+    def wall(
+        self, outline: ArrayLike, low_m: float, high_m: float, u_per_m: float, v_low: float, v_high: float
+    ) -> None:
         """Vertical quads along a 2D polyline; their front is on its right (outside of a counter-clockwise ring)."""
         outline = np.asarray(outline, np.float64)
         u = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))]) * u_per_m
@@ -107,7 +115,7 @@ class MeshBuilder:
         points = np.concatenate([xy, np.full((len(xy), 1), z_m)], axis=1)
         self.add(points, np.arange(len(xy)).reshape(-1, 3), xy * uv_per_m)
 
-    def blob(self, rng: np.random.Generator, center: Sequence, radius: float, rough: float = 0.2) -> None:
+    def blob(self, rng: np.random.Generator, center: ArrayLike, radius: float, rough: float = 0.2) -> None:
         """A lumpy ball, as for the crown of a tree."""
         points, faces = icosphere(2)
         lumps = sum(np.sin(points @ (rng.normal(size=3) * rng.uniform(2, 6)) + 6 * rng.random()) for _ in range(4)) / 4

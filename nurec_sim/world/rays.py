@@ -25,13 +25,14 @@ def cast(
 ) -> tuple[Int32[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     """What rays of unit ``direction`` from one point meet first: geom id (-1 nothing), distance (0), normal (0)."""
     count = len(direction)
-    geom, distance, normal = np.empty(count, np.int32), np.empty(count), np.empty(3 * count)
+    geom, distance, normal = np.empty(count, np.int32), np.empty(count), np.empty((count, 3))
     rays = np.ascontiguousarray(direction, np.float64).ravel()
     origin = np.ascontiguousarray(origin, np.float64)
-    mujoco.mj_multiRay(street.model, data, origin, rays, _VISIBLE, 1, -1, geom, distance, normal, count, reach_m)
+    mujoco.mj_multiRay(
+        street.model, data, origin, rays, _VISIBLE, 1, -1, geom, distance, normal.reshape(-1), count, reach_m
+    )
     missed = geom < 0
     distance[missed] = 0.0
-    normal = normal.reshape(-1, 3)
     normal[missed] = 0.0
     return geom, distance, normal
 
@@ -71,7 +72,8 @@ def fire_column(
     """
     direction = beams @ world_from_lidar[:3, :3].T
     geom, distance, normal = cast(street, data, world_from_lidar[:3, 3], direction, lidar.range_m[1])
-    returned = (geom >= 0) & (distance >= lidar.range_m[0])
+    # mj_multiRay leaves out whole geoms by their distance, so a large one still answers beyond the reach.
+    returned = (geom >= 0) & (distance >= lidar.range_m[0]) & (distance <= lidar.range_m[1])
     facing = np.abs(np.sum(normal * direction, axis=1))
     intensity = np.where(returned, street.geom_reflectivity[geom] * (0.25 + 0.75 * facing), 0.0)
     return np.where(returned, distance, 0.0), intensity.astype(np.float32), np.where(returned, geom, -1)

@@ -85,12 +85,13 @@ class GlPainter:
             eye.frustum_bottom = -(camera.height_px - lens.cy_px) / lens.fy_px * NEAR_M
         sun = self._scene.lights[[i for i in range(self._scene.nlight) if self._scene.lights[i].castshadow][0]]
         forward = pose[:3, 2] * [1, 1, 0]
-        middle = pose[:3, 3] + SHADOW_AHEAD_M * forward / max(np.linalg.norm(forward), 1e-6)
+        middle = pose[:3, 3] + SHADOW_AHEAD_M * forward / (np.linalg.norm(forward) + 1e-9)
         sun.pos = middle + 120.0 * self.street.sun
 
     def _in_view(self, data: Any, camera: CameraModel, pose: Float64[np.ndarray, "4 4"]) -> np.ndarray:
         """Geoms whose bounding sphere meets the frustum, or may throw a shadow into it: the renderer culls nothing."""
         lens, radius = camera.lens, self.model.geom_rbound
+        assert isinstance(lens, Pinhole)
         offset = data.geom_xpos - pose[:3, 3]
         x, y, z = (offset @ pose[:3, :3]).T
         wide = max(lens.cx_px, camera.width_px - lens.cx_px) / lens.fx_px

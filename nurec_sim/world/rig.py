@@ -34,11 +34,13 @@ def street_rig(width_px: int = 448, height_px: int = 256, lidar_rows: int = 48, 
         lens = Pinhole(focal, focal, width_px / 2, 0.44 * height_px)
         rotation = geometry.rotation_from_yaw(np.deg2rad(yaw_deg)) @ CAMERA_FROM_RIG_AXES
         cameras[name] = CameraModel(name, width_px, height_px, lens, geometry.pose(rotation, np.array(place)))
-    steep = np.linspace(-26.0, -9.0, lidar_rows // 3, endpoint=False)
-    flat = np.linspace(-9.0, 12.0, lidar_rows - len(steep))
+    # Rows lie closest around the horizon, where the street is far, and reach up to the roofs.
+    steep, high = lidar_rows // 3, lidar_rows // 5
+    bands = ((-26.0, -9.0, steep), (-9.0, 6.0, lidar_rows - steep - high), (6.0, 21.0, high))
+    elevation_deg = np.concatenate([np.linspace(low, top, count, endpoint=False) for low, top, count in bands])
     lidar = LidarModel(
         id=LIDAR_ID,
-        elevation_rad=np.deg2rad(np.concatenate([steep, flat])[::-1]),
+        elevation_rad=np.deg2rad(elevation_deg[::-1]),
         azimuth_rad=np.pi - 2 * np.pi * (np.arange(lidar_columns) + 0.5) / lidar_columns,
         row_azimuth_offset_rad=np.zeros(lidar_rows),
         rig_from_lidar=geometry.pose(np.eye(3), np.array([1.1, 0.0, 1.9])),

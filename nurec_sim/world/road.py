@@ -40,7 +40,7 @@ class RoadLine:
         self, station_m: float | Float64[np.ndarray, "*n"], offset_m: float | Float64[np.ndarray, "*n"] = 0.0
     ) -> tuple[Float64[np.ndarray, "*n 2"], Float64[np.ndarray, "*n"]]:
         """Position and heading of places on the road; stations before the start or past the end are held there."""
-        yaw = np.interp(station_m, self.station_m, self.yaw_rad)
+        yaw = np.asarray(np.interp(station_m, self.station_m, self.yaw_rad))
         x = np.interp(station_m, self.station_m, self.xy_m[:, 0])
         y = np.interp(station_m, self.station_m, self.xy_m[:, 1])
         return np.stack([x - offset_m * np.sin(yaw), y + offset_m * np.cos(yaw)], axis=-1), yaw

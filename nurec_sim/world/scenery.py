@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import shapely
 
@@ -174,7 +176,7 @@ def _props(builder: SpecBuilder, plan: StreetPlan, rng: np.random.Generator) -> 
     meshes = {"bush": builder.mesh(bush, 180.0), "lamp": builder.mesh(_lamp()), "pole": builder.mesh(_sign_pole())}
     meshes["board"] = builder.mesh(_sign_board())
     for prop in plan.props:
-        where = {"xyz": (prop.x_m, prop.y_m, plan.road.kerb_height_m), "yaw": prop.yaw_rad}
+        where: dict[str, Any] = {"xyz": (prop.x_m, prop.y_m, plan.road.kerb_height_m), "yaw": prop.yaw_rad}
         leaves, world = f"leaves{prop.variant % TREES}", builder.world
         if prop.kind == "tree":
             size = int(np.searchsorted((0.9, 1.15), prop.scale))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,7 +14,16 @@ from jaxtyping import Float32, Float64, Int32, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError, TooLargeError
-from nurec_sim.types import CameraFrame, LidarFrame, LidarModel, Pinhole, SensorFrame, SensorRequest, Shutter
+from nurec_sim.types import (
+    CameraFrame,
+    CameraModel,
+    LidarFrame,
+    LidarModel,
+    Pinhole,
+    SensorFrame,
+    SensorRequest,
+    Shutter,
+)
 from nurec_sim.world import rays
 from nurec_sim.world.backend import pick_backend
 from nurec_sim.world.build import ActorPlaces, Street, build_street
@@ -61,6 +71,7 @@ class TrueWorld:
         self._recorded = {track.id: track.path for track in plan.tracks()}
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="street")
         self._painter: Any = None
+        self._closed = False
         try:
             self.street: Street = self._run(self._start)
         except BaseException:
@@ -75,8 +86,9 @@ class TrueWorld:
 
     def close(self) -> None:
         """Frees the GL context and the thread; may be called again."""
-        if not self._thread._shutdown:
+        if not self._closed:
             self._run(self._stop)
+            self._closed = True
             self._thread.shutdown()
 
     def sense(self, requests: Sequence[SensorRequest]) -> list[SensorFrame]:
@@ -88,26 +100,31 @@ class TrueWorld:
         """
         for request in requests:
             self._check(request)
-        return [self._run(lambda r=request: self._frame(r)) for request in requests]
+        return [self._run(functools.partial(self._frame, request)) for request in requests]
 
     def view(self, request: SensorRequest) -> TrueView:
         """A camera image with exact depth, classes and instances; raises as ``sense`` does."""
         self._check(request)
-        return self._run(lambda: self._view(request))
+        return self._run(functools.partial(self._view, request))
 
     def scan(self, request: SensorRequest) -> TrueScan:
         """A LiDAR turn as measured, each column from where the sensor and the actors were when it fired."""
         self._check(request)
-        return self._run(lambda: self._scan(request))
+        return self._run(functools.partial(self._scan, request))
 
     # ------------------------------------------------------------------------------------- in the street's thread
 
     def _run(self, work: Callable[[], T]) -> T:
+        if self._closed:
+            raise RuntimeError("this street is closed; make a new TrueWorld")
         return self._thread.submit(work).result()
 
     def _start(self) -> Street:
         street = build_street(self.plan)
         self._data = mujoco.MjData(street.model)
+        start_us = self.plan.span_us[0]
+        actors = {name: path.at(start_us)[None] for name, path in self._recorded.items()}
+        street.pose(self._data, start_us, street.actor_places(actors, 1))
         if self.backend != "rays":
             from nurec_sim.world.render import GlPainter
 
@@ -128,12 +145,15 @@ class TrueWorld:
         return self.street.actor_places(actors, len(fractions))
 
     def _view(self, request: SensorRequest) -> TrueView:
+        camera = request.sensor
+        if not isinstance(camera, CameraModel):
+            raise RequestError(f"a view needs a camera, and {camera.id!r} is none")
         self.street.pose(self._data, request.start_us, self._places(request, np.zeros(1)))
         pose = np.asarray(request.world_from_sensor, np.float64)[0]
         if self._painter is not None:
-            rgb, geom, depth = self._painter.view(self._data, request.sensor, pose)
+            rgb, geom, depth = self._painter.view(self._data, camera, pose)
         else:
-            rgb, geom, depth = rays.view(self.street, self._data, request.sensor, pose)
+            rgb, geom, depth = rays.view(self.street, self._data, camera, pose)
         return TrueView(rgb, depth, *self._named(geom))
 
     def _named(self, geom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -144,6 +164,8 @@ class TrueWorld:
 
     def _scan(self, request: SensorRequest) -> TrueScan:
         lidar = request.sensor
+        if not isinstance(lidar, LidarModel):
+            raise RequestError(f"a scan needs a LiDAR, and {lidar.id!r} is none")
         beams, fractions = sensors.beam_directions(lidar), sensors.column_fraction(lidar)
         poses = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), fractions)
         shape = beams.shape[:2]
@@ -158,7 +180,7 @@ class TrueWorld:
 
     def _frame(self, request: SensorRequest) -> SensorFrame:
         if isinstance(request.sensor, LidarModel):
-            return _lidar_frame(request, self._scan(request))
+            return _lidar_frame(request, request.sensor, self._scan(request))
         view = self._view(request)
         alpha = (view.surface != SurfaceClass.SKY).astype(np.float32)
         return CameraFrame(request.sensor, request.start_us, request.end_us, view.rgb, view.depth_m, alpha,
@@ -205,10 +227,8 @@ def measured_points(
     return directions * scan.range_m.ravel()[beam, None], scan.intensity.ravel()[beam], beam
 
 
-def _lidar_frame(request: SensorRequest, scan: TrueScan) -> LidarFrame:
+def _lidar_frame(request: SensorRequest, lidar: LidarModel, scan: TrueScan) -> LidarFrame:
     """A turn as a frame: points in the sensor frame at the end of the spin."""
-    lidar = request.sensor
-    assert isinstance(lidar, LidarModel)
     xyz, intensity, beam = measured_points(lidar, scan)
     pair = np.asarray(request.world_from_sensor, np.float64)
     fired = geometry.interpolate_pose_pair(pair, sensors.column_fraction(lidar))[beam % scan.range_m.shape[1]]

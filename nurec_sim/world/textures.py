@@ -36,7 +36,7 @@ def asphalt(rng: np.random.Generator, size: int = 1024) -> Image:
     for _ in range(7):
         steps = np.cumsum(rng.normal(0, 0.35, 70)) + rng.uniform(0, 6.28)
         path = rng.random(2) * size + np.cumsum(8 * np.stack([np.cos(steps), np.sin(steps)], axis=1), axis=0)
-        cv2.polylines(grey, [np.int32(path)], False, base * 0.55, int(rng.integers(1, 3)), cv2.LINE_AA)
+        cv2.polylines(grey, [path.astype(np.int32)], False, base * 0.55, int(rng.integers(1, 3)), cv2.LINE_AA)
     for _ in range(4):
         (x, y), (w, h) = rng.integers(0, size, 2), rng.integers(70, 240, 2)
         grey[y : y + h, x : x + w] *= rng.uniform(0.78, 1.1)

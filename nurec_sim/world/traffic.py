@@ -84,8 +84,8 @@ def parked_car(name: str, kind: str, colour: int, road: RoadLine, span_us: tuple
     size = CAR_SIZES_M[kind]
     offset = side * (road.road.half_width_m - 0.12 - size[1] / 2 - abs(slack[0]))
     xy, yaw = road.at(station_m, offset)
-    yaw = float(yaw) + (np.pi if side > 0 else 0.0) + slack[1]
-    path = tuple((t, float(xy[0]), float(xy[1]), size[2] / 2, yaw) for t in span_us)
+    heading = float(yaw) + (np.pi if side > 0 else 0.0) + slack[1]
+    path = tuple((t, float(xy[0]), float(xy[1]), size[2] / 2, heading) for t in span_us)
     return Actor(name, kind, size, COLOURS[colour % len(COLOURS)], False, path)
 
 

@@ -21,8 +21,8 @@ from nurec_sim.world.rig import street_rig
 from nurec_sim.world.road import RoadLine
 from nurec_sim.world.sense import TrueView, TrueWorld, measured_points
 
-Progress = Callable[[int, int], None]
-"""Called with (frames done, frames in all)."""
+Progress = Callable[[str, float], None]
+"""Called with (what was drawn, fraction done)."""
 SPIN_US = 100_000
 
 
@@ -32,7 +32,7 @@ def write_street_clip(
     *,
     rig: Rig | None = None,
     period_us: int = 200_000,
-    jpeg_quality: int = 84,
+    jpeg_quality: int = 80,
     point_step_m: float = 0.01,
     backend: str | None = None,
     truth: str | Path | None = None,
@@ -42,7 +42,7 @@ def write_street_clip(
 ) -> Path:
     """Drive through a street and write the log, as a folder or a ``.zip``.
 
-    Every ``period_us`` the LiDAR turns once (0.1 s, from behind over the left clockwise) and all cameras expose at
+    Every ``period_us`` the LiDAR turns once (0.1 s, clockwise, from straight behind) and all cameras expose at
     once in the middle of the turn, when the LiDAR looks straight ahead. Sweeps are motion-compensated to that middle.
 
     Args:
@@ -67,7 +67,9 @@ def write_street_clip(
     """
     if period_us < SPIN_US:
         raise ClipError(f"a LiDAR turn takes {SPIN_US} us; period_us must not be less, got {period_us}")
-    truth = None if truth is None else Path(truth)
+    path, truth = Path(path), None if truth is None else Path(truth)
+    if path.exists() and not overwrite:
+        raise ClipError(f"{str(path)!r} exists; choose another path or allow overwriting")
     if truth is not None:
         if truth.exists():
             raise ClipError(f"{str(truth)!r} exists; choose another folder for the truth")
@@ -117,7 +119,7 @@ def _frames(
         for lidar in rig.lidars.values():
             yield logs.LidarEntry(lidar.id, _sweep(world, ego, lidar, turn_us, point_step_m))
             done += 1
-            _tell(progress, done, total)
+            _tell(progress, lidar.id, done / total)
         now_us = turn_us + SPIN_US // 2
         for camera in rig.cameras.values():
             pose = ego.at(now_us) @ camera.rig_from_camera
@@ -126,12 +128,12 @@ def _frames(
                 _write_truth(truth / camera.id / f"{index:04d}.npz", view)
             yield logs.CameraEntry(camera.id, now_us, now_us, _jpeg(view.rgb, jpeg_quality), np.stack([pose, pose]))
             done += 1
-            _tell(progress, done, total)
+            _tell(progress, camera.id, done / total)
 
 
-def _tell(progress: Progress | None, done: int, total: int) -> None:
+def _tell(progress: Progress | None, stage: str, fraction: float) -> None:
     if progress is not None:
-        progress(done, total)
+        progress(stage, fraction)
 
 
 def _sweep(world: TrueWorld, ego: Trajectory, lidar: LidarModel, start_us: int, point_step_m: float) -> Sweep:

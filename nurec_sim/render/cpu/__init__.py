@@ -1,0 +1,1 @@
+"""The CPU back end: Numba kernels and the stages that run them."""

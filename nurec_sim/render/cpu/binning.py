@@ -1,18 +1,15 @@
-"""Kernels that sort records by depth and hand them out to tiles of the ray grid; stable, so results never depend on threads."""
+"""Kernels that sort records by depth and hand them out to tiles of the ray grid; stable, so threads do not matter."""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from nurec_sim.render.cpu.bounds import JIT, f4
-from nurec_sim.render.cpu.projection import BOX
+from nurec_sim.render.cpu.kernel import kernel
 
-TILE = 16
 RADIX_BITS = 11
 
 
-@njit(**JIT)
+@kernel
 def sort_by_depth(keys, starts, counts, order):
     """Indices of records in the order of their (positive) float32 keys; ties keep the order of the rows.
 
@@ -44,36 +41,23 @@ def sort_by_depth(keys, starts, counts, order):
     return total
 
 
-@njit(inline="always")
-def _tile_span(low, high, tiles):
-    """Tiles whose cell centres can lie in [low, high]."""
-    first = np.int64(max(low - f4(0.5), f4(0)) * f4(1 / TILE))
-    last = np.int64(min(max(high - f4(0.5), f4(-1)), f4(tiles * TILE - 1)) * f4(1 / TILE) + f4(1)) - 1
-    return first, min(last, tiles - 1)
-
-
-@njit(**JIT)
-def count_tiles(records, order, first, last, columns, rows, counts):
+@kernel
+def count_tiles(spans, order, first, last, columns, counts):
     """Add to ``counts`` [tiles] how many of ``order[first:last]`` touch each tile."""
     for j in range(first, last):
-        r = records[order[j]]
-        x0, x1 = _tile_span(r[BOX], r[BOX + 1], columns)
-        y0, y1 = _tile_span(r[BOX + 2], r[BOX + 3], rows)
-        for ty in range(y0, y1 + 1):
-            for tx in range(x0, x1 + 1):
+        i = order[j]
+        for ty in range(spans[i, 2], spans[i, 3] + 1):
+            for tx in range(spans[i, 0], spans[i, 1] + 1):
                 counts[ty * columns + tx] += 1
 
 
-@njit(**JIT)
-def fill_tiles(records, order, first, last, columns, rows, position, lists):
+@kernel
+def fill_tiles(spans, order, first, last, columns, position, lists):
     """Append the records of ``order[first:last]`` to their tiles' lists at ``position`` [tiles], which moves on."""
     for j in range(first, last):
         i = order[j]
-        r = records[i]
-        x0, x1 = _tile_span(r[BOX], r[BOX + 1], columns)
-        y0, y1 = _tile_span(r[BOX + 2], r[BOX + 3], rows)
-        for ty in range(y0, y1 + 1):
-            for tx in range(x0, x1 + 1):
+        for ty in range(spans[i, 2], spans[i, 3] + 1):
+            for tx in range(spans[i, 0], spans[i, 1] + 1):
                 t = ty * columns + tx
                 lists[position[t]] = i
                 position[t] += 1

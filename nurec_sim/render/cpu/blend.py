@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from nurec_sim.render.cpu.binning import TILE
-from nurec_sim.render.cpu.bounds import JIT, f4
-from nurec_sim.render.cpu.projection import BALL, BOX, FADE, FEATURE, MAP, ORIGIN, RANGE, TAG
+from nurec_sim.render.cpu.kernel import f4, inner, kernel
+from nurec_sim.render.cpu.projection import BALL, BOX, DEEP, FADE, FEATURE, MAP, ORIGIN, RANGE, RIM, SLOPE, TAG, TILE
 
 SIDE = 8
 CELLS = SIDE * SIDE
@@ -36,7 +34,7 @@ def _exponential() -> tuple[np.float32, ...]:
 E0, E1, E2, E3, E4 = _exponential()
 
 
-@njit(**JIT)
+@inner
 def _load_rays(b, direction, valid, line, lines, x0, y0, width, height):
     """Rays of a block in the reference frame; cells outside of the grid or without a ray are dead from the start."""
     alive = 0
@@ -60,7 +58,58 @@ def _load_rays(b, direction, valid, line, lines, x0, y0, width, height):
     return alive
 
 
-@njit(**JIT)
+@inner
+def _bundle(b, middle):
+    """A cone around a block's rays: ``middle`` gets its direction and origin; returns its spread of both."""
+    for e in range(6):
+        middle[e] = f4(0)
+    alive = f4(0)
+    for k in range(CELLS):
+        live = b[LIVE * CELLS + k]
+        alive += live
+        for e in range(6):
+            middle[e] += live * b[e * CELLS + k]
+    for e in range(6):
+        middle[e] /= alive
+    wide = shift = f4(0)
+    for k in range(CELLS):
+        if b[LIVE * CELLS + k] > f4(0):
+            dx, dy, dz = b[DX * CELLS + k] - middle[0], b[DY * CELLS + k] - middle[1], b[DZ * CELLS + k] - middle[2]
+            ox, oy, oz = b[OX * CELLS + k] - middle[3], b[OY * CELLS + k] - middle[4], b[OZ * CELLS + k] - middle[5]
+            wide, shift = max(wide, dx * dx + dy * dy + dz * dz), max(shift, ox * ox + oy * oy + oz * oz)
+    return math.sqrt(wide), math.sqrt(shift)
+
+
+@inner
+def _misses(records, i, middle, wide, shift, moving):
+    """Whether no ray of a bundle can meet a Gaussian before it has faded to 1/255; never wrongly true."""
+    dx, dy, dz = middle[0], middle[1], middle[2]
+    x = records[i, MAP] * dx + records[i, MAP + 1] * dy + records[i, MAP + 2] * dz
+    y = records[i, MAP + 3] * dx + records[i, MAP + 4] * dy + records[i, MAP + 5] * dz
+    w = records[i, MAP + 6] * dx + records[i, MAP + 7] * dy + records[i, MAP + 8] * dz
+    rim = records[i, RIM]
+    if moving:
+        # Seen from the bundle's origin the centre lies at -gro, a little off the third axis.
+        far = records[i, RANGE]
+        px, py, pz = (
+            middle[3] - records[i, ORIGIN],
+            middle[4] - records[i, ORIGIN + 1],
+            middle[5] - records[i, ORIGIN + 2],
+        )
+        gx = records[i, MAP] * px + records[i, MAP + 1] * py + records[i, MAP + 2] * pz
+        gy = records[i, MAP + 3] * px + records[i, MAP + 4] * py + records[i, MAP + 5] * pz
+        gw = far - (records[i, MAP + 6] * px + records[i, MAP + 7] * py + records[i, MAP + 8] * pz)
+        if abs(gx) + abs(gy) > f4(0.1) * gw:
+            return False
+        ahead = w / gw
+        x, y = x + ahead * gx, y + ahead * gy
+        wide = f4(1.1) * (wide + shift / gw)
+        rim *= f4(1.05) * far / gw
+    nearest = math.sqrt(x * x + y * y) - records[i, SLOPE] * wide
+    return nearest > rim * max(w + records[i, DEEP] * wide, f4(0))
+
+
+@inner
 def _blend_fixed(b, r, near):
     """Blend one record into a block whose rays all start at the reference point."""
     m00, m01, m02, m10, m11, m12 = r[MAP], r[MAP + 1], r[MAP + 2], r[MAP + 3], r[MAP + 4], r[MAP + 5]
@@ -98,7 +147,7 @@ def _blend_fixed(b, r, near):
         b[BEST * CELLS + k] = max(weight, best)
 
 
-@njit(**JIT)
+@inner
 def _blend_moving(b, r, near):
     """Blend one record into a block whose rays start anywhere: full cross product with the offset of the origin."""
     m00, m01, m02, m10, m11, m12 = r[MAP], r[MAP + 1], r[MAP + 2], r[MAP + 3], r[MAP + 4], r[MAP + 5]
@@ -141,7 +190,7 @@ def _blend_moving(b, r, near):
         b[BEST * CELLS + k] = max(weight, best)
 
 
-@njit(**JIT)
+@kernel
 def blend(tiles, starts, lists, records, direction, valid, line, lines, near, columns, planes):
     """Blend the given tiles into ``planes`` [6,h,w]: three features, distance, alpha (weighted sums), label.
 
@@ -160,6 +209,7 @@ def blend(tiles, starts, lists, records, direction, valid, line, lines, near, co
     """
     height, width = valid.shape
     b = np.empty(SECTIONS * CELLS, np.float32)
+    middle = np.empty(6, np.float32)
     moving = lines.shape[0] > 1
     for index in range(tiles.shape[0]):
         tile = tiles[index]
@@ -169,17 +219,22 @@ def blend(tiles, starts, lists, records, direction, valid, line, lines, near, co
             if x0 >= width or y0 >= height:
                 continue
             if _load_rays(b, direction, valid, line, lines, x0, y0, width, height) > 0:
+                wide, shift = _bundle(b, middle)
                 left, right = f4(x0) + f4(0.5), f4(x0) + f4(SIDE - 0.5)
                 top, bottom = f4(y0) + f4(0.5), f4(y0) + f4(SIDE - 0.5)
                 done = 0
                 for j in range(starts[tile], starts[tile + 1]):
-                    r = records[lists[j]]
-                    if r[BOX + 1] < left or r[BOX] > right or r[BOX + 3] < top or r[BOX + 2] > bottom:
+                    i = lists[j]
+                    if records[i, BOX + 1] < left or records[i, BOX] > right:
+                        continue
+                    if records[i, BOX + 3] < top or records[i, BOX + 2] > bottom:
+                        continue
+                    if _misses(records, i, middle, wide, shift, moving):
                         continue
                     if moving:
-                        _blend_moving(b, r, near)
+                        _blend_moving(b, records[i], near)
                     else:
-                        _blend_fixed(b, r, near)
+                        _blend_fixed(b, records[i], near)
                     done += 1
                     if done % 16 == 0:
                         live = f4(0)

@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from nurec_sim.render.cpu.grid import LENS, LIDAR, PINHOLE
+from nurec_sim.render.cpu.kernel import f4, inner
 
-JIT = {"nogil": True, "cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp"}}
-f4 = np.float32
 EVERYWHERE = (f4(-1e9), f4(1e9), f4(-1e9), f4(1e9))
 NOWHERE = (f4(-1e9), f4(-1e9), f4(-1e9), f4(-1e9))
 WIDE = f4(1.5)
 """Tangent of the angular radius from which a Gaussian is taken to cover the whole grid of a lens or a LiDAR."""
 
 
-@njit(inline="always")
+@inner
 def fast_atan2(y, x):
     """Angle of (x, y) to about 1e-5 rad."""
     ax, ay = abs(x), abs(y)
@@ -31,7 +29,7 @@ def fast_atan2(y, x):
     return -r if y < 0 else r
 
 
-@njit(**JIT)
+@inner
 def lens_place(x, y, z, params, table):
     """Bilinear lookup of the pixel of a direction (any length)."""
     size = table.shape[0]
@@ -49,7 +47,7 @@ def lens_place(x, y, z, params, table):
     return u0 + ft * (u1 - u0), v0 + ft * (v1 - v0)
 
 
-@njit(**JIT)
+@inner
 def lidar_column(x, y, params, table):
     """Grid column of an azimuth."""
     two_pi = f4(2 * math.pi)
@@ -60,7 +58,7 @@ def lidar_column(x, y, params, table):
     return table[0, i, 0] + (s - f4(i)) * (table[0, i + 1, 0] - table[0, i, 0])
 
 
-@njit(**JIT)
+@inner
 def lidar_row(x, y, z, table):
     """Grid row of an elevation."""
     sine = z / max(math.sqrt(x * x + y * y + z * z), f4(1e-20))
@@ -69,7 +67,7 @@ def lidar_row(x, y, z, table):
     return table[1, i, 0] + (s - f4(i)) * (table[1, i + 1, 0] - table[1, i, 0])
 
 
-@njit(**JIT)
+@inner
 def place(kind, x, y, z, params, table):
     """Grid place (column, row) of a direction."""
     if kind == PINHOLE:
@@ -80,7 +78,7 @@ def place(kind, x, y, z, params, table):
     return lidar_column(x, y, params, table), lidar_row(x, y, z, table)
 
 
-@njit(**JIT)
+@inner
 def pinhole_bounds(x, y, z, axes, k2, params, cells):
     """Exact box around the image of the ellipsoid of squared radius k2: tangents of its dual conic k2 Sigma - m m^T.
 
@@ -125,9 +123,9 @@ def pinhole_bounds(x, y, z, axes, k2, params, cells):
             params[1] * v0 + params[3] - pad, params[1] * v1 + params[3] + pad)  # fmt: skip
 
 
-@njit(**JIT)
+@inner
 def outline_bounds(kind, x, y, z, axes, e1, e2, squeeze, radius, params, table):
-    """Box around points of the ellipsoid's outline, sent through the grid's tables, with a margin for what lies between.
+    """Box around points of the ellipsoid's outline, sent through the grid's tables, with a margin for the rest.
 
     The outline is the circle ``squeeze`` m + ``radius`` (e1 cos + e2 sin) in the frame where the Gaussian is a unit
     ball (``axes`` leads back to the sensor); e1, e2 are perpendicular to the view direction there.
@@ -177,3 +175,15 @@ def outline_bounds(kind, x, y, z, axes, e1, e2, squeeze, radius, params, table):
     if around:
         return f4(-1e9), f4(1e9), v0, v1
     return u0, u1, v0, v1
+
+
+@inner
+def perpendicular(x, y, z, n2, e1, e2):
+    """Two unit vectors perpendicular to a vector and to each other (Duff et al. 2017)."""
+    inverse = f4(1) / math.sqrt(n2)
+    x, y, z = x * inverse, y * inverse, z * inverse
+    sign = f4(1) if z >= f4(0) else f4(-1)
+    a = f4(-1) / (sign + z)
+    b = x * y * a
+    e1[0], e1[1], e1[2] = f4(1) + sign * x * x * a, sign * b, -sign * x
+    e2[0], e2[1], e2[2] = b, sign + y * y * a, -y

@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from nurec_sim.render.cpu.bounds import JIT, f4
+from nurec_sim.render.cpu.kernel import f4, inner, kernel
 from nurec_sim.types import Label
 
 SKY = int(Label.SKY)
 SURFACE_ALPHA = 0.5
 
 
-@njit(**JIT)
+@inner
 def sky_lookup(sky, x, y, z, out):
     """Bilinear colour of a world direction (``geometry.cubemap_coordinates``), clamped within a face."""
     gx, gy, gz = -y, z, -x
@@ -38,7 +37,7 @@ def sky_lookup(sky, x, y, z, out):
         out[c] = top + fv * (bottom - top)
 
 
-@njit(**JIT)
+@kernel
 def composite(first, last, planes, direction, valid, line, world_from_line, sky, isp, rgb, depth, alpha, label):
     """Finish the rows first..last of a camera frame; ``world_from_line`` [l,3,3] turns a line's rays into the world."""
     width = valid.shape[1]

@@ -29,8 +29,9 @@ class Grid:
 
     ``params``: PINHOLE fx fy cx cy; LENS half-width of the table, cosine of its rim; LIDAR sign of the spin, azimuth
     of column 0, half the gap behind the last column, columns per radian, whether full circle, smallest and largest
-    residual of the row offsets in columns.
-    ``table``: LENS place by stereographic direction [s,s,2]; LIDAR [2,t,1]: column by azimuth, row by sine of elevation.
+    residual of the row offsets in columns, smallest and largest row shift (0 included).
+    ``table``: LENS place by stereographic direction [s,s,2]; LIDAR [2,t,1]: column by azimuth, row by sine of
+    elevation.
     ``row_shift``: LIDAR rows are rolled by whole columns so that a grid column looks in one azimuth.
     """
 
@@ -140,7 +141,8 @@ def _lidar_grid(lidar: LidarModel) -> Grid:
     down = -np.asarray(lidar.elevation_rad, np.float64)
     row_of = _extrapolated(-np.arcsin(sines), down, steps.mean())
     residual = offset - shift
-    params = [sign, lidar.azimuth_rad[0], gap / 2, 1 / steps.min(), full_circle, residual.min(), residual.max()]
+    params = [sign, lidar.azimuth_rad[0], gap / 2, 1 / steps.min(), full_circle, residual.min(), residual.max(),
+              min(shift.min(), 0), max(shift.max(), 0)]  # fmt: skip
     return Grid(
         kind=LIDAR,
         direction=np.ascontiguousarray(rays.direction[row, fired], np.float32),

@@ -7,8 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from nurec_sim.render.cpu.projection import COLOUR, LABEL, LOG_OPACITY, MEAN, PACKED, QUAT, REACH, SCALE
 from nurec_sim.types import Gaussians
+
+# Columns of a packed Gaussian.
+MEAN, QUAT, SCALE, LOG_OPACITY, REACH, COLOUR, LABEL = 0, 3, 7, 10, 11, 12, 15
+PACKED = 16
 
 BLOCK = 256
 MIN_SCALE_M = 1e-5

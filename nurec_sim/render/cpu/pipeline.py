@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry
-from nurec_sim.render.cpu.binning import TILE, count_tiles, fill_tiles, sort_by_depth
+from nurec_sim.render.cpu.binning import count_tiles, fill_tiles, sort_by_depth
 from nurec_sim.render.cpu.blend import PLANES, blend
 from nurec_sim.render.cpu.grid import Grid
 from nurec_sim.render.cpu.pack import BLOCK, PackedGaussians
-from nurec_sim.render.cpu.projection import RECORD, project
+from nurec_sim.render.cpu.projection import RECORD, TILE, project
 
 SPLIT = 6
 """Ranges per thread: enough to even out tiles of very different cost."""
@@ -108,8 +108,8 @@ def draw(
     columns, rows = -(-width // TILE), -(-height // TILE)
     planes = np.empty((PLANES, height, width), np.float32)
     with buffers.lend() as array:
-        records, order = _visible(grid, view, layers, use_intensity, workers, array)
-        starts, lists = _bin(records, order, columns, rows, workers, array)
+        records, spans, order = _visible(grid, view, layers, use_intensity, workers, array)
+        starts, lists = _bin(spans, order, columns, rows, workers, array)
         load = np.diff(starts)
         # Heavy tiles first and dealt out in turn, so that threads end together.
         heavy_first = np.argsort(-load, kind="stable").astype(np.int64)
@@ -126,8 +126,8 @@ def draw(
 
 def _visible(
     grid: Grid, view: View, layers: Sequence[PackedGaussians], use_intensity: bool, workers: Workers, array: Callable
-) -> tuple[np.ndarray, np.ndarray]:
-    """Records of all layers, and their order front to back."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Records of all layers, the tiles they span, and their order front to back."""
     eye = view.world_from_reference[:3, 3].copy()
     rotation = view.world_from_reference[:3, :3].T
     quat = geometry.quat_from_matrix(rotation).astype(np.float32)
@@ -135,6 +135,7 @@ def _visible(
     chosen = [_blocks_in_view(grid, view, layer) for layer in layers]
     capacity = 2 * BLOCK * sum(len(blocks) for blocks in chosen)
     records, keys = array("records", (capacity, RECORD), np.float32), array("keys", (capacity,), np.float32)
+    spans = array("spans", (capacity, 4), np.int16)
     arguments, starts, base = [], [], 0
     for layer, blocks in zip(layers, chosen, strict=True):
         values = layer.intensity if use_intensity else layer.intensity[:0]
@@ -144,13 +145,13 @@ def _visible(
             arguments.append(
                 (layer.rows, values, rest, first, last, blocks, BLOCK, eye, quat, rotation.astype(np.float32),
                  grid.kind, grid.params, grid.table, grid.row_shift, grid.line_axis, view.lines, cells, grid.by_range,
-                 np.float32(grid.near_m), records, keys, base)
+                 np.float32(grid.near_m), records, spans, keys, base)
             )  # fmt: skip
             base += 2 * BLOCK * (last - first)
     counts = np.array(workers.run(project, arguments), np.int64)
     order = array("order", (int(counts.sum()),), np.int32)
     sort_by_depth(keys, np.array(starts, np.int64), counts, order)
-    return records, order
+    return records, spans, order
 
 
 def _blocks_in_view(grid: Grid, view: View, layer: PackedGaussians) -> np.ndarray:
@@ -171,7 +172,7 @@ def _blocks_in_view(grid: Grid, view: View, layer: PackedGaussians) -> np.ndarra
 
 
 def _bin(
-    records: np.ndarray, order: np.ndarray, columns: int, rows: int, workers: Workers, array: Callable
+    spans: np.ndarray, order: np.ndarray, columns: int, rows: int, workers: Workers, array: Callable
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lists of records per tile, front to back, as (start of each tile's list, all lists)."""
     tiles = columns * rows
@@ -179,7 +180,7 @@ def _bin(
     counts = np.zeros((len(ranges), tiles), np.int64)
     workers.run(
         count_tiles,
-        [(records, order, first, last, columns, rows, counts[k]) for k, (first, last) in enumerate(ranges)],
+        [(spans, order, first, last, columns, counts[k]) for k, (first, last) in enumerate(ranges)],
     )
     starts = np.zeros(tiles + 1, np.int64)
     np.cumsum(counts.sum(axis=0), out=starts[1:])
@@ -187,6 +188,6 @@ def _bin(
     lists = array("lists", (int(starts[-1]),), np.int32)
     workers.run(
         fill_tiles,
-        [(records, order, first, last, columns, rows, position[k], lists) for k, (first, last) in enumerate(ranges)],
+        [(spans, order, first, last, columns, position[k], lists) for k, (first, last) in enumerate(ranges)],
     )
     return starts, lists

@@ -16,7 +16,7 @@ import yaml
 from nurec_sim.errors import NurecSimError, ScenarioError
 from nurec_sim.plugins import load_policy
 from nurec_sim.runs import folder as layout
-from nurec_sim.runs.finish import finish
+from nurec_sim.runs.results import finish
 from nurec_sim.runs.rollout_file import load_rollout, save_rollout
 from nurec_sim.runs.scene_file import SceneRecord, record_scene, save_scene_record
 from nurec_sim.runs.video import record_video

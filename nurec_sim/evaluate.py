@@ -1,0 +1,246 @@
+"""Measures a reconstruction against its log: images of cameras that it did not see, sweeps that were held out.
+
+The scene is built from the input cameras and the sweeps that are not held out, then asked, over gRPC unless told
+otherwise, for what the target cameras and the held-out sweeps recorded. Figures are plain JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from nurec_sim import geometry
+from nurec_sim.errors import ReconstructError
+from nurec_sim.metrics.images import psnr, ssim
+from nurec_sim.metrics.lidar_scores import LidarScore, scanner_along, score_sweep
+from nurec_sim.types import Clip, GaussianScene, Sense, SensorRequest, Sweep
+
+Progress = Callable[[str, float], None]
+
+
+def evaluate(
+    clip: Clip,
+    method: str = "lift",
+    *,
+    input_cameras: Sequence[str] | None = None,
+    target_cameras: Sequence[str] | None = None,
+    hold_out_every: int = 0,
+    hold_out_sweeps: Sequence[int] = (),
+    via_grpc: bool = True,
+    images_dir: Path | None = None,
+    progress: Progress | None = None,
+    **options: object,
+) -> dict[str, object]:
+    """Reconstruct a clip and score what it renders.
+
+    Args:
+        clip: the log.
+        method: reconstruction method.
+        input_cameras: cameras that the reconstruction may see; all if None.
+        target_cameras: cameras to compare with, at all their frames; the input cameras if None.
+        hold_out_every: hold out sweeps K, 2K, 3K, ...; 0 holds out none.
+        hold_out_sweeps: further sweeps to hold out, by index.
+        via_grpc: whether frames come from a sensor server in this process over gRPC, or from a renderer directly.
+        images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
+        progress: called with a stage and the fraction of it that is done.
+        options: passed on to ``reconstruct``.
+
+    Returns:
+        JSON-ready figures: ``image`` per target camera (``psnr_db``, ``ssim``: means and per-frame lists; ``floor``:
+        the same for copying the input image nearest in time; ``input``: whether the reconstruction saw the camera),
+        and over all of them; ``lidar`` (``median_abs_range_error_m`` over the beams that returned,
+        ``return_recall`` over the beams with a recorded return, shares within 0.1 m and 0.5 m of these, per-sweep
+        lists), None if nothing was held out; ``seconds`` per stage; ``counts``; ``unknown``.
+
+    Raises:
+        ReconstructError: an unknown method, camera or sweep, or a clip that lacks what the method needs.
+    """
+    from nurec_sim.reconstruct import reconstruct
+
+    report = progress or (lambda stage, fraction: None)
+    inputs = list(clip.rig.cameras) if input_cameras is None else list(input_cameras)
+    targets = inputs if target_cameras is None else list(target_cameras)
+    unknown = [camera for camera in targets if camera not in clip.rig.cameras]
+    if unknown:
+        raise ReconstructError(f"clip {clip.id!r} has no camera {unknown}; have {list(clip.rig.cameras)}")
+    if hold_out_every < 0:
+        raise ReconstructError(f"hold_out_every must be 0 or more, got {hold_out_every}")
+    held = held_out(clip, hold_out_every, hold_out_sweeps)
+    started = time.perf_counter()
+    scene = reconstruct(clip, method, cameras=inputs, hold_out_sweeps=held, progress=report, **options)
+    seconds = {f"reconstruct: {k}": v for k, v in dict(scene.provenance.get("seconds", {})).items()}
+    seconds["reconstruct"] = round(time.perf_counter() - started, 3)
+    with sensing(scene, via_grpc) as sense:
+        started = time.perf_counter()
+        image = _score_images(clip, inputs, targets, sense, images_dir, report)
+        seconds["images"] = round(time.perf_counter() - started, 3)
+        started = time.perf_counter()
+        lidar = _score_lidars(clip, held, sense, report) if held else None
+        seconds["lidar"] = round(time.perf_counter() - started, 3)
+    return {
+        "clip": clip.id,
+        "method": method,
+        "input_cameras": inputs,
+        "target_cameras": targets,
+        "held_out_sweeps": held,
+        "via": "grpc" if via_grpc else "local",
+        "image": image,
+        "lidar": lidar,
+        "seconds": seconds,
+        "counts": {"static": len(scene.static), "dynamic": len(scene.dynamic)}
+        | dict(scene.provenance.get("counts", {})),
+        "unknown": list(scene.provenance.get("unknown", [])),
+    }
+
+
+def held_out(clip: Clip, every: int, listed: Sequence[int]) -> list[int]:
+    """Indices of the sweeps to hold out: every K-th but the first, and those listed."""
+    most = max((len(clip.sweep_times_us(lidar)) for lidar in clip.rig.lidars), default=0)
+    return sorted({*(range(every, most, every) if every else ()), *(int(i) for i in listed)})
+
+
+@contextlib.contextmanager
+def sensing(scene: GaussianScene, via_grpc: bool) -> Iterator[Sense]:
+    """A ``sense`` for a scene: through a server on a free port of this machine, or a renderer in this process."""
+    if not via_grpc:
+        from nurec_sim.render import Renderer
+
+        yield Renderer(scene).sense
+        return
+    from nurec_sim.client import RemoteSensors
+    from nurec_sim.scene_store import SceneStore
+    from nurec_sim.server import SensorServer
+
+    with SensorServer(SceneStore([scene]), port=0) as address, RemoteSensors(address, scene.id) as remote:
+        yield remote.sense
+
+
+# ----------------------------------------------------------------------------------------------------------- images
+
+
+def _score_images(
+    clip: Clip, inputs: Sequence[str], targets: Sequence[str], sense: Sense, images_dir: Path | None, report: Progress
+) -> dict[str, object]:
+    per_camera = {}
+    for camera in targets:
+        shown: dict[str, list[float]] = {"psnr_db": [], "ssim": []}
+        floor: dict[str, list[float]] = {"psnr_db": [], "ssim": []}
+        times = clip.camera_times_us(camera)
+        for index in range(len(times)):
+            report(f"images of {camera}", index / len(times))
+            recorded = clip.image(camera, index)
+            start_us, end_us = int(times[index, 0]), max(int(times[index, 1]), int(times[index, 0]) + 1)
+            request = SensorRequest(
+                clip.id, clip.rig.cameras[camera], start_us, end_us, clip.world_from_camera(camera, index)
+            )
+            rendered = sense([request])[0].rgb
+            copied = _nearest_input(clip, camera, index, inputs)
+            _append(shown, rendered, recorded)
+            if copied is not None:
+                _append(floor, copied, recorded)
+            if images_dir is not None:
+                _write_pair(images_dir / f"{camera}_{index:04d}.png", recorded, rendered)
+        report(f"images of {camera}", 1.0)
+        per_camera[camera] = {**_with_means(shown), "input": camera in inputs, "floor": _with_means(floor)}
+    means = {
+        name: float(np.mean([value for row in per_camera.values() for value in row["per_frame"][name]]))
+        for name in ("psnr_db", "ssim")
+        if per_camera
+    }
+    return {**means, "cameras": per_camera}
+
+
+def _append(lists: dict[str, list[float]], image: np.ndarray, recorded: np.ndarray) -> None:
+    lists["psnr_db"].append(min(psnr(image, recorded), 100.0))
+    lists["ssim"].append(ssim(image, recorded))
+
+
+def _with_means(lists: dict[str, list[float]]) -> dict[str, object]:
+    if not lists["psnr_db"]:
+        return {"psnr_db": None, "ssim": None, "per_frame": lists}
+    return {**{name: float(np.mean(values)) for name, values in lists.items()}, "per_frame": lists}
+
+
+def _nearest_input(clip: Clip, camera: str, index: int, inputs: Sequence[str]) -> UInt8[np.ndarray, "h w 3"] | None:
+    """What copying would show: the input frame nearest in time whose camera looks most alike; never the frame itself."""
+    import cv2
+
+    model, t_us = clip.rig.cameras[camera], int(clip.camera_times_us(camera)[index].sum()) // 2
+    best: tuple[float, float, str, int] | None = None
+    for other in inputs:
+        times = clip.camera_times_us(other).sum(axis=1) // 2
+        gap = np.abs(times - t_us).astype(np.float64)
+        if other == camera:
+            gap[index] = np.inf
+        nearest = int(np.argmin(gap)) if len(gap) else 0
+        if not len(gap) or not np.isfinite(gap[nearest]):
+            continue
+        facing = float(clip.rig.cameras[other].rig_from_camera[:3, 2] @ model.rig_from_camera[:3, 2])
+        candidate = (round(-facing, 2), float(gap[nearest]), other, nearest)
+        best = candidate if best is None or candidate < best else best
+    if best is None or best[0] > 0:
+        return None
+    image = clip.image(best[2], best[3])
+    size = (model.width_px, model.height_px)
+    return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _write_pair(path: Path, recorded: np.ndarray, rendered: np.ndarray) -> None:
+    import cv2
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.ascontiguousarray(np.vstack([recorded, rendered])[..., ::-1]))
+
+
+# ------------------------------------------------------------------------------------------------------------ LiDAR
+
+
+def _score_lidars(clip: Clip, held: Sequence[int], sense: Sense, report: Progress) -> dict[str, object]:
+    scores, names = [], []
+    jobs = [(lidar, i) for lidar in clip.rig.lidars for i in held if i < len(clip.sweep_times_us(lidar))]
+    for done, (lidar, index) in enumerate(jobs):
+        report("held-out sweeps", done / len(jobs))
+        sweep = clip.sweep(lidar, index)
+        fired, poses = as_fired(clip, lidar, sweep)
+        scanner = scanner_along(clip.rig.lidars[lidar], fired)
+        request = SensorRequest(clip.id, scanner, sweep.start_us, max(sweep.end_us, sweep.start_us + 1), poses)
+        scores.append(score_sweep(sense([request])[0], fired))
+        names.append({"lidar": lidar, "sweep": index})
+    report("held-out sweeps", 1.0)
+    total = LidarScore.pooled(scores)
+    return {
+        "median_abs_range_error_m": total.median_abs_error_m,
+        "return_recall": total.recall,
+        "within_0.1_m": _within(total, 0.1),
+        "within_0.5_m": _within(total, 0.5),
+        "beams": total.beams,
+        "per_sweep": [
+            {**name, "median_abs_range_error_m": s.median_abs_error_m, "return_recall": s.recall}
+            for name, s in zip(names, scores, strict=True)
+        ],
+    }
+
+
+def _within(score: LidarScore, limit_m: float) -> float:
+    """Share of the beams with a recorded return whose simulated return exists and is as near as this."""
+    return float((score.abs_error_m < limit_m).sum() / score.beams) if score.beams else float("nan")
+
+
+def as_fired(
+    clip: Clip, lidar: str, sweep: Sweep
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "2 4 4"]]:
+    """Returns in the frame of the sensor when each was fired, and the sensor's poses at the sweep's start and end."""
+    rig_from_lidar = clip.rig.lidars[lidar].rig_from_lidar
+    # The log's own pose of the sweep counts; the ego trajectory gives the motion around it.
+    fix = sweep.world_from_lidar @ geometry.inverse(clip.ego.at(sweep.t_us) @ rig_from_lidar)
+    times = np.array([sweep.start_us, sweep.end_us])
+    poses = np.einsum("ij,njk->nik", fix, clip.ego.at(times) @ rig_from_lidar)
+    span = max(sweep.end_us - sweep.start_us, 1)
+    fraction = np.clip((sweep.point_t_us - sweep.start_us) / span, 0, 1)
+    inverse = geometry.inverse(geometry.interpolate_pose_pair(poses, fraction))
+    return np.einsum("nij,nj->ni", inverse[:, :3, :3], sweep.xyz_world_m) + inverse[:, :3, 3], poses

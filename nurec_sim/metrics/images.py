@@ -1,0 +1,62 @@
+"""How alike two images are: PSNR and SSIM.
+
+Images are [h, w] or [h, w, channels] of one type; integers count in 0..255, floats in 0..1 unless ``data_range`` says
+otherwise.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+SSIM_WINDOW = 7
+SSIM_K1, SSIM_K2 = 0.01, 0.03
+
+
+def psnr(image: np.ndarray, reference: np.ndarray, data_range: float | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, over all pixels and channels; infinite if the images are equal.
+
+    Raises:
+        ValueError: the images differ in shape or are empty.
+    """
+    a, b, span = _checked(image, reference, data_range)
+    error = float(np.mean((a - b) ** 2))
+    return float("inf") if error == 0 else float(10 * np.log10(span**2 / error))
+
+
+def ssim(image: np.ndarray, reference: np.ndarray, data_range: float | None = None) -> float:
+    """Structural similarity: mean over channels and all pixels whose 7x7 window lies inside the image.
+
+    Uniform window, unbiased (n - 1) variances, K1 = 0.01, K2 = 0.03 (Wang et al. 2004): the same choices as
+    scikit-image's defaults.
+
+    Raises:
+        ValueError: the images differ in shape or are smaller than the window.
+    """
+    a, b, span = _checked(image, reference, data_range)
+    if min(a.shape[:2]) < SSIM_WINDOW:
+        raise ValueError(f"SSIM needs images of at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, got {a.shape}")
+    c1, c2 = (SSIM_K1 * span) ** 2, (SSIM_K2 * span) ** 2
+    count = SSIM_WINDOW**2
+    unbiased = count / (count - 1)
+    border = SSIM_WINDOW // 2
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        full = cv2.boxFilter(values, cv2.CV_64F, (SSIM_WINDOW, SSIM_WINDOW), borderType=cv2.BORDER_REFLECT)
+        return full[border:-border, border:-border]
+
+    mean_a, mean_b = mean(a), mean(b)
+    var_a = unbiased * (mean(a * a) - mean_a**2)
+    var_b = unbiased * (mean(b * b) - mean_b**2)
+    covariance = unbiased * (mean(a * b) - mean_a * mean_b)
+    alike = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    return float(np.mean(alike / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))))
+
+
+def _checked(image: np.ndarray, reference: np.ndarray, data_range: float | None) -> tuple[np.ndarray, np.ndarray, float]:
+    if image.shape != reference.shape or image.size == 0 or image.ndim not in (2, 3):
+        raise ValueError(f"two images of one shape [h, w] or [h, w, c] are needed, got {image.shape}, {reference.shape}")
+    if (image.dtype.kind == "f") != (reference.dtype.kind == "f"):
+        raise ValueError(f"images of one kind are needed, got {image.dtype}, {reference.dtype}")
+    span = data_range if data_range is not None else (1.0 if image.dtype.kind == "f" else 255.0)
+    return image.astype(np.float64), reference.astype(np.float64), float(span)

@@ -1,0 +1,93 @@
+"""How alike a simulated and a recorded LiDAR sweep are, beam by beam.
+
+Every recorded return asks for one beam: the one that left the sensor where and when the return was measured, in its
+direction. Azimuths snap to the nearest column of the scanner; elevations are covered by rows so dense that the range
+at the exact elevation is interpolated between the two rows around it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from nurec_sim import sensors
+from nurec_sim.types import LidarFrame, LidarModel
+
+ROW_STEP_RAD = np.radians(0.05)
+SAME_SURFACE = 0.05
+"""Two rows of a beam see one surface if their ranges differ by less than this part."""
+
+
+@dataclass(frozen=True)
+class LidarScore:
+    """Beams with a recorded return, how many of them returned in the simulation, and the errors of those that did."""
+
+    beams: int
+    returned: int
+    abs_error_m: Float64[np.ndarray, " returned"]
+
+    @property
+    def recall(self) -> float:
+        """Share of recorded returns whose beam has a simulated return."""
+        return self.returned / self.beams if self.beams else float("nan")
+
+    @property
+    def median_abs_error_m(self) -> float:
+        """Median over the beams that returned; NaN if none did."""
+        return float(np.median(self.abs_error_m)) if self.returned else float("nan")
+
+    @staticmethod
+    def pooled(scores: list[LidarScore]) -> LidarScore:
+        """All beams of several sweeps as one."""
+        errors = np.concatenate([score.abs_error_m for score in scores]) if scores else np.zeros(0)
+        return LidarScore(sum(s.beams for s in scores), sum(s.returned for s in scores), errors)
+
+
+def scanner_along(lidar: LidarModel, xyz_fired_m: Float64[np.ndarray, "n 3"]) -> LidarModel:
+    """The scanner with dense rows over the elevations of recorded returns, given in the frame they were fired in."""
+    elevation = _elevation(xyz_fired_m)
+    low, high = np.floor(elevation.min() / ROW_STEP_RAD), np.ceil(elevation.max() / ROW_STEP_RAD)
+    rows = np.arange(high + 1, low - 2, -1) * ROW_STEP_RAD
+    # Rows that no return lies beside need not be fired; the two around each return must.
+    index = np.unique(np.floor(elevation / ROW_STEP_RAD).astype(np.int64))
+    needed = np.isin(np.round(rows / ROW_STEP_RAD).astype(np.int64), np.concatenate([index, index + 1]))
+    return dataclasses.replace(lidar, elevation_rad=rows[needed], row_azimuth_offset_rad=np.zeros(int(needed.sum())))
+
+
+def score_sweep(simulated: LidarFrame, xyz_fired_m: Float64[np.ndarray, "n 3"]) -> LidarScore:
+    """Compare a sweep simulated with ``scanner_along`` with the recorded returns.
+
+    Args:
+        simulated: frame of that scanner, from the recorded poses.
+        xyz_fired_m: recorded returns, each in the frame of the sensor when it was fired.
+
+    Returns:
+        one beam per recorded return within the scanner's range.
+    """
+    lidar = simulated.lidar
+    rows, columns = len(lidar.elevation_rad), len(lidar.azimuth_rad)
+    image = np.full(rows * columns, np.nan)
+    image[simulated.beam] = simulated.range_m
+    image = image.reshape(rows, columns)
+    recorded = np.linalg.norm(xyz_fired_m, axis=1)
+    usable = np.isfinite(recorded) & (recorded >= lidar.range_m[0]) & (recorded <= lidar.range_m[1])
+    xyz, recorded = xyz_fired_m[usable], recorded[usable]
+    _, column, _ = sensors.beam_coordinates(lidar, xyz)
+    column = np.round(np.nan_to_num(column)).astype(np.int64) % columns
+    upper = np.clip(np.searchsorted(-lidar.elevation_rad, -_elevation(xyz), side="right") - 1, 0, rows - 2)
+    above, below = lidar.elevation_rad[upper], lidar.elevation_rad[upper + 1]
+    fraction = np.clip((above - _elevation(xyz)) / (above - below), 0, 1)
+    first, second = image[upper, column], image[upper + 1, column]
+    nearest = np.where(fraction < 0.5, first, second)
+    other = np.where(fraction < 0.5, second, first)
+    same = np.abs(first - second) < SAME_SURFACE * np.minimum(first, second)
+    distance = np.where(same, first + fraction * (second - first), np.where(np.isfinite(nearest), nearest, other))
+    back = np.isfinite(distance)
+    return LidarScore(len(recorded), int(back.sum()), np.abs(distance[back] - recorded[back]))
+
+
+def _elevation(xyz_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+    return np.arctan2(xyz_m[:, 2], np.hypot(xyz_m[:, 0], xyz_m[:, 1]))

@@ -1,0 +1,117 @@
+"""One image laid on the ground, compared with the colour of the road: what ``camera_road_follower`` sees.
+
+Grids ``[x, y]`` lie in the rig frame: rows ahead from the rear axle, columns from the right (-SIDE_M) to the left.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from nurec_sim import geometry
+from nurec_sim.types import CameraFrame, CameraModel
+
+CELL_M, AHEAD_M, SIDE_M = 0.25, 32.0, 10.0
+TINT_TOLERANCE, DARKER, BRIGHTER = 0.09, -0.9, 0.28
+"""Road differs from its known colour by at most this in log colour ratios, and by this in log brightness."""
+SUNLIGHT, SUN_TOLERANCE, SUN_SPREAD, SUN_STEP, SUN_RANGE = (0.11, -0.14), 0.03, 0.05, 0.6, 2.0
+"""From shade, lit by the sky, into the sun, log r/g and log b/g of asphalt change by this times the log brightness."""
+PAINT_TOLERANCE, PAINT_CELLS = 0.08, 2
+ISLAND_M = 3.5
+
+
+def ground_view(frame: CameraFrame) -> tuple[Bool[np.ndarray, "x y"], Float64[np.ndarray, "x y 3"]]:
+    """The image laid on the ground: which cells it shows, and their (log r/g, log b/g, log brightness)."""
+    pixels = ground_pixels(frame.camera)
+    seen = pixels[..., 0] >= 0
+    rgb = smoothed(frame.rgb)[pixels[..., 1], pixels[..., 0]]
+    logs = np.log(rgb + 4.0)
+    return seen, np.stack([logs[..., 0] - logs[..., 1], logs[..., 2] - logs[..., 1], logs.mean(axis=-1)], axis=-1)
+
+
+def ground_pixels(camera: CameraModel) -> np.ndarray:
+    """Image column and row [x, y, 2] at which an ideal pinhole sees each ground cell; -1 where it does not."""
+    x = (np.arange(int(AHEAD_M / CELL_M)) + 0.5) * CELL_M
+    y = (np.arange(int(2 * SIDE_M / CELL_M)) + 0.5) * CELL_M - SIDE_M
+    ground = np.stack(np.broadcast_arrays(x[:, None], y[None, :], 0.0), axis=-1)
+    inside_camera = geometry.transform_points(geometry.inverse(camera.rig_from_camera), ground)
+    depth = np.maximum(inside_camera[..., 2], 0.1)
+    lens = camera.lens
+    u = np.floor(lens.fx_px * inside_camera[..., 0] / depth + lens.cx_px)
+    v = np.floor(lens.fy_px * inside_camera[..., 1] / depth + lens.cy_px)
+    good = (inside_camera[..., 2] > 0.5) & (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
+    return np.where(good[..., None], np.stack([u, v], axis=-1), -1).astype(np.int64)
+
+
+def smoothed(rgb: UInt8[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"]:
+    """Mean over 3 x 3 pixels."""
+    padded = np.pad(rgb.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="edge")
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    return (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9
+
+
+def looks_like(
+    colours: Float64[np.ndarray, "*n 3"], road: Float64[np.ndarray, " 3"], sunlit: bool
+) -> Bool[np.ndarray, "*n"]:
+    """Whether log colours are the road's: same tint and about as bright, or the same asphalt in shade or sun.
+
+    Nothing is brighter than a road in the sun, and the sun brightens by at least ``SUN_STEP``: a pavement by less.
+    """
+    difference = colours - road
+    brighter = difference[..., 2]
+    tint = np.abs(difference[..., :2]).max(axis=-1)
+    alike = (tint < TINT_TOLERANCE) & (brighter > DARKER) & (brighter < BRIGHTER)
+    unsunned = np.abs(difference[..., :2] - brighter[..., None] * SUNLIGHT).max(axis=-1)
+    lit = (brighter > SUN_STEP) & (brighter < SUN_RANGE) & (not sunlit)
+    relit = unsunned < SUN_TOLERANCE + SUN_SPREAD * np.abs(brighter)
+    return alike | (relit & (lit | ((brighter > -SUN_RANGE) & (brighter < 0.0))))
+
+
+def without_paint(
+    blocked: Bool[np.ndarray, "x y"], colours: Float64[np.ndarray, "x y 3"], road: Float64[np.ndarray, " 3"]
+) -> Bool[np.ndarray, "x y"]:
+    """Blocked cells less what is thin: cracks and single pixels up to 0.5 m, white paint up to 1 m."""
+    difference = colours - road
+    paint = (np.abs(difference[..., :2]).max(axis=-1) < PAINT_TOLERANCE) & (difference[..., 2] > 0)
+    return opened(blocked & ~paint, 1) | opened(blocked, PAINT_CELLS)
+
+
+def borders(seen: Bool[np.ndarray, "x y"], blocked: Bool[np.ndarray, "x y"]) -> Bool[np.ndarray, "x y"]:
+    """Blocked cells that bound the road: all but islands up to 3.5 m wide with road on their right and their left.
+
+    Islands are cars and people: one brakes for them, but the road does not bend around them.
+    """
+    right, left = room_beside(opened(seen & ~blocked, 2), np.inf)
+    return blocked & (right + left > ISLAND_M)
+
+
+def opened(mask: Bool[np.ndarray, "x y"], cells: int) -> Bool[np.ndarray, "x y"]:
+    """A mask without its parts that are no wider than 2 ``cells``."""
+    return grown(~grown(~mask, cells), cells)
+
+
+def grown(mask: Bool[np.ndarray, "x y"], cells: int) -> Bool[np.ndarray, "x y"]:
+    """A mask widened by ``cells`` on every side."""
+    padded = np.pad(mask, cells)
+    n, m = mask.shape
+    across = np.logical_or.reduce([padded[:, j : j + m] for j in range(2 * cells + 1)])
+    return np.logical_or.reduce([across[i : i + n] for i in range(2 * cells + 1)])
+
+
+def distance_to(blocked: Bool[np.ndarray, "x y"], limit_m: float) -> Float64[np.ndarray, "x y"]:
+    """Metres to the next blocked cell, up to ``limit_m``, in steps of one cell (octagonal neighbourhoods)."""
+    near, distance = blocked, np.zeros(blocked.shape)
+    for i in range(int(limit_m / CELL_M) + 1):
+        distance += ~near * CELL_M
+        padded = np.pad(near, 1)
+        cross = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:] | near
+        near = grown(near, 1) if i % 2 else cross
+    return distance
+
+
+def room_beside(mask: Bool[np.ndarray, "x y"], limit_m: float) -> Float64[np.ndarray, "2 x y"]:
+    """Metres from each cell to the next marked one on its right and on its left, ``limit_m`` where there is none."""
+    columns = np.arange(mask.shape[1])
+    right = np.maximum.accumulate(np.where(mask, columns, -10_000), axis=1)
+    left = np.minimum.accumulate(np.where(mask, columns, 10_000)[:, ::-1], axis=1)[:, ::-1]
+    return np.minimum(np.stack([columns - right, left - columns]) * CELL_M, limit_m)

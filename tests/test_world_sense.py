@@ -1,0 +1,259 @@
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import shapely
+
+from nurec_sim import geometry, sensors
+from nurec_sim.errors import RequestError, TooLargeError
+from nurec_sim.types import Fisheye, Label, SensorRequest, Shutter
+from nurec_sim.world import (
+    LABEL_OF_CLASS,
+    LIDAR_ID,
+    SurfaceClass,
+    TrueWorld,
+    pick_backend,
+    street_plan,
+    street_rig,
+)
+from nurec_sim.world.vehicles import GREENHOUSE, car_parts
+
+RIG = street_rig(112, 64, lidar_rows=16, lidar_columns=90)
+FRONT, LIDAR = RIG.cameras["camera_front"], RIG.lidars[LIDAR_ID]
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return street_plan(7)
+
+
+@pytest.fixture(scope="module")
+def rays(plan):
+    with TrueWorld(plan, "rays") as world:
+        yield world
+
+
+@pytest.fixture(scope="module")
+def painted(plan):
+    backend = pick_backend()
+    if backend == "rays":
+        pytest.skip("neither EGL nor OSMesa works here (or NUREC_SIM_GL=rays)")
+    with TrueWorld(plan, backend) as world:
+        yield world
+
+
+@pytest.fixture(scope="module")
+def empty(plan):
+    with TrueWorld(dataclasses.replace(plan, actors=()), "rays") as world:
+        yield world
+
+
+def request_at(plan, sensor, seconds, duration_us=0, actors=None):
+    start = plan.span_us[0] + round(seconds * 1e6)
+    mount = sensor.rig_from_lidar if sensor is LIDAR else sensor.rig_from_camera
+    poses = plan.ego_trajectory().at(np.array([start, start + duration_us])) @ mount
+    return SensorRequest("street", sensor, start, start + duration_us, poses, actors or {})
+
+
+def test_two_worlds_of_one_plan_give_the_same_bytes(plan, rays):
+    camera, lidar = request_at(plan, FRONT, 2.0), request_at(plan, LIDAR, 2.0, 100_000)
+    with TrueWorld(street_plan(7), "rays") as again:
+        (image, sweep), (other_image, other_sweep) = rays.sense([camera, lidar]), again.sense([camera, lidar])
+    assert image.rgb.tobytes() == other_image.rgb.tobytes()
+    assert image.depth_m.tobytes() == other_image.depth_m.tobytes()
+    assert sweep.xyz_m.tobytes() == other_sweep.xyz_m.tobytes()
+    assert sweep.intensity.tobytes() == other_sweep.intensity.tobytes()
+
+
+def test_many_rays_at_once_agree_with_single_rays(plan, rays):
+    """Guards against mj_multiRay losing the visual geoms of bodies with colliders."""
+    import mujoco
+
+    rng = np.random.default_rng(3)
+    request = request_at(plan, LIDAR, 4.0)
+    scan = rays.scan(request)
+    pose, beams = request.world_from_sensor[0], sensors.beam_directions(LIDAR)
+    actors = scan.instance > 0
+    assert actors.sum() > 20
+    picked = [
+        *zip(*np.nonzero(actors), strict=True),
+        *zip(rng.integers(0, 16, 150), rng.integers(0, 90, 150), strict=True),
+    ]
+    street, geom = rays.street, np.zeros(1, np.int32)
+    for row, column in picked:
+        direction = pose[:3, :3] @ beams[row, column]
+        groups = np.array([1, 1, 1, 0, 0, 0], np.uint8)
+        distance = mujoco.mj_ray(street.model, rays._data, pose[:3, 3], direction, groups, 1, -1, geom, None)
+        if distance < 0 or not LIDAR.range_m[0] <= distance <= LIDAR.range_m[1]:
+            assert scan.range_m[row, column] == 0
+        else:
+            assert np.isclose(scan.range_m[row, column], distance, atol=1e-9)
+            assert scan.surface[row, column] == street.geom_class[geom[0]]
+
+
+@pytest.mark.parametrize("camera_id", list(RIG.cameras))
+@pytest.mark.parametrize("seconds", [0.0, 6.0, 11.0])
+def test_no_sky_below_the_horizon(plan, rays, camera_id, seconds):
+    request = request_at(plan, RIG.cameras[camera_id], seconds)
+    view = rays.view(request)
+    assert_ground_below_horizon(request, view)
+
+
+def assert_ground_below_horizon(request, view):
+    up = (sensors.pixel_rays(request.sensor)[0] @ request.world_from_sensor[0][:3, :3].T)[..., 2]
+    assert (view.surface[up < -0.004] != SurfaceClass.SKY).all()
+    assert ((view.depth_m > 0) == (view.surface != SurfaceClass.SKY)).all()
+
+
+@pytest.mark.needs_gl
+@pytest.mark.parametrize(
+    "camera_id, seconds", [("camera_front", 1.0), ("camera_front_left", 6.0), ("camera_front_right", 11.0)]
+)
+def test_opengl_agrees_with_ray_casting(plan, painted, rays, camera_id, seconds):
+    request = request_at(plan, street_rig(224, 128).cameras[camera_id], seconds)
+    drawn, cast = painted.view(request), rays.view(request)
+    assert_ground_below_horizon(request, drawn)
+    assert np.mean(LABEL_OF_CLASS[drawn.surface] == LABEL_OF_CLASS[cast.surface]) > 0.995
+    assert np.mean(drawn.instance == cast.instance) > 0.995
+    same = (drawn.surface == cast.surface) & (drawn.depth_m > 0)
+    assert np.median(np.abs(drawn.depth_m - cast.depth_m)[same]) < 1e-3
+    sky = cast.surface == SurfaceClass.SKY
+    if sky.sum() > 50:  # both look up the same sky
+        assert np.abs(drawn.rgb.astype(int) - cast.rgb)[sky].mean() < 8
+    ground = cast.surface == SurfaceClass.ROAD
+    assert abs(drawn.rgb[ground].mean() - cast.rgb[ground].mean()) < 45
+
+
+@pytest.mark.needs_gl
+def test_opengl_follows_an_off_centre_lens(plan, painted, rays):
+    lens = dataclasses.replace(FRONT.lens, cx_px=30.0, cy_px=40.0, fy_px=FRONT.lens.fx_px * 1.2)
+    request = request_at(plan, dataclasses.replace(FRONT, lens=lens), 3.0)
+    drawn, cast = painted.view(request), rays.view(request)
+    assert np.mean(drawn.surface == cast.surface) > 0.98
+    assert np.median(np.abs(drawn.depth_m - cast.depth_m)[drawn.surface == cast.surface]) < 1e-3
+
+
+@pytest.mark.needs_gl
+def test_opengl_serves_many_threads_with_the_same_frames(plan, painted):
+    requests = [request_at(plan, FRONT, 0.5 * i) for i in range(8)]
+    alone = [painted.sense([request])[0].rgb.tobytes() for request in requests]
+    large = painted.sense([request_at(plan, sensors.scaled_camera(FRONT, 1120, 640), 0.0)])[0]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda request: painted.sense([request])[0].rgb.tobytes(), requests))
+    assert together == alone
+    small = np.frombuffer(alone[0], np.uint8).reshape(64, 112, 3).astype(float)
+    assert np.abs(large.rgb.reshape(64, 10, 112, 10, 3).mean((1, 3)) - small).mean() < 8
+
+
+def test_drivable_polygon_is_where_the_road_is(empty):
+    from nurec_sim.world import RoadLine
+    from nurec_sim.world.rays import cast
+
+    line = RoadLine(empty.plan.road)
+    polygon = shapely.Polygon(line.road_map().drivable[0][0])
+    rng = np.random.default_rng(5)
+    xy, _ = line.at(rng.uniform(-2, line.length_m + 2, 1500), rng.uniform(-9, 9, 1500))
+    clear = shapely.distance(shapely.points(xy), polygon.exterior) > 0.01
+    inside = shapely.contains_xy(polygon, *xy.T)
+    for place, expected in zip(xy[clear], inside[clear], strict=True):
+        geom, distance, _ = cast(empty.street, empty._data, np.array([*place, 1.9]), np.array([[0.0, 0.0, -1.0]]))
+        assert (LABEL_OF_CLASS[empty.street.geom_class[geom[0]]] == Label.ROAD) == expected, place
+        if expected:
+            assert 1.9 - 0.011 <= distance[0] <= 1.9 + 1e-9
+
+
+def test_returns_from_actors_lie_in_their_boxes(plan, rays):
+    seen = set()
+    for seconds in (0.0, 3.0, 8.0):
+        request = request_at(plan, LIDAR, seconds)
+        frame, scan = rays.sense([request])[0], rays.scan(request)
+        world = geometry.transform_points(request.world_from_sensor[1], frame.xyz_m.astype(np.float64))
+        instance = scan.instance.ravel()[frame.beam]
+        for index in np.unique(instance[instance > 0]):
+            track = plan.actors[index - 1].track()
+            box = geometry.transform_points(geometry.inverse(track.path.at(request.start_us)), world[instance == index])
+            assert geometry.points_in_box(box, track.size_m, 0.01).all(), track.id
+            seen.add(track.label)
+    assert seen >= {"automobile", "person"}
+
+
+@pytest.mark.parametrize("kind", sorted(GREENHOUSE))
+def test_cars_fill_their_boxes_exactly(kind):
+    size = np.array([4.4, 1.8, 1.6])
+    points = np.concatenate([part.points for part in car_parts(kind, tuple(size)).values()])
+    np.testing.assert_allclose(points.min(axis=0), -size / 2, atol=1e-9)
+    np.testing.assert_allclose(points.max(axis=0), size / 2, atol=1e-9)
+
+
+def test_turning_lidar_on_a_moving_car_sees_a_flat_road(empty):
+    plan = empty.plan
+    request = request_at(plan, LIDAR, 5.0, 100_000)
+    assert np.linalg.norm(np.diff(request.world_from_sensor[:, :3, 3], axis=0)) > 0.5
+    frame, scan = empty.sense([request])[0], empty.scan(request)
+    world = geometry.transform_points(request.world_from_sensor[1], frame.xyz_m.astype(np.float64))
+    surface = scan.surface.ravel()[frame.beam]
+    assert (surface == SurfaceClass.ROAD).sum() > 100
+    np.testing.assert_allclose(world[surface == SurfaceClass.ROAD, 2], 0.0, atol=1e-4)
+    inside = shapely.contains_xy(
+        shapely.Polygon(_road_ring(plan)).buffer(1e-3), *world[LABEL_OF_CLASS[surface] == Label.ROAD, :2].T
+    )
+    assert inside.all()
+    assert (frame.intensity > 0).all() and (frame.intensity <= 1).all()
+
+
+def _road_ring(plan):
+    from nurec_sim.world import RoadLine
+
+    return RoadLine(plan.road).road_map().drivable[0][0]
+
+
+def test_actors_stand_where_a_request_puts_them(plan, rays):
+    request = request_at(plan, FRONT, 5.0)
+    place = plan.ego_trajectory().at(request.start_us) @ geometry.pose_from_xyyaw(12.0, 0.0, 0.0, 0.72)
+    moved = dataclasses.replace(request, actors={"lead": np.stack([place, place])})
+    lead = 1 + [actor.id for actor in plan.actors].index("lead")
+    recorded, shown = rays.view(request), rays.view(moved)
+    rows, columns = np.nonzero(shown.instance == lead)
+    assert len(rows) > 2 * (recorded.instance == lead).sum()
+    assert abs(columns.mean() - FRONT.lens.cx_px) < 3
+    rear = 12.0 - plan.actors[lead - 1].size_m[0] / 2 - FRONT.rig_from_camera[0, 3]
+    assert np.isclose(shown.depth_m[shown.instance == lead].min(), rear, atol=0.05)
+    assert rays.view(request).rgb.tobytes() == recorded.rgb.tobytes()  # nothing stays behind
+
+
+def test_frames_carry_labels_depth_and_alpha(plan, rays):
+    frame = rays.sense([request_at(plan, FRONT, 0.0)])[0]
+    assert frame.rgb.shape == (64, 112, 3) and frame.rgb.dtype == np.uint8
+    assert {Label.ROAD, Label.MOVABLE, Label.SKY, Label.OTHER} <= set(np.unique(frame.label))
+    assert (frame.alpha[frame.label == Label.SKY] == 0).all() and (frame.alpha[frame.label != Label.SKY] == 1).all()
+
+
+def test_what_cannot_be_drawn_is_refused(plan, rays):
+    request = request_at(plan, FRONT, 0.0)
+
+    def ask(text, error=RequestError, **changes):
+        camera = {key: changes.pop(key) for key in list(changes) if hasattr(FRONT, key)}
+        with pytest.raises(error, match=text):
+            rays.sense([dataclasses.replace(request, sensor=dataclasses.replace(FRONT, **camera), **changes)])
+
+    ask("draws pinhole cameras without distortion.*got Fisheye", lens=Fisheye(50.0, 50.0, 56.0, 32.0))
+    ask("without distortion", lens=dataclasses.replace(FRONT.lens, radial=(0.1, 0, 0, 0, 0, 0)))
+    ask("draws global shutters only, got top_to_bottom", shutter=Shutter.TOP_TO_BOTTOM)
+    ask("5000 x 64 pixels; at most 4096 a side", TooLargeError, width_px=5000)
+    ask(r"no actor 'ghost' in this street; have \['lead'", actors={"ghost": np.stack([np.eye(4)] * 2)})
+    ask("actor 'lead': world_from_box must be two poses", actors={"lead": np.eye(4)})
+    ask("world_from_sensor must be two poses", world_from_sensor=np.zeros((2, 4, 4)))
+    ask("end_us not before start_us", end_us=5)
+    with pytest.raises(RequestError, match="a view needs a camera, and 'lidar_top' is none"):
+        rays.view(request_at(plan, LIDAR, 0.0))
+    with pytest.raises(RequestError, match="a scan needs a LiDAR, and 'camera_front' is none"):
+        rays.scan(request)
+
+
+def test_a_closed_world_says_so_and_closes_twice(plan):
+    world = TrueWorld(dataclasses.replace(plan, actors=(), buildings=(), props=()), "rays")
+    world.close()
+    world.close()
+    with pytest.raises(RuntimeError, match="this street is closed"):
+        world.sense([request_at(plan, FRONT, 0.0)])
