@@ -82,6 +82,7 @@ def street_scene(count, seed=0):
         size = 2 * np.tan(np.radians(40.0)) / width * hit * 0.62 / np.sqrt(grazing)
         rgb = np.where((box >= 0)[:, None], box_colour[np.maximum(box, 0)], 0.35)
         point = origin + direction * hit[:, None]
+        point[np.arange(len(hit)), axis] += rng.normal(0, 0.05, len(hit)) * size  # no two at exactly one depth
         rgb = np.where((np.floor(point).sum(axis=1) % 2 > 0)[:, None], rgb, rgb * 0.7)
         parts.append((point, axis, size, rgb + rng.normal(0, 0.03, rgb.shape), box < 0))
     point, axis, size, rgb, road = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -101,7 +102,7 @@ def street_scene(count, seed=0):
         label=road.astype(np.uint8),
         intensity=rng.random(n).astype(np.float32),
     )
-    return GaussianScene("street", static, DynamicGaussians.empty(), np.full((6, 16, 16, 3), 0.7, np.float32), {},
+    return GaussianScene("street", static, DynamicGaussians.empty(), np.full((6, 16, 16, 3), 0.72, np.float32), {},
                          Rig({}, {}), Trajectory(np.array([START_US]), np.eye(4)[None]), [], None,
                          (START_US, 2 * START_US))  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect as inspect_module
 import json
 import sys
 import time
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from nurec_sim.types import GaussianScene
 
 app = tyro.extras.SubcommandApp()
-out = Console()
+out = Console(width=None if sys.stdout.isatty() else 120)
 err = Console(stderr=True)
 
 Paths = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH...")]
@@ -44,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
-        err.print("interrupted; what was finished is kept, the same command goes on from there", markup=False)
+        err.print("interrupted; finished rollouts are kept: add --resume runs/latest to go on", markup=False)
         raise SystemExit(130) from None
 
 
@@ -232,17 +233,17 @@ def run(
 def demo(
     *,
     out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs"),
+    resume: Path | None = None,
     cache: Path | None = None,
 ) -> None:
     """Run the whole chain on the log that ships with the package: about five minutes on two cores.
 
     Args:
         out_path: folder that collects run folders.
+        resume: go on with this run folder; finished rollouts are kept.
         cache: where the reconstructed scene is kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
     """
-    clip = resources.files("nurec_sim.scenarios") / "demo_clip.zip"
-    with resources.as_file(clip) as path:
-        drive((path,), "demo", (), (), out_path, None, None, cache, True)
+    drive((), "demo", (), (), out_path, resume, None, cache, True)
 
 
 @app.command
@@ -311,7 +312,9 @@ def policies(check: Annotated[str | None, tyro.conf.Positional] = None) -> None:
     from nurec_sim import plugins
 
     if check is None:
-        print_table("policies", [(name, plugins.describe_policy(name)) for name in plugins.available_policies()])
+        found = [(name, plugins.load_policy(name)) for name in plugins.available_policies()]
+        rows = [(name, (inspect_module.getdoc(policy) or "").split("\n")[0]) for name, policy in found]
+        print_table("policies", rows, ("name", "what it does"))
         return
     from nurec_sim.sim.conformance import check_policy
 
@@ -341,8 +344,13 @@ def drive(
     from nurec_sim.server import SensorServer
 
     started = time.monotonic()
-    scenario = sim.load_scenario(scenario_name)
-    store = SceneStore(sources, cache_dir=cache)
+    scenario_path = find_scenario(scenario_name)
+    scenario = sim.load_scenario(scenario_path)
+    if not sources and scenario.clip is None:
+        raise NurecSimError(f"scenario {scenario.name!r} names no clip; give clips or scenes to drive through")
+    store = SceneStore(sources or [scenario_path.parent / str(scenario.clip)], cache_dir=cache)
+    for fault in store.faults.values():
+        raise NurecSimError(fault)
     with progress("reconstructing") as advance:
         scenes = [store.get(scene_id, progress=advance).scene for scene_id in store.ids]
     with contextlib.ExitStack() as stack:
@@ -361,8 +369,20 @@ def drive(
                 video=video,
                 progress=advance,
             )
-    print_table("policies", runs.headline(folder))
+    heading, *rows = runs.headline(folder)
+    print_table("means over rollouts", rows, heading)
     out.print(f"{time.monotonic() - started:.0f} s. Report: {(folder / 'report.html').resolve()}", soft_wrap=True)
+
+
+def find_scenario(name: str) -> Path:
+    """The file of a shipped scenario, or ``name`` itself if it is a YAML file."""
+    if name.endswith((".yaml", ".yml")):
+        return Path(name)
+    folder = Path(str(resources.files("nurec_sim.scenarios")))
+    shipped = sorted(path.stem for path in folder.glob("*.yaml"))
+    if name not in shipped:
+        raise NurecSimError(f"no shipped scenario {name!r}; have {shipped}, or give a .yaml file")
+    return folder / f"{name}.yaml"
 
 
 def load_scene(source: Path) -> GaussianScene:
@@ -398,7 +418,7 @@ def print_table(title: str, rows: Sequence[Sequence[object]], heading: Sequence[
     """Rows as a table, with or without a heading."""
     table = Table(title=title, title_justify="left", show_header=bool(heading))
     for name in heading or [""] * max((len(row) for row in rows), default=0):
-        table.add_column(name)
+        table.add_column(name, no_wrap=name == "policy")
     for row in rows:
         table.add_row(*(escape(str(cell)) for cell in row))
     out.print(table)

@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 MAX_NAMES_IN_TEXT = 20
 _MAX_SIDECAR_BYTES = 1 << 20
 
+Progress = Callable[[str, float], None]
+
 
 class SceneRenderer(Protocol):
     """What a server needs of ``render.Renderer``."""
@@ -68,7 +70,7 @@ class SceneStore:
     not disturb the others.
 
     Args:
-        sources: objects, or paths of archives (``.usdz``) and clips.
+        sources: objects, or paths of archives (``.usdz``), clips, and folders of them.
         capacity: scenes kept in memory; the least recently used one goes first.
         cache_dir: where reconstructed clips are kept, by content; None for ``default_cache_dir()``.
         method: reconstruction method of clips.
@@ -103,21 +105,20 @@ class SceneStore:
         for source in sources:
             self.add(source)
 
-    def add(self, source: GaussianScene | str | Path) -> str | None:
-        """Offers one more scene; gives its id, or None if it became a fault."""
-        try:
-            entry = _identify(source)
-            with self._lock:
-                if entry.id in self._sources:
-                    raise ArchiveError(f"{_describe(source)}: a scene of id {entry.id!r} is already served")
-                self._sources[entry.id] = entry
-            return entry.id
-        except (NurecSimError, OSError) as error:
-            text = f"{_describe(source)}: {error}" if isinstance(error, OSError) else str(error)
-            log.warning("not served: %s", text)
-            with self._lock:
-                self._faults[_stem(source)] = text
-            return None
+    def add(self, source: GaussianScene | str | Path) -> None:
+        """Offers the scene, or all scenes of a folder; what cannot be opened becomes a fault."""
+        for one in [source] if isinstance(source, GaussianScene) else find_sources(Path(source)):
+            try:
+                entry = _identify(one)
+                with self._lock:
+                    if entry.id in self._sources:
+                        raise ArchiveError(f"{_describe(one)}: a scene of id {entry.id!r} is already served")
+                    self._sources[entry.id] = entry
+            except (NurecSimError, OSError) as error:
+                text = f"{_describe(one)}: {error}" if isinstance(error, OSError) else str(error)
+                log.warning("not served: %s", text)
+                with self._lock:
+                    self._faults[_stem(one)] = text
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -240,6 +241,16 @@ class SceneStore:
             log.warning("a reconstruction could not be kept at %s: %s", kept, error)
             return scene
         return read_scene(kept)
+
+
+def find_sources(path: Path) -> list[Path]:
+    """Archives and clips in a folder, at any depth; the path itself if it is one of them, or holds none."""
+    from nurec_sim.logs.storage import META_FILE
+
+    if not path.is_dir() or (path / META_FILE).exists():
+        return [path]
+    found = [*path.rglob("*.usdz"), *path.rglob("*.zip"), *(meta.parent for meta in path.rglob(META_FILE))]
+    return sorted(found) or [path]
 
 
 def content_key(clip_path: Path, method: str) -> str:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
@@ -247,7 +247,7 @@ class RoadMap:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One LiDAR revolution, motion-compensated to ``t_us``; ``intensity`` in 0..1 or None, ``point_t_us`` when fired."""
+    """One LiDAR turn, motion-compensated to ``t_us``; ``intensity`` in 0..1 or None, ``point_t_us`` when fired."""
 
     t_us: int
     start_us: int
@@ -266,11 +266,30 @@ class Sweep:
 class Clip(Protocol):
     """A driving log, read lazily. ``logs.open_clip`` makes one from a path."""
 
-    id: str
-    rig: Rig
-    ego: Trajectory
-    tracks: Sequence[Track]
-    road_map: RoadMap | None
+    @property
+    def id(self) -> str:
+        """Name of the log."""
+        ...
+
+    @property
+    def rig(self) -> Rig:
+        """Sensors and outline of the car."""
+        ...
+
+    @property
+    def ego(self) -> Trajectory:
+        """Recorded poses of the rig."""
+        ...
+
+    @property
+    def tracks(self) -> Sequence[Track]:
+        """Labelled objects; empty when the log has no boxes."""
+        ...
+
+    @property
+    def road_map(self) -> RoadMap | None:
+        """What is known of the road."""
+        ...
 
     @property
     def span_us(self) -> tuple[int, int]:
@@ -334,8 +353,8 @@ class Gaussians:
         return len(self.mean_m)
 
     def __getitem__(self, index: np.ndarray | slice) -> Gaussians:
-        rest = None if self.sh_rest is None else self.sh_rest[index]
-        return Gaussians(*(getattr(self, name)[index] for name in GAUSSIAN_FIELDS), sh_rest=rest)
+        fields: dict[str, Any] = {name: getattr(self, name)[index] for name in GAUSSIAN_FIELDS}
+        return Gaussians(**fields, sh_rest=None if self.sh_rest is None else self.sh_rest[index])
 
     @classmethod
     def empty(cls, n: int = 0) -> Gaussians:
@@ -355,8 +374,10 @@ class Gaussians:
         merged = None if all(r is None for r in rest) else np.concatenate([r for r in rest if r is not None])
         if merged is not None and any(r is None for r in rest):
             raise ValueError("cannot join Gaussians with and without sh_rest")
-        fields = (np.concatenate([getattr(part, name) for part in parts]) for name in GAUSSIAN_FIELDS)
-        return cls(*fields, sh_rest=merged)
+        fields: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in GAUSSIAN_FIELDS
+        }
+        return cls(**fields, sh_rest=merged)
 
 
 GAUSSIAN_FIELDS = ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal", "label", "intensity")
@@ -408,7 +429,7 @@ class GaussianScene:
     road_map: RoadMap | None
     span_us: tuple[int, int]
     camera_times_us: Mapping[str, Int64[np.ndarray, "frames 2"]] = field(default_factory=dict)
-    provenance: Mapping[str, object] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
 
 # --------------------------------------------------------------------------------------------------------- sensing
@@ -445,7 +466,7 @@ class CameraFrame:
 
 @dataclass(frozen=True)
 class LidarFrame:
-    """A simulated sweep: returns only, in the sensor frame at the end of the spin; ``beam`` = row * columns + column."""
+    """A simulated sweep: returns only, in the sensor frame at the end of the spin; beam = row * columns + column."""
 
     lidar: LidarModel
     start_us: int

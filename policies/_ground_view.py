@@ -14,10 +14,48 @@ from nurec_sim.types import CameraFrame, CameraModel
 CELL_M, AHEAD_M, SIDE_M = 0.25, 32.0, 10.0
 TINT_TOLERANCE, DARKER, BRIGHTER = 0.09, -0.9, 0.28
 """Road differs from its known colour by at most this in log colour ratios, and by this in log brightness."""
-SUNLIGHT, SUN_TOLERANCE, SUN_SPREAD, SUN_STEP, SUN_RANGE = (0.11, -0.14), 0.03, 0.05, 0.6, 2.0
+SUNLIGHT, SUN_TOLERANCE, SUN_SPREAD, SUN_STEP, SUN_RANGE = (0.11, -0.14), 0.03, 0.05, 0.45, 2.0
 """From shade, lit by the sky, into the sun, log r/g and log b/g of asphalt change by this times the log brightness."""
 PAINT_TOLERANCE, PAINT_CELLS = 0.08, 2
 ISLAND_M = 3.5
+SEED_LENGTH_M, SEED_HALF_WIDTH_M = 4.0, 1.0
+SHADE, SHADE_SHARE = 0.4, 0.015
+"""Sun and shade differ by at least this in log brightness; so much of the view in shade shows that the sun is out."""
+
+
+class RoadColour:
+    """What the road looks like: learnt from the seed, the ground right ahead of the car, from plan to plan."""
+
+    def __init__(self) -> None:
+        self.road: Float64[np.ndarray, " 3"] | None = None
+        self.sunlit = False
+
+    def blocked(self, seen: Bool[np.ndarray, "x y"], colours: Float64[np.ndarray, "x y 3"]) -> Bool[np.ndarray, "x y"]:
+        """Seen ground cells that do not look like road."""
+        middle, half = seen.shape[1] // 2, int(SEED_HALF_WIDTH_M / CELL_M)
+        first = int(np.argmax(seen[:, middle]))
+        ahead = np.zeros_like(seen)
+        ahead[first : first + int(SEED_LENGTH_M / CELL_M), middle - half : middle + half] = True
+        if not (ahead & seen).any():
+            return seen
+        road = self.learn(colours[ahead & seen], colours[seen])
+        return without_paint(seen & ~looks_like(colours, road, self.sunlit), colours, road) & seen
+
+    def learn(self, seed: Float64[np.ndarray, "n 3"], view: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, " 3"]:
+        """Follow the seed while it looks like road, up into the sun at once, never down into the shade."""
+        here = np.median(seed, axis=0)
+        road = here if self.road is None else self.road
+        brighter = here[2] - road[2]
+        if looks_like(seed, road, sunlit=False).mean() > 0.5 and brighter > -SHADE:
+            self.sunlit |= bool(brighter > SHADE)
+            road = road + (1.0 if brighter > SHADE else 0.3) * (here - road)
+        difference = view - road
+        # Shade is lit by the sky, so it is bluer; what is only darker may be a tyre or wet asphalt.
+        bluer = (difference[:, 0] < 0.05 * difference[:, 2]) & (difference[:, 1] > -0.05 * difference[:, 2])
+        shaded = looks_like(view, road, sunlit=True) & (difference[:, 2] < -SHADE) & bluer
+        self.sunlit |= bool(shaded.mean() > SHADE_SHARE)
+        self.road = road
+        return road
 
 
 def ground_view(frame: CameraFrame) -> tuple[Bool[np.ndarray, "x y"], Float64[np.ndarray, "x y 3"]]:

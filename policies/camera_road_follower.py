@@ -16,23 +16,19 @@ from nurec_sim.policies._ground_view import (
     AHEAD_M,
     CELL_M,
     SIDE_M,
+    RoadColour,
     borders,
     distance_to,
     ground_view,
-    looks_like,
     room_beside,
-    without_paint,
 )
 from nurec_sim.policies._paths import make_plan, pursue, toward_speed
 from nurec_sim.types import Needs, Observation, Plan, Rig
 
-SEED_LENGTH_M, SEED_HALF_WIDTH_M = 4.0, 1.0
-SHADE = 0.4
-"""Sun and shade differ by at least this in log brightness."""
 CAR_HALF_WIDTH_M, SPARE_M = 1.15, 1.0
 CURVATURES = np.array([-0.12, -0.08, -0.05, -0.03, -0.015, -0.006, 0.0, 0.006, 0.015, 0.03, 0.05, 0.08, 0.12])
 FIRST_ARC_M, STEP_M = 10.0, 0.5
-BORDER_LIMIT_M, BORDER_SLACK_M, NEARER, PLACE_M = 6.0, 0.5, 0.5, (8.0, 22.0)
+BORDER_LIMIT_M, BORDER_SLACK_M, NEARER, PLACE_M = 8.0, 0.3, 0.5, (8.0, 22.0)
 BRAKE_MPS2, STOP_GAP_M, START_SPEED_MPS = 3.0, 3.0, 4.0
 FREE_WEIGHT, SPARE_WEIGHT, PLACE_WEIGHT, BEND_WEIGHT, S_BEND_WEIGHT, CHANGE_WEIGHT = 0.3, 6.0, 6.0, 25.0, 12.0, 20.0
 """Worth of a metre of way without cars, of spare room, out of place, and of curvature, in metres of road ahead."""
@@ -50,8 +46,7 @@ class CameraRoadFollower:
     def reset(self, rig: Rig, seed: int) -> None:
         """Forget the road's colour, the place on it, and the speed at the start."""
         self.front_m = rig.body.center_m[0] + rig.body.size_m[0] / 2
-        self.road: Float64[np.ndarray, " 3"] | None = None
-        self.sunlit = False
+        self.road = RoadColour()
         self.place_m: Float64[np.ndarray, " 2"] | None = None
         self.cruise_mps = 0.0
         self.curvature = 0.0
@@ -61,7 +56,7 @@ class CameraRoadFollower:
         if self.cruise_mps == 0.0:
             self.cruise_mps = max(observation.ego.speed_mps, START_SPEED_MPS)
         seen, colours = ground_view(observation.cameras["front"])
-        path, free_m = self.roomiest(self.blocked(seen, colours), seen)
+        path, free_m = self.roomiest(self.road.blocked(seen, colours), seen)
         to_stop = max(0.0, free_m - self.front_m - STOP_GAP_M)
 
         def accel_of(t_s: float, driven_m: float, speed: float) -> float:
@@ -69,36 +64,6 @@ class CameraRoadFollower:
             return max(-6.0, 4 * (safe - speed)) if safe < speed else toward_speed(min(self.cruise_mps, safe), speed)
 
         return make_plan(observation, pursue(path, observation.ego.speed_mps, accel_of))
-
-    def blocked(self, seen: Bool[np.ndarray, "x y"], colours: Float64[np.ndarray, "x y 3"]) -> Bool[np.ndarray, "x y"]:
-        """Seen ground cells that do not look like road."""
-        self.learn(seen, colours)
-        if self.road is None:
-            return seen
-        return without_paint(seen & ~looks_like(colours, self.road, self.sunlit), colours, self.road) & seen
-
-    def learn(self, seen: Bool[np.ndarray, "x y"], colours: Float64[np.ndarray, "x y 3"]) -> None:
-        """Keep the colour of the road, in the sun where there is one, from the seed ahead of the car."""
-        middle = seen.shape[1] // 2
-        first = int(np.argmax(seen[:, middle]))
-        half = int(SEED_HALF_WIDTH_M / CELL_M)
-        ahead = np.zeros_like(seen)
-        ahead[first : first + int(SEED_LENGTH_M / CELL_M), middle - half : middle + half] = True
-        seed = colours[ahead & seen]
-        if len(seed) == 0:
-            return
-        here = np.median(seed, axis=0)
-        if self.road is None:
-            self.road = here
-        brighter = here[2] - self.road[2]
-        if looks_like(seed, self.road, sunlit=False).mean() > 0.5 and brighter > -SHADE:
-            # A car right ahead must not become "road", nor shade the measure of sunlit road.
-            self.sunlit |= brighter > SHADE
-            self.road = self.road + (1.0 if brighter > SHADE else 0.3) * (here - self.road)
-        around = colours[seen] - self.road
-        bluish = (around[:, 0] < 0.1 * around[:, 2] / 2) & (around[:, 1] > -0.1 * around[:, 2] / 2)
-        shaded = looks_like(colours[seen], self.road, sunlit=True) & (around[:, 2] < -SHADE) & bluish
-        self.sunlit |= bool(shaded.mean() > 0.05)
 
     def roomiest(
         self, blocked: Bool[np.ndarray, "x y"], seen: Bool[np.ndarray, "x y"]
@@ -136,10 +101,11 @@ class CameraRoadFollower:
         beside = room_beside(edges, BORDER_LIMIT_M)[:, row, column]
         rooms = np.stack([mean_where(counted, side) for side in beside])
         if self.place_m is None:
-            self.place_m = rooms[:, len(CURVATURES) ** 2 // 2]  # the straight path is the middle one
+            self.place_m = rooms[:, len(CURVATURES) ** 2 // 2]  # of the straight path, the middle one of all
         farther = rooms - self.place_m[:, None]
         cost = np.clip(farther - BORDER_SLACK_M, 0.0, None) + NEARER * np.clip(-farther - BORDER_SLACK_M, 0.0, None)
-        return cost.sum(axis=0)
+        known = (self.place_m > 0) & (self.place_m < BORDER_LIMIT_M)
+        return known @ cost
 
 
 def free_along(station: Float64[np.ndarray, " s"], stops: Bool[np.ndarray, "p s"]) -> Float64[np.ndarray, " p"]:

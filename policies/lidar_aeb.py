@@ -96,10 +96,7 @@ def above_ground(points: Float64[np.ndarray, "n 3"]) -> np.ndarray:
     """Which points stand on the ground: their height above the lowest point of their and the eight next 1 m cells."""
     columns = int(2 * SIDE_M / CELL_M) + 2
     rows = int(RANGE_M / CELL_M) + 2
-    # Far cells may hold no ground at all: there the road is taken to rise by at most 3 % from the wheels on.
-    row = (points[:, 0] / CELL_M).astype(np.int64) + 1
-    column = ((points[:, 1] + SIDE_M) / CELL_M).astype(np.int64) + 1
-    ground = np.repeat(0.03 * CELL_M * np.arange(rows + 1)[:, None], columns + 1, axis=1)
+    ground = np.full((rows + 1, columns + 1), np.inf)
     np.minimum.at(ground, (row, column), points[:, 2])
     around = [np.roll(ground, (i, j), axis=(0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     height = points[:, 2] - np.minimum.reduce(around)[row, column]

@@ -19,6 +19,8 @@ from nurec_sim.scene.describe import scene_arrays
 from nurec_sim.sensors import lidar_model
 from nurec_sim.types import DynamicGaussians, Gaussians, Label, Rig, Trajectory
 
+KNOT_FIELDS = ("knot_t_us", "knot_m", "track")
+
 
 def assert_same(a, b, where="scene"):
     """Equality of nested dataclasses, mappings, sequences and arrays; NaN equals NaN, and -0 equals 0."""
@@ -55,6 +57,16 @@ def test_round_trip_loses_nothing(tmp_path, sh_terms):
 def test_round_trip_of_unusual_scenes(tmp_path, make):
     write_scene(make(), tmp_path / "new folder" / "a [1].usdz")
     assert_same(make(), read_scene(tmp_path / "new folder" / "a [1].usdz"))
+
+
+def test_no_moving_gaussians_keep_their_degree(tmp_path):
+    """Otherwise they could not be joined with the static ones."""
+    scene = full_scene(15)
+    none = DynamicGaussians(scene.dynamic.gaussians[:0], *(getattr(scene.dynamic, name)[:0] for name in KNOT_FIELDS))
+    write_scene(dataclasses.replace(scene, dynamic=none), tmp_path / "a.usdz")
+    back = read_scene(tmp_path / "a.usdz")
+    assert_same(none, back.dynamic)
+    assert len(Gaussians.concatenate([back.static, back.dynamic.gaussians])) == 400
 
 
 finite32 = st.floats(allow_nan=False, allow_infinity=False, width=32)

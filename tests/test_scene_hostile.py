@@ -239,6 +239,21 @@ def test_broken_manifest(good, text):
     refused(good, "not the manifest|is not valid JSON")
 
 
+@pytest.mark.parametrize("counts", [{}, {"static": 1, "dynamic": 2}, {"static": "many"}, [], {"static": -1}])
+def test_broken_counts(good, counts):
+    manifest = json.loads(members_of(good)[archive.MANIFEST]) | {"counts": counts}
+    refused(forge(good, **{archive.MANIFEST: json.dumps(manifest).encode()}), "manifest.json: counts")
+
+
+def test_impossible_harmonics(good):
+    members = members_of(write_scene(empty_scene(), good.parent / "b.usdz"))
+    manifest = json.loads(members[archive.MANIFEST])
+    for count in (4, -3, 10**15):
+        manifest["counts"]["dynamic_sh_rest"] = count
+        write_package(good, members | {archive.MANIFEST: json.dumps(manifest).encode()})
+        refused(good, "dynamic_sh_rest must be 0, 3, 8 or 15, got")
+
+
 def test_gaussians_that_are_not_finite(good):
     static = full_scene(0).static
     static.mean_m[7, 1] = np.nan

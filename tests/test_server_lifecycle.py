@@ -204,6 +204,17 @@ def test_an_archive_changed_inside_fails_when_loaded_and_only_then(archive, tmp_
     assert store.loaded_ids == () and store.get("good").scene.id == "good"
 
 
+def test_a_folder_offers_all_that_lies_in_it(archive, tmp_path):
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    write_scene(scene("a"), tmp_path / "deep" / "er" / "a.usdz")
+    shutil.copy(archive, tmp_path / "b.usdz")
+    damaged(archive, tmp_path / "deep")
+    store = SceneStore([tmp_path])
+    assert store.ids == ("clipgt-street", "clipgt-a")
+    assert sorted(store.faults) == ["empty", "flipped", "half", "text"]
+    assert "clipgt-street' is already served" in store.faults["flipped"]
+
+
 def test_two_sources_of_one_id_are_the_first(archive):
     store = SceneStore([scene(), archive])
     assert store.ids == ("clipgt-street",)
@@ -275,7 +286,9 @@ def clip(tmp_path, monkeypatch):
     (folder / "data.bin").write_bytes(b"one")
     calls = []
 
-    def reconstruct(opened, method):
+    def reconstruct(opened, method, progress=None):
+        if progress:
+            progress("lifting", 0.5)
         calls.append((opened.id, method))
         return scene("drive")
 
@@ -290,8 +303,9 @@ def test_a_clip_is_reconstructed_once_and_kept_by_content(clip, tmp_path):
     options = {"cache_dir": cache, "make_renderer": one_thread}
     store = SceneStore([folder], on_progress=said.append, **options)
     assert store.ids == ("clipgt-drive",) and calls == []
-    first = store.get("drive-folder").scene
-    assert calls == [("drive", "lift")] and "reconstructing" in said[0]
+    stages = []
+    first = store.get("drive-folder", progress=lambda *stage: stages.append(stage)).scene
+    assert calls == [("drive", "lift")] and "reconstructing" in said[0] and stages == [("lifting", 0.5)]
     (kept,) = cache.iterdir()
     second = SceneStore([folder], **options).get("drive").scene
     assert calls == [("drive", "lift")]

@@ -1,18 +1,13 @@
 """The wire contract: numbers of the public interface, compiled descriptors, and life beside other generated code."""
 
-import importlib
 import re
 import shutil
-import sys
-import warnings
-from pathlib import Path
 
 import pytest
+from generated_code import PROTOS, generate_like_alpasim, protoc
 
 from nurec_sim import wire
 from nurec_sim.wire import messages
-
-PROTOS = Path(__file__).parents[1] / "protos"
 
 # Facts of the public NuRec and AlpaSim interfaces; nested names with dots.
 NUMBERS = {
@@ -80,13 +75,6 @@ def test_times_are_fixed64():
         assert fields["frame_start_us"].type == fields["frame_end_us"].type == 6  # TYPE_FIXED64
 
 
-def protoc(*arguments: str) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # grpc_tools reads its own resources in a deprecated way
-        compiler = pytest.importorskip("grpc_tools.protoc", reason="grpcio-tools is not installed")
-        assert compiler.main(["protoc", *arguments]) == 0
-
-
 def test_the_committed_descriptors_match_the_protos(tmp_path):
     built = tmp_path / "descriptors.binpb"
     names = [path.name for path in (PROTOS / n for n in ("common.proto", "sensorsim.proto", "egodriver.proto"))]
@@ -94,29 +82,8 @@ def test_the_committed_descriptors_match_the_protos(tmp_path):
     assert built.read_bytes() == messages.descriptor_bytes(), "run `python protos/build.py` and commit the result"
 
 
-def generate_like_alpasim(folder: Path):
-    """Python code of our protos without our additions, laid out and imported as AlpaSim does it."""
-    package = folder / "alpasim_like" / "v0"
-    package.mkdir(parents=True)
-    for source in PROTOS.glob("*.proto"):
-        text = re.sub(r"^.*= 200\d;.*$", "", source.read_text(), flags=re.MULTILINE)
-        (package / source.name).write_text(re.sub(r'import "', 'import "alpasim_like/v0/', text))
-    names = [f"alpasim_like/v0/{path.name}" for path in package.glob("*.proto")]
-    protoc(f"-I{folder}", f"--python_out={folder}", f"--grpc_python_out={folder}", *names)
-    sys.path.insert(0, str(folder))
-    try:
-        return [importlib.import_module(f"alpasim_like.v0.{n}") for n in ("common_pb2", "sensorsim_pb2")]
-    finally:
-        sys.path.remove(str(folder))
-
-
-@pytest.fixture(scope="module")
-def alpasim_like(tmp_path_factory):
-    return generate_like_alpasim(tmp_path_factory.mktemp("generated"))
-
-
-def test_generated_code_of_the_same_packages_lives_beside_ours(alpasim_like):
-    common, sensorsim = alpasim_like
+def test_generated_code_of_the_same_packages_lives_beside_ours(tmp_path):
+    common, sensorsim = generate_like_alpasim(tmp_path)
     assert sensorsim.RGBRenderRequest.DESCRIPTOR.full_name == wire.sensorsim.RGBRenderRequest.DESCRIPTOR.full_name
     assert sensorsim.RGBRenderRequest is not wire.sensorsim.RGBRenderRequest
     theirs = sensorsim.RGBRenderRequest(scene_id="a", frame_start_us=2**40, image_format=sensorsim.JPEG)

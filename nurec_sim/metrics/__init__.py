@@ -15,6 +15,7 @@ _HOMES = {
     "find_contacts": "collision",
     "judge_footprints": "offroad",
     "metric_table": "table",
+    "read_table": "table",
     "offroad_agreement": "offroad",
     "rollout_values": "aggregate",
     "scene_offroad_grid": "offroad_grid",

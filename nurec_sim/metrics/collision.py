@@ -23,6 +23,8 @@ SIDES = ("front", "rear", "lateral")
 AT_FAULT_RULE = "front_or_lateral"
 """Name of the rule behind ``collision_at_fault``: front and lateral contacts are the ego's, rear ones are not."""
 
+SUB_STEPS = 10
+"""Places between two states that are looked at for the first touch."""
 _ARC_TOLERANCE_M = 2e-3  # shapely's arcs are inscribed polygons, up to 0.6 mm inside the true outline
 
 
@@ -90,7 +92,7 @@ def find_contacts(rollout: Rollout, profile: str = "strict") -> list[Contact]:
         if len(counted) == 0:
             continue
         index = int(counted[0])
-        side = contact_side(ego.at([index]), box.at([index]))
+        side = _first_side(ego, box, index, profile)
         relative = ego_velocity[index] - speed_of(box.world_from_box, t_us)[index]
         found.append(
             Contact(
@@ -124,11 +126,12 @@ def contact_side(ego: BoxPath, actor: BoxPath) -> str:
 
 
 def _outline(box: BoxPath):
-    """Rounded outline of a box at its first time as a shapely polygon."""
+    """Rounded outline of a box at its first time as a shapely geometry."""
     import shapely
 
-    core = shapely.polygons(geometry.box_corners_xy(box.world_from_box[0], *box.core_m))
-    return shapely.buffer(core, box.radius_m)
+    # The hull of a box without area is a line or a point, where a polygon would be empty.
+    core = shapely.convex_hull(shapely.multipoints(geometry.box_corners_xy(box.world_from_box[0], *box.core_m)))
+    return shapely.buffer(core, box.radius_m) if box.radius_m > 0 else core
 
 
 def _counted(ego: BoxPath, actor: BoxPath, profile: str, relevant: np.ndarray) -> np.ndarray:
@@ -147,6 +150,22 @@ def _counted(ego: BoxPath, actor: BoxPath, profile: str, relevant: np.ndarray) -
     return counted
 
 
+def _first_side(ego: BoxPath, actor: BoxPath, index: int, profile: str) -> str:
+    """Side of a contact first seen at a state.
+
+    A car moves metres between two states, far enough to swallow a pedestrian beyond its bumper, so ``strict`` looks
+    where the two first touched on the way from the state before.
+    """
+    if profile == "strict" and index > 0 and ego.present[index - 1] and actor.present[index - 1]:
+        on_the_way = np.arange(1, SUB_STEPS + 1) / SUB_STEPS
+        ego, actor = (
+            BoxPath(geometry.interpolate_pose_pair(box.world_from_box[index - 1 : index + 1], on_the_way), box.size_m)
+            for box in (ego, actor)
+        )
+        index = int(np.argmax(touching(ego, actor)))
+    return contact_side(ego.at([index]), actor.at([index]))
+
+
 def _side_flags(rollout: Rollout, profile: str) -> dict[str, np.ndarray]:
     """Per side, [t] whether an actor touches there."""
     ego = ego_boxes(rollout)
@@ -154,7 +173,7 @@ def _side_flags(rollout: Rollout, profile: str) -> dict[str, np.ndarray]:
     relevant = rollout.t_us >= rollout.first_closed_loop_us
     for box in actor_boxes(rollout).values():
         times: Sequence[int] = np.flatnonzero(_counted(ego, box, profile, relevant)).tolist()
-        first_side = contact_side(ego.at([times[0]]), box.at([times[0]])) if times else ""
+        first_side = _first_side(ego, box, times[0], profile) if times else ""
         for index in times:
             if profile == "strict":
                 flags[first_side][index] = True

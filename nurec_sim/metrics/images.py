@@ -53,9 +53,13 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float | None = No
     return float(np.mean(alike / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))))
 
 
-def _checked(image: np.ndarray, reference: np.ndarray, data_range: float | None) -> tuple[np.ndarray, np.ndarray, float]:
+def _checked(
+    image: np.ndarray, reference: np.ndarray, data_range: float | None
+) -> tuple[np.ndarray, np.ndarray, float]:
     if image.shape != reference.shape or image.size == 0 or image.ndim not in (2, 3):
-        raise ValueError(f"two images of one shape [h, w] or [h, w, c] are needed, got {image.shape}, {reference.shape}")
+        raise ValueError(
+            f"two images of one shape [h, w] or [h, w, c] are needed, got {image.shape}, {reference.shape}"
+        )
     if (image.dtype.kind == "f") != (reference.dtype.kind == "f"):
         raise ValueError(f"images of one kind are needed, got {image.dtype}, {reference.dtype}")
     span = data_range if data_range is not None else (1.0 if image.dtype.kind == "f" else 255.0)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from nurec_sim.reconstruct.points import Cloud
 from nurec_sim.reconstruct.settings import GroundSettings
@@ -27,7 +27,8 @@ class Ground:
     """Heights over a grid of the world's x, y; row and column 0 start at ``corner_m``.
 
     ``height_m`` is smooth and has no holes; ``known`` says where it was measured, ``near`` where it is measured or
-    filled over a short distance, ``road`` where a car can drive to from the path without meeting a step.
+    filled over a short distance, ``road`` where a car can drive to from the path without meeting a step, ``stride`` how
+    many cells one point of the sheet stands for.
     """
 
     corner_m: Float64[np.ndarray, " 2"]
@@ -36,6 +37,7 @@ class Ground:
     known: Bool[np.ndarray, "rows columns"]
     near: Bool[np.ndarray, "rows columns"]
     road: Bool[np.ndarray, "rows columns"]
+    stride: UInt8[np.ndarray, "rows columns"]
 
     def cells(self, xyz_m: Float64[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, " n"]]:
         """Row and column (clipped to the grid) of points, and whether they lie in it."""
@@ -57,12 +59,16 @@ class Ground:
         return inside & flat & self.road[row, column]
 
     def sheet(self, static: Cloud) -> Cloud:
-        """The ground as one regular cloud: a point per cell wherever it is known or filled over a short distance.
+        """The ground as one regular cloud wherever it is known or filled over a short distance.
 
-        Intensity is the mean of the points in the cell, or in its surroundings; NaN where there are none.
+        One point per cell near the driven path, per 2 x 2 cells from 8 m on and per 4 x 4 from 16 m on. Intensity is the mean of the points in the cell, or in its surroundings; NaN where there are none.
         """
-        row, column = np.nonzero(self.near)
-        xyz = np.column_stack([self.corner_m + (np.column_stack([column, row]) + 0.5) * self.cell_m,
+        size = self.stride
+        rows, columns = np.indices(size.shape, sparse=True)
+        row, column = np.nonzero(self.near & (rows % size == 0) & (columns % size == 0))
+        size = size[row, column]
+        row, column = (np.minimum(i + size // 2, n - 1) for i, n in zip((row, column), self.height_m.shape, strict=True))
+        xyz = np.column_stack([self.corner_m + (np.column_stack([column, row]) + (size % 2)[:, None] / 2) * self.cell_m,
                                self.height_m[row, column]])  # fmt: skip
         source = static[np.abs(self.above(static.xyz_m)) < 0.1]
         known = np.isfinite(source.intensity)
@@ -70,13 +76,13 @@ class Ground:
         total, count = np.zeros(self.height_m.shape, np.float32), np.zeros(self.height_m.shape, np.float32)
         np.add.at(total, (r, c), source.intensity[known])
         np.add.at(count, (r, c), 1)
-        for size in (5, 21, 61):
-            soft_total, soft_count = cv2.blur(total, (size, size)), cv2.blur(count, (size, size))
+        for width in (5, 21, 61):
+            soft_total, soft_count = cv2.blur(total, (width, width)), cv2.blur(count, (width, width))
             empty = count == 0
             total, count = np.where(empty, soft_total, total), np.where(empty, soft_count, count)
         with np.errstate(invalid="ignore", divide="ignore"):
             intensity = np.where(count > 1e-6, total / count, np.nan)[row, column]
-        spacing = np.full(len(xyz), self.cell_m, np.float32)
+        spacing = (size * self.cell_m).astype(np.float32)
         eye = xyz + (0, 0, 2.0)
         return Cloud(xyz, eye, spacing, intensity.astype(np.float32), np.ones(len(xyz), np.int32))
 
@@ -124,7 +130,8 @@ def find_ground(
     free = ~steps & ~tall & near & (distance <= settings.road_reach_m)
     seen = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) * cell <= SEEN_M
     road = _grow(free, seen | (distance < 1.2), filled, distance, cell, settings)
-    return Ground(low, cell, filled, known, near | (distance < 1.2), road)
+    stride = np.where(distance < 8, 1, np.where(distance < 16, 2, 4)).astype(np.uint8)
+    return Ground(low, cell, filled, known, near | (distance < 1.2), road, stride)
 
 
 def densify_path(world_from_rig: Float64[np.ndarray, "k 4 4"], step_m: float = 0.1) -> Float64[np.ndarray, "m 3"]:
@@ -142,7 +149,7 @@ def densify_path(world_from_rig: Float64[np.ndarray, "k 4 4"], step_m: float = 0
 
 
 def _low_heights(z: np.ndarray, flat: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean height of the lowest few centimetres in each cell: less noisy than a quantile, blind to what stands there."""
+    """Mean height of the lowest centimetres in each cell: less noisy than a quantile, blind to what stands there."""
     height = np.zeros(rows * columns, np.float32)
     known = np.zeros(rows * columns, bool)
     if len(z):

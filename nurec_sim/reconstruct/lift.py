@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
@@ -54,11 +54,12 @@ class Surfels:
 
 @dataclass(frozen=True)
 class DepthPicture:
-    """Dense inverse depth of a view; which body each pixel shows, and the surfel that gave its depth (-1: none)."""
+    """Dense inverse depth of a view; which body each pixel shows, the surfel that gave its depth (-1: none), and sky."""
 
     inverse_depth: Float32[np.ndarray, "h w"]
     body: Int32[np.ndarray, "h w"]
     surfel: Int32[np.ndarray, "h w"]
+    sky: Bool[np.ndarray, "h w"]
 
 
 def lift(
@@ -99,8 +100,8 @@ def lift(
             windows = actor_layer.windows_of(body.actor, clip.span_us, settings)
             moving.append(actor_layer.emit(body.actor, gaussians, windows))
     clock.start("sky")
-    far = [(p.inverse_depth < 1 / settings.views.max_depth_m) & v.tile.valid for p, v in zip(pictures, views, strict=True)]
-    sky = make_sky(views, canonical, far, settings.sky_px)
+    sky = make_sky(views, canonical, [_sky_weight(p, v, settings) for p, v in zip(pictures, views, strict=True)],
+                   settings.sky_px)  # fmt: skip
     dynamic = actor_layer.join(moving)
     clock.stop()
     counts = {
@@ -134,6 +135,12 @@ def lift(
         camera_times_us={camera: clip.camera_times_us(camera) for camera in clip.rig.cameras},
         provenance=provenance,
     )
+
+
+def _sky_weight(picture: DepthPicture, view: View, settings: LiftSettings) -> np.ndarray:
+    """How much each pixel tells of the sky: 1 if it is far and looks like sky, little if it is merely far."""
+    far = (picture.inverse_depth < 1 / settings.views.max_depth_m) & view.tile.valid
+    return np.where(far, np.where(picture.sky, 1.0, 0.02), 0.0)
 
 
 class _Clock:
@@ -208,6 +215,7 @@ def _depth_pictures(
         def one(k: int) -> DepthPicture:
             view = views[k]
             prior, index, body = _draw(view, bodies)
+            depth.trim_silhouettes(prior, index, grays[k])
             sky = lifting.sky_coloured(view, prior, bright)
             around = [(views[n].packed, views[n].rgb, codes[n]) for n in neighbours_of(views, k, options.neighbours)]
             dense = depth.dense_inverse_depth(
@@ -216,7 +224,7 @@ def _depth_pictures(
             dense[~view.tile.valid] = 0
             index[dense != prior] = -1
             body = _bodies_of_pixels(view, bodies, dense, np.where(index >= 0, body, STATIC))
-            return DepthPicture(dense, body, index)
+            return DepthPicture(dense, body, index, sky)
 
         pictures = []
         for done, picture in enumerate(pool.map(one, range(len(views)))):
@@ -227,17 +235,15 @@ def _depth_pictures(
 
 def _draw(view: View, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Splat all bodies: inverse depth, surfel row within its body, and body number per pixel."""
-    shape = view.rgb.shape[:2]
-    inverse_depth, index, body = np.zeros(shape, np.float32), depth.unused_index(shape), np.zeros(shape, np.int32)
-    offset, starts = 0, []
+    offset, starts, jobs = 0, [], []
     for surfels in bodies:
         starts.append(offset)
         if surfels.present(view.t_us) and len(surfels.cloud):
             pose = geometry.inverse(view.world_from_view) @ surfels.world_from_body(view.t_us)
-            depth.splat(view.packed_from(pose), surfels.cloud.xyz_m, surfels.normal, surfels.spacing_m, offset,
-                        inverse_depth, index)  # fmt: skip
+            jobs.append((view.packed_from(pose), surfels.cloud.xyz_m, surfels.normal, surfels.spacing_m, offset))
         offset += len(surfels.cloud)
-    depth.drop_shine_through(inverse_depth, index)
+    inverse_depth, index = depth.draw_surfels(view.rgb.shape[:2], jobs)
+    body = np.zeros(index.shape, np.int32)
     drawn = index >= 0
     body[drawn] = np.searchsorted(starts, index[drawn], side="right") - 1
     # Bodies without surfels share their start with the next one: searchsorted picks the last, which holds the row.
@@ -369,7 +375,7 @@ def _lifted(
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         ray = ray @ (body_from_world @ view.world_from_view)[:3, :3].T
         z = 1 / picture.inverse_depth[mask].astype(np.float64)
-        parts.append(Lifted(xyz, normal, ray, z / view.tile.focal_px, (rgb[k][mask] / 255).astype(np.float32), surfel,
+        parts.append(Lifted(xyz, normal, ray, z / view.tile.focal_px, rgb[k][mask].astype(np.float32), surfel,
                             np.full(len(z), k, np.int32)))  # fmt: skip
         depths.append(z)
     if not parts:
@@ -377,18 +383,16 @@ def _lifted(
     everything, z = Lifted.concatenate(parts), np.concatenate(depths)
     packed, present = _packed(views, body)
     step = 1 / settings.views.min_depth_m / (settings.views.levels - 1)
-    stack = lifting.stacked([picture.inverse_depth for picture in pictures])
-    chunks = np.array_split(np.arange(len(everything)), THREADS)
+    depth_stack, rgb_stack = lifting.stacked([picture.inverse_depth for picture in pictures]), lifting.stacked(rgb)
+    middle = len(everything) // 2
+    chunks = [slice(0, middle), slice(middle, None)]
     with ThreadPoolExecutor(THREADS) as pool:
-        kept = list(
-            pool.map(
-                lambda part: lifting.owned(
-                    everything.xyz_m[part], z[part], everything.view[part], packed, stack, present,
-                    0.3 * step, lifting.OWNER_RATIO, lifting.OWNER_BORDER,
-                ),
-                chunks,
-            )
-        )  # fmt: skip
+        jobs = [
+            pool.submit(lifting.owned, everything.xyz_m[part], z[part], everything.view[part], everything.rgb[part],
+                        packed, depth_stack, rgb_stack, present, 0.3 * step, lifting.OWNER_RATIO, lifting.OWNER_BORDER)
+            for part in chunks
+        ]
+        kept = [job.result() for job in jobs]  # fmt: skip
     return everything[np.concatenate(kept)]
 
 
@@ -403,7 +407,7 @@ def _lifted_gaussians(lifted: Lifted, body: Surfels, ground: Ground, settings: L
         intensity = np.where(from_surfel, body.cloud.intensity[lifted.surfel], intensity)
     if body.actor is None:
         label = np.where(~from_surfel & ground.is_road(lifted.xyz_m), Label.ROAD, label)
-    return surfaces.footprints(lifted.xyz_m, lifted.normal, lifted.ray, lifted.pixel_m, lifted.rgb, intensity, label,
+    return surfaces.footprints(lifted.xyz_m, lifted.normal, lifted.ray, lifted.pixel_m, lifted.rgb / 255, intensity, label,
                                settings.opacity)  # fmt: skip
 
 

@@ -15,6 +15,8 @@ from nurec_sim.reconstruct.views import View
 STATIC = -1
 OWNER_RATIO = 0.95
 """A view gives up a surface that another view sees from less than this part of its distance."""
+MIXING = 0.3
+"""Weight of another view's colour for a surface, next to 1 for the owner's."""
 OWNER_BORDER = 0.04
 """Views own nothing in this part of their width at the border, where nothing checks their depth."""
 
@@ -97,8 +99,11 @@ def normals_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64
 
 
 @njit(cache=True, nogil=True)
-def owned(xyz, depth, own_view, packed, inverse_depth, present, tolerance, ratio, border):
+def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, tolerance, ratio, border):
     """Which points no other view sees from much nearer, and not more views look through than agree with.
+
+    ``rgb`` (0..255) of the points that stay is mixed with the colours that the agreeing views show, weighted by their
+    nearness: exposure drifts and reflections even out.
 
     A view agrees with a point that projects well inside it if its inverse depth there is the same within ``tolerance``
     (1/m) plus 10 %; it looks through the point if it is clearly smaller. ``packed[k]`` projects from the points' frame
@@ -106,7 +111,8 @@ def owned(xyz, depth, own_view, packed, inverse_depth, present, tolerance, ratio
     """
     keep = np.ones(len(xyz), np.bool_)
     for i in range(len(xyz)):
-        agree, through = 0, 0
+        agree, through, total = 0, 0, 1.0
+        mixed = rgb[i].copy()
         for k in range(len(packed)):
             if k == own_view[i] or not present[k]:
                 continue
@@ -122,10 +128,15 @@ def owned(xyz, depth, own_view, packed, inverse_depth, present, tolerance, ratio
                 if inside and z < ratio * depth[i]:
                     keep[i] = False
                     break
+                share = MIXING * (depth[i] / max(z, depth[i])) ** 2
+                total += share
+                for c in range(3):
+                    mixed[c] += share * pictures[k, int(v), int(u), c]
             elif w < here:
                 through += 1
         if through > agree:
             keep[i] = False
+        rgb[i] = mixed / total
     return keep
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from numba import njit
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.settings import PointSettings
@@ -276,17 +277,24 @@ def seen_through(
     """
     through = np.zeros(len(cloud), np.int32)
     for lidar_from_world, image in range_images:
-        nearest = image
-        for axis, shift in ((0, 1), (0, -1)):
-            nearest = np.minimum(nearest, np.roll(image, shift, axis))
+        nearest = np.minimum(image, np.minimum(np.roll(image, 1, 0), np.roll(image, -1, 0)))
         nearest = np.minimum(nearest, np.minimum(np.roll(nearest, 1, 1), np.roll(nearest, -1, 1)))
-        xyz = geometry.transform_points(lidar_from_world, cloud.xyz_m)
-        distance = np.linalg.norm(xyz, axis=1)
-        azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
-        elevation = np.degrees(np.arcsin(xyz[:, 2] / np.maximum(distance, 1e-9)))
-        column = np.floor((azimuth / (2 * np.pi) + 0.5) * AZIMUTHS).astype(np.int64) % AZIMUTHS
-        row = np.floor((elevation - LOWEST_DEG) / STEP_DEG).astype(np.int64)
-        inside = (row >= 1) & (row < ELEVATIONS - 1) & (distance < 60)
-        seen = np.where(inside, nearest[np.clip(row, 0, ELEVATIONS - 1), column], 0)
-        through += np.isfinite(seen) & (seen > 1.05 * distance + 0.7)
+        _count_through(cloud.xyz_m, lidar_from_world, nearest, through)
     return (through >= votes) & (through >= 2 * cloud.sweeps)
+
+
+@njit(cache=True, nogil=True)
+def _count_through(xyz, lidar_from_world, nearest, through):
+    m = lidar_from_world
+    for i in range(len(xyz)):
+        x = m[0, 0] * xyz[i, 0] + m[0, 1] * xyz[i, 1] + m[0, 2] * xyz[i, 2] + m[0, 3]
+        y = m[1, 0] * xyz[i, 0] + m[1, 1] * xyz[i, 1] + m[1, 2] * xyz[i, 2] + m[1, 3]
+        z = m[2, 0] * xyz[i, 0] + m[2, 1] * xyz[i, 1] + m[2, 2] * xyz[i, 2] + m[2, 3]
+        distance = np.sqrt(x * x + y * y + z * z)
+        if distance > 60.0 or distance < 0.5:
+            continue
+        row = int(np.floor((np.degrees(np.arcsin(z / distance)) - LOWEST_DEG) / STEP_DEG))
+        column = int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * AZIMUTHS) % AZIMUTHS
+        if 1 <= row < ELEVATIONS - 1:
+            seen = nearest[row, column]
+            through[i] += np.isfinite(seen) and seen > 1.05 * distance + 0.7

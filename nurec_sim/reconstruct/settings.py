@@ -13,9 +13,9 @@ class PointSettings:
     """Boxes grow by this on every side before points are taken out of the static world."""
     standing_m: float = 0.3
     """A track that moves less than this over its labelled life stands: it is kept over the whole clip."""
-    min_voxel_m: float = 0.05
-    max_voxel_m: float = 0.4
-    voxel_per_distance: float = 0.005
+    min_voxel_m: float = 0.06
+    max_voxel_m: float = 0.48
+    voxel_per_distance: float = 0.01
     """Voxel edge per metre of distance to the driven path, rounded down to a power of two times ``min_voxel_m``."""
     max_range_m: float = 120.0
     carve: bool = True

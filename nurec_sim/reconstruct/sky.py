@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lifting import rays_of
@@ -16,27 +16,28 @@ from nurec_sim.reconstruct.views import View
 def make_sky(
     views: Sequence[View],
     colours: Sequence[Float64[np.ndarray, "h w 3"]],
-    far: Sequence[Bool[np.ndarray, "h w"]],
+    weights: Sequence[Float64[np.ndarray, "h w"]],
     size: int,
 ) -> Float32[np.ndarray, "6 size size 3"]:
     """Average the far pixels of all views per cubemap texel and fill the rest from their surroundings.
 
-    ``colours`` are canonical, 0..255. Directions that nothing is known of take the colour of the nearest known ones,
+    ``colours`` are canonical, 0..255; ``weights`` say how surely each pixel is sky, 0 if it is not. Directions that nothing is known of take the colour of the nearest known ones,
     ever smoother with distance.
     """
     total, count = np.zeros((6 * size * size, 3)), np.zeros(6 * size * size)
-    for view, rgb, mask in zip(views, colours, far, strict=True):
+    for view, rgb, weight in zip(views, colours, weights, strict=True):
+        mask = weight > 0
         if not mask.any():
             continue
         direction = rays_of(view)[mask] @ view.world_from_view[:3, :3].T
         face, s, t = geometry.cubemap_coordinates(direction)
         column, row = (np.clip((x * size).astype(np.int64), 0, size - 1) for x in (s, t))
         texel = (face * size + row) * size + column
-        count += np.bincount(texel, minlength=len(count))
+        count += np.bincount(texel, weights=weight[mask], minlength=len(count))
         for k in range(3):
-            total[:, k] += np.bincount(texel, weights=rgb[mask][:, k] / 255, minlength=len(count))
+            total[:, k] += np.bincount(texel, weights=weight[mask] * rgb[mask][:, k] / 255, minlength=len(count))
     known = count > 0
-    colour = np.where(known[:, None], total / np.maximum(count, 1)[:, None], 0.0)
+    colour = np.where(known[:, None], total / np.maximum(count, 1e-9)[:, None], 0.0)
     return _spread(colour.reshape(6, size, size, 3), known.reshape(6, size, size)).astype(np.float32)
 
 
@@ -46,12 +47,11 @@ def _spread(colour: np.ndarray, known: np.ndarray) -> np.ndarray:
     result, weight = np.zeros_like(colour), np.zeros(known.shape)
     for face in range(6):
         value, mass = colour[face] * known[face][..., None], known[face].astype(np.float64)
-        for sigma in (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0):
+        for sigma in (1.0, 2.0, 4.0, 8.0, 16.0, 32.0):
             missing = weight[face] == 0
             if not missing.any():
                 break
-            blurred = value if sigma == 0 else cv2.GaussianBlur(value, (0, 0), sigma)
-            soft = mass if sigma == 0 else cv2.GaussianBlur(mass, (0, 0), sigma)
+            blurred, soft = cv2.GaussianBlur(value, (0, 0), sigma), cv2.GaussianBlur(mass, (0, 0), sigma)
             take = missing & (soft > 0.02)
             result[face][take] = blurred[take] / soft[take, None]
             weight[face][take] = 1

@@ -12,9 +12,12 @@ from nurec_sim.types import Gaussians, Label
 NEIGHBOURS = 10
 LINE_RATIO = 0.02
 """Second over first variance below which neighbours lie on one scan line and say nothing about the surface."""
-DISC_SIGMA = 0.6
+DISC_SIGMA = 0.45
 """Standard deviation of a disc per metre of point spacing: discs on a square lattice then leave no visible gaps."""
-THICKNESS_M = 0.01
+PIXEL_SIGMA = 0.6
+"""The same for footprints of pixels, whose lattice shears where the surface is curved."""
+THINNEST_M = 0.003
+"""Thicker discs would catch grazing LiDAR beams far in front of the ground."""
 
 
 def surface_of(
@@ -54,7 +57,7 @@ def surface_of(
         normal = np.where(line[:, None], facing, normal)
         flip = np.sum(normal * to_eye[part], axis=1) < 0
         normals[part] = np.where(flip[:, None], -normal, normal)
-        spacing[part] = np.clip(distance[:, min(4, k)] * 0.8, cloud.spacing_m[part], 3 * cloud.spacing_m[part])
+        spacing[part] = np.clip(distance[:, min(4, k)] * 0.7, cloud.spacing_m[part], 3 * cloud.spacing_m[part])
     return normals, spacing
 
 
@@ -78,7 +81,7 @@ def discs(
 ) -> Gaussians:
     """Gaussians as round discs in the surface, one per point, thin along the normal."""
     across = np.asarray(spacing_m, np.float64) * DISC_SIGMA
-    scale = np.column_stack([across, across, np.maximum(0.1 * across, THICKNESS_M)])
+    scale = np.column_stack([across, across, np.maximum(0.05 * across, THINNEST_M)])
     return _gaussians(xyz_m, rotation_onto(normal), scale, normal, rgb, intensity, label, opacity)
 
 
@@ -102,9 +105,9 @@ def footprints(
     across = np.where(size > 1e-3, across / np.maximum(size, 1e-9), fallback)
     along = np.cross(across, normal)
     rotation = np.stack([along, across, normal], axis=-1)
-    sigma = pixel_m * DISC_SIGMA
+    sigma = pixel_m * PIXEL_SIGMA
     stretch = np.minimum(1 / np.maximum(facing, 1e-3), stretch_limit)
-    scale = np.column_stack([sigma * stretch, sigma, np.minimum(np.maximum(0.25 * sigma, 0.004), sigma)])
+    scale = np.column_stack([sigma * stretch, sigma, np.minimum(np.maximum(0.1 * sigma, THINNEST_M), sigma)])
     return _gaussians(xyz_m, rotation, scale, normal, rgb, intensity, label, opacity)
 
 

@@ -7,8 +7,8 @@ A ray (unit direction d from o) meets a Gaussian (mean m, rotation R, standard d
 at the distance t = -(d' . o') / |S^-1 R^T d| where the response along the ray is largest (3DGUT). There is no blur, so
 a Gaussian smaller than a pixel can fall between rays. A hit counts when alpha >= 1/255 and t >= near. Gaussians whose
 centre lies nearer than the near plane are culled. They are blended front to back in the order of their centres at the
-reference instant (``rays.RayGrid.by_range``), ties in the order static layer, dynamic layer. The Gaussian that would
-bring the transmittance to 1e-4 or below is dropped and ends the ray.
+reference instant (``rays.RayGrid.by_range``); back ends may swap centres whose depths differ by less than float32
+resolves. The Gaussian that would bring the transmittance to 1e-4 or below is dropped and ends the ray.
 
 Outputs: ``alpha`` is the sum of the weights; ``depth`` the weighted mean of t, times the ray's z in the camera, 0
 where alpha < 0.5; ``label`` that of the largest single weight, ``SKY`` where alpha < 0.5. The colour gets (1 - alpha)

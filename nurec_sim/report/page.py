@@ -11,8 +11,9 @@ from nurec_sim.metrics.aggregate import CENSOR_M, DERIVED, MAX_UNKNOWN_FRAC
 from nurec_sim.metrics.collision import AT_FAULT_RULE
 from nurec_sim.metrics.series import METRICS
 from nurec_sim.report.cells import by_policy, count_of, escape, fact_list, full_name, list_items, meaning, summary_cell
+from nurec_sim.report.charts import collision_bars, time_view
 from nurec_sim.report.data import ReportScene, RunReport
-from nurec_sim.report.plots import View, collision_bars, plan_view, time_view
+from nurec_sim.report.plan import View, plan_view
 from nurec_sim.report.rollout_card import rollout_card
 from nurec_sim.report.template import SCRIPT, STYLE
 
@@ -136,6 +137,10 @@ def _unknown(report: RunReport) -> str:
     for scene in report.scenes:
         items += [f"{escape(scene.id)} ({escape(scene.reconstruction)}): {escape(text)}" for text in scene.unknown]
     for (reconstruction, policy), cells in by_policy(report.summary):
+        first = next(iter(cells.values()))
+        if first["n_failed"] == first["n"]:
+            items.append(f"{escape(policy)} ({escape(reconstruction)}): every rollout failed, so nothing was measured")
+            continue
         dead = [
             name for name, row in cells.items()
             if row["n_valid"] == 0 and name not in ("time_to_first_event_s", "collision_delta_v_mps")

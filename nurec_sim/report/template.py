@@ -13,7 +13,7 @@ p { margin:6px 0; max-width:80ch; } .soft { color:var(--soft); } small { color:v
 .scroll { overflow-x:auto; }
 table { border-collapse:collapse; width:100%; font-variant-numeric:tabular-nums; }
 th { text-align:left; font-weight:600; font-size:13px; color:var(--soft); vertical-align:bottom; }
-th, td { padding:7px 10px; border-bottom:1px solid var(--line); } tr:last-child td { border-bottom:0; }
+th, td { padding:7px 7px; border-bottom:1px solid var(--line); } tr:last-child td { border-bottom:0; }
 td.n, th.n { text-align:right; white-space:nowrap; } td small { display:block; }
 .none { color:var(--soft); font-style:italic; }
 .bad { color:var(--bad); font-weight:600; } .good { color:var(--good); }
@@ -27,7 +27,8 @@ details.card > summary .where { font-weight:400; color:var(--soft); }
 video { width:100%; border-radius:6px; background:#0f172a; display:block; }
 pre { white-space:pre-wrap; overflow-wrap:anywhere; background:#f1f5f9; border-radius:6px;
   padding:8px 10px; font-size:12.5px; margin:6px 0; }
-.plot { width:100%; min-height:120px; } ul { margin:6px 0; padding-left:22px; } li { margin:3px 0; }
+.plot { width:100%; min-height:120px; } #collisions { min-height:0; }
+ul { margin:6px 0; padding-left:22px; } li { margin:3px 0; }
 dl { display:grid; grid-template-columns:max-content 1fr; gap:3px 16px; margin:8px 0; } dt { color:var(--soft); }
 dd { margin:0; overflow-wrap:anywhere; }
 .columns { columns:2; column-gap:28px; } .columns table { break-inside:avoid; }
@@ -49,7 +50,7 @@ SCRIPT = """
       figure.layout.images[index] = Object.assign({xref: 'x', yref: 'y', xanchor: 'left', yanchor: 'top',
         sizing: 'stretch', layer: 'below'}, stored);
     });
-    Plotly.newPlot(element, figure.data, figure.layout, {responsive: true, displaylogo: false});
+    Plotly.newPlot(element, figure.data, figure.layout, {responsive: true, displayModeBar: false});
   }
   function drawInside(root) { root.querySelectorAll('.plot').forEach(draw); }
   document.querySelectorAll('details').forEach(function (details) {

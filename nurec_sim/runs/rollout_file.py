@@ -78,7 +78,8 @@ def load_rollout(path: Path | str) -> Rollout:
     """
     path = Path(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # numpy leaves a file that it opened itself open when it turns out to be broken
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             missing = [name for name in ("header", *_ARRAYS) if name not in file.files]
             if missing:
                 raise RunError(f"{path} is no rollout file: it lacks {missing}")

@@ -14,8 +14,7 @@ import numpy as np
 from nurec_sim.errors import ArchiveError, ReconstructError, RunError
 from nurec_sim.metrics.offroad_grid import OffroadGrid, scene_offroad_grid
 from nurec_sim.runs.folder import ROAD, SCENE, write_text
-from nurec_sim.scene import codec
-from nurec_sim.scene import scene_hash
+from nurec_sim.scene import codec, scene_hash
 from nurec_sim.types import GaussianScene, Label, RoadMap
 
 
@@ -108,7 +107,7 @@ def load_scene_record(folder: Path) -> SceneRecord:
 
 
 def _load_grid(path: Path) -> OffroadGrid:
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
         state, place = file["state"], file["place"]
     if state.ndim != 2 or min(state.shape) < 2 or place.shape != (5,) or place[2] <= 0:
         raise ValueError(f"{path.name}: a grid needs cells [rows, columns] and 5 numbers, got {state.shape}")

@@ -7,6 +7,7 @@ same scene gives the same bytes.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import io
 from pathlib import Path
@@ -107,6 +108,8 @@ def read_scene(path: Path | str) -> GaussianScene:
         static = _read_fields(static_usd, ["/Static/background", "/Static/road"], counts["static"], f"{path}: static")
         actors_usd = open_member(path, ACTORS_LAYER)
         moving = _read_fields(actors_usd, field_paths(actors_usd), counts["dynamic"], f"{path}: dynamic")
+        if not len(moving) and counts["dynamic_sh_rest"]:  # no field is there to tell their degree
+            moving = dataclasses.replace(moving, sh_rest=np.zeros((0, counts["dynamic_sh_rest"], 3), np.float32))
         dynamic = DynamicGaussians(moving, *(_read_npy(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS)))
         isp_json = codec.load(package.read(ISP, MAX_JSON_BYTES), f"{path}: {ISP}")
         isp = codec.from_json(codec.mapping(codec.array(np.float64, 3, 4)), isp_json, f"{path}: {ISP}")
@@ -140,6 +143,7 @@ def archive_faults(path: Path | str) -> list[str]:
 
 
 def _manifest(scene: GaussianScene, digest: str, members: dict[str, bytes]) -> dict[str, Any]:
+    harmonics = scene.dynamic.gaussians.sh_rest
     return {
         "format": "nurec_sim scene archive",
         "version": FORMAT_VERSION,
@@ -148,7 +152,11 @@ def _manifest(scene: GaussianScene, digest: str, members: dict[str, bytes]) -> d
         "units": {"length": "m", "time": "us", "angle": "rad", "axes": "z up", "colour": "display (sRGB)"},
         "layers": {"static": STATIC_LAYER, "dynamic": ACTORS_LAYER, "sky": SKY, "isp": ISP, "facts": FACTS},
         "classes": {label.name.lower(): int(label) for label in Label},
-        "counts": {"static": len(scene.static), "dynamic": len(scene.dynamic), "tracks": len(scene.tracks)},
+        "counts": {
+            "static": len(scene.static),
+            "dynamic": len(scene.dynamic),
+            "dynamic_sh_rest": 0 if harmonics is None else harmonics.shape[1],
+        },
         "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},
     }
 
@@ -169,9 +177,12 @@ def _read_manifest(package: Package) -> dict[str, Any]:
         )
     for key, decoder in (("counts", codec.mapping(codec.integer)), ("sha256", codec.mapping(codec.text))):
         codec.from_json(decoder, manifest.get(key), f"{where}: {key}")
-    missing = {"static", "dynamic"} - set(manifest["counts"])
+    missing = {"static", "dynamic", "dynamic_sh_rest"} - set(manifest["counts"])
     if missing:
         raise ArchiveError(f"{where}: counts lacks {sorted(missing)}")
+    if manifest["counts"]["dynamic_sh_rest"] not in (0, 3, 8, 15):
+        given = manifest["counts"]["dynamic_sh_rest"]
+        raise ArchiveError(f"{where}: counts: dynamic_sh_rest must be 0, 3, 8 or 15, got {given}")
     return manifest
 
 

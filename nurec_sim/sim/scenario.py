@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -89,13 +90,18 @@ class Scenario(_Strict):
 
 
 def load_scenario(path: str | Path) -> Scenario:
-    """Read a scenario file.
+    """Read a scenario file; a bare name such as ``demo`` means the shipped one.
 
     Raises:
         ScenarioError: the file cannot be read, is no YAML mapping, or a key is unknown or wrong; the text names the
             file, every wrong key, and what is allowed there.
     """
     path = Path(path)
+    if not path.suffix and not path.exists():
+        shipped = resources.files("nurec_sim.scenarios")
+        if not (shipped / f"{path}.yaml").is_file():
+            raise ScenarioError(f"no scenario named '{path}'; have {shipped_scenarios()}, or give a YAML file")
+        path = Path(str(shipped / f"{path}.yaml"))
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -107,6 +113,12 @@ def load_scenario(path: str | Path) -> Scenario:
     if not isinstance(content, dict):
         raise ScenarioError(f"scenario file '{path}' must hold keys and values, got {type(content).__name__}")
     return make_scenario(content, source=f"scenario file '{path}'")
+
+
+def shipped_scenarios() -> list[str]:
+    """Names of the scenarios that come with the package, sorted."""
+    names = (entry.name for entry in resources.files("nurec_sim.scenarios").iterdir())
+    return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
 
 
 def make_scenario(content: dict, source: str = "scenario") -> Scenario:

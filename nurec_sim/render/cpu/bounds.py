@@ -11,6 +11,7 @@ from nurec_sim.render.cpu.kernel import f4, inner
 
 EVERYWHERE = (f4(-1e9), f4(1e9), f4(-1e9), f4(1e9))
 NOWHERE = (f4(-1e9), f4(-1e9), f4(-1e9), f4(-1e9))
+CIRCLE = np.array([(math.cos(k * math.pi / 8), math.sin(k * math.pi / 8)) for k in range(16)], np.float32)
 WIDE = f4(1.5)
 """Tangent of the angular radius from which a Gaussian is taken to cover the whole grid of a lens or a LiDAR."""
 
@@ -151,8 +152,7 @@ def outline_bounds(kind, x, y, z, axes, e1, e2, squeeze, radius, params, table):
     su = suu = sv = svv = f4(0)
     points = 4 if angle < f4(0.02) else (8 if angle < f4(0.2) else 16)
     for k in range(points):
-        turn = f4(2 * math.pi) * f4(k) / f4(points)
-        a, b = math.cos(turn), math.sin(turn)
+        a, b = CIRCLE[k * 16 // points, 0], CIRCLE[k * 16 // points, 1]
         px, py, pz = cx + a * ax + b * bx, cy + a * ay + b * by, cz + a * az + b * bz
         if kind == LIDAR:
             # Azimuth from the centre's, so that nothing wraps.

@@ -28,7 +28,7 @@ BOX, MAP, BALL, FADE, RANGE, FEATURE, TAG, ORIGIN, RIM, SLOPE, DEEP = 0, 4, 13, 
 RECORD = 26
 
 LOG_255 = math.log(255.0)
-TILE = 16
+TILE = 8
 """Side of the tiles that records are handed out to, in cells."""
 
 

@@ -1,0 +1,135 @@
+"""Curves of a rollout over time, and collision classes per policy."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nurec_sim.report.data import ReportRollout
+from nurec_sim.report.figure import ALARM, EGO, RECORDED, base_layout, rounded
+from nurec_sim.types import Rollout, Series
+
+if TYPE_CHECKING:
+    import polars as pl
+
+CLASS_COLOURS = {"front": "#d55e00", "lateral": "#e69f00", "rear": "#0072b2"}  # Okabe-Ito: told apart by all eyes
+
+
+def time_view(entry: ReportRollout) -> dict[str, Any]:
+    """Speed, acceleration, reach beyond the road and gap to the nearest actor over time."""
+    rollout = entry.rollout
+    t_us = rollout.t_us
+    zero_us = int(t_us[0])
+    seconds = (t_us - zero_us) / 1e6
+    recorded_speed = _recorded_speed(rollout)
+    speed = np.array([state.speed_mps for state in rollout.states])
+    rows = [
+        ("speed, m/s", [("ego", speed, EGO, None), ("recorded", recorded_speed, RECORDED, "dash")]),
+        ("acceleration, m/s2", [("ego", [s.accel_mps2 for s in rollout.states], EGO, None)]),
+        ("beyond the road, m", [("ego", _values_of(entry.series.get("offroad_max_excursion_m")), EGO, None)]),
+        ("gap to actors, m", [("ego", _values_of(entry.series.get("min_distance_to_obstacle_m")), EGO, None)]),
+    ]  # fmt: skip
+    layout, data = base_layout(560), []
+    layout["xaxis"] |= {
+        "title": {"text": "seconds since the start"},
+        "anchor": "y4",
+        "range": rounded([0, max(seconds[-1], 0.1)]),
+    }
+    layout["showlegend"] = False
+    height, gap = 0.205, 0.06
+    for index, (title, lines) in enumerate(rows):
+        axis = "y" if index == 0 else f"y{index + 1}"
+        top = 1 - index * (height + gap)
+        layout[f"yaxis{'' if index == 0 else index + 1}"] = {
+            **layout["yaxis"], "domain": rounded([max(top - height, 0), top]), "rangemode": "tozero", "nticks": 4,
+        }  # fmt: skip
+        layout.setdefault("annotations", []).append(
+            {"text": title, "xref": "paper", "yref": "paper", "x": 0, "y": top, "xanchor": "left", "yanchor": "bottom",
+             "showarrow": False, "font": {"size": 12, "color": "#475569"}}
+        )  # fmt: skip
+        for name, values, colour, dash in lines:
+            style = {"color": colour, "width": 2} | ({"dash": dash} if dash else {})
+            data.append(
+                {"type": "scatter", "mode": "lines", "name": name, "x": rounded(seconds), "y": rounded(values),
+                 "xaxis": "x", "yaxis": axis, "line": style, "connectgaps": False}
+            )  # fmt: skip
+    layout["shapes"] = _spans(entry, zero_us) + [
+        {"type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1,
+         "line": {"color": colour, "width": 1.5, "dash": dash}}
+        for at, colour, dash in _moments(entry, zero_us)
+    ]  # fmt: skip
+    return {"data": data, "layout": layout}
+
+
+def collision_bars(summary: pl.DataFrame) -> dict[str, Any]:
+    """Share of rollouts with a front, lateral and rear contact, stacked per policy."""
+    import polars as pl
+
+    layout = base_layout(110)
+    names: list[str] = []
+    data, total = [], np.zeros(0)
+    many = summary["reconstruction"].n_unique() > 1
+    for side, colour in CLASS_COLOURS.items():
+        rows = summary.filter(pl.col("name") == f"collision_{side}")
+        names = [
+            f"{row['policy']} · {row['reconstruction']}" if many else row["policy"]
+            for row in rows.iter_rows(named=True)
+        ]
+        shares = [None if value is None else round(100 * value, 2) for value in rows["mean"].to_list()]
+        total = np.array(rows["mean"].fill_null(float("nan")).to_list()) + (total if len(total) else 0.0)
+        data.append(
+            {"type": "bar", "orientation": "h", "name": side, "y": names, "x": shares, "marker": {"color": colour},
+             "hovertemplate": "%{y}: %{x:.0f} % " + side + "<extra></extra>"}
+        )  # fmt: skip
+    layout |= {"barmode": "stack", "height": 110 + 30 * len(names), "bargap": 0.35}
+    layout["xaxis"] |= {
+        "title": {"text": "% of rollouts with a contact"},
+        "range": [0, max(100.0, 100 * float(np.nanmax(total, initial=0.0)))],
+    }
+    words = {name: "not known" if np.isnan(share) else "no contact" for name, share in zip(names, total, strict=True)}
+    layout["annotations"] = [
+        {"x": 0.5, "y": name, "text": words[name], "xanchor": "left", "showarrow": False, "font": {"color": "#64748b"}}
+        for name, share in zip(names, total, strict=True)
+        if not share > 0
+    ]
+    layout["yaxis"] |= {"autorange": "reversed", "automargin": True}
+    return {"data": data, "layout": layout}
+
+
+def _values_of(series: Series | None) -> np.ndarray:
+    return np.zeros(0) if series is None else np.where(series.valid, series.values, np.nan)
+
+
+def _recorded_speed(rollout: Rollout) -> np.ndarray:
+    recorded, t_us = rollout.recorded, rollout.t_us
+    if len(recorded.t_us) < 2:
+        return np.full(len(t_us), np.nan)
+    steps = np.linalg.norm(np.diff(recorded.position_m[:, :2], axis=0), axis=1) / (np.diff(recorded.t_us) / 1e6)
+    middle = (recorded.t_us[1:] + recorded.t_us[:-1]) / 2
+    return np.where(t_us <= recorded.end_us, np.interp(t_us, middle, steps), np.nan)
+
+
+def _moments(entry: ReportRollout, zero_us: int) -> list[tuple[float, str, str]]:
+    """Vertical lines: take-over, contacts."""
+    lines = [((entry.rollout.first_closed_loop_us - zero_us) / 1e6, "#64748b", "dot")]
+    lines += [((contact.t_us - zero_us) / 1e6, ALARM, "solid") for contact in entry.contacts]
+    return [(round(at, 3), colour, dash) for at, colour, dash in lines if at > 0]
+
+
+def _spans(entry: ReportRollout, zero_us: int) -> list[dict[str, Any]]:
+    """Shaded times behind the curves: off-road red, road unknown grey."""
+    shapes = []
+    for name, colour in (("offroad", "rgba(220,38,38,0.15)"), ("offroad_unknown_frac", "rgba(100,116,139,0.18)")):
+        series = entry.series.get(name)
+        if series is None or not len(series.t_us):
+            continue
+        marked = np.concatenate([[False], series.valid & (np.nan_to_num(series.values) > 0.5), [False]])
+        edges = np.flatnonzero(np.diff(marked.astype(int)))
+        for start, end in zip(edges[::2], edges[1::2], strict=True):
+            x0, x1 = ((int(series.t_us[index]) - zero_us) / 1e6 for index in (start, end - 1))
+            shapes.append(
+                {"type": "rect", "xref": "x", "yref": "paper", "x0": round(x0 - 0.05, 3), "x1": round(x1 + 0.05, 3),
+                 "y0": 0, "y1": 1, "fillcolor": colour, "line": {"width": 0}, "layer": "below"}
+            )  # fmt: skip
+    return shapes

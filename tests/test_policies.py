@@ -1,0 +1,123 @@
+"""The shipped policies: the conformance kit on each, and what each is for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import worlds
+
+from nurec_sim import geometry
+from nurec_sim.plugins import available_policies, load_policy
+from nurec_sim.sim import Scenario, run_rollout
+from nurec_sim.sim.conformance import check_policy
+from nurec_sim.types import Needs, Plan
+
+
+def drive(name, world, **keys):
+    return run_rollout(Scenario(**{"name": "test", "duration_s": 8.0, **keys}), load_policy(name), world.sense, world)
+
+
+def lateral(rollout, world):
+    return geometry.project_to_polyline(rollout.world_from_rig[:, :2, 3], world.ego.position_m[:, :2])[1]
+
+
+@pytest.mark.parametrize("name", available_policies())
+def test_shipped_policies_conform(name):
+    assert check_policy(load_policy(name)) == []
+
+
+def test_the_kit_finds_what_is_wrong():
+    class Bad:
+        name = "bad"
+        needs = Needs()
+        count = 0
+
+        def reset(self, rig, seed): ...
+
+        def plan(self, observation):
+            self.count += 1
+            times = np.arange(1, 31)
+            pose = np.column_stack([times / 10, np.full(30, self.count * 0.01), np.zeros(30)])
+            observation.route_m[...] = 0
+            return Plan(observation.t_us + 100_000 * times, pose)
+
+    faults = " | ".join(check_policy(Bad()))
+    for text in ("changed its observation", "should reach 5 s ahead", "a second run after reset"):
+        assert text in faults
+    Bad.plan = lambda self, observation: None
+    assert all("must return a nurec_sim.types.Plan" in fault for fault in check_policy(Bad()))
+    Bad.needs, Bad.name = None, ""
+    assert check_policy(Bad()) == ["name must be a text that is not empty", "needs must be a nurec_sim.types.Needs"]
+
+
+@pytest.mark.parametrize("name", ["route_follower", "lidar_aeb"])
+def test_route_drivers_keep_to_the_route_in_a_curve(name):
+    world = worlds.curve()
+    rollout = drive(name, world)
+    assert rollout.status == "ok" and np.abs(lateral(rollout, world)).max() < 0.6
+    assert geometry.arc_length(rollout.world_from_rig[:, :2, 3])[-1] > 50
+
+
+@pytest.mark.parametrize("name", ["route_follower", "lidar_aeb"])
+def test_a_parked_car_stops_who_keeps_to_the_route(name):
+    rollout = drive(name, worlds.parked_car_ahead())
+    gap = 45.0 - 2.25 - 3.85 - rollout.world_from_rig[-1, 0, 3]
+    assert rollout.status == "ok" and rollout.states[-1].speed_mps < 0.5 and 0.3 < gap < 6.0
+
+
+def test_the_camera_does_not_hit_a_parked_car():
+    world = worlds.parked_car_ahead()
+    rollout = drive("camera_road_follower", world)
+    ego = rollout.world_from_rig[:, :2, 3] + 1.4 * rollout.world_from_rig[:, :2, 0]
+    apart = np.abs(ego - [45.0, 0.0])
+    assert rollout.status == "ok" and not ((apart[:, 0] < 4.7) & (apart[:, 1] < 1.85)).any()
+    assert np.abs(geometry.project_to_polyline(ego, world.road_m)[1]).max() < world.road_width_m / 2
+
+
+def test_the_camera_follows_a_curve_it_only_sees():
+    world = worlds.curve(radius_m=45.0)
+    rollout = drive("camera_road_follower", world)
+    _, offset = geometry.project_to_polyline(rollout.world_from_rig[:, :2, 3], world.road_m)
+    assert rollout.status == "ok" and np.abs(offset).max() < world.road_width_m / 2
+    assert geometry.arc_length(rollout.world_from_rig[:, :2, 3])[-1] > 40
+
+
+def test_the_camera_reads_nothing_but_its_image():
+    world = worlds.parked_car_ahead()
+    elsewhere = replace(worlds.straight_road(), tracks=())
+    seen = run_rollout(Scenario(name="a", duration_s=6.0), load_policy("camera_road_follower"), world.sense, world)
+    fooled = run_rollout(
+        Scenario(name="a", duration_s=6.0), load_policy("camera_road_follower"), world.sense, elsewhere
+    )
+    assert seen.world_from_rig.tobytes() == fooled.world_from_rig.tobytes()
+
+
+def test_lidar_sees_no_obstacle_in_empty_sloping_ground():
+    from nurec_sim.policies.lidar_aeb import above_ground
+
+    rng = np.random.default_rng(0)
+    xy = rng.uniform([3, -8], [50, 8], (4000, 2))
+    ground = np.column_stack([xy, 0.06 * xy[:, 0] + rng.normal(0, 0.03, len(xy))])
+    assert above_ground(ground).mean() < 0.01
+    box = np.column_stack([np.full(50, 20.0), np.linspace(-0.5, 0.5, 50), np.linspace(1.6, 2.6, 50)])
+    assert above_ground(np.concatenate([ground, box]))[-50:].mean() > 0.8
+
+
+def test_route_follower_lets_pass_who_does_not_cross():
+    steps = np.arange(81)
+    oncoming = worlds.car("oncoming", np.array([[200.0, 3.5], [0.0, 3.5], [-200.0, 3.5]]), 8.0 * steps / 10 + 60)
+    world = replace(worlds.straight_road(), tracks=(oncoming,))
+    rollout = drive("route_follower", world)
+    assert min(state.speed_mps for state in rollout.states) > 9.5
+
+
+def test_route_follower_waits_for_a_crossing_pedestrian():
+    steps = np.arange(81)
+    walker = worlds.car("walker", np.array([[40.0, -8.0], [40.0, 0.0], [40.0, 12.0]]), 1.4 * steps / 10 + 2.5)
+    walker = replace(walker, size_m=(0.6, 0.6, 1.8), label="person")
+    world = replace(worlds.straight_road(), tracks=(walker,))
+    rollout = drive("route_follower", world)
+    boxes = rollout.actors["walker"][:, :2, 3]
+    ahead = boxes[:, 0] - rollout.world_from_rig[:, 0, 3]
+    inside = (np.abs(boxes[:, 1]) < 1.25) & (ahead > -1.4) & (ahead < 4.15)
+    assert not inside.any() and min(state.speed_mps for state in rollout.states) < 6.0
