@@ -43,6 +43,7 @@ class RemoteSensors:
                 ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
                 ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
                 ("grpc.max_reconnect_backoff_ms", 1000),
+                ("grpc.enable_http_proxy", 0),  # sensor servers are near; a proxy for the web is not for them
                 ("grpc.service_config", json.dumps(config)),
             ],
         )

@@ -96,6 +96,8 @@ def above_ground(points: Float64[np.ndarray, "n 3"]) -> np.ndarray:
     """Which points stand on the ground: their height above the lowest point of their and the eight next 1 m cells."""
     columns = int(2 * SIDE_M / CELL_M) + 2
     rows = int(RANGE_M / CELL_M) + 2
+    row = (points[:, 0] / CELL_M).astype(np.int64) + 1
+    column = ((points[:, 1] + SIDE_M) / CELL_M).astype(np.int64) + 1
     ground = np.full((rows + 1, columns + 1), np.inf)
     np.minimum.at(ground, (row, column), points[:, 2])
     around = [np.roll(ground, (i, j), axis=(0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]

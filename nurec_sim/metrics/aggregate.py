@@ -57,8 +57,8 @@ def rollout_values(table: pl.DataFrame, profile: str = "strict") -> pl.DataFrame
             value = values.get(name, np.nan)
             valid = bool(np.isfinite(value))
             rows.append({**keys, "name": name, "unit": unit, "value": float(value) if valid else None, "valid": valid})
-    schema = {name: table.schema[name] for name in ROLLOUT_KEYS}
-    schema |= {"name": pl.String, "unit": pl.String, "value": pl.Float64, "valid": pl.Boolean}
+    own = {"name": pl.String(), "unit": pl.String(), "value": pl.Float64(), "valid": pl.Boolean()}
+    schema = pl.Schema({name: table.schema[name] for name in ROLLOUT_KEYS} | own)
     return _without_unseen_scenes(pl.DataFrame(rows, schema=schema))
 
 
@@ -95,14 +95,13 @@ def summarize(values: pl.DataFrame, seed: int = 0) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=_summary_schema())
 
 
-def _summary_schema() -> dict[str, object]:
+def _summary_schema() -> pl.Schema:
     import polars as pl
 
-    text, whole, real = pl.String, pl.Int64, pl.Float64
-    return {
-        "world": text, "reconstruction": text, "policy": text, "name": text, "unit": text, "n": whole,
-        "n_failed": whole, "n_valid": whole, "scenes": whole, "mean": real, "low": real, "high": real,
-    }  # fmt: skip
+    text, whole, real = pl.String(), pl.Int64(), pl.Float64()
+    texts = ("world", "reconstruction", "policy", "name", "unit")
+    wholes, reals = ("n", "n_failed", "n_valid", "scenes"), ("mean", "low", "high")
+    return pl.Schema(dict.fromkeys(texts, text) | dict.fromkeys(wholes, whole) | dict.fromkeys(reals, real))
 
 
 def _interval(means: np.ndarray, draws: np.ndarray) -> tuple[float | None, float | None]:

@@ -48,7 +48,7 @@ class BoxPath:
         length, width = self.length_width_m
         return length - 2 * self.radius_m, width - 2 * self.radius_m
 
-    def at(self, index: np.ndarray | slice) -> BoxPath:
+    def at(self, index: np.ndarray | slice | list[int]) -> BoxPath:
         """The box at some of the times."""
         return BoxPath(self.world_from_box[index], self.size_m)
 

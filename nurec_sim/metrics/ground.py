@@ -59,14 +59,14 @@ def fit_ground(
         return np.clip(index[:, 1], 0, rows - 1) * columns + np.clip(index[:, 0], 0, columns - 1)
 
     heights = _CellHeights(cell_of(road_m[:, :2]), road_m[:, 2])
-    level = np.full(rows * columns, np.nan)
+    flat_level = np.full(rows * columns, np.nan)
     path_cells = cell_of(path_m[:, :2])
     seeds, inverse, counts = np.unique(path_cells, return_inverse=True, return_counts=True)
     wheels = np.bincount(inverse, path_m[:, 2]) / counts
     found = heights.low_quantile(seeds, wheels, SEED_STEP_M)
-    level[seeds] = np.where(np.isnan(found), wheels, found)
+    flat_level[seeds] = np.where(np.isnan(found), wheels, found)
 
-    level = level.reshape(rows, columns)
+    level = flat_level.reshape(rows, columns)
     while _grow(level, heights):
         pass
     observed = np.isfinite(level)
@@ -115,22 +115,19 @@ def _extrapolate(level: np.ndarray, observed: np.ndarray) -> np.ndarray:
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
     rows, columns = np.indices(level.shape)
-    x, y = columns * PITCH_M, rows * PITCH_M
+    x: np.ndarray = columns * PITCH_M
+    y: np.ndarray = rows * PITCH_M
     weight = observed.astype(np.float64)
-    z = np.where(observed, level, 0.0)
-    base = z.sum() / weight.sum()
-    z = np.where(observed, z - base, 0.0)
+    base = float(level[observed].mean())
+    z: np.ndarray = np.where(observed, level - base, 0.0)
 
     def smooth(values: np.ndarray) -> np.ndarray:
         return gaussian_filter(values * weight, PLANE_SIGMA_M / PITCH_M, mode="constant", truncate=2.0)
 
     mass = np.maximum(smooth(np.ones_like(z)), 1e-12)
     mean_x, mean_y, mean_z = smooth(x) / mass, smooth(y) / mass, smooth(z) / mass
-    xx, yy, xy = (
-        smooth(x * x) / mass - mean_x**2,
-        smooth(y * y) / mass - mean_y**2,
-        smooth(x * y) / mass - mean_x * mean_y,
-    )
+    xx, yy = smooth(x * x) / mass - mean_x**2, smooth(y * y) / mass - mean_y**2
+    xy = smooth(x * y) / mass - mean_x * mean_y
     xz, yz = smooth(x * z) / mass - mean_x * mean_z, smooth(y * z) / mass - mean_y * mean_z
     ridge = 0.05  # m^2: a strip seen edge-on has no cross slope; hold it level
     xx, yy = xx + ridge, yy + ridge

@@ -146,7 +146,7 @@ def build_offroad_grid(
 
     band = from_path < settings.density_band_m
     density = np.count_nonzero(band.reshape(-1)[flat]) / (np.count_nonzero(band) * cell**2)
-    bandwidth = float(np.clip(settings.bandwidth_factor / np.sqrt(max(density, 1e-6)), *settings.bandwidth_m))
+    bandwidth = float(np.clip(settings.bandwidth_factor / np.sqrt(max(float(density), 1e-6)), *settings.bandwidth_m))
     state = _decide(evidence[0], evidence[1], cell, bandwidth, settings)
     _drop_specks(state, cell, settings)
     corridor = from_path <= settings.corridor_m

@@ -60,8 +60,8 @@ def make_series(name: str, t_us: np.ndarray, values: np.ndarray, valid: np.ndarr
     """A registered metric over time; values that are not finite become invalid."""
     metric = METRICS[name]
     values = np.asarray(values, np.float64)
-    valid = np.broadcast_to(np.asarray(valid, bool), values.shape) & np.isfinite(values)
-    return Series(name, metric.unit, np.asarray(t_us, np.int64), np.where(valid, values, np.nan), valid, metric.reduce)
+    known = np.broadcast_to(np.asarray(valid, bool), values.shape) & np.isfinite(values)
+    return Series(name, metric.unit, np.asarray(t_us, np.int64), np.where(known, values, np.nan), known, metric.reduce)
 
 
 def unknown_series(name: str, t_us: np.ndarray) -> Series:

@@ -113,13 +113,13 @@ def read_table(path: Path) -> pl.DataFrame:
     return table
 
 
-def _schema() -> dict[str, object]:
+def _schema() -> pl.Schema:
     import polars as pl
 
-    special = {
+    special: dict[str, type[pl.DataType]] = {
         "timestamps_us": pl.Int64, "values": pl.Float64, "valid": pl.Boolean, "trial": pl.Int64, "seed": pl.Int64,
     }  # fmt: skip
-    return {name: special.get(name, pl.String) for name in (*ALPASIM_COLUMNS, *OWN_COLUMNS)}
+    return pl.Schema({name: special.get(name, pl.String) for name in (*ALPASIM_COLUMNS, *OWN_COLUMNS)})
 
 
 def _place(rollout: Rollout) -> tuple[str, str, str, str, int]:

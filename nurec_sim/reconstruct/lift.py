@@ -179,7 +179,7 @@ def _surfels(
         ghosts = points.seen_through(static, gathered.range_images, settings.points.carve_votes) & ~(above < 0.25)
     sheet = ground.sheet(static)
     standing = static[~ghosts & ~(np.abs(above) < 0.08)]
-    normal, spacing = surfaces.surface_of(standing)
+    standing, normal, spacing = surfaces.surface_of(standing)
     row, column, _ = ground.cells(sheet.xyz_m)
     road = ground.road[row, column]
     bodies = [
@@ -196,7 +196,7 @@ def _surfels(
         if actor.index in gathered.feet:
             box_feet, world_feet = gathered.feet[actor.index]
             cloud = Cloud.concatenate([cloud, points.thinned(box_feet[~(np.abs(ground.above(world_feet)) < 0.08)])])
-        normal, spacing = surfaces.surface_of(cloud)
+        cloud, normal, spacing = surfaces.surface_of(cloud)
         bodies.append(Surfels(actor, cloud, normal, spacing, np.full(len(cloud), Label.MOVABLE, np.uint8)))
     return bodies, ground
 
@@ -270,14 +270,14 @@ def _bodies_of_pixels(view: View, bodies: Sequence[Surfels], dense: np.ndarray, 
 
 
 def neighbours_of(views: Sequence[View], k: int, count: int) -> list[int]:
-    """Views to match view k against: like direction, a base line between 0.3 and 5 m, best near 1.5 m, close in time."""
+    """Views to match view k against: like direction, a base line between 0.25 and 8 m, best near 1.5 m, close in time."""
     mine = views[k]
     scored = []
     for n, other in enumerate(views):
         move = other.world_from_view[:3, 3] - mine.world_from_view[:3, 3]
         base = float(np.linalg.norm(move))
         facing = float(other.world_from_view[:3, 2] @ mine.world_from_view[:3, 2])
-        if n == k or not 0.3 < base < 5.0 or facing < 0.9:
+        if n == k or not 0.25 < base < 8.0 or facing < 0.9:
             continue
         ahead = float(move @ mine.world_from_view[:3, 2])
         score = abs(np.log(base / 1.5)) + 2 * (1 - facing) + 0.3 * abs(other.t_us - mine.t_us) / 1e6

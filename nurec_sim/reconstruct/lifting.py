@@ -100,7 +100,7 @@ def normals_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64
 
 @njit(cache=True, nogil=True)
 def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, tolerance, ratio, border):
-    """Which points no other view sees from much nearer, and not more views look through than agree with.
+    """Which points no other view sees from much nearer, and that at most half as many views look through as agree with.
 
     ``rgb`` (0..255) of the points that stay is mixed with the colours that the agreeing views show, weighted by their
     nearness: exposure drifts and reflections even out.
@@ -134,7 +134,7 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
                     mixed[c] += share * pictures[k, int(v), int(u), c]
             elif w < here:
                 through += 1
-        if through > agree:
+        if 2 * through > agree:
             keep[i] = False
         rgb[i] = mixed / total
     return keep

@@ -47,7 +47,7 @@ class ViewSettings:
     """Working views have at most this width, by a whole-number reduction of the image."""
     max_field_deg: float = 110.0
     """Wider lenses are cut into several views."""
-    max_views: int = 36
+    max_views: int = 60
     """Frames are skipped evenly until no more working views than this are left."""
     levels: int = 72
     """Inverse-depth hypotheses of the matching, from infinity to ``min_depth_m``."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
@@ -9,7 +11,9 @@ from nurec_sim import geometry
 from nurec_sim.reconstruct.points import Cloud
 from nurec_sim.types import Gaussians, Label
 
-NEIGHBOURS = 10
+NEIGHBOURS = 20
+PLANE_RATIO = 0.15
+"""First over second variance below which neighbours lie on a plane, and points are moved onto it."""
 LINE_RATIO = 0.02
 """Second over first variance below which neighbours lie on one scan line and say nothing about the surface."""
 DISC_SIGMA = 0.45
@@ -20,22 +24,22 @@ THINNEST_M = 0.003
 """Thicker discs would catch grazing LiDAR beams far in front of the ground."""
 
 
-def surface_of(
-    cloud: Cloud, chunk: int = 200_000
-) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
-    """Unit normals that face the sensor, and the spacing between neighbouring points (metres).
+def surface_of(cloud: Cloud, chunk: int = 200_000) -> tuple[Cloud, np.ndarray, np.ndarray]:
+    """The cloud moved onto its local planes, unit normals that face the sensor, and the spacing between points (m).
 
-    The normal is the direction of least variance of the nearest points. Where these lie on a line (one scan ring), the
+    Sweeps of a moving car disagree by centimetres, so that walls are thick; a grazing beam would end at their near
+    side. The normal is the direction of least variance of the nearest points. Where these lie on a line (one scan ring), the
     surface is taken to contain the line and to face the sensor as well as it can.
     """
     from scipy.spatial import cKDTree
 
     n = len(cloud)
+    xyz = cloud.xyz_m.copy()
     normals, spacing = np.zeros((n, 3), np.float32), cloud.spacing_m.astype(np.float32).copy()
     to_eye = cloud.eye_m - cloud.xyz_m
     to_eye /= np.maximum(np.linalg.norm(to_eye, axis=1, keepdims=True), 1e-9)
     if n < 4:
-        return to_eye.astype(np.float32), spacing
+        return cloud, to_eye.astype(np.float32), spacing
     k = min(NEIGHBOURS, n - 1)
     tree = cKDTree(cloud.xyz_m)
     for start in range(0, n, chunk):
@@ -43,7 +47,7 @@ def surface_of(
         distance, index = tree.query(cloud.xyz_m[part], k=k + 1, workers=2)
         offset = cloud.xyz_m[index] - cloud.xyz_m[part][:, None]
         # Neighbours across a gap belong to another surface.
-        close = distance < np.maximum(4 * distance[:, 3:4], 2 * cloud.spacing_m[part, None])
+        close = distance < np.maximum(4 * distance[:, 3:4], 4 * cloud.spacing_m[part, None])
         weight = close / close.sum(axis=1, keepdims=True)
         mean = np.einsum("nk,nkd->nd", weight, offset)
         centred = offset - mean[:, None]
@@ -55,10 +59,13 @@ def surface_of(
         facing = to_eye[part] - np.sum(to_eye[part] * along, axis=1, keepdims=True) * along
         facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
         normal = np.where(line[:, None], facing, normal)
+        plane = ~line & (variance[:, 0] < PLANE_RATIO * variance[:, 1])
+        height = np.where(plane, np.sum(normal * mean, axis=1), 0.0)
+        xyz[part] += height[:, None] * normal
         flip = np.sum(normal * to_eye[part], axis=1) < 0
         normals[part] = np.where(flip[:, None], -normal, normal)
         spacing[part] = np.clip(distance[:, min(4, k)] * 0.7, cloud.spacing_m[part], 3 * cloud.spacing_m[part])
-    return normals, spacing
+    return dataclasses.replace(cloud, xyz_m=xyz), normals, spacing
 
 
 def rotation_onto(normal: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from nurec_sim.metrics.aggregate import DERIVED
 from nurec_sim.metrics.series import METRICS
@@ -14,7 +14,7 @@ from nurec_sim.report.data import ReportRollout
 if TYPE_CHECKING:
     import polars as pl
 
-Row = dict[str, object]
+Row = dict[str, Any]
 
 
 def by_policy(summary: pl.DataFrame) -> Iterator[tuple[tuple[str, str], dict[str, Row]]]:
@@ -23,7 +23,7 @@ def by_policy(summary: pl.DataFrame) -> Iterator[tuple[tuple[str, str], dict[str
         yield key, {row["name"]: row for row in part.iter_rows(named=True)}
 
 
-def summary_cell(row: Mapping[str, object]) -> str:
+def summary_cell(row: Row) -> str:
     """A table cell: mean, interval, and in how many rollouts it could be computed."""
     if row["mean"] is None:
         return f'<td class="n"><span class="none">not known</span><small>0 of {row["n"]}</small></td>'

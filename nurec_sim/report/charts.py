@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nurec_sim.report.data import ReportRollout
-from nurec_sim.report.figure import ALARM, EGO, RECORDED, base_layout, rounded
+from nurec_sim.report.figure import ALARM, EGO, RECORDED, base_layout, plain, rounded
 from nurec_sim.types import Rollout, Series
 
 if TYPE_CHECKING:
@@ -24,9 +24,9 @@ def time_view(entry: ReportRollout) -> dict[str, Any]:
     seconds = (t_us - zero_us) / 1e6
     recorded_speed = _recorded_speed(rollout)
     speed = np.array([state.speed_mps for state in rollout.states])
-    rows = [
+    rows: list[tuple[str, list[tuple[str, np.ndarray, str, str | None]]]] = [
         ("speed, m/s", [("ego", speed, EGO, None), ("recorded", recorded_speed, RECORDED, "dash")]),
-        ("acceleration, m/s2", [("ego", [s.accel_mps2 for s in rollout.states], EGO, None)]),
+        ("acceleration, m/s2", [("ego", np.array([s.accel_mps2 for s in rollout.states]), EGO, None)]),
         ("beyond the road, m", [("ego", _values_of(entry.series.get("offroad_max_excursion_m")), EGO, None)]),
         ("gap to actors, m", [("ego", _values_of(entry.series.get("min_distance_to_obstacle_m")), EGO, None)]),
     ]  # fmt: skip
@@ -73,7 +73,7 @@ def collision_bars(summary: pl.DataFrame) -> dict[str, Any]:
     for side, colour in CLASS_COLOURS.items():
         rows = summary.filter(pl.col("name") == f"collision_{side}")
         names = [
-            f"{row['policy']} · {row['reconstruction']}" if many else row["policy"]
+            plain(f"{row['policy']} · {row['reconstruction']}" if many else row["policy"])
             for row in rows.iter_rows(named=True)
         ]
         shares = [None if value is None else round(100 * value, 2) for value in rows["mean"].to_list()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +22,11 @@ def base_layout(height: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def plain(text: str) -> str:
+    """Text that plotly shows as it is; it would take tags for markup."""
+    return html.escape(text, quote=False)
+
+
 def rounded(values: Sequence[float] | np.ndarray) -> list[float | None]:
     """Three decimals, None where not finite: small and valid JSON."""
     return [round(float(value), 3) if np.isfinite(value) else None for value in np.asarray(values, np.float64)]
@@ -29,6 +35,6 @@ def rounded(values: Sequence[float] | np.ndarray) -> list[float | None]:
 def line_trace(name: str, points: np.ndarray, colour: str, width: float = 2, dash: str = "solid") -> dict[str, Any]:
     """A polyline through points [n, 2]; NaN breaks it."""
     return {
-        "type": "scatter", "mode": "lines", "name": name, "x": rounded(points[:, 0]), "y": rounded(points[:, 1]),
+        "type": "scatter", "mode": "lines", "name": plain(name), "x": rounded(points[:, 0]), "y": rounded(points[:, 1]),
         "line": {"color": colour, "width": width, "dash": dash}, "hoverinfo": "name",
     }  # fmt: skip

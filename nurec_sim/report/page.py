@@ -53,7 +53,7 @@ def render_report(report: RunReport) -> str:
             figures[f"time{index}"] = time_view(entry)
         cards.append(rollout_card(index, entry, report, embed))
     stored = json.dumps({"figures": figures, "images": images}, separators=(",", ":"), allow_nan=False)
-    stored = stored.replace("</", "<\\/")  # text of an event must not end the script
+    stored = stored.replace("<", "\\u003c")  # whatever the texts say, they cannot end the script
     body = [
         _header(report),
         _headline(report),

@@ -15,7 +15,7 @@ from nurec_sim import geometry
 from nurec_sim.metrics.boxes import BoxPath, actor_boxes, ego_boxes
 from nurec_sim.metrics.offroad_grid import Cell, OffroadGrid
 from nurec_sim.report.data import ReportRollout
-from nurec_sim.report.figure import ACTOR, ALARM, EGO, PARKED, RECORDED, base_layout, line_trace, rounded
+from nurec_sim.report.figure import ACTOR, ALARM, EGO, PARKED, RECORDED, base_layout, line_trace, plain, rounded
 from nurec_sim.types import RoadMap, Trajectory
 
 CELL_COLOURS = {Cell.ROAD: (203, 213, 225), Cell.NONROAD: (240, 226, 205), Cell.UNKNOWN: (255, 255, 255)}
@@ -101,7 +101,7 @@ def plan_view(entry: ReportRollout, view: View, image_key: str | None, road_map:
     drawn = [trace for trace in data if trace["x"]]
     reach = np.vstack([view.points(rollout.world_from_rig[:, :2, 3]), line])
     low, high = reach.min(axis=0) - 10, reach.max(axis=0) + 10
-    layout = base_layout(430)
+    layout = base_layout(460)
     layout["xaxis"] |= {"title": {"text": "metres along the recorded drive"}, "range": rounded([low[0], high[0]])}
     layout["yaxis"] |= {"title": {"text": "metres to the left"}, "range": rounded([low[1], high[1]])}
     layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
@@ -120,7 +120,7 @@ def _outlines(
     return trace | ({"fill": "toself", "fillcolor": fill} if fill else {})
 
 
-def _outline(view: View, box: BoxPath, index: int) -> np.ndarray:
+def _outline(view: View, box: BoxPath, index: int | np.integer) -> np.ndarray:
     corners = geometry.box_corners_xy(box.world_from_box[index], *box.size_m[:2])
     return view.points(corners[[0, 1, 2, 3, 0]])
 
@@ -154,9 +154,9 @@ def _event_marks(entry: ReportRollout, view: View) -> list[dict[str, Any]]:
         place = view.points(geometry.interpolate_poses(rollout.t_us, rollout.world_from_rig, t_us)[None, :2, 3])[0]
         at_s = (t_us - rollout.states[0].t_us) / 1e6
         traces.append(
-            {"type": "scatter", "mode": "markers", "name": text[:40],
+            {"type": "scatter", "mode": "markers", "name": plain(text[:40]),
              "x": rounded(place[:1]), "y": rounded(place[1:]),
              "marker": {"color": colour, "symbol": symbol, "size": 11, "line": {"color": "#ffffff", "width": 1}},
-             "text": [f"{at_s:.1f} s: {text}"], "hoverinfo": "text"}
+             "text": [plain(f"{at_s:.1f} s: {text}")], "hoverinfo": "text"}
         )  # fmt: skip
     return traces

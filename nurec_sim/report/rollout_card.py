@@ -26,9 +26,12 @@ def rollout_card(index: int, entry: ReportRollout, report: RunReport, embed: boo
     if rollout.states:
         parts.append(
             f'<div class="pair"><div>{_video(entry, embed)}{_events(entry)}</div>'
-            f'<div class="plot" id="plan{index}"></div></div><div class="plot" id="time{index}"></div>'
+            f'<div><div class="plot" id="time{index}"></div>'
             '<p class="key">Dotted line: the policy takes over. Red line: contact. Red shade: off-road. '
-            "Grey shade: road unknown.</p>"
+            "Grey shade: road unknown.</p></div></div>"
+            f'<div class="plot" id="plan{index}"></div>'
+            '<p class="key">Blue: ego, each second. Dashed: recorded path. Brown: moving actors, each second. '
+            "Grey boxes: standing actors. Red box: ego at the first event.</p>"
         )
     else:
         parts.append('<p class="none">No state was reached: nothing to draw.</p>')

@@ -23,7 +23,7 @@ td.n, th.n { text-align:right; white-space:nowrap; } td small { display:block; }
 .tag.warn { background:#fef3c7; color:#92400e; }
 details.card > summary { cursor:pointer; font-weight:600; }
 details.card > summary .where { font-weight:400; color:var(--soft); }
-.pair { display:grid; grid-template-columns:minmax(0,5fr) minmax(0,6fr); gap:16px; margin-top:12px; align-items:start; }
+.pair { display:grid; grid-template-columns:minmax(0,1fr) minmax(0,1fr); gap:16px; margin-top:12px; align-items:start; }
 video { width:100%; border-radius:6px; background:#0f172a; display:block; }
 pre { white-space:pre-wrap; overflow-wrap:anywhere; background:#f1f5f9; border-radius:6px;
   padding:8px 10px; font-size:12.5px; margin:6px 0; }
@@ -50,6 +50,7 @@ SCRIPT = """
       figure.layout.images[index] = Object.assign({xref: 'x', yref: 'y', xanchor: 'left', yanchor: 'top',
         sizing: 'stretch', layer: 'below'}, stored);
     });
+    if (element.clientWidth < 560) figure.layout.showlegend = false;
     Plotly.newPlot(element, figure.data, figure.layout, {responsive: true, displayModeBar: false});
   }
   function drawInside(root) { root.querySelectorAll('.plot').forEach(draw); }

@@ -134,10 +134,8 @@ def execute(
     for index, job in enumerate(jobs):
 
         def advance(share: float, job: _Job = job, index: int = index) -> None:
-            say(
-                f"{job.policy.name} in {job.scene.id}, seed {job.seed}",
-                min(0.05 + 0.9 * (index + share) / len(jobs), 0.95),
-            )
+            done = min(0.05 + 0.9 * (index + share) / len(jobs), 0.95)
+            say(f"{job.policy.name} in {job.scene.id}, seed {job.seed}", done)
 
         advance(0.0)
         wants_video = video and bool(job.scene.rig.cameras)

@@ -65,7 +65,7 @@ def save_rollout(rollout: Rollout, path: Path | str) -> Path:
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}")
     with part.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, allow_pickle=False, **arrays)
     os.replace(part, path)
     return path
 

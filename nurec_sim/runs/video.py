@@ -102,9 +102,9 @@ def _captions(rollout: Rollout, grid: OffroadGrid | None) -> list[tuple[str, str
             alarms[index].append(f"COLLISION {contact.side}")
     if grid is not None:
         verdicts = judge_footprints(grid, rollout.world_from_rig, rollout.rig.body).verdict
-        for index, verdict in enumerate(verdicts):
-            if verdict != Verdict.ON and t_us[index] >= rollout.first_closed_loop_us:
-                alarms[index].append("OFF ROAD" if verdict == Verdict.OFF else "road unknown")
+        for state, verdict in enumerate(verdicts):
+            if verdict != Verdict.ON and t_us[state] >= rollout.first_closed_loop_us:
+                alarms[state].append("OFF ROAD" if verdict == Verdict.OFF else "road unknown")
     plain = [
         f"{rollout.policy}  {(t - t_us[0]) / 1e6:4.1f} s  {state.speed_mps:4.1f} m/s"
         + ("" if t >= rollout.first_closed_loop_us else "  (log)")

@@ -1,6 +1,6 @@
 """The wire contract: message classes of ``protos/``, and what takes them to the types of ``nurec_sim.types`` and back.
 
-Nothing outside this folder knows what a message looks like, except for the field copying of ``server`` and ``client``.
+Nothing outside this folder knows what a message looks like, except that ``service`` and ``client`` copy plain fields.
 """
 
 from nurec_sim.wire.messages import (

@@ -160,8 +160,9 @@ def read_camera_frame(message, request: SensorRequest) -> CameraFrame:
             f"camera {camera.id!r}: asked for {camera.width_px}x{camera.height_px} planar RGB, "
             f"got {len(message.image_bytes)} bytes"
         )
-    planar = np.frombuffer(message.image_bytes, np.uint8).reshape(shape)
-    rgb = np.ascontiguousarray(np.moveaxis(planar, 0, 2))
+    import cv2
+
+    rgb = cv2.merge(list(np.frombuffer(message.image_bytes, np.uint8).reshape(shape)))  # far quicker than NumPy's copy
     return CameraFrame(camera, request.start_us, request.end_us, rgb)
 
 

@@ -7,16 +7,15 @@ import math
 import numpy as np
 
 from nurec_sim.render.cpu.kernel import f4, inner, kernel
-from nurec_sim.render.cpu.projection import BALL, BOX, DEEP, FADE, FEATURE, MAP, ORIGIN, RANGE, RIM, SLOPE, TAG, TILE
+from nurec_sim.render.cpu.projection import BALL, DEEP, FADE, FEATURE, MAP, ORIGIN, RANGE, RIM, SLOPE, TAG, TILE
 
-SIDE = 8
-CELLS = SIDE * SIDE
-"""A block of rays that is blended at once; its sums stay in the first-level cache."""
+CELLS = TILE * TILE
+"""Rays of a tile; they are blended at once and their sums stay in the first-level cache."""
 
 PLANES = 6
 """Output planes: three features, distance, alpha, label."""
 
-# Sections of a block's buffer, CELLS values each.
+# Sections of a tile's buffer, CELLS values each.
 DX, DY, DZ, OX, OY, OZ, LIVE, SUM = 0, 1, 2, 3, 4, 5, 6, 7
 BEST = SUM + PLANES
 SECTIONS = BEST + 1
@@ -36,10 +35,10 @@ E0, E1, E2, E3, E4 = _exponential()
 
 @inner
 def _load_rays(b, direction, valid, line, lines, x0, y0, width, height):
-    """Rays of a block in the reference frame; cells outside of the grid or without a ray are dead from the start."""
+    """Rays of a tile in the reference frame; cells outside of the grid or without a ray are dead from the start."""
     alive = 0
     for k in range(CELLS):
-        x, y = x0 + k % SIDE, y0 + k // SIDE
+        x, y = x0 + k % TILE, y0 + k // TILE
         b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k] = f4(0), f4(0), f4(1)
         b[OX * CELLS + k], b[OY * CELLS + k], b[OZ * CELLS + k] = f4(0), f4(0), f4(0)
         b[LIVE * CELLS + k] = f4(0)
@@ -60,7 +59,7 @@ def _load_rays(b, direction, valid, line, lines, x0, y0, width, height):
 
 @inner
 def _bundle(b, middle):
-    """A cone around a block's rays: ``middle`` gets its direction and origin; returns its spread of both."""
+    """A cone around a tile's rays: ``middle`` gets its direction and origin; returns its spread of both."""
     for e in range(6):
         middle[e] = f4(0)
     alive = f4(0)
@@ -110,12 +109,44 @@ def _misses(records, i, middle, wide, shift, moving):
 
 
 @inner
-def _blend_fixed(b, r, near):
-    """Blend one record into a block whose rays all start at the reference point."""
-    m00, m01, m02, m10, m11, m12 = r[MAP], r[MAP + 1], r[MAP + 2], r[MAP + 3], r[MAP + 4], r[MAP + 5]
-    m20, m21, m22 = r[MAP + 6], r[MAP + 7], r[MAP + 8]
-    ball, fade, far, tag = r[BALL], r[FADE], r[RANGE], r[TAG]
-    fa, fb, fc = r[FEATURE], r[FEATURE + 1], r[FEATURE + 2]
+def _add(b, k, a, t, near, fa, fb, fc, tag):
+    """Blend a hit at distance ``t`` into ray k; its alpha is exp(-8 a)."""
+    e = E0 + a * (E1 + a * (E2 + a * (E3 + a * E4)))
+    e = e * e
+    e = e * e
+    e = min(e * e, f4(0.99))
+    live = b[LIVE * CELLS + k]
+    weight = e * live
+    left = live - weight
+    hit = (a < f4(CUT)) & (t >= near)
+    ends = left <= f4(1e-4)
+    weight = weight if hit & (not ends) else f4(0)
+    left = f4(0) if ends else left
+    b[LIVE * CELLS + k] = left if hit else live
+    b[SUM * CELLS + k] += weight * fa
+    b[(SUM + 1) * CELLS + k] += weight * fb
+    b[(SUM + 2) * CELLS + k] += weight * fc
+    b[(SUM + 3) * CELLS + k] += weight * t
+    b[(SUM + 4) * CELLS + k] += weight
+    best = b[BEST * CELLS + k]
+    b[(SUM + 5) * CELLS + k] = tag if weight > best else b[(SUM + 5) * CELLS + k]
+    b[BEST * CELLS + k] = max(weight, best)
+
+
+@inner
+def _blend_fixed(b, records, i, near):
+    """Blend one record into a tile whose rays all start at the reference point."""
+    m00, m01, m02, m10, m11, m12 = (
+        records[i, MAP],
+        records[i, MAP + 1],
+        records[i, MAP + 2],
+        records[i, MAP + 3],
+        records[i, MAP + 4],
+        records[i, MAP + 5],
+    )
+    m20, m21, m22 = records[i, MAP + 6], records[i, MAP + 7], records[i, MAP + 8]
+    ball, fade, far, tag = records[i, BALL], records[i, FADE], records[i, RANGE], records[i, TAG]
+    fa, fb, fc = records[i, FEATURE], records[i, FEATURE + 1], records[i, FEATURE + 2]
     for k in range(CELLS):
         dx, dy, dz = b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k]
         x = m00 * dx + m01 * dy + m02 * dz
@@ -125,36 +156,24 @@ def _blend_fixed(b, r, near):
         inverse = f4(1) / (off + w * w)
         a = ball * off * inverse + fade
         t = far * w * inverse
-        e = E0 + a * (E1 + a * (E2 + a * (E3 + a * E4)))
-        e = e * e
-        e = e * e
-        e = min(e * e, f4(0.99))
-        live = b[LIVE * CELLS + k]
-        weight = e * live
-        left = live - weight
-        hit = (a < f4(CUT)) & (t >= near)
-        ends = left <= f4(1e-4)
-        weight = weight if hit & (not ends) else f4(0)
-        left = f4(0) if ends else left
-        b[LIVE * CELLS + k] = left if hit else live
-        b[SUM * CELLS + k] += weight * fa
-        b[(SUM + 1) * CELLS + k] += weight * fb
-        b[(SUM + 2) * CELLS + k] += weight * fc
-        b[(SUM + 3) * CELLS + k] += weight * t
-        b[(SUM + 4) * CELLS + k] += weight
-        best = b[BEST * CELLS + k]
-        b[(SUM + 5) * CELLS + k] = tag if weight > best else b[(SUM + 5) * CELLS + k]
-        b[BEST * CELLS + k] = max(weight, best)
+        _add(b, k, a, t, near, fa, fb, fc, tag)
 
 
 @inner
-def _blend_moving(b, r, near):
-    """Blend one record into a block whose rays start anywhere: full cross product with the offset of the origin."""
-    m00, m01, m02, m10, m11, m12 = r[MAP], r[MAP + 1], r[MAP + 2], r[MAP + 3], r[MAP + 4], r[MAP + 5]
-    m20, m21, m22 = r[MAP + 6], r[MAP + 7], r[MAP + 8]
-    ball, fade, far, tag = r[BALL], r[FADE], r[RANGE], r[TAG]
-    fa, fb, fc = r[FEATURE], r[FEATURE + 1], r[FEATURE + 2]
-    ox, oy, oz = r[ORIGIN], r[ORIGIN + 1], r[ORIGIN + 2]
+def _blend_moving(b, records, i, near):
+    """Blend one record into a tile whose rays start anywhere: full cross product with the offset of the origin."""
+    m00, m01, m02, m10, m11, m12 = (
+        records[i, MAP],
+        records[i, MAP + 1],
+        records[i, MAP + 2],
+        records[i, MAP + 3],
+        records[i, MAP + 4],
+        records[i, MAP + 5],
+    )
+    m20, m21, m22 = records[i, MAP + 6], records[i, MAP + 7], records[i, MAP + 8]
+    ball, fade, far, tag = records[i, BALL], records[i, FADE], records[i, RANGE], records[i, TAG]
+    fa, fb, fc = records[i, FEATURE], records[i, FEATURE + 1], records[i, FEATURE + 2]
+    ox, oy, oz = records[i, ORIGIN], records[i, ORIGIN + 1], records[i, ORIGIN + 2]
     for k in range(CELLS):
         dx, dy, dz = b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k]
         px, py, pz = b[OX * CELLS + k] - ox, b[OY * CELLS + k] - oy, b[OZ * CELLS + k] - oz
@@ -168,26 +187,7 @@ def _blend_moving(b, r, near):
         inverse = f4(1) / (x * x + y * y + w * w)
         a = ball * (cx * cx + cy * cy + cw * cw) * inverse + fade
         t = -(x * gx + y * gy + w * gw) * inverse
-        e = E0 + a * (E1 + a * (E2 + a * (E3 + a * E4)))
-        e = e * e
-        e = e * e
-        e = min(e * e, f4(0.99))
-        live = b[LIVE * CELLS + k]
-        weight = e * live
-        left = live - weight
-        hit = (a < f4(CUT)) & (t >= near)
-        ends = left <= f4(1e-4)
-        weight = weight if hit & (not ends) else f4(0)
-        left = f4(0) if ends else left
-        b[LIVE * CELLS + k] = left if hit else live
-        b[SUM * CELLS + k] += weight * fa
-        b[(SUM + 1) * CELLS + k] += weight * fb
-        b[(SUM + 2) * CELLS + k] += weight * fc
-        b[(SUM + 3) * CELLS + k] += weight * t
-        b[(SUM + 4) * CELLS + k] += weight
-        best = b[BEST * CELLS + k]
-        b[(SUM + 5) * CELLS + k] = tag if weight > best else b[(SUM + 5) * CELLS + k]
-        b[BEST * CELLS + k] = max(weight, best)
+        _add(b, k, a, t, near, fa, fb, fc, tag)
 
 
 @kernel
@@ -213,37 +213,27 @@ def blend(tiles, starts, lists, records, direction, valid, line, lines, near, co
     moving = lines.shape[0] > 1
     for index in range(tiles.shape[0]):
         tile = tiles[index]
-        ty, tx = tile // columns, tile % columns
-        for part in range((TILE // SIDE) ** 2):
-            x0, y0 = tx * TILE + part % 2 * SIDE, ty * TILE + part // 2 * SIDE
-            if x0 >= width or y0 >= height:
-                continue
-            if _load_rays(b, direction, valid, line, lines, x0, y0, width, height) > 0:
-                wide, shift = _bundle(b, middle)
-                left, right = f4(x0) + f4(0.5), f4(x0) + f4(SIDE - 0.5)
-                top, bottom = f4(y0) + f4(0.5), f4(y0) + f4(SIDE - 0.5)
-                done = 0
-                for j in range(starts[tile], starts[tile + 1]):
-                    i = lists[j]
-                    if records[i, BOX + 1] < left or records[i, BOX] > right:
-                        continue
-                    if records[i, BOX + 3] < top or records[i, BOX + 2] > bottom:
-                        continue
-                    if _misses(records, i, middle, wide, shift, moving):
-                        continue
-                    if moving:
-                        _blend_moving(b, records[i], near)
-                    else:
-                        _blend_fixed(b, records[i], near)
-                    done += 1
-                    if done % 16 == 0:
-                        live = f4(0)
-                        for k in range(CELLS):
-                            live += b[LIVE * CELLS + k]
-                        if live == f4(0):
-                            break
-            for k in range(CELLS):
-                x, y = x0 + k % SIDE, y0 + k // SIDE
-                if x < width and y < height:
-                    for p in range(PLANES):
-                        planes[p, y, x] = b[(SUM + p) * CELLS + k]
+        x0, y0 = tile % columns * TILE, tile // columns * TILE
+        if _load_rays(b, direction, valid, line, lines, x0, y0, width, height) > 0:
+            wide, shift = _bundle(b, middle)
+            done = 0
+            for j in range(starts[tile], starts[tile + 1]):
+                i = np.uint64(lists[j])  # unsigned: spares the test for negative indices
+                if _misses(records, i, middle, wide, shift, moving):
+                    continue
+                if moving:
+                    _blend_moving(b, records, i, near)
+                else:
+                    _blend_fixed(b, records, i, near)
+                done += 1
+                if done % 16 == 0:
+                    live = f4(0)
+                    for k in range(CELLS):
+                        live += b[LIVE * CELLS + k]
+                    if live == f4(0):
+                        break
+        for k in range(CELLS):
+            x, y = x0 + k % TILE, y0 + k // TILE
+            if x < width and y < height:
+                for p in range(PLANES):
+                    planes[p, y, x] = b[(SUM + p) * CELLS + k]

@@ -37,4 +37,4 @@ def kernel(function: Callable) -> Callable:
 
 def inner(function: Callable) -> Callable:
     """A function that only kernels call."""
-    return njit(**_OPTIONS)(function)
+    return njit(forceinline=True, **_OPTIONS)(function)
