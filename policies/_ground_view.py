@@ -14,7 +14,7 @@ from nurec_sim.types import CameraFrame, CameraModel
 CELL_M, AHEAD_M, SIDE_M = 0.25, 32.0, 10.0
 TINT_TOLERANCE, DARKER, BRIGHTER = 0.09, -0.9, 0.28
 """Road differs from its known colour by at most this in log colour ratios, and by this in log brightness."""
-SUNLIGHT, SUN_TOLERANCE, SUN_SPREAD, SUN_STEP, SUN_RANGE = (0.11, -0.14), 0.03, 0.05, 0.45, 2.0
+SUNLIGHT, SUN_TOLERANCE, SUN_SPREAD, SUN_STEP, SUN_RANGE = (0.11, -0.14), 0.03, 0.05, (0.45, 0.9), 2.0
 """From shade, lit by the sky, into the sun, log r/g and log b/g of asphalt change by this times the log brightness."""
 PAINT_TOLERANCE, PAINT_CELLS = 0.08, 2
 ISLAND_M = 3.5
@@ -93,14 +93,14 @@ def looks_like(
 ) -> Bool[np.ndarray, "*n"]:
     """Whether log colours are the road's: same tint and about as bright, or the same asphalt in shade or sun.
 
-    Nothing is brighter than a road in the sun, and the sun brightens by at least ``SUN_STEP``: a pavement by less.
+    The sun brightens by at least ``SUN_STEP``, a pavement by less; more is asked for once the road seemed sunlit.
     """
     difference = colours - road
     brighter = difference[..., 2]
     tint = np.abs(difference[..., :2]).max(axis=-1)
     alike = (tint < TINT_TOLERANCE) & (brighter > DARKER) & (brighter < BRIGHTER)
     unsunned = np.abs(difference[..., :2] - brighter[..., None] * SUNLIGHT).max(axis=-1)
-    lit = (brighter > SUN_STEP) & (brighter < SUN_RANGE) & (not sunlit)
+    lit = (brighter > SUN_STEP[sunlit]) & (brighter < SUN_RANGE)
     relit = unsunned < SUN_TOLERANCE + SUN_SPREAD * np.abs(brighter)
     return alike | (relit & (lit | ((brighter > -SUN_RANGE) & (brighter < 0.0))))
 

@@ -25,7 +25,7 @@ from nurec_sim.policies._ground_view import (
 from nurec_sim.policies._paths import make_plan, pursue, toward_speed
 from nurec_sim.types import Needs, Observation, Plan, Rig
 
-CAR_HALF_WIDTH_M, SPARE_M = 1.15, 1.0
+CAR_HALF_WIDTH_M, SPARE_M = 1.25, 0.9
 CURVATURES = np.array([-0.12, -0.08, -0.05, -0.03, -0.015, -0.006, 0.0, 0.006, 0.015, 0.03, 0.05, 0.08, 0.12])
 FIRST_ARC_M, STEP_M = 10.0, 0.5
 BORDER_LIMIT_M, BORDER_SLACK_M, NEARER, PLACE_M = 8.0, 0.3, 0.5, (8.0, 22.0)
@@ -63,7 +63,7 @@ class CameraRoadFollower:
             safe = math.sqrt(2 * BRAKE_MPS2 * max(0.0, to_stop - driven_m))
             return max(-6.0, 4 * (safe - speed)) if safe < speed else toward_speed(min(self.cruise_mps, safe), speed)
 
-        return make_plan(observation, pursue(path, observation.ego.speed_mps, accel_of))
+        return make_plan(observation, pursue(path, observation.ego.speed_mps, accel_of, lookahead_s=0.3))
 
     def roomiest(
         self, blocked: Bool[np.ndarray, "x y"], seen: Bool[np.ndarray, "x y"]

@@ -20,7 +20,7 @@ from nurec_sim.types import LidarFrame, Needs, Observation, Plan, Rig
 CELL_M, RANGE_M, SIDE_M = 1.0, 60.0, 12.0
 MIN_HEIGHT_M, MAX_HEIGHT_M = 0.4, 2.2
 CORRIDOR_MARGIN_M = 0.25
-MIN_POINTS = 3
+MIN_POINTS, STEEPEST = 3, 0.06
 TTC_S, BRAKE_MPS2, STOP_GAP_M = 2.0, 4.0, 2.0
 """Brake when the time to collision falls below 2 s, or the distance below v^2 / (2 * 4) + 2 m."""
 
@@ -89,7 +89,8 @@ def points_in_rig(frame: LidarFrame) -> Float64[np.ndarray, "n 3"]:
     """Returns in the rig frame, of the region ahead that matters."""
     points = geometry.transform_points(frame.lidar.rig_from_lidar, frame.xyz_m)
     ahead = (points[:, 0] > 0) & (points[:, 0] < RANGE_M) & (np.abs(points[:, 1]) < SIDE_M)
-    return points[ahead]
+    # Rendered sweeps hold stray returns under the road, which would make the road around them an obstacle.
+    return points[ahead & (points[:, 2] > -0.3 - STEEPEST * points[:, 0])]
 
 
 def above_ground(points: Float64[np.ndarray, "n 3"]) -> np.ndarray:

@@ -115,8 +115,7 @@ def _extrapolate(level: np.ndarray, observed: np.ndarray) -> np.ndarray:
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
     rows, columns = np.indices(level.shape)
-    x: np.ndarray = columns * PITCH_M
-    y: np.ndarray = rows * PITCH_M
+    x, y = np.asarray(columns * PITCH_M), np.asarray(rows * PITCH_M)
     weight = observed.astype(np.float64)
     base = float(level[observed].mean())
     z: np.ndarray = np.where(observed, level - base, 0.0)

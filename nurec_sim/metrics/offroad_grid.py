@@ -116,7 +116,7 @@ def build_offroad_grid(
     settings = settings or GridSettings()
     path = driven_path(ego, body)
     low, high = path[:, :2].min(axis=0) - settings.margin_m, path[:, :2].max(axis=0) + settings.margin_m
-    fine = np.prod((high - low) / settings.cell_m) <= settings.max_fine_cells
+    fine = float(np.prod((high - low) / settings.cell_m)) <= settings.max_fine_cells
     cell = settings.cell_m if fine else settings.coarse_cell_m
     columns, rows = (np.ceil((high - low) / cell)).astype(int)
 
@@ -145,12 +145,12 @@ def build_offroad_grid(
     from_path = distance_to(on_path, cell)
 
     band = from_path < settings.density_band_m
-    density = np.count_nonzero(band.reshape(-1)[flat]) / (np.count_nonzero(band) * cell**2)
+    density = int(np.count_nonzero(band.reshape(-1)[flat])) / (int(np.count_nonzero(band)) * cell**2)
     bandwidth = float(np.clip(settings.bandwidth_factor / np.sqrt(max(float(density), 1e-6)), *settings.bandwidth_m))
     state = _decide(evidence[0], evidence[1], cell, bandwidth, settings)
     _drop_specks(state, cell, settings)
     corridor = from_path <= settings.corridor_m
-    overruled = float(np.count_nonzero(state[corridor] == Cell.NONROAD) / max(np.count_nonzero(corridor), 1))
+    overruled = float(np.mean(state[corridor] == Cell.NONROAD))
     state[corridor] = Cell.ROAD
     _close(state, cell, settings)
     _fill_holes(state, cell, settings)

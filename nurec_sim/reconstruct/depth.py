@@ -321,7 +321,7 @@ def dense_inverse_depth(
         matching_cost(packed, world_from_view, prior, others, rgb, census(gray), pictures, codes, step, levels, cost)
     add_prior(cost, prior, sky, step)
     result = smooth_depth(cost, gray, step)
-    trusted = (prior > 0) & (np.abs(result - prior) < 1.5 * step + 0.1 * prior)
+    trusted = (prior > 0) & ((np.abs(result - prior) < 1.5 * step + 0.1 * prior) | (prior > (levels - 2) * step))
     return np.where(trusted, prior, result).astype(np.float32)
 
 

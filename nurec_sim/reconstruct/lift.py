@@ -30,6 +30,8 @@ from nurec_sim.reconstruct.views import View, read_views
 from nurec_sim.types import Clip, Gaussians, GaussianScene, Label
 
 THREADS = 2
+KEPT_SHARE = 0.4
+"""Share of the pixels of all views that owns a surface, about; to meet the budget before ownership is known."""
 Progress = Callable[[str, float], None]
 
 
@@ -85,6 +87,7 @@ def lift(
     views = read_views(clip, cameras, settings.views, clock.fraction)
     clock.start("depth")
     pictures = _depth_pictures(views, bodies, settings, clock.fraction)
+    views = [view for view in views if view.key]
     clock.start("colours")
     isp, lonely = _isp(views, pictures, bodies, cameras)
     canonical = [colour.to_canonical(view.rgb, isp[view.camera_id]).astype(np.uint8) for view in views]
@@ -204,7 +207,8 @@ def _surfels(
 def _depth_pictures(
     views: Sequence[View], bodies: Sequence[Surfels], settings: LiftSettings, progress: Callable[[float], None]
 ) -> list[DepthPicture]:
-    """Dense depth of all views."""
+    """Dense depth of the key views, matched against all views."""
+    keys = [k for k, view in enumerate(views) if view.key]
     options = settings.views
     step = 1 / options.min_depth_m / (options.levels - 1)
     bright = float(np.percentile(np.concatenate([v.rgb[::8, ::8].mean(axis=-1).ravel() for v in views]), 98)) if views else 0
@@ -223,12 +227,14 @@ def _depth_pictures(
             )
             dense[~view.tile.valid] = 0
             index[dense != prior] = -1
-            body = _bodies_of_pixels(view, bodies, dense, np.where(index >= 0, body, STATIC))
+            drawn = np.where(index >= 0, body, STATIC)
+            body = _bodies_of_pixels(view, bodies, dense, drawn)
+            index[body != drawn] = -1
             return DepthPicture(dense, body, index, sky)
 
         pictures = []
-        for done, picture in enumerate(pool.map(one, range(len(views)))):
-            progress(done / len(views))
+        for done, picture in enumerate(pool.map(one, keys)):
+            progress(done / len(keys))
             pictures.append(picture)
     return pictures
 
@@ -252,9 +258,9 @@ def _draw(view: View, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.ndarray
 
 
 def _bodies_of_pixels(view: View, bodies: Sequence[Surfels], dense: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """Body number per pixel: that of the surfel, else of the box that the lifted pixel lies in, else the world (0)."""
+    """Body number per pixel: that of the actor's surfel, else of the box that the pixel lies in, else the world (0)."""
     body = np.where(drawn >= 0, drawn, 0).astype(np.int32)
-    open_pixels = (drawn < 0) & (dense > 0)
+    open_pixels = (drawn <= 0) & (dense > 0)
     if len(bodies) > 1 and open_pixels.any():
         xyz = lifting.points_of(view, dense)[open_pixels]
         found = np.zeros(len(xyz), np.int32)
@@ -362,8 +368,11 @@ def _lifted(
 ) -> Lifted:
     """The pixels of all views that show a body and that no other view owns."""
     parts, depths = [], []
+    pixels = sum(view.rgb.shape[0] * view.rgb.shape[1] for view in views)
+    stride = max(1, int(np.ceil(np.sqrt(KEPT_SHARE * pixels / settings.views.budget))))
     for k, (view, picture) in enumerate(zip(views, pictures, strict=True)):
         mask = (picture.body == number) & (picture.inverse_depth > 1 / settings.views.max_depth_m) & view.tile.valid
+        mask &= lifting.lattice(mask.shape, stride)
         if not mask.any():
             continue
         body_from_world = geometry.inverse(body.world_from_body(view.t_us))
@@ -375,7 +384,7 @@ def _lifted(
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         ray = ray @ (body_from_world @ view.world_from_view)[:3, :3].T
         z = 1 / picture.inverse_depth[mask].astype(np.float64)
-        parts.append(Lifted(xyz, normal, ray, z / view.tile.focal_px, rgb[k][mask].astype(np.float32), surfel,
+        parts.append(Lifted(xyz, normal, ray, stride * z / view.tile.focal_px, rgb[k][mask].astype(np.float32), surfel,
                             np.full(len(z), k, np.int32)))  # fmt: skip
         depths.append(z)
     if not parts:
@@ -389,7 +398,7 @@ def _lifted(
     with ThreadPoolExecutor(THREADS) as pool:
         jobs = [
             pool.submit(lifting.owned, everything.xyz_m[part], z[part], everything.view[part], everything.rgb[part],
-                        packed, depth_stack, rgb_stack, present, 0.3 * step, lifting.OWNER_RATIO, lifting.OWNER_BORDER)
+                        packed, depth_stack, rgb_stack, present, 0.3 * step, lifting.OWNER_RING, lifting.OWNER_BORDER)
             for part in chunks
         ]
         kept = [job.result() for job in jobs]  # fmt: skip

@@ -13,8 +13,8 @@ from nurec_sim.reconstruct.depth import project_point
 from nurec_sim.reconstruct.views import View
 
 STATIC = -1
-OWNER_RATIO = 0.95
-"""A view gives up a surface that another view sees from less than this part of its distance."""
+OWNER_RING = 0.1
+"""Views own by rings of distance, each larger by exp of this."""
 MIXING = 0.3
 """Weight of another view's colour for a surface, next to 1 for the owner's."""
 OWNER_BORDER = 0.04
@@ -99,10 +99,11 @@ def normals_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64
 
 
 @njit(cache=True, nogil=True)
-def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, tolerance, ratio, border):
-    """Which points no other view sees from much nearer, and that at most half as many views look through as agree with.
+def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, tolerance, ring, border):
+    """Which points no other view owns, and that at most half as many views look through as agree with.
 
-    ``rgb`` (0..255) of the points that stay is mixed with the colours that the agreeing views show, weighted by their
+    The owner of a surface is the view in the nearest ring of distance, rings growing by the factor ``exp(ring)``, and
+    the first of these; a strict order, so that exactly one view owns it. ``rgb`` (0..255) of the points that stay is mixed with the colours that the agreeing views show, weighted by their
     nearness: exposure drifts and reflections even out.
 
     A view agrees with a point that projects well inside it if its inverse depth there is the same within ``tolerance``
@@ -112,6 +113,7 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
     keep = np.ones(len(xyz), np.bool_)
     for i in range(len(xyz)):
         agree, through, total = 0, 0, 1.0
+        own_ring = np.floor(np.log(depth[i]) / ring)
         mixed = rgb[i].copy()
         for k in range(len(packed)):
             if k == own_view[i] or not present[k]:
@@ -125,7 +127,7 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
                 agree += 1
                 margin = border * view[3]
                 inside = margin < u < view[3] - margin and 0.5 * margin < v < view[4] - 0.5 * margin
-                if inside and z < ratio * depth[i]:
+                if inside and (np.floor(np.log(z) / ring), k) < (own_ring, own_view[i]):
                     keep[i] = False
                     break
                 share = MIXING * (depth[i] / max(z, depth[i])) ** 2
@@ -138,6 +140,13 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
             keep[i] = False
         rgb[i] = mixed / total
     return keep
+
+
+def lattice(shape: tuple[int, int], stride: int) -> Bool[np.ndarray, "h w"]:
+    """Every ``stride``-th pixel of every ``stride``-th row."""
+    mask = np.zeros(shape, bool)
+    mask[stride // 2 :: stride, stride // 2 :: stride] = True
+    return mask
 
 
 def stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:

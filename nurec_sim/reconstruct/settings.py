@@ -47,8 +47,12 @@ class ViewSettings:
     """Working views have at most this width, by a whole-number reduction of the image."""
     max_field_deg: float = 110.0
     """Wider lenses are cut into several views."""
-    max_views: int = 60
-    """Frames are skipped evenly until no more working views than this are left."""
+    max_views: int = 40
+    """Pixels are lifted from every n-th frame, so that no more working views than this are left."""
+    max_frames: int = 240
+    """Frames between them only help to find depth; they too are thinned evenly to this number."""
+    budget: int = 1_200_000
+    """Gaussians to lift from pixels, about: pixels are skipped on a regular lattice to meet it."""
     levels: int = 72
     """Inverse-depth hypotheses of the matching, from infinity to ``min_depth_m``."""
     min_depth_m: float = 3.5
@@ -67,8 +71,8 @@ class LiftSettings:
     views: ViewSettings = field(default_factory=ViewSettings)
     sky_px: int = 512
     """Edge of a cubemap face."""
-    window_position_m: float = 0.03
+    window_position_m: float = 0.05
     """Largest error of the linear motion between the knots of an actor's window."""
-    window_rotation_deg: float = 2.0
+    window_rotation_deg: float = 2.5
     """Largest turn of an actor within one window."""
     opacity: float = 0.95

@@ -35,11 +35,12 @@ class Tile:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One frame through one tile. ``rgb`` is display colour; ``valid`` marks pixels that the camera really saw."""
+    """One frame through one tile. ``rgb`` is display colour; pixels of ``key`` views are lifted."""
 
     camera_id: str
     frame: int
     t_us: int
+    key: bool
     tile: Tile
     world_from_view: Float64[np.ndarray, "4 4"]
     drift_m: Float64[np.ndarray, " 3"]
@@ -136,12 +137,18 @@ def _with_fraction(tile: Tile, camera: CameraModel) -> Tile:
     return Tile(*(getattr(tile, name) for name in list(tile.__dataclass_fields__)[:-1]), solution)
 
 
-def choose_frames(clip: Clip, cameras: Sequence[str], tiles: int, limit: int) -> list[tuple[str, int]]:
-    """(camera, frame) pairs, in order of time, thinned evenly until ``tiles`` of them fit under ``limit``."""
+def choose_frames(
+    clip: Clip, cameras: Sequence[str], tiles: int, settings: ViewSettings
+) -> list[tuple[str, int, bool]]:
+    """(camera, frame, whether it is a key frame) in order of time, thinned evenly to the limits of the settings."""
     counts = {camera: len(clip.camera_times_us(camera)) for camera in cameras}
-    step = max(1, int(np.ceil(sum(counts.values()) * tiles / max(len(cameras), 1) / limit)))
-    pairs = [(camera, frame) for camera in cameras for frame in range(0, counts[camera], step)]
-    return sorted(pairs, key=lambda pair: (int(clip.camera_times_us(pair[0])[pair[1]].sum()), pair))
+    total = sum(counts.values()) * tiles / max(len(cameras), 1)
+    skip = max(1, int(np.ceil(total / settings.max_frames)))
+    step = max(1, int(np.ceil(total / skip / settings.max_views)))
+    chosen = [
+        (camera, frame, frame // skip % step == 0) for camera in cameras for frame in range(0, counts[camera], skip)
+    ]
+    return sorted(chosen, key=lambda row: (int(clip.camera_times_us(row[0])[row[1]].sum()), row))
 
 
 def read_views(
@@ -152,10 +159,10 @@ def read_views(
 ) -> list[View]:
     """Read and resample the chosen frames of the cameras."""
     tiles = {camera: tiles_of(clip.rig.cameras[camera], settings) for camera in cameras}
-    pairs = choose_frames(clip, cameras, sum(map(len, tiles.values())), settings.max_views)
+    frames = choose_frames(clip, cameras, sum(map(len, tiles.values())), settings)
     views = []
-    for done, (camera, frame) in enumerate(pairs):
-        progress(done / len(pairs))
+    for done, (camera, frame, key) in enumerate(frames):
+        progress(done / len(frames))
         image = clip.image(camera, frame)
         start_us, end_us = (int(t) for t in clip.camera_times_us(camera)[frame])
         pair = np.asarray(clip.world_from_camera(camera, frame), np.float64)
@@ -165,7 +172,7 @@ def read_views(
             pose = world_from_camera @ geometry.pose(tile.camera_from_tile, np.zeros(3))
             rgb = _resample(image, tile)
             drift = tile.camera_from_tile.T @ travel if tile.fraction.any() else np.zeros(3)
-            views.append(View(camera, frame, (start_us + end_us) // 2, tile, pose, drift, rgb))
+            views.append(View(camera, frame, (start_us + end_us) // 2, key, tile, pose, drift, rgb))
     return views
 
 

@@ -53,8 +53,10 @@ def moving_gaussians(
     recorded_mean = mean.copy()
     index_of = {track.id: k for k, track in enumerate(tracks)}
     for name, world_from_box in actors.items():
-        index = index_of.get(name)
-        mine = np.flatnonzero(dynamic.track[alive] == index) if index is not None else ()
+        if name not in index_of:
+            continue
+        index = index_of[name]
+        mine = np.flatnonzero(dynamic.track[alive] == index)
         if len(mine) == 0:
             continue
         new_from_recorded = world_from_box @ geometry.inverse(tracks[index].path.at(t_us))

@@ -54,7 +54,7 @@ def ray_grid(sensor: CameraModel | LidarModel) -> RayGrid:
 
 def reference_pose(request: SensorRequest, reference: float) -> tuple[Float64[np.ndarray, "4 4"], int]:
     """``world_from_sensor`` and time in microseconds at the fraction ``reference`` of the exposure."""
-    pose = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), np.float64(reference))
+    pose = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), np.array(reference))
     return pose, request.start_us + int(round(reference * (request.end_us - request.start_us)))
 
 

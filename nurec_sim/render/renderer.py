@@ -39,7 +39,7 @@ class Renderer:
             raise ValueError(f"a renderer needs at least 1 thread, got {threads}")
         self.scene = scene
         self.apply_isp = apply_isp
-        self._workers = Workers(threads or len(os.sched_getaffinity(0)))
+        self._workers = Workers(threads or _usable_cores())
         self._buffers = Buffers()
         self._static = pack(scene.static)
         self._sky = np.ascontiguousarray(scene.sky, np.float32)
@@ -106,12 +106,12 @@ class Renderer:
         grid = self._grid(request)
         view = View.of(grid, request.world_from_sensor)
         planes = draw(grid, view, self._layers(request, grid), True, self._workers, self._buffers)
-        planes = _by_beam(planes, grid).astype(np.float64)
+        assert grid.beam is not None
+        planes = _by_beam(planes, grid.beam).astype(np.float64)
         alpha = planes[4]
         distance = planes[3] / np.maximum(alpha, MIN_ALPHA)
         intensity = planes[0] / np.maximum(planes[1], 1e-12)
-        direction = np.empty((*alpha.shape, 3), np.float32)
-        direction.reshape(-1, 3)[grid.beam.reshape(-1)] = grid.direction.reshape(-1, 3)
+        direction = np.moveaxis(_by_beam(np.moveaxis(grid.direction, 2, 0), grid.beam), 0, 2)
         # Beams of a column share its pose; the grid's line of a beam is its column.
         poses = np.broadcast_to(view.world_from_line, (alpha.shape[1], 4, 4))
         world_direction = np.einsum("cij,rcj->rci", poses[:, :3, :3], direction.astype(np.float64))
@@ -124,7 +124,7 @@ class Renderer:
             return [self._static]
         pose, t_us = reference_pose(request, grid.reference)
         actors = {
-            name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.float64(grid.reference))
+            name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(grid.reference))
             for name, pair in request.actors.items()
         }
         moving = moving_gaussians(self.scene.dynamic, self.scene.tracks, t_us, actors, pose[:3, 3])
@@ -146,8 +146,12 @@ class Renderer:
         return grid
 
 
-def _by_beam(planes: np.ndarray, grid: Grid) -> np.ndarray:
-    """Planes in the order of the LiDAR's beams instead of the grid's cells."""
+def _usable_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _by_beam(planes: np.ndarray, beam: np.ndarray) -> np.ndarray:
+    """Planes [p,h,w] in the order of the LiDAR's beams instead of the grid's cells."""
     result = np.empty_like(planes)
-    result.reshape(len(planes), -1)[:, grid.beam.reshape(-1)] = planes.reshape(len(planes), -1)
+    result.reshape(len(planes), -1)[:, beam.reshape(-1)] = planes.reshape(len(planes), -1)
     return result

@@ -26,7 +26,16 @@ from jaxtyping import Float64
 from nurec_sim import geometry
 from nurec_sim.render.layers import moving_gaussians, view_colour
 from nurec_sim.render.rays import RayGrid, ray_grid, reference_pose, world_rays
-from nurec_sim.types import CameraFrame, Gaussians, GaussianScene, Label, LidarFrame, SensorRequest
+from nurec_sim.types import (
+    CameraFrame,
+    CameraModel,
+    Gaussians,
+    GaussianScene,
+    Label,
+    LidarFrame,
+    LidarModel,
+    SensorRequest,
+)
 
 MAX_ALPHA = 0.99
 MIN_ALPHA = 1 / 255
@@ -47,6 +56,7 @@ class RaySums:
 
 def render_camera(scene: GaussianScene, request: SensorRequest, apply_isp: bool = True) -> CameraFrame:
     """A camera frame; see the module for what it contains."""
+    assert isinstance(request.sensor, CameraModel)
     grid = ray_grid(request.sensor)
     gaussians, order = visible_gaussians(scene, request, grid)
     origin, direction = world_rays(request, grid)
@@ -93,6 +103,7 @@ def sweep_frame(
     opacity_threshold: float,
 ) -> LidarFrame:
     """The returns of a grid of beams, as points in the sensor frame at the end of the sweep."""
+    assert isinstance(request.sensor, LidarModel)
     nearest, farthest = request.sensor.range_m
     beam = np.flatnonzero((alpha > opacity_threshold) & (distance >= nearest) & (distance <= farthest))
     distance = distance.reshape(-1)[beam]
@@ -112,7 +123,7 @@ def visible_gaussians(scene: GaussianScene, request: SensorRequest, grid: RayGri
     """Both layers at the reference instant, coloured for the view, and the order of those in front."""
     world_from_sensor, t_us = reference_pose(request, grid.reference)
     actors = {
-        name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.float64(grid.reference))
+        name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(grid.reference))
         for name, pair in request.actors.items()
     }
     eye = world_from_sensor[:3, 3]

@@ -74,7 +74,7 @@ def plan_view(entry: ReportRollout, view: View, image_key: str | None, road_map:
         rings = [np.vstack([ring, ring[:1]]) for area in road_map.drivable for ring in area]
         data.append(_outlines("true road edge", [view.points(ring) for ring in rings], "#0f766e", width=1, dash="dot"))
     seconds = np.arange(0, len(rollout.states), EVERY_STATES)
-    parked, moving = [], []
+    parked, moving, movers = [], [], []
     for box in boxes.values():
         known = np.flatnonzero(box.present)
         if len(known) == 0:
@@ -83,6 +83,7 @@ def plan_view(entry: ReportRollout, view: View, image_key: str | None, road_map:
         if np.ptp(centres, axis=0).max() < 0.5:
             parked.append(_outline(view, box, known[0]))
         else:
+            movers.append(box)
             moving += [_outline(view, box, index) for index in seconds if box.present[index]]
     data.append(_outlines("standing actors", parked, PARKED, fill="rgba(148,163,184,0.45)"))
     data.append(_outlines("moving actors, each second", moving, ACTOR, width=1))
@@ -92,8 +93,8 @@ def plan_view(entry: ReportRollout, view: View, image_key: str | None, road_map:
     data.append(_outlines("ego, each second", [_outline(view, ego, index) for index in seconds], EGO, width=1))
     moment, marks = _first_event(entry), _event_marks(entry, view)
     if moment is not None:
-        hit = [_outline(view, box, moment) for box in boxes.values() if box.present[moment]]
-        data.append(_outlines("actors at the first event", hit, ACTOR, width=2, fill="rgba(180,83,9,0.25)"))
+        hit = [_outline(view, box, moment) for box in movers if box.present[moment]]
+        data.append(_outlines("moving actors at the first event", hit, ACTOR, width=2, fill="rgba(180,83,9,0.25)"))
         data.append(
             _outlines("ego at the first event", [_outline(view, ego, moment)], ALARM, fill="rgba(220,38,38,0.25)")
         )

@@ -16,7 +16,7 @@ from nurec_sim.render.rays import ray_grid
 from nurec_sim.types import CameraModel, LidarModel, Pinhole, Shutter, Spin
 
 PINHOLE, LENS, LIDAR = 0, 1, 2
-LENS_TABLE_SIZE = 257
+LENS_TABLE_SIZE = 129
 LIDAR_TABLE_SIZE = 8193
 IMAGE_MARGIN_RAD = 0.05
 FIELD_MARGIN_RAD = 0.6
@@ -74,8 +74,7 @@ def _camera_grid(camera: CameraModel) -> Grid:
     if camera.shutter is Shutter.GLOBAL:
         line, fraction = np.zeros((height, width), np.int32), np.zeros(1)
     else:
-        index = np.arange(width)[None, :] if by_column else np.arange(height)[:, None]
-        line = np.broadcast_to(index, (height, width)).astype(np.int32)
+        line = np.indices((height, width), np.int32)[1 if by_column else 0]
         fraction = rays.fraction[0] if by_column else rays.fraction[:, 0]
     field_cos = float(direction[rays.valid][:, 2].min()) if rays.valid.any() else 1.0
     lens = camera.lens
@@ -98,8 +97,7 @@ def _lens_table(camera: CameraModel, half_width: float, field_rad: float) -> Flo
     Distortion polynomials may run away outside of the image, where nobody fitted them.
     """
     p = np.linspace(-half_width, half_width, LENS_TABLE_SIZE)
-    y, x = np.meshgrid(p, p, indexing="ij")
-    x, y = x.ravel(), y.ravel()
+    x, y = np.tile(p, LENS_TABLE_SIZE), np.repeat(p, LENS_TABLE_SIZE)
     angle, azimuth = 2 * np.arctan(np.hypot(x, y)), np.arctan2(y, x)
 
     def look(angle_rad: np.ndarray, azimuth_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,14 +9,18 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.core.options import DefaultOptions
 
 f4 = np.float32
 """Wraps constants in kernels: a bare Python number would make the expression float64."""
 
-_OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp"}}
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp"}}
+# Arrays cost a dozen words each as arguments; where Numba can, small kernels become part of large ones.
+_INLINE: dict[str, Any] = {"forceinline": True} if hasattr(DefaultOptions, "forceinline") else {}
 
 
 def _source_digest() -> str:
@@ -32,9 +36,12 @@ _DIGEST = _source_digest()
 def kernel(function: Callable) -> Callable:
     """An entry point: called from Python, its machine code kept on disk."""
     function.__qualname__ += f"_{_DIGEST}"
-    return njit(cache=True, **_OPTIONS)(function)
+    try:
+        return njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # no folder to write to: compiled anew in every process
+        return njit(**_OPTIONS)(function)
 
 
 def inner(function: Callable) -> Callable:
     """A function that only kernels call."""
-    return njit(forceinline=True, **_OPTIONS)(function)
+    return njit(**_INLINE, **_OPTIONS)(function)

@@ -85,7 +85,7 @@ class View:
     def of(cls, grid: Grid, pair: Float64[np.ndarray, "2 4 4"]) -> View:
         """The view of a grid whose sensor moves from the first to the second pose; one line where it does not move."""
         pair = np.asarray(pair, np.float64)
-        reference = geometry.interpolate_pose_pair(pair, np.float64(grid.reference))
+        reference = geometry.interpolate_pose_pair(pair, np.array(grid.reference))
         still = len(grid.line_fraction) == 1 or np.array_equal(pair[0], pair[1])
         poses = reference[None] if still else geometry.interpolate_pose_pair(pair, grid.line_fraction)
         reference_from_line = geometry.inverse(reference) @ poses

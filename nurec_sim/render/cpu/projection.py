@@ -24,8 +24,8 @@ from nurec_sim.render.cpu.pack import COLOUR, LABEL, LOG_OPACITY, QUAT, SCALE
 from nurec_sim.render.cpu.sightings import sightings
 
 # Columns of a record.
-BOX, MAP, BALL, FADE, RANGE, FEATURE, TAG, ORIGIN, RIM, SLOPE, DEEP = 0, 4, 13, 14, 15, 16, 19, 20, 23, 24, 25
-RECORD = 26
+MAP, BALL, FADE, RANGE, FEATURE, TAG, ORIGIN, RIM, SLOPE, DEEP = 0, 9, 10, 11, 12, 15, 16, 19, 20, 21
+RECORD = 22
 
 LOG_255 = math.log(255.0)
 TILE = 8
@@ -51,11 +51,24 @@ def _motion(first, last):
 
 
 @inner
-def _tile_span(low, high, cells):
-    """Tiles of a row of cells whose cell centres can lie in [low, high]."""
-    first = np.int64(max(low - f4(0.5), f4(0))) // TILE
-    last = np.int64(min(max(high + f4(0.5), f4(0)), cells) + f4(TILE - 1)) // TILE - 1
+def _cell_span(low, high, cells):
+    """First and last cell whose centre lies in [low, high]; the first is larger if there is none."""
+    first = np.int64(math.ceil(max(low, f4(0)) - f4(0.5)))
+    last = np.int64(math.floor(min(high, cells) - f4(0.5))) if high > f4(0) else -1
     return first, last
+
+
+@inner
+def _drop_between_rays(boxes, count, cells, cell_spans):
+    """Cells of the boxes that hold a ray at all, moved to the front; returns their number."""
+    kept = 0
+    for k in range(count):
+        x0, x1 = _cell_span(boxes[k, 0], boxes[k, 1], cells[0])
+        y0, y1 = _cell_span(boxes[k, 2], boxes[k, 3], cells[1])
+        if x0 <= x1 and y0 <= y1:
+            cell_spans[kept, 0], cell_spans[kept, 1], cell_spans[kept, 2], cell_spans[kept, 3] = x0, x1, y0, y1
+            kept += 1
+    return kept
 
 
 @inner
@@ -104,7 +117,7 @@ def project(
         cells: (columns, rows) of the grid, float32.
         by_range: order by distance instead of z.
         near: near plane.
-        records: [.., 24] output, from row ``base`` on.
+        records: [.., 22] output, from row ``base`` on.
         spans: [..,4] first and last tile column and row of the records' boxes.
         keys: sort keys of the records.
         base: first row to write.
@@ -114,7 +127,7 @@ def project(
     """
     n = base
     rotation, axes = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
-    boxes = np.empty((2, 4), np.float32)
+    boxes, cell_spans = np.empty((2, 4), np.float32), np.empty((2, 4), np.int64)
     e1, e2 = np.empty(3, np.float32), np.empty(3, np.float32)
     map_ = np.empty((3, 3), np.float32)
     moving = lines.shape[0] > 1
@@ -157,6 +170,7 @@ def project(
                     x, y, z, rotation, packed, i, k2, lines, travel, swing,
                     kind, params, table, row_shift, line_axis, cells, axes, e1, e2, boxes,
                 )  # fmt: skip
+            seen = _drop_between_rays(boxes, seen, cells, cell_spans)
             if seen == 0:
                 continue
             ox = oy = oz = f4(0)
@@ -218,9 +232,7 @@ def project(
                     for e in range(RECORD):
                         records[n, e] = records[n - 1, e]
                 for b in range(4):
-                    records[n, BOX + b] = boxes[k, b]
-                spans[n, 0], spans[n, 1] = _tile_span(boxes[k, 0], boxes[k, 1], cells[0])
-                spans[n, 2], spans[n, 3] = _tile_span(boxes[k, 2], boxes[k, 3], cells[1])
+                    spans[n, b] = cell_spans[k, b] // TILE
                 keys[n] = key
                 n += 1
     return n - base
