@@ -19,7 +19,7 @@ from nurec_sim.types import LidarFrame, Needs, Observation, Plan, Rig
 
 CELL_M, RANGE_M, SIDE_M = 1.0, 60.0, 12.0
 MIN_HEIGHT_M, MAX_HEIGHT_M = 0.4, 2.2
-CORRIDOR_MARGIN_M = 0.25
+CORRIDOR_MARGIN_M, SIDE_MARGIN_M = 0.25, 2.0
 MIN_POINTS, STEEPEST = 3, 0.06
 TTC_S, BRAKE_MPS2, STOP_GAP_M = 2.0, 4.0, 2.0
 """Brake when the time to collision falls below 2 s, or the distance below v^2 / (2 * 4) + 2 m."""
@@ -63,6 +63,9 @@ class LidarAeb:
     def free_distance(self, points: Float64[np.ndarray, "n 3"], line: Float64[np.ndarray, "k 2"]) -> float | None:
         """Metres from the front bumper to the nearest obstacle in the corridor along ``line``; None when free."""
         obstacles = points[above_ground(points)]
+        sides = line[line[:, 0] < RANGE_M, 1]
+        between = (obstacles[:, 1] > sides.min() - SIDE_MARGIN_M) & (obstacles[:, 1] < sides.max() + SIDE_MARGIN_M)
+        obstacles = obstacles[between]
         if len(obstacles) == 0:
             return None
         station, lateral = geometry.project_to_polyline(obstacles[:, :2], line)

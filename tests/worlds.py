@@ -46,7 +46,7 @@ def braking_lead(gap_m: float = 22.0, speed_mps: float = 10.0, duration_s: float
 
 def curve(radius_m: float = 40.0, speed_mps: float = 8.0, duration_s: float = 8.0) -> FlatWorld:
     """20 m straight, then a left-hand curve."""
-    angle = np.linspace(0.0, 2.4, 49)
+    angle = np.linspace(0.0, 2.4, 25)
     bend = np.column_stack([20.0 + radius_m * np.sin(angle), radius_m * (1 - np.cos(angle))])
     return flat_world("curve", np.concatenate([[[0.0, 0.0]], bend]), speed_mps, duration_s)
 

@@ -4,6 +4,7 @@ Public names load on first use, so that importing the package costs nothing.
 """
 
 from importlib import import_module
+from typing import Any
 
 _HOMES = {
     "Agreement": "offroad",
@@ -26,7 +27,7 @@ _HOMES = {
 __all__ = sorted(_HOMES)
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     """Import the module that holds a public name."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

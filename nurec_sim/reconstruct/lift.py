@@ -22,7 +22,7 @@ from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct import actors as actor_layer
 from nurec_sim.reconstruct import colour, depth, lifting, points, surfaces
 from nurec_sim.reconstruct.ground import Ground, find_ground
-from nurec_sim.reconstruct.lifting import STATIC, Lifted
+from nurec_sim.reconstruct.lifting import NOBODY, STATIC, Lifted
 from nurec_sim.reconstruct.points import Actor, Cloud
 from nurec_sim.reconstruct.settings import LiftSettings
 from nurec_sim.reconstruct.sky import make_sky
@@ -263,14 +263,17 @@ def _bodies_of_pixels(view: View, bodies: Sequence[Surfels], dense: np.ndarray, 
     open_pixels = (drawn <= 0) & (dense > 0)
     if len(bodies) > 1 and open_pixels.any():
         xyz = lifting.points_of(view, dense)[open_pixels]
-        found = np.zeros(len(xyz), np.int32)
+        found, unmeasured = np.zeros(len(xyz), np.int32), (drawn < 0)[open_pixels]
         for number, surfels in enumerate(bodies[1:], start=1):
             if not surfels.present(view.t_us):
                 continue
             box = geometry.transform_points(geometry.inverse(surfels.world_from_body(view.t_us)), xyz)
             size = surfels.actor.track.size_m
-            inside = geometry.points_in_box(box, size, 0.1) & (box[:, 2] > -size[2] / 2 + 0.15)
-            found[inside & (found == 0)] = number
+            upper = box[:, 2] > -size[2] / 2 + 0.15
+            inside = geometry.points_in_box(box, size, 0.1) & upper
+            found[inside & (found <= 0)] = number
+            # Unmeasured pixels just outside a box are its silhouette at a wrong depth: nobody's.
+            found[~inside & (found == 0) & unmeasured & geometry.points_in_box(box, size, 0.6) & upper] = NOBODY
         body[open_pixels] = found
     return body
 

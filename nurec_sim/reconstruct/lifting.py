@@ -12,7 +12,7 @@ from numba import njit
 from nurec_sim.reconstruct.depth import project_point
 from nurec_sim.reconstruct.views import View
 
-STATIC = -1
+STATIC, NOBODY = -1, -2
 OWNER_RING = 0.1
 """Views own by rings of distance, each larger by exp of this."""
 MIXING = 0.3

@@ -65,7 +65,7 @@ class PlannedPath:
         )
 
 
-Controller = Callable[[PlannedPath, VehicleState, int, int, Limits], VehicleState]
+Controller = Callable[[PlannedPath, VehicleState, int, float, Limits], VehicleState]
 
 
 def pursuit_pi(path: PlannedPath, state: VehicleState, since_us: int, driven_m: float, limits: Limits) -> VehicleState:

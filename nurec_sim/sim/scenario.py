@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -133,7 +134,7 @@ def make_scenario(content: dict, source: str = "scenario") -> Scenario:
         raise ScenarioError(f"{source}: " + "; ".join(_fault(item) for item in error.errors())) from None
 
 
-def _fault(item: dict) -> str:
+def _fault(item: Mapping[str, Any]) -> str:
     """One pydantic complaint as a sentence: key, what is allowed, what was given."""
     location = [str(part) for part in item["loc"]]
     key = ".".join(location) or "(top level)"
@@ -148,6 +149,6 @@ def _fault(item: dict) -> str:
 
 def _fields_at(location: list[str]) -> list[str]:
     """Names allowed at a place of the file."""
-    parts = {"sensors": SensorSettings, "perturbation": Perturbation, "actors": ActorEdit}
-    model: type[BaseModel] = parts.get(location[0], Scenario) if location else Scenario
+    parts: dict[str, type[BaseModel]] = {"sensors": SensorSettings, "perturbation": Perturbation, "actors": ActorEdit}
+    model = parts.get(location[0], Scenario) if location else Scenario
     return sorted(model.model_fields)

@@ -1,0 +1,28 @@
+"""The command line: one function per verb; heavy modules are imported by the verb that needs them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from nurec_sim.cli import driving, scenes
+from nurec_sim.cli.console import app, err
+from nurec_sim.errors import NurecSimError
+
+__all__ = ["driving", "main", "scenes"]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one verb; errors of ours become one line and exit status 1, Ctrl-C becomes 130."""
+    try:
+        app.cli(
+            prog="nurec-sim",
+            description="An open closed-loop sensor simulator for driving. A log becomes a Gaussian world, a gRPC "
+            "server renders it, policies drive through it, a report says which is better. Start with: nurec-sim demo",
+            args=None if arguments is None else list(arguments),
+        )
+    except NurecSimError as error:
+        err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False)
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        err.print("interrupted; finished rollouts are kept: add --resume runs/latest to go on", markup=False)
+        raise SystemExit(130) from None

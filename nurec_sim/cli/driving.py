@@ -1,0 +1,157 @@
+"""Verbs that drive policies: run, demo, report, policies."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import time
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from nurec_sim.cli.console import OnePath, Paths, app, out, print_faults, print_table, progress
+from nurec_sim.errors import NurecSimError
+
+
+@app.command
+def run(
+    sources: Paths,
+    *,
+    scenario: str = "short",
+    policies: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (),
+    out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs"),
+    resume: Path | None = None,
+    address: str | None = None,
+    cache: Path | None = None,
+    video: bool = True,
+) -> None:
+    """Drive policies closed-loop through scenes, measure, and write a report.
+
+    Starts a server of its own unless --address names one. The run folder holds report.html, metrics.parquet,
+    metrics.csv and one folder per rollout; runs/latest points to the newest.
+
+    Args:
+        sources: scene archives or clips.
+        scenario: a shipped scenario's name, or a YAML file.
+        policies: names, files as my_policy.py:Class, or entry points; the scenario's own if not given.
+        seeds: one rollout each per scene and policy; the scenario's own if not given.
+        out_path: folder that collects run folders.
+        resume: go on with this run folder; finished rollouts are kept.
+        address: host:port of a running server that serves the same scenes.
+        cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
+        video: also record the front camera of every rollout.
+    """
+    drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video)
+
+
+@app.command
+def demo(
+    *,
+    out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs"),
+    resume: Path | None = None,
+    cache: Path | None = None,
+) -> None:
+    """Run the whole chain on the log that ships with the package: about five minutes on two cores.
+
+    Args:
+        out_path: folder that collects run folders.
+        resume: go on with this run folder; finished rollouts are kept.
+        cache: where the reconstructed scene is kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
+    """
+    drive((), "demo", (), (), out_path, resume, None, cache, True)
+
+
+@app.command
+def report(run_folder: OnePath) -> None:
+    """Write report.html of a run folder anew.
+
+    Args:
+        run_folder: a folder made by `nurec-sim run`.
+    """
+    from nurec_sim import runs
+
+    out.print(f"wrote {runs.write_report(run_folder)}", soft_wrap=True)
+
+
+@app.command
+def policies(check: Annotated[str | None, tyro.conf.Positional] = None) -> None:
+    """List the policies that can be driven, or check that one keeps the contract.
+
+    Args:
+        check: a policy's name, or my_policy.py:Class.
+    """
+    from nurec_sim import plugins
+
+    if check is None:
+        found = [(name, plugins.load_policy(name)) for name in plugins.available_policies()]
+        rows = [(name, (inspect.getdoc(policy) or "").split("\n")[0]) for name, policy in found]
+        print_table("policies", rows, ("name", "what it does"))
+        return
+    from nurec_sim.sim.conformance import check_policy
+
+    faults = check_policy(plugins.load_policy(check))
+    print_faults(faults)
+    out.print(f"{check} keeps the contract")
+
+
+def drive(
+    sources: Sequence[Path],
+    scenario_name: str,
+    policy_names: Sequence[str],
+    seeds: Sequence[int],
+    out_dir: Path,
+    resume: Path | None,
+    address: str | None,
+    cache: Path | None,
+    video: bool,
+) -> None:
+    """Scenes, server, rollouts, report: what `run` and `demo` share."""
+    from nurec_sim import runs, sim
+    from nurec_sim.client import RemoteSensors
+    from nurec_sim.scene_store import SceneStore
+    from nurec_sim.server import SensorServer
+
+    started = time.monotonic()
+    scenario_path = find_scenario(scenario_name)
+    scenario = sim.load_scenario(scenario_path)
+    if not sources and scenario.clip is None:
+        raise NurecSimError(f"scenario {scenario.name!r} names no clip; give clips or scenes to drive through")
+    store = SceneStore(sources or [scenario_path.parent / str(scenario.clip)], cache_dir=cache)
+    for fault in store.faults.values():
+        raise NurecSimError(fault)
+    with progress("reconstructing") as advance:
+        scenes = [store.get(scene_id, progress=advance).scene for scene_id in store.ids]
+    with contextlib.ExitStack() as stack:
+        if address is None:
+            address = stack.enter_context(SensorServer(store, port=0))
+        out.print(f"sensors from {address}; {len(scenes)} scene(s), scenario {scenario.name}")
+        with progress("driving") as advance:
+            folder = runs.execute(
+                scenes,
+                scenario,
+                policy_names or scenario.policies,
+                lambda scene_id: stack.enter_context(RemoteSensors(address, scene_id)).sense,
+                out_dir,
+                seeds=seeds or scenario.seeds,
+                resume=resume,
+                video=video,
+                progress=advance,
+            )
+    heading, *rows = runs.headline(folder)
+    print_table("means over rollouts", rows, heading)
+    out.print(f"{time.monotonic() - started:.0f} s. Report: {(folder / 'report.html').resolve()}", soft_wrap=True)
+
+
+def find_scenario(name: str) -> Path:
+    """The file of a shipped scenario, or ``name`` itself if it is a YAML file."""
+    if name.endswith((".yaml", ".yml")):
+        return Path(name)
+    folder = Path(str(resources.files("nurec_sim.scenarios")))
+    shipped = sorted(path.stem for path in folder.glob("*.yaml"))
+    if name not in shipped:
+        raise NurecSimError(f"no shipped scenario {name!r}; have {shipped}, or give a .yaml file")
+    return folder / f"{name}.yaml"

@@ -1,0 +1,226 @@
+"""Verbs about one log or scene: inspect, world, reconstruct, render, serve, evaluate."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from nurec_sim.cli.console import OnePath, Paths, app, err, out, print_faults, print_table, progress
+from nurec_sim.errors import NurecSimError
+
+if TYPE_CHECKING:
+    from nurec_sim.types import GaussianScene
+
+
+@app.command
+def inspect(clip: OnePath) -> None:
+    """Show what a driving log holds, and check it.
+
+    Prints a table of sensors, rates, spans and boxes, then every fault as one line. Exit status 1 if there are faults.
+
+    Args:
+        clip: a clip folder, or a .zip of one (docs/clip_format.md).
+    """
+    from nurec_sim import logs
+    from nurec_sim.logs.describe import SENSOR_COLUMNS
+
+    log = logs.open_clip(clip)
+    summary = logs.describe_clip(log)
+    print_table(f"clip {log.id}", summary.facts)
+    print_table("sensors", summary.sensors, SENSOR_COLUMNS)
+    with err.status("reading every image and sweep"):
+        faults = logs.check_clip(log)
+    print_faults(faults)
+    out.print("no faults")
+
+
+@app.command
+def world(
+    *,
+    out_path: Annotated[Path, tyro.conf.arg(name="out")],
+    seed: int = 7,
+    seconds: float = 12.0,
+    truth: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Draw a small MuJoCo street and write it as a driving log.
+
+    Args:
+        out_path: the clip to write: a folder, or a .zip.
+        seed: same seed, same street, same log.
+        seconds: length of the log, 1 to 20.
+        truth: also write exact depth and labels into this folder, apart from the log.
+        overwrite: replace a clip that is there.
+    """
+    from nurec_sim.world import street_plan, write_street_clip
+
+    command = f"nurec-sim world --seed {seed} --seconds {seconds:g} --out {out_path.name}"
+    with progress("drawing the street") as advance:
+        path = write_street_clip(
+            street_plan(seed, seconds), out_path, truth=truth, command=command, progress=advance, overwrite=overwrite
+        )
+    out.print(f"wrote {path}", soft_wrap=True)
+
+
+@app.command
+def reconstruct(
+    clip: OnePath,
+    *,
+    out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+    method: Literal["lift"] = "lift",
+    cameras: tuple[str, ...] = (),
+    overwrite: bool = False,
+) -> None:
+    """Turn a driving log into a Gaussian scene archive (.usdz).
+
+    Args:
+        clip: a clip folder, or a .zip of one.
+        out_path: the archive to write; CLIP's name with .usdz in the current folder if not given.
+        method: how to reconstruct; lift colours LiDAR points, no learning.
+        cameras: use only these cameras; all if not given.
+        overwrite: replace an archive that is there.
+    """
+    from nurec_sim import logs, scene
+    from nurec_sim.reconstruct import reconstruct as run_method
+
+    log = logs.open_clip(clip)
+    target = out_path or Path(f"{log.id}.usdz")
+    if target.exists() and not overwrite:
+        raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
+    with progress("reconstructing") as advance:
+        world_scene = run_method(log, method, cameras=cameras or None, progress=advance)
+    scene.write_scene(world_scene, target, overwrite=overwrite)
+    print_table(f"scene {world_scene.id}", scene.summary(world_scene))
+    for text in world_scene.provenance.get("unknown", ()):
+        out.print(f"not known: {text}", markup=False)
+    out.print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+
+
+@app.command
+def render(
+    source: OnePath,
+    *,
+    out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("frame.png"),
+    camera: str | None = None,
+    frame: int = 0,
+    left_m: float = 0.0,
+    yaw_deg: float = 0.0,
+    layer: Literal["rgb", "depth", "alpha", "label"] = "rgb",
+    width: int | None = None,
+) -> None:
+    """Render one camera image of a scene to a PNG, from where it was recorded or beside it.
+
+    Args:
+        source: a scene archive or a clip.
+        out_path: the PNG to write.
+        camera: camera id; the first if not given.
+        frame: which recorded frame's time and pose to take.
+        left_m: move the car to the left by so many metres.
+        yaw_deg: turn the car to the left by so many degrees.
+        layer: what to draw.
+        width: image width in pixels; the camera's own if not given.
+    """
+    from nurec_sim.render.still import render_still
+
+    scene_ = load_scene(source)
+    render_still(scene_, out_path, camera, frame, left_m=left_m, yaw_deg=yaw_deg, layer=layer, width_px=width)
+    out.print(f"wrote {out_path}", soft_wrap=True)
+
+
+@app.command
+def serve(
+    sources: Paths,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    threads: int | None = None,
+    cache: Path | None = None,
+) -> None:
+    """Serve scenes over gRPC, for AlpaSim, CARLA and NuRec clients. Ctrl-C stops.
+
+    Prints `Serving on <host>:<port>` when ready. Clips are reconstructed on first use and kept in the cache.
+
+    Args:
+        sources: scene archives, clips, or folders of them.
+        host: address to listen on; only this machine unless said otherwise.
+        port: 0 takes a free one.
+        threads: render threads; the number of cores if not given.
+        cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
+    """
+    from nurec_sim.scene_store import SceneStore
+    from nurec_sim.server import serve as run_server
+
+    store = SceneStore(sources, cache_dir=cache, threads=threads, on_progress=err.print)
+    try:
+        run_server(store, host=host, port=port)
+    except OSError as error:
+        raise NurecSimError(str(error)) from None
+
+
+@app.command
+def evaluate(
+    clip: OnePath,
+    *,
+    method: Literal["lift"] = "lift",
+    input_cameras: tuple[str, ...] = (),
+    target_cameras: tuple[str, ...] = (),
+    hold_out_sweeps: int = 0,
+    local: bool = False,
+    images: Path | None = None,
+    json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
+) -> None:
+    """Measure a reconstruction against what the log recorded: images of other cameras, LiDAR sweeps left out.
+
+    Args:
+        clip: a clip folder, or a .zip of one.
+        method: how to reconstruct.
+        input_cameras: cameras that the reconstruction may see; all if not given.
+        target_cameras: cameras to compare with; the input cameras if not given.
+        hold_out_sweeps: leave out every so-manieth sweep and simulate it; 0 leaves out none.
+        local: render in this process instead of through gRPC.
+        images: also write rendered and recorded images side by side into this folder.
+        json_path: write all figures here.
+    """
+    from nurec_sim import logs
+    from nurec_sim.evaluate import evaluate as run_evaluation
+
+    log = logs.open_clip(clip)
+    with progress("evaluating") as advance:
+        figures = run_evaluation(
+            log,
+            method,
+            input_cameras=input_cameras or None,
+            target_cameras=target_cameras or None,
+            hold_out_every=hold_out_sweeps,
+            via_grpc=not local,
+            images_dir=images,
+            progress=advance,
+        )
+    if json_path is not None:
+        json_path.write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
+    print_table(f"{method} on {log.id}", flatten(figures))
+
+
+def load_scene(source: Path) -> GaussianScene:
+    """A scene from an archive, or from a clip that is reconstructed now."""
+    from nurec_sim.scene_store import SceneStore
+
+    store = SceneStore([source])
+    for fault in store.faults.values():
+        raise NurecSimError(fault)
+    with progress("loading") as advance:
+        return store.get(store.ids[0], progress=advance).scene
+
+
+def flatten(figures: dict, prefix: str = "") -> list[tuple[str, str]]:
+    """Nested figures as dotted rows; lists stay in the JSON file."""
+    rows: list[tuple[str, str]] = []
+    for key, value in figures.items():
+        if isinstance(value, dict):
+            rows += flatten(value, f"{prefix}{key}.")
+        elif not isinstance(value, list):
+            rows.append((prefix + key, f"{value:.4g}" if isinstance(value, float) else str(value)))
+    return rows

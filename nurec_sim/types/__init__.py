@@ -1,0 +1,104 @@
+"""Every dataclass that crosses a module border.
+
+Conventions (all modules): transforms are spelt ``a_from_b`` and take ``b`` coordinates to ``a``; metres, radians,
+integer microseconds; intervals are half-open; quaternions are ``wxyz`` with ``w >= 0``. Rig: x forward, y left, z up,
+origin at the rear axle on the ground. Camera: x right, y down, z forward. LiDAR: x forward, y left, z up. Pixels have
+their origin at the image corner, centres at +0.5. Gaussian scales are standard deviations in metres and opacities lie
+in 0..1. World: metres, z up.
+"""
+
+from nurec_sim.types.logs import (
+    MOVABLE_LABELS,
+    Clip,
+    RoadMap,
+    Sweep,
+    Track,
+)
+from nurec_sim.types.loop import (
+    ActorState,
+    EgoState,
+    Event,
+    Needs,
+    Observation,
+    Plan,
+    Policy,
+    Reduce,
+    Rollout,
+    Series,
+)
+from nurec_sim.types.scenes import (
+    GAUSSIAN_FIELDS,
+    DynamicGaussians,
+    Gaussians,
+    GaussianScene,
+    Label,
+)
+from nurec_sim.types.sensing import (
+    CameraFrame,
+    LidarFrame,
+    Sense,
+    SensorFrame,
+    SensorRequest,
+)
+from nurec_sim.types.sensors import (
+    Box,
+    CameraModel,
+    Fisheye,
+    FTheta,
+    FThetaReference,
+    Lens,
+    LidarModel,
+    Pinhole,
+    Rig,
+    Shutter,
+    Spin,
+    Windshield,
+    WindshieldReference,
+)
+from nurec_sim.types.trajectories import (
+    Matrix4,
+    Trajectory,
+)
+
+__all__ = [
+    "ActorState",
+    "Box",
+    "CameraFrame",
+    "CameraModel",
+    "Clip",
+    "DynamicGaussians",
+    "EgoState",
+    "Event",
+    "FTheta",
+    "FThetaReference",
+    "Fisheye",
+    "GAUSSIAN_FIELDS",
+    "GaussianScene",
+    "Gaussians",
+    "Label",
+    "Lens",
+    "LidarFrame",
+    "LidarModel",
+    "MOVABLE_LABELS",
+    "Matrix4",
+    "Needs",
+    "Observation",
+    "Pinhole",
+    "Plan",
+    "Policy",
+    "Reduce",
+    "Rig",
+    "RoadMap",
+    "Rollout",
+    "Sense",
+    "SensorFrame",
+    "SensorRequest",
+    "Series",
+    "Shutter",
+    "Spin",
+    "Sweep",
+    "Track",
+    "Trajectory",
+    "Windshield",
+    "WindshieldReference",
+]

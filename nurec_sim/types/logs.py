@@ -1,0 +1,107 @@
+"""What a driving log holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from nurec_sim import geometry
+from nurec_sim.types.sensors import Rig
+from nurec_sim.types.trajectories import Matrix4, Trajectory
+
+MOVABLE_LABELS = ("automobile", "heavy_truck", "bus", "trailer", "train", "other_vehicle", "person", "rider", "animal")
+
+
+@dataclass(frozen=True)
+class Track:
+    """One labelled object over time; ``path`` holds the poses of its box centre (x forward, y left, z up)."""
+
+    id: str
+    label: str
+    size_m: tuple[float, float, float]
+    path: Trajectory
+    controllable: bool = True
+
+
+@dataclass(frozen=True)
+class RoadMap:
+    """What is known of the road: drivable areas as (outer ring, holes...) of [k,2] metres, lane centre lines [k,3]."""
+
+    drivable: tuple[tuple[Float64[np.ndarray, "k 2"], ...], ...] = ()
+    lanes: tuple[Float64[np.ndarray, "k 3"], ...] = ()
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One LiDAR turn, motion-compensated to ``t_us``; ``intensity`` in 0..1 or None, ``point_t_us`` when fired."""
+
+    t_us: int
+    start_us: int
+    end_us: int
+    world_from_lidar: Matrix4
+    xyz_m: Float64[np.ndarray, "n 3"]
+    intensity: Float32[np.ndarray, " n"] | None
+    point_t_us: Int64[np.ndarray, " n"]
+
+    @property
+    def xyz_world_m(self) -> Float64[np.ndarray, "n 3"]:
+        """Points in the world."""
+        return geometry.transform_points(self.world_from_lidar, self.xyz_m)
+
+
+class Clip(Protocol):
+    """A driving log, read lazily. ``logs.open_clip`` makes one from a path."""
+
+    @property
+    def id(self) -> str:
+        """Name of the log."""
+        ...
+
+    @property
+    def rig(self) -> Rig:
+        """Sensors and outline of the car."""
+        ...
+
+    @property
+    def ego(self) -> Trajectory:
+        """Recorded poses of the rig."""
+        ...
+
+    @property
+    def tracks(self) -> Sequence[Track]:
+        """Labelled objects; empty when the log has no boxes."""
+        ...
+
+    @property
+    def road_map(self) -> RoadMap | None:
+        """What is known of the road."""
+        ...
+
+    @property
+    def span_us(self) -> tuple[int, int]:
+        """[start, end) of the log; start >= 1_000_000."""
+        ...
+
+    def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:
+        """Exposure start and end of every frame; equal when the log knows one time only."""
+        ...
+
+    def world_from_camera(self, camera_id: str, index: int) -> Float64[np.ndarray, "2 4 4"]:
+        """Camera poses at the start and the end of the exposure."""
+        ...
+
+    def image(self, camera_id: str, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        """One RGB frame."""
+        ...
+
+    def sweep_times_us(self, lidar_id: str) -> Int64[np.ndarray, "sweeps 2"]:
+        """Start and end of every sweep."""
+        ...
+
+    def sweep(self, lidar_id: str, index: int) -> Sweep:
+        """One motion-compensated sweep."""
+        ...

@@ -1,0 +1,176 @@
+"""What the closed loop exchanges with policies and leaves behind."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from nurec_sim.types.sensing import CameraFrame, LidarFrame
+from nurec_sim.types.sensors import Rig
+from nurec_sim.types.trajectories import Matrix4, Trajectory
+
+
+@dataclass(frozen=True)
+class EgoState:
+    """The car at one instant: rig pose, speed along x, acceleration, yaw rate, front-wheel angle."""
+
+    t_us: int
+    world_from_rig: Matrix4
+    speed_mps: float
+    accel_mps2: float = 0.0
+    yaw_rate_radps: float = 0.0
+    steering_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class ActorState:
+    """A true actor around the ego, in the rig frame of now. Only policies that declare ``privileged`` see it."""
+
+    id: str
+    label: str
+    size_m: tuple[float, float, float]
+    rig_from_box: Matrix4
+    velocity_mps: Float64[np.ndarray, " 2"]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a policy sees at ``t_us``.
+
+    ``route_m`` is up to 20 way points over the next 80 m of the recorded path, in the rig frame;
+    ``route_speed_mps`` the recorded speed at each. ``recorded`` is the recorded future (t_us, x, y, yaw in the rig
+    frame) for log replay. ``actors`` is None unless the policy declared ``privileged``.
+    """
+
+    t_us: int
+    ego: EgoState
+    history: tuple[EgoState, ...]
+    cameras: Mapping[str, CameraFrame]
+    lidars: Mapping[str, LidarFrame]
+    route_m: Float64[np.ndarray, "k 2"]
+    route_speed_mps: Float64[np.ndarray, " k"]
+    recorded_t_us: Int64[np.ndarray, " m"]
+    recorded_pose: Float64[np.ndarray, "m 3"]
+    actors: tuple[ActorState, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A policy's answer: poses (x, y, yaw) in the rig frame of the observation at increasing times after it.
+
+    At least 2.5 s ahead; return 5 s. ``stop_session`` asks to end the rollout.
+    """
+
+    t_us: Int64[np.ndarray, " k"]
+    pose: Float64[np.ndarray, "k 3"]
+    stop_session: bool = False
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a policy reads; the loop renders nothing else.
+
+    ``cameras`` and ``lidars`` are sensor ids of the rig, or the aliases ``front`` (the camera that looks most
+    forward) and ``any`` (the first LiDAR). Images are rendered at ``image_width_px``, keeping the field of view.
+    """
+
+    cameras: tuple[str, ...] = ()
+    lidars: tuple[str, ...] = ()
+    image_width_px: int = 320
+    privileged: bool = False
+
+
+class Policy(Protocol):
+    """A driver. One instance drives one rollout at a time."""
+
+    name: str
+    needs: Needs
+
+    def reset(self, rig: Rig, seed: int) -> None:
+        """Forget everything; a new rollout begins."""
+        ...
+
+    def plan(self, observation: Observation) -> Plan:
+        """Answer with the poses to drive."""
+        ...
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened in a rollout: ``kind`` such as ``plan_error`` or ``stop_session``, with a text."""
+
+    t_us: int
+    kind: str
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One policy driven through one scene once.
+
+    ``states`` are at 10 Hz; ``actors[id]`` holds ``world_from_box [t,4,4]`` at the same times, NaN while absent.
+    ``status`` is ``ok`` or ``failed``; a failed rollout keeps its states up to the failure and its error text.
+    """
+
+    scenario: str
+    scene_id: str
+    reconstruction: str
+    policy: str
+    seed: int
+    rig: Rig
+    states: tuple[EgoState, ...]
+    actors: Mapping[str, Float64[np.ndarray, "t 4 4"]]
+    actor_sizes_m: Mapping[str, tuple[float, float, float]]
+    actor_labels: Mapping[str, str]
+    recorded: Trajectory
+    plans: tuple[tuple[int, Plan], ...]
+    events: tuple[Event, ...] = ()
+    status: str = "ok"
+    error: str = ""
+    first_closed_loop_us: int = 0
+
+    @property
+    def t_us(self) -> Int64[np.ndarray, " t"]:
+        """Times of the states."""
+        return np.array([state.t_us for state in self.states], dtype=np.int64)
+
+    @property
+    def world_from_rig(self) -> Float64[np.ndarray, "t 4 4"]:
+        """Ego poses."""
+        return np.array([state.world_from_rig for state in self.states], dtype=np.float64).reshape(-1, 4, 4)
+
+
+class Reduce(enum.Enum):
+    """How a series becomes one number."""
+
+    MEAN = "mean"
+    MEDIAN = "median"
+    MAX = "max"
+    MIN = "min"
+    LAST = "last"
+
+
+@dataclass(frozen=True)
+class Series:
+    """One metric over time. ``valid`` marks the values that could be computed; the others are never counted."""
+
+    name: str
+    unit: str
+    t_us: Int64[np.ndarray, " t"]
+    values: Float64[np.ndarray, " t"]
+    valid: np.ndarray
+    reduce: Reduce
+
+    def value(self) -> float:
+        """The series as one number; NaN where nothing is valid."""
+        values = np.asarray(self.values, np.float64)[np.asarray(self.valid, bool)]
+        if len(values) == 0:
+            return float("nan")
+        if self.reduce is Reduce.LAST:
+            return float(values[-1])
+        return float(getattr(np, self.reduce.value)(values))

@@ -1,0 +1,127 @@
+"""The layered Gaussian world."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64, UInt8
+
+from nurec_sim.types.logs import RoadMap, Track
+from nurec_sim.types.sensors import Rig
+from nurec_sim.types.trajectories import Trajectory
+
+
+class Label(enum.IntEnum):
+    """Semantic class of a Gaussian and of a rendered pixel."""
+
+    OTHER = 0
+    ROAD = 1
+    MOVABLE = 2
+    SKY = 3
+    EGO = 4
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians, as structure of arrays.
+
+    ``rgb`` is the display-space colour in 0..1 (degree 0); ``sh_rest`` holds the view-dependent spherical-harmonic
+    coefficients of degree 1 and up (k = 3, 8 or 15, basis and order as in 3DGS files) or None. ``intensity`` is the
+    LiDAR return in 0..1, NaN where unknown. ``normal`` is a unit vector, zero where unknown.
+    """
+
+    mean_m: Float32[np.ndarray, "n 3"]
+    quat_wxyz: Float32[np.ndarray, "n 4"]
+    scale_m: Float32[np.ndarray, "n 3"]
+    opacity: Float32[np.ndarray, " n"]
+    rgb: Float32[np.ndarray, "n 3"]
+    normal: Float32[np.ndarray, "n 3"]
+    label: UInt8[np.ndarray, " n"]
+    intensity: Float32[np.ndarray, " n"]
+    sh_rest: Float32[np.ndarray, "n k 3"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.mean_m)
+
+    def __getitem__(self, index: np.ndarray | slice) -> Gaussians:
+        fields: dict[str, Any] = {name: getattr(self, name)[index] for name in GAUSSIAN_FIELDS}
+        return Gaussians(**fields, sh_rest=None if self.sh_rest is None else self.sh_rest[index])
+
+    @classmethod
+    def empty(cls, n: int = 0) -> Gaussians:
+        """N Gaussians of zeros (identity rotation, unknown intensity)."""
+        quat = np.zeros((n, 4), np.float32)
+        quat[:, 0] = 1
+        zeros3 = np.zeros((n, 3), np.float32)
+        return cls(zeros3, quat, zeros3.copy(), np.zeros(n, np.float32), zeros3.copy(), zeros3.copy(),
+                   np.zeros(n, np.uint8), np.full(n, np.nan, np.float32))  # fmt: skip
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Gaussians]) -> Gaussians:
+        """All parts one after the other; every part has ``sh_rest`` of one degree, or none has."""
+        if not parts:
+            return cls.empty()
+        rest = [part.sh_rest for part in parts]
+        merged = None if all(r is None for r in rest) else np.concatenate([r for r in rest if r is not None])
+        if merged is not None and any(r is None for r in rest):
+            raise ValueError("cannot join Gaussians with and without sh_rest")
+        fields: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in GAUSSIAN_FIELDS
+        }
+        return cls(**fields, sh_rest=merged)
+
+
+GAUSSIAN_FIELDS = ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal", "label", "intensity")
+
+
+@dataclass(frozen=True)
+class DynamicGaussians:
+    """Gaussians that move: three knots each (paper section 3.1).
+
+    ``gaussians.mean_m`` is the middle knot. Between knots positions are linear; opacity is multiplied by
+    ``exp(-x**10)`` with x = (t - t2) / (t3 - t2) after the middle knot and (t2 - t) / (t2 - t1) before it, so a
+    Gaussian lives from its first to its last knot. ``track`` indexes ``GaussianScene.tracks``, -1 for none. All
+    positions and rotations are in the world, as recorded; re-posing an actor applies
+    ``world_from_box(requested) @ inverse(track.path.at(t))``.
+    """
+
+    gaussians: Gaussians
+    knot_t_us: Int64[np.ndarray, "n 3"]
+    knot_m: Float32[np.ndarray, "n 3 3"]
+    track: Int32[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    @classmethod
+    def empty(cls) -> DynamicGaussians:
+        """No Gaussians."""
+        return cls(Gaussians.empty(), np.zeros((0, 3), np.int64), np.zeros((0, 3, 3), np.float32),
+                   np.zeros(0, np.int32))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class GaussianScene:
+    """A layered Gaussian world: what a reconstruction gives, an archive holds and a renderer draws.
+
+    ``sky`` is a cubemap ``[6,h,h,3]`` of display-space colours, faces and axes as in ``geometry.cubemap_directions``.
+    ``isp`` maps a camera id to ``[3,4]``: shown colour = ``isp[:, :3] @ colour + isp[:, 3]``, after sky compositing.
+    ``provenance`` is plain JSON: method, settings, what was not known (no map, no boxes, ...).
+    """
+
+    id: str
+    static: Gaussians
+    dynamic: DynamicGaussians
+    sky: Float32[np.ndarray, "6 h h 3"]
+    isp: Mapping[str, Float64[np.ndarray, "3 4"]]
+    rig: Rig
+    ego: Trajectory
+    tracks: Sequence[Track]
+    road_map: RoadMap | None
+    span_us: tuple[int, int]
+    camera_times_us: Mapping[str, Int64[np.ndarray, "frames 2"]] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)

@@ -1,0 +1,58 @@
+"""Requests for sensor frames, and the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, UInt8
+
+from nurec_sim.types.sensors import CameraModel, LidarModel
+
+
+@dataclass(frozen=True)
+class SensorRequest:
+    """Ask for one frame: sensor, exposure [start, end), its poses at both ends, and actors to re-pose.
+
+    ``actors`` maps track ids to ``world_from_box`` at start and end; tracks not named move as recorded.
+    """
+
+    scene_id: str
+    sensor: CameraModel | LidarModel
+    start_us: int
+    end_us: int
+    world_from_sensor: Float64[np.ndarray, "2 4 4"]
+    actors: Mapping[str, Float64[np.ndarray, "2 4 4"]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CameraFrame:
+    """A rendered image. ``depth_m`` is the distance along the optical axis of the visible surface, 0 where none."""
+
+    camera: CameraModel
+    start_us: int
+    end_us: int
+    rgb: UInt8[np.ndarray, "h w 3"]
+    depth_m: Float32[np.ndarray, "h w"] | None = None
+    alpha: Float32[np.ndarray, "h w"] | None = None
+    label: UInt8[np.ndarray, "h w"] | None = None
+    normal: Float32[np.ndarray, "h w 3"] | None = None
+
+
+@dataclass(frozen=True)
+class LidarFrame:
+    """A simulated sweep: returns only, in the sensor frame at the end of the spin; beam = row * columns + column."""
+
+    lidar: LidarModel
+    start_us: int
+    end_us: int
+    xyz_m: Float32[np.ndarray, "n 3"]
+    range_m: Float32[np.ndarray, " n"]
+    intensity: Float32[np.ndarray, " n"]
+    beam: Int32[np.ndarray, " n"]
+
+
+SensorFrame = CameraFrame | LidarFrame
+Sense = Callable[[Sequence[SensorRequest]], Sequence[SensorFrame]]
+"""Renders requests, one frame each, in order: the loop's only view of a renderer, a server or the true world."""
