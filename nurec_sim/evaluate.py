@@ -147,11 +147,10 @@ def _score_images(
                 _write_pair(images_dir / f"{camera}_{index:04d}.png", recorded, rendered)
         report(f"images of {camera}", 1.0)
         per_camera[camera] = {**_with_means(shown), "input": camera in inputs, "floor": _with_means(floor)}
-    means = {
-        name: float(np.mean([value for row in per_camera.values() for value in row["per_frame"][name]]))
-        for name in ("psnr_db", "ssim")
-        if per_camera
-    }
+    means: dict[str, float | None] = {}
+    for name in ("psnr_db", "ssim"):
+        values = [value for row in per_camera.values() for value in row["per_frame"][name]]
+        means[name] = float(np.mean(values)) if values else None
     return {**means, "cameras": per_camera}
 
 
@@ -167,7 +166,7 @@ def _with_means(lists: dict[str, list[float]]) -> dict[str, object]:
 
 
 def _nearest_input(clip: Clip, camera: str, index: int, inputs: Sequence[str]) -> UInt8[np.ndarray, "h w 3"] | None:
-    """What copying would show: the input frame nearest in time whose camera looks most alike; never the frame itself."""
+    """What copying would show: the input frame nearest in time, of the camera that looks most alike; never itself."""
     import cv2
 
     model, t_us = clip.rig.cameras[camera], int(clip.camera_times_us(camera)[index].sum()) // 2
@@ -214,26 +213,29 @@ def _score_lidars(clip: Clip, held: Sequence[int], sense: Sense, report: Progres
     report("held-out sweeps", 1.0)
     total = LidarScore.pooled(scores)
     return {
-        "median_abs_range_error_m": total.median_abs_error_m,
-        "return_recall": total.recall,
+        "median_abs_range_error_m": _known(total.median_abs_error_m),
+        "return_recall": _known(total.recall),
         "within_0.1_m": _within(total, 0.1),
         "within_0.5_m": _within(total, 0.5),
         "beams": total.beams,
         "per_sweep": [
-            {**name, "median_abs_range_error_m": s.median_abs_error_m, "return_recall": s.recall}
+            {**name, "median_abs_range_error_m": _known(s.median_abs_error_m), "return_recall": _known(s.recall)}
             for name, s in zip(names, scores, strict=True)
         ],
     }
 
 
-def _within(score: LidarScore, limit_m: float) -> float:
+def _within(score: LidarScore, limit_m: float) -> float | None:
     """Share of the beams with a recorded return whose simulated return exists and is as near as this."""
-    return float((score.abs_error_m < limit_m).sum() / score.beams) if score.beams else float("nan")
+    return float((score.abs_error_m < limit_m).sum() / score.beams) if score.beams else None
 
 
-def as_fired(
-    clip: Clip, lidar: str, sweep: Sweep
-) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "2 4 4"]]:
+def _known(value: float) -> float | None:
+    """JSON has no NaN: what cannot be computed is null."""
+    return float(value) if np.isfinite(value) else None
+
+
+def as_fired(clip: Clip, lidar: str, sweep: Sweep) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "2 4 4"]]:
     """Returns in the frame of the sensor when each was fired, and the sensor's poses at the sweep's start and end."""
     rig_from_lidar = clip.rig.lidars[lidar].rig_from_lidar
     # The log's own pose of the sweep counts; the ego trajectory gives the motion around it.

@@ -32,14 +32,11 @@ def make_plan(observation: Observation, pose: Float64[np.ndarray, "50 3"]) -> Pl
     return Plan(observation.t_us + 100_000 * np.arange(1, STEPS + 1, dtype=np.int64), pose)
 
 
-def pursue(
-    path_m: Float64[np.ndarray, "k 2"], speed_mps: float, accel_of: AccelOf, lookahead_s: float = 0.8
-) -> Float64[np.ndarray, "50 3"]:
+def pursue(path_m: Float64[np.ndarray, "k 2"], speed_mps: float, accel_of: AccelOf) -> Float64[np.ndarray, "50 3"]:
     """Poses of a car at the origin that pursues a path for 5 s: pure pursuit, lookahead clip(0.8 v, 4, 15) m.
 
     ``path_m`` starts near the car, in its frame; it goes on straight beyond its end. Where the path bends, speed is
-    kept below sqrt(2.5 m/s^2 / curvature). A shorter ``lookahead_s`` cuts fewer corners, for paths that start in the
-    car's own direction.
+    kept below sqrt(2.5 m/s^2 / curvature).
     """
     line = extended(path_m)
     arc = geometry.arc_length(line)
@@ -47,7 +44,7 @@ def pursue(
     station = float(geometry.project_to_polyline(np.zeros((1, 2)), line)[0][0])
     poses = np.empty((STEPS, 3))
     for i in range(STEPS):
-        lookahead = min(max(lookahead_s * speed, 5 * lookahead_s), 15.0)
+        lookahead = min(max(0.8 * speed, 4.0), 15.0)
         dx = float(np.interp(station + lookahead, arc, line[:, 0])) - x
         dy = float(np.interp(station + lookahead, arc, line[:, 1])) - y
         left = -math.sin(yaw) * dx + math.cos(yaw) * dy

@@ -28,10 +28,10 @@ from nurec_sim.types import Needs, Observation, Plan, Rig
 CAR_HALF_WIDTH_M, SPARE_M = 1.25, 0.9
 CURVATURES = np.array([-0.12, -0.08, -0.05, -0.03, -0.015, -0.006, 0.0, 0.006, 0.015, 0.03, 0.05, 0.08, 0.12])
 FIRST_ARC_M, STEP_M = 10.0, 0.5
-BORDER_LIMIT_M, BORDER_SLACK_M, NEARER, PLACE_M = 8.0, 0.3, 0.5, (8.0, 22.0)
+BORDER_LIMIT_M, BORDER_SLACK_M, NEARER, PLACE_M = 8.0, 0.2, 0.5, (8.0, 22.0)
 BRAKE_MPS2, STOP_GAP_M, START_SPEED_MPS = 3.0, 3.0, 4.0
-FREE_WEIGHT, SPARE_WEIGHT, PLACE_WEIGHT, BEND_WEIGHT, S_BEND_WEIGHT, CHANGE_WEIGHT = 0.3, 6.0, 6.0, 25.0, 12.0, 20.0
-"""Worth of a metre of way without cars, of spare room, out of place, and of curvature, in metres of road ahead."""
+SPARE_WEIGHT, PLACE_WEIGHT, BEND_WEIGHT, S_BEND_WEIGHT, CHANGE_WEIGHT = 6.0, 9.0, 25.0, 12.0, 20.0
+"""Worth of a metre of spare room, of a metre out of place, and of curvature, in metres of road ahead."""
 
 
 class CameraRoadFollower:
@@ -63,7 +63,7 @@ class CameraRoadFollower:
             safe = math.sqrt(2 * BRAKE_MPS2 * max(0.0, to_stop - driven_m))
             return max(-6.0, 4 * (safe - speed)) if safe < speed else toward_speed(min(self.cruise_mps, safe), speed)
 
-        return make_plan(observation, pursue(path, observation.ego.speed_mps, accel_of, lookahead_s=0.3))
+        return make_plan(observation, pursue(path, observation.ego.speed_mps, accel_of))
 
     def roomiest(
         self, blocked: Bool[np.ndarray, "x y"], seen: Bool[np.ndarray, "x y"]
@@ -84,10 +84,10 @@ class CameraRoadFollower:
         room_to_edges = distance_to(edges, CAR_HALF_WIDTH_M + SPARE_M)[row, column]
         road = free_along(station, hidden | (room_to_edges < CAR_HALF_WIDTH_M))
         spare = mean_where(station < free[:, None], np.clip(room - CAR_HALF_WIDTH_M, 0.0, SPARE_M))
-        # More way than it takes to stop from cruising speed is worth nothing: else every car is overtaken.
+        # More way than it takes to stop from cruising speed is worth nothing: a lane is as good as a square.
         enough = self.front_m + STOP_GAP_M + self.cruise_mps**2 / (2 * BRAKE_MPS2) + 4.0
         counted = (station < road[:, None]) & (station >= PLACE_M[0]) & (station < PLACE_M[1])
-        gain = np.minimum(road, enough) + FREE_WEIGHT * np.minimum(free, enough) + SPARE_WEIGHT * spare
+        gain = np.minimum(road, enough) + SPARE_WEIGHT * spare
         cost = PLACE_WEIGHT * self.displaced(edges, row, column, counted) + BEND_WEIGHT * np.abs(first)
         cost += S_BEND_WEIGHT * np.abs(second - first) + CHANGE_WEIGHT * np.abs(first - self.curvature)
         best = int(np.argmax(gain - cost))

@@ -18,9 +18,9 @@ from nurec_sim.policies._paths import (
 from nurec_sim.types import LidarFrame, Needs, Observation, Plan, Rig
 
 CELL_M, RANGE_M, SIDE_M = 1.0, 60.0, 12.0
-MIN_HEIGHT_M, MAX_HEIGHT_M = 0.4, 2.2
+MIN_HEIGHT_M, MAX_HEIGHT_M = 0.5, 2.2
 CORRIDOR_MARGIN_M, SIDE_MARGIN_M = 0.25, 2.0
-MIN_POINTS, STEEPEST = 3, 0.06
+MIN_POINTS, STEEPEST = 5, 0.06
 TTC_S, BRAKE_MPS2, STOP_GAP_M = 2.0, 4.0, 2.0
 """Brake when the time to collision falls below 2 s, or the distance below v^2 / (2 * 4) + 2 m."""
 
@@ -73,7 +73,7 @@ class LidarAeb:
         nearest = np.sort(station[inside & (station < RANGE_M)])
         if len(nearest) < MIN_POINTS:
             return None
-        # A lone point is noise; an obstacle is where three lie within a metre.
+        # A lone point is noise; an obstacle is where five lie within a metre.
         solid = nearest[MIN_POINTS - 1 :] - nearest[: len(nearest) - MIN_POINTS + 1] < 1.0
         return float(nearest[np.argmax(solid)]) - self.front_m if solid.any() else None
 

@@ -50,7 +50,9 @@ class Street:
         )
         self.rig = Rig({c.id: c for c in self.cameras}, {"top": lidar})
         self.t_us = 1_000_000 + FRAME_US * np.arange(self.frames)
-        poses = np.stack([geometry.pose_from_xyyaw(self.speed_mps * k * FRAME_US / 1e6, 0, 0) for k in range(self.frames)])
+        poses = np.stack(
+            [geometry.pose_from_xyyaw(self.speed_mps * k * FRAME_US / 1e6, 0, 0) for k in range(self.frames)]
+        )
         self.ego = Trajectory(self.t_us, poses)
         self.tracks = [
             Track(name, "automobile", size, Trajectory(self.t_us, self._box_poses(name)))
@@ -82,7 +84,7 @@ class Street:
 
         rays, _ = sensors.pixel_rays(self.rig.cameras[camera_id])
         pose = self.world_from_camera(camera_id, index)[0]
-        direction = rays.reshape(-1, 3) @ pose[:3, :3].T
+        direction = np.nan_to_num(rays.reshape(-1, 3) @ pose[:3, :3].T)
         distance, what = self.cast(pose[:3, 3], direction, index)
         hit = pose[:3, 3] + np.where(np.isfinite(distance), distance, 0)[:, None] * direction
         rgb = colour_of(what, hit) * self.gains.get(camera_id, 1.0)
@@ -106,7 +108,11 @@ class Street:
         best, what = np.full(len(direction), np.inf), np.zeros(len(direction), int)
         step = STEP_M if self.kerb else 0.0
         with np.errstate(divide="ignore", invalid="ignore"):
-            planes = [(2, 0.0, 1), (2, step, 2)] + [(1, s * KERB_M, 3) for s in (1, -1)] + [(1, s * WALL_M, 4) for s in (1, -1)]
+            planes = (
+                [(2, 0.0, 1), (2, step, 2)]
+                + [(1, s * KERB_M, 3) for s in (1, -1)]
+                + [(1, s * WALL_M, 4) for s in (1, -1)]
+            )
             for axis, at, kind in planes:
                 t = (at - origin[axis]) / direction[:, axis]
                 p = origin + t[:, None] * direction

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numba import njit
 
-from nurec_sim.reconstruct.depth import project_point
+from nurec_sim.reconstruct.splat import project_point
 from nurec_sim.reconstruct.views import View
 
 ENOUGH_SHARED = 300

@@ -1,4 +1,4 @@
-"""Dense depth of a working view: sweeps splatted into it, matched against neighbouring views, smoothed along 8 paths.
+"""Dense depth of a working view: measured where surfels lie, matched against neighbours elsewhere, smoothed over all.
 
 Inverse depth (1/m, along the optical axis) everywhere; 0 is infinitely far. Compiled kernels run without the
 interpreter lock.
@@ -8,101 +8,13 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, UInt8, UInt64
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt64
 from numba import njit
 
 PRIOR_COST, PRIOR_CAP = 40.0, 220.0
 SKY_COST, NOT_SKY_COST = 60.0, 40.0
 NEUTRAL_COST = 24.0
-SPLAT_RADIUS = 0.5
 SMOOTH_ONE, SMOOTH_MANY = 6.0, 48.0
-
-
-@njit(cache=True, nogil=True)
-def project_point(view, x, y, z):
-    """Pixel and depth of a point: (u, v, depth); depth <= 0 if behind. ``view`` is ``View.packed``."""
-    a = view[5] * x + view[6] * y + view[7] * z + view[14]
-    b = view[8] * x + view[9] * y + view[10] * z + view[15]
-    c = view[11] * x + view[12] * y + view[13] * z + view[16]
-    if c <= 1e-3:
-        return 0.0, 0.0, -1.0
-    u, v = view[0] * a / c + view[1], view[0] * b / c + view[2]
-    if view[17] != 0.0 or view[18] != 0.0 or view[19] != 0.0:
-        for _ in range(3):
-            f = min(max(view[20] * u + view[21] * v + view[22], -0.5), 0.5)
-            d = c - view[19] * f
-            if d <= 1e-3:
-                return 0.0, 0.0, -1.0
-            u, v = view[0] * (a - view[17] * f) / d + view[1], view[0] * (b - view[18] * f) / d + view[2]
-        c -= view[19] * f
-    return u, v, c
-
-
-@njit(cache=True, nogil=True)
-def splat(view, xyz, normal, spacing, offset, front, total, weight, nearest, index, second):
-    """Draw surfels: in the first pass keep the smallest depth in ``front``, in the second average near it.
-
-    Each surfel covers a disc of its spacing and takes at every pixel the depth of its tangent plane, bounded so that a
-    grazing plane does not run away. The second pass sums inverse depths within 4 % of the front, weighted by the
-    distance from the pixel's centre, so that noise does not pull surfaces forward; ``index`` gets ``offset`` + the row
-    of the surfel whose centre is nearest.
-    """
-    width, height, focal = int(view[3]), int(view[4]), view[0]
-    for i in range(len(xyz)):
-        u, v, depth = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
-        if depth < 0.3 or u < -8 or v < -8 or u > width + 8 or v > height + 8:
-            continue
-        radius = min(max(SPLAT_RADIUS * spacing[i] * focal / depth, 0.6), 8.0)
-        n0 = view[5] * normal[i, 0] + view[6] * normal[i, 1] + view[7] * normal[i, 2]
-        n1 = view[8] * normal[i, 0] + view[9] * normal[i, 1] + view[10] * normal[i, 2]
-        n2 = view[11] * normal[i, 0] + view[12] * normal[i, 1] + view[13] * normal[i, 2]
-        along = n0 * (u - view[1]) / focal + n1 * (v - view[2]) / focal + n2
-        w = 1.0 / depth
-        limit = min(1.5 * spacing[i] * w * w / max(abs(along), 0.05), 0.1 * w)
-        for row in range(max(int(v - radius), 0), min(int(v + radius) + 1, height)):
-            for column in range(max(int(u - radius), 0), min(int(u + radius) + 1, width)):
-                du, dv = column + 0.5 - u, row + 0.5 - v
-                square = (du * du + dv * dv) / (radius * radius)
-                if square > 1.0:
-                    continue
-                here = w
-                if abs(along) > 1e-6:
-                    slant = w * (n0 * du + n1 * dv) / (focal * along)
-                    here = w + min(max(slant, -limit), limit)
-                if not second:
-                    front[row, column] = max(front[row, column], here)
-                elif here > 0.96 * front[row, column]:
-                    share = np.exp(-2.0 * square)
-                    total[row, column] += share * here
-                    weight[row, column] += share
-                    if square < nearest[row, column]:
-                        nearest[row, column] = square
-                        index[row, column] = offset + i
-
-
-@njit(cache=True, nogil=True)
-def drop_shine_through(inverse_depth, index):
-    """Empty pixels that most of their 7x7 surroundings lie well in front of: seen through gaps of a surface."""
-    height, width = inverse_depth.shape
-    bad = np.zeros((height, width), np.bool_)
-    for row in range(height):
-        for column in range(width):
-            w = inverse_depth[row, column]
-            if w <= 0:
-                continue
-            front, total = 0, 0
-            for r in range(max(row - 3, 0), min(row + 4, height)):
-                for c in range(max(column - 3, 0), min(column + 4, width)):
-                    other = inverse_depth[r, c]
-                    if other > 0:
-                        total += 1
-                        front += other > 1.2 * w + 0.002
-            bad[row, column] = front * 2 > total + 4
-    for row in range(height):
-        for column in range(width):
-            if bad[row, column]:
-                inverse_depth[row, column] = 0
-                index[row, column] = -1
 
 
 def census(gray: UInt8[np.ndarray, "h w"]) -> UInt64[np.ndarray, "h w"]:
@@ -192,35 +104,6 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
             for level in range(levels):
                 if cost[row, column, level] < 0:
                     cost[row, column, level] = unseen
-
-
-@njit(cache=True, nogil=True)
-def trim_silhouettes(inverse_depth, index, gray):
-    """Empty pixels at the rim of a nearer surface that look unlike its inside: splats reach over silhouettes."""
-    height, width = inverse_depth.shape
-    rim = np.zeros((height, width), np.bool_)
-    for row in range(1, height - 1):
-        for column in range(1, width - 1):
-            w = inverse_depth[row, column]
-            if w <= 0:
-                continue
-            own = float(gray[row, column])
-            outside, inside, n_outside, n_inside = 0.0, 0.0, 0, 0
-            for r in range(max(row - 2, 0), min(row + 3, height)):
-                for c in range(max(column - 2, 0), min(column + 3, width)):
-                    if inverse_depth[r, c] < 0.8 * w:
-                        outside += gray[r, c]
-                        n_outside += 1
-                    else:
-                        inside += gray[r, c]
-                        n_inside += 1
-            if n_outside >= 3 and n_inside > 0:
-                rim[row, column] = abs(own - outside / n_outside) + 8 < abs(own - inside / n_inside)
-    for row in range(height):
-        for column in range(width):
-            if rim[row, column]:
-                inverse_depth[row, column] = 0
-                index[row, column] = -1
 
 
 @njit(cache=True, nogil=True)
@@ -323,17 +206,3 @@ def dense_inverse_depth(
     result = smooth_depth(cost, gray, step)
     trusted = (prior > 0) & ((np.abs(result - prior) < 1.5 * step + 0.1 * prior) | (prior > (levels - 2) * step))
     return np.where(trusted, prior, result).astype(np.float32)
-
-
-def draw_surfels(
-    shape: tuple[int, int], bodies: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]]
-) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"]]:
-    """Inverse depth (0: nothing) and surfel per pixel (-1: none) of (packed view, xyz, normal, spacing, offset)."""
-    front, total, weight = (np.zeros(shape, np.float32) for _ in range(3))
-    nearest, index = np.full(shape, 2.0, np.float32), np.full(shape, -1, np.int32)
-    for second in (False, True):
-        for packed, xyz, normal, spacing, offset in bodies:
-            splat(packed, xyz, normal, spacing, offset, front, total, weight, nearest, index, second)
-    inverse_depth = np.where(weight > 0, total / np.maximum(weight, 1e-9), 0).astype(np.float32)
-    drop_shine_through(inverse_depth, index)
-    return inverse_depth, index

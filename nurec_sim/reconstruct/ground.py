@@ -61,13 +61,16 @@ class Ground:
     def sheet(self, static: Cloud) -> Cloud:
         """The ground as one regular cloud wherever it is known or filled over a short distance.
 
-        One point per cell near the driven path, per 2 x 2 cells from 8 m on and per 4 x 4 from 16 m on. Intensity is the mean of the points in the cell, or in its surroundings; NaN where there are none.
+        One point per cell near the driven path, per 2 x 2 cells from 8 m on and per 4 x 4 from 16 m on. Intensity
+        is the mean of the points in the cell, or in its surroundings; NaN where there are none.
         """
         size = self.stride
         rows, columns = np.indices(size.shape, sparse=True)
         row, column = np.nonzero(self.near & (rows % size == 0) & (columns % size == 0))
         size = size[row, column]
-        row, column = (np.minimum(i + size // 2, n - 1) for i, n in zip((row, column), self.height_m.shape, strict=True))
+        row, column = (
+            np.minimum(i + size // 2, n - 1) for i, n in zip((row, column), self.height_m.shape, strict=True)
+        )
         xyz = np.column_stack([self.corner_m + (np.column_stack([column, row]) + (size % 2)[:, None] / 2) * self.cell_m,
                                self.height_m[row, column]])  # fmt: skip
         source = static[np.abs(self.above(static.xyz_m)) < 0.1]

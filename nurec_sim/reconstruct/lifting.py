@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 from numba import njit
 
-from nurec_sim.reconstruct.depth import project_point
+from nurec_sim.reconstruct.splat import project_point
 from nurec_sim.reconstruct.views import View
 
 STATIC, NOBODY = -1, -2
@@ -88,9 +88,7 @@ def normals_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64
     slope_v = (shifted(2, 0) - shifted(-2, 0)) / 4 * tile.focal_px
     rays = rays_of(view)
     normal = np.stack([slope_u, slope_v, w - slope_u * rays[..., 0] - slope_v * rays[..., 1]], axis=-1)
-    bend = np.maximum(
-        np.abs(shifted(0, 2) + shifted(0, -2) - 2 * w), np.abs(shifted(2, 0) + shifted(-2, 0) - 2 * w)
-    )
+    bend = np.maximum(np.abs(shifted(0, 2) + shifted(0, -2) - 2 * w), np.abs(shifted(2, 0) + shifted(-2, 0) - 2 * w))
     size = np.linalg.norm(normal, axis=-1, keepdims=True)
     unit_ray = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     smooth = (bend < 0.05 * w) & (size[..., 0] > 1e-9)
@@ -103,8 +101,9 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
     """Which points no other view owns, and that at most half as many views look through as agree with.
 
     The owner of a surface is the view in the nearest ring of distance, rings growing by the factor ``exp(ring)``, and
-    the first of these; a strict order, so that exactly one view owns it. ``rgb`` (0..255) of the points that stay is mixed with the colours that the agreeing views show, weighted by their
-    nearness: exposure drifts and reflections even out.
+    the first of these; a strict order, so that exactly one view owns it. ``rgb`` (0..255) of the points that stay is
+    mixed with the colours that the agreeing views show, weighted by their nearness: exposure drifts and reflections
+    even out.
 
     A view agrees with a point that projects well inside it if its inverse depth there is the same within ``tolerance``
     (1/m) plus 10 %; it looks through the point if it is clearly smaller. ``packed[k]`` projects from the points' frame
@@ -142,11 +141,13 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
     return keep
 
 
-def lattice(shape: tuple[int, int], stride: int) -> Bool[np.ndarray, "h w"]:
-    """Every ``stride``-th pixel of every ``stride``-th row."""
-    mask = np.zeros(shape, bool)
-    mask[stride // 2 :: stride, stride // 2 :: stride] = True
-    return mask
+def lattice(shape: tuple[int, int], thinning: int) -> Bool[np.ndarray, "h w"]:
+    """One pixel in ``thinning`` (a power of two), on a square lattice, turned by 45 degrees for 2, 8, 32, ..."""
+    row, column = np.indices(shape, sparse=True)
+    while thinning >= 4:
+        row, column, thinning = np.where(row % 2, -1, row // 2), np.where(column % 2, -1, column // 2), thinning // 4
+    mask = (row >= 0) & (column >= 0)
+    return mask & ((row + column) % 2 == 0) if thinning == 2 else mask
 
 
 def stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
@@ -158,9 +159,7 @@ def stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
     return result
 
 
-def sky_coloured(
-    view: View, prior: Float32[np.ndarray, "h w"], bright: float
-) -> Bool[np.ndarray, "h w"]:
+def sky_coloured(view: View, prior: Float32[np.ndarray, "h w"], bright: float) -> Bool[np.ndarray, "h w"]:
     """Pixels that look like sky: above the horizon, no surface measured, and bright or clearly blue."""
     rgb = view.rgb.astype(np.float32)
     up = rays_of(view) @ view.world_from_view[2, :3]

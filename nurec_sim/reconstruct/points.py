@@ -54,7 +54,7 @@ CLOUD_FIELDS = ("xyz_m", "eye_m", "spacing_m", "intensity", "sweeps")
 
 @dataclass(frozen=True)
 class Actor:
-    """A labelled object: ``index`` in ``clip.tracks``; one that stands has one pose, and is there over the whole clip."""
+    """A labelled object, ``clip.tracks[index]``; one that stands has one pose, and is there over the whole clip."""
 
     index: int
     track: Track
@@ -203,7 +203,9 @@ def gather(
         xyz = sweep.xyz_world_m
         rig_from_world = geometry.inverse(clip.ego.at(sweep.t_us))
         body = clip.rig.body
-        keep &= ~geometry.points_in_box(geometry.transform_points(rig_from_world, xyz) - body.center_m, body.size_m, 0.3)
+        keep &= ~geometry.points_in_box(
+            geometry.transform_points(rig_from_world, xyz) - body.center_m, body.size_m, 0.3
+        )
         xyz, t_us, local = xyz[keep], sweep.point_t_us[keep], sweep.xyz_m[keep]
         intensity = np.full(len(xyz), np.nan) if sweep.intensity is None else sweep.intensity[keep].astype(np.float64)
         known |= bool(np.isfinite(intensity).any())
@@ -268,9 +270,7 @@ def spherical_ranges(xyz_lidar_m: Float64[np.ndarray, "n 3"]) -> Float32[np.ndar
     return image
 
 
-def seen_through(
-    cloud: Cloud, range_images: list[tuple[np.ndarray, np.ndarray]], votes: int
-) -> Bool[np.ndarray, " n"]:
+def seen_through(cloud: Cloud, range_images: list[tuple[np.ndarray, np.ndarray]], votes: int) -> Bool[np.ndarray, " n"]:
     """Points that sweeps look through: at least ``votes`` and twice as many as those that hit them.
 
     A sweep looks through a point when every return in the 3x3 bins around its direction lies well behind it.

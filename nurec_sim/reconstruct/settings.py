@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+THREADS = 2
+"""Of the compiled kernels; results do not depend on it."""
+
 
 @dataclass(frozen=True)
 class PointSettings:
@@ -51,7 +54,7 @@ class ViewSettings:
     """Pixels are lifted from every n-th frame, so that no more working views than this are left."""
     max_frames: int = 240
     """Frames between them only help to find depth; they too are thinned evenly to this number."""
-    budget: int = 1_200_000
+    budget: int = 900_000
     """Gaussians to lift from pixels, about: pixels are skipped on a regular lattice to meet it."""
     levels: int = 72
     """Inverse-depth hypotheses of the matching, from infinity to ``min_depth_m``."""

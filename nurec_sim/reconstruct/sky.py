@@ -21,8 +21,8 @@ def make_sky(
 ) -> Float32[np.ndarray, "6 size size 3"]:
     """Average the far pixels of all views per cubemap texel and fill the rest from their surroundings.
 
-    ``colours`` are canonical, 0..255; ``weights`` say how surely each pixel is sky, 0 if it is not. Directions that nothing is known of take the colour of the nearest known ones,
-    ever smoother with distance.
+    ``colours`` are canonical, 0..255; ``weights`` say how surely each pixel is sky, 0 if it is not.
+    Directions that nothing is known of take the colour of the nearest known ones, ever smoother with distance.
     """
     total, count = np.zeros((6 * size * size, 3)), np.zeros(6 * size * size)
     for view, rgb, weight in zip(views, colours, weights, strict=True):

@@ -28,8 +28,8 @@ def surface_of(cloud: Cloud, chunk: int = 200_000) -> tuple[Cloud, np.ndarray, n
     """The cloud moved onto its local planes, unit normals that face the sensor, and the spacing between points (m).
 
     Sweeps of a moving car disagree by centimetres, so that walls are thick; a grazing beam would end at their near
-    side. The normal is the direction of least variance of the nearest points. Where these lie on a line (one scan ring), the
-    surface is taken to contain the line and to face the sensor as well as it can.
+    side. The normal is the direction of least variance of the nearest points. Where these lie on a line (one scan
+    ring), the surface is taken to contain the line and to face the sensor as well as it can.
     """
     from scipy.spatial import cKDTree
 

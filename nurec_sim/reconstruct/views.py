@@ -6,6 +6,7 @@ moves during the exposure is kept as ``drift_m``, scaled by a shutter fraction t
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -15,7 +16,10 @@ from jaxtyping import Bool, Float64, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.settings import ViewSettings
-from nurec_sim.types import CameraModel, Clip, Pinhole, Shutter
+from nurec_sim.types import Box, CameraModel, Clip, Pinhole, Shutter
+
+EGO_HEIGHT_M = 0.9
+"""Bonnet and boot of a car lie at about this height: what is lower within its outline is the car itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +102,30 @@ def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
     return tiles
 
 
+def without_ego(tile: Tile, camera: CameraModel, body: Box) -> Tile:
+    """The tile without the pixels that must show the ego car: their rays pass through its lower body.
+
+    Cameras below ``EGO_HEIGHT_M`` look out of that body, and keep all pixels.
+    """
+    centre, size = np.asarray(body.center_m), np.asarray(body.size_m)
+    low, high = centre - size / 2, centre + size / 2
+    high[2] = min(high[2], low[2] + EGO_HEIGHT_M)
+    origin = camera.rig_from_camera[:3, 3]
+    if np.all((origin >= low) & (origin <= high)):
+        return tile
+    u, v = np.meshgrid(np.arange(tile.width) + 0.5, np.arange(tile.height) + 0.5)
+    rays = np.stack([(u - tile.center_px[0]) / tile.focal_px, (v - tile.center_px[1]) / tile.focal_px, u * 0 + 1], -1)
+    rays = rays @ (camera.rig_from_camera[:3, :3] @ tile.camera_from_tile).T
+    rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
+    near, far = (low - origin) / rays, (high - origin) / rays
+    enter, leave = np.minimum(near, far).max(axis=-1), np.maximum(near, far).min(axis=-1)
+    return dataclasses.replace(tile, valid=tile.valid & ~((enter < leave) & (leave > 0)))
+
+
 def _pixels_per_radian(camera: CameraModel) -> float:
-    middle = np.array([[camera.width_px / 2 - 8, camera.height_px / 2], [camera.width_px / 2 + 8, camera.height_px / 2]])
+    middle = np.array(
+        [[camera.width_px / 2 - 8, camera.height_px / 2], [camera.width_px / 2 + 8, camera.height_px / 2]]
+    )
     rays, _ = sensors.unproject(camera, middle)
     return 16.0 / float(np.arccos(np.clip(rays[0] @ rays[1], -1, 1)))
 
@@ -119,7 +145,9 @@ def _resampled_tile(
     seen &= sensors.in_image(camera, uv)
     uv = np.where(seen[:, None], uv, -1e4) / reduction - 0.5
     maps = uv[:, 0].reshape(height, width).astype(np.float32), uv[:, 1].reshape(height, width).astype(np.float32)
-    tile = Tile(width, height, focal, center, camera_from_tile, reduction, maps, seen.reshape(height, width), np.zeros(3))
+    tile = Tile(
+        width, height, focal, center, camera_from_tile, reduction, maps, seen.reshape(height, width), np.zeros(3)
+    )
     return _with_fraction(tile, camera)
 
 
@@ -128,7 +156,9 @@ def _with_fraction(tile: Tile, camera: CameraModel) -> Tile:
     if camera.shutter is Shutter.GLOBAL:
         return tile
     v, u = (a.ravel() + 0.5 for a in np.mgrid[0 : tile.height : 8, 0 : tile.width : 8])
-    rays = np.column_stack([(u - tile.center_px[0]) / tile.focal_px, (v - tile.center_px[1]) / tile.focal_px, u * 0 + 1])
+    rays = np.column_stack(
+        [(u - tile.center_px[0]) / tile.focal_px, (v - tile.center_px[1]) / tile.focal_px, u * 0 + 1]
+    )
     uv, seen = sensors.project(camera, rays @ tile.camera_from_tile.T)
     seen &= sensors.in_image(camera, uv)
     target = sensors.shutter_fraction(camera, uv[seen]) - 0.5
@@ -158,7 +188,10 @@ def read_views(
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[View]:
     """Read and resample the chosen frames of the cameras."""
-    tiles = {camera: tiles_of(clip.rig.cameras[camera], settings) for camera in cameras}
+    tiles = {}
+    for camera in cameras:
+        model = clip.rig.cameras[camera]
+        tiles[camera] = [without_ego(tile, model, clip.rig.body) for tile in tiles_of(model, settings)]
     frames = choose_frames(clip, cameras, sum(map(len, tiles.values())), settings)
     views = []
     for done, (camera, frame, key) in enumerate(frames):

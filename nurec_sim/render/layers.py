@@ -35,10 +35,11 @@ def moving_gaussians(
     """
     knots = dynamic.knot_t_us
     alive = np.flatnonzero((knots[:, 0] <= t_us) & (t_us <= knots[:, 2]))
-    after = t_us >= knots[alive, 1]
+    knots = knots[alive]
+    after = t_us >= knots[:, 1]
     rows = np.arange(len(alive))
     low = np.where(after, 1, 0)
-    start_us, end_us = knots[alive][rows, low], knots[alive][rows, low + 1]
+    start_us, end_us = knots[rows, low], knots[rows, low + 1]
     fraction = (t_us - start_us) / np.maximum(end_us - start_us, 1)
     fade = np.exp(-(np.where(after, fraction, 1 - fraction) ** 10))
     opacity = dynamic.gaussians.opacity[alive] * fade
@@ -51,12 +52,13 @@ def moving_gaussians(
     quat, normal = gaussians.quat_wxyz.astype(np.float64), gaussians.normal.astype(np.float64)
     eye = np.broadcast_to(np.asarray(eye_m, np.float64), mean.shape).copy()
     recorded_mean = mean.copy()
+    owner = dynamic.track[alive]
     index_of = {track.id: k for k, track in enumerate(tracks)}
     for name, world_from_box in actors.items():
         if name not in index_of:
             continue
         index = index_of[name]
-        mine = np.flatnonzero(dynamic.track[alive] == index)
+        mine = np.flatnonzero(owner == index)
         if len(mine) == 0:
             continue
         new_from_recorded = world_from_box @ geometry.inverse(tracks[index].path.at(t_us))

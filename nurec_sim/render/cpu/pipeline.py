@@ -18,7 +18,7 @@ from jaxtyping import Float32, Float64
 from nurec_sim import geometry
 from nurec_sim.render.cpu.binning import count_tiles, fill_tiles, sort_by_depth
 from nurec_sim.render.cpu.blend import PLANES, blend
-from nurec_sim.render.cpu.grid import Grid
+from nurec_sim.render.cpu.grid import LIDAR, Grid
 from nurec_sim.render.cpu.pack import BLOCK, PackedGaussians
 from nurec_sim.render.cpu.projection import RECORD, TILE, project
 
@@ -133,7 +133,8 @@ def _visible(
     quat = geometry.quat_from_matrix(rotation).astype(np.float32)
     cells = np.array([grid.valid.shape[1], grid.valid.shape[0]], np.float32)
     chosen = [_blocks_in_view(grid, view, layer) for layer in layers]
-    capacity = 2 * BLOCK * sum(len(blocks) for blocks in chosen)
+    most = BLOCK * (2 if grid.kind == LIDAR else 1)  # records per block: around the seam of a turn two each
+    capacity = most * sum(len(blocks) for blocks in chosen)
     records, keys = array("records", (capacity, RECORD), np.float32), array("keys", (capacity,), np.float32)
     spans = array("spans", (capacity, 4), np.int16)
     arguments, starts, base = [], [], 0
@@ -147,7 +148,7 @@ def _visible(
                  grid.kind, grid.params, grid.table, grid.row_shift, grid.line_axis, view.lines, cells, grid.by_range,
                  np.float32(grid.near_m), records, spans, keys, base)
             )  # fmt: skip
-            base += 2 * BLOCK * (last - first)
+            base += most * (last - first)
     counts = np.array(workers.run(project, arguments), np.int64)
     order = array("order", (int(counts.sum()),), np.int32)
     sort_by_depth(keys, np.array(starts, np.int64), counts, order)
