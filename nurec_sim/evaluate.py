@@ -10,6 +10,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -18,7 +19,7 @@ from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
 from nurec_sim.metrics.images import psnr, ssim
 from nurec_sim.metrics.lidar_scores import LidarScore, scanner_along, score_sweep
-from nurec_sim.types import Clip, GaussianScene, Sense, SensorRequest, Sweep
+from nurec_sim.types import CameraFrame, Clip, GaussianScene, LidarFrame, Sense, SensorRequest, Sweep
 
 Progress = Callable[[str, float], None]
 
@@ -34,7 +35,7 @@ def evaluate(
     via_grpc: bool = True,
     images_dir: Path | None = None,
     progress: Progress | None = None,
-    **options: object,
+    **options: Any,
 ) -> dict[str, object]:
     """Reconstruct a clip and score what it renders.
 
@@ -110,7 +111,8 @@ def sensing(scene: GaussianScene, via_grpc: bool) -> Iterator[Sense]:
     if not via_grpc:
         from nurec_sim.render import Renderer
 
-        yield Renderer(scene).sense
+        local: Sense = Renderer(scene).sense
+        yield local
         return
     from nurec_sim.client import RemoteSensors
     from nurec_sim.scene_store import SceneStore
@@ -126,7 +128,7 @@ def sensing(scene: GaussianScene, via_grpc: bool) -> Iterator[Sense]:
 def _score_images(
     clip: Clip, inputs: Sequence[str], targets: Sequence[str], sense: Sense, images_dir: Path | None, report: Progress
 ) -> dict[str, object]:
-    per_camera = {}
+    per_camera: dict[str, dict[str, Any]] = {}
     for camera in targets:
         shown: dict[str, list[float]] = {"psnr_db": [], "ssim": []}
         floor: dict[str, list[float]] = {"psnr_db": [], "ssim": []}
@@ -138,7 +140,9 @@ def _score_images(
             request = SensorRequest(
                 clip.id, clip.rig.cameras[camera], start_us, end_us, clip.world_from_camera(camera, index)
             )
-            rendered = sense([request])[0].rgb
+            frame = sense([request])[0]
+            assert isinstance(frame, CameraFrame)
+            rendered = frame.rgb
             copied = _nearest_input(clip, camera, index, inputs)
             _append(shown, rendered, recorded)
             if copied is not None:
@@ -208,7 +212,9 @@ def _score_lidars(clip: Clip, held: Sequence[int], sense: Sense, report: Progres
         fired, poses = as_fired(clip, lidar, sweep)
         scanner = scanner_along(clip.rig.lidars[lidar], fired)
         request = SensorRequest(clip.id, scanner, sweep.start_us, max(sweep.end_us, sweep.start_us + 1), poses)
-        scores.append(score_sweep(sense([request])[0], fired))
+        frame = sense([request])[0]
+        assert isinstance(frame, LidarFrame)
+        scores.append(score_sweep(frame, fired))
         names.append({"lidar": lidar, "sweep": index})
     report("held-out sweeps", 1.0)
     total = LidarScore.pooled(scores)

@@ -109,6 +109,8 @@ class SensorServer:
         Raises:
             OSError: the address cannot be listened at.
         """
+        if not 0 <= self._port <= 65535:
+            raise OSError(f"cannot listen at port {self._port}; ports are 0 (any free one) to 65535")
         loop, stopping = asyncio.get_running_loop(), asyncio.Event()
 
         def request_stop() -> None:

@@ -58,3 +58,26 @@ def test_readme_uses_only_verbs_that_exist() -> None:
     used = set(re.findall(r"^nurec-sim (\w+)", (REPO / "README.md").read_text(), flags=re.MULTILINE))
     assert used
     assert used <= set(VERBS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["serve", "nowhere.usdz"], "nothing to serve: nowhere.usdz does not exist"),
+        (["run", "--scenario", "nope"], "no scenario named 'nope'; have ['demo', 'short']"),
+        (["run", "--scenario", "short"], "names no clip"),
+        (["render", "nowhere.usdz"], "nowhere.usdz does not exist"),
+        (["evaluate", "nowhere"], "no clip at 'nowhere'"),
+        (["policies", "nobody"], "unknown policy 'nobody'; have ['camera_road_follower'"),
+        (["world", "--out", "a.zip", "--seconds", "100"], "1..20 seconds"),
+    ],
+)
+def test_mistakes_are_one_clear_line(
+    arguments: list[str], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments)
+    assert stop.value.code == 1
+    assert text in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

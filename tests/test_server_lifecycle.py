@@ -81,6 +81,11 @@ def test_a_taken_port_is_an_error_that_names_it():
             assert remote.scenes() == ["clipgt-street"]
 
 
+def test_a_port_that_no_machine_has_is_an_error():
+    with pytest.raises(OSError, match="ports are 0 .any free one. to 65535"):
+        SensorServer(SceneStore([scene()], make_renderer=one_thread), port=99999).start()
+
+
 def test_stopping_twice_is_harmless_and_a_server_can_start_again():
     server = SensorServer(SceneStore([scene()]), port=0)
     first = server.start()

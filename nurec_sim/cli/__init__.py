@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
 from nurec_sim.cli import driving, scenes
@@ -13,6 +14,7 @@ __all__ = ["driving", "main", "scenes"]
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb; errors of ours become one line and exit status 1, Ctrl-C becomes 130."""
+    logging.basicConfig(format="%(message)s", level=logging.ERROR)
     try:
         app.cli(
             prog="nurec-sim",
@@ -21,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             args=None if arguments is None else list(arguments),
         )
     except NurecSimError as error:
-        err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False)
+        err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         err.print("interrupted; finished rollouts are kept: add --resume runs/latest to go on", markup=False)

@@ -6,7 +6,6 @@ import contextlib
 import inspect
 import time
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Annotated
 
@@ -116,7 +115,7 @@ def drive(
     from nurec_sim.server import SensorServer
 
     started = time.monotonic()
-    scenario_path = find_scenario(scenario_name)
+    scenario_path = sim.scenario_file(scenario_name)
     scenario = sim.load_scenario(scenario_path)
     if not sources and scenario.clip is None:
         raise NurecSimError(f"scenario {scenario.name!r} names no clip; give clips or scenes to drive through")
@@ -144,14 +143,3 @@ def drive(
     heading, *rows = runs.headline(folder)
     print_table("means over rollouts", rows, heading)
     out.print(f"{time.monotonic() - started:.0f} s. Report: {(folder / 'report.html').resolve()}", soft_wrap=True)
-
-
-def find_scenario(name: str) -> Path:
-    """The file of a shipped scenario, or ``name`` itself if it is a YAML file."""
-    if name.endswith((".yaml", ".yml")):
-        return Path(name)
-    folder = Path(str(resources.files("nurec_sim.scenarios")))
-    shipped = sorted(path.stem for path in folder.glob("*.yaml"))
-    if name not in shipped:
-        raise NurecSimError(f"no shipped scenario {name!r}; have {shipped}, or give a .yaml file")
-    return folder / f"{name}.yaml"

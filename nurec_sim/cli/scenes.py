@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -57,11 +58,13 @@ def world(
     """
     from nurec_sim.world import street_plan, write_street_clip
 
+    try:
+        plan = street_plan(seed, seconds)
+    except ValueError as error:
+        raise NurecSimError(str(error)) from None
     command = f"nurec-sim world --seed {seed} --seconds {seconds:g} --out {out_path.name}"
     with progress("drawing the street") as advance:
-        path = write_street_clip(
-            street_plan(seed, seconds), out_path, truth=truth, command=command, progress=advance, overwrite=overwrite
-        )
+        path = write_street_clip(plan, out_path, truth=truth, command=command, progress=advance, overwrite=overwrite)
     out.print(f"wrote {path}", soft_wrap=True)
 
 
@@ -152,10 +155,14 @@ def serve(
     """
     from nurec_sim.scene_store import SceneStore
     from nurec_sim.server import serve as run_server
+    from nurec_sim.service import ServiceOptions
 
+    logging.getLogger("nurec_sim").setLevel(logging.WARNING)
     store = SceneStore(sources, cache_dir=cache, threads=threads, on_progress=err.print)
+    if not store.ids:
+        raise NurecSimError("nothing to serve: " + ("; ".join(store.faults.values()) or "give archives or clips"))
     try:
-        run_server(store, host=host, port=port)
+        run_server(store, host=host, port=port, options=ServiceOptions(warm_up=True))
     except OSError as error:
         raise NurecSimError(str(error)) from None
 

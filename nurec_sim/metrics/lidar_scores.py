@@ -69,9 +69,9 @@ def score_sweep(simulated: LidarFrame, xyz_fired_m: Float64[np.ndarray, "n 3"]) 
     """
     lidar = simulated.lidar
     rows, columns = len(lidar.elevation_rad), len(lidar.azimuth_rad)
-    image = np.full(rows * columns, np.nan)
-    image[simulated.beam] = simulated.range_m
-    image = image.reshape(rows, columns)
+    flat = np.full(rows * columns, np.nan)
+    flat[simulated.beam] = simulated.range_m
+    image = flat.reshape(rows, columns)
     recorded = np.linalg.norm(xyz_fired_m, axis=1)
     usable = np.isfinite(recorded) & (recorded >= lidar.range_m[0]) & (recorded <= lidar.range_m[1])
     xyz, recorded = xyz_fired_m[usable], recorded[usable]

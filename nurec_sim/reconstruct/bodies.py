@@ -29,6 +29,11 @@ class Surfels:
         """Where the body is."""
         return np.eye(4) if self.actor is None else self.actor.path.at(t_us)
 
+    @property
+    def box_size_m(self) -> tuple[float, float, float]:
+        """Size of the actor's box; infinite for the world."""
+        return (np.inf,) * 3 if self.actor is None else self.actor.track.size_m
+
     def present(self, t_us: int) -> bool:
         """Whether the body is known to be there."""
         return self.actor is None or bool(self.actor.present(np.array(t_us)))

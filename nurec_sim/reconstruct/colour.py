@@ -40,7 +40,8 @@ def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, toleranc
             if z <= 0.3 or u < 1 or v < 1 or u >= view[3] - 1 or v >= view[4] - 1:
                 continue
             row, column = int(v), int(u)
-            if abs(inverse_depth[k, row, column] - 1.0 / z) > tolerance + 0.08 / z:
+            # Written so that a masked pixel, NaN, neither agrees nor is looked through.
+            if not abs(inverse_depth[k, row, column] - 1.0 / z) <= tolerance + 0.08 / z:
                 through[i] += inverse_depth[k, row, column] < 1.0 / z
                 continue
             rx, ry = (u - view[1]) / view[0], (v - view[2]) / view[0]
@@ -109,7 +110,7 @@ def solve_isp(
     isp = {camera: identity.copy() for camera in cameras}
     total = np.zeros_like(next(iter(colours.values()))[0], dtype=np.float64) if colours else np.zeros((0, 3))
     count = np.zeros(len(total))
-    waiting, joined = list(cameras), []
+    waiting, joined = list(cameras), list[str]()
     while waiting:
         shared = {camera: int((colours[camera][1] & (count > 0)).sum()) for camera in waiting}
         camera = waiting[0] if not joined else max(waiting, key=lambda name: shared[name])

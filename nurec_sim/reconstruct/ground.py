@@ -65,7 +65,7 @@ class Ground:
         is the mean of the points in the cell, or in its surroundings; NaN where there are none.
         """
         size = self.stride
-        rows, columns = np.indices(size.shape, sparse=True)
+        rows, columns = np.arange(size.shape[0])[:, None], np.arange(size.shape[1])[None]
         row, column = np.nonzero(self.near & (rows % size == 0) & (columns % size == 0))
         size = size[row, column]
         row, column = (

@@ -115,7 +115,8 @@ class _Clock:
     """Seconds per stage, and progress calls."""
 
     def __init__(self, progress: Progress) -> None:
-        self.progress, self.seconds, self.stage, self.since = progress, {}, "", 0.0
+        self.progress, self.stage, self.since = progress, "", 0.0
+        self.seconds: dict[str, float] = {}
 
     def start(self, stage: str) -> None:
         self.stop()

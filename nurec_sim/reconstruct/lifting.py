@@ -98,7 +98,7 @@ def normals_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64
 
 @njit(cache=True, nogil=True)
 def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, tolerance, ring, border):
-    """Which points no other view owns, and that at most half as many views look through as agree with.
+    """Which points no other view owns, and that few views look through.
 
     The owner of a surface is the view in the nearest ring of distance, rings growing by the factor ``exp(ring)``, and
     the first of these; a strict order, so that exactly one view owns it. ``rgb`` (0..255) of the points that stay is
@@ -106,8 +106,9 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
     even out.
 
     A view agrees with a point that projects well inside it if its inverse depth there is the same within ``tolerance``
-    (1/m) plus 10 %; it looks through the point if it is clearly smaller. ``packed[k]`` projects from the points' frame
-    into view k.
+    (1/m) plus 10 %; it looks through the point if it is clearly smaller. Points go if more than half as many views look
+    through them as agree.
+    ``packed[k]`` projects from the points' frame into view k.
     """
     keep = np.ones(len(xyz), np.bool_)
     for i in range(len(xyz)):

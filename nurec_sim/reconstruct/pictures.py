@@ -95,7 +95,7 @@ def _bodies_of_pixels(view: View, bodies: Sequence[Surfels], dense: np.ndarray, 
             if not surfels.present(view.t_us):
                 continue
             box = geometry.transform_points(geometry.inverse(surfels.world_from_body(view.t_us)), xyz)
-            size = surfels.actor.track.size_m
+            size = surfels.box_size_m
             upper = box[:, 2] > -size[2] / 2 + 0.15
             inside = geometry.points_in_box(box, size, 0.1) & upper
             found[inside & (found <= 0)] = number

@@ -18,7 +18,7 @@ from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.settings import ViewSettings
 from nurec_sim.types import Box, CameraModel, Clip, Pinhole, Shutter
 
-EGO_HEIGHT_M = 0.9
+EGO_HEIGHT_M = 0.75
 """Bonnet and boot of a car lie at about this height: what is lower within its outline is the car itself."""
 
 
@@ -164,7 +164,7 @@ def _with_fraction(tile: Tile, camera: CameraModel) -> Tile:
     target = sensors.shutter_fraction(camera, uv[seen]) - 0.5
     basis = np.column_stack([u, v, np.ones_like(u)])[seen]
     solution = np.linalg.lstsq(basis, target, rcond=None)[0]
-    return Tile(*(getattr(tile, name) for name in list(tile.__dataclass_fields__)[:-1]), solution)
+    return dataclasses.replace(tile, fraction=solution)
 
 
 def choose_frames(

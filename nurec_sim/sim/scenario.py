@@ -97,12 +97,7 @@ def load_scenario(path: str | Path) -> Scenario:
         ScenarioError: the file cannot be read, is no YAML mapping, or a key is unknown or wrong; the text names the
             file, every wrong key, and what is allowed there.
     """
-    path = Path(path)
-    if not path.suffix and not path.exists():
-        shipped = resources.files("nurec_sim.scenarios")
-        if not (shipped / f"{path}.yaml").is_file():
-            raise ScenarioError(f"no scenario named '{path}'; have {shipped_scenarios()}, or give a YAML file")
-        path = Path(str(shipped / f"{path}.yaml"))
+    path = scenario_file(path)
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -114,6 +109,21 @@ def load_scenario(path: str | Path) -> Scenario:
     if not isinstance(content, dict):
         raise ScenarioError(f"scenario file '{path}' must hold keys and values, got {type(content).__name__}")
     return make_scenario(content, source=f"scenario file '{path}'")
+
+
+def scenario_file(name: str | Path) -> Path:
+    """The file of a shipped scenario's name, or ``name`` itself if it is a path; a scenario's ``clip`` lies beside it.
+
+    Raises:
+        ScenarioError: no shipped scenario of that name.
+    """
+    path = Path(name)
+    if path.suffix or path.exists():
+        return path
+    shipped = resources.files("nurec_sim.scenarios")
+    if not (shipped / f"{path}.yaml").is_file():
+        raise ScenarioError(f"no scenario named '{path}'; have {shipped_scenarios()}, or give a YAML file")
+    return Path(str(shipped / f"{path}.yaml"))
 
 
 def shipped_scenarios() -> list[str]:
