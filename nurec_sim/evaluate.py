@@ -109,7 +109,7 @@ def held_out(clip: Clip, every: int, listed: Sequence[int]) -> list[int]:
 def sensing(scene: GaussianScene, via_grpc: bool) -> Iterator[Sense]:
     """A ``sense`` for a scene: through a server on a free port of this machine, or a renderer in this process."""
     if not via_grpc:
-        from nurec_sim.render import Renderer
+        from nurec_sim.render.renderer import Renderer
 
         local: Sense = Renderer(scene).sense
         yield local
