@@ -72,10 +72,11 @@ def evaluate(
     if hold_out_every < 0:
         raise ReconstructError(f"hold_out_every must be 0 or more, got {hold_out_every}")
     held = held_out(clip, hold_out_every, hold_out_sweeps)
-    started = time.perf_counter()
-    scene = reconstruct(clip, method, cameras=inputs, hold_out_sweeps=held, progress=report, **options)
-    seconds = {f"reconstruct: {k}": v for k, v in dict(scene.provenance.get("seconds", {})).items()}
-    seconds["reconstruct"] = round(time.perf_counter() - started, 3)
+    stages = _StageClock(report)
+    scene = reconstruct(clip, method, cameras=inputs, hold_out_sweeps=held, progress=stages, **options)
+    stages.stop()
+    seconds = {f"reconstruct: {stage}": round(spent, 3) for stage, spent in stages.seconds.items()}
+    seconds["reconstruct"] = round(sum(stages.seconds.values()), 3)
     with sensing(scene, via_grpc) as sense:
         started = time.perf_counter()
         image = _score_images(clip, inputs, targets, sense, images_dir, report)
@@ -97,6 +98,25 @@ def evaluate(
         | dict(scene.provenance.get("counts", {})),
         "unknown": list(scene.provenance.get("unknown", [])),
     }
+
+
+class _StageClock:
+    """Passes progress on, and adds up the time between the calls by stage."""
+
+    def __init__(self, report: Progress) -> None:
+        self.report, self.stage, self.since = report, "start", time.perf_counter()
+        self.seconds: dict[str, float] = {}
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        if stage != self.stage:
+            self.stop()
+            self.stage = stage
+        self.report(stage, fraction)
+
+    def stop(self) -> None:
+        now = time.perf_counter()
+        self.seconds[self.stage] = self.seconds.get(self.stage, 0.0) + now - self.since
+        self.since = now
 
 
 def held_out(clip: Clip, every: int, listed: Sequence[int]) -> list[int]:

@@ -9,7 +9,6 @@ stay where no view saw them. What nothing covers is sky.
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -37,29 +36,29 @@ def lift(
     Raises:
         ReconstructError: the clip has no LiDAR sweep to build from.
     """
-    clock = _Clock(progress)
-    clock.start("sweeps")
+    stages = _Stages(progress)
+    stages.start("sweeps")
     actors = points.actors_of(clip, settings.points)
-    gathered = points.gather(clip, actors, hold_out, settings.points, clock.fraction)
+    gathered = points.gather(clip, actors, hold_out, settings.points, stages.fraction)
     if gathered.point_count == 0:
         raise ReconstructError(
             f"clip {clip.id!r}: method 'lift' needs LiDAR sweeps; have lidars {list(clip.rig.lidars)} "
             f"with no usable points after holding out sweeps {sorted(hold_out)}"
         )
-    clock.start("ground and surfaces")
+    stages.start("ground and surfaces")
     bodies, ground = surfels_of(clip, actors, gathered, settings)
-    clock.start("images")
-    views = read_views(clip, cameras, settings.views, clock.fraction)
-    clock.start("depth")
-    pictures = depth_pictures(views, bodies, settings, clock.fraction)
+    stages.start("images")
+    views = read_views(clip, cameras, settings.views, stages.fraction)
+    stages.start("depth")
+    pictures = depth_pictures(views, bodies, settings, stages.fraction)
     views = [view for view in views if view.key]
-    clock.start("colours")
+    stages.start("colours")
     isp, lonely = camera_isp(views, pictures, bodies, cameras)
     canonical = [colour.to_canonical(view.rgb, isp[view.camera_id]).astype(np.uint8) for view in views]
-    clock.start("lifting")
+    stages.start("lifting")
     static, moving, lifted = Gaussians.empty(), [], 0
     for number, body in enumerate(bodies):
-        clock.fraction(number / len(bodies))
+        stages.fraction(number / len(bodies))
         gaussians, count = body_gaussians(number, body, ground, views, pictures, canonical, settings)
         lifted += count
         if body.actor is None:
@@ -67,11 +66,11 @@ def lift(
         elif len(gaussians):
             windows = actor_layer.windows_of(body.actor, clip.span_us, settings)
             moving.append(actor_layer.emit(body.actor, gaussians, windows))
-    clock.start("sky")
+    stages.start("sky")
     sky = make_sky(views, canonical, [_sky_weight(p, v, settings) for p, v in zip(pictures, views, strict=True)],
                    settings.sky_px)  # fmt: skip
     dynamic = actor_layer.join(moving)
-    clock.stop()
+    stages.stop()
     counts = {
         "sweeps": gathered.sweep_count,
         "points": gathered.point_count,
@@ -85,7 +84,6 @@ def lift(
         "settings": dataclasses.asdict(settings),
         "cameras": list(cameras),
         "held_out_sweeps": sorted(hold_out),
-        "seconds": clock.seconds,
         "counts": counts,
         "unknown": _unknown(clip, cameras, actors, gathered, lonely),
     }
@@ -111,16 +109,15 @@ def _sky_weight(picture: DepthPicture, view: View, settings: LiftSettings) -> np
     return np.where(far, np.where(picture.sky, 1.0, 0.02), 0.0)
 
 
-class _Clock:
-    """Seconds per stage, and progress calls."""
+class _Stages:
+    """Tells the caller which stage runs. Times are the caller's business: a scene must not depend on the clock."""
 
     def __init__(self, progress: Progress) -> None:
-        self.progress, self.stage, self.since = progress, "", 0.0
-        self.seconds: dict[str, float] = {}
+        self.progress, self.stage = progress, ""
 
     def start(self, stage: str) -> None:
         self.stop()
-        self.stage, self.since = stage, time.perf_counter()
+        self.stage = stage
         self.progress(stage, 0.0)
 
     def fraction(self, fraction: float) -> None:
@@ -128,7 +125,6 @@ class _Clock:
 
     def stop(self) -> None:
         if self.stage:
-            self.seconds[self.stage] = round(time.perf_counter() - self.since, 3)
             self.progress(self.stage, 1.0)
 
 
