@@ -76,6 +76,16 @@ def test_lidar_threshold_range_and_unknown_intensity():
     assert len(Renderer(scene(wall())).render_lidar(request(short)).beam) == 0
 
 
+def test_lidar_reports_the_surface_and_no_mean_of_two():
+    lidar = sensors.lidar_model("VLP-16", np.eye(4), columns=360)
+    veil = dataclasses.replace(wall(6.0), opacity=np.full(len(wall()), 0.12, np.float32))
+    both = scene(Gaussians.concatenate([veil, wall(12.0)]))
+    for frame in (Renderer(both).render_lidar(request(lidar)), spec.render_lidar(both, request(lidar))):
+        ahead = frame.xyz_m[np.abs(frame.xyz_m[:, 1]) < 2.0]
+        assert len(ahead) > 20
+        assert np.abs(ahead[:, 0] - 12.0).max() < 0.05
+
+
 def test_fade_and_motion_between_knots():
     layer = DynamicGaussians(
         gaussians([[5.0, 0, 0]], opacity=0.8),

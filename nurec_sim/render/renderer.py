@@ -18,7 +18,7 @@ from nurec_sim.render.cpu.pipeline import Buffers, View, Workers, draw
 from nurec_sim.render.layers import moving_gaussians
 from nurec_sim.render.rays import reference_pose
 from nurec_sim.render.requests import CAMERA_OUTPUTS, check_request
-from nurec_sim.render.spec import MIN_ALPHA, sweep_frame
+from nurec_sim.render.spec import beam_range, sweep_frame
 from nurec_sim.types import CameraFrame, CameraModel, GaussianScene, LidarFrame, SensorFrame, SensorRequest
 
 IDENTITY_ISP = np.eye(3, 4, dtype=np.float32)
@@ -109,7 +109,7 @@ class Renderer:
         assert grid.beam is not None
         planes = _by_beam(planes, grid.beam).astype(np.float64)
         alpha = planes[4]
-        distance = planes[3] / np.maximum(alpha, MIN_ALPHA)
+        distance = beam_range(planes[6], planes[3], alpha)
         intensity = planes[0] / np.maximum(planes[1], 1e-12)
         direction = np.moveaxis(_by_beam(np.moveaxis(grid.direction, 2, 0), grid.beam), 0, 2)
         # Beams of a column share its pose; the grid's line of a beam is its column.

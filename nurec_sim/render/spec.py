@@ -11,7 +11,8 @@ reference instant (``rays.RayGrid.by_range``); back ends may swap centres whose 
 resolves. The Gaussian that would bring the transmittance to 1e-4 or below is dropped and ends the ray.
 
 Outputs: ``alpha`` is the sum of the weights; ``depth`` the weighted mean of t, times the ray's z in the camera, 0
-where alpha < 0.5; ``label`` that of the largest single weight, ``SKY`` where alpha < 0.5. The colour gets (1 - alpha)
+where alpha < 0.5; ``half`` the t at which the transmittance first falls to a half, 0 where it does not: the range of a
+LiDAR, which reports the surface it meets and no mean of two; ``label`` that of the largest single weight, ``SKY`` where alpha < 0.5. The colour gets (1 - alpha)
 of the sky, then the camera's affine correction, is clipped to 0..1 and rounded half up to 8 bits. Pixels without a
 valid ray are black. A moving actor stands still during an exposure, where it is at the reference instant.
 """
@@ -50,6 +51,7 @@ class RaySums:
 
     features: Float64[np.ndarray, "h w c"]
     distance: Float64[np.ndarray, "h w"]
+    half: Float64[np.ndarray, "h w"]
     alpha: Float64[np.ndarray, "h w"]
     label: np.ndarray
 
@@ -77,9 +79,10 @@ def render_camera(scene: GaussianScene, request: SensorRequest, apply_isp: bool 
 
 
 def render_lidar(scene: GaussianScene, request: SensorRequest, opacity_threshold: float = SURFACE_ALPHA) -> LidarFrame:
-    """A sweep: beams whose alpha exceeds the threshold, at the weighted mean distance, if within the sensor's range.
+    """A sweep: beams whose alpha exceeds the threshold, if within the sensor's range.
 
-    Each column fires from its own pose; points are given in the sensor frame at the end of the sweep. Intensity is
+    The range is where half of the beam has been stopped; beams of which less is stopped (thresholds below a half) get
+    the weighted mean distance. Each column fires from its own pose; points are given in the sensor frame at the end of the sweep. Intensity is
     the weighted mean over the Gaussians whose intensity is known, 0 where none is.
     """
     grid = ray_grid(request.sensor)
@@ -88,9 +91,16 @@ def render_lidar(scene: GaussianScene, request: SensorRequest, opacity_threshold
     features = np.stack([np.where(known, gaussians.intensity, 0), known], axis=-1)
     origin, direction = world_rays(request, grid)
     sums = blend_rays(gaussians, features, order, origin, direction, grid)
-    distance = sums.distance / np.maximum(sums.alpha, MIN_ALPHA)
+    distance = beam_range(sums.half, sums.distance, sums.alpha)
     intensity = sums.features[..., 0] / np.maximum(sums.features[..., 1], 1e-12)
     return sweep_frame(request, sums.alpha, distance, intensity, origin, direction, opacity_threshold)
+
+
+def beam_range(
+    half: Float64[np.ndarray, "h w"], distance: Float64[np.ndarray, "h w"], alpha: Float64[np.ndarray, "h w"]
+) -> Float64[np.ndarray, "h w"]:
+    """Range of LiDAR beams from the sums of blending."""
+    return np.where(half > 0, half, distance / np.maximum(alpha, MIN_ALPHA))
 
 
 def sweep_frame(
@@ -152,6 +162,7 @@ def blend_rays(
     shape = direction.shape[:2]
     transmittance, live = np.ones(shape), grid.valid.copy()
     sums, distance, alpha_sum = np.zeros((*shape, features.shape[1])), np.zeros(shape), np.zeros(shape)
+    half = np.zeros(shape)
     best, label = np.zeros(shape), np.full(shape, int(Label.SKY))
     rotation = geometry.matrix_from_quat(gaussians.quat_wxyz)
     for i in order:
@@ -167,13 +178,14 @@ def blend_rays(
         ends = hit & (transmittance * (1 - alpha) <= MIN_TRANSMITTANCE)
         weight = np.where(hit & ~ends, alpha * transmittance, 0.0)
         live &= ~ends
+        half = np.where((transmittance > 0.5) & (transmittance - weight <= 0.5), t, half)
         transmittance -= weight
         sums += weight[..., None] * features[i]
         distance += weight * t
         alpha_sum += weight
         label = np.where(weight > best, gaussians.label[i], label)
         best = np.maximum(best, weight)
-    return RaySums(sums, distance, alpha_sum, label)
+    return RaySums(sums, distance, half, alpha_sum, label)
 
 
 def sky_colour(

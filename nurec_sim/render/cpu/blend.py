@@ -12,8 +12,8 @@ from nurec_sim.render.cpu.projection import BALL, DEEP, FADE, FEATURE, MAP, ORIG
 CELLS = TILE * TILE
 """Rays of a tile; they are blended at once and their sums stay in the first-level cache."""
 
-PLANES = 6
-"""Output planes: three features, distance, alpha, label."""
+PLANES = 7
+"""Output planes: three features, distance, alpha, label, distance at half transmittance."""
 
 # Sections of a tile's buffer, CELLS values each.
 DX, DY, DZ, OX, OY, OZ, LIVE, SUM = 0, 1, 2, 3, 4, 5, 6, 7
@@ -121,6 +121,8 @@ def _add(b, k, a, t, near, fa, fb, fc, tag):
     hit = (a < f4(CUT)) & (t >= near)
     ends = left <= f4(1e-4)
     weight = weight if hit & (not ends) else f4(0)
+    half = hit & (live > f4(0.5)) & (left <= f4(0.5))
+    b[(SUM + 6) * CELLS + k] = t if half else b[(SUM + 6) * CELLS + k]
     left = f4(0) if ends else left
     b[LIVE * CELLS + k] = left if hit else live
     b[SUM * CELLS + k] += weight * fa
@@ -192,7 +194,7 @@ def _blend_moving(b, records, i, near):
 
 @kernel
 def blend(tiles, starts, lists, records, direction, valid, line, lines, near, columns, planes):
-    """Blend the given tiles into ``planes`` [6,h,w]: three features, distance, alpha (weighted sums), label.
+    """Blend the given tiles into ``planes`` [7,h,w]: three features, distance, alpha (weighted sums), label, half.
 
     Args:
         tiles: numbers of the tiles to do.

@@ -102,8 +102,8 @@ def draw(
     use_intensity: bool,
     workers: Workers,
     buffers: Buffers,
-) -> Float32[np.ndarray, "6 h w"]:
-    """Weighted sums per ray (``blend``): three features, distance, alpha, label; colours, or intensity and known."""
+) -> Float32[np.ndarray, "7 h w"]:
+    """What ``blend`` leaves per ray; the features are colours, or intensity and whether it is known."""
     height, width = grid.valid.shape
     columns, rows = -(-width // TILE), -(-height // TILE)
     planes = np.empty((PLANES, height, width), np.float32)
