@@ -12,9 +12,10 @@ resolves. The Gaussian that would bring the transmittance to 1e-4 or below is dr
 
 Outputs: ``alpha`` is the sum of the weights; ``depth`` the weighted mean of t, times the ray's z in the camera, 0
 where alpha < 0.5; ``half`` the t at which the transmittance first falls to a half, 0 where it does not: the range of a
-LiDAR, which reports the surface it meets and no mean of two; ``label`` that of the largest single weight, ``SKY`` where alpha < 0.5. The colour gets (1 - alpha)
-of the sky, then the camera's affine correction, is clipped to 0..1 and rounded half up to 8 bits. Pixels without a
-valid ray are black. A moving actor stands still during an exposure, where it is at the reference instant.
+LiDAR, which reports the surface it meets and no mean of two; ``label`` that of the largest single weight, ``SKY`` where
+alpha < 0.5. The colour gets (1 - alpha) of the sky, then the camera's affine correction, is clipped to 0..1 and rounded
+half up to 8 bits. Pixels without a valid ray are black. A moving actor stands still during an exposure, where it is at
+the reference instant.
 """
 
 from __future__ import annotations
@@ -82,8 +83,8 @@ def render_lidar(scene: GaussianScene, request: SensorRequest, opacity_threshold
     """A sweep: beams whose alpha exceeds the threshold, if within the sensor's range.
 
     The range is where half of the beam has been stopped; beams of which less is stopped (thresholds below a half) get
-    the weighted mean distance. Each column fires from its own pose; points are given in the sensor frame at the end of the sweep. Intensity is
-    the weighted mean over the Gaussians whose intensity is known, 0 where none is.
+    the weighted mean distance. Each column fires from its own pose; points are given in the sensor frame at the end of
+    the sweep. Intensity is the weighted mean over the Gaussians whose intensity is known, 0 where none is.
     """
     grid = ray_grid(request.sensor)
     gaussians, order = visible_gaussians(scene, request, grid)
