@@ -81,3 +81,48 @@ def test_mistakes_are_one_clear_line(
     assert stop.value.code == 1
     assert text in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def spoilt_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clip whose second image ends in the middle."""
+    import tiny_clip
+
+    folder = tiny_clip.write(tmp_path_factory.mktemp("clips") / "spoilt", jpeg_quality=90)
+    image = sorted(folder.rglob("*.jpg"))[1]
+    image.write_bytes(image.read_bytes()[:200])
+    return folder
+
+
+def test_a_corrupt_image_is_found_and_nothing_is_half_written(
+    spoilt_clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["inspect", str(spoilt_clip)])
+    assert stop.value.code == 1
+    assert "fault:" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["reconstruct", str(spoilt_clip), "--out", "scene.usdz"])
+    assert stop.value.code == 1
+    assert ".jpg" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_server_lives_on_beside_a_corrupt_clip(spoilt_clip: Path, tmp_path: Path) -> None:
+    from serving_world import camera_request, scene
+
+    from nurec_sim.client import RemoteSensors
+    from nurec_sim.errors import NurecSimError
+    from nurec_sim.scene_store import SceneStore
+    from nurec_sim.server import SensorServer
+
+    good = scene()
+    store = SceneStore([good, spoilt_clip], cache_dir=tmp_path)
+    assert len(store.ids) == 2
+    with SensorServer(store, port=0) as address:
+        with RemoteSensors(address, store.ids[1]) as bad, pytest.raises(NurecSimError, match=r"\.jpg"):
+            bad.sense([camera_request(scene_id="tiny")])
+        with RemoteSensors(address, good.id) as remote:
+            assert remote.sense([camera_request()])[0].rgb.any()
+    assert not list(tmp_path.iterdir())
