@@ -239,7 +239,7 @@ def cubemap_directions(size: int) -> Float64[np.ndarray, "6 size size 3"]:
     """World directions (z up) of the texel centres of a cubemap.
 
     Faces in OpenGL order +X -X +Y -Y +Z -Z, looked up with GL axes x = -y_world, y = z_world, z = -x_world
-    (``spec/scene_usdz.md`` 1.4), so face 5 (-Z) looks along the world's x axis and face 2 (+Y) up.
+    (docs/scene_format.md), so face 5 (-Z) looks along the world's x axis and face 2 (+Y) up.
     """
     c = (np.arange(size) + 0.5) / size * 2 - 1
     t, s = np.meshgrid(c, c, indexing="ij")

@@ -1,7 +1,7 @@
 """Ego and actor boxes of a rollout seen from above: rounded outlines and the exact distance between them.
 
 A rounded outline is a rectangle grown by a disk, so the gap between two of them is the distance between the two
-rectangles less both radii: no polygons, no tolerance. Shrink and rounding are AlpaSim's (``spec/alpasim.md`` 3.1).
+rectangles less both radii: no polygons, no tolerance. Shrink and rounding are AlpaSim's (docs/metrics.md).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Comfort of the executed motion and feasibility of motions and plans.
 
 Bounds and smoothing (Savitzky-Golay, order 2, window 8 for accelerations and 5 for derivatives) are nuPlan's,
-infeasibility is Waymax' inverse bicycle model (``spec/metrics.md`` 1.5).
+infeasibility is Waymax' inverse bicycle model (docs/metrics.md).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A footprint is *off* if it reaches more than ``TOLERANCE_M`` beyond everything that may be road, *unknown* if it does so
 only should the unseen not be road, else *on*. Off counts from the second state in a row. An unknown state is never
-counted as either (``spec/metrics.md`` 1.2).
+counted as either (docs/metrics.md).
 """
 
 from __future__ import annotations

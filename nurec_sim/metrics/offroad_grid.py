@@ -1,6 +1,6 @@
 """Where the road is, read from road-class Gaussians: a grid seen from above with road, non-road and unknown cells.
 
-``build_offroad_grid`` follows ``spec/metrics.md`` 1.2.2 step by step: ground heights, evidence, adaptive bandwidth,
+``build_offroad_grid`` follows docs/metrics.md step by step: ground heights, evidence, adaptive bandwidth,
 specks, driven corridor, closing, holes, two distance fields. Cells are [row along y, column along x]; a cell's index is
 ``floor((xy - origin) / cell)``.
 """
@@ -32,12 +32,16 @@ class Cell(enum.IntEnum):
 
 @dataclass(frozen=True)
 class GridSettings:
-    """Parameters of the grid; the defaults are those of ``spec/metrics.md`` 1.2.2."""
+    """Parameters of the grid (``docs/metrics.md``).
+
+    ``reach_m``: farther from the driven path nothing counts as non-road, because reconstructions label road only so far.
+    """
 
     cell_m: float = 0.1
     coarse_cell_m: float = 0.2
     max_fine_cells: int = 6_000_000
     margin_m: float = 20.0
+    reach_m: float = 12.0
     below_ground_m: float = 0.4
     above_ground_m: float = 0.6
     min_opacity: float = 0.05
@@ -154,6 +158,7 @@ def build_offroad_grid(
     state[corridor] = Cell.ROAD
     _close(state, cell, settings)
     _fill_holes(state, cell, settings)
+    state[(from_path > settings.reach_m) & (state == Cell.NONROAD)] = Cell.UNKNOWN
     return OffroadGrid.from_state((float(low[0]), float(low[1])), cell, state, bandwidth, overruled)
 
 

@@ -1,4 +1,4 @@
-"""The long table of all rollouts: AlpaSim's columns first, ours behind (``spec/alpasim.md`` 3.2).
+"""The long table of all rollouts: AlpaSim's columns first, ours behind (docs/metrics.md).
 
 One row per rollout, metric and time. Ids are uuid5 of what they name, so the same run gives the same bytes.
 """

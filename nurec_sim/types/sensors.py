@@ -65,7 +65,7 @@ class FTheta:
 
     ``pixel = [[c, d], [e, 1]] @ (r(theta) * direction) + (cx, cy)``. The principal point here is corner-origin like
     every pixel of ours; formats that count pixel centres as whole numbers add 0.5 when they read
-    (``spec/scene_usdz.md`` 1.5). An empty polynomial is filled in by numeric inversion of the other one.
+    (docs/scene_format.md). An empty polynomial is filled in by numeric inversion of the other one.
     """
 
     cx_px: float
