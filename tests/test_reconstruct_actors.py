@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.actors import emit, windows_of
+from nurec_sim.reconstruct.actors import emit, tracks_of, windows_of
 from nurec_sim.reconstruct.points import actors_of
 from nurec_sim.reconstruct.settings import LiftSettings, PointSettings
 from nurec_sim.types import Gaussians, Track, Trajectory
@@ -13,6 +13,8 @@ SPAN_US = (1_000_000, 6_000_000)
 
 
 class Log:
+    span_us = SPAN_US
+
     def __init__(self, *tracks):
         self.tracks = tracks
 
@@ -96,3 +98,15 @@ def test_emitted_gaussians_move_with_their_box():
         assert layer.gaussians.mean_m[k] == pytest.approx(pose[:3, :3] @ box.mean_m[k % 3] + pose[:3, 3], abs=1e-3)
         assert layer.gaussians.normal[k] == pytest.approx(pose[:3, :3] @ [0, 1, 0], abs=1e-3)
         assert np.array_equal(layer.knot_m[k, 1], layer.gaussians.mean_m[k])
+
+
+def test_a_standing_actor_stays_to_be_hit_after_its_labels_end():
+    clip = Log(Track("car", "automobile", (4.0, 1.8, 1.5), drive(speed=0.0, seconds=1.0)))
+    (shown,) = tracks_of(clip, actors_of(clip, PointSettings()))
+    assert (shown.path.start_us, shown.path.end_us) == SPAN_US
+    assert np.array_equal(shown.path.at(SPAN_US[1]), clip.tracks[0].path.world_from_body[0])
+
+
+def test_a_moving_actor_keeps_its_recorded_path():
+    clip = Log(Track("car", "automobile", (4.0, 1.8, 1.5), drive()))
+    assert tracks_of(clip, actors_of(clip, PointSettings())) == clip.tracks

@@ -26,5 +26,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
         err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
-        err.print("interrupted; finished rollouts are kept: add --resume runs/latest to go on", markup=False)
+        err.print("interrupted; finished rollouts are kept: go on with --resume runs/latest (or your run folder)")
         raise SystemExit(130) from None

@@ -34,7 +34,7 @@ class Cell(enum.IntEnum):
 class GridSettings:
     """Parameters of the grid (``docs/metrics.md``).
 
-    ``reach_m``: farther from the driven path nothing counts as non-road, because reconstructions label road only so far.
+    ``reach_m``: farther from the driven path nothing counts as non-road, for reconstructions label road only so far.
     """
 
     cell_m: float = 0.1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +12,7 @@ from jaxtyping import Float64, Int64
 from nurec_sim import geometry
 from nurec_sim.reconstruct.points import Actor
 from nurec_sim.reconstruct.settings import LiftSettings
-from nurec_sim.types import DynamicGaussians, Gaussians, Trajectory
+from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Track, Trajectory
 
 OVERLAP = 1.2
 """Knots lie this much farther from the middle than the core that a window is for: exp(-(1/1.2)**10) = 0.85 there."""
@@ -24,6 +26,20 @@ class Window:
     t_us: Int64[np.ndarray, " 3"]
     position_m: Float64[np.ndarray, "3 3"]
     world_from_box: Float64[np.ndarray, "4 4"]
+
+
+def tracks_of(clip: Clip, actors: Sequence[Actor]) -> tuple[Track, ...]:
+    """The clip's tracks as the scene shows them: one that stands does so at one place, over the whole clip.
+
+    Logs label objects only while a sensor sees them; a parked car that the ego has passed is still there to be hit.
+    """
+    tracks = list(clip.tracks)
+    for actor in actors:
+        if actor.standing:
+            pose = actor.path.world_from_body[0]
+            path = Trajectory(np.array(clip.span_us), np.stack([pose, pose]))
+            tracks[actor.index] = dataclasses.replace(actor.track, path=path)
+    return tuple(tracks)
 
 
 def windows_of(actor: Actor, span_us: tuple[int, int], settings: LiftSettings) -> list[Window]:

@@ -95,7 +95,7 @@ def lift(
         isp=isp,
         rig=clip.rig,
         ego=clip.ego,
-        tracks=clip.tracks,
+        tracks=actor_layer.tracks_of(clip, actors),
         road_map=clip.road_map,
         span_us=clip.span_us,
         camera_times_us={camera: clip.camera_times_us(camera) for camera in clip.rig.cameras},
