@@ -254,8 +254,10 @@ def find_sources(path: Path) -> list[Path]:
 
 
 def content_key(clip_path: Path, method: str) -> str:
-    """A name for what a reconstruction depends on: every file of the clip, the method and our version."""
+    """A name for what a reconstruction depends on: every file of the clip, the method, our version and its code."""
     digest = hashlib.sha256(f"{nurec_sim.__version__}\0{method}\0".encode())
+    for source in sorted((Path(nurec_sim.__file__).parent / "reconstruct").glob("*.py")):
+        digest.update(source.read_bytes())
     files = sorted(p for p in clip_path.rglob("*") if p.is_file()) if clip_path.is_dir() else [clip_path]
     for path in files:
         name = path.relative_to(clip_path).as_posix() if clip_path.is_dir() else ""
