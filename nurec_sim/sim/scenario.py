@@ -65,7 +65,7 @@ class Scenario(_Strict):
     """One scenario. Every key but ``name`` has a default; durations are multiples of 0.1 s.
 
     ``clip`` is a clip or scene (path or name), left out where the command line gives it. ``warm_up_s`` of
-    ``duration_s`` follow the log before the policy drives. ``thresholds`` belong to the metrics.
+    ``duration_s`` follow the log before the policy drives.
     """
 
     name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")
@@ -80,7 +80,6 @@ class Scenario(_Strict):
     sensors: SensorSettings = SensorSettings()
     perturbation: Perturbation = Perturbation()
     actors: dict[str, ActorEdit] = {}
-    thresholds: dict[str, float] = {}
 
     @field_validator("seeds")
     @classmethod
