@@ -8,7 +8,6 @@ from typing import Any
 
 _HOMES = {
     "execute": "drive",
-    "finish": "results",
     "headline": "results",
     "load_rollout": "rollout_file",
     "record_video": "video",

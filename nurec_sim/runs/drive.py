@@ -16,7 +16,7 @@ import yaml
 from nurec_sim.errors import NurecSimError, ScenarioError
 from nurec_sim.plugins import load_policy
 from nurec_sim.runs import folder as layout
-from nurec_sim.runs.results import finish
+from nurec_sim.runs.results import write_report
 from nurec_sim.runs.rollout_file import load_rollout, save_rollout
 from nurec_sim.runs.scene_file import SceneRecord, record_scene, save_scene_record
 from nurec_sim.runs.video import record_video
@@ -146,7 +146,7 @@ def execute(
             senses[job.scene.id] = sense_for(job.scene.id)
         _drive(job, senses[job.scene.id], wants_video, done, advance)
     say("scoring", 0.95)
-    finish(run, progress=lambda stage, share: say(stage, 0.95 + 0.05 * share))
+    write_report(run, progress=lambda stage, share: say(stage, 0.95 + 0.05 * share))
     say("", 1.0)
     return run
 

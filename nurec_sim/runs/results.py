@@ -19,7 +19,7 @@ from nurec_sim.runs.scene_file import SceneRecord, load_scene_record
 PROFILE = "strict"
 
 
-def finish(run: Path | str, progress: Callable[[str, float], None] | None = None) -> Path:
+def write_report(run: Path | str, progress: Callable[[str, float], None] | None = None) -> Path:
     """Write ``metrics.parquet``, ``metrics.csv`` and ``report.html`` from the rollouts and scenes in a run folder.
 
     Returns:
@@ -60,10 +60,6 @@ def finish(run: Path | str, progress: Callable[[str, float], None] | None = None
     path = run / layout.REPORT
     layout.write_text(path, render_report(report))
     return path
-
-
-write_report = finish
-"""The command line's name for ``finish``."""
 
 
 def headline(run: Path | str) -> list[tuple[str, ...]]:
