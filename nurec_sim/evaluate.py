@@ -7,6 +7,7 @@ otherwise, for what the target cameras and the held-out sweeps recorded. Figures
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,6 +20,8 @@ from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
 from nurec_sim.metrics.images import psnr, ssim
 from nurec_sim.metrics.lidar_scores import LidarScore, scanner_along, score_sweep
+from nurec_sim.metrics.offroad import offroad_agreement
+from nurec_sim.metrics.offroad_grid import scene_offroad_grid
 from nurec_sim.types import CameraFrame, Clip, GaussianScene, LidarFrame, Sense, SensorRequest, Sweep
 
 Progress = Callable[[str, float], None]
@@ -56,7 +59,8 @@ def evaluate(
         the same for copying the input image nearest in time; ``input``: whether the reconstruction saw the camera),
         and over all of them; ``lidar`` (``median_abs_range_error_m`` over the beams that returned,
         ``return_recall`` over the beams with a recorded return, shares within 0.1 m and 0.5 m of these, per-sweep
-        lists), None if nothing was held out; ``seconds`` per stage; ``counts``; ``unknown``.
+        lists), None if nothing was held out; ``road``: how off-road from Gaussians agrees with the log's own map
+        (``metrics.offroad_agreement``), None without a map; ``seconds`` per stage; ``counts``; ``unknown``.
 
     Raises:
         ReconstructError: an unknown method, camera or sweep, or a clip that lacks what the method needs.
@@ -93,6 +97,7 @@ def evaluate(
         "via": "grpc" if via_grpc else "local",
         "image": image,
         "lidar": lidar,
+        "road": _score_road(scene),
         "seconds": seconds,
         "counts": {"static": len(scene.static), "dynamic": len(scene.dynamic)}
         | dict(scene.provenance.get("counts", {})),
@@ -218,6 +223,19 @@ def _write_pair(path: Path, recorded: np.ndarray, rendered: np.ndarray) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), np.ascontiguousarray(np.vstack([recorded, rendered])[..., ::-1]))
+
+
+# ------------------------------------------------------------------------------------------------------------- road
+
+
+def _score_road(scene: GaussianScene) -> dict[str, object] | None:
+    if scene.road_map is None or not scene.road_map.drivable:
+        return None
+    try:
+        found = offroad_agreement(scene_offroad_grid(scene), scene.road_map, scene.ego, scene.rig.body)
+    except (ReconstructError, ValueError) as error:  # no road was labelled, or the car hardly moved
+        return {"not_known": str(error)}
+    return {name: None if value != value else value for name, value in dataclasses.asdict(found).items()}
 
 
 # ------------------------------------------------------------------------------------------------------------ LiDAR

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from nurec_sim import geometry
-from nurec_sim.types import CameraModel, LidarModel, Pinhole, Rig, Sweep, Track, Trajectory
+from nurec_sim.types import CameraModel, LidarModel, Pinhole, Rig, RoadMap, Sweep, Track, Trajectory
 
 KERB_M, WALL_M, STEP_M = 4.0, 8.0, 0.15
 FRAME_US = 200_000
@@ -36,7 +36,7 @@ class Street:
     kerb: bool = True
     gains: dict[str, float] = field(default_factory=dict)
     id: str = "street"
-    road_map: None = None
+    road_map: RoadMap | None = None
 
     def __post_init__(self) -> None:
         rows, columns = 32, 360

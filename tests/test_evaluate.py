@@ -11,7 +11,7 @@ from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate import as_fired, evaluate, held_out
 from nurec_sim.metrics.lidar_scores import LidarScore, scanner_along, score_sweep
 from nurec_sim.reconstruct import LiftSettings, ViewSettings
-from nurec_sim.types import LidarFrame
+from nurec_sim.types import LidarFrame, RoadMap
 
 SMALL = LiftSettings(sky_px=32, views=ViewSettings(levels=32))
 
@@ -58,6 +58,22 @@ def test_over_grpc_the_figures_are_the_same(figures):
     assert over["via"] == "grpc"
     assert over["image"] == figures[0]["image"]
     assert over["lidar"] == figures[0]["lidar"]
+
+
+@pytest.mark.parametrize("half_width_m, agrees", [(4.0, True), (1.2, False)])
+def test_road_is_scored_against_the_map_of_the_log(half_width_m, agrees):
+    ring = np.array([[-40, -half_width_m], [60, -half_width_m], [60, half_width_m], [-40, half_width_m]])
+    clip = Street(frames=5, road_map=RoadMap(((ring,),)))
+    road = evaluate(clip, via_grpc=False, settings=SMALL)["road"]
+    assert road["known"] > 100
+    assert (road["agreement"] >= 0.95) == agrees
+
+
+def test_road_is_not_scored_without_a_map_or_a_drive(figures):
+    assert figures[0]["road"] is None
+    ring = np.array([[-40.0, -4], [60, -4], [60, 4], [-40, 4]])
+    standing = Street(frames=2, speed_mps=0.0, road_map=RoadMap(((ring,),)))
+    assert "not_known" in evaluate(standing, via_grpc=False, settings=SMALL)["road"]
 
 
 def test_which_sweeps_are_held_out():
