@@ -1,216 +1,219 @@
-"""Speed of the CPU renderer on a seeded street of Gaussians, each row with its PSNR against the reference.
+"""Times the renderer on seeded scenes and one real log, with its distance from the float64 reference beside every time.
 
-``python benchmarks/render.py [--gaussians 300000] [--threads 2] [--repeats 15]`` prints a table and writes
-``build/bench.json``. The scene is pixel-aligned like a feed-forward reconstruction: Gaussians sit where rays of a
-driving camera meet a road, facades, cars and poles, and are as large as their pixels. The PSNR is that of the same
-sensor, smaller, on a part of the same scene, because the reference is slow.
+Sensors and back ends of a scene take turns frame by frame in one process, every frame from another pose of the path.
 """
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
+import contextlib
 import json
 import os
-import time
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+import backward
+import bars
+import first_frame
+import parity
+import plan
+import timing
+import tyro
+from plan import Options
+from scenes import BenchScene
 
-from nurec_sim import geometry, sensors
-from nurec_sim.render import Renderer, spec
-from nurec_sim.types import (
-    CameraModel,
-    DynamicGaussians,
-    Fisheye,
-    Gaussians,
-    GaussianScene,
-    LidarModel,
-    Pinhole,
-    Rig,
-    SensorRequest,
-    Shutter,
-    Trajectory,
+from nurec_sim.cli import console
+from nurec_sim.cli.console import err, out
+from nurec_sim.render import Renderer
+
+PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
+HEADING = (
+    f"{'sensor':20s} {'path':7s} {'backend':16s} {'size':>9s} {'ms':>8s} {'p99':>8s} {'cpu':>8s} {'first':>8s}"
+    f" {'eval/px':>8s} {'dB':>6s} {'depth':>6s} {'alpha':>6s} {'label':>6s}  stages"
 )
 
-START_US = 1_000_000
-CAMERA_AXES = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-PSNR_GAUSSIANS = 3000
+
+def main() -> None:
+    """Run what the command line asks for."""
+    options = tyro.cli(Options)
+    if options.quick:
+        options = plan.quick(options)
+    facts = {"machine": machine_name(), "simd": instruction_set()}
+    load = os.getloadavg()[0]
+    out.print(f"{facts['machine']}, {facts['simd']}, {options.thread_count} threads, load {load:.2f}", **PLAIN)
+    rows: list[dict[str, Any]] = []
+    try:
+        for name in options.scenes:
+            for row in scene_rows(name, options):
+                rows.append({**row, **facts} | {"simd": row.get("simd", facts["simd"])})
+                write(rows, options.output)
+    except KeyboardInterrupt:
+        err.print(f"interrupted: the {len(rows)} rows that were done are in {options.output}", **PLAIN)
+        raise SystemExit(130) from None
+    for line in bars.verdicts(rows):
+        out.print(line, **PLAIN)
+    out.print(f"wrote {len(rows)} rows to {options.output}", **PLAIN)
 
 
-def street_boxes(rng):
-    """Lower corners, upper corners and colours of facades, cars and poles along the x axis."""
-    low, high, colour = [], [], []
+def scene_rows(name: str, options: Options) -> Iterator[dict[str, Any]]:
+    """Build a scene, time all that is planned for it, and yield its rows as their parity becomes known."""
+    with progress(name) as advance:
+        advance("making the scene", 0.0)
+        built = plan.build(name, options, advance)
+        advance("packing the scene", 0.9)
+        renderer = Renderer(built.scene, threads=options.thread_count)
+        entries, notes = plan.entries(name, built, renderer, options)
+    out.print(f"\n{name}: {plan.count(built.scene):,} Gaussians. {built.about}", **PLAIN)
+    for note in notes:
+        out.print(note, **PLAIN)
+    interrupted = not all_timed(name, entries)
+    out.print(HEADING, **PLAIN)
+    for entry in entries:
+        if not interrupted:
+            try:
+                with progress(f"{name}: parity") as advance:
+                    advance(f"{entry.facts['sensor']} {entry.facts['backend']}", 0.5)
+                    entry.figures.update(timing.account(entry))
+                    entry.figures.update(compared(built, entry, entries, options.parity_rays))
+            except KeyboardInterrupt:
+                interrupted = True
+        if entry.wall_ms:
+            if entry.facts["name"] == plan.FIRST_FRAME_ROW and options.extras and not interrupted:
+                asked = entry.ticks[0][0]
+                entry.figures.update(first_frame.measure(built.scene, asked, options.thread_count, plan.BUILD))
+            row = {**parity.NOTHING, **entry.row()}
+            out.print(line_of(row), **PLAIN)
+            yield row
+    if interrupted:
+        raise KeyboardInterrupt
+    if name == "driving" and options.extras:
+        yield from extra_rows(name, built, options)
 
-    def add(a, b, rgb):
-        low.append(np.minimum(a, b))
-        high.append(np.maximum(a, b))
-        colour.append(rgb)
 
-    for side in (-1, 1):
-        x = -30.0
-        while x < 320:
-            length, height, depth = rng.uniform(10, 30), rng.uniform(5, 20), rng.uniform(8, 14)
-            front = side * rng.uniform(11, 15)
-            add([x, front, 0], [x + length, front + side * depth, height], rng.uniform(0.3, 0.8, 3))
-            x += length + rng.uniform(0, 8)
-    for _ in range(60):
-        x, y = rng.uniform(-20, 280), rng.choice([-6.5, 2.0, 6.5])
-        add([x, y - 0.9, 0.1], [x + 4.4, y + 0.9, 1.5], rng.uniform(0.05, 0.95, 3))
-    for _ in range(80):
-        x, y = rng.uniform(-20, 300), rng.choice([-8.5, 8.5])
-        add([x, y - 0.15, 0], [x + 0.3, y + 0.15, 5], np.array([0.3, 0.25, 0.2]))
-    return np.array(low), np.array(high), np.array(colour)
+def all_timed(name: str, entries: Sequence[timing.Entry]) -> bool:
+    """Time the entries in turns under a progress bar; False if Ctrl-C ended that early."""
+    total, done = sum(len(entry.ticks) + 1 for entry in entries), 0
+    with progress(f"{name}: timing") as advance:
+
+        def tick(entry: timing.Entry) -> None:
+            nonlocal done
+            done += 1
+            advance(f"{entry.facts['sensor']} {entry.facts['backend']}", done / total)
+
+        try:
+            timing.take_turns(entries, tick)
+        except KeyboardInterrupt:
+            return False
+    return True
 
 
-def street_scene(count, seed=0):
-    """A scene of ``count`` Gaussians seen from 36 views along the street."""
-    rng = np.random.default_rng(seed)
-    low, high, box_colour = street_boxes(rng)
-    views = [(x, yaw) for x in np.arange(12) * 5.0 for yaw in (0.0, 60.0, -60.0)]
-    width = int(np.sqrt(count * 1.8 / len(views) * 16 / 9))
-    height = width * 9 // 16
-    parts = []
-    for x, yaw in views:
-        origin = np.array([x, -2.0, 1.6])
-        u, v = rng.uniform(-1, 1, (2, width * height)) * np.tan(np.radians([[40.0], [25.0]]))
-        direction = np.stack([np.ones_like(u), -u, -v], axis=-1) @ geometry.rotation_from_yaw(np.radians(yaw)).T
-        hit, axis, box = first_hits(origin, direction, low, high)
-        keep = hit < 200
-        hit, axis, box, direction = hit[keep], axis[keep], box[keep], direction[keep]
-        grazing = np.maximum(0.15, np.abs(direction[np.arange(len(hit)), axis]) / np.linalg.norm(direction, axis=1))
-        size = 2 * np.tan(np.radians(40.0)) / width * hit * 0.62 / np.sqrt(grazing)
-        rgb = np.where((box >= 0)[:, None], box_colour[np.maximum(box, 0)], 0.35)
-        point = origin + direction * hit[:, None]
-        point[np.arange(len(hit)), axis] += rng.normal(0, 0.05, len(hit)) * size  # no two at exactly one depth
-        rgb = np.where((np.floor(point).sum(axis=1) % 2 > 0)[:, None], rgb, rgb * 0.7)
-        parts.append((point, axis, size, rgb + rng.normal(0, 0.03, rgb.shape), box < 0))
-    point, axis, size, rgb, road = (np.concatenate(part) for part in zip(*parts, strict=True))
-    chosen = rng.permutation(len(point))[:count]
-    point, axis, size, rgb, road = point[chosen], axis[chosen], size[chosen], rgb[chosen], road[chosen]
-    n = len(point)
-    scale = np.repeat(size[:, None], 3, axis=1) * np.exp(0.3 * rng.standard_normal((n, 3)))
-    scale[np.arange(n), axis] *= 0.15
-    tilt = np.concatenate([np.ones((n, 1)), rng.normal(0, 0.05, (n, 3))], axis=1)
-    static = dataclasses.replace(
-        Gaussians.empty(n),
-        mean_m=point.astype(np.float32),
-        quat_wxyz=geometry.quat_normalize(tilt).astype(np.float32),
-        scale_m=scale.astype(np.float32),
-        opacity=np.clip(rng.beta(1.6, 0.9, n), 0.02, 0.995).astype(np.float32),
-        rgb=np.clip(rgb, 0, 1).astype(np.float32),
-        label=road.astype(np.uint8),
-        intensity=rng.random(n).astype(np.float32),
+def compared(
+    built: BenchScene, entry: timing.Entry, entries: Sequence[timing.Entry], parity_rays: int
+) -> dict[str, Any]:
+    """Distances of a row's middle frame from the reference, and of simplified scenes from the full one."""
+    asked = entry.ticks[len(entry.ticks) // 2]
+    frames = entry.draw(asked)
+    figures: dict[str, Any] = {}
+    if parity_rays:
+        figures.update(parity.against_spec(built.scene, asked, frames, parity_rays))
+        figures["parity_rays"] = parity_rays
+    full = entry.facts.get("full")
+    for other in entries:
+        if full is not None and other.facts["name"] == full:
+            figures["psnr_vs_full_db"] = parity.image_psnr_db(frames, other.draw(asked))
+    return figures
+
+
+def extra_rows(name: str, built: BenchScene, options: Options) -> Iterator[dict[str, Any]]:
+    """What cannot take turns with the rest: gradients, and our kernels for other machines."""
+    with progress(f"{name}: gradients") as advance:
+        for row in backward.rows(name, built, options, lambda sensor: advance(sensor, 0.5)):
+            out.print(line_of(row), **PLAIN)
+            yield row
+    yield from lesser_kernels(options)
+
+
+def lesser_kernels(options: Options) -> Iterator[dict[str, Any]]:
+    """Our own rows on machines without this one's vectors, each set in a process of its own."""
+    for kernels in plan.LESSER_KERNELS:
+        if kernels == instruction_set():
+            continue
+        target = plan.BUILD / f"bench_{kernels}.json"
+        command = [sys.executable, __file__, "--scenes", "driving", "--paths", "drive", "--no-extras"]
+        command += ["--sensors", *plan.LESSER_SENSORS, "--repeats", str(min(options.repeats, 10))]
+        command += ["--threads", str(options.thread_count), "--parity-rays", str(options.parity_rays)]
+        command += ["--output", str(target)]
+        command += [] if options.gaussians is None else ["--gaussians", str(options.gaussians)]
+        with progress(f"driving: kernels for {kernels}") as advance:
+            advance("in a process of their own", 0.5)
+            ran = subprocess.run(
+                command, env={**os.environ, "NUREC_SIM_SIMD": kernels}, capture_output=True, text=True, check=False
+            )
+        if ran.returncode != 0:
+            last = (ran.stderr.strip() or ran.stdout.strip() or "no output").splitlines()[-1]
+            out.print(f"kernels for {kernels} could not be measured: {last}", **PLAIN)
+            continue
+        for row in json.loads(target.read_text()):
+            if row["backend"] == "ours":
+                row = {**row, "backend": f"ours {kernels}", "name": f"{row['name']} {kernels}"}
+                out.print(line_of(row), **PLAIN)
+                yield row
+
+
+def line_of(row: dict[str, Any]) -> str:
+    """A row as one line of the table."""
+
+    def number(key: str, width: int, digits: int = 1) -> str:
+        value = row.get(key)
+        return f"{'-' if value is None else format(value, f'.{digits}f'):>{width}s}"
+
+    stages = " ".join(f"{stage} {value:.1f}" for stage, value in (row.get("stages") or {}).items())
+    extra = [stages]
+    if row.get("lidar_range_error_m_median") is not None:
+        extra.append(f"range error {1e3 * row['lidar_range_error_m_median']:.3f} mm")
+    for key, text in (("psnr_vs_full_db", "{:.1f} dB to full"), ("normal_agreement", "normals {:.4f}"),
+                      ("backward_over_forward", "backward/forward {:.2f}")):  # fmt: skip
+        if row.get(key) is not None:
+            extra.append(text.format(row[key]))
+    return (
+        f"{row['sensor']:20s} {row['path']:7s} {row['backend']:16s} {row['width']:>4d}x{row['height']:<4d}"
+        f" {number('ms_median', 8)} {number('ms_p99', 8)} {number('cpu_ms_median', 8)} {number('ms_first', 8)}"
+        f" {number('evaluations_per_pixel', 8)} {number('psnr_vs_spec_db', 6)} {number('depth_psnr_db', 6)}"
+        f" {number('alpha_psnr_db', 6)} {number('label_agreement', 6, 4)}  {', '.join(part for part in extra if part)}"
     )
-    return GaussianScene("street", static, DynamicGaussians.empty(), np.full((6, 16, 16, 3), 0.72, np.float32), {},
-                         Rig({}, {}), Trajectory(np.array([START_US]), np.eye(4)[None]), [], None,
-                         (START_US, 2 * START_US))  # fmt: skip
 
 
-def first_hits(origin, direction, low, high):
-    """Ray parameter, axis of the normal and number of the first box that rays meet; -1 for the ground at z = 0."""
-    down = np.minimum(direction[:, 2], -1e-9)
-    best = np.where(direction[:, 2] < -1e-6, -origin[2] / down, np.inf)
-    axis, box = np.full(len(direction), 2), np.full(len(direction), -1)
-    inverse = 1 / np.where(np.abs(direction) < 1e-9, 1e-9, direction)
-    for k in range(len(low)):
-        a, b = (low[k] - origin) * inverse, (high[k] - origin) * inverse
-        near, far = np.minimum(a, b), np.maximum(a, b)
-        enter = near.max(axis=1)
-        hit = (enter > 0.1) & (enter < far.min(axis=1)) & (enter < best)
-        best[hit], axis[hit], box[hit] = enter[hit], near[hit].argmax(axis=1), k
-    return best, axis, box
+def progress(title: str) -> contextlib.AbstractContextManager[console.Report]:
+    """A progress bar, where someone watches."""
+    return console.progress(title) if err.is_terminal else contextlib.nullcontext(lambda stage, fraction: None)
 
 
-def cases():
-    """Name and sensor of every row."""
-
-    def camera(width, height, lens=None, shutter=Shutter.GLOBAL):
-        lens = lens or Pinhole(width / 2, width / 2, width / 2, height / 2)
-        return CameraModel("camera", width, height, lens, np.eye(4), shutter)
-
-    for width, height in ((320, 180), (640, 360), (960, 540), (1920, 1080)):
-        yield "pinhole", camera(width, height)
-    yield "pinhole, rolling", camera(640, 360, shutter=Shutter.TOP_TO_BOTTOM)
-    yield "distorted", camera(640, 360, Pinhole(320, 320, 320, 180, (-0.1, 0.02, 0, 0, 0, 0)))
-    yield "fisheye", camera(640, 360, Fisheye(200, 200, 320, 180, max_angle_rad=1.6))
-    yield "lidar, driving", sensors.lidar_model("HDL-64", np.eye(4), columns=1800)
-    yield "lidar, driving", sensors.lidar_model("PANDAR128", np.eye(4), columns=1800)
+def write(rows: Sequence[dict[str, Any]], target: Path) -> None:
+    """All rows, replacing the file as a whole."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = target.with_suffix(".part")
+    part.write_text(json.dumps(rows, indent=1) + "\n")
+    part.replace(target)
 
 
-def street_request(sensor):
-    """A request in the middle of the street; sensors that do not expose at one instant move at 13 m/s."""
-    start = geometry.pose_from_xyyaw(22.0, -2.0, 0.0, 1.7)
-    exposure_us = 100_000 if isinstance(sensor, LidarModel) else 30_000
-    end = geometry.pose_from_xyyaw(22.0 + 13e-6 * exposure_us, -2.0, 2e-7 * exposure_us, 1.7)
-    mount = CAMERA_AXES if isinstance(sensor, CameraModel) else np.eye(4)
-    if isinstance(sensor, CameraModel) and sensor.shutter is Shutter.GLOBAL:
-        end = start
-    return SensorRequest("street", sensor, START_US, START_US + exposure_us, np.stack([start @ mount, end @ mount]))
+def machine_name() -> str:
+    """The processor, as the operating system names it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
-def psnr_against_spec(scene, sensor):
-    """PSNR of a smaller version of the sensor on a part of the scene; for LiDARs that of the ranges, peak 100 m."""
-    subset = np.random.default_rng(1).permutation(len(scene.static))[:PSNR_GAUSSIANS]
-    static = dataclasses.replace(scene.static[subset], scale_m=scene.static.scale_m[subset] * 4)
-    part = dataclasses.replace(scene, static=static)
-    if isinstance(sensor, LidarModel):
-        asked = street_request(dataclasses.replace(sensor, azimuth_rad=sensor.azimuth_rad[::18]))
-        got, expected = Renderer(part).render_lidar(asked), spec.render_lidar(part, asked)
-        _, mine, theirs = np.intersect1d(got.beam, expected.beam, return_indices=True)
-        difference, peak = got.range_m[mine] - expected.range_m[theirs], 100.0
-    else:
-        asked = street_request(sensors.scaled_camera(sensor, 160, 90))
-        got, expected = Renderer(part).render_camera(asked), spec.render_camera(part, asked)
-        difference, peak = got.rgb.astype(float) - expected.rgb, 255.0
-    return float(10 * np.log10(peak**2 / max(np.mean(np.square(difference, dtype=np.float64)), 1e-12)))
+def instruction_set() -> str:
+    """The vectors that the kernels use."""
+    from nurec_sim.render.cpu import simd
 
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--gaussians", type=int, default=300_000)
-    parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
-    parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--output", type=Path, default=Path("build/bench.json"))
-    options = parser.parse_args()
-    scene = street_scene(options.gaussians)
-    renderer = Renderer(scene, threads=options.threads)
-    rows = []
-    print(f"{len(scene.static)} Gaussians, {options.threads} threads, load {os.getloadavg()[0]:.1f}")
-    print(f"{'sensor':18s} {'size':>10s} {'median ms':>10s} {'p99 ms':>8s} {'cpu ms':>8s} {'PSNR dB':>8s}")
-    for name, sensor in cases():
-        asked = street_request(sensor)
-        began = time.perf_counter()
-        renderer.sense([asked])  # compiles, or loads the compiled kernels, and makes the sensor's tables
-        first_ms = (time.perf_counter() - began) * 1e3
-        wall, cpu = [], []
-        for _ in range(options.repeats):
-            began, cpu_began = time.perf_counter(), time.process_time()
-            renderer.sense([asked])
-            wall.append((time.perf_counter() - began) * 1e3)
-            cpu.append((time.process_time() - cpu_began) * 1e3)
-        lidar = isinstance(sensor, LidarModel)
-        width, height = (1800, len(sensor.elevation_rad)) if lidar else (sensor.width_px, sensor.height_px)
-        row = {
-            "name": name,
-            "width": width,
-            "height": height,
-            "gaussians": len(scene.static),
-            "threads": options.threads,
-            "ms_median": float(np.median(wall)),
-            "ms_p99": float(np.quantile(wall, 0.99)),
-            "cpu_ms_median": float(np.median(cpu)),
-            "ms_first": first_ms,
-            "psnr_vs_spec_db": psnr_against_spec(scene, sensor),
-        }
-        rows.append(row)
-        print(
-            f"{name:18s} {width:>5d}x{height:<4d} {row['ms_median']:10.1f} {row['ms_p99']:8.1f} "
-            f"{row['cpu_ms_median']:8.1f} {row['psnr_vs_spec_db']:8.1f}",
-            flush=True,
-        )
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(rows, indent=1) + "\n")
+    return simd.INSTRUCTION_SET
 
 
 if __name__ == "__main__":

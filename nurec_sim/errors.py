@@ -12,6 +12,7 @@
     │   └── TooLargeError      more pixels or items than allowed      (gRPC RESOURCE_EXHAUSTED)
     ├── PlanError        a policy answered something that cannot be driven
     ├── ScenarioError    a scenario file is wrong
+    ├── GpuError         the CUDA back end cannot be used here
     ├── ServerError      a sensor server cannot be reached, or failed
     └── RunError         a run folder or a file in it cannot be read or written
 
@@ -57,6 +58,10 @@ class PlanError(NurecSimError):
 
 class ScenarioError(NurecSimError):
     """A scenario file is wrong."""
+
+
+class GpuError(NurecSimError):
+    """The CUDA back end cannot be used here: no GPU, a package missing, kernels that do not compile."""
 
 
 class ServerError(NurecSimError):

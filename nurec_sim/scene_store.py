@@ -16,7 +16,7 @@ from typing import Protocol
 
 import nurec_sim
 from nurec_sim.errors import ArchiveError, NurecSimError, UnknownSceneError
-from nurec_sim.types import CameraFrame, GaussianScene, LidarFrame, SensorRequest
+from nurec_sim.types import CameraFrame, GaussianScene, LidarFilter, LidarFrame, SensorRequest
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ class SceneRenderer(Protocol):
         """One image."""
         ...
 
-    def render_lidar(self, request: SensorRequest, opacity_threshold: float = ...) -> LidarFrame:
+    def render_lidar(self, request: SensorRequest, filter: LidarFilter | None = ...) -> LidarFrame:
         """One sweep."""
         ...
 

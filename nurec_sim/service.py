@@ -150,16 +150,15 @@ class SensorService:
     async def render_lidar(self, request):
         """One sweep."""
         loaded = await self._scene(request.scene_id)
-        sensing, threshold = await self._run(self._reading, wire.read_lidar_request, request)
+        sensing, filter = await self._run(self._reading, wire.read_lidar_request, request)
         sensing = self._admit(sensing, loaded.scene)
         beams = len(sensing.sensor.elevation_rad) * len(sensing.sensor.azimuth_rad)
         self._check_pixels(beams, f"{len(sensing.sensor.elevation_rad)}x{len(sensing.sensor.azimuth_rad)} beams")
         self._check_reply(_BYTES_A_POINT * beams, "points", "beams")
-        choice = {} if threshold is None else {"opacity_threshold": threshold}
 
         def render():
             reply = sensorsim.LidarRenderReturn()
-            wire.write_lidar_frame(loaded.renderer.render_lidar(sensing, **choice), reply)
+            wire.write_lidar_frame(loaded.renderer.render_lidar(sensing, filter), reply)
             return reply
 
         return await self._run(self._rendering, render)

@@ -6,16 +6,20 @@ import dataclasses
 
 import numpy as np
 
-from nurec_sim import geometry
+from nurec_sim import geometry, sensors
 from nurec_sim.types import (
     CameraModel,
     DynamicGaussians,
+    Fisheye,
+    FTheta,
+    FThetaReference,
     Gaussians,
     GaussianScene,
     Pinhole,
     Rig,
     SensorRequest,
     Shutter,
+    Spin,
     Track,
     Trajectory,
 )
@@ -23,6 +27,30 @@ from nurec_sim.types import (
 START_US = 1_000_000
 CAMERA_AXES = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """rig_from_camera of a camera that looks forward."""
+LENSES = {
+    "pinhole": Pinhole(47.0, 49.0, 35.0, 25.0),
+    "wide pinhole": Pinhole(20.0, 20.0, 36.0, 24.0),
+    "distorted": Pinhole(47.0, 47.0, 36.0, 24.0, (-0.2, 0.05, 0, 0, 0, 0), (0.002, -0.003), (0.001, 0, 0.002, 0)),
+    "fisheye": Fisheye(24.0, 24.0, 36.0, 24.0, (0.02, -0.005, 0, 0), max_angle_rad=1.7),
+    "f-theta": FTheta(36.0, 24.0, FThetaReference.PIXELDIST_TO_ANGLE, (0.0, 0.04, 0.0, 2e-6), max_angle_rad=1.6),
+}
+"""Every kind of lens, for ``camera()``'s 72 x 48 pixels."""
+LIDARS = {
+    "full": sensors.lidar_model("VLP-16", np.eye(4), columns=240),
+    "sector": sensors.lidar_model("AT128", np.eye(4), columns=100),
+    "offsets": dataclasses.replace(
+        sensors.lidar_model("HDL-32", np.eye(4), columns=200), row_azimuth_offset_rad=np.tile([0.07, -0.05], 16)
+    ),
+    "other way": dataclasses.replace(
+        sensors.lidar_model("HDL-32", np.eye(4), columns=200),
+        azimuth_rad=np.linspace(-1, 2 * np.pi - 1, 200, endpoint=False),
+        spin=Spin.COUNTERCLOCKWISE,
+    ),
+    "sector with offsets": dataclasses.replace(
+        sensors.lidar_model("AT128", np.eye(4), columns=100), row_azimuth_offset_rad=np.tile([0.02, -0.03], 64)
+    ),
+}
+"""Spinning LiDARs of all kinds: full turns and sectors, either way round, rows with offsets."""
 
 
 def gaussians(mean, scale=0.1, opacity=0.9, rgb=(0.5, 0.5, 0.5), label=0, intensity=np.nan, quat=(1, 0, 0, 0)):
@@ -45,21 +73,26 @@ def gaussians(mean, scale=0.1, opacity=0.9, rgb=(0.5, 0.5, 0.5), label=0, intens
     )
 
 
-def cloud(n=250, seed=0, low=(-8, -8, -3), high=(14, 8, 4), sh=0):
-    """Random Gaussians around and in front of the origin, some very flat, some large, some over the camera plane."""
+def cloud(n=250, seed=0, low=(-8, -8, -3), high=(14, 8, 4), sh=0, drop=False):
+    """Random Gaussians around and in front of the origin: flat, large, over the camera plane; some without a normal."""
     rng = np.random.default_rng(seed)
     scale = np.exp(rng.uniform(np.log(0.02), np.log(0.8), (n, 3)))
     scale[rng.random(n) < 0.3, 2] = 0.004
     result = gaussians(rng.uniform(low, high, (n, 3)), scale=0.1)
+    normal = np.random.default_rng(seed + 1).normal(size=(n, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal[::5] = 0
     return dataclasses.replace(
         result,
         quat_wxyz=rng.normal(size=(n, 4)).astype(np.float32),
         scale_m=scale.astype(np.float32),
         opacity=rng.uniform(0.02, 1.0, n).astype(np.float32),
         rgb=rng.random((n, 3)).astype(np.float32),
+        normal=normal.astype(np.float32),
         label=rng.integers(0, 3, n).astype(np.uint8),
         intensity=np.where(rng.random(n) < 0.2, np.nan, rng.random(n)).astype(np.float32),
         sh_rest=rng.normal(0, 0.15, (n, sh, 3)).astype(np.float32) if sh else None,
+        ray_drop=np.random.default_rng(seed + 2).random(n).astype(np.float32) if drop else None,
     )
 
 

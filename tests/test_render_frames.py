@@ -10,7 +10,7 @@ from render_scenes import START_US, camera, cloud, gaussians, moved, moving_clou
 from nurec_sim import geometry, sensors
 from nurec_sim.render import Renderer, encode_image, spec
 from nurec_sim.render.layers import moving_gaussians, sh_basis
-from nurec_sim.types import DynamicGaussians, Gaussians, Label, Shutter
+from nurec_sim.types import DynamicGaussians, Gaussians, Label, LidarFilter, Shutter
 
 
 def test_one_gaussian_is_where_it_should_be():
@@ -69,8 +69,8 @@ def test_lidar_threshold_range_and_unknown_intensity():
     thin = dataclasses.replace(wall(), opacity=np.full(len(wall()), 0.12, np.float32))
     thin = dataclasses.replace(thin, intensity=np.full(len(thin), np.nan, np.float32))
     renderer = Renderer(scene(thin))
-    assert len(renderer.render_lidar(request(lidar), opacity_threshold=0.9).beam) == 0
-    some = renderer.render_lidar(request(lidar), opacity_threshold=0.05)
+    assert len(renderer.render_lidar(request(lidar), LidarFilter(opacity_threshold=0.9)).beam) == 0
+    some = renderer.render_lidar(request(lidar), LidarFilter(opacity_threshold=0.05))
     assert len(some.beam) > 0 and (some.intensity == 0).all()
     short = dataclasses.replace(lidar, range_m=(0.5, 5.0))
     assert len(Renderer(scene(wall())).render_lidar(request(short)).beam) == 0

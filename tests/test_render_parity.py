@@ -4,32 +4,51 @@ import dataclasses
 
 import numpy as np
 import pytest
-from render_scenes import START_US, camera, cloud, moved, moving_cloud, psnr_db, request, scene, track
+from render_scenes import (
+    LENSES,
+    LIDARS,
+    START_US,
+    camera,
+    cloud,
+    moved,
+    moving_cloud,
+    psnr_db,
+    request,
+    scene,
+    track,
+)
 
-from nurec_sim import geometry, sensors
+from nurec_sim import geometry
 from nurec_sim.render import Renderer, spec
-from nurec_sim.types import Fisheye, FTheta, FThetaReference, Pinhole, Shutter, Spin, Windshield, WindshieldReference
-
-LENSES = {
-    "pinhole": Pinhole(47.0, 49.0, 35.0, 25.0),
-    "wide pinhole": Pinhole(20.0, 20.0, 36.0, 24.0),
-    "distorted": Pinhole(47.0, 47.0, 36.0, 24.0, (-0.2, 0.05, 0, 0, 0, 0), (0.002, -0.003), (0.001, 0, 0.002, 0)),
-    "fisheye": Fisheye(24.0, 24.0, 36.0, 24.0, (0.02, -0.005, 0, 0), max_angle_rad=1.7),
-    "f-theta": FTheta(36.0, 24.0, FThetaReference.PIXELDIST_TO_ANGLE, (0.0, 0.04, 0.0, 2e-6), max_angle_rad=1.6),
-}
+from nurec_sim.render.requests import CAMERA_OUTPUTS
+from nurec_sim.types import LidarFilter, Shutter, Windshield, WindshieldReference
 
 
 def assert_same_image(world, asked, least_db=60.0):
-    got, expected = Renderer(world, threads=2).render_camera(asked), spec.render_camera(world, asked)
+    renderer, expected = Renderer(world, threads=2), spec.render_camera(world, asked)
+    got = renderer.render_camera(asked, CAMERA_OUTPUTS)
     assert psnr_db(got.rgb, expected.rgb) >= least_db
+    assert psnr_db(renderer.render_camera(asked).rgb, expected.rgb) >= least_db
     # A hit right at the cut of 1/255 may fall to either side.
     error = np.abs(got.alpha - expected.alpha)
     assert error.max() < 0.006 and (error > 5e-4).mean() < 2e-3
+    # Weights that are as good as equal may give either label.
     assert (got.label != expected.label).mean() < 2e-3
     both = (got.depth_m > 0) & (expected.depth_m > 0)
     assert (got.depth_m > 0).mean() == pytest.approx((expected.depth_m > 0).mean(), abs=2e-3)
     if both.any():
-        assert np.median(np.abs(got.depth_m - expected.depth_m)[both]) < 1e-3
+        error = np.abs(got.depth_m - expected.depth_m)[both]
+        assert np.median(error) < 1e-3 and np.quantile(error / expected.depth_m[both], 0.99) < 5e-3
+    assert_same_normals(got.normal, expected.normal)
+
+
+def assert_same_normals(got, expected):
+    length = np.linalg.norm(got, axis=-1)
+    assert np.isin(np.round(length, 5), (0, 1)).all()
+    assert ((length > 0) != (np.linalg.norm(expected, axis=-1) > 0)).mean() < 2e-3
+    error = np.linalg.norm(got - expected, axis=-1)[length > 0]
+    if len(error):
+        assert np.median(error) < 1e-3 and np.quantile(error, 0.99) < 0.02
 
 
 @pytest.mark.parametrize("shutter", list(Shutter))
@@ -81,21 +100,14 @@ def test_moving_actors(actors):
     assert psnr_db(without.rgb, Renderer(world).render_camera(asked).rgb) < 40
 
 
-LIDARS = {
-    "full": sensors.lidar_model("VLP-16", np.eye(4), columns=240),
-    "sector": sensors.lidar_model("AT128", np.eye(4), columns=100),
-    "offsets": dataclasses.replace(
-        sensors.lidar_model("HDL-32", np.eye(4), columns=200), row_azimuth_offset_rad=np.tile([0.07, -0.05], 16)
-    ),
-    "other way": dataclasses.replace(
-        sensors.lidar_model("HDL-32", np.eye(4), columns=200),
-        azimuth_rad=np.linspace(-1, 2 * np.pi - 1, 200, endpoint=False),
-        spin=Spin.COUNTERCLOCKWISE,
-    ),
-    "sector with offsets": dataclasses.replace(
-        sensors.lidar_model("AT128", np.eye(4), columns=100), row_azimuth_offset_rad=np.tile([0.02, -0.03], 64)
-    ),
-}
+def same_sweeps(world, asked, filter=None):
+    """Both sweeps at the beams that return from both; all but 1 in 500 must."""
+    got, expected = Renderer(world, threads=2).render_lidar(asked, filter), spec.render_lidar(world, asked, filter)
+    _, mine, theirs = np.intersect1d(got.beam, expected.beam, return_indices=True)
+    assert len(mine) > 300
+    assert len(mine) >= 0.998 * max(len(got.beam), len(expected.beam))
+    for name in ("xyz_m", "range_m", "intensity", "beam"):
+        yield getattr(got, name)[mine], getattr(expected, name)[theirs]
 
 
 @pytest.mark.parametrize("moving", [False, True])
@@ -106,11 +118,27 @@ def test_lidar(name, moving):
     asked = request(
         LIDARS[name], moved(0.3), moved(0.42, 1.2, 0.3) if moving else moved(0.3), end_us=START_US + 100_000
     )
-    got, expected = Renderer(world, threads=2).render_lidar(asked), spec.render_lidar(world, asked)
-    _, mine, theirs = np.intersect1d(got.beam, expected.beam, return_indices=True)
-    assert len(mine) > 300
-    assert len(mine) >= 0.998 * max(len(got.beam), len(expected.beam))
-    error = np.abs(got.range_m[mine] - expected.range_m[theirs])
+    xyz, distance, intensity, _ = same_sweeps(world, asked)
+    error = np.abs(distance[0] - distance[1])
     assert np.median(error) < 1e-3 and np.quantile(error, 0.99) < 1e-2
-    assert np.median(np.abs(got.xyz_m[mine] - expected.xyz_m[theirs])) < 1e-3
-    assert np.quantile(np.abs(got.intensity[mine] - expected.intensity[theirs]), 0.99) < 1e-2
+    assert np.median(np.abs(xyz[0] - xyz[1])) < 1e-3
+    assert np.quantile(np.abs(intensity[0] - intensity[1]), 0.99) < 1e-2
+
+
+@pytest.mark.parametrize(
+    "filter",
+    [
+        LidarFilter(),
+        LidarFilter(raydrop_threshold=0.4),
+        LidarFilter(opacity_threshold=0.2),
+        LidarFilter(opacity_threshold=0.4, distance_threshold_m=0.7),
+    ],
+)
+def test_lidar_filters(filter):
+    """Every filter takes some beams, and the same ones as in the reference."""
+    world = scene(cloud(1500, 3, low=(-12, -12, -3), high=(12, 12, 3), drop=True))
+    asked = request(LIDARS["full"], moved(0.3), moved(0.42, 1.2, 0.3), end_us=START_US + 100_000)
+    _, distance, _, beam = same_sweeps(world, asked, filter)
+    assert np.median(np.abs(distance[0] - distance[1])) < 1e-3
+    everything = LidarFilter(raydrop_threshold=1.0, opacity_threshold=0.01)
+    assert len(beam[0]) < 0.9 * len(Renderer(world).render_lidar(asked, everything).beam)

@@ -50,7 +50,7 @@ def test_sensors():
         sensor=camera(lens=dataclasses.replace(GOOD.sensor.lens, fx_px=0)),
     )
     refused(TooLargeError, "9000 x 10 pixels are too many; at most 8192 a side", sensor=camera(9000, 10))
-    refused(TooLargeError, "16777216 in all", sensor=camera(8000, 8000))
+    refused(TooLargeError, "33177600 in all", sensor=camera(8000, 8000))
     lidar = sensors.lidar_model("VLP-16", np.eye(4), columns=8)
     refused(RequestError, "range_m", sensor=dataclasses.replace(lidar, range_m=(3.0, 1.0)))
     refused(RequestError, "must be a CameraModel or a LidarModel, got str", sensor="front")

@@ -69,6 +69,26 @@ def test_no_moving_gaussians_keep_their_degree(tmp_path):
     assert len(Gaussians.concatenate([back.static, back.dynamic.gaussians])) == 400
 
 
+def with_ray_drop(scene):
+    """The scene with a drop probability for every Gaussian."""
+
+    def dropping(part):
+        return dataclasses.replace(part, ray_drop=np.random.default_rng(len(part)).random(len(part), np.float32))
+
+    moving = dataclasses.replace(scene.dynamic, gaussians=dropping(scene.dynamic.gaussians))
+    return dataclasses.replace(scene, static=dropping(scene.static), dynamic=moving)
+
+
+@pytest.mark.parametrize("make", [full_scene, empty_scene])
+def test_ray_drop_is_kept_where_there_is_one(tmp_path, make):
+    scene = with_ray_drop(make())
+    write_scene(scene, tmp_path / "a.usdz")
+    back = read_scene(tmp_path / "a.usdz")
+    assert_same(scene, back)
+    assert scene_hash(scene) == scene_hash(back) != scene_hash(make())
+    assert archive_faults(tmp_path / "a.usdz") == []
+
+
 finite32 = st.floats(allow_nan=False, allow_infinity=False, width=32)
 finite64 = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -167,6 +187,8 @@ FAULTS = {
     "lengths": (lambda: broken(opacity=np.ones(4, np.float32)), r"opacity must be float32 \(5,\), got float32 \(4,\)"),
     "opacity": (lambda: broken(opacity=np.full(5, 1.5, np.float32)), r"opacity: 5 of 5 are outside 0\.\.1"),
     "intensity": (lambda: broken(intensity=np.full(5, -1, np.float32)), r"intensity: 5 of 5 are outside 0\.\.1"),
+    "ray drop": (lambda: broken(ray_drop=np.full(5, 1.5, np.float32)), r"ray_drop: 5 of 5 are outside 0\.\.1"),
+    "no ray drop": (lambda: broken(ray_drop=NAN[:, 0]), r"ray_drop: 5 of 5 are not finite"),
     "scale": (lambda: broken(scale_m=np.full((5, 3), -1, np.float32)), r"scale_m: 5 of 5 are negative"),
     "quaternion": (lambda: broken(quat_wxyz=np.ones((5, 4), np.float32)), r"quat_wxyz: 5 of 5 are not of unit length"),
     "label": (lambda: broken(label=np.full(5, 99, np.uint8)), r"label: 5 of 5 are not a Label"),

@@ -119,9 +119,9 @@ class Counting:
         self.drawn.append(request.sensor.id)
         return self.inner.render_camera(request, outputs)
 
-    def render_lidar(self, request):
+    def render_lidar(self, request, filter=None):
         self.drawn.append(request.sensor.id)
-        return self.inner.render_lidar(request)
+        return self.inner.render_lidar(request, filter)
 
 
 def test_a_server_can_warm_up_before_somebody_asks(caplog):

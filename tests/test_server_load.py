@@ -1,8 +1,13 @@
 """Batches, many clients at once, clients that leave, and a server that stops in between."""
 
+import itertools
+import signal
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,11 +21,12 @@ from serving_calls import (
     pixels,
     refusal,
     street_renderer,
+    street_server,
     street_stub,
     wait_until,
     with_change,
 )
-from serving_world import LAST_US, START_US, camera_request, scene
+from serving_world import LAST_US, START_US, camera_request, lidar_request, scene
 
 from nurec_sim.render import Renderer
 from nurec_sim.scene_store import SceneStore
@@ -82,6 +88,55 @@ def test_eight_clients_at_once_get_what_one_gets(workers):
             together = [job.result().image_bytes for job in jobs]
     assert together == alone * 4
     assert slowest < 1.0
+
+
+def test_sixteen_clients_of_cameras_and_lidars_get_what_one_gets():
+    """Each client has a channel of its own, asks in its own order, and for two scenes."""
+    asked = []
+    for scene_id, t_us in itertools.product(("street", "other"), (5_100_000, 6_300_000)):
+        for camera in ("front", "wide", "fish"):
+            asked.append(("render_rgb", camera_message(camera_request(camera, t_us), scene_id=scene_id)))
+        asked.append(("render_lidar", lidar_message(lidar_request(t_us), scene_id=scene_id)))
+    begin = threading.Barrier(16)
+
+    def ask(address, seed):
+        order = np.random.default_rng(seed).permutation(len(asked))
+        with Stub(address) as stub:
+            begin.wait(30)
+            replies = {k: getattr(stub, asked[k][0])(asked[k][1], timeout=60) for k in order}
+        return [replies[k].SerializeToString(deterministic=True) for k in range(len(asked))]
+
+    with street_server(render_workers=2) as address, ThreadPoolExecutor(16) as pool:
+        with Stub(address) as stub:
+            alone = [getattr(stub, name)(message).SerializeToString(deterministic=True) for name, message in asked]
+        together = list(pool.map(ask, [address] * 16, range(16)))
+    assert len(set(alone)) > len(asked) // 2  # some see nothing in which the two scenes differ
+    assert all(replies == alone for replies in together)
+
+
+def start_soak(*options):
+    program = Path(__file__).parents[1] / "benchmarks" / "soak.py"
+    command = [sys.executable, str(program), "--width", "64", "--height", "36", *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the memory of a process is read from /proc")
+def test_memory_does_not_grow_with_frames():
+    """A short form of ``benchmarks/soak.py``."""
+    with start_soak("--frames", "300") as soak:
+        text = soak.communicate(timeout=120)[0]
+    assert soak.returncode == 0 and "300 frames" in text and "memory grew by" in text, text
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the memory of a process is read from /proc")
+def test_an_interrupted_soak_says_what_it_has_seen():
+    with start_soak("--frames", "1000000", "--direct") as soak:
+        lines = []
+        for line in soak.stdout:
+            lines.append(line)
+            if "to warm up" in line:
+                soak.send_signal(signal.SIGINT)
+    assert lines[-2] == "interrupted\n" and "memory grew by" in lines[-1], lines
 
 
 def slowest_health_check(channel, until):

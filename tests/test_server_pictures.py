@@ -70,14 +70,19 @@ def test_a_sweep_is_the_renderers_own(stub, renderer):
     assert np.array_equal(np.frombuffer(reply.point_beams_buffer, "<i4"), frame.beam)
 
 
-def test_a_named_lidar_and_its_opacity_threshold(stub):
+def test_a_named_lidar_and_its_filters(stub):
     message = lidar_message()
     message.lidar_config.Clear()
     message.lidar_config.lidar_type = 1
     some = stub.render_lidar(message).num_points
     message.render_filter.opacity_threshold = 0.01
     message.render_filter.raydrop_threshold = 0.5
-    assert 100 < some < stub.render_lidar(message).num_points
+    all_beams = stub.render_lidar(message).num_points
+    assert 100 < some < all_beams
+    message.render_filter.distance_filter_threshold = 0.001
+    assert stub.render_lidar(message).num_points == all_beams
+    message.render_filter.enable_distance_filter = True
+    assert stub.render_lidar(message).num_points < all_beams
 
 
 def test_a_requested_size_scales_the_intrinsics(stub, renderer):

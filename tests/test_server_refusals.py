@@ -67,7 +67,7 @@ BAD_CAMERA_REQUESTS = {
     "100 megapixels": (
         hundred_megapixels,
         Code.RESOURCE_EXHAUSTED,
-        "a frame may have 16,777,216 pixels or beams, got 10000x10000 pixels = 100,000,000",
+        "a frame may have 33,177,600 pixels or beams, got 10000x10000 pixels = 100,000,000",
     ),
     "no intrinsics": (
         lambda m: m.ClearField("camera_intrinsics"),
@@ -128,7 +128,7 @@ def test_a_bad_lidar_request_is_explained_and_the_server_goes_on(stub, case):
 
 @pytest.mark.parametrize(
     ("rows", "columns", "text"),
-    [(300, 100_000, "got 300x100000 beams = 30,000,000"), (40, 100_000, "may take 96,000,000 bytes of 67,108,864")],
+    [(400, 100_000, "got 400x100000 beams = 40,000,000"), (40, 100_000, "may take 96,000,000 bytes of 67,108,864")],
 )
 def test_too_many_beams_are_refused(stub, rows, columns, text):
     lidar = replace(

@@ -104,9 +104,10 @@ def test_strange_lidar_requests(data, count):
     wire.write_lidar_request(lidar_request(), message, scene_id="street")
     mutate(data, message, count)
     with contextlib.suppress(RequestError):
-        request, threshold = wire.read_lidar_request(message)
+        request, filter = wire.read_lidar_request(message)
         is_sound(request)
-        assert threshold is None or 0 <= threshold <= 1
+        assert 0 <= filter.opacity_threshold <= 1 and 0 <= filter.raydrop_threshold <= 1
+        assert filter.distance_threshold_m is None or 0 <= filter.distance_threshold_m < np.inf
 
 
 @FUZZ

@@ -16,6 +16,7 @@ from nurec_sim.types import (
     Fisheye,
     FTheta,
     FThetaReference,
+    LidarFilter,
     Pinhole,
     Shutter,
     Trajectory,
@@ -295,11 +296,40 @@ def test_camera_requests_travel_bit_for_bit():
 def test_lidar_requests_travel_bit_for_bit():
     request, message = lidar_request(), sensorsim.LidarRenderRequest()
     wire.write_lidar_request(request, message, scene_id="s")
-    message.render_filter.opacity_threshold = 0.25
-    back, threshold = wire.read_lidar_request(message)
-    assert np.array_equal(back.world_from_sensor, request.world_from_sensor) and threshold == 0.25
-    message.render_filter.opacity_threshold = 1.5
-    with pytest.raises(RequestError, match=r"opacity_threshold must lie in 0..1, got 1.5"):
+    back, filter = wire.read_lidar_request(message)
+    assert np.array_equal(back.world_from_sensor, request.world_from_sensor) and filter == LidarFilter()
+
+
+@pytest.mark.parametrize(
+    "fields, wanted",
+    [
+        ({"opacity_threshold": 0.25}, LidarFilter(opacity_threshold=0.25)),
+        ({"opacity_threshold": 0.0, "raydrop_threshold": 1.0}, LidarFilter(raydrop_threshold=1, opacity_threshold=0)),
+        ({"enable_distance_filter": True}, LidarFilter(distance_threshold_m=1.0)),
+        ({"enable_distance_filter": True, "distance_filter_threshold": 0.5}, LidarFilter(distance_threshold_m=0.5)),
+        ({"distance_filter_threshold": 0.5}, LidarFilter()),
+        ({"enable_distance_filter": False, "distance_filter_threshold": 0.5}, LidarFilter()),
+    ],
+)
+def test_lidar_filters(fields, wanted):
+    message = sensorsim.LidarRenderRequest(render_filter=fields)
+    wire.write_lidar_request(lidar_request(), message, scene_id="s")
+    assert wire.read_lidar_request(message)[1] == wanted
+
+
+@pytest.mark.parametrize(
+    "fields, text",
+    [
+        ({"opacity_threshold": 1.5}, r"render_filter: opacity_threshold must lie in 0\.\.1, got 1\.5"),
+        ({"raydrop_threshold": float("nan")}, r"render_filter: raydrop_threshold must lie in 0\.\.1, got nan"),
+        ({"distance_filter_threshold": -1.0}, r"distance_filter_threshold must be finite and not negative, .*got -1"),
+        ({"distance_filter_threshold": float("inf")}, "distance_filter_threshold must be finite and not negative"),
+    ],
+)
+def test_lidar_filters_out_of_range(fields, text):
+    message = sensorsim.LidarRenderRequest(render_filter=fields)
+    wire.write_lidar_request(lidar_request(), message, scene_id="s")
+    with pytest.raises(RequestError, match=text):
         wire.read_lidar_request(message)
 
 

@@ -2,15 +2,59 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int64
 
 from nurec_sim import geometry
-from nurec_sim.types import DynamicGaussians, Gaussians, Track
+from nurec_sim.render.rays import RayGrid, reference_pose
+from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, SensorRequest, Track
 
-MIN_FADE = 1 / 255
+MIN_ALPHA = 1 / 255
+"""What is less opaque is not drawn."""
+LARGEST = 1e12
+"""Positions, scales and colours beyond this are taken for broken."""
+
+
+def visible_gaussians(
+    scene: GaussianScene, request: SensorRequest, grid: RayGrid
+) -> tuple[Gaussians, Int64[np.ndarray, " k"]]:
+    """Both layers at the reference instant, coloured for the view, and the order of those that can be drawn."""
+    world_from_sensor, t_us = reference_pose(request, grid.reference)
+    actors = {
+        name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(grid.reference))
+        for name, pair in request.actors.items()
+    }
+    eye = world_from_sensor[:3, 3]
+    static = scene.static
+    if static.sh_rest is not None:
+        rgb = view_colour(static.rgb, static.sh_rest, static.mean_m - eye).astype(np.float32)
+        static = dataclasses.replace(static, rgb=rgb, sh_rest=None)
+    moving = moving_gaussians(scene.dynamic, scene.tracks, t_us, actors, eye)
+    gaussians = Gaussians.concatenate([static, moving])
+    rows = np.flatnonzero(drawable(gaussians))
+    centre = geometry.transform_points(geometry.inverse(world_from_sensor), gaussians.mean_m[rows])
+    depth = np.linalg.norm(centre, axis=-1) if grid.by_range else centre[:, 2]
+    order = np.argsort(depth, kind="stable")
+    return gaussians, rows[order[depth[order] >= grid.near_m]]
+
+
+def drawable(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
+    """Which Gaussians can be drawn at all: finite, with extent, at least 1/255 opaque."""
+    columns = (gaussians.mean_m, gaussians.quat_wxyz, gaussians.scale_m, gaussians.rgb, gaussians.opacity[:, None])
+    sound = np.all([(np.abs(column) <= LARGEST).all(axis=1) for column in columns], axis=0)  # NaN is not
+    sound &= np.linalg.norm(gaussians.quat_wxyz, axis=1) > 1e-12
+    return sound & (gaussians.scale_m > 0).all(axis=1) & (gaussians.opacity >= np.float32(MIN_ALPHA))
+
+
+def facing_normals(gaussians: Gaussians, eye_m: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "n 3"]:
+    """Normals turned to face a point; unknown ones, which are zero or not finite, become zero."""
+    known = np.isfinite(gaussians.normal).all(axis=1) & np.isfinite(gaussians.mean_m).all(axis=1)
+    normal = np.where(known[:, None], gaussians.normal, 0).astype(np.float64)
+    away = np.sum(normal * np.where(known[:, None], gaussians.mean_m - eye_m, 0), axis=1, keepdims=True) > 0
+    return np.where(away, -normal, normal)
 
 
 def moving_gaussians(
@@ -43,7 +87,8 @@ def moving_gaussians(
     fraction = (t_us - start_us) / np.maximum(end_us - start_us, 1)
     fade = np.exp(-(np.where(after, fraction, 1 - fraction) ** 10))
     opacity = dynamic.gaussians.opacity[alive] * fade
-    seen = opacity >= MIN_FADE
+    seen = (opacity >= MIN_ALPHA) & drawable(dynamic.gaussians[alive])
+    seen &= np.isfinite(dynamic.knot_m[alive]).all(axis=(1, 2))
     alive, rows, low, fraction, opacity = alive[seen], rows[seen], low[seen], fraction[seen], opacity[seen]
 
     gaussians, knot_m = dynamic.gaussians[alive], dynamic.knot_m[alive].astype(np.float64)
@@ -79,6 +124,7 @@ def moving_gaussians(
         normal=normal.astype(np.float32),
         label=gaussians.label,
         intensity=gaussians.intensity,
+        ray_drop=gaussians.ray_drop,
     )
 
 

@@ -23,9 +23,9 @@ class RayGrid:
     """Rays of a sensor in its own frame; those that are not valid point along z.
 
     ``fraction`` is the place of each ray's instant in the exposure, 0 at its start and 1 at its end; ``reference``
-    the fraction at which Gaussians are sorted, culled and, where they move, placed (the middle; 0 for a global
-    shutter). ``by_range`` says whether Gaussians are ordered by the distance of their centre (LiDAR, fisheye and
-    F-theta lenses, which see sideways) or by its z (pinhole).
+    the fraction at which Gaussians are sorted, culled and, where they move, placed: the middle, or the one instant of
+    all rays (a global shutter, a LiDAR of one column). ``by_range`` says whether Gaussians are ordered by the distance
+    of their centre (LiDAR, fisheye and F-theta lenses, which see sideways) or by its z (pinhole).
     """
 
     direction: Float64[np.ndarray, "h w 3"]
@@ -42,14 +42,21 @@ def ray_grid(sensor: CameraModel | LidarModel) -> RayGrid:
         direction = np.asarray(sensors.beam_directions(sensor), np.float64)
         fraction = np.broadcast_to(sensors.column_fraction(sensor), direction.shape[:2])
         valid = np.ones(direction.shape[:2], bool)
-        return RayGrid(direction, valid, fraction, 0.5, True, max(NEAR_M, sensor.range_m[0]))
+        return RayGrid(direction, valid, fraction, _reference(fraction), True, max(NEAR_M, sensor.range_m[0]))
     direction, valid = sensors.pixel_rays(sensor)
-    rows, columns = np.mgrid[0 : sensor.height_px, 0 : sensor.width_px] + 0.5
-    uv = np.stack([columns.ravel(), rows.ravel()], axis=-1)
-    fraction = np.asarray(sensors.shutter_fraction(sensor, uv)).reshape(valid.shape)
-    reference = 0.0 if sensor.shutter is Shutter.GLOBAL else 0.5
+    by_column = sensor.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
+    line = np.arange(valid.shape[1] if by_column else valid.shape[0]) + 0.5
+    shared = np.asarray(sensors.shutter_fraction(sensor, np.stack([line, line], axis=-1)))
+    fraction = np.broadcast_to(shared if by_column else shared[:, None], valid.shape)
     direction = np.where(valid[..., None], direction, (0.0, 0.0, 1.0))
-    return RayGrid(direction, valid, fraction, reference, not isinstance(sensor.lens, Pinhole), NEAR_M)
+    by_range = not isinstance(sensor.lens, Pinhole)
+    return RayGrid(direction, valid, fraction, _reference(fraction), by_range, NEAR_M)
+
+
+def _reference(fraction: Float64[np.ndarray, "h w"]) -> float:
+    """``RayGrid.reference`` of rays fired at the given fractions."""
+    first = float(fraction[0, 0])
+    return first if (fraction == first).all() else 0.5
 
 
 def reference_pose(request: SensorRequest, reference: float) -> tuple[Float64[np.ndarray, "4 4"], int]:

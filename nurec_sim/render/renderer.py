@@ -4,25 +4,44 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 
 import numpy as np
 
 from nurec_sim import geometry
 from nurec_sim.errors import RequestError
+from nurec_sim.render.cpu.blend import CAMERA, LIDAR, NORMALS
 from nurec_sim.render.cpu.composite import composite
-from nurec_sim.render.cpu.grid import Grid, grid_key, make_grid
+from nurec_sim.render.cpu.grid import PINHOLE, Grid, grid_key, make_grid
+from nurec_sim.render.cpu.moving import PackedMoving
 from nurec_sim.render.cpu.pack import PackedGaussians, pack
-from nurec_sim.render.cpu.pipeline import Buffers, View, Workers, draw
-from nurec_sim.render.layers import moving_gaussians
+from nurec_sim.render.cpu.pipeline import NO_TABLE, FrameStats, Picture, blocks_in_view, draw
+from nurec_sim.render.cpu.rays import RayTiles, tile_rays
+from nurec_sim.render.cpu.sweep import sweep_returns
+from nurec_sim.render.cpu.tiles import AFFINE, ROLLING
+from nurec_sim.render.cpu.view import View
+from nurec_sim.render.cpu.workers import Buffers, Lend, Workers
 from nurec_sim.render.rays import reference_pose
 from nurec_sim.render.requests import CAMERA_OUTPUTS, check_request
-from nurec_sim.render.spec import beam_range, sweep_frame
-from nurec_sim.types import CameraFrame, CameraModel, GaussianScene, LidarFrame, SensorFrame, SensorRequest
+from nurec_sim.types import CameraFrame, CameraModel, GaussianScene, LidarFilter, LidarFrame, SensorFrame, SensorRequest
 
 IDENTITY_ISP = np.eye(3, 4, dtype=np.float32)
 KEPT_GRIDS = 24
+SENSED_OUTPUTS = ("rgb", "depth", "alpha", "label")
+"""What ``sense`` asks of cameras."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Sensor:
+    """Tables of a sensor; ``rays`` and ``ray_z`` (z of the unit rays) only where a pinhole's formula will not do."""
+
+    grid: Grid
+    rays: RayTiles
+    ray_z: np.ndarray
 
 
 class Renderer:
@@ -42,24 +61,22 @@ class Renderer:
         self._workers = Workers(threads or _usable_cores())
         self._buffers = Buffers()
         self._static = pack(scene.static)
+        self._moving = PackedMoving.of(scene.dynamic, scene.tracks)
         self._sky = np.ascontiguousarray(scene.sky, np.float32)
-        self._isp = {name: np.asarray(matrix, np.float32) for name, matrix in scene.isp.items()}
-        self._grids: OrderedDict[tuple, Grid] = OrderedDict()
-        self._grids_lock = threading.Lock()
+        self._isp = {name: np.ascontiguousarray(matrix, np.float32) for name, matrix in scene.isp.items()}
+        self._sensors: OrderedDict[tuple, _Sensor] = OrderedDict()
+        self._sensors_lock = threading.Lock()
 
     def sense(self, requests: Sequence[SensorRequest]) -> list[SensorFrame]:
-        """One frame per request, in order: ``types.Sense``.
+        """One frame per request, in order: ``types.Sense``. All frames go through the stages together.
 
         Raises:
             RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
         """
-        return [
-            self.render_camera(request) if isinstance(request.sensor, CameraModel) else self.render_lidar(request)
-            for request in requests
-        ]
+        return self.measure(requests)[0]
 
-    def render_camera(self, request: SensorRequest, outputs: Sequence[str] = CAMERA_OUTPUTS) -> CameraFrame:
-        """A camera frame with ``rgb`` and those of depth, alpha and label that ``outputs`` names.
+    def render_camera(self, request: SensorRequest, outputs: Sequence[str] = SENSED_OUTPUTS) -> CameraFrame:
+        """A camera frame with ``rgb`` and those of depth, alpha, label and normal that ``outputs`` names.
 
         Raises:
             RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or an unknown output.
@@ -67,21 +84,78 @@ class Renderer:
         unknown = sorted(set(outputs) - set(CAMERA_OUTPUTS))
         if unknown:
             raise RequestError(f"unknown outputs {unknown}; have {list(CAMERA_OUTPUTS)}")
-        check_request(request, self.scene)
         if not isinstance(request.sensor, CameraModel):
-            raise RequestError(f"render_camera needs a camera, sensor {request.sensor.id!r} is a LiDAR")
-        grid = self._grid(request)
-        view = View.of(grid, request.world_from_sensor)
-        planes = draw(grid, view, self._layers(request, grid), False, self._workers, self._buffers)
+            raise RequestError("render_camera needs a camera, the request's sensor is a LiDAR")
+        frame = self.measure([request], outputs)[0][0]
+        assert isinstance(frame, CameraFrame)
+        return frame
+
+    def render_lidar(self, request: SensorRequest, filter: LidarFilter | None = None) -> LidarFrame:
+        """A sweep: the beams that return by ``filter`` (``LidarFilter()`` if None); see ``spec.sweep_frame``.
+
+        Raises:
+            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
+        """
+        if isinstance(request.sensor, CameraModel):
+            raise RequestError(f"render_lidar needs a LiDAR, sensor {request.sensor.id!r} is a camera")
+        frame = self.measure([request], filter=filter)[0][0]
+        assert isinstance(frame, LidarFrame)
+        return frame
+
+    def measure(
+        self,
+        requests: Sequence[SensorRequest],
+        outputs: Sequence[str] = SENSED_OUTPUTS,
+        filter: LidarFilter | None = None,
+    ) -> tuple[list[SensorFrame], list[FrameStats]]:
+        """Frames as of ``sense``, and what each of them took.
+
+        Raises:
+            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
+        """
+        for request in requests:
+            check_request(request, self.scene)
+        with ExitStack() as loans:
+            pictures, sensors = [], []
+            for request in requests:
+                array = loans.enter_context(self._buffers.lend())
+                sensor = self._sensor(request)
+                view = View.of(sensor.grid, request.world_from_sensor)
+                kind = (
+                    LIDAR if not isinstance(request.sensor, CameraModel) else NORMALS if "normal" in outputs else CAMERA
+                )
+                sensors.append(sensor)
+                rays = NO_TABLE if view.way in (AFFINE, ROLLING) else self._ray_tables(sensor)
+                pictures.append(Picture(view, rays, kind, self._layers(request, view, array), array))
+            planes = draw(pictures, self._workers)
+            began = time.perf_counter()
+            frames: list[SensorFrame] = [
+                self._camera_frame(request, picture, sensor, plane, outputs)
+                if isinstance(request.sensor, CameraModel)
+                else self._lidar_frame(request, picture, plane, filter or LidarFilter())
+                for request, picture, sensor, plane in zip(requests, pictures, sensors, planes, strict=True)
+            ]
+            for picture in pictures:
+                picture.stats.seconds["finish"] = time.perf_counter() - began
+            return frames, [picture.stats for picture in pictures]
+
+    def _camera_frame(
+        self, request: SensorRequest, picture: Picture, sensor: _Sensor, planes: np.ndarray, outputs: Sequence[str]
+    ) -> CameraFrame:
+        assert isinstance(request.sensor, CameraModel)
+        grid, view = sensor.grid, picture.view
         height, width = grid.valid.shape
         rgb, label = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.uint8)
         depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+        normal = np.empty((height, width, 3) if picture.kind == NORMALS else (0, 0, 3), np.float32)
         isp = self._isp.get(request.sensor.id, IDENTITY_ISP) if self.apply_isp else IDENTITY_ISP
         turn = view.world_from_line[:, :3, :3].astype(np.float32)
-        line = grid.line if len(turn) > 1 else np.zeros_like(grid.line)
+        linear = view.way in (AFFINE, ROLLING)
+        ray_z = np.zeros((0, 0), np.float32) if linear else sensor.ray_z
         self._workers.run(
             composite,
-            [(first, last, planes, grid.direction, grid.valid, line, turn, self._sky, isp, rgb, depth, alpha, label)
+            [(first, last, planes, ray_z, grid.direction, grid.valid, grid.line, turn, self._sky, isp, rgb, depth,
+              alpha, label, normal)
              for first, last in self._workers.ranges(height, 16)],
         )  # fmt: skip
         return CameraFrame(
@@ -92,66 +166,72 @@ class Renderer:
             depth_m=depth if "depth" in outputs else None,
             alpha=alpha if "alpha" in outputs else None,
             label=label if "label" in outputs else None,
+            normal=normal if "normal" in outputs else None,
         )
 
-    def render_lidar(self, request: SensorRequest, opacity_threshold: float = 0.5) -> LidarFrame:
-        """A sweep: a return per beam whose alpha exceeds ``opacity_threshold`` and whose range the sensor can measure.
-
-        Raises:
-            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
-        """
-        check_request(request, self.scene)
-        if isinstance(request.sensor, CameraModel):
-            raise RequestError(f"render_lidar needs a LiDAR, sensor {request.sensor.id!r} is a camera")
-        grid = self._grid(request)
-        view = View.of(grid, request.world_from_sensor)
-        planes = draw(grid, view, self._layers(request, grid), True, self._workers, self._buffers)
+    def _lidar_frame(
+        self, request: SensorRequest, picture: Picture, planes: np.ndarray, filter: LidarFilter
+    ) -> LidarFrame:
+        assert not isinstance(request.sensor, CameraModel)
+        grid = picture.view.grid
         assert grid.beam is not None
-        planes = _by_beam(planes, grid.beam).astype(np.float64)
-        alpha = planes[4]
-        distance = beam_range(planes[6], planes[3], alpha)
-        intensity = planes[0] / np.maximum(planes[1], 1e-12)
-        direction = np.moveaxis(_by_beam(np.moveaxis(grid.direction, 2, 0), grid.beam), 0, 2)
-        # Beams of a column share its pose; the grid's line of a beam is its column.
-        poses = np.broadcast_to(view.world_from_line, (alpha.shape[1], 4, 4))
-        world_direction = np.einsum("cij,rcj->rci", poses[:, :3, :3], direction.astype(np.float64))
-        origin = np.broadcast_to(poses[None, :, :3, 3], world_direction.shape)
-        return sweep_frame(request, alpha, distance, intensity, origin, world_direction, opacity_threshold)
+        rows, columns = grid.beam.shape
+        end_from_line = (
+            geometry.inverse(np.asarray(request.world_from_sensor[1], np.float64)) @ picture.view.world_from_line
+        )
+        limit = np.inf if filter.distance_threshold_m is None else filter.distance_threshold_m
+        filters = (filter.raydrop_threshold, filter.opacity_threshold, limit)
+        ranges, intensities = np.empty(rows * columns, np.float32), np.empty(rows * columns, np.float32)
+        points, beams = np.empty((rows * columns, 3), np.float32), np.empty(rows * columns, np.int32)
+        parts = self._workers.ranges(rows, 4)
+        counts = self._workers.run(
+            sweep_returns,
+            [(first, last, planes, grid.direction, grid.beam, grid.line, np.ascontiguousarray(end_from_line[:, :3]),
+              np.array(request.sensor.range_m, np.float64), np.array(filters, np.float64), ranges, intensities, points,
+              beams) for first, last in parts],
+        )  # fmt: skip
+        found = [
+            slice(first * columns, first * columns + count) for (first, _), count in zip(parts, counts, strict=True)
+        ]
+        xyz, range_m, intensity, beam = (
+            np.concatenate([values[part] for part in found]) for values in (points, ranges, intensities, beams)
+        )
+        return LidarFrame(request.sensor, request.start_us, request.end_us, xyz, range_m, intensity, beam)
 
-    def _layers(self, request: SensorRequest, grid: Grid) -> list[PackedGaussians]:
-        """The static layer, and the dynamic one as it is at the reference instant."""
-        if len(self.scene.dynamic) == 0:
-            return [self._static]
-        pose, t_us = reference_pose(request, grid.reference)
-        actors = {
-            name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(grid.reference))
-            for name, pair in request.actors.items()
-        }
-        moving = moving_gaussians(self.scene.dynamic, self.scene.tracks, t_us, actors, pose[:3, 3])
-        return [self._static, pack(moving, sort=False)]
+    def _layers(self, request: SensorRequest, view: View, array: Lend) -> list[tuple[PackedGaussians, np.ndarray]]:
+        """The static layer, and the dynamic one as it is at the reference instant, with their blocks in view."""
+        layers = [self._static]
+        if len(self.scene.dynamic):
+            pose, t_us = reference_pose(request, view.grid.reference)
+            actors = {
+                name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(view.grid.reference))
+                for name, pair in request.actors.items()
+            }
+            layers.append(self._moving.at(t_us, actors, pose[:3, 3], self._workers, array))
+        return [(layer, blocks_in_view(view, layer)) for layer in layers]
 
-    def _grid(self, request: SensorRequest) -> Grid:
+    def _sensor(self, request: SensorRequest) -> _Sensor:
         """Tables of the request's sensor, the latest ``KEPT_GRIDS`` kept."""
         key = grid_key(request.sensor)
-        with self._grids_lock:
-            grid = self._grids.get(key)
-            if grid is not None:
-                self._grids.move_to_end(key)
-                return grid
+        with self._sensors_lock:
+            sensor = self._sensors.get(key)
+            if sensor is not None:
+                self._sensors.move_to_end(key)
+                return sensor
         grid = make_grid(request.sensor)
-        with self._grids_lock:
-            self._grids[key] = grid
-            while len(self._grids) > KEPT_GRIDS:
-                self._grids.popitem(last=False)
-        return grid
+        sensor = _Sensor(
+            grid, NO_TABLE if grid.kind == PINHOLE else tile_rays(grid), np.ascontiguousarray(grid.direction[..., 2])
+        )
+        with self._sensors_lock:
+            self._sensors[key] = sensor
+            while len(self._sensors) > KEPT_GRIDS:
+                self._sensors.popitem(last=False)
+        return sensor
+
+    def _ray_tables(self, sensor: _Sensor) -> RayTiles:
+        """The sensor's rays as a table; a pinhole needs one only where it moves too fast for ``View.way`` to roll."""
+        return tile_rays(sensor.grid) if sensor.rays is NO_TABLE else sensor.rays
 
 
 def _usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _by_beam(planes: np.ndarray, beam: np.ndarray) -> np.ndarray:
-    """Planes [p,h,w] in the order of the LiDAR's beams instead of the grid's cells."""
-    result = np.empty_like(planes)
-    result.reshape(len(planes), -1)[:, beam.reshape(-1)] = planes.reshape(len(planes), -1)
-    return result

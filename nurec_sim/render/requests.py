@@ -9,8 +9,8 @@ from nurec_sim.errors import OutOfRangeError, RequestError, TooLargeError
 from nurec_sim.types import CameraModel, GaussianScene, LidarModel, SensorRequest
 
 MAX_SIDE_PX = 8192
-MAX_RAYS = 16_777_216
-CAMERA_OUTPUTS = ("rgb", "depth", "alpha", "label")
+MAX_RAYS = 7680 * 4320
+CAMERA_OUTPUTS = ("rgb", "depth", "alpha", "label", "normal")
 
 
 def check_request(request: SensorRequest, scene: GaussianScene) -> None:

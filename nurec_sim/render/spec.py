@@ -2,20 +2,27 @@
 
 A ray (unit direction d from o) meets a Gaussian (mean m, rotation R, standard deviations S, opacity p) with
 
-    o' = S^-1 R^T (o - m),  d' = S^-1 R^T d / |S^-1 R^T d|,  q = |d' x o'|^2,  alpha = min(0.99, p exp(-q / 2))
+    o' = S^-1 R^T (o - m),  d' = S^-1 R^T d / |S^-1 R^T d|,  q = |d' x o'|^2,  alpha = min(p, 0.99) exp(-q / 2)
 
 at the distance t = -(d' . o') / |S^-1 R^T d| where the response along the ray is largest (3DGUT). There is no blur, so
 a Gaussian smaller than a pixel can fall between rays. A hit counts when alpha >= 1/255 and t >= near. Gaussians whose
-centre lies nearer than the near plane are culled. They are blended front to back in the order of their centres at the
-reference instant (``rays.RayGrid.by_range``); back ends may swap centres whose depths differ by less than float32
-resolves. The Gaussian that would bring the transmittance to 1e-4 or below is dropped and ends the ray.
+centre lies nearer than the near plane are culled; those with values that are not finite or beyond 1e12, or without
+extent, are not drawn; standard deviations below 1e-5 m count as that. Order: front to back by centre at the reference
+instant (``rays.RayGrid.by_range``); back ends may swap centres whose depths differ by less than float32 resolves. Each
+hit weighs alpha times the transmittance before it. A ray ends with the hit that brings its transmittance to 1e-4 or
+below; back ends may go on, what follows weighs 1e-4 at most.
 
-Outputs: ``alpha`` is the sum of the weights; ``depth`` the weighted mean of t, times the ray's z in the camera, 0
-where alpha < 0.5; ``half`` the t at which the transmittance first falls to a half, 0 where it does not: the range of a
-LiDAR, which reports the surface it meets and no mean of two; ``label`` that of the largest single weight, ``SKY`` where
-alpha < 0.5. The colour gets (1 - alpha) of the sky, then the camera's affine correction, is clipped to 0..1 and rounded
-half up to 8 bits. Pixels without a valid ray are black. A moving actor stands still during an exposure, where it is at
-the reference instant.
+Outputs of a ray: ``alpha`` is the sum of the weights; ``depth`` the weighted mean of t, times the ray's z in the
+camera; ``half`` the t at which the transmittance first falls to a half or below, 0 where it does not: the range of a
+LiDAR, which reports the surface it meets and no mean of two; ``label`` that of the largest single weight (back ends may
+take another that is within 1/16384 of it); ``normal`` the weighted mean of the Gaussians' normals, each turned to face
+the eye at the reference instant, in the world, of unit length. Where alpha < 0.5 there is no surface: depth and normal
+are 0 and the label is ``SKY``. The colour gets (1 - alpha) of the sky, then the camera's affine correction, is clipped
+to 0..1 and rounded half up to 8 bits. Pixels without a valid ray are black. A moving actor stands still during an
+exposure, where it is at the reference instant; its Gaussians fade at the ends of their lives (``layers``).
+
+Where a Gaussian lies in the image is needed to skip what a ray cannot meet, never for its response;
+``unscented.unscented_projection`` states it.
 """
 
 from __future__ import annotations
@@ -23,170 +30,251 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int64
 
 from nurec_sim import geometry
-from nurec_sim.render.layers import moving_gaussians, view_colour
-from nurec_sim.render.rays import RayGrid, ray_grid, reference_pose, world_rays
+from nurec_sim.render.layers import MIN_ALPHA, facing_normals, visible_gaussians
+from nurec_sim.render.rays import ray_grid, reference_pose, world_rays
 from nurec_sim.types import (
     CameraFrame,
     CameraModel,
     Gaussians,
     GaussianScene,
     Label,
+    LidarFilter,
     LidarFrame,
     LidarModel,
     SensorRequest,
 )
 
-MAX_ALPHA = 0.99
-MIN_ALPHA = 1 / 255
+MAX_OPACITY = 0.99
 MIN_TRANSMITTANCE = 1e-4
+MIN_SCALE_M = 1e-5
 SURFACE_ALPHA = 0.5
-"""Below this alpha a pixel has no depth and is labelled SKY."""
+"""Below this alpha a pixel has no depth and no normal and is labelled SKY."""
+PAIRS_AT_ONCE = 1 << 22
+"""Pairs of a ray and a Gaussian that are looked at together; bounds the memory, changes no result."""
+
+Values = Float64[np.ndarray, " n"]
+Vectors = Float64[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True)
 class RaySums:
     """What blending leaves per ray: ``features`` and ``distance`` are weighted sums, not yet divided by ``alpha``."""
 
-    features: Float64[np.ndarray, "h w c"]
-    distance: Float64[np.ndarray, "h w"]
-    half: Float64[np.ndarray, "h w"]
-    alpha: Float64[np.ndarray, "h w"]
-    label: np.ndarray
+    features: Float64[np.ndarray, "*rays c"]
+    distance: Float64[np.ndarray, "*rays"]
+    half: Float64[np.ndarray, "*rays"]
+    alpha: Float64[np.ndarray, "*rays"]
+    label: Int64[np.ndarray, "*rays"]
 
 
-def render_camera(scene: GaussianScene, request: SensorRequest, apply_isp: bool = True) -> CameraFrame:
-    """A camera frame; see the module for what it contains."""
+def render_camera(
+    scene: GaussianScene,
+    request: SensorRequest,
+    apply_isp: bool = True,
+    pixels: Int64[np.ndarray, " k"] | None = None,
+) -> CameraFrame:
+    """A camera frame; see the module for what it contains.
+
+    Args:
+        scene: the world.
+        request: a camera's.
+        apply_isp: whether ``scene.isp`` of the camera is applied.
+        pixels: flat indices (row * width + column) of the pixels to draw; the frame is then one row of them.
+    """
     assert isinstance(request.sensor, CameraModel)
     grid = ray_grid(request.sensor)
     gaussians, order = visible_gaussians(scene, request, grid)
+    eye = reference_pose(request, grid.reference)[0][:3, 3]
+    features = np.concatenate([gaussians.rgb, facing_normals(gaussians, eye)], axis=1)
     origin, direction = world_rays(request, grid)
-    sums = blend_rays(gaussians, gaussians.rgb, order, origin, direction, grid)
+    ray, valid = grid.direction, grid.valid
+    if pixels is not None:
+        origin, direction, ray, valid = (
+            a.reshape(-1, *a.shape[2:])[pixels][None] for a in (origin, direction, ray, valid)
+        )
+    sums = blend_rays(gaussians, features, order, origin, direction, grid.near_m, valid)
     isp = scene.isp.get(request.sensor.id) if apply_isp else None
-    colour = finish_colour(sums.features, sums.alpha, sky_colour(scene.sky, direction), isp)
+    colour = finish_colour(sums.features[..., :3], sums.alpha, sky_colour(scene.sky, direction), isp)
     surface = sums.alpha >= SURFACE_ALPHA
-    mean_distance = sums.distance / np.maximum(sums.alpha, MIN_ALPHA)
+    depth = np.maximum(sums.distance / np.maximum(sums.alpha, MIN_ALPHA) * ray[..., 2], 0)
     return CameraFrame(
         camera=request.sensor,
         start_us=request.start_us,
         end_us=request.end_us,
-        rgb=np.where(grid.valid[..., None], to_uint8(colour), 0).astype(np.uint8),
-        depth_m=np.where(surface, np.maximum(mean_distance * grid.direction[..., 2], 0), 0).astype(np.float32),
+        rgb=np.where(valid[..., None], to_uint8(colour), 0).astype(np.uint8),
+        depth_m=np.where(surface, depth, 0).astype(np.float32),
         alpha=sums.alpha.astype(np.float32),
         label=np.where(surface, sums.label, Label.SKY).astype(np.uint8),
+        normal=np.where(surface[..., None], unit(sums.features[..., 3:]), 0).astype(np.float32),
     )
 
 
-def render_lidar(scene: GaussianScene, request: SensorRequest, opacity_threshold: float = SURFACE_ALPHA) -> LidarFrame:
-    """A sweep: beams whose alpha exceeds the threshold, if within the sensor's range.
+def render_lidar(
+    scene: GaussianScene,
+    request: SensorRequest,
+    filter: LidarFilter | None = None,
+    beams: Int64[np.ndarray, " k"] | None = None,
+) -> LidarFrame:
+    """A sweep; see ``sweep_frame`` for which beams return and what. Each column fires from its own pose.
 
-    The range is where half of the beam has been stopped; beams of which less is stopped (thresholds below a half) get
-    the weighted mean distance. Each column fires from its own pose; points are given in the sensor frame at the end of
-    the sweep. Intensity is the weighted mean over the Gaussians whose intensity is known, 0 where none is.
+    Args:
+        scene: the world.
+        request: a LiDAR's.
+        filter: which beams return; ``LidarFilter()`` if None.
+        beams: flat indices (row * columns + column) of the beams to fire; all if None.
     """
     grid = ray_grid(request.sensor)
     gaussians, order = visible_gaussians(scene, request, grid)
     known = np.isfinite(gaussians.intensity)
-    features = np.stack([np.where(known, gaussians.intensity, 0), known], axis=-1)
+    drop = np.zeros(len(gaussians)) if gaussians.ray_drop is None else np.clip(np.nan_to_num(gaussians.ray_drop), 0, 1)
+    features = np.stack([np.where(known, gaussians.intensity, 0), known, drop], axis=-1).astype(np.float64)
     origin, direction = world_rays(request, grid)
-    sums = blend_rays(gaussians, features, order, origin, direction, grid)
-    distance = beam_range(sums.half, sums.distance, sums.alpha)
-    intensity = sums.features[..., 0] / np.maximum(sums.features[..., 1], 1e-12)
-    return sweep_frame(request, sums.alpha, distance, intensity, origin, direction, opacity_threshold)
-
-
-def beam_range(
-    half: Float64[np.ndarray, "h w"], distance: Float64[np.ndarray, "h w"], alpha: Float64[np.ndarray, "h w"]
-) -> Float64[np.ndarray, "h w"]:
-    """Range of LiDAR beams from the sums of blending."""
-    return np.where(half > 0, half, distance / np.maximum(alpha, MIN_ALPHA))
+    fired = grid.valid.copy()
+    if beams is not None:
+        fired[:] = False
+        fired.reshape(-1)[beams] = True
+    sums = blend_rays(gaussians, features, order, origin, direction, grid.near_m, fired)
+    return sweep_frame(request, sums, origin, direction, filter or LidarFilter())
 
 
 def sweep_frame(
     request: SensorRequest,
-    alpha: Float64[np.ndarray, "h w"],
-    distance: Float64[np.ndarray, "h w"],
-    intensity: Float64[np.ndarray, "h w"],
+    sums: RaySums,
     origin: Float64[np.ndarray, "h w 3"],
     direction: Float64[np.ndarray, "h w 3"],
-    opacity_threshold: float,
+    filter: LidarFilter,
 ) -> LidarFrame:
-    """The returns of a grid of beams, as points in the sensor frame at the end of the sweep."""
+    """The returns of a grid of blended beams, as points in the sensor frame at the end of the sweep.
+
+    The range is where half of the beam has been stopped; beams of which less is stopped (opacity thresholds below a
+    half) get the weighted mean. Features are intensity, whether it is known, and ray drop: intensity is the weighted
+    mean over the Gaussians whose intensity is known, clipped to 0..1, 0 where none is; the probability of a drop the
+    weighted mean of all. A beam returns if its alpha exceeds the opacity threshold, its drop probability does not
+    exceed its threshold, its range lies within the sensor's, and is not farther from the weighted mean than the
+    distance threshold.
+    """
     assert isinstance(request.sensor, LidarModel)
+    mean = sums.distance / np.maximum(sums.alpha, MIN_ALPHA)
+    distance = np.where(sums.half > 0, sums.half, mean)
     nearest, farthest = request.sensor.range_m
-    beam = np.flatnonzero((alpha > opacity_threshold) & (distance >= nearest) & (distance <= farthest))
-    distance = distance.reshape(-1)[beam]
-    world = origin.reshape(-1, 3)[beam] + direction.reshape(-1, 3)[beam] * distance[:, None]
+    returns = (sums.alpha > filter.opacity_threshold) & (distance >= nearest) & (distance <= farthest)
+    returns &= sums.features[..., 2] <= filter.raydrop_threshold * sums.alpha
+    if filter.distance_threshold_m is not None:
+        returns &= np.abs(distance - mean) <= filter.distance_threshold_m
+    intensity = np.clip(sums.features[..., 0] / np.maximum(sums.features[..., 1], 1e-12), 0, 1)
+    world = origin[returns] + direction[returns] * distance[returns, None]
     return LidarFrame(
         lidar=request.sensor,
         start_us=request.start_us,
         end_us=request.end_us,
         xyz_m=geometry.transform_points(geometry.inverse(request.world_from_sensor[1]), world).astype(np.float32),
-        range_m=distance.astype(np.float32),
-        intensity=intensity.reshape(-1)[beam].astype(np.float32),
-        beam=beam.astype(np.int32),
+        range_m=distance[returns].astype(np.float32),
+        intensity=intensity[returns].astype(np.float32),
+        beam=np.flatnonzero(returns).astype(np.int32),
     )
-
-
-def visible_gaussians(scene: GaussianScene, request: SensorRequest, grid: RayGrid) -> tuple[Gaussians, np.ndarray]:
-    """Both layers at the reference instant, coloured for the view, and the order of those in front."""
-    world_from_sensor, t_us = reference_pose(request, grid.reference)
-    actors = {
-        name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(grid.reference))
-        for name, pair in request.actors.items()
-    }
-    eye = world_from_sensor[:3, 3]
-    static = scene.static
-    if static.sh_rest is not None:
-        rgb = view_colour(static.rgb, static.sh_rest, static.mean_m - eye).astype(np.float32)
-        static = Gaussians(static.mean_m, static.quat_wxyz, static.scale_m, static.opacity, rgb, static.normal,
-                           static.label, static.intensity)  # fmt: skip
-    moving = moving_gaussians(scene.dynamic, scene.tracks, t_us, actors, eye)
-    gaussians = Gaussians.concatenate([static, moving])
-    centre = geometry.transform_points(geometry.inverse(world_from_sensor), gaussians.mean_m)
-    depth = np.linalg.norm(centre, axis=-1) if grid.by_range else centre[:, 2]
-    order = np.argsort(depth, kind="stable")
-    return gaussians, order[depth[order] >= grid.near_m]
 
 
 def blend_rays(
     gaussians: Gaussians,
     features: Float64[np.ndarray, "n c"],
-    order: np.ndarray,
-    origin: Float64[np.ndarray, "h w 3"],
-    direction: Float64[np.ndarray, "h w 3"],
-    grid: RayGrid,
+    order: Int64[np.ndarray, " k"],
+    origin: Float64[np.ndarray, "*rays 3"],
+    direction: Float64[np.ndarray, "*rays 3"],
+    near_m: float,
+    valid: Bool[np.ndarray, "*rays"] | None = None,
 ) -> RaySums:
-    """Blend Gaussians front to back along every ray."""
-    shape = direction.shape[:2]
-    transmittance, live = np.ones(shape), grid.valid.copy()
-    sums, distance, alpha_sum = np.zeros((*shape, features.shape[1])), np.zeros(shape), np.zeros(shape)
-    half = np.zeros(shape)
-    best, label = np.zeros(shape), np.full(shape, int(Label.SKY))
-    rotation = geometry.matrix_from_quat(gaussians.quat_wxyz)
-    for i in order:
-        canonical = (rotation[i] / gaussians.scale_m[i].astype(np.float64)).T
-        o = (origin - gaussians.mean_m[i]) @ canonical.T
-        d = direction @ canonical.T
-        length = np.linalg.norm(d, axis=-1)
-        d = d / length[..., None]
-        q = np.sum(np.cross(d, o) ** 2, axis=-1)
-        t = -np.sum(d * o, axis=-1) / length
-        alpha = np.minimum(MAX_ALPHA, gaussians.opacity[i] * np.exp(-q / 2))
-        hit = live & (alpha >= MIN_ALPHA) & (t >= grid.near_m)
-        ends = hit & (transmittance * (1 - alpha) <= MIN_TRANSMITTANCE)
-        weight = np.where(hit & ~ends, alpha * transmittance, 0.0)
-        live &= ~ends
-        half = np.where((transmittance > 0.5) & (transmittance - weight <= 0.5), t, half)
-        transmittance -= weight
-        sums += weight[..., None] * features[i]
-        distance += weight * t
-        alpha_sum += weight
-        label = np.where(weight > best, gaussians.label[i], label)
-        best = np.maximum(best, weight)
-    return RaySums(sums, distance, half, alpha_sum, label)
+    """Blend Gaussians along rays.
+
+    Args:
+        gaussians: the world.
+        features: what is summed along a ray, a row per Gaussian.
+        order: rows of the Gaussians to blend, front to back.
+        origin: where the rays start.
+        direction: their unit directions.
+        near_m: hits nearer than this do not count.
+        valid: rays to blend; all others meet nothing. All if None.
+    """
+    shape = direction.shape[:-1]
+    count = int(np.prod(shape))
+    chosen = np.arange(count) if valid is None else np.flatnonzero(valid)
+    mean = gaussians.mean_m[order].astype(np.float64)
+    scale = np.maximum(gaussians.scale_m[order].astype(np.float64), MIN_SCALE_M)
+    # S^-1 R^T: from the world to the axes and units in which the Gaussian is a unit sphere.
+    canonical = np.swapaxes(geometry.matrix_from_quat(gaussians.quat_wxyz[order]), 1, 2) / scale[:, :, None]
+    opacity = np.minimum(gaussians.opacity[order].astype(np.float64), MAX_OPACITY)
+    reach_m = scale.max(axis=1) * np.sqrt(np.maximum(2 * np.log(opacity / MIN_ALPHA), 0))
+
+    sums, label = np.zeros((count, features.shape[1] + 3)), np.full(count, int(Label.SKY))
+    step = max(1, PAIRS_AT_ONCE // max(len(order), 1))
+    for start in range(0, len(chosen), step):
+        rays = chosen[start : start + step]
+        o, d = origin.reshape(-1, 3)[rays], direction.reshape(-1, 3)[rays]
+        ray, row = np.nonzero(lines_near(o, d, mean, reach_m))
+        alpha, t = response(o[ray], d[ray], mean[row], canonical[row], opacity[row])
+        hit = (alpha >= MIN_ALPHA) & (t >= near_m)
+        if not hit.any():
+            continue
+        ray, row, alpha, t = ray[hit], order[row[hit]], alpha[hit], t[hit]
+        weight, before, after = composite(ray, alpha)
+        half = np.where((before > 0.5) & (after <= 0.5), t, 0)
+        columns = np.column_stack([weight[:, None] * features[row], weight, weight * t, half])
+        for c, column in enumerate(columns.T):
+            sums[rays, c] = np.bincount(ray, column, minlength=len(rays))
+        first = np.unique(ray, return_index=True)[1]
+        heaviest = np.lexsort((-weight, ray))[first]
+        label[rays[ray[first]]] = gaussians.label[row[heaviest]]
+    alpha, distance, half = np.moveaxis(sums[:, -3:], 1, 0).reshape(3, *shape)
+    return RaySums(sums[:, :-3].reshape(*shape, -1), distance, half, alpha, label.reshape(shape))
+
+
+def composite(ray: Int64[np.ndarray, " n"], alpha: Values) -> tuple[Values, Values, Values]:
+    """Weights of hits, and the transmittance before and after each.
+
+    Args:
+        ray: to which ray each hit belongs, rising.
+        alpha: of the hits, front to back within a ray.
+    """
+    place = np.arange(len(ray)) - np.searchsorted(ray, ray)
+    clear = np.ones((ray[-1] + 1, place.max() + 2))
+    clear[ray, place + 1] = 1 - alpha
+    transmittance = np.cumprod(clear, axis=1)
+    before, after = transmittance[ray, place], transmittance[ray, place + 1]
+    return np.where(before > MIN_TRANSMITTANCE, alpha * before, 0.0), before, after
+
+
+def response(
+    origin: Vectors, direction: Vectors, mean: Vectors, canonical: Float64[np.ndarray, "n 3 3"], opacity: Values
+) -> tuple[Values, Values]:
+    """Alpha and distance at which rays meet Gaussians, pair by pair; the formula at the top of the module."""
+    o = np.einsum("nij,nj->ni", canonical, origin - mean)
+    d = np.einsum("nij,nj->ni", canonical, direction)
+    length = np.linalg.norm(d, axis=-1)
+    d = d / length[:, None]
+    q = np.sum(np.cross(d, o) ** 2, axis=-1)
+    return opacity * np.exp(-q / 2), -np.sum(d * o, axis=-1) / length
+
+
+def lines_near(
+    origin: Float64[np.ndarray, "r 3"],
+    direction: Float64[np.ndarray, "r 3"],
+    mean: Float64[np.ndarray, "n 3"],
+    reach_m: Float64[np.ndarray, " n"],
+) -> Bool[np.ndarray, "r n"]:
+    """Which lines pass a Gaussian within its reach, the distance at which its largest axis has faded to 1/255."""
+    middle = origin.mean(axis=0)  # squares of large coordinates would lose the small distances between them
+    o, m = origin - middle, mean - middle
+    along = direction @ m.T - np.sum(direction * o, axis=1, keepdims=True)
+    squared = np.sum(o**2, axis=1, keepdims=True) - 2 * o @ m.T + np.sum(m**2, axis=1)
+    return squared - along**2 <= reach_m**2 + 1e-9 * (squared + 1)
+
+
+def unit(vectors: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
+    """Vectors of unit length; those that vanish stay zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 1e-6, vectors / np.maximum(length, 1e-6), 0)
 
 
 def sky_colour(
@@ -205,16 +293,16 @@ def sky_colour(
 
 
 def finish_colour(
-    colour: Float64[np.ndarray, "h w 3"],
-    alpha: Float64[np.ndarray, "h w"],
-    sky: Float64[np.ndarray, "h w 3"],
+    colour: Float64[np.ndarray, "*n 3"],
+    alpha: Float64[np.ndarray, "*n"],
+    sky: Float64[np.ndarray, "*n 3"],
     isp: Float64[np.ndarray, "3 4"] | None,
-) -> Float64[np.ndarray, "h w 3"]:
+) -> Float64[np.ndarray, "*n 3"]:
     """The sky behind the Gaussians, then the camera's affine colour correction."""
     colour = colour + (1 - alpha)[..., None] * sky
     return colour if isp is None else colour @ isp[:, :3].T + isp[:, 3]
 
 
-def to_uint8(colour: Float64[np.ndarray, "h w 3"]) -> np.ndarray:
+def to_uint8(colour: Float64[np.ndarray, "*n 3"]) -> np.ndarray:
     """0..1 to 0..255, rounded half up, clipped."""
     return np.floor(np.clip(colour, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -108,8 +108,10 @@ def read_scene(path: Path | str) -> GaussianScene:
         static = _read_fields(static_usd, ["/Static/background", "/Static/road"], counts["static"], f"{path}: static")
         actors_usd = open_member(path, ACTORS_LAYER)
         moving = _read_fields(actors_usd, field_paths(actors_usd), counts["dynamic"], f"{path}: dynamic")
-        if not len(moving) and counts["dynamic_sh_rest"]:  # no field is there to tell their degree
-            moving = dataclasses.replace(moving, sh_rest=np.zeros((0, counts["dynamic_sh_rest"], 3), np.float32))
+        if not len(moving):  # no field is there to tell which optional ones they have
+            harmonics = np.zeros((0, counts["dynamic_sh_rest"], 3), np.float32) if counts["dynamic_sh_rest"] else None
+            drop = np.zeros(0, np.float32) if counts.get("dynamic_ray_drop") else None
+            moving = dataclasses.replace(moving, sh_rest=harmonics, ray_drop=drop)
         dynamic = DynamicGaussians(moving, *(_read_npy(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS)))
         isp_json = codec.load(package.read(ISP, MAX_JSON_BYTES), f"{path}: {ISP}")
         isp = codec.from_json(codec.mapping(codec.array(np.float64, 3, 4)), isp_json, f"{path}: {ISP}")
@@ -156,6 +158,7 @@ def _manifest(scene: GaussianScene, digest: str, members: dict[str, bytes]) -> d
             "static": len(scene.static),
             "dynamic": len(scene.dynamic),
             "dynamic_sh_rest": 0 if harmonics is None else harmonics.shape[1],
+            "dynamic_ray_drop": int(scene.dynamic.gaussians.ray_drop is not None),
         },
         "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},
     }

@@ -9,7 +9,7 @@ import numpy as np
 
 from nurec_sim.scene import codec
 from nurec_sim.scene.facts import scene_facts
-from nurec_sim.types import GAUSSIAN_FIELDS, Gaussians, GaussianScene, Label
+from nurec_sim.types import GAUSSIAN_FIELDS, OPTIONAL_GAUSSIAN_FIELDS, Gaussians, GaussianScene, Label
 
 
 def scene_arrays(scene: GaussianScene) -> dict[str, np.ndarray]:
@@ -22,8 +22,8 @@ def scene_arrays(scene: GaussianScene) -> dict[str, np.ndarray]:
 
 
 def _columns(gaussians: Gaussians) -> Mapping[str, np.ndarray]:
-    columns = {name: getattr(gaussians, name) for name in GAUSSIAN_FIELDS}
-    return columns if gaussians.sh_rest is None else columns | {"sh_rest": gaussians.sh_rest}
+    columns = {name: getattr(gaussians, name) for name in GAUSSIAN_FIELDS + OPTIONAL_GAUSSIAN_FIELDS}
+    return {name: column for name, column in columns.items() if column is not None}
 
 
 def scene_hash(scene: GaussianScene) -> str:

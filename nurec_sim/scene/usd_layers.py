@@ -5,7 +5,7 @@ Conventions of OpenUSD: quaternion arrays are ``x, y, z, w`` in memory, spherica
 ``absoluteTimeOffsetMicroSec``, which is the scene's start.
 
 What a ParticleField cannot hold travels in primvars of our namespace: the exact display colour (the DC coefficient
-rounds it), the normal, the semantic class, the LiDAR intensity, and ``index``, the place of a Gaussian in its scene.
+rounds it), the normal, the semantic class, LiDAR intensity and ray drop, and ``index``, its place in the scene.
 """
 
 from __future__ import annotations
@@ -175,13 +175,17 @@ def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray
 
     types = Sdf.ValueTypeNames
     primvars = UsdGeom.PrimvarsAPI(field)
-    for name, kind, array in (
+    columns = [
         ("index", types.IntArray, Vt.IntArray.FromNumpy(np.ascontiguousarray(index))),
         ("rgb", types.Color3fArray, Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(gaussians.rgb))),
         ("normal", types.Normal3fArray, Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(gaussians.normal))),
         ("semanticClass", types.UCharArray, Vt.UCharArray.FromNumpy(np.ascontiguousarray(gaussians.label))),
         ("intensity", types.FloatArray, Vt.FloatArray.FromNumpy(np.ascontiguousarray(gaussians.intensity))),
-    ):
+    ]
+    if gaussians.ray_drop is not None:
+        drop = Vt.FloatArray.FromNumpy(np.ascontiguousarray(gaussians.ray_drop))
+        columns.append(("rayDrop", types.FloatArray, drop))
+    for name, kind, array in columns:
         primvars.CreatePrimvar(f"{NAMESPACE}:{name}", kind, UsdGeom.Tokens.vertex).Set(array)
     return field
 
@@ -219,6 +223,8 @@ def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Ga
         "intensity": values(f"{prefix}intensity", np.float32),
         "index": values(f"{prefix}index", np.int32),
     }
+    if layer.GetAttributeAtPath(f"{path}.{prefix}rayDrop") is not None:
+        columns["ray_drop"] = values(f"{prefix}rayDrop", np.float32)
     lengths = {name: len(column) for name, column in columns.items()} | {"coefficients": len(coefficients) / terms}
     wrong = {name: length for name, length in lengths.items() if length != n}
     if wrong:
@@ -227,7 +233,7 @@ def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Ga
     quat_wxyz = np.ascontiguousarray(columns["orientations"][:, [3, 0, 1, 2]])
     return columns["index"], Gaussians(
         positions, quat_wxyz, columns["scales"], columns["opacities"], columns["rgb"], columns["normal"],
-        columns["label"], columns["intensity"], rest,
+        columns["label"], columns["intensity"], rest, columns.get("ray_drop"),
     )  # fmt: skip
 
 

@@ -17,6 +17,9 @@ from nurec_sim.sensors.lens import check_lens, project_lens, unproject_lens
 from nurec_sim.types import CameraModel, FTheta, Lens, Shutter, Windshield
 
 ROLLING_ITERATIONS = 10
+KEPT_PIXELS = 1 << 22
+"""Rays of images up to this size are kept for the next caller."""
+PIXELS_AT_ONCE = 1 << 16
 
 Points2 = Float64[np.ndarray, "n 2"]
 Points3 = Float64[np.ndarray, "n 3"]
@@ -61,19 +64,28 @@ def unproject(camera: CameraModel, uv_px: Points2) -> tuple[Points3, Mask]:
 
 
 def pixel_rays(camera: CameraModel) -> tuple[Float64[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Unit rays through all pixel centres, and which are valid; read-only, the latest few are kept."""
-    return _pixel_rays(camera.lens, camera.windshield, camera.width_px, camera.height_px)
+    """Unit rays through all pixel centres, and which are valid; read-only, the latest few of usual size are kept."""
+    usual = camera.width_px * camera.height_px <= KEPT_PIXELS
+    make = _kept_pixel_rays if usual else _pixel_rays
+    return make(camera.lens, camera.windshield, camera.width_px, camera.height_px)
 
 
-@functools.lru_cache(maxsize=8)
 def _pixel_rays(lens: Lens, glass: Windshield | None, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     camera = CameraModel("", width, height, lens, np.eye(4), windshield=glass)
-    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays, valid = unproject(camera, np.stack([columns, rows], axis=-1).reshape(-1, 2))
-    rays, valid = rays.reshape(height, width, 3), valid.reshape(height, width)
+    rays, valid = np.empty((height, width, 3)), np.empty((height, width), bool)
+    # In strips, so that what happens in between fits into the caches, and an image of any size into memory.
+    step = max(1, PIXELS_AT_ONCE // width)
+    for first in range(0, height, step):
+        last = min(first + step, height)
+        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(first, last) + 0.5)
+        strip, seen = unproject(camera, np.stack([columns, rows], axis=-1).reshape(-1, 2))
+        rays[first:last], valid[first:last] = strip.reshape(-1, width, 3), seen.reshape(-1, width)
     rays.setflags(write=False)
     valid.setflags(write=False)
     return rays, valid
+
+
+_kept_pixel_rays = functools.lru_cache(maxsize=8)(_pixel_rays)
 
 
 def in_image(camera: CameraModel, uv_px: Points2) -> Mask:

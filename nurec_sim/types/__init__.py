@@ -28,6 +28,7 @@ from nurec_sim.types.loop import (
 )
 from nurec_sim.types.scenes import (
     GAUSSIAN_FIELDS,
+    OPTIONAL_GAUSSIAN_FIELDS,
     DynamicGaussians,
     Gaussians,
     GaussianScene,
@@ -35,6 +36,7 @@ from nurec_sim.types.scenes import (
 )
 from nurec_sim.types.sensing import (
     CameraFrame,
+    LidarFilter,
     LidarFrame,
     Sense,
     SensorFrame,
@@ -77,11 +79,13 @@ __all__ = [
     "Gaussians",
     "Label",
     "Lens",
+    "LidarFilter",
     "LidarFrame",
     "LidarModel",
     "MOVABLE_LABELS",
     "Matrix4",
     "Needs",
+    "OPTIONAL_GAUSSIAN_FIELDS",
     "Observation",
     "Pinhole",
     "Plan",

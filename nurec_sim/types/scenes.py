@@ -31,7 +31,9 @@ class Gaussians:
 
     ``rgb`` is the display-space colour in 0..1 (degree 0); ``sh_rest`` holds the view-dependent spherical-harmonic
     coefficients of degree 1 and up (k = 3, 8 or 15, basis and order as in 3DGS files) or None. ``intensity`` is the
-    LiDAR return in 0..1, NaN where unknown. ``normal`` is a unit vector, zero where unknown.
+    LiDAR return in 0..1, NaN where unknown. ``normal`` is a unit vector, zero where unknown. ``ray_drop`` is the
+    probability in 0..1 that a LiDAR beam which meets the Gaussian does not return (glass, black paint, water), or None:
+    every beam returns.
     """
 
     mean_m: Float32[np.ndarray, "n 3"]
@@ -43,17 +45,21 @@ class Gaussians:
     label: UInt8[np.ndarray, " n"]
     intensity: Float32[np.ndarray, " n"]
     sh_rest: Float32[np.ndarray, "n k 3"] | None = None
+    ray_drop: Float32[np.ndarray, " n"] | None = None
 
     def __len__(self) -> int:
         return len(self.mean_m)
 
     def __getitem__(self, index: np.ndarray | slice) -> Gaussians:
         fields: dict[str, Any] = {name: getattr(self, name)[index] for name in GAUSSIAN_FIELDS}
-        return Gaussians(**fields, sh_rest=None if self.sh_rest is None else self.sh_rest[index])
+        for name in OPTIONAL_GAUSSIAN_FIELDS:
+            values = getattr(self, name)
+            fields[name] = None if values is None else values[index]
+        return Gaussians(**fields)
 
     @classmethod
     def empty(cls, n: int = 0) -> Gaussians:
-        """N Gaussians of zeros (identity rotation, unknown intensity)."""
+        """N Gaussians of zeros (identity rotation, unknown intensity, no optional fields)."""
         quat = np.zeros((n, 4), np.float32)
         quat[:, 0] = 1
         zeros3 = np.zeros((n, 3), np.float32)
@@ -62,7 +68,10 @@ class Gaussians:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Gaussians]) -> Gaussians:
-        """All parts one after the other; every part has ``sh_rest`` of one degree, or none has."""
+        """All parts one after the other; every part has ``sh_rest`` of one degree, or none has.
+
+        If some parts have ``ray_drop``, those without get 0.
+        """
         if not parts:
             return cls.empty()
         rest = [part.sh_rest for part in parts]
@@ -72,10 +81,17 @@ class Gaussians:
         fields: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in parts]) for name in GAUSSIAN_FIELDS
         }
-        return cls(**fields, sh_rest=merged)
+        drops = [part.ray_drop for part in parts]
+        ray_drop = None
+        if any(drop is not None for drop in drops):
+            ray_drop = np.concatenate(
+                [np.zeros(len(p), np.float32) if d is None else d for p, d in zip(parts, drops, strict=True)]
+            )
+        return cls(**fields, sh_rest=merged, ray_drop=ray_drop)
 
 
 GAUSSIAN_FIELDS = ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal", "label", "intensity")
+OPTIONAL_GAUSSIAN_FIELDS = ("sh_rest", "ray_drop")
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
+from nurec_sim.errors import RequestError
 from nurec_sim.types.sensors import CameraModel, LidarModel
 
 
@@ -28,7 +30,11 @@ class SensorRequest:
 
 @dataclass(frozen=True)
 class CameraFrame:
-    """A rendered image. ``depth_m`` is the distance along the optical axis of the visible surface, 0 where none."""
+    """A rendered image.
+
+    ``depth_m`` is the distance along the optical axis of the visible surface, 0 where none; ``normal`` the surface's
+    unit normal in the world, turned to the camera, zero where none is known.
+    """
 
     camera: CameraModel
     start_us: int
@@ -38,6 +44,33 @@ class CameraFrame:
     alpha: Float32[np.ndarray, "h w"] | None = None
     label: UInt8[np.ndarray, "h w"] | None = None
     normal: Float32[np.ndarray, "h w 3"] | None = None
+
+
+@dataclass(frozen=True)
+class LidarFilter:
+    """Which beams of a simulated LiDAR return.
+
+    Args:
+        raydrop_threshold: beams whose drop probability is above it are lost, 0..1.
+        opacity_threshold: beams whose gathered opacity does not exceed it meet nothing, 0..1.
+        distance_threshold_m: beams whose range differs by more than this from the mean range of all that they meet
+            have hit two things (an edge, a floater) and are lost; None keeps them.
+
+    Raises:
+        RequestError: a threshold is not finite or out of its range.
+    """
+
+    raydrop_threshold: float = 0.5
+    opacity_threshold: float = 0.5
+    distance_threshold_m: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("raydrop_threshold", "opacity_threshold"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise RequestError(f"{name} must lie in 0..1, got {getattr(self, name)}")
+        limit = self.distance_threshold_m
+        if limit is not None and not 0 <= limit < math.inf:
+            raise RequestError(f"distance_threshold_m must be finite and not negative, or None, got {limit}")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
@@ -12,13 +13,15 @@ from jaxtyping import Float64, UInt8
 from nurec_sim.errors import RequestError
 from nurec_sim.render.encode import encode_image
 from nurec_sim.render.requests import check_pose_pair
-from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, LidarModel, SensorRequest
+from nurec_sim.types import CameraFrame, CameraModel, LidarFilter, LidarFrame, LidarModel, SensorRequest
 from nurec_sim.wire.messages import ImageFormat
 from nurec_sim.wire.poses import check_interval, read_poses, write_poses
 from nurec_sim.wire.sensors import read_camera, read_lidar, write_camera, write_lidar
 
 _ENCODER = {ImageFormat.PNG: "png", ImageFormat.JPEG: "jpeg", ImageFormat.RGB_UINT8_PLANAR: "rgb_planar"}
 DEFAULT_JPEG_QUALITY = 95
+DEFAULT_DISTANCE_THRESHOLD_M = 1.0
+"""Of a request that enables the distance filter without saying how far is too far."""
 
 Sensor = TypeVar("Sensor", CameraModel, LidarModel)
 
@@ -94,18 +97,29 @@ def read_camera_request(message, cameras: Mapping[str, CameraModel]) -> tuple[Se
     return _read_frame(message, camera), options
 
 
-def read_lidar_request(message) -> tuple[SensorRequest, float | None]:
-    """The request of a ``LidarRenderRequest``, and its opacity threshold if it has one.
+def read_lidar_request(message) -> tuple[SensorRequest, LidarFilter]:
+    """The request of a ``LidarRenderRequest``, and which of its beams return.
 
     Raises:
         RequestError: a field is missing or malformed; the text names it.
     """
-    threshold = None
-    if message.render_filter.HasField("opacity_threshold"):
-        threshold = message.render_filter.opacity_threshold
-        if not 0 <= threshold <= 1:
-            raise RequestError(f"render_filter.opacity_threshold must lie in 0..1, got {threshold}")
-    return _read_frame(message, read_lidar(message.lidar_config)), threshold
+    return _read_frame(message, read_lidar(message.lidar_config)), _read_lidar_filter(message.render_filter)
+
+
+def _read_lidar_filter(message) -> LidarFilter:
+    """Thresholds that are left out are ``LidarFilter``'s own; the distance filter is off unless it is enabled."""
+    given = {name: getattr(message, name) for name in ("raydrop_threshold", "opacity_threshold")
+             if message.HasField(name)}  # fmt: skip
+    distance = message.distance_filter_threshold if message.HasField("distance_filter_threshold") else None
+    try:
+        checked = LidarFilter(**given, distance_threshold_m=distance)
+    except RequestError as error:
+        raise RequestError(
+            f"render_filter: {error}".replace("distance_threshold_m", "distance_filter_threshold")
+        ) from None
+    enabled = message.enable_distance_filter
+    limit = (DEFAULT_DISTANCE_THRESHOLD_M if distance is None else distance) if enabled else None
+    return dataclasses.replace(checked, distance_threshold_m=limit)
 
 
 def _read_frame(message, sensor) -> SensorRequest:

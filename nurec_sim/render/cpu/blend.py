@@ -1,241 +1,287 @@
-"""Kernel that blends a tile's records front to back with the exact response along every ray; float32."""
+"""Vector code that blends a list of records into a block of 8 x 8 rays, whose sums stay in registers.
+
+A block's state is [planes, 64] float32: transmittance, features, distance, and for cameras the largest weight so far,
+whose lowest bits hold the label it came with, for LiDARs the distance at which the transmittance fell to a half.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from llvmlite import ir
 
-from nurec_sim.render.cpu.kernel import f4, inner, kernel
-from nurec_sim.render.cpu.projection import BALL, DEEP, FADE, FEATURE, MAP, ORIGIN, RANGE, RIM, SLOPE, TAG, TILE
+from nurec_sim.render.cpu.records import LABEL_BITS
+from nurec_sim.render.cpu.simd import I8, I32, I64, INTS, LANES, Lanes, Vector, spread, vector_kernel
+from nurec_sim.render.cpu.tiles import (
+    AFFINE,
+    B_D0,
+    B_DX,
+    B_DY,
+    BATCH,
+    C_DRIFT,
+    C_FADE,
+    C_FEATURE,
+    C_FLAT,
+    C_NORMAL,
+    C_TAG,
+    C_W,
+    C_X,
+    C_Y,
+    MOVING,
+    RAYS,
+    SIDE,
+    TABLE,
+)
 
-CELLS = TILE * TILE
-"""Rays of a tile; they are blended at once and their sums stay in the first-level cache."""
+CAMERA, NORMALS, LIDAR = 0, 1, 2
+"""What is summed up: three features, distance and label; the same and three more features; features, distance, half."""
 
-PLANES = 7
-"""Output planes: three features, distance, alpha, label, distance at half transmittance."""
+# Planes of a block's state.
+T, FEATURES = 0, 1
+PLANES = {CAMERA: 6, NORMALS: 9, LIDAR: 6}
+"""T, 3 features, (3 more,) distance, and the largest weight or the half distance."""
+MOST_PLANES = 9
 
-# Sections of a tile's buffer, CELLS values each.
-DX, DY, DZ, OX, OY, OZ, LIVE, SUM = 0, 1, 2, 3, 4, 5, 6, 7
-BEST = SUM + PLANES
-SECTIONS = BEST + 1
+# Planes of a block's rays: direction, 1 where there is one else 0, place on the way of a moving sensor.
+DX, DY, DZ, VALID, PLACE = 0, 1, 2, 3, 4
+RAY_PLANES = 5
 
 CUT = math.log(255.0) / 8
+MIN_TRANSMITTANCE = 1e-4
+VECTORS = RAYS // LANES
+"""Vectors that cover a block."""
+AT_ONCE = 4 if LANES == 16 else 2
+"""Vectors of rays that are blended at once: as many as the registers hold."""
 
 
-def _exponential() -> tuple[np.float32, ...]:
+def _exponential() -> list[float]:
     """Coefficients of the quartic nearest to exp(-x) on 0..CUT in relative terms (Chebyshev nodes)."""
     x = (1 - np.cos((np.arange(64) + 0.5) * np.pi / 64)) / 2 * CUT
     basis = np.stack([x**k for k in range(5)], axis=1) * np.exp(x)[:, None]
-    return tuple(np.float32(c) for c in np.linalg.lstsq(basis, np.ones(64), rcond=None)[0])
+    return [float(c) for c in np.linalg.lstsq(basis, np.ones(64), rcond=None)[0]]
 
 
-E0, E1, E2, E3, E4 = _exponential()
+EXPONENTIAL = _exponential()
 
 
-@inner
-def _load_rays(b, direction, valid, line, lines, x0, y0, width, height):
-    """Rays of a tile in the reference frame; cells outside of the grid or without a ray are dead from the start."""
-    alive = 0
-    for k in range(CELLS):
-        x, y = x0 + k % TILE, y0 + k // TILE
-        b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k] = f4(0), f4(0), f4(1)
-        b[OX * CELLS + k], b[OY * CELLS + k], b[OZ * CELLS + k] = f4(0), f4(0), f4(0)
-        b[LIVE * CELLS + k] = f4(0)
-        for s in range(SUM, SECTIONS):
-            b[s * CELLS + k] = f4(0)
-        if x < width and y < height and valid[y, x] != 0:
-            dx, dy, dz = direction[y, x, 0], direction[y, x, 1], direction[y, x, 2]
-            if lines.shape[0] > 1:
-                m = lines[line[y, x]]
-                b[OX * CELLS + k], b[OY * CELLS + k], b[OZ * CELLS + k] = m[9], m[10], m[11]
-                dx, dy, dz = (m[0] * dx + m[1] * dy + m[2] * dz, m[3] * dx + m[4] * dy + m[5] * dz,
-                              m[6] * dx + m[7] * dy + m[8] * dz)  # fmt: skip
-            b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k] = dx, dy, dz
-            b[LIVE * CELLS + k] = f4(1)
-            alive += 1
-    return alive
+def fading(x: list[Vector]) -> list[Vector]:
+    """exp(-8 x) for x in 0..CUT to 2e-5: the quartic, three times squared."""
+    e = [xi * EXPONENTIAL[4] + EXPONENTIAL[3] for xi in x]
+    for c in EXPONENTIAL[2::-1]:
+        e = [ei * xi + c for ei, xi in zip(e, x, strict=True)]
+    for _ in range(3):
+        e = [ei * ei for ei in e]
+    return e
 
 
-@inner
-def _bundle(b, middle):
-    """A cone around a tile's rays: ``middle`` gets its direction and origin; returns its spread of both."""
-    for e in range(6):
-        middle[e] = f4(0)
-    alive = f4(0)
-    for k in range(CELLS):
-        live = b[LIVE * CELLS + k]
-        alive += live
-        for e in range(6):
-            middle[e] += live * b[e * CELLS + k]
-    for e in range(6):
-        middle[e] /= alive
-    wide = shift = f4(0)
-    for k in range(CELLS):
-        if b[LIVE * CELLS + k] > f4(0):
-            dx, dy, dz = b[DX * CELLS + k] - middle[0], b[DY * CELLS + k] - middle[1], b[DZ * CELLS + k] - middle[2]
-            ox, oy, oz = b[OX * CELLS + k] - middle[3], b[OY * CELLS + k] - middle[4], b[OZ * CELLS + k] - middle[5]
-            wide, shift = max(wide, dx * dx + dy * dy + dz * dz), max(shift, ox * ox + oy * oy + oz * oz)
-    return math.sqrt(wide), math.sqrt(shift)
-
-
-@inner
-def _misses(records, i, middle, wide, shift, moving):
-    """Whether no ray of a bundle can meet a Gaussian before it has faded to 1/255; never wrongly true."""
-    dx, dy, dz = middle[0], middle[1], middle[2]
-    x = records[i, MAP] * dx + records[i, MAP + 1] * dy + records[i, MAP + 2] * dz
-    y = records[i, MAP + 3] * dx + records[i, MAP + 4] * dy + records[i, MAP + 5] * dz
-    w = records[i, MAP + 6] * dx + records[i, MAP + 7] * dy + records[i, MAP + 8] * dz
-    rim = records[i, RIM]
-    if moving:
-        # Seen from the bundle's origin the centre lies at -gro, a little off the third axis.
-        far = records[i, RANGE]
-        px, py, pz = (
-            middle[3] - records[i, ORIGIN],
-            middle[4] - records[i, ORIGIN + 1],
-            middle[5] - records[i, ORIGIN + 2],
-        )
-        gx = records[i, MAP] * px + records[i, MAP + 1] * py + records[i, MAP + 2] * pz
-        gy = records[i, MAP + 3] * px + records[i, MAP + 4] * py + records[i, MAP + 5] * pz
-        gw = far - (records[i, MAP + 6] * px + records[i, MAP + 7] * py + records[i, MAP + 8] * pz)
-        if abs(gx) + abs(gy) > f4(0.1) * gw:
-            return False
-        ahead = w / gw
-        x, y = x + ahead * gx, y + ahead * gy
-        wide = f4(1.1) * (wide + shift / gw)
-        rim *= f4(1.05) * far / gw
-    nearest = math.sqrt(x * x + y * y) - records[i, SLOPE] * wide
-    return nearest > rim * max(w + records[i, DEEP] * wide, f4(0))
-
-
-@inner
-def _add(b, k, a, t, near, fa, fb, fc, tag):
-    """Blend a hit at distance ``t`` into ray k; its alpha is exp(-8 a)."""
-    e = E0 + a * (E1 + a * (E2 + a * (E3 + a * E4)))
-    e = e * e
-    e = e * e
-    e = min(e * e, f4(0.99))
-    live = b[LIVE * CELLS + k]
-    weight = e * live
-    left = live - weight
-    hit = (a < f4(CUT)) & (t >= near)
-    ends = left <= f4(1e-4)
-    weight = weight if hit & (not ends) else f4(0)
-    half = hit & (live > f4(0.5)) & (left <= f4(0.5))
-    b[(SUM + 6) * CELLS + k] = t if half else b[(SUM + 6) * CELLS + k]
-    left = f4(0) if ends else left
-    b[LIVE * CELLS + k] = left if hit else live
-    b[SUM * CELLS + k] += weight * fa
-    b[(SUM + 1) * CELLS + k] += weight * fb
-    b[(SUM + 2) * CELLS + k] += weight * fc
-    b[(SUM + 3) * CELLS + k] += weight * t
-    b[(SUM + 4) * CELLS + k] += weight
-    best = b[BEST * CELLS + k]
-    b[(SUM + 5) * CELLS + k] = tag if weight > best else b[(SUM + 5) * CELLS + k]
-    b[BEST * CELLS + k] = max(weight, best)
-
-
-@inner
-def _blend_fixed(b, records, i, near):
-    """Blend one record into a tile whose rays all start at the reference point."""
-    m00, m01, m02, m10, m11, m12 = (
-        records[i, MAP],
-        records[i, MAP + 1],
-        records[i, MAP + 2],
-        records[i, MAP + 3],
-        records[i, MAP + 4],
-        records[i, MAP + 5],
-    )
-    m20, m21, m22 = records[i, MAP + 6], records[i, MAP + 7], records[i, MAP + 8]
-    ball, fade, far, tag = records[i, BALL], records[i, FADE], records[i, RANGE], records[i, TAG]
-    fa, fb, fc = records[i, FEATURE], records[i, FEATURE + 1], records[i, FEATURE + 2]
-    for k in range(CELLS):
-        dx, dy, dz = b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k]
-        x = m00 * dx + m01 * dy + m02 * dz
-        y = m10 * dx + m11 * dy + m12 * dz
-        w = m20 * dx + m21 * dy + m22 * dz
-        off = x * x + y * y
-        inverse = f4(1) / (off + w * w)
-        a = ball * off * inverse + fade
-        t = far * w * inverse
-        _add(b, k, a, t, near, fa, fb, fc, tag)
-
-
-@inner
-def _blend_moving(b, records, i, near):
-    """Blend one record into a tile whose rays start anywhere: full cross product with the offset of the origin."""
-    m00, m01, m02, m10, m11, m12 = (
-        records[i, MAP],
-        records[i, MAP + 1],
-        records[i, MAP + 2],
-        records[i, MAP + 3],
-        records[i, MAP + 4],
-        records[i, MAP + 5],
-    )
-    m20, m21, m22 = records[i, MAP + 6], records[i, MAP + 7], records[i, MAP + 8]
-    ball, fade, far, tag = records[i, BALL], records[i, FADE], records[i, RANGE], records[i, TAG]
-    fa, fb, fc = records[i, FEATURE], records[i, FEATURE + 1], records[i, FEATURE + 2]
-    ox, oy, oz = records[i, ORIGIN], records[i, ORIGIN + 1], records[i, ORIGIN + 2]
-    for k in range(CELLS):
-        dx, dy, dz = b[DX * CELLS + k], b[DY * CELLS + k], b[DZ * CELLS + k]
-        px, py, pz = b[OX * CELLS + k] - ox, b[OY * CELLS + k] - oy, b[OZ * CELLS + k] - oz
-        x = m00 * dx + m01 * dy + m02 * dz
-        y = m10 * dx + m11 * dy + m12 * dz
-        w = m20 * dx + m21 * dy + m22 * dz
-        gx = m00 * px + m01 * py + m02 * pz
-        gy = m10 * px + m11 * py + m12 * pz
-        gw = m20 * px + m21 * py + m22 * pz - far
-        cx, cy, cw = y * gw - w * gy, w * gx - x * gw, x * gy - y * gx
-        inverse = f4(1) / (x * x + y * y + w * w)
-        a = ball * (cx * cx + cy * cy + cw * cw) * inverse + fade
-        t = -(x * gx + y * gy + w * gw) * inverse
-        _add(b, k, a, t, near, fa, fb, fc, tag)
-
-
-@kernel
-def blend(tiles, starts, lists, records, direction, valid, line, lines, near, columns, planes):
-    """Blend the given tiles into ``planes`` [7,h,w]: three features, distance, alpha (weighted sums), label, half.
+def responses(
+    v: Lanes,
+    way: int,
+    coefficient: Callable[[int], Vector],
+    rays: Callable[[int], list[Vector]],
+    x: Vector,
+    y: list[Vector],
+) -> tuple[list[Vector], list[Vector]]:
+    """Faded exponents Q1 / Q2 + FADE and distances t of one record for some vectors of rays.
 
     Args:
-        tiles: numbers of the tiles to do.
-        starts: [tiles+1] where each tile's list starts.
-        lists: rows of ``records`` front to back, tile after tile.
-        records: see projection.
-        direction: [h,w,3] rays in the sensor frame, with valid and line as in ``Grid``.
-        valid: [h,w].
-        line: [h,w].
-        lines: poses per line; a single one when nothing moves.
-        near: near plane.
-        columns: tiles per row of tiles.
-        planes: output; cells that see nothing hold 0.
+        v: vectors.
+        way: AFFINE, TABLE or MOVING.
+        coefficient: a row of the record's coefficients in all lanes.
+        rays: a plane of the rays, per vector (unused for AFFINE).
+        x: cells from the tile's centre (AFFINE), the same for every vector.
+        y: the same along y, per vector.
     """
-    height, width = valid.shape
-    b = np.empty(SECTIONS * CELLS, np.float32)
-    middle = np.empty(6, np.float32)
-    moving = lines.shape[0] > 1
-    for index in range(tiles.shape[0]):
-        tile = tiles[index]
-        x0, y0 = tile % columns * TILE, tile // columns * TILE
-        if _load_rays(b, direction, valid, line, lines, x0, y0, width, height) > 0:
-            wide, shift = _bundle(b, middle)
-            done = 0
-            for j in range(starts[tile], starts[tile + 1]):
-                i = np.uint64(lists[j])  # unsigned: spares the test for negative indices
-                if _misses(records, i, middle, wide, shift, moving):
-                    continue
-                if moving:
-                    _blend_moving(b, records, i, near)
+    count = len(y)
+    rows = [[coefficient(start + k) for k in range(3)] for start in (C_X, C_Y, C_W)]
+    if way == AFFINE:
+        first = [row[0] + row[1] * x for row in rows]
+        big_x, big_y, big_w = ([first[r] + rows[r][2] * y[k] for k in range(count)] for r in range(3))
+    else:
+        d = [rays(plane) for plane in (DX, DY, DZ)]
+        big_x, big_y, big_w = (
+            [row[0] * d[0][k] + row[1] * d[1][k] + row[2] * d[2][k] for k in range(count)] for row in rows
+        )
+    flat, fade = coefficient(C_FLAT), coefficient(C_FADE)
+    q1 = [a * a + b * b for a, b in zip(big_x, big_y, strict=True)]
+    q2 = [flat * q + w * w for q, w in zip(q1, big_w, strict=True)]
+    inverse = [q.reciprocal() for q in q2]
+    if way != MOVING:
+        return (
+            [q * i + fade for q, i in zip(q1, inverse, strict=True)],
+            [w * i for w, i in zip(big_w, inverse, strict=True)],
+        )
+    # The origin lies s v from the reference point; exact, see ``tiles.py``.
+    xv, yv, wv = (coefficient(C_DRIFT + k) for k in range(3))
+    exponents, distances = [], []
+    for k, s in enumerate(rays(PLACE)):
+        rest = 1 - s * wv
+        step = s * big_w[k]
+        a, b = big_x[k] * rest + xv * step, big_y[k] * rest + yv * step
+        c = s * (big_x[k] * yv - big_y[k] * xv)
+        exponents.append((a * a + b * b + flat * c * c) * inverse[k] + fade)
+        along = big_w[k] * rest - s * flat * (big_x[k] * xv + big_y[k] * yv)
+        distances.append(along * inverse[k])
+    return exponents, distances
+
+
+def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
+    @vector_kernel("iiiiiifff")
+    def blend(
+        v: Lanes,
+        state: ir.Value,
+        numbers: ir.Value,
+        count: ir.Value,
+        coefficients: ir.Value,
+        rays: ir.Value,
+        basis: ir.Value,
+        x0: ir.Value,
+        y0: ir.Value,
+        near: ir.Value,
+    ) -> ir.Value:
+        """Blend records into a block; returns 1 while any of its rays still has transmittance.
+
+        Args:
+            v: vectors.
+            state: address of [planes,64].
+            numbers: address of the records' numbers in the batch, a byte each.
+            count: how many, at least 1.
+            coefficients: address of [COEFFICIENTS,BATCH].
+            rays: address of the block's [RAY_PLANES,64].
+            basis: address of the tile's basis.
+            x0: first cell's x from the tile's centre.
+            y0: the same for y.
+            near: near plane.
+        """
+        b = v.b
+        alive: ir.Value | None = None
+        for part in range(0, VECTORS, AT_ONCE):
+            row = SIDE * 4  # bytes of 8 rays
+            offsets = [4 * LANES * (part + k) for k in range(AT_ONCE)]
+            assert row * SIDE == 4 * RAYS
+            x = v.numbers([lane % SIDE for lane in range(LANES)]) + v.spread(x0)
+            y = [
+                v.numbers([((part + k) * LANES + lane) // SIDE for lane in range(LANES)]) + v.spread(y0)
+                for k in range(AT_ONCE)
+            ]
+
+            def plane_of(base: ir.Value, plane: int, offsets: list[int] = offsets) -> list[Vector]:
+                return [v.load(base, 4 * RAYS * plane + offset, align=32) for offset in offsets]
+
+            def body(
+                i: ir.Value, values: list[Vector], x: Vector = x, y: list[Vector] = y, plane_of: Any = plane_of
+            ) -> list[Vector]:
+                number = b.zext(b.load(v.pointer(numbers, i), typ=I8, align=1), I64)
+                where = v.address(coefficients, b.shl(number, ir.Constant(I64, 2)))
+
+                def coefficient(k: int) -> Vector:
+                    return v.broadcast(where, 4 * BATCH * k)
+
+                planes = [values[k : k + AT_ONCE] for k in range(0, len(values), AT_ONCE)]
+                exponent, distance = responses(v, way, coefficient, lambda plane: plane_of(rays, plane), x, y)
+                hits = [e < CUT for e in exponent]
+                if check_near:
+                    least = v.spread(near)
+                    if way == AFFINE:
+                        d = [[v.broadcast(basis, 4 * (start + c)) for start in (B_D0, B_DX, B_DY)] for c in range(3)]
+                        for k in range(AT_ONCE):
+                            lengths = [c[0] + c[1] * x + c[2] * y[k] for c in d]
+                            length = (
+                                lengths[0] * lengths[0] + lengths[1] * lengths[1] + lengths[2] * lengths[2]
+                            ).sqrt()
+                            hits[k] = hits[k] & (distance[k] * length >= least)
+                    else:
+                        hits = [hit & (t >= least) for hit, t in zip(hits, distance, strict=True)]
+                distance = [hit.where(t, 0) for hit, t in zip(hits, distance, strict=True)]  # no NaN from a miss
+                alpha = fading(exponent)
+                before = planes[T]
+                weight = [hit.where(a * t, 0) for hit, a, t in zip(hits, alpha, before, strict=True)]
+                after = [t - w for t, w in zip(before, weight, strict=True)]
+                result = [after]
+                features = [C_FEATURE + k for k in range(3)] + (
+                    [C_NORMAL + k for k in range(3)] if kind == NORMALS else []
+                )
+                for plane, feature in zip(planes[FEATURES:], features, strict=False):
+                    f = coefficient(feature)
+                    result.append([p + w * f for p, w in zip(plane, weight, strict=True)])
+                result.append([p + w * t for p, w, t in zip(planes[-2], weight, distance, strict=True)])
+                if kind == LIDAR:
+                    crossing = [(t > 0.5) & (u <= 0.5) for t, u in zip(before, after, strict=True)]
+                    result.append([c.where(t, p) for c, t, p in zip(crossing, distance, planes[-1], strict=True)])
                 else:
-                    _blend_fixed(b, records, i, near)
-                done += 1
-                if done % 16 == 0:
-                    live = f4(0)
-                    for k in range(CELLS):
-                        live += b[LIVE * CELLS + k]
-                    if live == f4(0):
-                        break
-        for k in range(CELLS):
-            x, y = x0 + k % TILE, y0 + k // TILE
-            if x < width and y < height:
-                for p in range(PLANES):
-                    planes[p, y, x] = b[(SUM + p) * CELLS + k]
+                    label = b.and_(coefficient(C_TAG).bits(), ir.Constant(INTS, [LABEL_BITS] * LANES))
+                    keep = ir.Constant(INTS, [~LABEL_BITS] * LANES)
+                    tagged = [v.from_bits(b.or_(b.and_(w.bits(), keep), label)) for w in weight]
+                    result.append([p.max(w) for p, w in zip(planes[-1], tagged, strict=True)])
+                return [value for plane in result for value in plane]
+
+            initial = [value for plane in range(PLANES[kind]) for value in plane_of(state, plane)]
+            final = v.repeat(count, initial, body)
+            for plane in range(PLANES[kind]):
+                for k, offset in enumerate(offsets):
+                    v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset, align=32)
+            most = final[0]
+            for other in final[1:AT_ONCE]:
+                most = most.max(other)
+            left = (most > MIN_TRANSMITTANCE).any()
+            alive = left if alive is None else b.or_(alive, left)
+        assert alive is not None
+        return alive
+
+    return blend
+
+
+blend_affine_camera = _blending(AFFINE, CAMERA, False)
+blend_affine_camera_near = _blending(AFFINE, CAMERA, True)
+blend_affine_normals = _blending(AFFINE, NORMALS, True)
+blend_table_camera = _blending(TABLE, CAMERA, True)
+blend_table_normals = _blending(TABLE, NORMALS, True)
+blend_table_lidar = _blending(TABLE, LIDAR, True)
+blend_moving_camera = _blending(MOVING, CAMERA, True)
+blend_moving_normals = _blending(MOVING, NORMALS, True)
+blend_moving_lidar = _blending(MOVING, LIDAR, True)
+
+
+@vector_kernel("iii")
+def open_block(v: Lanes, state: ir.Value, planes: ir.Value, rays: ir.Value) -> None:
+    """Start a block: full transmittance where there is a ray (everywhere if ``rays`` is 0), all sums zero."""
+    b = v.b
+    table = b.icmp_signed("!=", rays, ir.Constant(I64, 0))
+    source = b.select(table, b.add(rays, ir.Constant(I64, 4 * RAYS * VALID)), state)
+    for k in range(VECTORS):
+        valid = v.load(source, 4 * LANES * k, align=32)
+        one = b.select(spread(b, table, ir.VectorType(ir.IntType(1), LANES)), valid.value, v.number(1).value)
+        v.store(Vector(b, one), state, 4 * LANES * k, align=32)
+
+    def clear(i: ir.Value, values: list[Vector]) -> list[Vector]:
+        v.store(v.number(0), state, b.mul(b.add(i, ir.Constant(I64, VECTORS)), ir.Constant(I64, 4 * LANES)), align=32)
+        return values
+
+    v.repeat(b.mul(b.sub(planes, ir.Constant(I64, 1)), ir.Constant(I64, VECTORS)), [], clear)
+
+
+def _writing(count: int) -> Callable[..., Any]:
+    @vector_kernel("iiii")
+    def write_block(v: Lanes, state: ir.Value, target: ir.Value, row_bytes: ir.Value, plane_bytes: ir.Value) -> None:
+        """Copy a block's state to image planes [planes,h,w] whose sides are multiples of 8; T becomes alpha."""
+        b = v.b
+        half = ir.VectorType(ir.FloatType(), SIDE)
+        for plane in range(count):
+            base = b.add(target, b.mul(plane_bytes, ir.Constant(I64, plane)))
+            for k in range(VECTORS):
+                x = v.load(state, 4 * (RAYS * plane + LANES * k), align=32)
+                x = 1 - x if plane == T else x
+                for part in range(LANES // SIDE):
+                    lanes = ir.Constant(ir.VectorType(I32, SIDE), list(range(SIDE * part, SIDE * part + SIDE)))
+                    row = k * (LANES // SIDE) + part
+                    piece = b.shuffle_vector(x.value, x.value, lanes)
+                    assert piece.type == half
+                    b.store(piece, v.pointer(base, b.mul(row_bytes, ir.Constant(I64, row))), align=4)
+
+    return write_block
+
+
+write_block_6, write_block_9 = _writing(6), _writing(9)

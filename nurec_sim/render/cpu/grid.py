@@ -12,15 +12,13 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from nurec_sim import sensors
+from nurec_sim.render.cpu.charts import MIDDLE, PARAMETERS, TEXELS, Chart, extrapolated, lens_chart, lidar_chart
 from nurec_sim.render.rays import ray_grid
 from nurec_sim.types import CameraModel, LidarModel, Pinhole, Shutter, Spin
 
 PINHOLE, LENS, LIDAR = 0, 1, 2
-LENS_TABLE_SIZE = 129
 LIDAR_TABLE_SIZE = 8193
-IMAGE_MARGIN_RAD = 0.05
-FIELD_MARGIN_RAD = 0.6
-"""How far outside its field a lens table goes on, so that Gaussians over the edge are bounded well."""
+NO_CHART = Chart(np.zeros(PARAMETERS, np.float32), np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +49,8 @@ class Grid:
     """Cosine of the largest angle between a ray and the z axis; -1 for LiDARs."""
     line_axis: int
     """0 where a line is a row, 1 where it is a column."""
+    chart: Chart
+    """From directions to places; empty for an ideal pinhole with a global shutter."""
 
 
 def make_grid(sensor: CameraModel | LidarModel) -> Grid:
@@ -77,48 +77,20 @@ def _camera_grid(camera: CameraModel) -> Grid:
         line = np.indices((height, width), np.int32)[1 if by_column else 0]
         fraction = rays.fraction[0] if by_column else rays.fraction[:, 0]
     field_cos = float(direction[rays.valid][:, 2].min()) if rays.valid.any() else 1.0
-    lens = camera.lens
+    lens, chart = camera.lens, NO_CHART
+    ideal = isinstance(lens, Pinhole) and not lens.distorted and camera.windshield is None
+    if not ideal or len(fraction) > 1:
+        chart = lens_chart(camera, direction, rays.valid)
     if isinstance(lens, Pinhole) and not lens.distorted and camera.windshield is None:
         kind, table = PINHOLE, np.zeros((1, 1, 2), np.float32)
         params = np.array([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px], np.float32)
     else:
-        field = np.arccos(np.clip(field_cos, -1, 1))
-        rim = min(field + FIELD_MARGIN_RAD, 0.97 * np.pi)
-        kind, table = LENS, _lens_table(camera, np.tan(rim / 2), field + IMAGE_MARGIN_RAD)
-        params = np.array([np.tan(rim / 2), np.cos(rim)], np.float32)
+        half_width = chart.params[MIDDLE] / chart.params[TEXELS]
+        kind, table = LENS, np.ascontiguousarray(chart.places[..., :2])
+        params = np.array([half_width, np.cos(2 * np.arctan(half_width))], np.float32)
     return Grid(kind, direction, rays.valid.astype(np.uint8), np.ascontiguousarray(line), np.asarray(fraction), None,
                 params, table, np.zeros(height, np.int32), rays.reference, rays.by_range, rays.near_m, field_cos,
-                int(by_column))  # fmt: skip
-
-
-def _lens_table(camera: CameraModel, half_width: float, field_rad: float) -> Float32[np.ndarray, "s s 2"]:
-    """Pixels by stereographic direction (x, y) / (1 + z), continued linearly outside of ``field_rad`` and of the lens.
-
-    Distortion polynomials may run away outside of the image, where nobody fitted them.
-    """
-    p = np.linspace(-half_width, half_width, LENS_TABLE_SIZE)
-    x, y = np.tile(p, LENS_TABLE_SIZE), np.repeat(p, LENS_TABLE_SIZE)
-    angle, azimuth = 2 * np.arctan(np.hypot(x, y)), np.arctan2(y, x)
-
-    def look(angle_rad: np.ndarray, azimuth_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        flat = np.sin(angle_rad)
-        xyz = np.stack([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.cos(angle_rad)], axis=-1)
-        uv, valid = sensors.project(camera, xyz)
-        return uv, valid & (angle_rad <= field_rad)
-
-    uv, valid = look(angle, azimuth)
-    # The first invalid angle along each outward line, by bisection; beyond it the image goes on with its last slope.
-    outside = np.flatnonzero(~valid)
-    low, high = np.zeros(len(outside)), angle[outside].copy()
-    for _ in range(24):
-        middle = (low + high) / 2
-        inside = look(middle, azimuth[outside])[1]
-        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
-    step = 1e-3
-    rim_uv, _ = look(low, azimuth[outside])
-    inner_uv, _ = look(np.maximum(low - step, 0), azimuth[outside])
-    uv[outside] = rim_uv + (rim_uv - inner_uv) * ((angle[outside] - low) / step)[:, None]
-    return np.nan_to_num(uv, nan=-1e6).reshape(LENS_TABLE_SIZE, LENS_TABLE_SIZE, 2).astype(np.float32)
+                int(by_column), chart)  # fmt: skip
 
 
 def _lidar_grid(lidar: LidarModel) -> Grid:
@@ -134,16 +106,17 @@ def _lidar_grid(lidar: LidarModel) -> Grid:
     fired = (np.arange(columns)[None, :] - shift[:, None]) % columns
     row = np.arange(rows)[:, None]
     low, high = -gap / 2, 2 * np.pi - gap / 2
-    column_of = _extrapolated(np.linspace(low, high, LIDAR_TABLE_SIZE), azimuth, steps.mean())
+    column_of = extrapolated(np.linspace(low, high, LIDAR_TABLE_SIZE), azimuth, steps.mean())
     sines = np.linspace(-1, 1, LIDAR_TABLE_SIZE)
     down = -np.asarray(lidar.elevation_rad, np.float64)
-    row_of = _extrapolated(-np.arcsin(sines), down, steps.mean())
+    row_of = extrapolated(-np.arcsin(sines), down, steps.mean())
     residual = offset - shift
     params = [sign, lidar.azimuth_rad[0], gap / 2, 1 / steps.min(), full_circle, residual.min(), residual.max(),
               min(shift.min(), 0), max(shift.max(), 0)]  # fmt: skip
+    direction = np.ascontiguousarray(rays.direction[row, fired], np.float32)
     return Grid(
         kind=LIDAR,
-        direction=np.ascontiguousarray(rays.direction[row, fired], np.float32),
+        direction=direction,
         valid=np.ones((rows, columns), np.uint8),
         line=fired.astype(np.int32),
         line_fraction=np.asarray(sensors.column_fraction(lidar), np.float64),
@@ -156,12 +129,5 @@ def _lidar_grid(lidar: LidarModel) -> Grid:
         near_m=rays.near_m,
         field_cos=-1.0,
         line_axis=1,
+        chart=lidar_chart(lidar, direction, shift),
     )
-
-
-def _extrapolated(value: np.ndarray, grid: np.ndarray, default_step: float) -> np.ndarray:
-    """Fractional index of values in a rising grid, carried on linearly past its ends."""
-    if len(grid) == 1:
-        return (value - grid[0]) / default_step
-    low = np.clip(np.searchsorted(grid, value, side="right") - 1, 0, len(grid) - 2)
-    return low + (value - grid[low]) / (grid[low + 1] - grid[low])

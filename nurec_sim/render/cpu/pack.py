@@ -1,68 +1,120 @@
-"""Gaussians as the kernels read them: one 64-byte row each, in blocks that lie close together in space."""
+"""Gaussians as the kernels read them: blocks of neighbours in space, each a structure of float32 arrays."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from nurec_sim.types import Gaussians
 
-# Columns of a packed Gaussian.
-MEAN, QUAT, SCALE, LOG_OPACITY, REACH, COLOUR, LABEL = 0, 3, 7, 10, 11, 12, 15
-PACKED = 16
+# Fields of a block.
+MEAN, QUAT, SCALE, LOG_OPACITY, COLOUR, LABEL, INTENSITY, KNOWN, DROP, NORMAL = 0, 3, 7, 10, 11, 14, 15, 16, 17, 18
+FIELDS = 21
 
 BLOCK = 256
 MIN_SCALE_M = 1e-5
+MAX_OPACITY = 0.99
+REACH = float(np.sqrt(2 * np.log(255)))
+"""Standard deviations at which an opaque Gaussian has faded to 1/255."""
+NEVER_SEEN = -1e9
+"""LOG_OPACITY of rows that only fill a block up."""
+LARGEST = 1e12
+"""Positions, scales and colours beyond this are taken for broken."""
 
 
 @dataclass(frozen=True, eq=False)
 class PackedGaussians:
-    """Rows for the kernels, and a sphere around every block of ``BLOCK`` rows."""
+    """Gaussians in blocks of ``BLOCK``; the last block of a group is filled up with rows that are never seen.
 
-    rows: Float32[np.ndarray, "n 16"]
-    intensity: Float32[np.ndarray, " n"]
-    sh_rest: Float32[np.ndarray, "n k 3"]
-    block_centre: Float64[np.ndarray, "b 3"]
-    block_radius: Float64[np.ndarray, " b"]
+    ``index`` is the row of each packed Gaussian in the Gaussians it was packed from, -1 where it only fills up.
+    ``block_centre`` and ``block_radius`` bound everything of a block that is at least 1/255 opaque. ``sh_rest`` is
+    coefficient-major, row 3 j + c for coefficient j of colour c, and [0,0,0] without view-dependent colours.
+    """
+
+    fields: Float32[np.ndarray, "blocks 21 256"]
+    sh_rest: Float32[np.ndarray, "blocks k3 256"]
+    index: Int32[np.ndarray, " rows"]
+    block_centre: Float64[np.ndarray, "blocks 3"]
+    block_radius: Float64[np.ndarray, " blocks"]
 
     def __len__(self) -> int:
-        return len(self.rows)
+        """Number of blocks."""
+        return len(self.fields)
 
 
 def pack(gaussians: Gaussians, sort: bool = True) -> PackedGaussians:
-    """Pack Gaussians, dropping what can never be drawn (not finite, opacity below 1/255).
+    """Pack Gaussians; those that can never be drawn (not finite, opacity below 1/255) are left out.
 
     ``sort`` groups neighbours in space into blocks, which changes the order of Gaussians of exactly equal depth only.
     """
-    rows = np.zeros((len(gaussians), PACKED), np.float32)
-    quat = gaussians.quat_wxyz.astype(np.float64)
-    norm = np.linalg.norm(quat, axis=1, keepdims=True)
-    scale = np.maximum(gaussians.scale_m, MIN_SCALE_M)
-    rows[:, MEAN : MEAN + 3] = gaussians.mean_m
-    rows[:, QUAT : QUAT + 4] = quat / np.maximum(norm, 1e-12)
-    rows[:, SCALE : SCALE + 3] = scale
-    opacity = gaussians.opacity.astype(np.float64)
-    rows[:, LOG_OPACITY] = np.log(np.clip(opacity, 1e-6, 1.0))
-    rows[:, REACH] = scale.max(axis=1) * np.sqrt(2 * np.log(255))
-    rows[:, COLOUR : COLOUR + 3] = gaussians.rgb
-    rows[:, LABEL] = gaussians.label
-    keep = np.isfinite(rows).all(axis=1) & (norm[:, 0] > 1e-12) & (opacity >= 1 / 255)
-    chosen = np.flatnonzero(keep)
+    chosen = np.flatnonzero(drawable(gaussians))
     if sort and len(chosen):
-        chosen = chosen[np.argsort(_morton(rows[chosen, :3]), kind="stable")]
-    rows = rows[chosen]
+        chosen = chosen[morton_order(gaussians.mean_m[chosen])]
+    blocks = -(-len(chosen) // BLOCK)
+    index = np.full(blocks * BLOCK, -1, np.int32)
+    index[: len(chosen)] = chosen
     rest = gaussians.sh_rest
-    rest = np.zeros((0, 0, 3), np.float32) if rest is None else np.ascontiguousarray(rest[chosen], np.float32)
-    centre, radius = _block_spheres(rows)
-    return PackedGaussians(rows, np.ascontiguousarray(gaussians.intensity[chosen], np.float32), rest, centre, radius)
+    fields = to_blocks(gaussian_columns(gaussians, chosen), blocks, fill=LOG_OPACITY)
+    sh_rest = np.zeros((0, 0, 0), np.float32)
+    if rest is not None and len(chosen):
+        sh_rest = to_blocks(rest[chosen].reshape(len(chosen), -1).astype(np.float32), blocks)
+    centre, radius = block_spheres(fields)
+    return PackedGaussians(fields, sh_rest, index, centre, radius)
 
 
-def _morton(points: Float32[np.ndarray, "n 3"]) -> np.ndarray:
-    """Place of points along a Z-order curve of 2^21 cells a side."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    cells = (points - low) / max(float((high - low).max()), 1e-9) * (2**21 - 1)
+def drawable(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
+    """Which Gaussians can be drawn at all: everything of them finite and sensible, opacity at least 1/255."""
+    norm = np.linalg.norm(gaussians.quat_wxyz.astype(np.float64), axis=1)
+    with np.errstate(invalid="ignore"):
+        keep = np.isfinite(norm) & (norm > 1e-12) & (gaussians.opacity >= np.float32(1 / 255))
+        keep &= np.isfinite(gaussians.opacity) & (gaussians.scale_m > 0).all(axis=1)
+        for values in (gaussians.mean_m, gaussians.scale_m, gaussians.rgb):
+            keep &= (np.abs(values) <= LARGEST).all(axis=1)
+        if gaussians.sh_rest is not None:
+            keep &= np.isfinite(gaussians.sh_rest).all(axis=(1, 2))
+    return keep
+
+
+def gaussian_columns(gaussians: Gaussians, chosen: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n 21"]:
+    """The fields of the chosen Gaussians, one row each."""
+    columns = np.zeros((len(chosen), FIELDS), np.float32)
+    quat = gaussians.quat_wxyz[chosen].astype(np.float64)
+    columns[:, MEAN : MEAN + 3] = gaussians.mean_m[chosen]
+    columns[:, QUAT : QUAT + 4] = quat / np.maximum(np.linalg.norm(quat, axis=1, keepdims=True), 1e-12)
+    columns[:, SCALE : SCALE + 3] = np.maximum(gaussians.scale_m[chosen], MIN_SCALE_M)
+    opacity = gaussians.opacity[chosen].astype(np.float64)
+    columns[:, LOG_OPACITY] = np.log(np.clip(opacity, 1e-6, MAX_OPACITY))
+    columns[:, COLOUR : COLOUR + 3] = gaussians.rgb[chosen]
+    columns[:, LABEL] = gaussians.label[chosen]
+    intensity = gaussians.intensity[chosen]
+    known = np.isfinite(intensity)
+    columns[:, INTENSITY], columns[:, KNOWN] = np.where(known, intensity, 0), known
+    drop = getattr(gaussians, "ray_drop", None)
+    if drop is not None:
+        columns[:, DROP] = np.clip(np.nan_to_num(drop[chosen]), 0, 1)
+    normal = gaussians.normal[chosen]
+    columns[:, NORMAL : NORMAL + 3] = np.where(np.isfinite(normal), np.clip(normal, -1, 1), 0)
+    return columns
+
+
+def to_blocks(
+    columns: Float32[np.ndarray, "n fields"], blocks: int, fill: int | None = None
+) -> Float32[np.ndarray, "blocks fields 256"]:
+    """Rows to blocks of arrays; rows that fill up are zero but for the column ``fill``, which is NEVER_SEEN."""
+    rows = np.zeros((blocks * BLOCK, columns.shape[1]), np.float32)
+    if fill is not None:
+        rows[:, fill] = NEVER_SEEN
+        rows[:, [QUAT, SCALE, SCALE + 1, SCALE + 2]] = 1
+    rows[: len(columns)] = columns
+    return np.ascontiguousarray(rows.reshape(blocks, BLOCK, columns.shape[1]).transpose(0, 2, 1))
+
+
+def morton_order(points: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+    """Order of points along a Z-order curve of 2^21 cells a side over all but the most distant of them."""
+    low, high = np.quantile(points, 0.001, axis=0), np.quantile(points, 0.999, axis=0)
+    cells = np.clip((points - low) / max(float((high - low).max()), 1e-9), 0, 1) * (2**21 - 1)
     code = np.zeros(len(points), np.uint64)
     for axis in range(3):
         v = cells[:, axis].astype(np.uint64)
@@ -70,14 +122,20 @@ def _morton(points: Float32[np.ndarray, "n 3"]) -> np.ndarray:
                             (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):  # fmt: skip
             v = (v | (v << np.uint64(shift))) & np.uint64(mask)
         code |= v << np.uint64(axis)
-    return code
+    return np.argsort(code, kind="stable")
 
 
-def _block_spheres(rows: Float32[np.ndarray, "n 16"]) -> tuple[np.ndarray, np.ndarray]:
-    starts = np.arange(0, len(rows), BLOCK)
-    if len(starts) == 0:
+def block_spheres(
+    fields: Float32[np.ndarray, "blocks 21 256"],
+) -> tuple[Float64[np.ndarray, "blocks 3"], Float64[np.ndarray, " blocks"]]:
+    """A sphere around everything of each block that is at least 1/255 opaque."""
+    if len(fields) == 0:
         return np.zeros((0, 3)), np.zeros(0)
-    mean = rows[:, :3].astype(np.float64)
-    reach = rows[:, REACH, None].astype(np.float64)
-    low, high = np.minimum.reduceat(mean - reach, starts), np.maximum.reduceat(mean + reach, starts)
+    mean = fields[:, MEAN : MEAN + 3].astype(np.float64)
+    reach = fields[:, SCALE : SCALE + 3].max(axis=1).astype(np.float64)[:, None] * REACH
+    seen = fields[:, None, LOG_OPACITY] > NEVER_SEEN
+    low = np.where(seen, mean - reach, np.inf).min(axis=2)
+    high = np.where(seen, mean + reach, -np.inf).max(axis=2)
+    empty = ~seen.any(axis=(1, 2))
+    low[empty], high[empty] = 0, 0
     return (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2

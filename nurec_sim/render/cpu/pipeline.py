@@ -1,194 +1,242 @@
-"""The stages of one frame on the CPU: cull, project, sort, bin, blend; the same for cameras and LiDARs.
+"""The stages of frames on the CPU: cull, project, sort, bin, blend; the same for cameras and LiDARs.
 
-Kernels release the interpreter lock and run on the renderer's own threads. Every stage splits its work into ranges
-whose results do not depend on how many there are, so frames are the same bytes at any thread count.
+Several frames go through each stage together, so that all threads have work until the last tile. Kernels release the
+interpreter lock. Every stage splits its work into ranges whose results do not depend on how many there are, so frames
+are the same bytes at any thread count.
 """
 
 from __future__ import annotations
 
-import contextlib
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Int32, Int64
 
-from nurec_sim import geometry
 from nurec_sim.render.cpu.binning import count_tiles, fill_tiles, sort_by_depth
-from nurec_sim.render.cpu.blend import PLANES, blend
-from nurec_sim.render.cpu.grid import LIDAR, Grid
+from nurec_sim.render.cpu.blend import CAMERA, LIDAR, NORMALS
+from nurec_sim.render.cpu.draw import EVALUATIONS, VISITS, draw_tiles, record_normals
+from nurec_sim.render.cpu.grid import LIDAR as LIDAR_GRID
 from nurec_sim.render.cpu.pack import BLOCK, PackedGaussians
-from nurec_sim.render.cpu.projection import RECORD, TILE, project
+from nurec_sim.render.cpu.project_general import project_general
+from nurec_sim.render.cpu.project_pinhole import project_pinhole
+from nurec_sim.render.cpu.rays import RayTiles
+from nurec_sim.render.cpu.records import MACRO, RECORD
+from nurec_sim.render.cpu.simd import LANES
+from nurec_sim.render.cpu.tiles import AFFINE, MOVING, ROLLING
+from nurec_sim.render.cpu.view import View
+from nurec_sim.render.cpu.workers import SPLIT, Lend, Workers
 
-SPLIT = 6
-"""Ranges per thread: enough to even out tiles of very different cost."""
-
-
-class Workers:
-    """Threads that run kernel calls; safe to use from many threads at once."""
-
-    def __init__(self, threads: int) -> None:
-        self.threads = threads
-        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="render") if threads > 1 else None
-
-    def run(self, function: Callable, arguments: Sequence[tuple]) -> list:
-        """``function`` of each tuple of arguments, in order."""
-        if self._pool is None or len(arguments) <= 1:
-            return [function(*each) for each in arguments]
-        return [future.result() for future in [self._pool.submit(function, *each) for each in arguments]]
-
-    def ranges(self, count: int, least: int) -> list[tuple[int, int]]:
-        """0..count cut into about ``SPLIT`` ranges per thread of at least ``least``."""
-        parts = max(1, min(self.threads * SPLIT if self.threads > 1 else 1, count // max(least, 1)))
-        edges = np.linspace(0, count, parts + 1).astype(np.int64)
-        return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+NO_TABLE = RayTiles(np.zeros((1, 1, 1, 1), np.float32), np.zeros((1, 1, 1), np.int16), np.zeros((1, 1, 1), np.float32))
+"""What a pinhole has instead of a table of rays."""
 
 
-class Buffers:
-    """Large scratch arrays, kept between frames; each frame has a set of its own."""
+@dataclass(eq=False)
+class FrameStats:
+    """What a frame took: Gaussians in view, pairs of them with macro tiles, responses, wall seconds per stage.
 
-    def __init__(self) -> None:
-        self._free: list[dict[str, np.ndarray]] = []
-        self._lock = threading.Lock()
+    Stages that several frames go through together count in full for each of them.
+    """
 
-    @contextlib.contextmanager
-    def lend(self) -> Iterator[Callable[[str, tuple[int, ...], type], np.ndarray]]:
-        """A function that gives an uninitialised array of a name, a shape and a type."""
-        with self._lock:
-            arrays = self._free.pop() if self._free else {}
-
-        def array(name: str, shape: tuple[int, ...], dtype: type) -> np.ndarray:
-            size = int(np.prod(shape))
-            if name not in arrays or arrays[name].size < size:
-                arrays[name] = np.empty(int(size * 1.2) + 64, dtype)
-            return arrays[name][:size].reshape(shape)
-
-        try:
-            yield array
-        finally:
-            with self._lock:
-                if len(self._free) < 4:
-                    self._free.append(arrays)
+    visible: int = 0
+    pairs: int = 0
+    visits: int = 0
+    evaluations: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class View:
-    """Where a grid looks from: poses of its lines, and their middle as the frame that everything is computed in."""
+@dataclass(eq=False)
+class Picture:
+    """One frame on its way through the stages.
 
-    world_from_reference: Float64[np.ndarray, "4 4"]
-    world_from_line: Float64[np.ndarray, "l 4 4"]
-    lines: Float32[np.ndarray, "l 24"]
+    ``layers`` are Gaussians and the numbers of their blocks to look at; ``kind`` is CAMERA, NORMALS or LIDAR.
+    ``records`` to ``lists`` are filled in by ``bin_pictures``: see ``records``, ``project_pinhole`` and ``binning``;
+    ``runs`` are the first row and the number of records that each layer has written, by range.
+    """
 
-    @classmethod
-    def of(cls, grid: Grid, pair: Float64[np.ndarray, "2 4 4"]) -> View:
-        """The view of a grid whose sensor moves from the first to the second pose; one line where it does not move."""
-        pair = np.asarray(pair, np.float64)
-        reference = geometry.interpolate_pose_pair(pair, np.array(grid.reference))
-        still = len(grid.line_fraction) == 1 or np.array_equal(pair[0], pair[1])
-        poses = reference[None] if still else geometry.interpolate_pose_pair(pair, grid.line_fraction)
-        reference_from_line = geometry.inverse(reference) @ poses
-        line_from_reference = geometry.inverse(reference_from_line)
-        parts = [m for pose in (reference_from_line, line_from_reference)
-                 for m in (pose[:, :3, :3].reshape(-1, 9), pose[:, :3, 3])]  # fmt: skip
-        return cls(reference, poses, np.concatenate(parts, axis=1).astype(np.float32))
+    view: View
+    rays: RayTiles
+    kind: int
+    layers: Sequence[tuple[PackedGaussians, Int64[np.ndarray, " b"]]]
+    array: Lend
+    records: Float32[np.ndarray, "n 16"] = field(init=False)
+    keys: Float32[np.ndarray, " n"] = field(init=False)
+    spans: np.ndarray = field(init=False)
+    sources: Int32[np.ndarray, " n"] = field(init=False)
+    runs: list[tuple[int, int, int]] = field(init=False)
+    order: Int32[np.ndarray, " m"] = field(init=False)
+    starts: Int64[np.ndarray, " t"] = field(init=False)
+    lists: Int32[np.ndarray, " p"] = field(init=False)
+    stats: FrameStats = field(default_factory=FrameStats)
 
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Columns and rows of the grid."""
+        height, width = self.view.grid.valid.shape
+        return width, height
 
-def draw(
-    grid: Grid,
-    view: View,
-    layers: Sequence[PackedGaussians],
-    use_intensity: bool,
-    workers: Workers,
-    buffers: Buffers,
-) -> Float32[np.ndarray, "7 h w"]:
-    """What ``blend`` leaves per ray; the features are colours, or intensity and whether it is known."""
-    height, width = grid.valid.shape
-    columns, rows = -(-width // TILE), -(-height // TILE)
-    planes = np.empty((PLANES, height, width), np.float32)
-    with buffers.lend() as array:
-        records, spans, order = _visible(grid, view, layers, use_intensity, workers, array)
-        starts, lists = _bin(spans, order, columns, rows, workers, array)
-        # Neighbouring tiles share records, so a thread takes runs of them, of about equal work.
-        work = np.cumsum(np.diff(starts) + 8)
-        parts = max(1, workers.threads * SPLIT) if workers.threads > 1 else 1
-        cuts = np.searchsorted(work, np.linspace(0, work[-1], parts + 1)[1:-1])
-        tiles = np.split(np.arange(columns * rows), cuts)
-        near = np.float32(grid.near_m)
-        workers.run(
-            blend,
-            [(some, starts, lists, records, grid.direction, grid.valid, grid.line, view.lines, near, columns, planes)
-             for some in tiles],
-        )  # fmt: skip
-    return planes
+    @property
+    def tile_columns(self) -> int:
+        """Macro tiles per row of them."""
+        return -(-self.cells[0] // MACRO)
+
+    @property
+    def tiles(self) -> int:
+        """Macro tiles in all."""
+        return self.tile_columns * -(-self.cells[1] // MACRO)
 
 
-def _visible(
-    grid: Grid, view: View, layers: Sequence[PackedGaussians], use_intensity: bool, workers: Workers, array: Callable
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Records of all layers, the tiles they span, and their order front to back."""
-    eye = view.world_from_reference[:3, 3].copy()
-    rotation = view.world_from_reference[:3, :3].T
-    quat = geometry.quat_from_matrix(rotation).astype(np.float32)
-    cells = np.array([grid.valid.shape[1], grid.valid.shape[0]], np.float32)
-    chosen = [_blocks_in_view(grid, view, layer) for layer in layers]
-    most = BLOCK * (2 if grid.kind == LIDAR else 1)  # records per block: around the seam of a turn two each
-    capacity = most * sum(len(blocks) for blocks in chosen)
-    records, keys = array("records", (capacity, RECORD), np.float32), array("keys", (capacity,), np.float32)
-    spans = array("spans", (capacity, 4), np.int16)
-    arguments, starts, base = [], [], 0
-    for layer, blocks in zip(layers, chosen, strict=True):
-        values = layer.intensity if use_intensity else layer.intensity[:0]
-        rest = layer.sh_rest[:0] if use_intensity else layer.sh_rest
-        for first, last in workers.ranges(len(blocks), 4):
-            starts.append(base)
-            arguments.append(
-                (layer.rows, values, rest, first, last, blocks, BLOCK, eye, quat, rotation.astype(np.float32),
-                 grid.kind, grid.params, grid.table, grid.row_shift, grid.line_axis, view.lines, cells, grid.by_range,
-                 np.float32(grid.near_m), records, spans, keys, base)
-            )  # fmt: skip
-            base += most * (last - first)
-    counts = np.array(workers.run(project, arguments), np.int64)
-    order = array("order", (int(counts.sum()),), np.int32)
-    sort_by_depth(keys, np.array(starts, np.int64), counts, order)
-    return records, spans, order
+def draw(pictures: Sequence[Picture], workers: Workers) -> list[Float32[np.ndarray, "p h w"]]:
+    """Blended planes of each picture, see ``draw.draw_tiles``; their sides are rounded up to whole blocks."""
+    bin_pictures(pictures, workers)
+    results, calls, counts = [], [], []
+    with _timed("blend", pictures):
+        for picture in pictures:
+            planes = _empty_planes(picture)
+            results.append(planes)
+            for tiles in tile_ranges(picture, workers.threads):
+                done = np.zeros(2, np.int64)
+                counts.append((picture, done))
+                calls.append((draw_tiles, *blend_arguments(picture, tiles), planes, done))
+        workers.run_calls(calls)
+    for picture, done in counts:
+        picture.stats.visits += int(done[VISITS])
+        picture.stats.evaluations += int(done[EVALUATIONS])
+    return results
 
 
-def _blocks_in_view(grid: Grid, view: View, layer: PackedGaussians) -> np.ndarray:
+def bin_pictures(pictures: Sequence[Picture], workers: Workers) -> None:
+    """All stages before blending: fill in the pictures' records and the lists of their macro tiles."""
+    with _timed("project", pictures):
+        _project(pictures, workers)
+    with _timed("sort", pictures):
+        totals = workers.run_calls([_sorting(picture) for picture in pictures])
+        for picture, total in zip(pictures, totals, strict=True):
+            picture.order, picture.stats.visible = picture.order[:total], int(total)
+    with _timed("bin", pictures):
+        _bin(pictures, workers)
+
+
+def tile_ranges(picture: Picture, threads: int) -> list[Int64[np.ndarray, " t"]]:
+    """Runs of neighbouring macro tiles, which share records, of about equal work."""
+    work = np.cumsum(np.diff(picture.starts) + 8)
+    parts = max(1, threads * SPLIT) if threads > 1 else 1
+    cuts = np.searchsorted(work, np.linspace(0, work[-1], parts + 1)[1:-1])
+    return [tiles for tiles in np.split(np.arange(picture.tiles), cuts) if len(tiles)]
+
+
+def blend_arguments(picture: Picture, tiles: Int64[np.ndarray, " t"]) -> tuple:
+    """The arguments of ``draw.draw_tiles`` up to the size of the grid."""
+    view, grid = picture.view, picture.view.grid
+    normals = picture.array("no normals", (1, 4), np.float32)
+    if picture.kind == NORMALS:
+        normals = picture.array("normals", (len(picture.records), 4), np.float32)
+    return (view.way, picture.kind, tiles, picture.starts, picture.lists, picture.records, normals, grid.params,
+            picture.rays.table, picture.rays.line, picture.rays.basis, view.turns, view.places, view.motion,
+            np.float32(grid.near_m), *picture.cells)  # fmt: skip
+
+
+def _empty_planes(picture: Picture) -> Float32[np.ndarray, "p h w"]:
+    width, height = (-(-cells // MACRO) * MACRO for cells in picture.cells)
+    return np.empty((9 if picture.kind == NORMALS else 6, height, width), np.float32)
+
+
+def _project(pictures: Sequence[Picture], workers: Workers) -> None:
+    calls: list[tuple] = []
+    owners = []
+    for picture in pictures:
+        view, grid = picture.view, picture.view.grid
+        most = BLOCK * (2 if grid.kind == LIDAR_GRID else 1)  # around the seam of a turn a Gaussian has two records
+        capacity = most * sum(len(blocks) for _, blocks in picture.layers) + LANES
+        picture.records = picture.array("records", (capacity, RECORD), np.float32)
+        picture.keys = picture.array("keys", (capacity,), np.float32)
+        picture.spans = picture.array("spans", (capacity, 4), np.int16)
+        picture.sources = picture.array("sources", (capacity,), np.int32)
+        picture.runs, base = [], 0
+        for number, (layer, blocks) in enumerate(picture.layers):
+            for first, last in workers.ranges(len(blocks), 4):
+                outputs = (picture.records, picture.keys, picture.spans, picture.sources, base)
+                what = (layer.fields, layer.sh_rest, blocks, first, last, view.parameters)
+                if view.way in (AFFINE, ROLLING):
+                    calls.append((project_pinhole, *what, view.ends, view.motion, *outputs))
+                else:
+                    chart = grid.chart
+                    tables = (chart.params, chart.places, chart.bends, view.lines, view.steps)
+                    calls.append((project_general, *what, picture.kind == LIDAR, *tables, *outputs))
+                owners.append((picture, number, base))
+                base += most * (last - first)
+    for (picture, number, base), count in zip(owners, workers.run_calls(calls), strict=True):
+        picture.runs.append((number, base, int(count)))
+    shading = [
+        (record_normals, layer.fields, picture.sources, first, count, view_eye(picture),
+         picture.array("normals", (len(picture.records), 4), np.float32))
+        for picture in pictures if picture.kind == NORMALS
+        for number, first, count in picture.runs for layer in [picture.layers[number][0]]
+    ]  # fmt: skip
+    workers.run_calls(shading)
+
+
+def view_eye(picture: Picture) -> np.ndarray:
+    """The reference point in the world."""
+    return picture.view.world_from_reference[:3, 3].copy()
+
+
+def _sorting(picture: Picture) -> tuple:
+    starts = np.array([first for _, first, _ in picture.runs], np.int64)
+    counts = np.array([count for _, _, count in picture.runs], np.int64)
+    total = int(counts.sum())
+    picture.order = picture.array("order", (total,), np.int32)
+    spare = picture.array("sorting", (2, total), np.uint64)
+    near = np.float32(picture.view.grid.near_m)
+    return sort_by_depth, picture.keys, starts, counts, near, picture.order, spare
+
+
+def _bin(pictures: Sequence[Picture], workers: Workers) -> None:
+    splits = [workers.ranges(len(picture.order), 20_000) for picture in pictures]
+    counts = [
+        np.zeros((len(ranges), picture.tiles), np.int64) for picture, ranges in zip(pictures, splits, strict=True)
+    ]
+    workers.run_calls(
+        [(count_tiles, picture.spans, picture.order, first, last, picture.tile_columns, count[k])
+         for picture, ranges, count in zip(pictures, splits, counts, strict=True)
+         for k, (first, last) in enumerate(ranges)],
+    )  # fmt: skip
+    calls = []
+    for picture, ranges, count in zip(pictures, splits, counts, strict=True):
+        picture.starts = np.zeros(picture.tiles + 1, np.int64)
+        np.cumsum(count.sum(axis=0), out=picture.starts[1:])
+        position = picture.starts[:-1] + np.cumsum(count, axis=0) - count
+        picture.stats.pairs = int(picture.starts[-1])
+        picture.lists = picture.array("lists", (picture.stats.pairs + LANES,), np.int32)
+        calls += [
+            (fill_tiles, picture.spans, picture.order, first, last, picture.tile_columns, position[k], picture.lists)
+            for k, (first, last) in enumerate(ranges)
+        ]
+    workers.run_calls(calls)
+
+
+@contextmanager
+def _timed(stage: str, pictures: Sequence[Picture]) -> Iterator[None]:
+    began = time.perf_counter()
+    yield
+    for picture in pictures:
+        picture.stats.seconds[stage] = time.perf_counter() - began
+
+
+def blocks_in_view(view: View, layer: PackedGaussians) -> Int64[np.ndarray, " b"]:
     """Blocks whose sphere meets the cone of the grid's rays, widened by the sensor's own motion."""
-    if grid.field_cos <= -1.0 or len(layer) == 0:
-        return np.arange(len(layer.block_radius))
-    travel = np.linalg.norm(view.world_from_line[:, :3, 3] - view.world_from_reference[:3, 3], axis=1).max()
-    axes = view.world_from_line[:, :3, 2]
+    if view.grid.field_cos <= -1.0 or len(layer) == 0:
+        return np.arange(len(layer))
     axis = view.world_from_reference[:3, 2]
-    swing = np.arccos(np.clip(axes @ axis, -1, 1)).max()
     offset = layer.block_centre - view.world_from_reference[:3, 3]
     distance = np.linalg.norm(offset, axis=1)
-    radius = layer.block_radius + travel
+    radius = layer.block_radius + view.travel_m
     angle = np.arccos(np.clip(offset @ axis / np.maximum(distance, 1e-9), -1, 1))
     reach = np.arcsin(np.clip(radius / np.maximum(distance, 1e-9), 0, 1))
-    field = np.arccos(grid.field_cos) + swing + 0.02
+    field = np.arccos(view.grid.field_cos) + view.swing_rad + 0.02
     return np.flatnonzero((distance <= radius) | (angle <= field + reach))
 
 
-def _bin(
-    spans: np.ndarray, order: np.ndarray, columns: int, rows: int, workers: Workers, array: Callable
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lists of records per tile, front to back, as (start of each tile's list, all lists)."""
-    tiles = columns * rows
-    ranges = workers.ranges(len(order), 20_000)
-    counts = np.zeros((len(ranges), tiles), np.int64)
-    workers.run(
-        count_tiles,
-        [(spans, order, first, last, columns, counts[k]) for k, (first, last) in enumerate(ranges)],
-    )
-    starts = np.zeros(tiles + 1, np.int64)
-    np.cumsum(counts.sum(axis=0), out=starts[1:])
-    position = starts[:-1] + np.cumsum(counts, axis=0) - counts
-    lists = array("lists", (int(starts[-1]),), np.int32)
-    workers.run(
-        fill_tiles,
-        [(spans, order, first, last, columns, position[k], lists) for k, (first, last) in enumerate(ranges)],
-    )
-    return starts, lists
+__all__ = ["CAMERA", "LIDAR", "MOVING", "NORMALS", "Picture", "FrameStats", "bin_pictures", "blocks_in_view", "draw"]

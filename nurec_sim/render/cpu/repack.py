@@ -1,0 +1,75 @@
+"""Kernel that packs Gaussians in the order given, for callers that change them before every frame."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from nurec_sim.render.cpu.kernel import f4, inner, kernel
+from nurec_sim.render.cpu.pack import (
+    BLOCK,
+    COLOUR,
+    INTENSITY,
+    LARGEST,
+    LOG_OPACITY,
+    MAX_OPACITY,
+    MEAN,
+    MIN_SCALE_M,
+    NEVER_SEEN,
+    QUAT,
+    SCALE,
+)
+
+
+@inner
+def _drawable(mean, quat, scale, opacity, features, i):
+    """What ``pack.drawable`` tests; written so that NaN fails."""
+    norm = 0.0
+    good = opacity[i] >= f4(1 / 255) and opacity[i] <= f4(LARGEST)
+    for k in range(3):
+        good = good and scale[i, k] > f4(0)
+        for value in (mean[i, k], scale[i, k], features[i, k]):
+            good = good and abs(value) <= f4(LARGEST)
+    for k in range(4):
+        norm += np.float64(quat[i, k]) ** 2
+    return good and norm > 1e-24 and norm <= LARGEST * LARGEST
+
+
+@kernel
+def repack(first, last, mean, quat, scale, opacity, features, lidar, fields):
+    """Fill blocks of ``fields``; row i of the Gaussians becomes packed row i.
+
+    Args:
+        first: first block.
+        last: one behind the last.
+        mean: [n,3] float32.
+        quat: [n,4] of any norm.
+        scale: [n,3].
+        opacity: [n].
+        features: [n,3] colours, or intensity, whether it is known, and drop probability.
+        lidar: whether the features are the latter.
+        fields: [blocks,21,256] output, see ``pack``.
+    """
+    feature = INTENSITY if lidar else COLOUR
+    fields[first:last] = f4(0)
+    for block in range(first, last):
+        out = fields[block]
+        out[QUAT] = f4(1)
+        out[SCALE : SCALE + 3] = f4(1)
+        out[LOG_OPACITY] = f4(NEVER_SEEN)
+        for k in range(min(BLOCK, len(mean) - block * BLOCK)):
+            i = block * BLOCK + k
+            if not _drawable(mean, quat, scale, opacity, features, i):
+                continue
+            norm = 0.0
+            for c in range(4):
+                norm += np.float64(quat[i, c]) ** 2
+            inverse = 1 / math.sqrt(norm)
+            for c in range(4):
+                out[QUAT + c, k] = f4(quat[i, c] * inverse)
+            for c in range(3):
+                out[MEAN + c, k] = mean[i, c]
+                out[SCALE + c, k] = max(scale[i, c], f4(MIN_SCALE_M))
+                out[feature + c, k] = features[i, c]
+            out[LOG_OPACITY, k] = f4(math.log(min(np.float64(opacity[i]), MAX_OPACITY)))

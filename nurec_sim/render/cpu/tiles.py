@@ -1,0 +1,273 @@
+"""Vector code that prepares the records of a macro tile for its 8 x 8 blocks of rays, LANES records at a time.
+
+In a macro tile of 32 x 32 cells of a pinhole a ray's direction is d0 + x dx + y dy for cells x, y from the tile's
+centre. A record's X, Y and W are then linear in (x, y), and the least Q1 over a block is that of a parabola over a
+square: an exact test of which blocks see it. Other grids read their rays from a table; for the test, each band of 8
+rows of a macro tile has a linear fit of its own, which is right up to ``bend``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+
+from nurec_sim.render.cpu.records import FADE, FEATURE, FLAT, INSIDE, LIM, LOG_255, MACRO, RECORD, TAG, WROW, XROW, YROW
+from nurec_sim.render.cpu.simd import (
+    BITS,
+    I1,
+    I8,
+    I32,
+    I64,
+    INTS,
+    LANES,
+    Lanes,
+    Mask,
+    Vector,
+    declare,
+    spread,
+    vector_kernel,
+)
+
+SIDE = 8
+"""Side of a block, in cells."""
+PER_SIDE = MACRO // SIDE
+BLOCKS = PER_SIDE * PER_SIDE
+RAYS = SIDE * SIDE
+BATCH = 128
+"""Records that are prepared at once; their coefficients stay in the first-level cache."""
+LIST = BATCH + LANES
+"""Room for the numbers of a batch's records that a block sees, a byte each."""
+
+# Rows of the coefficients [.., BATCH]. AFFINE: X, Y, W at the tile's centre and per cell along x and y, in turn;
+# otherwise the three rows of the record. DRIFT: the rows times the sensor's motion.
+C_X, C_Y, C_W, C_FLAT, C_FADE, C_TAG, C_FEATURE, C_NORMAL, C_DRIFT = 0, 3, 6, 9, 10, 11, 12, 15, 18
+COEFFICIENTS = 21
+
+# A basis (float32), of a pinhole's macro tile or of one of the 4 bands of another: d0, dx, dy, bend, then for moving
+# sensors: middle and half range of the rays' places s on the line origin = s v, that v, and s per cell along y.
+B_D0, B_DX, B_DY, B_BEND, B_MIDDLE, B_HALF, B_MOTION, B_RATE = 0, 3, 6, 9, 10, 11, 12, 15
+BASIS = 16
+
+AFFINE, ROLLING, TABLE, MOVING = 0, 1, 2, 3
+"""Ways to weigh a tile: linear directions, the same from a pose that moves along y, a table of directions, and a table
+of directions with origins."""
+
+NEEDLE = 1e-3
+"""Records thinner than this, seen from the side, go to all blocks of their tiles: their centre is ill-conditioned."""
+
+
+def _load_records(v: Lanes, ids: ir.Value, records: ir.Value, count: ir.Value) -> list[Vector]:
+    """Columns of the records with the numbers at ``ids``; lanes from ``count`` on repeat the first."""
+    rows = []
+    for lane in range(LANES):
+        inside = v.b.icmp_signed("<", ir.Constant(I64, lane), count)
+        place = v.b.select(inside, ir.Constant(I64, 4 * lane), ir.Constant(I64, 0))
+        number = v.b.zext(v.b.load(v.pointer(ids, place), typ=I32, align=4), I64)
+        rows.append(v.b.add(records, v.b.mul(number, ir.Constant(I64, 4 * RECORD))))
+    return [
+        column
+        for first in range(0, RECORD, LANES)
+        for column in v.transpose([v.load(row, 4 * first, align=32) for row in rows])
+    ]
+
+
+def _times(rows: list[list[Vector]], direction: list[Vector]) -> list[Vector]:
+    """The three rows of records times one direction."""
+    return [row[0] * direction[0] + row[1] * direction[1] + row[2] * direction[2] for row in rows]
+
+
+def _turned(
+    at: list[list[Vector]], drift: list[Vector], flat: Vector, place: Vector
+) -> tuple[list[list[Vector]], list[Vector], Vector]:
+    """(X, Y, W) at the centre and per cell, those of the sensor's motion, and FLAT, from a ``place`` on its way.
+
+    In the frame of the record a ray is D = (4 X, 4 Y, n W) and the centre b = (0, 0, n) - s (4 xv, 4 yv, n wv); the
+    frame is turned by the smallest rotation that brings b back to the third axis.
+    """
+    quarter = 1 / flat.sqrt()  # n / 4
+    bx, by, bz = -(drift[0] * place), -(drift[1] * place), quarter * (1 - drift[2] * place)
+    inverse = 1 / (bx * bx + by * by + bz * bz).max(1e-30).sqrt()
+    bx, by, bz = bx * inverse, by * inverse, bz * inverse
+    bend = 1 / (1 + bz.max(-0.9))
+    e1 = [1 - bx * bx * bend, -(bx * by * bend), -bx]
+    e2 = [-(bx * by * bend), 1 - by * by * bend, -by]
+
+    def turn(x: Vector, y: Vector, w: Vector) -> list[Vector]:
+        third = w * quarter
+        return [
+            e1[0] * x + e1[1] * y + e1[2] * third,
+            e2[0] * x + e2[1] * y + e2[2] * third,
+            (bx * x + by * y + bz * third) * inverse,
+        ]
+
+    return [turn(*part) for part in at], turn(*drift), inverse * inverse
+
+
+def _rolled(
+    at: list[list[Vector]], drift: list[Vector], flat: Vector, middle: Vector, rate: Vector
+) -> tuple[list[list[Vector]], Vector]:
+    """(X, Y, W) at the centre and per cell, and FLAT, for a shutter that rolls along y.
+
+    Each record is seen from the place that the sensor has reached at the row of its centre, or at the tile's edge where
+    the centre is outside; from there the sensor moves on by ``rate`` v per row, which shears the picture.
+    """
+    (centre, along_x, along_y), _, _ = _turned(at, drift, flat, middle)
+    det = along_x[0] * along_y[1] - along_y[0] * along_x[1]
+    row = (centre[0] * along_x[1] - centre[1] * along_x[0]) / (det.abs() > 1e-20).where(det, 1.0)
+    row = row.max(-MACRO / 2).min(MACRO / 2)
+    (centre, along_x, along_y), moved, flat = _turned(at, drift, flat, middle + rate * row)
+    step = rate * (centre[2] + row * along_y[2])
+    # Nearing the Gaussian by a part enlarges X and Y by it and shortens t; so does a W larger by that part.
+    shear = [step * moved[k] for k in range(3)]
+    centre = [c - row * change for c, change in zip(centre, shear, strict=True)]
+    return [centre, along_x, [a + change for a, change in zip(along_y, shear, strict=True)]], flat
+
+
+def _least_over_blocks(at: list[list[Vector]], bands: int, v: Lanes) -> tuple[list[Vector], Mask]:
+    """The least X^2 + Y^2 over each block of ``bands`` rows of four blocks, and where it could not be found."""
+    (x0, y0, _), (xx, yx, _), (xy, yy, _) = at
+    a, c, b2 = xx * xx + yx * yx, xy * xy + yy * yy, (xx * xy + yx * yy) * 2
+    det = xx * yy - xy * yx
+    unsure = ~(det.abs() > (a + c) * NEEDLE)
+    inverse = 1 / unsure.where(1.0, det)
+    mx, my = (y0 * xy - x0 * yy) * inverse, (x0 * yx - y0 * xx) * inverse
+    half_b = b2 * -0.5
+    slope_c, slope_a = half_b / c.max(1e-30), half_b / a.max(1e-30)
+
+    def spans(count: int, middle: Vector) -> list[tuple[Vector, Vector]]:
+        low = [SIDE * (k - count / 2) + 0.5 for k in range(count)]
+        return [(edge - middle, edge + (SIDE - 1) - middle) for edge in low]
+
+    span_x, span_y = spans(PER_SIDE, mx), spans(bands, my)
+    zero = v.number(0)
+    # Candidates: the side of the square nearest to the centre along one axis, the best place along the other.
+    near_x = [x.max(zero.min(x1)) for x, x1 in span_x]
+    near_y = [y.max(zero.min(y1)) for y, y1 in span_y]
+    best_y, best_x = [slope_c * x for x in near_x], [slope_a * y for y in near_y]
+    ax2, bx = [a * x * x for x in near_x], [b2 * x for x in near_x]
+    cy2, by = [c * y * y for y in near_y], [b2 * y for y in near_y]
+    least = []
+    for row in range(bands):
+        for column in range(PER_SIDE):
+            y = best_y[column].max(span_y[row][0]).min(span_y[row][1])
+            x = best_x[row].max(span_x[column][0]).min(span_x[column][1])
+            first = ax2[column] + (bx[column] + c * y) * y
+            second = cy2[row] + (by[row] + a * x) * x
+            least.append(first.min(second))
+    return least, unsure
+
+
+def _widened(
+    column: list[Vector], drift: list[Vector], base: list[Vector], flat: Vector, reach: Vector
+) -> tuple[Vector, Vector]:
+    """LIM for a sensor that is up to ``reach`` from where the record was made, and how far it may be off sideways.
+
+    From elsewhere on the way the ball of a Gaussian is nearer: allow for it.
+    """
+    sideways = (drift[0] * drift[0] + drift[1] * drift[1]).sqrt()
+    shrink = 1 - reach * (drift[2].abs() + sideways * column[FLAT].sqrt())
+    nearer = shrink.max(0.05)
+    rim = LOG_255 / 8 - column[FADE]
+    room = 1 - rim * flat / (nearer * nearer)
+    limit = ((room > 1e-4) & (shrink > 0.05)).where(rim / (room.max(1e-4) * nearer * nearer), INSIDE)
+    return limit, sideways
+
+
+def _append(v: Lanes, mask: ir.Value, numbers: ir.Value, lists: ir.Value, counts: ir.Value, block: int) -> None:
+    """Append the numbers of the lanes in a mask to a block's list of bytes."""
+    b = v.b
+    compress = declare(b, f"llvm.experimental.vector.compress.v{LANES}i32", INTS, [INTS, BITS, INTS])
+    bits = ir.IntType(LANES)
+    count_bits = declare(b, f"llvm.ctpop.i{LANES}", bits, [bits])
+    small = b.trunc(b.call(compress, [numbers, mask, ir.Constant(INTS, ir.Undefined)]), ir.VectorType(I8, LANES))
+    counter = v.pointer(counts, 8 * block)
+    count = b.load(counter, typ=I64, align=8)
+    b.store(small, v.pointer(v.address(lists, LIST * block), count), align=1)
+    b.store(b.add(count, b.zext(b.call(count_bits, [b.bitcast(mask, bits)]), I64)), counter, align=8)
+
+
+def _preparation(way: int) -> Callable[..., Any]:
+    linear, moving = way in (AFFINE, ROLLING), way in (ROLLING, MOVING)
+
+    @vector_kernel("iiiiiiiii")
+    def prepare(
+        v: Lanes,
+        ids: ir.Value,
+        records: ir.Value,
+        count: ir.Value,
+        alive: ir.Value,
+        basis: ir.Value,
+        coefficients: ir.Value,
+        lists: ir.Value,
+        counts: ir.Value,
+        entry: ir.Value,
+    ) -> None:
+        """Coefficients of up to LANES records, and their numbers appended to the lists of the blocks that see them.
+
+        Args:
+            v: vectors.
+            ids: address of their record numbers (int32).
+            records: address of the records.
+            count: how many there are, at least 1.
+            alive: bit k is set while block k still wants records.
+            basis: address of the tile's basis, or of those of its bands.
+            coefficients: address of [COEFFICIENTS,BATCH].
+            lists: address of [BLOCKS,LIST] bytes.
+            counts: address of [BLOCKS] int64.
+            entry: number of the first record within the batch.
+        """
+        b = v.b
+        column = _load_records(v, ids, records, count)
+        rows = [column[k : k + 3] for k in (XROW, YROW, WROW)]
+        where = v.address(coefficients, b.shl(entry, ir.Constant(I64, 2)))
+        lane = ir.Constant(INTS, list(range(LANES)))
+        given = b.icmp_signed("<", lane, spread(b, b.trunc(count, I32), INTS))
+        numbers = b.add(spread(b, b.trunc(entry, I32), INTS), lane)
+        bands = 1 if linear else PER_SIDE
+        flat, shown = column[FLAT], [row[k] for row in rows for k in range(3)]
+        for band in range(bands):
+            base = [v.broadcast(basis, 4 * (BASIS * band + k)) for k in range(BASIS)]
+            at = [_times(rows, base[k : k + 3]) for k in (B_D0, B_DX, B_DY)]
+            limit, slack = column[LIM], v.number(0)
+            drift = _times(rows, base[B_MOTION : B_MOTION + 3]) if moving else []
+            if way == ROLLING:
+                at, flat = _rolled(at, drift, flat, base[B_MIDDLE], base[B_RATE])
+                limit, _ = _widened(column, drift, base, flat, base[B_HALF])
+            height = MACRO / 2 / bands
+            widest = at[0][2] + at[1][2].abs() * (MACRO / 2) + at[2][2].abs() * height
+            if not linear:
+                slope = (sum((x * x for x in rows[0] + rows[1]), start=v.number(0))).sqrt()
+                slack = slope * base[B_BEND]
+                depth = (rows[2][0] * rows[2][0] + rows[2][1] * rows[2][1] + rows[2][2] * rows[2][2]).sqrt()
+                widest = widest + depth * base[B_BEND]
+            if way == MOVING:
+                reach = base[B_HALF] + base[B_MIDDLE].abs()
+                limit, sideways = _widened(column, drift, base, flat, reach)
+                middle = at[0][2] * base[B_MIDDLE]
+                at[0] = [at[0][0] + middle * drift[0], at[0][1] + middle * drift[1], at[0][2]]
+                slack = slack + base[B_HALF] * sideways * widest.max(0)
+                slack = slack + reach * drift[2].abs() * (limit.min(1e6).sqrt() * widest.max(0))
+            room = limit.min(INSIDE).sqrt() * widest.max(0) * 1.01 + slack
+            least, unsure = _least_over_blocks(at, PER_SIDE // bands, v)
+            always = unsure | (limit >= INSIDE)
+            seen = widest > 0
+            for k, value in enumerate(least):
+                block = band * PER_SIDE + k
+                open_ = spread(b, b.trunc(b.lshr(alive, ir.Constant(I64, block)), I1), BITS)
+                mask = (((value < room * room) & seen) | always).value
+                _append(v, b.and_(b.and_(mask, given), open_), numbers, lists, counts, block)
+        if linear:
+            shown = [at[j][k] for k in range(3) for j in range(3)]
+        values = [*shown, flat, column[FADE], column[TAG], *column[FEATURE : FEATURE + 3]]
+        for k, value in enumerate(values):
+            v.store(value, where, 4 * BATCH * k)
+        if way == MOVING:
+            for k in range(3):
+                v.store(drift[k], where, 4 * BATCH * (C_DRIFT + k))
+
+    return prepare
+
+
+prepare_affine, prepare_rolling, prepare_table, prepare_moving = (_preparation(way) for way in range(4))

@@ -1,0 +1,69 @@
+"""Threads that run kernels, and the scratch memory they work in."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+SPLIT = 6
+"""Ranges per thread: enough to even out tiles of very different cost."""
+KEPT = 4
+"""Sets of scratch arrays that are kept for later frames."""
+
+Lend = Callable[[str, tuple[int, ...], type], np.ndarray]
+"""Gives an uninitialised array of a name, a shape and a type."""
+
+
+class Workers:
+    """Threads that run kernel calls; safe to use from many threads at once."""
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="render") if threads > 1 else None
+
+    def run_calls(self, calls: Sequence[tuple]) -> list:
+        """The results of calls (function, argument, ...), in order."""
+        if self._pool is None or len(calls) <= 1:
+            return [function(*arguments) for function, *arguments in calls]
+        return [future.result() for future in [self._pool.submit(*call) for call in calls]]
+
+    def run(self, function: Callable, arguments: Sequence[tuple]) -> list:
+        """``function`` of each tuple of arguments, in order."""
+        return self.run_calls([(function, *each) for each in arguments])
+
+    def ranges(self, count: int, least: int) -> list[tuple[int, int]]:
+        """0..count cut into about ``SPLIT`` ranges per thread of at least ``least``."""
+        parts = max(1, min(self.threads * SPLIT if self.threads > 1 else 1, count // max(least, 1)))
+        edges = np.linspace(0, count, parts + 1).astype(np.int64)
+        return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+class Buffers:
+    """Large scratch arrays, kept between frames; each frame has a set of its own."""
+
+    def __init__(self) -> None:
+        self._free: list[dict[str, np.ndarray]] = []
+        self._lock = threading.Lock()
+
+    @contextlib.contextmanager
+    def lend(self) -> Iterator[Lend]:
+        """A function that gives an uninitialised array of a name, a shape and a type, the caller's until the end."""
+        with self._lock:
+            arrays = self._free.pop() if self._free else {}
+
+        def array(name: str, shape: tuple[int, ...], dtype: type) -> np.ndarray:
+            size = int(np.prod(shape))
+            if name not in arrays or arrays[name].size < size or arrays[name].dtype != dtype:
+                arrays[name] = np.empty(int(size * 1.2) + 64, dtype)
+            return arrays[name][:size].reshape(shape)
+
+        try:
+            yield array
+        finally:
+            with self._lock:
+                if len(self._free) < KEPT:
+                    self._free.append(arrays)

@@ -1,0 +1,116 @@
+"""Who runs the kernels: a GPU through ``cuda-core``, or anything else that follows ``Launcher``.
+
+The rest of this folder only sees tensors on ``Launcher.device`` and kernels by name, so that tests run all of it on a
+machine without a GPU (``tests/gpu_on_cpu``).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from nurec_sim.errors import GpuError
+from nurec_sim.render.gpu.compiler import cached_cubin, import_cuda_core, kernel_names
+
+if TYPE_CHECKING:
+    import torch
+
+    Argument = torch.Tensor | np.generic | int | float | None
+    """Tensors (None is a null pointer), ``int`` (32 bits), ``np.int64`` and ``float`` (32 bits)."""
+
+THREADS = 256
+"""Threads of a block, in every kernel."""
+
+
+class Launcher(Protocol):
+    """Runs kernels in the order in which they are launched."""
+
+    device: torch.device
+
+    def launch(self, kernel: str, grid: tuple[int, int], *arguments: Argument) -> None:
+        """Run a kernel on ``grid`` blocks (x, y) of ``THREADS`` threads; nothing if there are none."""
+        ...
+
+
+class CudaLauncher:
+    """Runs kernels on a CUDA device, on torch's current stream.
+
+    Args:
+        device: such as ``cuda`` or ``cuda:1``.
+
+    Raises:
+        GpuError: no such device, or the extra ``gpu`` is missing.
+    """
+
+    def __init__(self, device: str = "cuda") -> None:
+        core = import_cuda_core()
+        self.device = cuda_device(device)
+        self._core = core
+        self._device = core.Device(self.device.index)
+        self._device.set_current()
+        code = core.ObjectCode.from_cubin(cached_cubin(architecture_of(self.device)))
+        self._kernels = {name: code.get_kernel(name) for name in kernel_names()}
+
+    def launch(self, kernel: str, grid: tuple[int, int], *arguments: Argument) -> None:
+        """See ``Launcher``."""
+        if min(grid) == 0:
+            return
+        self._device.set_current()  # the calling thread may be a new one
+        config = self._core.LaunchConfig(grid=grid, block=THREADS)
+        values = [as_scalar(argument, self.device) for argument in arguments]
+        self._core.launch(_TorchStream(self.device), config, self._kernels[kernel], *values)
+
+
+class _TorchStream:
+    """Torch's current stream of a device, as ``cuda-core`` asks for it."""
+
+    def __init__(self, device: torch.device) -> None:
+        import torch
+
+        self._handle = torch.cuda.current_stream(device).cuda_stream
+
+    def __cuda_stream__(self) -> tuple[int, int]:
+        return 0, self._handle
+
+
+def as_scalar(argument: Argument, device: torch.device) -> np.generic:
+    """What a kernel receives for an argument: an address, a 32-bit or a 64-bit integer, or a 32-bit float."""
+    if argument is None:
+        return np.uint64(0)
+    if isinstance(argument, np.generic):
+        return argument
+    if isinstance(argument, int):
+        return np.int32(argument)
+    if isinstance(argument, float):
+        return np.float32(argument)
+    if argument.device != device or not argument.is_contiguous():
+        raise ValueError(f"kernels need contiguous tensors on {device}, got one on {argument.device}")
+    return np.uint64(argument.data_ptr())
+
+
+def cuda_device(device: str) -> torch.device:
+    """The device with its number.
+
+    Raises:
+        GpuError: it is not a CUDA device, or there is none.
+    """
+    import torch
+
+    if torch.version.cuda is None:
+        raise GpuError(f"no GPU: this torch ({torch.__version__}) was built without CUDA; install a CUDA build of torch")
+    if not torch.cuda.is_available():
+        raise GpuError("no GPU: torch finds no CUDA device; the CUDA back end needs an NVIDIA GPU and its driver")
+    asked = torch.device(device)
+    count = torch.cuda.device_count()
+    if asked.type != "cuda" or (asked.index or 0) >= count:
+        raise GpuError(f"no GPU {device!r}; have {[f'cuda:{k}' for k in range(count)]}")
+    return torch.device("cuda", torch.cuda.current_device() if asked.index is None else asked.index)
+
+
+def architecture_of(device: torch.device) -> str:
+    """Such as ``sm_90``."""
+    import torch
+
+    major, minor = torch.cuda.get_device_capability(device)
+    return f"sm_{major}{minor}"

@@ -1,0 +1,66 @@
+"""Gaussians that are tensors already, as the kernels read them."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nurec_sim.render.cpu.pack import (
+    BLOCK,
+    COLOUR,
+    FIELDS,
+    INTENSITY,
+    LOG_OPACITY,
+    MAX_OPACITY,
+    MEAN,
+    MIN_SCALE_M,
+    NEVER_SEEN,
+    QUAT,
+    SCALE,
+)
+from nurec_sim.render.gpu.pipeline import Blocks
+
+EVERYWHERE_M = 1e30
+"""Radius of a sphere that no view can miss."""
+
+
+def blocks_of(
+    mean_m: Float[Tensor, "n 3"],
+    quat_wxyz: Float[Tensor, "n 4"],
+    scale_m: Float[Tensor, "n 3"],
+    opacity: Float[Tensor, " n"],
+    features: Float[Tensor, "n 3"],
+    device: torch.device,
+) -> Blocks:
+    """Gaussians in the order in which they come; those that ``cpu.pack`` would leave out are never seen.
+
+    Args:
+        mean_m: centres in the world.
+        quat_wxyz: rotations, of any length.
+        scale_m: standard deviations.
+        opacity: 0..1.
+        features: what cameras sum as the colour, and LiDARs as intensity, whether it is known, and drop.
+        device: where to.
+    """
+    blocks = max(1, -(-len(mean_m) // BLOCK))
+    parts = (mean_m, quat_wxyz, scale_m, features, opacity[:, None])
+    given = torch.cat([part.detach().to(device, torch.float32) for part in parts], dim=1)
+    length = given[:, 3:7].norm(dim=1)
+    sound = torch.isfinite(given).all(dim=1) & (length > 1e-12)
+    sound &= (given[:, 7:10] > 0).all(dim=1) & (given[:, 13] >= 1 / 255)
+    given = torch.where(sound[:, None], given, 1.0)
+    columns = torch.zeros((blocks * BLOCK, FIELDS), device=device)
+    columns[:, LOG_OPACITY] = NEVER_SEEN
+    columns[:, [QUAT, SCALE, SCALE + 1, SCALE + 2]] = 1
+    rows = columns[: len(mean_m)]
+    rows[:, MEAN : MEAN + 3] = given[:, 0:3]
+    rows[:, QUAT : QUAT + 4] = given[:, 3:7] / given[:, 3:7].norm(dim=1, keepdim=True)
+    rows[:, SCALE : SCALE + 3] = given[:, 7:10].clamp(min=MIN_SCALE_M)
+    rows[:, COLOUR : COLOUR + 3] = given[:, 10:13]
+    rows[:, INTENSITY : INTENSITY + 3] = given[:, 10:13]
+    rows[:, LOG_OPACITY] = torch.where(sound, given[:, 13].clamp(max=MAX_OPACITY).log(), NEVER_SEEN)
+    fields = columns.reshape(blocks, BLOCK, FIELDS).transpose(1, 2).contiguous()
+    spheres = torch.zeros((blocks, 4), device=device)
+    spheres[:, 3] = EVERYWHERE_M
+    return Blocks(fields, torch.zeros((0, 0, 0), device=device), spheres)

@@ -1,0 +1,97 @@
+"""The few formulas of ``geometry``, ``layers`` and ``spec`` that gradients must pass through, in torch."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def quat_multiply(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
+    """Product of quaternions (wxyz)."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        dim=-1,
+    )
+
+
+def quat_from_matrix(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
+    """The unit quaternion (wxyz) of a rotation, by its largest component."""
+    m = rotation
+    squares = torch.stack(
+        [
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+        ]
+    )
+    # Products 4 q q^T of the quaternion with itself: the row of the largest component divides best.
+    wx, wy, wz = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    w2, x2, y2, z2 = squares
+    rows = [[w2, wx, wy, wz], [wx, x2, xy, xz], [wy, xy, y2, yz], [wz, xz, yz, z2]]
+    quat = torch.stack(rows[int(squares.argmax())])
+    return quat / quat.norm()
+
+
+def view_colour(
+    rgb: Float[Tensor, "n 3"], sh_rest: Float[Tensor, "n k 3"], eye_to_mean: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """``layers.view_colour``: colours seen along ``eye_to_mean``, not below 0."""
+    direction = eye_to_mean / eye_to_mean.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+    basis = sh_basis(direction, sh_rest.shape[1])
+    return (rgb + (basis[:, None, :] @ sh_rest)[:, 0]).clamp(min=0)
+
+
+def sh_basis(direction: Float[Tensor, "n 3"], k: int) -> Float[Tensor, "n k"]:
+    """``layers.sh_basis``: real spherical harmonics of degree 1 and up at unit directions."""
+    x, y, z = direction.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if k > 3:
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if k > 8:
+        basis += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+def sky_colour(sky: Float[Tensor, "6 s s 3"], direction: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """``spec.sky_colour``: bilinear lookup of a cubemap, clamped within a face (``geometry.cubemap_coordinates``)."""
+    gx, gy, gz = -direction[..., 1], direction[..., 2], -direction[..., 0]
+    ax, ay, az = gx.abs(), gy.abs(), gz.abs()
+    by_z = (az > ax) & (az > ay)
+    by_y = ~by_z & (ay > ax)
+    major = torch.where(by_z, az, torch.where(by_y, ay, ax))
+    face = torch.where(by_z, 4 + (gz <= 0).long(), torch.where(by_y, 2 + (gy <= 0).long(), (gx <= 0).long()))
+    s = torch.where(by_z, torch.where(gz > 0, gx, -gx), torch.where(by_y, gx, torch.where(gx > 0, -gz, gz)))
+    t = torch.where(by_y, torch.where(gy > 0, gz, -gz), -gy)
+    size = sky.shape[1]
+    x, y = (((part / major + 1) / 2 * size - 0.5).clamp(0, size - 1) for part in (s, t))
+    x0, y0 = x.detach().long(), y.detach().long()
+    x1, y1 = (x0 + 1).clamp(max=size - 1), (y0 + 1).clamp(max=size - 1)
+    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
+    top = sky[face, y0, x0] * (1 - fx) + sky[face, y0, x1] * fx
+    bottom = sky[face, y1, x0] * (1 - fx) + sky[face, y1, x1] * fx
+    return top * (1 - fy) + bottom * fy

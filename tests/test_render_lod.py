@@ -1,0 +1,175 @@
+"""Levels of detail: merging keeps moments, choices draw everything once, and pictures stay close to full detail."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from render_scenes import camera, gaussians, psnr_db, request, scene
+
+from nurec_sim import geometry
+from nurec_sim.render import Renderer
+from nurec_sim.render.cpu.pack import BLOCK
+from nurec_sim.render.lod import choose_blocks, merge_levels, ray_spacing
+from nurec_sim.render.merging import GROUP, as_surfels, grouped, merge
+from nurec_sim.types import Gaussians, Label
+
+
+def wall(n=30_000, seed=0, far=20.0, **fields):
+    """Overlapping flat Gaussians, a pixel or two wide, on a wall across the view and the road before it."""
+    rng = np.random.default_rng(seed)
+    upright = np.arange(n) < n // 2
+    mean = np.stack([np.full(n, far), rng.uniform(-12, 12, n), rng.uniform(-1.6, 6, n)], axis=1)
+    mean[~upright, 0], mean[~upright, 2] = rng.uniform(3, far, n - n // 2), -1.6
+    scale = np.repeat(0.05 * np.exp(0.3 * rng.normal(size=(n, 1))), 3, axis=1)
+    scale[upright, 0] *= 0.1
+    scale[~upright, 2] *= 0.1
+    bricks = (np.floor(mean / 4).sum(axis=1) % 2)[:, None]
+    values = {
+        "quat_wxyz": (np.array([1.0, 0, 0, 0]) + rng.normal(0, 0.02, (n, 4))).astype(np.float32),
+        "scale_m": scale.astype(np.float32),
+        "opacity": rng.uniform(0.3, 1, n).astype(np.float32),
+        "rgb": np.clip(0.3 + 0.3 * bricks + rng.normal(0, 0.02, (n, 3)), 0, 1).astype(np.float32),
+        "label": np.where(upright, Label.OTHER, Label.ROAD).astype(np.uint8),
+    }
+    return dataclasses.replace(gaussians(mean), **(values | fields))
+
+
+def covariance(some):
+    """Covariance matrices of Gaussians."""
+    spread = geometry.matrix_from_quat(some.quat_wxyz) * some.scale_m[:, None].astype(np.float64)
+    return spread @ spread.transpose(0, 2, 1)
+
+
+def everything(levels):
+    """Levels packed."""
+    return [level.packed() for level in levels]
+
+
+def test_merging_keeps_mean_covariance_and_coverage():
+    rng = np.random.default_rng(1)
+    faint = wall(1000, opacity=rng.uniform(0.02, 0.1, 1000).astype(np.float32))
+    surfels = as_surfels(faint, np.zeros(1000))
+    groups = grouped(surfels, GROUP * BLOCK)
+    merged = merge(surfels, groups).gaussians
+    mass = faint.opacity.astype(np.float64) * surfels.area
+    weight = mass[groups] / mass[groups].sum(axis=1, keepdims=True)
+    mean = np.einsum("gk,gkc->gc", weight, faint.mean_m[groups])
+    offset = faint.mean_m[groups] - mean[:, None]
+    second = np.einsum("gk,gkij->gij", weight, covariance(faint)[groups] + offset[..., :, None] * offset[..., None, :])
+    assert np.allclose(merged.mean_m, mean, atol=1e-5)
+    assert np.allclose(covariance(merged), second, atol=1e-6)
+    assert np.allclose(merged.rgb, np.einsum("gk,gkc->gc", weight, faint.rgb[groups]), atol=1e-6)
+    # Faint Gaussians hardly hide each other, so that the opacities times areas add up.
+    flat = (np.abs(surfels.axis[groups] @ [1, 0, 0]) > 0.99).all(axis=1)
+    drawn = merged.opacity.astype(np.float64) * np.sort(merged.scale_m, axis=1)[:, 1:].prod(axis=1)
+    assert flat.sum() > 50
+    assert np.median(drawn[flat] / mass[groups[flat]].sum(axis=1)) == pytest.approx(1, abs=0.05)
+
+
+def test_opaque_neighbours_merge_into_an_opaque_gaussian():
+    four = gaussians(
+        [(5, 0, 0), (5, 0.1, 0), (5, 0, 0.1), (5, 0.1, 0.1)], opacity=1.0, scale=np.float32([0.01, 0.2, 0.2])
+    )
+    surfels = as_surfels(four, np.zeros(4))
+    merged = merge(surfels, np.arange(4)[None])
+    assert merged.gaussians.opacity[0] == pytest.approx(0.99)
+    assert np.sort(merged.gaussians.scale_m[0])[1:].min() > 0.2
+    assert 0 < np.sqrt(merged.error_m2[0]) < 0.1
+
+
+def test_other_fields_follow_the_mass():
+    four = dataclasses.replace(
+        gaussians(np.eye(4, 3) * 0.01 + (5, 0, 0), scale=0.1, opacity=[0.9, 0.3, 0.3, 0.2], label=[1, 2, 2, 2]),
+        normal=np.float32([(1, 0, 0), (0, 1, 0), (0, 0, 0), (np.nan, 0, 0)]),
+        intensity=np.float32([0.2, 0.6, np.nan, np.nan]),
+        ray_drop=np.float32([1, 0, 0, 0]),
+        sh_rest=np.arange(36, dtype=np.float32).reshape(4, 3, 3),
+    )
+    merged = merge(as_surfels(four, np.zeros(4)), np.arange(4)[None]).gaussians
+    share = four.opacity / four.opacity.sum()
+    assert merged.label[0] == 1
+    assert merged.intensity[0] == pytest.approx(0.3)
+    assert merged.ray_drop is not None and merged.ray_drop[0] == pytest.approx(share[0])
+    assert merged.sh_rest is not None and np.allclose(merged.sh_rest[0], np.einsum("k,kjc->jc", share, four.sh_rest))
+    assert np.allclose(merged.normal[0], np.array([3, 1, 0]) / np.sqrt(10), atol=1e-6)
+    unknown = dataclasses.replace(four, intensity=np.full(4, np.nan, np.float32), normal=np.zeros((4, 3), np.float32))
+    blank = merge(as_surfels(unknown, np.zeros(4)), np.arange(4)[None]).gaussians
+    assert np.isnan(blank.intensity[0]) and not blank.normal.any()
+
+
+@pytest.mark.parametrize("n", [0, 1, 5, 1024, 5000])
+def test_every_level_has_a_quarter_of_the_one_below(n):
+    levels = merge_levels(wall(5000)[:n])
+    assert [len(level.gaussians) for level in levels] == [-(-n // 4**k) for k in range(4)]
+    for level, packed in zip(levels, everything(levels), strict=True):
+        assert len(packed) == len(level.error_m) == -(-len(level.gaussians) // BLOCK)
+        assert np.array_equal(packed.index[: len(level.gaussians)], np.arange(len(level.gaussians)))
+        assert np.isfinite(level.error_m).all()
+    assert not levels[0].error_m.any()
+
+
+def test_level_0_is_what_can_be_drawn():
+    opacity = np.full(5000, 0.5, np.float32)
+    opacity[::7] = 0.001
+    level = merge_levels(wall(5000, opacity=opacity), levels=1)[0]
+    assert len(level.gaussians) == (opacity > 0.01).sum()
+    assert (level.gaussians.opacity == 0.5).all()
+
+
+@pytest.mark.parametrize("tolerance_px", [0.0, 0.02, 0.3, 3.0, 1e6])
+def test_a_choice_draws_everything_exactly_once(tolerance_px):
+    levels = merge_levels(wall())
+    packed = everything(levels)
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        chosen = choose_blocks(levels, packed, rng.uniform(-30, 30, 3), 0.01, tolerance_px)
+        blocks = len(packed[0])
+        covered = [np.arange(b * GROUP**k, min((b + 1) * GROUP**k, blocks)) for k in range(4) for b in chosen[k]]
+        assert np.array_equal(np.sort(np.concatenate(covered)), np.arange(blocks))
+    if tolerance_px == 0:
+        assert [len(c) for c in chosen] == [blocks, 0, 0, 0]
+    if tolerance_px == 1e6:
+        assert [len(c) for c in chosen] == [0, 0, 0, len(packed[3])]
+
+
+def test_blocks_out_of_view_are_left_out_and_nearer_ones_are_finer():
+    levels = merge_levels(wall())
+    packed = everything(levels)
+    eye = np.array([0.0, 0, 0])
+    whole = choose_blocks(levels, packed, eye, 0.01, 0.3)
+    seen = [p.block_centre[:, 1] > 0 for p in packed]
+    half = choose_blocks(levels, packed, eye, 0.01, 0.3, seen)
+    for all_blocks, some, mask in zip(whole, half, seen, strict=True):
+        assert np.array_equal(some, all_blocks[mask[all_blocks]])
+    drawn = [
+        sum(len(blocks) for blocks in choose_blocks(levels, packed, np.array([x, 0, 0]), 0.01, 0.3))
+        for x in (0, -30, -90)
+    ]
+    assert drawn[0] > drawn[1] > drawn[2]
+
+
+def test_fewer_gaussians_draw_nearly_the_same_picture():
+    full = wall()
+    levels = merge_levels(full)
+    view = camera(320, 180)
+    spacing = ray_spacing(np.stack(np.meshgrid(np.arange(320) / 208, np.arange(180) / 208, [1.0]), axis=-1)[:, :, 0])
+    assert spacing == pytest.approx(1 / 208)
+    chosen = choose_blocks(levels, everything(levels), np.zeros(3), spacing, 0.15)
+    parts = [
+        level.gaussians[(np.isin(np.arange(len(level.gaussians)) // BLOCK, blocks))]
+        for level, blocks in zip(levels, chosen, strict=True)
+    ]
+    fewer = Gaussians.concatenate(parts)
+    assert 0 < len(parts[0]) < len(fewer) < 0.75 * len(full)
+    pictures = [Renderer(scene(static), threads=2).render_camera(request(view)) for static in (full, fewer)]
+    assert psnr_db(pictures[0].rgb, pictures[1].rgb) >= 50
+    assert (pictures[0].label != pictures[1].label).mean() < 0.01
+    assert np.abs(pictures[0].depth_m - pictures[1].depth_m)[pictures[0].alpha > 0.99].mean() < 0.05
+
+
+def test_merging_is_the_same_every_time():
+    first, second = merge_levels(wall(5000)), merge_levels(wall(5000))
+    for a, b in zip(first, second, strict=True):
+        for name in ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "label"):
+            assert np.array_equal(getattr(a.gaussians, name), getattr(b.gaussians, name))
+        assert np.array_equal(a.error_m, b.error_m)

@@ -1,0 +1,140 @@
+"""Frames do not depend on the number of threads or on who else renders; renderers leave nothing behind."""
+
+import dataclasses
+import gc
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from render_scenes import START_US, camera, cloud, moved, moving_cloud, request, scene, track
+
+from nurec_sim import geometry, sensors
+from nurec_sim.render import Renderer
+from nurec_sim.types import Fisheye, FTheta, FThetaReference, Pinhole, Shutter
+
+LIDAR = sensors.lidar_model("VLP-16", np.eye(4), columns=240)
+LENSES = [
+    None,
+    Pinhole(90.0, 90.0, 70.0, 45.0, (-0.2, 0.05, 0, 0, 0, 0)),
+    Fisheye(45.0, 45.0, 70.0, 45.0, max_angle_rad=1.7),
+    FTheta(70.0, 45.0, FThetaReference.PIXELDIST_TO_ANGLE, (0.0, 0.02, 0.0, 2e-7), max_angle_rad=1.6),
+]
+ACTORS = {"car": np.stack([geometry.pose_from_xyyaw(5.0, 1.0, 0.4), geometry.pose_from_xyyaw(5.5, 1.0, 0.4)])}
+
+
+def mixture():
+    """Cameras of all lenses, still and moving, LiDARs, other poses and times, an actor that is elsewhere."""
+    for k, lens in enumerate(LENSES):
+        yield request(camera(141, 90, lens), moved(0.1 * k))
+        yield request(camera(141, 90, lens, Shutter.TOP_TO_BOTTOM), moved(0.2 * k), moved(0.2 * k + 0.05))
+    yield request(LIDAR, moved(0.3), start_us=START_US + 10_000, end_us=START_US + 110_000)
+    yield request(LIDAR, moved(0.3), moved(0.4), start_us=START_US + 10_000, end_us=START_US + 110_000)
+    yield request(camera(141, 90), actors=ACTORS)
+    yield request(LIDAR, actors=ACTORS)
+
+
+def arrays(frame):
+    """The arrays of a frame by name, those that it lacks left out."""
+    values = {field.name: getattr(frame, field.name) for field in dataclasses.fields(frame)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def assert_same_bytes(some, others):
+    assert len(some) == len(others)
+    for k, (a, b) in enumerate(zip(map(arrays, some), map(arrays, others), strict=True)):
+        assert a.keys() == b.keys()
+        for name in a:
+            assert a[name].dtype == b[name].dtype and a[name].tobytes() == b[name].tobytes(), (k, name)
+
+
+@pytest.fixture(scope="module")
+def world():
+    static = cloud(6000, sh=8, low=(-15, -15, -4), high=(25, 15, 6))
+    moving = moving_cloud(800)
+    rest = np.random.default_rng(9).normal(0, 0.1, (800, 8, 3)).astype(np.float32)
+    moving = dataclasses.replace(moving, gaussians=dataclasses.replace(moving.gaussians, sh_rest=rest))
+    return scene(static, moving, [track()], sky=np.random.default_rng(1).random((6, 8, 8, 3)))
+
+
+@pytest.fixture(scope="module")
+def alone(world):
+    """Frames of the mixture from one thread, each by itself."""
+    renderer = Renderer(world, threads=1)
+    return [renderer.sense([asked])[0] for asked in mixture()]
+
+
+def test_the_mixture_has_something_to_see(alone):
+    assert len({tuple(sorted((name, a.tobytes()) for name, a in arrays(frame).items())) for frame in alone}) == len(
+        alone
+    )
+    for frame in alone:
+        seen = arrays(frame)
+        assert len(seen["beam"]) > 500 if "beam" in seen else seen["alpha"].mean() > 0.4
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])
+def test_same_bytes_at_any_thread_count(world, alone, threads):
+    assert_same_bytes(Renderer(world, threads=threads).sense(list(mixture())), alone)
+
+
+def test_a_batch_gives_what_one_by_one_gives_in_any_order(world, alone):
+    renderer, asked = Renderer(world, threads=2), list(mixture())
+    order = np.random.default_rng(3).permutation(2 * len(asked)) % len(asked)
+    frames = renderer.sense([asked[k] for k in order])
+    assert_same_bytes(frames, [alone[k] for k in order])
+    assert_same_bytes([renderer.render_camera(asked[0]), renderer.render_lidar(asked[-1])], [alone[0], alone[-1]])
+    assert renderer.sense([]) == []
+
+
+def test_sixteen_threads_share_a_renderer(world, alone):
+    """Also on its first frames, when tables and buffers are made."""
+    renderer, asked = Renderer(world, threads=2), list(mixture())
+    begin = threading.Barrier(16)
+
+    def client(seed):
+        order = np.random.default_rng(seed).permutation(len(asked))
+        begin.wait(30)
+        return order, renderer.sense([asked[k] for k in order[:6]]) + [renderer.sense([asked[k]])[0] for k in order[6:]]
+
+    with ThreadPoolExecutor(16) as pool:
+        for order, frames in pool.map(client, range(16)):
+            assert_same_bytes(frames, [alone[k] for k in order])
+
+
+def test_frames_are_not_overwritten_by_later_ones(world, alone):
+    renderer = Renderer(world, threads=2)
+    first = renderer.sense(list(mixture()))
+    renderer.sense([request(camera(141, 90), moved(2.0)), request(LIDAR, moved(2.0))])
+    assert_same_bytes(first, alone)
+
+
+def test_renderers_that_are_dropped_leave_no_threads(world):
+    before = set(threading.enumerate())
+    for _ in range(5):
+        renderer = Renderer(world, threads=4)
+        renderer.sense(list(mixture())[:2])
+        assert len(threading.enumerate()) < len(before) + 8
+        del renderer
+        gc.collect()
+    end = time.monotonic() + 10
+    while set(threading.enumerate()) - before and time.monotonic() < end:
+        time.sleep(0.01)
+    assert set(threading.enumerate()) <= before
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the memory of a process is read from /proc")
+def test_renderers_that_are_dropped_leave_no_memory(world):
+    asked = [next(mixture()), request(LIDAR)]
+    static = cloud(60_000, low=(-15, -15, -4), high=(25, 15, 6))  # about 10 MB packed and unpacked
+
+    def resident_mb(times):
+        for _ in range(times):
+            Renderer(scene(static), threads=2).sense(asked)
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+
+    before = resident_mb(4)
+    assert resident_mb(12) - before < 30
