@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs
 
-.PHONY: demo test check format bench clean
+.PHONY: demo test check format bench gpu-parity gpu-bench clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(f"nurec_sim needs Python 3.11 or newer; $(PYTHON) is {sys.version.split()[0]}. Try: make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
@@ -30,6 +30,13 @@ format: $(VENV)/.installed ## rewrite the code in house style
 
 bench: $(VENV)/.installed ## renderer timings, written to build/bench.json
 	$(BIN)/python benchmarks/render.py
+
+gpu-parity: $(VENV)/.installed ## the CUDA kernels against the reference, on this machine's GPU
+	$(BIN)/python -m nurec_sim.render.gpu
+	$(BIN)/python -m pytest -m needs_gpu tests/test_render_gpu.py tests/test_render_gpu_gradients.py
+
+gpu-bench: $(VENV)/.installed ## GPU timings, written to build/bench_gpu.json
+	$(BIN)/python benchmarks/gpu.py
 
 clean: ## forget the virtual environment and everything built
 	rm -rf $(VENV) build dist *.egg-info

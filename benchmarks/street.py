@@ -24,6 +24,8 @@ VIEW_YAW_DEG = (0.0, 60.0, -60.0)
 ROAD_HALF_WIDTH_M = 7.5
 SURFEL_WIDTH = 0.62
 """Standard deviation of a Gaussian over the width of its pixel's footprint."""
+RAYS_PER_GAUSSIAN = 1.35
+"""Input pixels per Gaussian that is kept; some meet the sky, some Gaussians are pruned."""
 
 
 @dataclass(frozen=True)
@@ -89,20 +91,14 @@ def first_hits(origin, direction, low, high):
 
 
 def surfels(boxes: Boxes, count: int, rng: np.random.Generator) -> Gaussians:
-    """``count`` Gaussians on what 36 views along the street see.
-
-    Raises:
-        ValueError: the views see fewer surfaces than that; more pixels are needed.
-    """
-    width = int(np.sqrt(count * 1.9 / (len(VIEW_X_M) * len(VIEW_YAW_DEG)) * 16 / 9)) + 1
-    parts = [
-        _view(boxes, np.array([x, LANE_Y_M, EYE_HEIGHT_M]), np.radians(yaw), width, rng)
-        for x in VIEW_X_M
-        for yaw in VIEW_YAW_DEG
-    ]
-    seen = Gaussians.concatenate(parts)
-    if len(seen) < count:
-        raise ValueError(f"the views see {len(seen)} surface points, {count} were asked for")
+    """``count`` Gaussians on what 36 views along the street see, a random part of what their pixels hit."""
+    views = [(np.array([x, LANE_Y_M, EYE_HEIGHT_M]), np.radians(yaw)) for x in VIEW_X_M for yaw in VIEW_YAW_DEG]
+    probe = np.random.default_rng(0)
+    width = 24
+    share = np.mean([len(_view(boxes, *view, width, probe)) for view in views]) / (width * (width * 9 // 16))
+    rays = max(RAYS_PER_GAUSSIAN, 1.05 / share) * count / len(views)
+    width = int(np.ceil(np.sqrt(rays * 16 / 9))) + 1
+    seen = Gaussians.concatenate([_view(boxes, *view, width, rng) for view in views])
     return seen[np.sort(rng.permutation(len(seen))[:count])]
 
 

@@ -73,6 +73,11 @@ def gaussians(mean, scale=0.1, opacity=0.9, rgb=(0.5, 0.5, 0.5), label=0, intens
     )
 
 
+def row_of_walls(distances_m, **kwargs):
+    """Wide discs across the x axis, 1 mm thick."""
+    return gaussians([[x, 0, 0] for x in distances_m], scale=(0.001, 50.0, 50.0), **kwargs)
+
+
 def cloud(n=250, seed=0, low=(-8, -8, -3), high=(14, 8, 4), sh=0, drop=False):
     """Random Gaussians around and in front of the origin: flat, large, over the camera plane; some without a normal."""
     rng = np.random.default_rng(seed)

@@ -9,14 +9,14 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from gpu_on_cpu.emulator import EmulatedLauncher, compiler_missing
+from gpu_on_cpu.places import PLACES, launcher_at
 from render_scenes import LENSES, LIDARS, START_US, camera, cloud, moved, moving_cloud, psnr_db, request, scene, track
 
 from nurec_sim import geometry
-from nurec_sim.errors import GpuError, RequestError
+from nurec_sim.errors import RequestError, TooLargeError
 from nurec_sim.render import spec
-from nurec_sim.render.gpu.launcher import CudaLauncher
 from nurec_sim.render.gpu.renderer import GpuRenderer
+from nurec_sim.render.requests import CAMERA_OUTPUTS
 from nurec_sim.types import LidarFilter, Shutter, Windshield, WindshieldReference
 
 SHUTTERS = {
@@ -28,20 +28,13 @@ SHUTTERS = {
 }
 
 
-ON_A_GPU = pytest.param("on a GPU", marks=pytest.mark.needs_gpu)
-
-
-@pytest.fixture(params=["on the CPU", ON_A_GPU] if torch.cuda.is_available() else ["on the CPU"])
+@pytest.fixture(params=PLACES)
 def launcher(request):
-    if request.param == "on a GPU":
-        return CudaLauncher()
-    if why := compiler_missing():
-        pytest.skip(why)
-    return EmulatedLauncher()
+    return launcher_at(request.param)
 
 
 def assert_same_image(launcher, world, asked):
-    got, expected = GpuRenderer(world, launcher).render_camera(asked), spec.render_camera(world, asked)
+    got, expected = GpuRenderer(world, launcher).render_camera(asked, CAMERA_OUTPUTS), spec.render_camera(world, asked)
     assert_same_frame(got, expected)
 
 
@@ -148,6 +141,15 @@ def test_sensors_of_a_batch_do_not_mix(launcher):
     assert renderer.sense([]) == []
 
 
+def test_memory_that_does_not_suffice_is_the_requests_fault(launcher, monkeypatch):
+    def full(*arguments, **options):
+        raise torch.OutOfMemoryError("no more")
+
+    monkeypatch.setattr("nurec_sim.render.gpu.renderer.draw", full)
+    with pytest.raises(TooLargeError, match="1 sensors at once are too many for the GPU: no more"):
+        GpuRenderer(scene(cloud(5)), launcher).render_camera(request(camera()))
+
+
 def test_degenerate_gaussians(launcher):
     static = cloud(40, 4)
     values = {name: getattr(static, name).copy() for name in ("mean_m", "scale_m", "quat_wxyz", "opacity", "rgb")}
@@ -161,7 +163,8 @@ def test_degenerate_gaussians(launcher):
     values["mean_m"][9] = 0
     world = scene(dataclasses.replace(static, **values))
     for asked in (request(camera(33, 17)), request(camera(1, 1)), request(camera(20, 20, lens=LENSES["fisheye"]))):
-        got, expected = GpuRenderer(world, launcher).render_camera(asked), spec.render_camera(world, asked)
+        got = GpuRenderer(world, launcher).render_camera(asked, CAMERA_OUTPUTS)
+        expected = spec.render_camera(world, asked)
         assert psnr_db(got.rgb, expected.rgb) >= 60
         assert np.isfinite(got.depth_m).all() and np.isfinite(got.normal).all()
     assert np.isfinite(GpuRenderer(world, launcher).render_lidar(request(LIDARS["full"])).xyz_m).all()
@@ -184,10 +187,7 @@ def test_a_million_pixels_against_the_cpu():
     """Sizes that the emulator and the reference are too slow for."""
     from nurec_sim.render import Renderer
 
-    try:
-        launcher = CudaLauncher()
-    except GpuError as error:
-        pytest.skip(str(error))
+    launcher = launcher_at("on a GPU")
     static = cloud(50_000, 1, low=(-40, -40, -5), high=(60, 40, 15))
     world = scene(dataclasses.replace(static, scale_m=static.scale_m * 0.3))
     asked = request(camera(1280, 800, shutter=Shutter.TOP_TO_BOTTOM), moved(0.02, 0.1), moved(0.05, 0.5, 0.1))

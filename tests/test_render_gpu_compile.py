@@ -3,11 +3,12 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from nurec_sim.errors import GpuError
 from nurec_sim.render.gpu import compiler
-from nurec_sim.render.gpu.launcher import CudaLauncher
+from nurec_sim.render.gpu.launcher import CudaLauncher, as_scalar
 
 
 @pytest.fixture(autouse=True)
@@ -69,7 +70,19 @@ def test_without_a_gpu_the_error_says_what_is_needed():
         CudaLauncher()
 
 
+def test_arguments_of_kernels_have_the_sizes_that_cuda_reads():
+    torch = pytest.importorskip("torch")
+    device, plane = torch.device("cpu"), torch.zeros(4, 6)
+    given = [as_scalar(value, device) for value in (plane, None, 3, 0.5, np.int64(7))]
+    assert [value.dtype for value in given] == [np.uint64, np.uint64, np.int32, np.float32, np.int64]
+    assert [int(value) for value in given] == [plane.data_ptr(), 0, 3, 0, 7]
+    with pytest.raises(ValueError, match="contiguous tensors on cpu"):
+        as_scalar(plane.T, device)
+
+
 def test_rendering_on_the_cpu_imports_nothing_of_it():
-    program = "import sys, nurec_sim.render, nurec_sim.render.renderer, nurec_sim.cli; " \
-              "assert not [m for m in sys.modules if m == 'cuda' or m.startswith(('cuda.', 'nurec_sim.render.gpu'))]"  # fmt: skip
+    program = (
+        "import sys, nurec_sim.render, nurec_sim.render.renderer, nurec_sim.cli; "
+        "assert not any(m.startswith(('cuda.', 'nurec_sim.render.gpu')) for m in sys.modules)"
+    )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from gpu_on_cpu.places import PLACES, launcher_at
 from render_scenes import LENSES, LIDARS, camera, cloud, moved, request
-from test_render_gpu import launcher  # noqa: F401
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
@@ -27,6 +27,11 @@ SENSORS = {
     ),
     "lidar": sensors.lidar_model("VLP-16", np.eye(4), columns=120),
 }
+
+
+@pytest.fixture(params=PLACES)
+def launcher(request):
+    return launcher_at(request.param)
 
 
 class Problem:
@@ -99,7 +104,7 @@ class Problem:
 
 
 @pytest.mark.parametrize("name", list(SENSORS))
-def test_gradients_are_finite_differences(launcher, name):  # noqa: F811
+def test_gradients_are_finite_differences(launcher, name):
     problem = Problem(SENSORS[name])
     gradients, pose_gradient, loss = problem.gradients(launcher)
     assert loss.item() == pytest.approx(problem.reference_loss(problem.values), abs=1e-3)
@@ -135,7 +140,7 @@ def rigid(motion):
     return pose
 
 
-def test_several_sensors_add_up_and_repeat(launcher):  # noqa: F811
+def test_several_sensors_add_up_and_repeat(launcher):
     cameras, world = [SENSORS["pinhole"], SENSORS["rolling fisheye"]], cloud(COUNT)
     poses = [torch.tensor(request(sensor, moved(0.1), moved(0.1, 0.3)).world_from_sensor) for sensor in cameras]
 
@@ -155,7 +160,7 @@ def test_several_sensors_add_up_and_repeat(launcher):  # noqa: F811
     assert np.array_equal(together, gradients([0, 1]))
 
 
-def test_malformed_arguments(launcher):  # noqa: F811
+def test_malformed_arguments(launcher):
     with pytest.raises(RequestError, match="not both"):
         DifferentiableRenderer([SENSORS["pinhole"], LIDARS["full"]], launcher)
     renderer = DifferentiableRenderer([SENSORS["pinhole"]], launcher)

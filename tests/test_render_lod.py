@@ -8,10 +8,11 @@ from render_scenes import camera, gaussians, psnr_db, request, scene
 
 from nurec_sim import geometry
 from nurec_sim.render import Renderer
+from nurec_sim.render.cpu.grid import make_grid
 from nurec_sim.render.cpu.pack import BLOCK
-from nurec_sim.render.lod import choose_blocks, merge_levels, ray_spacing
+from nurec_sim.render.lod import Detail, choose_blocks, merge_levels, ray_spacing
 from nurec_sim.render.merging import GROUP, as_surfels, grouped, merge
-from nurec_sim.types import Gaussians, Label
+from nurec_sim.types import Gaussians, Label, Pinhole
 
 
 def wall(n=30_000, seed=0, far=20.0, **fields):
@@ -38,11 +39,6 @@ def covariance(some):
     """Covariance matrices of Gaussians."""
     spread = geometry.matrix_from_quat(some.quat_wxyz) * some.scale_m[:, None].astype(np.float64)
     return spread @ spread.transpose(0, 2, 1)
-
-
-def everything(levels):
-    """Levels packed."""
-    return [level.packed() for level in levels]
 
 
 def test_merging_keeps_mean_covariance_and_coverage():
@@ -101,7 +97,8 @@ def test_other_fields_follow_the_mass():
 def test_every_level_has_a_quarter_of_the_one_below(n):
     levels = merge_levels(wall(5000)[:n])
     assert [len(level.gaussians) for level in levels] == [-(-n // 4**k) for k in range(4)]
-    for level, packed in zip(levels, everything(levels), strict=True):
+    for level in levels:
+        packed = level.packed
         assert len(packed) == len(level.error_m) == -(-len(level.gaussians) // BLOCK)
         assert np.array_equal(packed.index[: len(level.gaussians)], np.arange(len(level.gaussians)))
         assert np.isfinite(level.error_m).all()
@@ -119,52 +116,77 @@ def test_level_0_is_what_can_be_drawn():
 @pytest.mark.parametrize("tolerance_px", [0.0, 0.02, 0.3, 3.0, 1e6])
 def test_a_choice_draws_everything_exactly_once(tolerance_px):
     levels = merge_levels(wall())
-    packed = everything(levels)
+    blocks = len(levels[0].packed)
     rng = np.random.default_rng(2)
     for _ in range(5):
-        chosen = choose_blocks(levels, packed, rng.uniform(-30, 30, 3), 0.01, tolerance_px)
-        blocks = len(packed[0])
+        chosen = choose_blocks(levels, rng.uniform(-30, 30, 3), 0.01, tolerance_px)
         covered = [np.arange(b * GROUP**k, min((b + 1) * GROUP**k, blocks)) for k in range(4) for b in chosen[k]]
         assert np.array_equal(np.sort(np.concatenate(covered)), np.arange(blocks))
     if tolerance_px == 0:
         assert [len(c) for c in chosen] == [blocks, 0, 0, 0]
     if tolerance_px == 1e6:
-        assert [len(c) for c in chosen] == [0, 0, 0, len(packed[3])]
+        assert [len(c) for c in chosen] == [0, 0, 0, len(levels[3].error_m)]
 
 
 def test_blocks_out_of_view_are_left_out_and_nearer_ones_are_finer():
     levels = merge_levels(wall())
-    packed = everything(levels)
     eye = np.array([0.0, 0, 0])
-    whole = choose_blocks(levels, packed, eye, 0.01, 0.3)
-    seen = [p.block_centre[:, 1] > 0 for p in packed]
-    half = choose_blocks(levels, packed, eye, 0.01, 0.3, seen)
-    for all_blocks, some, mask in zip(whole, half, seen, strict=True):
-        assert np.array_equal(some, all_blocks[mask[all_blocks]])
+    whole = choose_blocks(levels, eye, 0.01, 0.3)
+    seen = [np.flatnonzero(level.packed.block_centre[:, 1] > 0) for level in levels]
+    half = choose_blocks(levels, eye, 0.01, 0.3, seen)
+    for all_blocks, some, visible in zip(whole, half, seen, strict=True):
+        assert np.array_equal(some, np.intersect1d(all_blocks, visible))
     drawn = [
-        sum(len(blocks) for blocks in choose_blocks(levels, packed, np.array([x, 0, 0]), 0.01, 0.3))
-        for x in (0, -30, -90)
+        sum(len(blocks) for blocks in choose_blocks(levels, np.array([x, 0, 0]), 0.01, 0.3)) for x in (0, -30, -90)
     ]
     assert drawn[0] > drawn[1] > drawn[2]
 
 
-def test_fewer_gaussians_draw_nearly_the_same_picture():
-    full = wall()
-    levels = merge_levels(full)
-    view = camera(320, 180)
-    spacing = ray_spacing(np.stack(np.meshgrid(np.arange(320) / 208, np.arange(180) / 208, [1.0]), axis=-1)[:, :, 0])
-    assert spacing == pytest.approx(1 / 208)
-    chosen = choose_blocks(levels, everything(levels), np.zeros(3), spacing, 0.15)
+def drawn_with(detail, asked):
+    """A picture of the chosen blocks of a layer, and how many Gaussians they hold."""
+    spacing = ray_spacing(make_grid(asked.sensor).direction)
+    chosen = choose_blocks(detail.levels, asked.world_from_sensor[0][:3, 3], spacing, detail.tolerance_px)
     parts = [
-        level.gaussians[(np.isin(np.arange(len(level.gaussians)) // BLOCK, blocks))]
-        for level, blocks in zip(levels, chosen, strict=True)
+        level.gaussians[np.isin(np.arange(len(level.gaussians)) // BLOCK, blocks)]
+        for level, blocks in zip(detail.levels, chosen, strict=True)
     ]
-    fewer = Gaussians.concatenate(parts)
-    assert 0 < len(parts[0]) < len(fewer) < 0.75 * len(full)
-    pictures = [Renderer(scene(static), threads=2).render_camera(request(view)) for static in (full, fewer)]
-    assert psnr_db(pictures[0].rgb, pictures[1].rgb) >= 50
-    assert (pictures[0].label != pictures[1].label).mean() < 0.01
-    assert np.abs(pictures[0].depth_m - pictures[1].depth_m)[pictures[0].alpha > 0.99].mean() < 0.05
+    some = Gaussians.concatenate(parts)
+    return Renderer(scene(some), threads=2).render_camera(asked), len(some)
+
+
+def test_fewer_gaussians_draw_nearly_the_same_picture():
+    full, asked = wall(60_000), request(camera(240, 136))
+    reference = Renderer(scene(full), threads=2).render_camera(asked)
+    picture, count = drawn_with(Detail.of(full, 0.15), asked)
+    assert 0.1 * len(full) < count < 0.7 * len(full)
+    assert psnr_db(picture.rgb, reference.rgb) >= 50
+    assert (picture.label != reference.label).mean() < 0.01
+    assert np.abs(picture.depth_m - reference.depth_m)[reference.alpha > 0.99].mean() < 0.05
+    coarse, fewer = drawn_with(Detail.of(full, 0.6), asked)
+    assert fewer < 0.5 * count and 30 < psnr_db(coarse.rgb, reference.rgb) < psnr_db(picture.rgb, reference.rgb)
+
+
+def test_no_tolerance_draws_the_same_picture():
+    full, asked = wall(5000), request(camera())
+    picture, count = drawn_with(Detail.of(full, 0.0), asked)
+    assert count == len(full)
+    assert psnr_db(picture.rgb, Renderer(scene(full), threads=2).render_camera(asked).rgb) > 70
+
+
+def test_layers_hold_the_chosen_blocks_in_view():
+    detail = Detail.of(wall(), 0.3)
+    everywhere = detail.layers(np.zeros(3), 0.01, lambda packed: np.arange(len(packed)))
+    chosen = choose_blocks(detail.levels, np.zeros(3), 0.01, 0.3)
+    kept = [blocks for blocks in chosen if len(blocks)]
+    assert len(kept) == len(everywhere) >= 2
+    assert all(np.array_equal(blocks, some) for (_, blocks), some in zip(everywhere, kept, strict=True))
+    assert detail.layers(np.zeros(3), 0.01, lambda packed: np.arange(0)) == []
+
+
+def test_spacing_is_that_of_most_neighbours():
+    direction = make_grid(camera(400, 400, Pinhole(2000.0, 2000.0, 200.0, 200.0))).direction
+    assert ray_spacing(direction) == pytest.approx(1 / 2000, rel=0.01)
+    assert ray_spacing(direction[:1, :1]) == 0.0
 
 
 def test_merging_is_the_same_every_time():

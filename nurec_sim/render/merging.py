@@ -21,7 +21,7 @@ MIN_OPACITY = 1.001 / 255
 CHUNK = 2048
 """Groups that are handled at once: their temporary arrays stay in the cache."""
 
-COLOUR_WEIGHT, NORMAL_WEIGHT, LABEL_WEIGHT = 4.0, 1.5, 4.0
+COLOUR_WEIGHT, NORMAL_WEIGHT, LABEL_WEIGHT = 12.0, 1.5, 4.0
 """What differences of colour (0..1), normal and label weigh in grouping, against one standard deviation of distance."""
 
 NEIGHBOURS = 64
@@ -51,6 +51,13 @@ class Surfels:
     area: Float64[np.ndarray, " n"]
     contrast2: Float64[np.ndarray, " n"]
     error_m2: Float64[np.ndarray, " n"]
+
+    def rows(self, order: Int64[np.ndarray, " m"]) -> Surfels:
+        """Some of them, in this order."""
+        return Surfels(self.gaussians[order], *(getattr(self, name)[order] for name in _ARRAYS))
+
+
+_ARRAYS = ("covariance", "axis", "area", "contrast2", "error_m2")
 
 
 def as_surfels(gaussians: Gaussians, contrast2: Float64[np.ndarray, " n"]) -> Surfels:
@@ -132,8 +139,7 @@ def merge(surfels: Surfels, groups: Int64[np.ndarray, "groups 4"]) -> Surfels:
     if not parts:
         return surfels
     gaussians = Gaussians.concatenate([part.gaussians for part in parts])
-    names = ("covariance", "axis", "area", "contrast2", "error_m2")
-    return Surfels(gaussians, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return Surfels(gaussians, *(np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS))
 
 
 def _merge_chunk(surfels: Surfels, groups: Int64[np.ndarray, "g 4"]) -> Surfels:
@@ -162,9 +168,12 @@ def _merge_chunk(surfels: Surfels, groups: Int64[np.ndarray, "g 4"]) -> Surfels:
     rgb = np.einsum("gk,gkc->gc", weight, g.rgb.astype(np.float64))
     label, same_label = _heaviest(g.label, mass)
     share = alphas / np.maximum(alphas.sum(axis=1, keepdims=True), 1e-12)
-    tint = np.matmul((share * alpha[:, None]).transpose(0, 2, 1), g.rgb - rgb[:, None])
+    # Which of them shows where they overlap depends on the view, so a colour counts in full, not its mean.
+    tint2 = ((g.rgb - rgb[:, None]) ** 2).mean(axis=2)
     contrast2 = np.einsum("gk,gk->g", weight, surfels.contrast2[rows])
-    wrong = (tint**2).sum(axis=2) / 3 + (alpha - drawn) ** 2 * (contrast2[:, None] + BASE_CONTRAST**2)
+    wrong = alpha**2 * np.einsum("gkp,gk->gp", share, tint2) + (alpha - drawn) ** 2 * (
+        contrast2[:, None] + BASE_CONTRAST**2
+    )
     wrong += alpha**2 * (ORDER_SHARE * contrast2 + (1 - same_label) ** 2)[:, None]
     error_m2 = wrong.sum(axis=1) * (GRID_CELL * sigma[:, 1] * sigma[:, 2])
     error_m2 += np.where(present, surfels.error_m2[rows], 0).sum(axis=1)

@@ -1,6 +1,7 @@
 """The renderer's contract as readable float64 NumPy; every back end is tested against it.
 
-A ray (unit direction d from o) meets a Gaussian (mean m, rotation R, standard deviations S, opacity p) with
+Rays come from ``rays``: one per pixel through lens and windshield or one per beam, each from the pose of its instant. A
+ray (unit direction d from o) meets a Gaussian (mean m, rotation R, standard deviations S, opacity p) with
 
     o' = S^-1 R^T (o - m),  d' = S^-1 R^T d / |S^-1 R^T d|,  q = |d' x o'|^2,  alpha = min(p, 0.99) exp(-q / 2)
 

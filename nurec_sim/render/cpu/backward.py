@@ -21,7 +21,7 @@ from nurec_sim.render.cpu.backward_blend import (
 )
 from nurec_sim.render.cpu.blend import CAMERA, RAY_PLANES
 from nurec_sim.render.cpu.draw import aligned, prepare
-from nurec_sim.render.cpu.kernel import f4, inner, kernel
+from nurec_sim.render.cpu.kernel import f4, inner, keep_alive, kernel
 from nurec_sim.render.cpu.rays import pinhole_basis, table_basis, turn_rays
 from nurec_sim.render.cpu.records import MACRO, RECORD, TAG
 from nurec_sim.render.cpu.simd import LANES, prefetch
@@ -184,3 +184,6 @@ def draw_tiles_back(
                             alive &= ~(1 << block)
             _keep_sums(sums, lists, first, last, spans, first_slot, row, column, slots)
             first = last
+    keep_alive(state)
+    keep_alive(chosen)
+    keep_alive(coefficients)

@@ -11,7 +11,9 @@ Everything a record gives along a ray d depends on (X, Y, W) = rows d, and only 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+import operator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from llvmlite import ir
@@ -30,7 +32,7 @@ from nurec_sim.render.cpu.blend import (
     VECTORS,
     fading,
 )
-from nurec_sim.render.cpu.simd import F32, I8, I32, I64, LANES, Lanes, Mask, Vector, vector_kernel
+from nurec_sim.render.cpu.simd import F32, I8, I32, I64, LANES, Lanes, Vector, vector_kernel
 from nurec_sim.render.cpu.tiles import (
     AFFINE,
     B_D0,
@@ -62,22 +64,83 @@ S_XX, S_XY, S_YY, S_XW, S_YW, S_WX, S_WY, S_WW, S_FLAT, S_FADE, S_FEATURE = 0, 1
 SUMS = 16
 
 
-class _Still:
-    """A record along vectors of rays from the reference point, and the way back."""
+class Bundle:
+    """Some vectors (or masks) that go through the same steps side by side, which keeps the arithmetic units busy."""
 
-    def __init__(self, x: Vector, y: Vector, w: Vector, flat: Vector) -> None:
+    __slots__ = ("parts",)
+
+    def __init__(self, parts: Iterable[Any]) -> None:
+        self.parts = list(parts)
+
+    def _with(self, step: Callable[..., Any], *others: Any) -> Bundle:
+        columns = [other.parts if isinstance(other, Bundle) else [other] * len(self.parts) for other in others]
+        return Bundle(step(*each) for each in zip(self.parts, *columns, strict=True))
+
+    def __add__(self, other: Any) -> Bundle:
+        return self._with(operator.add, other)
+
+    def __sub__(self, other: Any) -> Bundle:
+        return self._with(operator.sub, other)
+
+    def __rsub__(self, other: Any) -> Bundle:
+        return self._with(lambda mine, its: its - mine, other)
+
+    def __mul__(self, other: Any) -> Bundle:
+        return self._with(operator.mul, other)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __neg__(self) -> Bundle:
+        return self._with(operator.neg)
+
+    def __lt__(self, other: Any) -> Bundle:
+        return self._with(operator.lt, other)
+
+    def __le__(self, other: Any) -> Bundle:
+        return self._with(operator.le, other)
+
+    def __gt__(self, other: Any) -> Bundle:
+        return self._with(operator.gt, other)
+
+    def __ge__(self, other: Any) -> Bundle:
+        return self._with(operator.ge, other)
+
+    def __and__(self, other: Any) -> Bundle:
+        return self._with(operator.and_, other)
+
+    def where(self, yes: Any, no: Any) -> Bundle:
+        """``yes`` in true lanes, ``no`` in the others."""
+        return self._with(lambda mask, a, b: mask.where(a, b), yes, no)
+
+    def sqrt(self) -> Bundle:
+        """Square root."""
+        return self._with(lambda x: x.sqrt())
+
+    def reciprocal(self) -> Bundle:
+        """1 / x to about 1e-7."""
+        return self._with(lambda x: x.reciprocal())
+
+    def total(self) -> Vector:
+        """The sum of the vectors."""
+        return functools.reduce(operator.add, self.parts)
+
+
+class _Still:
+    """A record along rays from the reference point, and the way back."""
+
+    def __init__(self, x: Bundle, y: Bundle, w: Bundle, flat: Bundle) -> None:
         self.x, self.y, self.w, self.flat = x, y, w, flat
         self.q1 = x * x + y * y
         self.inverse = (flat * self.q1 + w * w).reciprocal()
         self.exponent, self.distance = self.q1 * self.inverse, w * self.inverse
 
-    def forget_misses(self, hit: Mask) -> None:
+    def forget_misses(self, hit: Bundle) -> None:
         """Make everything finite where there is no hit."""
         self.inverse, self.exponent, self.distance = (
             hit.where(value, 0) for value in (self.inverse, self.exponent, self.distance)
         )
 
-    def sums(self, by_exponent: Vector, by_distance: Vector) -> list[Vector]:
+    def sums(self, by_exponent: Bundle, by_distance: Bundle) -> list[Bundle]:
         """S_XX to S_FLAT of the gradients by exponent and distance."""
         by_q2 = -(by_exponent * self.exponent + by_distance * self.distance) * self.inverse
         twice_q1 = (by_exponent * self.inverse + self.flat * by_q2) * 2
@@ -90,7 +153,7 @@ class _Still:
 class _Moved:
     """The same along rays that start at s v, v being the record's (xv, yv, wv)."""
 
-    def __init__(self, x: Vector, y: Vector, w: Vector, flat: Vector, s: Vector, drift: list[Vector]) -> None:
+    def __init__(self, x: Bundle, y: Bundle, w: Bundle, flat: Bundle, s: Bundle, drift: list[Bundle]) -> None:
         self.x, self.y, self.w, self.flat, self.s, self.drift = x, y, w, flat, s, drift
         xv, yv, wv = drift
         self.left = 1 - s * wv
@@ -103,7 +166,7 @@ class _Moved:
 
     forget_misses = _Still.forget_misses
 
-    def sums(self, by_exponent: Vector, by_distance: Vector) -> list[Vector]:
+    def sums(self, by_exponent: Bundle, by_distance: Bundle) -> list[Bundle]:
         """S_XX to S_FLAT; products with v count like those with a ray's direction."""
         x, y, w, flat, s = self.x, self.y, self.w, self.flat, self.s
         xv, yv, wv = self.drift
@@ -133,12 +196,12 @@ class _Moved:
         ]
 
 
-def _far_enough(v: Lanes, way: int, basis: ir.Value, x: Vector, y: Vector, distance: Vector, near: ir.Value) -> Mask:
+def _far_enough(v: Lanes, way: int, basis: ir.Value, x: Vector, y: Bundle, distance: Bundle, near: ir.Value) -> Bundle:
     """Whether hits lie behind the near plane, as ``blend`` tests it."""
     if way != AFFINE:
         return distance >= v.spread(near)
     d = [[v.broadcast(basis, 4 * (start + c)) for start in (B_D0, B_DX, B_DY)] for c in range(3)]
-    lengths = [c[0] + c[1] * x + c[2] * y for c in d]
+    lengths = [y * c[2] + (c[0] + c[1] * x) for c in d]
     length = (lengths[0] * lengths[0] + lengths[1] * lengths[1] + lengths[2] * lengths[2]).sqrt()
     return distance * length >= v.spread(near)
 
@@ -178,16 +241,16 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
         for part in range(0, VECTORS, AT_ONCE):
             offsets = [4 * LANES * (part + k) for k in range(AT_ONCE)]
             x = v.numbers([lane % SIDE for lane in range(LANES)]) + v.spread(x0)
-            y = [
+            y = Bundle(
                 v.numbers([((part + k) * LANES + lane) // SIDE for lane in range(LANES)]) + v.spread(y0)
                 for k in range(AT_ONCE)
-            ]
+            )
 
-            def plane_of(base: ir.Value, plane: int, k: int, offsets: list[int] = offsets) -> Vector:
-                return v.load(base, 4 * RAYS * plane + offsets[k], align=32)
+            def plane_of(base: ir.Value, plane: int, offsets: list[int] = offsets) -> Bundle:
+                return Bundle(v.load(base, 4 * RAYS * plane + offset, align=32) for offset in offsets)
 
             def body(
-                i: ir.Value, values: list[Vector], x: Vector = x, y: list[Vector] = y, plane_of: Any = plane_of
+                i: ir.Value, values: list[Vector], x: Vector = x, y: Bundle = y, plane_of: Any = plane_of
             ) -> list[Vector]:
                 number = b.zext(b.load(v.pointer(numbers, i), typ=I8, align=1), I64)
                 where = v.address(coefficients, b.shl(number, ir.Constant(I64, 2)))
@@ -196,55 +259,47 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                     return v.broadcast(where, 4 * BATCH * k)
 
                 rows = [[coefficient(start + k) for k in range(3)] for start in (C_X, C_Y, C_W)]
-                flat, fade = coefficient(C_FLAT), coefficient(C_FADE)
-                features = [coefficient(C_FEATURE + c) for c in range(3)]
-                linear = [row[0] + row[1] * x for row in rows] if way == AFFINE else []
-                meetings: list[Any] = []
-                for k in range(AT_ONCE):
-                    if way == AFFINE:
-                        place = [linear[r] + rows[r][2] * y[k] for r in range(3)]
-                    else:
-                        d = [plane_of(rays, plane, k) for plane in (DX, DY, DZ)]
-                        place = [row[0] * d[0] + row[1] * d[1] + row[2] * d[2] for row in rows]
-                    if way == MOVING:
-                        drift = [coefficient(C_DRIFT + c) for c in range(3)]
-                        meetings.append(_Moved(*place, flat, plane_of(rays, PLACE, k), drift))
-                    else:
-                        meetings.append(_Still(*place, flat))
-                exponents = [meeting.exponent + fade for meeting in meetings]
-                alphas = fading(exponents)
-                after, rest, totals = [], [], []
-                for k, (meeting, exponent) in enumerate(zip(meetings, exponents, strict=True)):
-                    hit = exponent < CUT
-                    if check_near:
-                        hit = hit & _far_enough(v, way, basis, x, y[k], meeting.distance, near)
-                    meeting.forget_misses(hit)
-                    before = values[k]
-                    alpha = hit.where(alphas[k], 0)
-                    weight = alpha * before
-                    after.append(before - weight)
-                    by_sums = [plane_of(state, G_FEATURE + c, k) for c in range(3)]
-                    by_mean = plane_of(state, G_DISTANCE, k)
-                    q = plane_of(state, G_ALPHA, k) + by_mean * meeting.distance
-                    for c in range(3):
-                        q = q + by_sums[c] * features[c]
-                    rest.append(values[AT_ONCE + k] - weight * q)
-                    by_alpha = before * q - rest[k] * (1 - alpha).reciprocal()
-                    by_exponent = alpha * by_alpha * -8
-                    by_distance = weight * by_mean
-                    if kind == LIDAR:
-                        crossing = (before > 0.5) & (after[k] <= 0.5)
-                        by_distance = by_distance + crossing.where(plane_of(state, G_HALF, k), 0)
-                    parts = [*meeting.sums(by_exponent, by_distance), by_exponent, *(weight * g for g in by_sums)]
-                    totals = [a + p for a, p in zip(totals, parts, strict=True)] if totals else parts
+                flat, fade = Bundle([coefficient(C_FLAT)] * AT_ONCE), coefficient(C_FADE)
+                if way == AFFINE:
+                    place = [y * row[2] + (row[0] + row[1] * x) for row in rows]
+                else:
+                    d = [plane_of(rays, plane) for plane in (DX, DY, DZ)]
+                    place = [d[0] * row[0] + d[1] * row[1] + d[2] * row[2] for row in rows]
+                if way == MOVING:
+                    drift = [Bundle([coefficient(C_DRIFT + c)] * AT_ONCE) for c in range(3)]
+                    meeting: Any = _Moved(*place, flat, plane_of(rays, PLACE), drift)
+                else:
+                    meeting = _Still(*place, flat)
+                exponent = meeting.exponent + fade
+                hit = exponent < CUT
+                if check_near:
+                    hit = hit & _far_enough(v, way, basis, x, y, meeting.distance, near)
+                meeting.forget_misses(hit)
+                before, left = Bundle(values[:AT_ONCE]), Bundle(values[AT_ONCE:])
+                alpha = hit.where(Bundle(fading(exponent.parts)), 0)
+                weight = alpha * before
+                after = before - weight
+                by_mean = plane_of(state, G_DISTANCE)
+                q = plane_of(state, G_ALPHA) + by_mean * meeting.distance
+                for c in range(3):
+                    q = q + plane_of(state, G_FEATURE + c) * coefficient(C_FEATURE + c)
+                rest = left - weight * q
+                by_alpha = before * q - rest * (1 - alpha).reciprocal()
+                by_exponent, by_distance = alpha * by_alpha * -8, weight * by_mean
+                if kind == LIDAR:
+                    crossing = (before > 0.5) & (after <= 0.5)
+                    by_distance = by_distance + crossing.where(plane_of(state, G_HALF), 0)
+                sums_of = [*meeting.sums(by_exponent, by_distance), by_exponent]
+                sums_of += [weight * plane_of(state, G_FEATURE + c) for c in range(3)]
+                totals = [bundle.total() for bundle in sums_of]
                 totals += [v.number(0)] * (SUMS - len(totals))
                 place_of_sums = v.address(sums, b.shl(number, ir.Constant(I64, 6)))
                 for first in range(0, SUMS, LANES):
                     old = v.load(place_of_sums, 4 * first, align=32)
                     v.store(old + v.sums(totals[first : first + LANES]), place_of_sums, 4 * first, align=32)
-                return after + rest
+                return after.parts + rest.parts
 
-            initial = [plane_of(state, plane, k) for plane in (T, REST) for k in range(AT_ONCE)]
+            initial = plane_of(state, T).parts + plane_of(state, REST).parts
             final = v.repeat(count, initial, body)
             for plane in (T, REST):
                 for k, offset in enumerate(offsets):

@@ -37,10 +37,7 @@ from nurec_sim.render.cpu.backward_blend import (
 )
 from nurec_sim.render.cpu.kernel import inner, kernel
 from nurec_sim.render.cpu.pack import BLOCK, MAX_OPACITY, MIN_SCALE_M
-
-# Columns of a Gaussian's gradients.
-G_MEAN, G_QUAT, G_SCALE, G_OPACITY, G_FEATURES = 0, 3, 7, 10, 11
-GRADIENTS = 14
+from nurec_sim.render.cpu.records import XROW
 
 
 @inner
@@ -53,26 +50,25 @@ def _axes(q, out):
 
 
 @inner
-def _frame(axes, scale, ball, xrow, world_from_sensor, frame):
+def _frame(axes, scale, ball, records, i, world_from_sensor, frame):
     """Rows e1, e2, b / n of a record, in the Gaussian's axes: b from the parameters, e1 as its X row has it."""
     n = math.sqrt(ball[0] ** 2 + ball[1] ** 2 + ball[2] ** 2)
     along = 0.0
+    m = world_from_sensor
+    x, y, z = records[i, XROW], records[i, XROW + 1], records[i, XROW + 2]
+    x, y, z = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z, m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
+               m[2, 0] * x + m[2, 1] * y + m[2, 2] * z)  # fmt: skip
     for k in range(3):
         frame[2, k] = ball[k] / n
-        world = 0.0
-        for r in range(3):
-            turned = 0.0
-            for c in range(3):
-                turned += world_from_sensor[r, c] * xrow[c]
-            world += axes[r, k] * turned
-        frame[0, k] = world * scale[k]
+        frame[0, k] = (axes[0, k] * x + axes[1, k] * y + axes[2, k] * z) * scale[k]
         along += frame[0, k] * frame[2, k]
     length = 0.0
     for k in range(3):
         frame[0, k] -= along * frame[2, k]
         length += frame[0, k] ** 2
+    length = math.sqrt(length)
     for k in range(3):
-        frame[0, k] /= math.sqrt(length)
+        frame[0, k] /= length
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         frame[1, k] = frame[2, i] * frame[0, j] - frame[2, j] * frame[0, i]
@@ -80,24 +76,21 @@ def _frame(axes, scale, ball, xrow, world_from_sensor, frame):
 
 
 @inner
-def _kernel_matrix(sums, n, frame, moment, out):
+def _kernel_matrix(sums, n, frame, out):
     """K in the Gaussian's axes."""
-    moment[0, 0], moment[1, 1], moment[2, 2] = sums[S_XX], sums[S_YY], -32 * sums[S_FLAT] / (n * n)
-    moment[0, 1], moment[0, 2], moment[1, 2] = sums[S_XY], 4 * sums[S_WX] / n, 4 * sums[S_WY] / n
-    moment[1, 0], moment[2, 0], moment[2, 1] = moment[0, 1], moment[0, 2], moment[1, 2]
-    for i in range(3):
-        for j in range(3):
-            value = 0.0
-            for r in range(3):
-                for c in range(3):
-                    value += frame[r, i] * moment[r, c] * frame[c, j]
-            out[i, j] = value
+    xx, xy, yy = sums[S_XX], sums[S_XY], sums[S_YY]
+    xb, yb, bb = 4 * sums[S_WX] / n, 4 * sums[S_WY] / n, -32 * sums[S_FLAT] / (n * n)
+    for j in range(3):
+        e1, e2, e3 = frame[0, j], frame[1, j], frame[2, j]
+        a, b, c = xx * e1 + xy * e2 + xb * e3, xy * e1 + yy * e2 + yb * e3, xb * e1 + yb * e2 + bb * e3
+        for i in range(3):
+            out[i, j] = frame[0, i] * a + frame[1, i] * b + frame[2, i] * c
 
 
 @kernel
 def project_back(
     first, count, records, spans, sources, first_slot, slots, mean, quat, scale, opacity, world_from_sensor,
-    gradients, pose,
+    by_mean, by_quat, by_scale, by_opacity, by_features, pose,
 ):  # fmt: skip
     """Add the gradients of a run of records to those of their Gaussians and of the pose.
 
@@ -114,12 +107,16 @@ def project_back(
         scale: [g,3].
         opacity: [g].
         world_from_sensor: [4,4] float64, at the reference instant.
-        gradients: [g,GRADIENTS] float32, added to.
+        by_mean: [g,3] float32 gradients, added to, like the following four.
+        by_quat: [g,4].
+        by_scale: [g,3].
+        by_opacity: [g].
+        by_features: [g,3].
         pose: [blocks,6] float64 per block of 256 Gaussians, added to: force on the eye, torque about it, in the world.
     """
     sums, axes, frame = np.empty(SUMS), np.empty((3, 3)), np.empty((3, 3))
-    offset, ball, by_ball, by_mean, s = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    moment, k_ = np.empty((3, 3)), np.empty((3, 3))
+    offset, ball, by_ball, force, s = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    k_ = np.empty((3, 3))
     for i in range(first, first + count):
         tiles = (np.int64(spans[i, 1]) - spans[i, 0] + 1) * (np.int64(spans[i, 3]) - spans[i, 2] + 1)
         sums[:] = 0.0
@@ -143,7 +140,7 @@ def project_back(
             s[k] = max(np.float64(scale[g, k]), MIN_SCALE_M)
         for k in range(3):
             ball[k] = (axes[0, k] * offset[0] + axes[1, k] * offset[1] + axes[2, k] * offset[2]) / s[k]
-        n = _frame(axes, s, ball, records[i], world_from_sensor, frame)
+        n = _frame(axes, s, ball, records, i, world_from_sensor, frame)
         inverse = 1 / (n * n)
         across = 4 * sums[S_WX] * inverse - sums[S_XW] / 4
         down = 4 * sums[S_WY] * inverse - sums[S_YW] / 4
@@ -151,26 +148,25 @@ def project_back(
         for k in range(3):
             by_ball[k] = (frame[0, k] * across + frame[1, k] * down + frame[2, k] * along) / s[k]
         for k in range(3):
-            by_mean[k] = axes[k, 0] * by_ball[0] + axes[k, 1] * by_ball[1] + axes[k, 2] * by_ball[2]
-        _kernel_matrix(sums, n, frame, moment, k_)
+            force[k] = axes[k, 0] * by_ball[0] + axes[k, 1] * by_ball[1] + axes[k, 2] * by_ball[2]
+        _kernel_matrix(sums, n, frame, k_)
         tx = k_[1, 2] * (s[2] / s[1] - s[1] / s[2])
         ty = k_[2, 0] * (s[0] / s[2] - s[2] / s[0])
         tz = k_[0, 1] * (s[1] / s[0] - s[0] / s[1])
-        out = gradients[g]
-        out[G_QUAT] += (-q[1] * tx - q[2] * ty - q[3] * tz) * 2 / norm
-        out[G_QUAT + 1] += (q[0] * tx + q[2] * tz - q[3] * ty) * 2 / norm
-        out[G_QUAT + 2] += (q[0] * ty + q[3] * tx - q[1] * tz) * 2 / norm
-        out[G_QUAT + 3] += (q[0] * tz + q[1] * ty - q[2] * tx) * 2 / norm
+        by_quat[g, 0] += (-q[1] * tx - q[2] * ty - q[3] * tz) * 2 / norm
+        by_quat[g, 1] += (q[0] * tx + q[2] * tz - q[3] * ty) * 2 / norm
+        by_quat[g, 2] += (q[0] * ty + q[3] * tx - q[1] * tz) * 2 / norm
+        by_quat[g, 3] += (q[0] * tz + q[1] * ty - q[2] * tx) * 2 / norm
         for k in range(3):
-            out[G_MEAN + k] += by_mean[k]
+            by_mean[g, k] += force[k]
             if scale[g, k] >= MIN_SCALE_M:
-                out[G_SCALE + k] -= k_[k, k] / s[k]
-            out[G_FEATURES + k] += sums[S_FEATURE + k]
+                by_scale[g, k] -= k_[k, k] / s[k]
+            by_features[g, k] += sums[S_FEATURE + k]
         if opacity[g] < MAX_OPACITY:
-            out[G_OPACITY] -= sums[S_FADE] / (8 * np.float64(opacity[g]))
-        part = pose[g // BLOCK]
+            by_opacity[g] -= sums[S_FADE] / (8 * np.float64(opacity[g]))
+        part = g // BLOCK
         for k in range(3):
             i1, i2 = (k + 1) % 3, (k + 2) % 3
-            part[k] -= by_mean[k]
-            part[3 + k] -= offset[i1] * by_mean[i2] - offset[i2] * by_mean[i1]
-            part[3 + k] -= axes[k, 0] * tx + axes[k, 1] * ty + axes[k, 2] * tz
+            pose[part, k] -= force[k]
+            pose[part, 3 + k] -= offset[i1] * force[i2] - offset[i2] * force[i1]
+            pose[part, 3 + k] -= axes[k, 0] * tx + axes[k, 1] * ty + axes[k, 2] * tz

@@ -9,71 +9,98 @@ from nurec_sim.render.cpu.kernel import kernel
 RADIX_BITS = 11
 DROPPED_BITS = 5
 """Low bits that the radix sort leaves to the final pass: 22 bits hold depths from 1e-3 to 1e4 times the nearest."""
+SAMPLE = 64
+"""Of how many keys one is looked at to divide the depths among threads."""
+
+
+def depth_cuts(keys, starts, counts, parts):
+    """Depths, as bits, that divide records into ``parts`` of about equal number: [parts + 1] uint64."""
+    runs = [keys[first : first + count : SAMPLE] for first, count in zip(starts, counts, strict=True)]
+    some = np.sort(np.concatenate(runs)).view(np.uint32)
+    cuts = np.zeros(parts + 1, np.uint64)
+    cuts[-1] = 1 << 32
+    if len(some):
+        cuts[1:-1] = some[len(some) * np.arange(1, parts) // parts]
+    return cuts
 
 
 @kernel
-def sort_by_depth(keys, starts, counts, nearest, order, spare):
-    """Record numbers in the order of their float32 keys; ties keep the order of the rows.
+def sort_by_depth(keys, starts, counts, nearest, low_cut, high_cut, spans, order, sorted_spans, spare):
+    """Put the records whose keys lie in [low_cut, high_cut) where they belong in the order of all keys.
 
     Two passes of a radix sort over the leading bits leave keys that differ by less than 4e-6 in the order of their
-    rows; an insertion sort over whole keys, which are nearly sorted then, finishes.
+    rows; an insertion sort over whole keys, which are nearly sorted then, finishes. Ties keep the order of the rows.
 
     Args:
-        keys: positive depths.
+        keys: positive float32 depths.
         starts: [runs] first row of each run of valid rows.
         counts: [runs] their lengths.
         nearest: smallest possible key.
-        order: [total] int32 output.
-        spare: [2,total] uint64 scratch.
-
-    Returns:
-        Number of records.
+        low_cut: smallest key to sort, as bits (uint64).
+        high_cut: one behind the largest.
+        spans: [..,4] tiles of the records.
+        order: [total] output: record numbers; only this range's part is written.
+        sorted_spans: [total,4] output: their spans.
+        spare: [2,total] uint64 scratch, of which only this range's part is used.
     """
     bits = keys.view(np.uint32)
     low = np.array([nearest], np.float32).view(np.uint32)[0] >> np.uint32(DROPPED_BITS)
     size = 1 << RADIX_BITS
-    top = np.uint32((1 << (2 * RADIX_BITS)) - 1)
-    mask = np.uint32(size - 1)
-    now, other = spare[0], spare[1]
+    top = np.uint64((1 << (2 * RADIX_BITS)) - 1)
+    mask = np.uint64(size - 1)
+    before = 0
+    n = 0
+    for run in range(len(starts)):
+        for i in range(starts[run], starts[run] + counts[run]):
+            key = np.uint64(bits[i])
+            before += 1 if key < low_cut else 0
+            n += 1 if low_cut <= key < high_cut else 0
+    now, other = spare[0, before : before + n], spare[1, before : before + n]
     first, second = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
     n = 0
     for run in range(len(starts)):
         for i in range(starts[run], starts[run] + counts[run]):
-            value = bits[i] >> np.uint32(DROPPED_BITS)
-            value = min(value - low if value > low else np.uint32(0), top)
-            now[n] = (np.uint64(value) << np.uint64(32)) | np.uint64(i)
-            first[np.int64(value & mask) + 1] += 1
-            second[np.int64(value >> np.uint32(RADIX_BITS)) + 1] += 1
-            n += 1
+            key = np.uint64(bits[i])
+            if low_cut <= key < high_cut:
+                value = key >> np.uint64(DROPPED_BITS)
+                value = min(value - low if value > low else np.uint64(0), top)
+                now[n] = (key << np.uint64(32)) | np.uint64(i)
+                first[np.int64(value & mask) + 1] += 1
+                second[np.int64(value >> np.uint64(RADIX_BITS)) + 1] += 1
+                n += 1
     for d in range(size):
         first[d + 1] += first[d]
         second[d + 1] += second[d]
     for i in range(n):
-        digit = np.int64((now[i] >> np.uint64(32)) & np.uint64(mask))
+        value = now[i] >> np.uint64(32 + DROPPED_BITS)
+        digit = np.int64(min(value - low if value > low else np.uint64(0), top) & mask)
         other[first[digit]] = now[i]
         first[digit] += 1
     for i in range(n):
-        digit = np.int64(other[i] >> np.uint64(32 + RADIX_BITS))
-        order[second[digit]] = np.int32(other[i] & np.uint64(0xFFFFFFFF))
+        value = other[i] >> np.uint64(32 + DROPPED_BITS)
+        digit = np.int64(min(value - low if value > low else np.uint64(0), top) >> np.uint64(RADIX_BITS))
+        now[second[digit]] = other[i]
         second[digit] += 1
     for i in range(1, n):
-        row = order[i]
-        key = bits[row]
+        item = now[i]
         j = i
-        while j > 0 and (bits[order[j - 1]] > key or (bits[order[j - 1]] == key and order[j - 1] > row)):
-            order[j] = order[j - 1]
+        while j > 0 and now[j - 1] > item:
+            now[j] = now[j - 1]
             j -= 1
-        order[j] = row
-    return n
+        now[j] = item
+    for i in range(n):
+        row = np.uint64(now[i] & np.uint64(0xFFFFFFFF))
+        order[before + i] = np.int32(row)
+        for k in range(4):
+            sorted_spans[before + i, k] = spans[row, k]
 
 
 @kernel
-def count_tiles(spans, order, first, last, columns, counts):
-    """Add to ``counts`` [tiles] how many of ``order[first:last]`` touch each macro tile."""
+def count_tiles(spans, first, last, columns, counts):
+    """Add to ``counts`` [tiles] how many of the sorted records ``first`` .. ``last`` - 1 touch each macro tile."""
     for j in range(first, last):
-        i = np.uint64(order[j])
-        for ty in range(spans[i, 2], spans[i, 3] + 1):
-            for tx in range(spans[i, 0], spans[i, 1] + 1):
+        for ty in range(spans[j, 2], spans[j, 3] + 1):
+            for tx in range(spans[j, 0], spans[j, 1] + 1):
                 counts[np.uint64(ty * columns + tx)] += 1
 
 
@@ -81,9 +108,9 @@ def count_tiles(spans, order, first, last, columns, counts):
 def fill_tiles(spans, order, first, last, columns, position, lists):
     """Append the records of ``order[first:last]`` to their tiles' lists at ``position`` [tiles], which moves on."""
     for j in range(first, last):
-        i = np.uint64(order[j])
-        for ty in range(spans[i, 2], spans[i, 3] + 1):
-            for tx in range(spans[i, 0], spans[i, 1] + 1):
+        record = order[j]
+        for ty in range(spans[j, 2], spans[j, 3] + 1):
+            for tx in range(spans[j, 0], spans[j, 1] + 1):
                 t = np.uint64(ty * columns + tx)
-                lists[position[t]] = np.int32(i)
+                lists[position[t]] = record
                 position[t] += 1

@@ -84,6 +84,7 @@ def responses(
     rays: Callable[[int], list[Vector]],
     x: Vector,
     y: list[Vector],
+    refined: bool,
 ) -> tuple[list[Vector], list[Vector]]:
     """Faded exponents Q1 / Q2 + FADE and distances t of one record for some vectors of rays.
 
@@ -94,6 +95,7 @@ def responses(
         rays: a plane of the rays, per vector (unused for AFFINE).
         x: cells from the tile's centre (AFFINE), the same for every vector.
         y: the same along y, per vector.
+        refined: whether distances need more than 14 bits (LiDARs).
     """
     count = len(y)
     rows = [[coefficient(start + k) for k in range(3)] for start in (C_X, C_Y, C_W)]
@@ -108,7 +110,7 @@ def responses(
     flat, fade = coefficient(C_FLAT), coefficient(C_FADE)
     q1 = [a * a + b * b for a, b in zip(big_x, big_y, strict=True)]
     q2 = [flat * q + w * w for q, w in zip(q1, big_w, strict=True)]
-    inverse = [q.reciprocal() for q in q2]
+    inverse = [q.reciprocal(refined) for q in q2]
     if way != MOVING:
         return (
             [q * i + fade for q, i in zip(q1, inverse, strict=True)],
@@ -181,7 +183,7 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                     return v.broadcast(where, 4 * BATCH * k)
 
                 planes = [values[k : k + AT_ONCE] for k in range(0, len(values), AT_ONCE)]
-                exponent, distance = responses(v, way, coefficient, lambda plane: plane_of(rays, plane), x, y)
+                exponent, distance = responses(v, way, coefficient, lambda plane: plane_of(rays, plane), x, y, kind == LIDAR)
                 hits = [e < CUT for e in exponent]
                 if check_near:
                     least = v.spread(near)

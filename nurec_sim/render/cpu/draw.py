@@ -22,10 +22,10 @@ from nurec_sim.render.cpu.blend import (
     write_block_6,
     write_block_9,
 )
-from nurec_sim.render.cpu.kernel import f4, inner, kernel
+from nurec_sim.render.cpu.kernel import f4, inner, keep_alive, kernel
 from nurec_sim.render.cpu.pack import BLOCK, MEAN, NORMAL
 from nurec_sim.render.cpu.rays import pinhole_basis, rolling_basis, table_basis, turn_rays
-from nurec_sim.render.cpu.records import MACRO, RECORD, TAG
+from nurec_sim.render.cpu.records import MACRO, RECORD
 from nurec_sim.render.cpu.simd import LANES, prefetch
 from nurec_sim.render.cpu.tiles import (
     AFFINE,
@@ -65,13 +65,12 @@ def aligned(count):
 def prepare(way, ids, records, count, alive, basis, coefficients, lists, counts, entry):
     """The preparation of a way; see ``tiles``."""
     if way == AFFINE:
-        prepare_affine(ids, records, count, alive, basis, coefficients, lists, counts, entry)
-    elif way == ROLLING:
-        prepare_rolling(ids, records, count, alive, basis, coefficients, lists, counts, entry)
-    elif way == TABLE:
-        prepare_table(ids, records, count, alive, basis, coefficients, lists, counts, entry)
-    else:
-        prepare_moving(ids, records, count, alive, basis, coefficients, lists, counts, entry)
+        return prepare_affine(ids, records, count, alive, basis, coefficients, lists, counts, entry)
+    if way == ROLLING:
+        return prepare_rolling(ids, records, count, alive, basis, coefficients, lists, counts, entry)
+    if way == TABLE:
+        return prepare_table(ids, records, count, alive, basis, coefficients, lists, counts, entry)
+    return prepare_moving(ids, records, count, alive, basis, coefficients, lists, counts, entry)
 
 
 @inner
@@ -131,7 +130,6 @@ def draw_tiles(
         np.zeros((PER_SIDE, BASIS), np.float32),
     )
     chosen, listed = np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
-    tags = records.view(np.int32)
     turned = rays.reshape(BLOCKS, RAY_PLANES, RAYS)
     columns = (width + MACRO - 1) // MACRO
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
@@ -176,18 +174,17 @@ def draw_tiles(
                 listed[block] = 0
             entry = 0
             first = j
-            close = False
+            close = np.int64(0)
             while j < batch_end:
                 for ahead in range(j + LANES, min(j + 2 * LANES, end)):
                     prefetch(records_at + np.int64(lists[ahead]) * (4 * RECORD))
                 some_count = min(batch_end - j, LANES)
-                prepare(way, lists_at + 4 * j, records_at, some_count, alive_now, basis_at, coefficients_at,
-                        chosen_at, listed_at, entry)  # fmt: skip
+                close |= prepare(way, lists_at + 4 * j, records_at, some_count, alive_now, basis_at, coefficients_at,
+                                 chosen_at, listed_at, entry)  # fmt: skip
                 entry += LANES
                 j += LANES
-            for k in range(first, batch_end):
-                close |= tags[np.uint64(lists[k]), TAG] < 0
-                if kind == NORMALS:
+            if kind == NORMALS:
+                for k in range(first, batch_end):
                     for c in range(3):
                         coefficients[C_NORMAL + c, k - first] = normals[np.uint64(lists[k]), c]
             visits += batch_end - first
@@ -197,7 +194,7 @@ def draw_tiles(
                 if n > 0:
                     evaluations += n * RAYS
                     more = blend_block(
-                        way, kind, close, state_at + block * block_bytes, chosen_at + block * LIST, n, coefficients_at,
+                        way, kind, close != 0, state_at + block * block_bytes, chosen_at + block * LIST, n, coefficients_at,
                         rays_at + block * ray_bytes, basis_at, f4(block % PER_SIDE * SIDE) - f4(15.5),
                         f4(block // PER_SIDE * SIDE) - f4(15.5), near,
                     )  # fmt: skip
@@ -211,6 +208,8 @@ def draw_tiles(
                     write_block_9(state_at + block * block_bytes, target, row_bytes, plane_bytes)
                 else:
                     write_block_6(state_at + block * block_bytes, target, row_bytes, plane_bytes)
+    keep_alive(state)
+    keep_alive(chosen)
     counts[VISITS] += visits
     counts[EVALUATIONS] += evaluations
 

@@ -17,7 +17,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from nurec_sim.render.cpu.backward import draw_tiles_back, number_slots
 from nurec_sim.render.cpu.backward_blend import IMAGE_PLANES, SUMS
-from nurec_sim.render.cpu.backward_project import GRADIENTS, project_back
+from nurec_sim.render.cpu.backward_project import project_back
 from nurec_sim.render.cpu.blend import CAMERA, LIDAR
 from nurec_sim.render.cpu.grid import Grid, grid_key, make_grid
 from nurec_sim.render.cpu.pack import BLOCK, FIELDS, PackedGaussians
@@ -33,8 +33,6 @@ KEPT_SENSORS = 16
 _BUFFERS = Buffers()
 _SENSORS: OrderedDict[tuple, Sensor] = OrderedDict()
 _SENSORS_LOCK = threading.Lock()
-GRADIENT_COLUMNS = np.cumsum([3, 4, 3, 1])
-"""Where the gradients of a Gaussian are cut: mean, rotation, scale, opacity, features."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,17 +182,16 @@ class Frame:
     ) -> tuple[Float32[np.ndarray, "n c"], ...]:
         picture, pose = self._picture, self.view.world_from_reference
         count = len(self._gaussians[0])
-        gradients = np.zeros((count, GRADIENTS), np.float32)
+        gradients = tuple(np.zeros((count, *width), np.float32) for width in ((3,), (4,), (3,), (), (3,)))
         forces = np.zeros((-(-count // BLOCK), 6))
         self._workers.run(
             project_back,
             [(first, many, picture.records, picture.spans, picture.sources, first_slot, slots, *self._gaussians,
-              pose, gradients, forces) for _, first, many in picture.runs],
+              pose, *gradients, forces) for _, first, many in picture.runs],
         )  # fmt: skip
         force, (x, y, z) = forces[:, :3].sum(axis=0), forces[:, 3:].sum(axis=0)
         by_pose = np.zeros((4, 4))
         # Of all matrices with this torque, the one along rotations.
         by_pose[:3, :3] = 0.5 * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose[:3, :3]
         by_pose[:3, 3] = force
-        mean, quat, scale, opacity, features = np.split(gradients, GRADIENT_COLUMNS, axis=1)
-        return mean, quat, scale, opacity[:, 0], features, by_pose
+        return *gradients, by_pose

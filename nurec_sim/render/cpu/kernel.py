@@ -55,3 +55,9 @@ def kernel(function: Callable) -> Callable:
 def inner(function: Callable) -> Callable:
     """A function that only kernels call."""
     return njit(**_INLINE, **_OPTIONS)(function)
+
+
+@inner
+def keep_alive(array):
+    """Use an array again: Numba frees it after its last use by name, whoever still works with its address."""
+    return array.size

@@ -9,21 +9,14 @@ what moves past less than half as fast as the lines near its box is not seen aga
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float32
 from llvmlite import ir
 
-from nurec_sim.render.cpu.charts import PERIOD, SHIFTED
-from nurec_sim.render.cpu.outlines import (
-    Box,
-    LensTables,
-    LidarTables,
-    Outline,
-    lens_box,
-    lidar_box,
-    outside_field,
-)
+from nurec_sim.render.cpu.charts import PER_RADIAN, PERIOD, SHIFTED
+from nurec_sim.render.cpu.outlines import Box, Lens, LensCone, Lidar, LidarCone, Outline, Texels
 from nurec_sim.render.cpu.records import CELLS, CENTRE, LOG_P, ROTATION, SIGMA, STEP, dot
 from nurec_sim.render.cpu.simd import BITS, LANES, Lanes, Mask, Vector, vector_kernel
 
@@ -59,7 +52,7 @@ def lens_lines(
     """The image row (or column) that the centres in ``scratch`` are seen in, to ``local``."""
     centre = [v.load(scratch, STEP * (CENTRE + k)) for k in range(3)]
     away = 1 / dot(centre, centre).max(1e-20).sqrt()
-    texels = LensTables(v, params, places, places).look([component * away for component in centre])
+    texels = Texels(Lens(v, params, places, places), [component * away for component in centre])
     axis = 1 - v.broadcast(motion, 4 * BY_COLUMN)
     place = texels.entry(axis) + texels.entry(axis * 2 + 2) * texels.ds + texels.entry(axis * 2 + 3) * texels.dt
     v.store(place.floor().max(0).min(v.broadcast(motion, 4 * LINES) - 1), local, STEP * LINE)
@@ -71,7 +64,7 @@ def lidar_lines(
 ) -> None:
     """The column that the centres in ``scratch`` are seen in, to ``local``."""
     centre = [v.load(scratch, STEP * (CENTRE + k)) for k in range(3)]
-    place = LidarTables(v, params, params).column(centre, v.broadcast(view, 4 * CELLS) * 0.5)
+    place = Lidar(v, params, params).column(centre, v.broadcast(view, 4 * CELLS) * 0.5)
     v.store(place.floor().max(0).min(v.broadcast(motion, 4 * LINES) - 1), local, STEP * LINE)
 
 
@@ -140,67 +133,66 @@ class Motion:
         return (high - self.line).max(self.line - low).max(0)
 
 
-def _widened(box: Box, turned: Vector) -> list[Vector]:
-    columns, rows = box.column_rate * turned, box.row_rate * turned
-    return [box.column[0] - columns, box.column[1] + columns, box.row[0] - rows, box.row[1] + rows]
+def _widened(ends: tuple[Vector, Vector], by: Vector) -> tuple[Vector, Vector]:
+    return ends[0] - by, ends[1] + by
 
 
 @vector_kernel("iiiiii")
 def moving_lens_boxes(
-    v: Lanes, local: ir.Value, params: ir.Value, places: ir.Value, bends: ir.Value, motion: ir.Value, box: ir.Value
+    v: Lanes, local: ir.Value, params: ir.Value, places: ir.Value, bends: ir.Value, motion: ir.Value, target: ir.Value
 ) -> ir.Value:
     """Cells that any line of a lens may see Gaussians in; the mask of those in its field."""
-    tables, outline = LensTables(v, params, places, bends), Outline(v, local)
-    texels, motions = tables.look(outline.f), Motion(v, motion, local, outline, 1.0)
+    outline = Outline(v, local)
+    cone = LensCone(Lens(v, params, places, bends), outline)
+    motions = Motion(v, motion, local, outline, 1.0)
     by_column = v.broadcast(motion, 4 * BY_COLUMN) > 0.5
-    most = motions.turned(motions.all_lines) * 1.25
-    seen = ~outside_field(tables, texels, (outline.reach + most) / (1 - outline.reach * most).max(0.2))
 
-    def along(cells: Box) -> list[Vector]:
-        return [by_column.where(cells.column[k], cells.row[k]) for k in range(2)]
+    def along(pair: Sequence[Vector], other: Sequence[Vector]) -> list[Vector]:
+        return [by_column.where(a, b) for a, b in zip(pair, other, strict=True)]
 
-    lines = motions.guess(*along(lens_box(tables, outline, texels, None)))
-    cells = lens_box(tables, outline, texels, motions.turned(lines))
-    lines = motions.lines_away(*along(cells), by_column.where(cells.column_rate, cells.row_rate), lines)
+    still, _ = cone.box()
+    lines = motions.guess(*along(still.column, still.row))
+    box, (column_rate, row_rate) = cone.box(motions.turned(lines))
+    lines = motions.lines_away(*along(box.column, box.row), by_column.where(column_rate, row_rate), lines)
     turned = motions.turned(lines)
-    for k, end in enumerate(_widened(cells, turned)):
-        v.store(end, box, STEP * k)
-    return seen.integer()
+    Box(_widened(box.column, column_rate * turned), _widened(box.row, row_rate * turned)).store(v, target)
+    return (~cone.outside(motions.turned(motions.all_lines))).integer()
 
 
 @vector_kernel("iiiiii")
 def moving_lidar_boxes(
-    v: Lanes, local: ir.Value, params: ir.Value, rows: ir.Value, view: ir.Value, motion: ir.Value, box: ir.Value
+    v: Lanes, local: ir.Value, params: ir.Value, rows: ir.Value, view: ir.Value, motion: ir.Value, target: ir.Value
 ) -> ir.Value:
     """Cells that any column of a LiDAR may see Gaussians in, were there no seam; the mask of those that may cross it.
 
     The seam is where the last column of a sweep meets the first one, fired from elsewhere.
     """
-    tables, outline = LidarTables(v, params, rows), Outline(v, local)
-    shifted, period = tables.param(SHIFTED), tables.param(PERIOD)
+    lidar, outline = Lidar(v, params, rows), Outline(v, local)
+    shifted, period = lidar.param(SHIFTED), lidar.param(PERIOD)
     motions = Motion(v, motion, local, outline, shifted)
-    still = lidar_box(tables, outline, motions.line, None)
-    lines = motions.guess(*still.column)
-    cells = lidar_box(tables, outline, motions.line, motions.turned(lines))
-    lines = motions.lines_away(*cells.column, cells.column_rate, lines)
+    cone = LidarCone(lidar, outline, motions.line)
+    lines = motions.guess(*cone.columns)
+    rate = cone.rate(motions.turned(lines))
+    lines = motions.lines_away(*cone.columns, rate, lines)
     turned = motions.turned(lines)
-    cells = Box(cells.column, still.row, cells.column_rate, cells.row_rate)
-    # Azimuth turns as directions do, seen from above.
-    flat = (outline.f[0] * outline.f[0] + outline.f[1] * outline.f[1]).sqrt() - outline.f[2].abs() * outline.reach
-    turn = motions.turned(motions.all_lines)
-    seam = None
-    for k, end in enumerate(_widened(cells, turned)):
-        v.store(end, box, STEP * k)
-    return seam.integer()
+    box = Box(_widened(cone.columns, rate * turned), cone.rows(turned))
+    box.store(v, target)
+    # Over the whole sweep azimuths turn at most as much as directions do that are level.
+    level = (cone.flat - outline.f[2].abs() * outline.reach).max(1e-3)
+    farthest = motions.turned(motions.all_lines) / level * lidar.param(PER_RADIAN).abs() * 1.5
+    low, high = _widened(box.column, farthest + shifted)
+    return ((low < v.broadcast(view, 4 * CELLS) - period) | (high > period)).integer()
 
 
-@vector_kernel("iiii")
-def join_ends(v: Lanes, seam: ir.Value, params: ir.Value, box: ir.Value, other: ir.Value) -> None:
+@vector_kernel("iiiii")
+def join_ends(v: Lanes, seam: ir.Value, params: ir.Value, view: ir.Value, box: ir.Value, other: ir.Value) -> None:
     """Let the boxes in the mask ``seam`` hold what is seen from the other end of the sweep as well, beyond the seam."""
     chosen = Mask(v.b, v.b.bitcast(v.b.trunc(seam, ir.IntType(LANES)), BITS))
-    period = v.broadcast(params, 4 * PERIOD)
+    period, shifted = v.broadcast(params, 4 * PERIOD), v.broadcast(params, 4 * SHIFTED)
     left, right, top, bottom = (v.load(box, STEP * k) for k in range(4))
     left2, right2, top2, bottom2 = (v.load(other, STEP * k) for k in range(4))
+    # Boxes that lie outside of the sweep as seen from its other end hold none of the cells that fire there.
+    chosen = chosen & (left2 < v.broadcast(view, 4 * CELLS) + shifted) & (right2 > -shifted)
     shift = period * ((left + right - left2 - right2) / (period * 2) + 0.5).floor()
     ends = left.min(left2 + shift), right.max(right2 + shift), top.min(top2), bottom.max(bottom2)
     for k, (own, end) in enumerate(zip((left, right, top, bottom), ends, strict=True)):

@@ -20,7 +20,6 @@ from nurec_sim.render.cpu.pack import (
     BLOCK,
     COLOUR,
     FIELDS,
-    LARGEST,
     LOG_OPACITY,
     MAX_OPACITY,
     MEAN,
@@ -30,13 +29,13 @@ from nurec_sim.render.cpu.pack import (
     REACH,
     SCALE,
     PackedGaussians,
-    drawable,
     gaussian_columns,
     morton_order,
     to_blocks,
 )
 from nurec_sim.render.cpu.records import EYE_HIGH, EYE_LOW, FEATURES, LOG_255, SCRATCH, VIEW
 from nurec_sim.render.cpu.simd import LANES
+from nurec_sim.render.layers import LARGEST, drawable
 from nurec_sim.types import DynamicGaussians, Track
 
 if TYPE_CHECKING:

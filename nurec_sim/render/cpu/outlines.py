@@ -40,7 +40,7 @@ STEEP = 1e-2
 
 
 class Outline:
-    """Cones of a group of Gaussians, which ``place`` left in ``scratch``, around the directions ``f`` of their centres."""
+    """Cones of the group that ``place`` left in ``scratch``, around the unit directions ``f`` of its centres."""
 
     def __init__(self, v: Lanes, scratch: ir.Value) -> None:
         def part(k: int) -> Vector:
@@ -80,18 +80,18 @@ class Outline:
 
 @dataclass
 class Box:
-    """Cells (fractional, centres at +0.5) of a Gaussian, and how they change with the direction it is seen in.
-
-    ``column_rate`` and ``row_rate`` are the most cells per radian.
-    """
+    """Cells (fractional, centres at +0.5) that a group of Gaussians may be seen in: lowest and highest."""
 
     column: tuple[Vector, Vector]
     row: tuple[Vector, Vector]
-    column_rate: Vector
-    row_rate: Vector
+
+    def store(self, v: Lanes, target: ir.Value) -> None:
+        """Write the ends to [4,LANES] floats."""
+        for k, end in enumerate((*self.column, *self.row)):
+            v.store(end, target, STEP * k)
 
 
-class LensTables:
+class Lens:
     """A lens chart in memory."""
 
     def __init__(self, v: Lanes, params: ir.Value, places: ir.Value, bends: ir.Value) -> None:
@@ -101,85 +101,96 @@ class LensTables:
         """A parameter of the chart, in all lanes."""
         return self.v.broadcast(self.params, 4 * k)
 
-    def look(self, f: list[Vector]) -> LensTexels:
-        """The texels nearest to unit directions."""
-        return LensTexels(self, f)
 
+class Texels:
+    """The texels of a lens chart nearest to unit directions ``f``, and the way (``ds``, ``dt``) from them to these."""
 
-class LensTexels:
-    """The texels of a lens chart nearest to unit directions, and the way from them to the directions."""
-
-    def __init__(self, tables: LensTables, f: list[Vector]) -> None:
-        v, self.tables = tables.v, tables
-        self.f = f
-        self.divisor = 1 / (1 + f[2]).max(1e-6)
-        self.s, self.t = f[0] * self.divisor, f[1] * self.divisor
-        texels, middle = tables.param(TEXELS), tables.param(MIDDLE)
-        self.texel = 1 / texels
-        x, y = self.s * texels + middle, self.t * texels + middle
+    def __init__(self, lens: Lens, f: list[Vector]) -> None:
+        self.lens, self.f = lens, f
+        self.inverse = 1 / (1 + f[2]).max(1e-6)
+        self.s, self.t = f[0] * self.inverse, f[1] * self.inverse
+        density, middle = lens.param(TEXELS), lens.param(MIDDLE)
+        x, y = self.s * density + middle, self.t * density + middle
         self.inside = (x >= 0) & (x <= LENS_SIZE - 1) & (y >= 0) & (y <= LENS_SIZE - 1)
-        column = (x + 0.5).floor().max(0).min(LENS_SIZE - 1)
-        row = (y + 0.5).floor().max(0).min(LENS_SIZE - 1)
-        self.ds, self.dt = (x - column) * self.texel, (y - row) * self.texel
+        column, row = ((p + 0.5).floor().max(0).min(LENS_SIZE - 1) for p in (x, y))
+        self.side = 1 / density
+        self.ds, self.dt = (x - column) * self.side, (y - row) * self.side
         self.number = row * LENS_SIZE + column
-        self.v = v
 
     def entry(self, k: int | Vector) -> Vector:
         """Value k of each texel."""
-        return self.v.gather(self.tables.places, (self.number * 6 + k).integers())
+        return self.lens.v.gather(self.lens.places, (self.number * 6 + k).integers())
 
     def place(self, axis: int) -> tuple[Vector, list[Vector]]:
         """Column (axis 0) or row (axis 1) of the directions, and its gradient by the direction, perpendicular to it."""
         by_s, by_t = self.entry(2 + 2 * axis), self.entry(3 + 2 * axis)
         inward = by_s * self.s + by_t * self.t
         gradient = [by_s - inward * self.f[0], by_t - inward * self.f[1], -inward * (1 + self.f[2])]
-        return self.entry(axis) + by_s * self.ds + by_t * self.dt, [part * self.divisor for part in gradient]
+        return self.entry(axis) + by_s * self.ds + by_t * self.dt, [part * self.inverse for part in gradient]
 
-    def bend(self, tangent: Vector) -> tuple[Vector, Vector, Mask]:
-        """Largest bend within an angle, half of whose tangent is at most half of ``tangent``.
-
-        Returns:
-            Cells per squared radian, the angle from the direction to its texel at most, and where this is known.
-        """
-        rho2 = self.s * self.s + self.t * self.t
+    def bend(self, tangent: Vector) -> tuple[Vector, Mask]:
+        """Largest bend within twice the angle whose tangent is half of ``tangent``, and where it is known."""
+        v, rho2 = self.lens.v, self.s * self.s + self.t * self.t
         half = tangent * 0.5
         room = 1 - half * rho2.sqrt()
-        texels = half * (1 + rho2) / room.max(0.05) * self.tables.param(TEXELS) + 1.75
-        b = self.v.b
-        exponent = b.lshr(texels.bits(), spread(b, I32(23), INTS))
-        window = self.v.from_integers(exponent) - 127.0  # its side of 2^(window + 1) texels holds all of them
+        texels = half * (1 + rho2) / room.max(0.05) * self.lens.param(TEXELS) + 1.75
+        exponent = v.b.lshr(texels.bits(), spread(v.b, I32(23), INTS))
+        window = v.from_integers(exponent) - 127.0  # 2^(window + 1) texels to each side hold all of them
         known = self.inside & (room > 0.05) & (window < WINDOWS) & (tangent < WIDE)
         entry = window.max(0).min(WINDOWS - 1) * (LENS_SIZE * LENS_SIZE) + self.number
-        return self.v.gather(self.tables.bends, entry.integers()), self.texel * 1.45 / (1 + rho2), known
+        return v.gather(self.lens.bends, entry.integers()), known
+
+    def offset(self) -> Vector:
+        """Angle from a direction to its texel, at most."""
+        return self.side * 1.45 / (1 + self.s * self.s + self.t * self.t)
 
 
-def lens_box(tables: LensTables, outline: Outline, texels: LensTexels, turned: Vector | None) -> Box:
-    """Cells that a lens may see a Gaussian in; with ``turned``, rates hold for directions up to that angle away."""
-    angle = outline.reach if turned is None else outline.reach + turned * 1.25
-    bend, offset, known = texels.bend(angle)
-    away = outline.reach + offset
-    ends, rates = [], []
-    for axis in range(2):
-        place, gradient = texels.place(axis)
-        low, high = outline.interval(gradient)
-        slope = dot(gradient, gradient).sqrt()
-        cubic = (slope + bend * away) * outline.reach * outline.reach * outline.reach * 0.3334
-        pad = bend * away * away * 0.5 + cubic + tables.param(MISFIT)
-        ends.append((known.where(place + low - pad, -EVERYWHERE), known.where(place + high + pad, EVERYWHERE)))
-        rates.append(slope + bend * (angle + offset))
-    return Box(ends[0], ends[1], rates[0], rates[1])
+class LensCone:
+    """Where a lens sees the cones of a group of Gaussians."""
+
+    def __init__(self, lens: Lens, outline: Outline) -> None:
+        self.lens, self.outline, self.texels = lens, outline, Texels(lens, outline.f)
+        self.offset = self.texels.offset()
+        self.places, self.slopes, self.intervals = [], [], []
+        for axis in range(2):
+            place, gradient = self.texels.place(axis)
+            self.places.append(place)
+            self.slopes.append(dot(gradient, gradient).sqrt())
+            self.intervals.append(outline.interval(gradient))
+
+    def box(self, turned: Vector | None = None) -> tuple[Box, list[Vector]]:
+        """The box, and the most columns and rows per radian for directions up to the angle ``turned`` away.
+
+        The place of the centre, its gradient times the tangents of the cone, and a pad for what bends: half the
+        largest second derivative times the square of the angle from the texel, and the cube by which a tangent
+        exceeds its angle.
+        """
+        reach = self.outline.reach
+        angle = reach if turned is None else reach + turned * 1.25
+        bend, known = self.texels.bend(angle)
+        away = reach + self.offset
+        ends, rates = [], []
+        for place, slope, (low, high) in zip(self.places, self.slopes, self.intervals, strict=True):
+            cube = (slope + bend * away) * reach * reach * reach * 0.3334
+            pad = bend * away * away * 0.5 + cube + self.lens.param(MISFIT)
+            ends.append((known.where(place + low - pad, -EVERYWHERE), known.where(place + high + pad, EVERYWHERE)))
+            rates.append(slope + bend * (angle + self.offset))
+        return Box(*ends), rates
+
+    def outside(self, turned: Vector | None = None) -> Mask:
+        """Which cones lie wholly outside of the lens's field, even turned by an angle."""
+        reach = self.outline.reach
+        if turned is not None:
+            most = turned * 1.25
+            reach = (reach + most) / (1 - reach * most).max(0.1)
+        cosine = 1 / (reach * reach + 1).sqrt()
+        sine = reach * cosine
+        cos_field, sin_field = self.lens.param(COS_FIELD), self.lens.param(SIN_FIELD)
+        beyond = self.outline.f[2] < cos_field * cosine - sin_field * sine
+        return beyond & (sin_field * cosine + cos_field * sine > 0) & (reach < WIDE)
 
 
-def outside_field(tables: LensTables, texels: LensTexels, reach: Vector) -> Mask:
-    """Where round cones, ``reach`` the tangent of their angular radius, lie wholly outside of a lens's field."""
-    cosine = 1 / (reach * reach + 1).sqrt()
-    sine = reach * cosine
-    cos_field, sin_field = tables.param(COS_FIELD), tables.param(SIN_FIELD)
-    beyond = texels.f[2] < cos_field * cosine - sin_field * sine
-    return beyond & (sin_field * cosine + cos_field * sine > 0) & (reach < WIDE)
-
-
-class LidarTables:
+class Lidar:
     """A LiDAR chart in memory."""
 
     def __init__(self, v: Lanes, params: ir.Value, rows: ir.Value) -> None:
@@ -202,48 +213,49 @@ class LidarTables:
         return self.v.gather(self.rows, entry.max(0).min(LIDAR_SIZE - 1).integers())
 
 
-def lidar_box(tables: LidarTables, outline: Outline, near: Vector, turned: Vector | None) -> Box:
-    """Cells that a LiDAR may see a Gaussian in, its columns within half a turn of ``near``.
+class LidarCone:
+    """Where a LiDAR sees the cones of a group of Gaussians: columns within half a turn of ``near``."""
 
-    With ``turned``, rows and rates hold for directions up to that angle away.
-    """
-    x, y, z = outline.f
-    flat = (x * x + y * y).max(1e-12).sqrt()
-    inverse = 1 / flat
-    left, right = outline.interval([-y * inverse, x * inverse, tables.v.number(0)])
-    down, up = outline.interval([-z * x * inverse, -z * y * inverse, flat])
-    known = outline.reach < WIDE
+    def __init__(self, lidar: Lidar, outline: Outline, near: Vector) -> None:
+        self.lidar, self.outline = lidar, outline
+        x, y, z = outline.f
+        reach = outline.reach
+        self.flat = flat = (x * x + y * y).max(1e-12).sqrt()
+        inverse = 1 / flat
+        left, right = outline.interval([-y * inverse, x * inverse, lidar.v.number(0)])
+        down, up = outline.interval([-z * x * inverse, -z * y * inverse, flat])
+        self.known = known = reach < WIDE
 
-    # Azimuth: with (u, w) the tangents to the left and up, its tangent is u / (cos e - w sin e).
-    least = flat - (down * z).max(up * z)
-    around = ~(least > 1e-3) | ~known  # it reaches over the pole
-    wide = 1 / least.max(1e-3)
-    first, last = (left * wide).max(-HALF_PI), (right * wide).min(HALF_PI)
-    per_radian = tables.param(PER_RADIAN)
-    one, other = first * per_radian, last * per_radian
-    column = tables.column(outline.f, near)
-    low = column + one.min(other) - tables.param(MOST_AHEAD)
-    high = column + one.max(other) - tables.param(LEAST_AHEAD)
+        # Azimuth: with (u, w) the tangents to the left and up, its tangent is u / (cos e - w sin e).
+        least = flat - (down * z).max(up * z)
+        around = ~(least > 1e-3) | ~known  # it reaches over the pole
+        wide = lidar.param(PER_RADIAN) / least.max(1e-3)
+        quarter = lidar.param(PER_RADIAN).abs() * HALF_PI
+        one, other = left * wide, right * wide
+        column = lidar.column(outline.f, near)
+        low = column + one.min(other).max(-quarter) - lidar.param(MOST_AHEAD)
+        high = column + one.max(other).min(quarter) - lidar.param(LEAST_AHEAD)
+        self.columns = around.where(-EVERYWHERE, low), around.where(EVERYWHERE, high)
 
-    # Elevation: its sine is (sin e + w cos e) / sqrt(1 + u^2 + w^2).
-    side = (-left).max(right)
-    aside = 1 / (side * side + 1).sqrt()
-    above = (z + up * flat) / (up * up + 1).sqrt()
-    below = (z + down * flat) / (down * down + 1).sqrt()
-    above, below = (above > 0).where(above, above * aside), (below < 0).where(below, below * aside)
-    # Over the pole: all that lies within a round cone.
-    cosine = 1 / (outline.reach * outline.reach + 1).sqrt()
-    above = around.where((z > 0).where(1.0, (z + outline.reach * flat) * cosine), above)
-    below = around.where((z < 0).where(-1.0, (z - outline.reach * flat) * cosine), below)
-    slack = tables.v.number(0) if turned is None else turned
-    above, below = known.where(above + slack, 1.0), known.where(below - slack, -1.0)
+        # Elevation: its sine is (sin e + w cos e) / sqrt(1 + u^2 + w^2); over the pole, that of a round cone.
+        side = (-left).max(right)
+        aside = 1 / (side * side + 1).sqrt()
+        above, below = (z + up * flat) / (up * up + 1).sqrt(), (z + down * flat) / (down * down + 1).sqrt()
+        above, below = (above > 0).where(above, above * aside), (below < 0).where(below, below * aside)
+        cosine = 1 / (reach * reach + 1).sqrt()
+        self.above = around.where((z > 0).where(1.0, (z + reach * flat) * cosine), above)
+        self.below = around.where((z < 0).where(-1.0, (z - reach * flat) * cosine), below)
 
-    rate = tables.v.number(0)
-    if turned is not None:
-        angle = outline.reach + turned
-        rate = per_radian.abs() / (flat * (1 - angle * angle * 0.5) - z.abs() * angle).max(1e-3)
-    columns = around.where(-EVERYWHERE, low), around.where(EVERYWHERE, high)
-    return Box(columns, (tables.row(above, True), tables.row(below, False)), rate, tables.v.number(0))
+    def rows(self, turned: Vector | float) -> tuple[Vector, Vector]:
+        """First and last row of directions up to an angle away from the cone."""
+        above, below = self.known.where(self.above + turned, 1.0), self.known.where(self.below - turned, -1.0)
+        return self.lidar.row(above, True), self.lidar.row(below, False)
+
+    def rate(self, turned: Vector) -> Vector:
+        """Most columns per radian for directions up to an angle away from the cone."""
+        angle = self.outline.reach + turned
+        lowest_cosine = self.flat * (1 - angle * angle * 0.5) - self.outline.f[2].abs() * angle
+        return self.lidar.param(PER_RADIAN).abs() / lowest_cosine.max(1e-3)
 
 
 def atan2(y: Vector, x: Vector) -> Vector:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
 
+from nurec_sim.render.layers import drawable
 from nurec_sim.types import Gaussians
 
 # Fields of a block.
@@ -20,8 +21,6 @@ REACH = float(np.sqrt(2 * np.log(255)))
 """Standard deviations at which an opaque Gaussian has faded to 1/255."""
 NEVER_SEEN = -1e9
 """LOG_OPACITY of rows that only fill a block up."""
-LARGEST = 1e12
-"""Positions, scales and colours beyond this are taken for broken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,19 +61,6 @@ def pack(gaussians: Gaussians, sort: bool = True) -> PackedGaussians:
         sh_rest = to_blocks(rest[chosen].reshape(len(chosen), -1).astype(np.float32), blocks)
     centre, radius = block_spheres(fields)
     return PackedGaussians(fields, sh_rest, index, centre, radius)
-
-
-def drawable(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians can be drawn at all: everything of them finite and sensible, opacity at least 1/255."""
-    norm = np.linalg.norm(gaussians.quat_wxyz.astype(np.float64), axis=1)
-    with np.errstate(invalid="ignore"):
-        keep = np.isfinite(norm) & (norm > 1e-12) & (gaussians.opacity >= np.float32(1 / 255))
-        keep &= np.isfinite(gaussians.opacity) & (gaussians.scale_m > 0).all(axis=1)
-        for values in (gaussians.mean_m, gaussians.scale_m, gaussians.rgb):
-            keep &= (np.abs(values) <= LARGEST).all(axis=1)
-        if gaussians.sh_rest is not None:
-            keep &= np.isfinite(gaussians.sh_rest).all(axis=(1, 2))
-    return keep
 
 
 def gaussian_columns(gaussians: Gaussians, chosen: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n 21"]:

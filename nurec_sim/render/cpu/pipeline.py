@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from nurec_sim.render.cpu.binning import count_tiles, fill_tiles, sort_by_depth
+from nurec_sim.render.cpu.binning import count_tiles, depth_cuts, fill_tiles, sort_by_depth
 from nurec_sim.render.cpu.blend import CAMERA, LIDAR, NORMALS
 from nurec_sim.render.cpu.draw import EVALUATIONS, VISITS, draw_tiles, record_normals
 from nurec_sim.render.cpu.grid import LIDAR as LIDAR_GRID
@@ -67,6 +67,7 @@ class Picture:
     sources: Int32[np.ndarray, " n"] = field(init=False)
     runs: list[tuple[int, int, int]] = field(init=False)
     order: Int32[np.ndarray, " m"] = field(init=False)
+    sorted_spans: np.ndarray = field(init=False)
     starts: Int64[np.ndarray, " t"] = field(init=False)
     lists: Int32[np.ndarray, " p"] = field(init=False)
     stats: FrameStats = field(default_factory=FrameStats)
@@ -112,9 +113,7 @@ def bin_pictures(pictures: Sequence[Picture], workers: Workers) -> None:
     with _timed("project", pictures):
         _project(pictures, workers)
     with _timed("sort", pictures):
-        totals = workers.run_calls([_sorting(picture) for picture in pictures])
-        for picture, total in zip(pictures, totals, strict=True):
-            picture.order, picture.stats.visible = picture.order[:total], int(total)
+        _sort(pictures, workers)
     with _timed("bin", pictures):
         _bin(pictures, workers)
 
@@ -183,14 +182,24 @@ def view_eye(picture: Picture) -> np.ndarray:
     return picture.view.world_from_reference[:3, 3].copy()
 
 
-def _sorting(picture: Picture) -> tuple:
-    starts = np.array([first for _, first, _ in picture.runs], np.int64)
-    counts = np.array([count for _, _, count in picture.runs], np.int64)
-    total = int(counts.sum())
-    picture.order = picture.array("order", (total,), np.int32)
-    spare = picture.array("sorting", (2, total), np.uint64)
-    near = np.float32(picture.view.grid.near_m)
-    return sort_by_depth, picture.keys, starts, counts, near, picture.order, spare
+def _sort(pictures: Sequence[Picture], workers: Workers) -> None:
+    calls = []
+    for picture in pictures:
+        starts = np.array([first for _, first, _ in picture.runs], np.int64)
+        counts = np.array([count for _, _, count in picture.runs], np.int64)
+        total = int(counts.sum())
+        picture.stats.visible = total
+        picture.order = picture.array("order", (total,), np.int32)
+        picture.sorted_spans = picture.array("sorted spans", (total, 4), np.int16)
+        spare = picture.array("sorting", (2, total), np.uint64)
+        near = np.float32(picture.view.grid.near_m)
+        cuts = depth_cuts(picture.keys, starts, counts, workers.threads if len(pictures) < workers.threads else 1)
+        calls += [
+            (sort_by_depth, picture.keys, starts, counts, near, low, high, picture.spans, picture.order,
+             picture.sorted_spans, spare)
+            for low, high in zip(cuts[:-1], cuts[1:], strict=True)
+        ]  # fmt: skip
+    workers.run_calls(calls)
 
 
 def _bin(pictures: Sequence[Picture], workers: Workers) -> None:
@@ -199,7 +208,7 @@ def _bin(pictures: Sequence[Picture], workers: Workers) -> None:
         np.zeros((len(ranges), picture.tiles), np.int64) for picture, ranges in zip(pictures, splits, strict=True)
     ]
     workers.run_calls(
-        [(count_tiles, picture.spans, picture.order, first, last, picture.tile_columns, count[k])
+        [(count_tiles, picture.sorted_spans, first, last, picture.tile_columns, count[k])
          for picture, ranges, count in zip(pictures, splits, counts, strict=True)
          for k, (first, last) in enumerate(ranges)],
     )  # fmt: skip
@@ -211,7 +220,7 @@ def _bin(pictures: Sequence[Picture], workers: Workers) -> None:
         picture.stats.pairs = int(picture.starts[-1])
         picture.lists = picture.array("lists", (picture.stats.pairs + LANES,), np.int32)
         calls += [
-            (fill_tiles, picture.spans, picture.order, first, last, picture.tile_columns, position[k], picture.lists)
+            (fill_tiles, picture.sorted_spans, picture.order, first, last, picture.tile_columns, position[k], picture.lists)
             for k, (first, last) in enumerate(ranges)
         ]
     workers.run_calls(calls)

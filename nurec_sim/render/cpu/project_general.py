@@ -6,7 +6,7 @@ import numpy as np
 from llvmlite import ir
 
 from nurec_sim.render.cpu.charts import PERIOD
-from nurec_sim.render.cpu.kernel import kernel
+from nurec_sim.render.cpu.kernel import keep_alive, kernel
 from nurec_sim.render.cpu.motion import (
     join_ends,
     lens_lines,
@@ -16,7 +16,7 @@ from nurec_sim.render.cpu.motion import (
     other_ends,
     to_lines,
 )
-from nurec_sim.render.cpu.outlines import LensTables, LidarTables, Outline, lens_box, lidar_box, outside_field
+from nurec_sim.render.cpu.outlines import Box, Lens, LensCone, Lidar, LidarCone, Outline
 from nurec_sim.render.cpu.pack import BLOCK, FIELDS
 from nurec_sim.render.cpu.project_pinhole import take_features
 from nurec_sim.render.cpu.records import (
@@ -40,20 +40,16 @@ def lens_boxes(
     v: Lanes, scratch: ir.Value, params: ir.Value, places: ir.Value, bends: ir.Value, box: ir.Value
 ) -> ir.Value:
     """Cells that a lens at one pose may see Gaussians in; the mask of those in its field."""
-    tables, outline = LensTables(v, params, places, bends), Outline(v, scratch)
-    texels = tables.look(outline.f)
-    cells = lens_box(tables, outline, texels, None)
-    for k, end in enumerate((*cells.column, *cells.row)):
-        v.store(end, box, STEP * k)
-    return (~outside_field(tables, texels, outline.reach)).integer()
+    cone = LensCone(Lens(v, params, places, bends), Outline(v, scratch))
+    cone.box()[0].store(v, box)
+    return (~cone.outside()).integer()
 
 
 @vector_kernel("iiiii")
 def lidar_boxes(v: Lanes, scratch: ir.Value, params: ir.Value, rows: ir.Value, view: ir.Value, box: ir.Value) -> None:
     """Cells that a LiDAR at one pose may see Gaussians in."""
-    cells = lidar_box(LidarTables(v, params, rows), Outline(v, scratch), v.broadcast(view, 4 * CELLS) * 0.5, None)
-    for k, end in enumerate((*cells.column, *cells.row)):
-        v.store(end, box, STEP * k)
+    cone = LidarCone(Lidar(v, params, rows), Outline(v, scratch), v.broadcast(view, 4 * CELLS) * 0.5)
+    Box(cone.columns, cone.rows(0.0)).store(v, box)
 
 
 def _cells(low: Vector, high: Vector, count: Vector) -> tuple[Vector, Vector]:
@@ -160,7 +156,7 @@ def project_general(
                         other_ends(path, there)
                         to_lines(here, lines.ctypes.data, path, there)
                         moving_lidar_boxes(there, chart, table, around, path, other_box.ctypes.data)
-                        join_ends(seam, chart, box.ctypes.data, other_box.ctypes.data)
+                        join_ends(seam, chart, around, box.ctypes.data, other_box.ctypes.data)
                 else:
                     lidar_boxes(here, chart, table, around, box.ctypes.data)
                 both = lidar_tiles(box.ctypes.data, around, chart, tiles.ctypes.data, other_tiles.ctypes.data)
@@ -169,6 +165,8 @@ def project_general(
             else:
                 if moving:
                     lens_lines(here, chart, table, path, there)
+                    to_lines(here, lines.ctypes.data, path, there)
+                    lens_lines(there, chart, table, path, there)
                     to_lines(here, lines.ctypes.data, path, there)
                     mask &= moving_lens_boxes(there, chart, table, bend, path, box.ctypes.data)
                 else:
@@ -181,4 +179,5 @@ def project_general(
             source = number * BLOCK + lane
             n = emit(mask, rows, scratch, tiles, source, n, records, keys, spans, sources)
             n = emit(again, rows, scratch, other_tiles, source, n, records, keys, spans, sources)
+    keep_alive(local)
     return n - base

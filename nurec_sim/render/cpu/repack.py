@@ -11,7 +11,7 @@ from nurec_sim.render.cpu.pack import (
     BLOCK,
     COLOUR,
     INTENSITY,
-    LARGEST,
+    LABEL,
     LOG_OPACITY,
     MAX_OPACITY,
     MEAN,
@@ -20,6 +20,7 @@ from nurec_sim.render.cpu.pack import (
     QUAT,
     SCALE,
 )
+from nurec_sim.render.layers import LARGEST
 
 
 @inner
@@ -49,18 +50,20 @@ def repack(first, last, mean, quat, scale, opacity, features, lidar, fields):
         opacity: [n].
         features: [n,3] colours, or intensity, whether it is known, and drop probability.
         lidar: whether the features are the latter.
-        fields: [blocks,21,256] output, see ``pack``.
+        fields: [blocks,21,256] output, see ``pack``; only what a frame without normals reads.
     """
     feature = INTENSITY if lidar else COLOUR
-    fields[first:last] = f4(0)
     for block in range(first, last):
         out = fields[block]
-        out[QUAT] = f4(1)
-        out[SCALE : SCALE + 3] = f4(1)
-        out[LOG_OPACITY] = f4(NEVER_SEEN)
-        for k in range(min(BLOCK, len(mean) - block * BLOCK)):
+        out[LABEL] = f4(0)
+        for k in range(BLOCK):
             i = block * BLOCK + k
-            if not _drawable(mean, quat, scale, opacity, features, i):
+            if i >= len(mean) or not _drawable(mean, quat, scale, opacity, features, i):
+                for c in range(3):
+                    out[MEAN + c, k], out[feature + c, k], out[SCALE + c, k] = f4(0), f4(0), f4(1)
+                for c in range(4):
+                    out[QUAT + c, k] = f4(0.5)
+                out[LOG_OPACITY, k] = f4(NEVER_SEEN)
                 continue
             norm = 0.0
             for c in range(4):

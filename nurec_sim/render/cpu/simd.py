@@ -137,13 +137,13 @@ class Vector:
         """Smallest whole number not below."""
         return self._unary("ceil")
 
-    def reciprocal(self) -> Vector:
-        """1 / x to about 1e-7; a refined estimate where that is quicker than a division."""
+    def reciprocal(self, refined: bool = True) -> Vector:
+        """1 / x to about 1e-7, or 6e-5 where that saves work and ``refined`` is False."""
         if INSTRUCTION_SET != "avx512":
             return 1 / self
         f = declare(self.b, "llvm.x86.avx512.rcp14.ps.512", FLOATS, [FLOATS, FLOATS, I16])
         r = Vector(self.b, self.b.call(f, [self.value, constant(0), ir.Constant(I16, -1)]))
-        return r * (2 - self * r)
+        return r * (2 - self * r) if refined else r
 
     def integers(self) -> ir.Value:
         """Truncated to int32 lanes (LLVM value)."""

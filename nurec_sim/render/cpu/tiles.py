@@ -35,7 +35,7 @@ SIDE = 8
 PER_SIDE = MACRO // SIDE
 BLOCKS = PER_SIDE * PER_SIDE
 RAYS = SIDE * SIDE
-BATCH = 128
+BATCH = 64
 """Records that are prepared at once; their coefficients stay in the first-level cache."""
 LIST = BATCH + LANES
 """Room for the numbers of a batch's records that a block sees, a byte each."""
@@ -203,8 +203,10 @@ def _preparation(way: int) -> Callable[..., Any]:
         lists: ir.Value,
         counts: ir.Value,
         entry: ir.Value,
-    ) -> None:
+    ) -> ir.Value:
         """Coefficients of up to LANES records, and their numbers appended to the lists of the blocks that see them.
+
+        Returns 1 if any of them is close (TAG), else 0.
 
         Args:
             v: vectors.
@@ -266,6 +268,9 @@ def _preparation(way: int) -> Callable[..., Any]:
         if way == MOVING:
             for k in range(3):
                 v.store(drift[k], where, 4 * BATCH * (C_DRIFT + k))
+
+        near = b.icmp_signed("<", column[TAG].bits(), ir.Constant(INTS, [0] * LANES))
+        return Mask(b, b.and_(near, given)).any()
 
     return prepare
 

@@ -193,7 +193,7 @@ class _Blend(torch.autograd.Function):
             by_opacity.to(opacity.dtype),
             rows[11:14].T.to(ctx.feature_kind),
         )
-        poses = [
+        poses: list[Tensor | None] = [
             _pose_gradient(mean, unit, part[:, : len(opacity)], reference)
             for part, reference in zip(by_view, ctx.references, strict=False)
         ]

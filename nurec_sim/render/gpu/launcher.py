@@ -98,7 +98,9 @@ def cuda_device(device: str) -> torch.device:
     import torch
 
     if torch.version.cuda is None:
-        raise GpuError(f"no GPU: this torch ({torch.__version__}) was built without CUDA; install a CUDA build of torch")
+        raise GpuError(
+            f"no GPU: this torch ({torch.__version__}) was built without CUDA; install a CUDA build of torch"
+        )
     if not torch.cuda.is_available():
         raise GpuError("no GPU: torch finds no CUDA device; the CUDA back end needs an NVIDIA GPU and its driver")
     asked = torch.device(device)

@@ -1,14 +1,13 @@
 """The stages of a batch on the device: cones of rays, projection, tile lists, blending; and the way back.
 
-Blocks of Gaussians that a sensor cannot see are dropped, the others become records (counted first, so that each lands in
-a place of its own), records are handed out to tiles of 16 x 16 rays as pairs with the key (tile, depth), pairs are
+Blocks of Gaussians that a sensor cannot see are dropped; the others become records, counted first so that each lands
+in a place of its own. Records are handed out to tiles of 16 x 16 rays as pairs with the key (tile, depth), pairs are
 sorted, and each tile is blended front to back. No kernel adds up in an order that may vary, so the same input gives
 the same bytes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -50,14 +49,6 @@ class Blocks:
         spheres[:, 3] += 1e-3 * spheres[:, 3] + 1e-6 * np.abs(spheres[:, :3]).sum(axis=1) + 1e-3
         arrays = (packed.fields, packed.sh_rest, spheres.astype(np.float32))
         return cls(*(torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in arrays))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Blocks]) -> Blocks:
-        """All parts (without ``sh_rest``), one after the other."""
-        import torch
-
-        fields, spheres = ([getattr(part, name) for part in parts] for name in ("fields", "spheres"))
-        return cls(torch.cat(fields), torch.zeros((0, 0, 0), device=fields[0].device), torch.cat(spheres))
 
     @classmethod
     def none(cls, device: torch.device) -> Blocks:

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nurec_sim import geometry
-from nurec_sim.errors import RequestError
+from nurec_sim.errors import RequestError, TooLargeError
 from nurec_sim.render.cpu.grid import grid_key, make_grid
-from nurec_sim.render.cpu.pack import PackedGaussians, pack
+from nurec_sim.render.cpu.pack import pack
 from nurec_sim.render.gpu.launcher import THREADS, CudaLauncher, Launcher
+from nurec_sim.render.gpu.moving import MovingLayer
 from nurec_sim.render.gpu.pipeline import ALPHA, Blocks, draw
 from nurec_sim.render.gpu.views import Batch, GridTensors, SensorView, make_batch
-from nurec_sim.render.layers import moving_gaussians
-from nurec_sim.render.rays import reference_pose
 from nurec_sim.render.requests import CAMERA_OUTPUTS, check_request
 from nurec_sim.types import (
     CameraFrame,
@@ -35,6 +33,8 @@ if TYPE_CHECKING:
     import torch
 
 KEPT_GRIDS = 24
+SENSED_OUTPUTS = ("rgb", "depth", "alpha", "label")
+"""What ``sense`` asks of cameras."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,8 @@ class Images:
 
     Of cameras: ``rgb`` [rays,3] uint8, ``depth`` and ``alpha`` [rays], ``label`` [rays] uint8, ``normal`` [rays,3]. Of
     LiDARs, in the order of the beams: ``returns`` [rays,6] with x, y, z in the sensor at the end of the sweep, range,
-    intensity, and 1 where the beam returns. What the other kind of sensor would have is not initialised.
+    intensity, and 1 where the beam returns. Rays of the other kind of sensor are not initialised, and there are none
+    where a batch has no sensor of a kind.
     """
 
     first_ray: np.ndarray
@@ -77,6 +78,7 @@ class GpuRenderer:
         self._launcher: Launcher = CudaLauncher(device) if isinstance(device, str) else device
         self.device = self._launcher.device
         self._static = Blocks.of(pack(scene.static), self.device)
+        self._moving = MovingLayer.of(scene.dynamic, scene.tracks, self.device)
         self._sky = torch.from_numpy(np.ascontiguousarray(scene.sky, np.float32)).to(self.device)
         self._grids: OrderedDict[tuple, GridTensors] = OrderedDict()
         self._lock = threading.Lock()
@@ -87,9 +89,9 @@ class GpuRenderer:
         Raises:
             RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
         """
-        return self._frames(requests, CAMERA_OUTPUTS, LidarFilter())
+        return self._frames(requests, SENSED_OUTPUTS, LidarFilter())
 
-    def render_camera(self, request: SensorRequest, outputs: Sequence[str] = CAMERA_OUTPUTS) -> CameraFrame:
+    def render_camera(self, request: SensorRequest, outputs: Sequence[str] = SENSED_OUTPUTS) -> CameraFrame:
         """A camera frame with ``rgb`` and those of the other outputs that ``outputs`` names.
 
         Raises:
@@ -120,13 +122,22 @@ class GpuRenderer:
         """What ``sense`` draws, left on the device; at least one request.
 
         Raises:
-            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
+            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or the GPU's memory is full.
         """
+        import torch
+
         for request in requests:
             check_request(request, self.scene)
-        batch, moving = self._batch(requests)
+        try:
+            return self._draw(requests, filter or LidarFilter())
+        except torch.OutOfMemoryError as error:
+            raise TooLargeError(f"{len(requests)} sensors at once are too many for the GPU: {error}") from None
+
+    def _draw(self, requests: Sequence[SensorRequest], filter: LidarFilter) -> Images:
+        batch = make_batch([self._view(request, k) for k, request in enumerate(requests)], self._sky)
+        moving = self._moving.placed(self._launcher, batch, requests)
         drawn = draw(self._launcher, batch, self._static, moving)
-        return self._finish(batch, drawn.planes, requests, filter or LidarFilter())
+        return self._finish(batch, drawn.planes, requests, filter)
 
     def _frames(
         self, requests: Sequence[SensorRequest], outputs: Sequence[str], filter: LidarFilter
@@ -134,73 +145,55 @@ class GpuRenderer:
         if not requests:
             return []
         images = self.draw(requests, filter)
-        cameras = any(isinstance(request.sensor, CameraModel) for request in requests)
-        planes = {
-            "rgb": images.rgb, "depth": images.depth, "alpha": images.alpha, "label": images.label,
-            "normal": images.normal,
-        }  # fmt: skip
-        wanted = {"rgb", *outputs} if cameras else ()
-        host = {name: planes[name].cpu().numpy() for name in wanted}
-        lidars = any(isinstance(request.sensor, LidarModel) for request in requests)
-        returns = images.returns.cpu().numpy() if lidars else np.zeros((0, 6), np.float32)
+        host = {name: getattr(images, name).cpu().numpy() for name in {"rgb", "returns", *outputs}}
         frames: list[SensorFrame] = []
         for k, request in enumerate(requests):
             part = slice(images.first_ray[k], images.first_ray[k + 1])
             if isinstance(request.sensor, CameraModel):
-                frames.append(_camera_frame(request, request.sensor, {name: a[part] for name, a in host.items()}))
+                frames.append(
+                    _camera_frame(request, request.sensor, {name: plane[part] for name, plane in host.items()})
+                )
             else:
-                frames.append(_lidar_frame(request, request.sensor, returns[part]))
+                frames.append(_lidar_frame(request, request.sensor, host["returns"][part]))
         return frames
 
-    def _batch(self, requests: Sequence[SensorRequest]) -> tuple[Batch, Blocks]:
-        """The sensors of the requests, and the moving layer as each of them sees it."""
-        sensors, layers, first_block = [], [], 0
-        for request in requests:
-            tensors = self._grid(request)
-            layer = self._moving(request, tensors.grid.reference)
-            isp = self.scene.isp.get(request.sensor.id) if self.apply_isp else None
-            sensors.append(SensorView(tensors, request.world_from_sensor, isp, first_block, len(layer)))
-            layers.append(layer)
-            first_block += len(layer)
-        full = [Blocks.of(layer, self.device) for layer in layers if len(layer)]
-        return make_batch(sensors, self._sky), Blocks.joined(full) if full else Blocks.none(self.device)
-
-    def _moving(self, request: SensorRequest, reference: float) -> PackedGaussians:
-        """The dynamic layer at the reference instant."""
-        pose, t_us = reference_pose(request, reference)
-        actors = {
-            name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(reference))
-            for name, pair in request.actors.items()
-        }
-        return pack(moving_gaussians(self.scene.dynamic, self.scene.tracks, t_us, actors, pose[:3, 3]), sort=False)
+    def _view(self, request: SensorRequest, number: int) -> SensorView:
+        """The sensor of the request of that number."""
+        isp = self.scene.isp.get(request.sensor.id) if self.apply_isp else None
+        blocks = len(self._moving)
+        return SensorView(self._grid(request), request.world_from_sensor, isp, number * blocks, blocks)
 
     def _finish(
         self, batch: Batch, planes: torch.Tensor, requests: Sequence[SensorRequest], filter: LidarFilter
     ) -> Images:
         import torch
 
-        rays = batch.ray_count
+        lidars = [request.sensor for request in requests if isinstance(request.sensor, LidarModel)]
+        image_rays = batch.ray_count if len(lidars) < len(requests) else 0
+        beam_rays = batch.ray_count if lidars else 0
 
         def empty(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.empty(shape, dtype=dtype, device=self.device)
 
         images = Images(
             first_ray=batch.first_ray,
-            rgb=empty(rays, 3, dtype=torch.uint8),
-            depth=empty(rays),
+            rgb=empty(image_rays, 3, dtype=torch.uint8),
+            depth=empty(image_rays),
             alpha=planes[ALPHA],
-            label=empty(rays, dtype=torch.uint8),
-            normal=empty(rays, 3),
-            returns=empty(rays, 6),
+            label=empty(image_rays, dtype=torch.uint8),
+            normal=empty(image_rays, 3),
+            returns=empty(beam_rays, 6),
         )
         grid = (-(-batch.largest_grid // THREADS), len(requests))
-        common = (batch.views, np.int64(rays), planes)
-        self._launcher.launch("finish_images", grid, *common, images.rgb, images.depth, images.label, images.normal)
-        limits = [r.sensor.range_m if isinstance(r.sensor, LidarModel) else (0.0, 0.0) for r in requests]
-        range_m = torch.tensor(limits, dtype=torch.float32).to(self.device)
-        farthest = -1.0 if filter.distance_threshold_m is None else float(filter.distance_threshold_m)
-        thresholds = (float(filter.opacity_threshold), float(filter.raydrop_threshold), farthest)
-        self._launcher.launch("finish_beams", grid, *common, range_m, *thresholds, images.returns)
+        common = (batch.views, np.int64(batch.ray_count), planes)
+        if image_rays:
+            self._launcher.launch("finish_images", grid, *common, images.rgb, images.depth, images.label, images.normal)
+        if beam_rays:
+            limits = [r.sensor.range_m if isinstance(r.sensor, LidarModel) else (0.0, 0.0) for r in requests]
+            range_m = torch.tensor(limits, dtype=torch.float32).to(self.device)
+            farthest = -1.0 if filter.distance_threshold_m is None else float(filter.distance_threshold_m)
+            thresholds = (float(filter.opacity_threshold), float(filter.raydrop_threshold), farthest)
+            self._launcher.launch("finish_beams", grid, *common, range_m, *thresholds, images.returns)
         return images
 
     def _grid(self, request: SensorRequest) -> GridTensors:
@@ -221,7 +214,7 @@ class GpuRenderer:
 
 def _camera_frame(request: SensorRequest, camera: CameraModel, planes: dict[str, np.ndarray]) -> CameraFrame:
     size = (camera.height_px, camera.width_px)
-    image = {name: plane.reshape(*size, *plane.shape[1:]) for name, plane in planes.items()}
+    image = {name: plane.reshape(*size, *plane.shape[1:]) for name, plane in planes.items() if name != "returns"}
     return CameraFrame(
         camera=camera,
         start_us=request.start_us,

@@ -91,7 +91,11 @@ class SensorView:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Sensors that are drawn together. ``views`` holds the bytes of one ``VIEW`` each; rays and tiles are counted on."""
+    """Sensors that are drawn together; their rays and tiles are numbered on.
+
+    ``views`` holds the bytes of one ``VIEW`` each, ``tile_view`` the sensor of each tile; the rays of sensor k begin at
+    ``first_ray[k]``, the last entry is ``ray_count``. Each sensor has at most ``moving_blocks`` of the moving layer.
+    """
 
     sensors: Sequence[SensorView]
     views: torch.Tensor
@@ -113,7 +117,8 @@ def make_batch(sensors: Sequence[SensorView], sky: torch.Tensor) -> Batch:
     import torch
 
     rows = np.zeros(len(sensors), VIEW)
-    cells, tiles = [], []
+    cells: list[int] = []
+    tiles: list[int] = []
     for row, sensor in zip(rows, sensors, strict=True):
         row["first_ray"], row["first_tile"] = sum(cells), sum(tiles)
         _fill(row, sensor)
