@@ -8,15 +8,17 @@ renderer (its PSNR against the reference is in its row). Peers that cannot run h
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
+from timing import Draw
 
 from nurec_sim import geometry
 from nurec_sim.render import spec
 from nurec_sim.render.rays import ray_grid
-from nurec_sim.types import CameraFrame, GaussianScene, Pinhole, SensorRequest, Shutter
+from nurec_sim.types import CameraFrame, GaussianScene, Pinhole, SensorFrame, SensorRequest, Shutter
 
 TILE_PX = 16
 BATCH = 512
@@ -28,7 +30,7 @@ NOT_RUN = {
 }
 
 
-def torch_frame(scene: GaussianScene, request: SensorRequest) -> CameraFrame:
+def torch_frame(scene: GaussianScene, request: SensorRequest, threads: int = 2) -> CameraFrame:
     """An image of an ideal pinhole camera with a global shutter: rgb, depth and alpha.
 
     Raises:
@@ -60,13 +62,19 @@ def torch_frame(scene: GaussianScene, request: SensorRequest) -> CameraFrame:
     starts = torch.searchsorted(tile_of, torch.arange(columns * rows + 1))
     image = torch.zeros(rows * TILE_PX, columns * TILE_PX, 5)
     v, u = torch.meshgrid(torch.arange(TILE_PX) + 0.5, torch.arange(TILE_PX) + 0.5, indexing="ij")
-    for tile in range(columns * rows):
+
+    def draw_tile(tile: int) -> None:
         row, column = tile // columns * TILE_PX, tile % columns * TILE_PX
         x, y = (u + column - lens.cx_px) / lens.fx_px, (v + row - lens.cy_px) / lens.fy_px
         ray = torch.stack([x, y, torch.ones_like(x)], dim=-1).reshape(-1, 3)
         picked = row_of[starts[tile] : starts[tile + 1]]
         blended = _blend_tile(ray, picked, forms, opacity, features)
         image[row : row + TILE_PX, column : column + TILE_PX] = blended.reshape(TILE_PX, TILE_PX, 5)
+
+    # Tiles by threads of ours: torch's own would meet at a barrier after every small operation.
+    torch.set_num_threads(1)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(draw_tile, range(columns * rows)))
     planes = image[:height, :width].double().numpy()
     return _finished(scene, request, planes)
 
@@ -185,10 +193,10 @@ def why_gsplat_cannot_run(scene: GaussianScene, request: SensorRequest) -> str |
     return None
 
 
-def drawing(frame_of, scene: GaussianScene):
-    """A ``timing.Draw`` of one of the functions above."""
+def drawing(frame_of: Callable[..., CameraFrame], scene: GaussianScene, **settings: int) -> Draw:
+    """One of the functions above as a back end."""
 
-    def draw(requests: Sequence[SensorRequest]) -> list[CameraFrame]:
-        return [frame_of(scene, request) for request in requests]
+    def draw(requests: Sequence[SensorRequest]) -> list[SensorFrame]:
+        return [frame_of(scene, request, **settings) for request in requests]
 
     return draw

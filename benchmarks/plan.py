@@ -142,7 +142,8 @@ def entries(name: str, built: BenchScene, renderer: Renderer, options: Options) 
             add(sensor, first, "ours lod", each(coarse, SENSORS[sensor].outputs), coarse, full=full)
     notes = []
     if options.extras and name == "driving" and PEER_SENSOR in chosen:
-        add(PEER_SENSOR, first, "torch", peers.drawing(peers.torch_frame, built.scene), frames=PEER_FRAMES)
+        torch = peers.drawing(peers.torch_frame, built.scene, threads=options.thread_count)
+        add(PEER_SENSOR, first, "torch", torch, frames=PEER_FRAMES)
         reason = peers.why_gsplat_cannot_run(built.scene, result[-1].ticks[0][0])
         if reason is None:
             add(PEER_SENSOR, first, "gsplat", peers.drawing(peers.gsplat_frame, built.scene), frames=PEER_FRAMES)

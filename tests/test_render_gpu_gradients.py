@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from gpu_on_cpu.places import PLACES, launcher_at
-from render_scenes import LENSES, LIDARS, camera, cloud, moved, request
+from render_scenes import LENSES, LIDARS, camera, cloud, moved, psnr_db, request, scene
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
@@ -158,6 +158,22 @@ def test_several_sensors_add_up_and_repeat(launcher):
     together = gradients([0, 1])
     assert np.allclose(together, gradients([0]) + gradients([1]), rtol=1e-4, atol=1e-3 * np.abs(together).max())
     assert np.array_equal(together, gradients([0, 1]))
+
+
+@pytest.mark.parametrize("name", ["rolling pinhole", "rolling fisheye"])
+def test_the_sky_is_that_of_frames(launcher, name):
+    cubemap = np.random.default_rng(1).random((6, 4, 4, 3)).astype(np.float32)
+    asked = request(SENSORS[name], moved(0.6, 0.1, 0.0), moved(1.2, 0.7, 0.2))
+    static, sky = cloud(COUNT), torch.tensor(cubemap, device=launcher.device, requires_grad=True)
+    tensors = {field.name: None for field in dataclasses.fields(GaussianTensors)}
+    for field in ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb"):
+        tensors[field] = torch.tensor(getattr(static, field), device=launcher.device)
+    renderer = DifferentiableRenderer([SENSORS[name]], launcher)
+    (image,) = renderer.render(GaussianTensors(**tensors), [torch.tensor(asked.world_from_sensor)], sky)
+    expected = spec.render_camera(scene(static, sky=cubemap), asked)
+    assert psnr_db(spec.to_uint8(image.rgb.detach().cpu().numpy()), expected.rgb) >= 60
+    image.rgb.sum().backward()
+    assert sky.grad.sum().item() == pytest.approx(3 * (1 - expected.alpha)[expected.rgb.any(axis=-1)].sum(), rel=1e-3)
 
 
 def test_malformed_arguments(launcher):

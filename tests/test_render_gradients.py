@@ -10,6 +10,8 @@ from render_scenes import CAMERA_AXES, START_US, camera, cloud, gaussians, moved
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
 from nurec_sim.render import spec
+from nurec_sim.render.cpu.background import draw_sky
+from nurec_sim.render.cpu.frame import shared_workers
 from nurec_sim.render.gradients import GaussianTensors, render_camera, render_lidar
 from nurec_sim.render.layers import view_colour
 from nurec_sim.render.rays import ray_grid, reference_pose, world_rays
@@ -192,19 +194,43 @@ def test_view_dependent_colours(k):
 @pytest.mark.parametrize("name", list(SMALL))
 def test_sensor_pose(name):
     sensor, made, pair = SMALL[name], world(), poses_of(name)
-    if name == "rolling":  # the relative motion of lines is fixed, which is exact where the sensor stands still
-        pair[1] = pair[0]
     sky = None if name == "lidar" else np.random.default_rng(4).random((6, 4, 4, 3))
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     poses = motion(twist) @ torch.from_numpy(pair)
     weight = weights(reference(made, sensor, pair))
     outputs = drawn(GaussianTensors.of(made), sensor, poses, None if sky is None else torch.from_numpy(sky))
     loss_of(outputs, weight).backward()
+    if sky is not None:
+        error = np.abs(outputs["rgb"].detach().numpy() - reference(made, sensor, pair, sky)["rgb"])
+        assert np.quantile(error, 0.98) < 1e-3
 
     def loss(values):
         return loss_of(reference(made, sensor, motion(torch.from_numpy(values)).numpy() @ pair, sky), weight)
 
     assert_slopes_agree(loss, np.zeros(6), twist.grad.numpy(), range(6), least=0.8)
+
+
+def test_the_sky_in_every_direction():
+    rng = np.random.default_rng(7)
+    direction, sky = rng.normal(size=(20, 30, 3)).astype(np.float32), rng.random((6, 5, 5, 3)).astype(np.float32)
+    turn = geometry.matrix_from_quat(rng.normal(size=4))
+    behind = draw_sky(direction, turn, sky, shared_workers(2))
+    assert np.abs(behind.transpose(1, 2, 0) - spec.sky_colour(sky, direction @ turn.T)).max() < 1e-5
+
+
+def test_sky_texels():
+    sensor, made, pair = SMALL["fisheye"], world(15), poses_of("fisheye")
+    sky = np.random.default_rng(4).random((6, 4, 4, 3))
+    leaf = torch.from_numpy(sky).requires_grad_()
+    weight = weights(reference(made, sensor, pair))
+    loss_of(drawn(GaussianTensors.of(made), sensor, torch.from_numpy(pair), leaf), weight, ["rgb"]).backward()
+    gradient = leaf.grad.numpy()
+    picked = [tuple(entry) for entry in np.argwhere(np.abs(gradient) > 1e-3)[::7]]
+
+    def loss(values):
+        return loss_of(reference(made, sensor, pair, values), weight, ["rgb"])
+
+    assert_slopes_agree(loss, sky, gradient, picked)
 
 
 @pytest.mark.parametrize("name", ["pinhole", "lidar"])
@@ -339,6 +365,43 @@ def test_a_moved_gaussian_finds_back():
     assert np.abs(mean.detach().numpy() - target.mean_m).max() < 0.03
 
 
+def test_changing_gaussians_before_the_gradients_are_taken_is_refused():
+    tensors = GaussianTensors.of(world(5))
+    leaves_of(tensors)
+    images = render_camera(tensors, SMALL["pinhole"], torch.from_numpy(poses_of("pinhole")))
+    with torch.no_grad():
+        tensors.mean_m.add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        images.rgb.sum().backward()
+
+
+def test_two_hundred_gaussians_become_an_image():
+    rows, columns = torch.meshgrid(torch.arange(32), torch.arange(48), indexing="ij")
+    checks = ((rows // 8 + columns // 8) % 2)[..., None] * torch.tensor([0.7, 0.3, -0.2]) + 0.2
+    seeded = torch.Generator().manual_seed(0)
+    spread = torch.tensor([6.0, 4.0, 1.0])
+    leaves = [
+        torch.rand(200, 3, generator=seeded) * spread + torch.tensor([-3.0, -2.0, 4.5]),
+        torch.randn(200, 4, generator=seeded),
+        torch.full((200, 3), -1.5),
+        torch.zeros(200),
+        torch.full((200, 3), 0.5),
+    ]
+    mean, quat, log_scale, logit, rgb = (leaf.requires_grad_() for leaf in leaves)
+    optimizer = torch.optim.Adam(leaves, lr=0.03)
+    errors = []
+    for _ in range(150):
+        fitted = GaussianTensors(mean, quat, log_scale.exp(), logit.sigmoid(), rgb)
+        error = (
+            (render_camera(fitted, camera(48, 32, Pinhole(40.0, 40.0, 24.0, 16.0)), torch.eye(4)).rgb - checks) ** 2
+        ).mean()
+        optimizer.zero_grad()
+        error.backward()
+        optimizer.step()
+        errors.append(error.item())
+    assert errors[-1] < 0.01 * errors[0] and errors[-1] < 2e-3  # 27 dB
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
@@ -370,6 +433,8 @@ def test_wrong_sensors_and_poses_are_refused():
         render_camera(tensors, SMALL["pinhole"], torch.eye(4).expand(3, 4, 4))
     with pytest.raises(RequestError, match="must be finite and rigid"):
         render_camera(tensors, SMALL["pinhole"], 2 * torch.eye(4))
+    with pytest.raises(RequestError, match=r"sky must be \[3\] or \[6, 's', 's', 3\], got \[6, 2, 3, 3\]"):
+        render_camera(tensors, SMALL["pinhole"], poses, torch.zeros(6, 2, 3, 3))
     with pytest.raises(RequestError, match="needs eye_m"):
         GaussianTensors.of(world(3, sh=3)).moved(torch.eye(4))
     with pytest.raises(RequestError, match="with and without sh_rest"):

@@ -15,13 +15,13 @@ from nurec_sim.render.merging import GROUP, as_surfels, grouped, merge
 from nurec_sim.types import Gaussians, Label, Pinhole
 
 
-def wall(n=30_000, seed=0, far=20.0, **fields):
+def wall(n=30_000, seed=0, far=20.0, sigma_m=0.05, **fields):
     """Overlapping flat Gaussians, a pixel or two wide, on a wall across the view and the road before it."""
     rng = np.random.default_rng(seed)
     upright = np.arange(n) < n // 2
     mean = np.stack([np.full(n, far), rng.uniform(-12, 12, n), rng.uniform(-1.6, 6, n)], axis=1)
     mean[~upright, 0], mean[~upright, 2] = rng.uniform(3, far, n - n // 2), -1.6
-    scale = np.repeat(0.05 * np.exp(0.3 * rng.normal(size=(n, 1))), 3, axis=1)
+    scale = np.repeat(sigma_m * np.exp(0.3 * rng.normal(size=(n, 1))), 3, axis=1)
     scale[upright, 0] *= 0.1
     scale[~upright, 2] *= 0.1
     bricks = (np.floor(mean / 4).sum(axis=1) % 2)[:, None]
@@ -113,6 +113,19 @@ def test_level_0_is_what_can_be_drawn():
     assert (level.gaussians.opacity == 0.5).all()
 
 
+def test_extreme_gaussians_merge_into_finite_ones():
+    strange = wall(3000)
+    mean, scale, rgb = strange.mean_m.copy(), strange.scale_m.copy(), strange.rgb.copy()
+    mean[::100], scale[50::100], scale[51::100] = 1e11, 1e9, 1e-12
+    rgb[30::100], mean[70::200], scale[99::100, 0] = 1e10, np.nan, np.inf
+    levels = merge_levels(dataclasses.replace(strange, mean_m=mean, scale_m=scale, rgb=rgb))
+    assert len(levels[0].gaussians) == 3000 - 15 - 30
+    for level in levels:
+        assert np.isfinite(level.error_m).all() and (level.packed.index[: len(level.gaussians)] >= 0).all()
+        for name in ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb"):
+            assert np.isfinite(getattr(level.gaussians, name)).all()
+
+
 @pytest.mark.parametrize("tolerance_px", [0.0, 0.02, 0.3, 3.0, 1e6])
 def test_a_choice_draws_everything_exactly_once(tolerance_px):
     levels = merge_levels(wall())
@@ -155,15 +168,15 @@ def drawn_with(detail, asked):
 
 
 def test_fewer_gaussians_draw_nearly_the_same_picture():
-    full, asked = wall(60_000), request(camera(240, 136))
+    full, asked = wall(60_000, far=35.0, sigma_m=0.1), request(camera(240, 136))
     reference = Renderer(scene(full), threads=2).render_camera(asked)
     picture, count = drawn_with(Detail.of(full, 0.15), asked)
-    assert 0.1 * len(full) < count < 0.7 * len(full)
+    assert 0.3 * len(full) < count < 0.75 * len(full)
     assert psnr_db(picture.rgb, reference.rgb) >= 50
     assert (picture.label != reference.label).mean() < 0.01
     assert np.abs(picture.depth_m - reference.depth_m)[reference.alpha > 0.99].mean() < 0.05
     coarse, fewer = drawn_with(Detail.of(full, 0.6), asked)
-    assert fewer < 0.5 * count and 30 < psnr_db(coarse.rgb, reference.rgb) < psnr_db(picture.rgb, reference.rgb)
+    assert fewer < 0.75 * count and 40 < psnr_db(coarse.rgb, reference.rgb) < psnr_db(picture.rgb, reference.rgb)
 
 
 def test_no_tolerance_draws_the_same_picture():

@@ -10,6 +10,7 @@ from nurec_sim import geometry
 from nurec_sim.render.cpu.moving import PackedMoving
 from nurec_sim.render.cpu.pack import (
     COLOUR,
+    DROP,
     INTENSITY,
     KNOWN,
     LABEL,
@@ -39,7 +40,8 @@ def layer(n=400, sh=0, seed=3):
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     normal[rng.random(3 * n) < 0.1] = 0
     rest = rng.normal(0, 0.3, (3 * n, sh, 3)).astype(np.float32) if sh else None
-    gaussians = dataclasses.replace(gaussians, normal=normal.astype(np.float32), sh_rest=rest)
+    drop = rng.random(3 * n).astype(np.float32)
+    gaussians = dataclasses.replace(gaussians, normal=normal.astype(np.float32), sh_rest=rest, ray_drop=drop)
     knot_t_us, knot_m, owner = (
         np.concatenate([getattr(part, name) for part in parts])[order] for name in ("knot_t_us", "knot_m", "track")
     )
@@ -79,6 +81,7 @@ def check(dynamic, t_us, actors=None):
     wanted_rows, wanted = expected(dynamic, t_us, actors)
     assert np.array_equal(rows, wanted_rows)
     quat = wanted.quat_wxyz / np.linalg.norm(wanted.quat_wxyz, axis=1, keepdims=True)
+    drop = np.zeros(len(rows)) if wanted.ray_drop is None else wanted.ray_drop
     for first, values in (
         (MEAN, wanted.mean_m),
         (SCALE, wanted.scale_m),
@@ -86,6 +89,7 @@ def check(dynamic, t_us, actors=None):
         (COLOUR, wanted.rgb),
         (NORMAL, wanted.normal),
         (LABEL, wanted.label[:, None]),
+        (DROP, drop[:, None]),
         (INTENSITY, np.nan_to_num(wanted.intensity)[:, None]),
         (KNOWN, np.isfinite(wanted.intensity)[:, None]),
     ):

@@ -5,7 +5,7 @@ What is drawn is ``render.spec`` before rounding; ``docs/gradients.md`` says wha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nurec_sim import geometry
+from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
 from nurec_sim.render import torch_maths
 from nurec_sim.render.cpu.frame import Frame, Sensor, sensor_tables
@@ -44,8 +44,8 @@ class GaussianTensors:
     def of(cls, gaussians: Gaussians) -> GaussianTensors:
         """Float32 copies of a layer's values."""
         names = [field.name for field in fields(cls)]
-        values = {name: getattr(gaussians, name) for name in names}
-        return cls(**{name: None if v is None else torch.tensor(v, dtype=torch.float32) for name, v in values.items()})
+        given = {name: value for name in names if (value := getattr(gaussians, name)) is not None}
+        return cls(**{name: torch.tensor(value, dtype=torch.float32) for name, value in given.items()})
 
     def moved(self, new_from_old: Float[Tensor, "4 4"], eye_m: Float[Tensor, " 3"] | None = None) -> GaussianTensors:
         """The Gaussians carried along by a rigid motion, such as an actor's ``world_from_actor``.
@@ -133,26 +133,25 @@ def render_camera(
     """
     if not isinstance(camera, CameraModel):
         raise RequestError(f"render_camera needs a CameraModel, got {type(camera).__name__}")
-    sensor = sensor_tables(camera)
+    _check(gaussians, sky)
+    sensor = _sensor(camera, sensors.check_camera)
     reference, pair = _poses(world_from_camera, sensor)
-    _check(gaussians)
     colour = gaussians.rgb
     if gaussians.sh_rest is not None:
         offset = gaussians.mean_m.double() - reference[:3, 3]
         colour = torch_maths.view_colour(colour, gaussians.sh_rest, offset.to(colour.dtype))
     frame = Frame(sensor, pair, False, threads)
     features, alpha, distance, _ = _draw(gaussians, colour, reference, frame)
-    rgb = features.permute(1, 2, 0)
+    rgb = features
     if sky is not None:
+        behind = sky[:, None, None] if sky.ndim == 1 else _Sky.apply(sky, reference, frame)
         clear = 1 - alpha if sensor.all_valid else torch.from_numpy(sensor.grid.valid > 0) * (1 - alpha)
-        directions = torch.from_numpy(frame.directions)
-        behind = sky if sky.ndim == 1 else torch_maths.sky_colour(sky, directions @ reference[:3, :3].T.to(directions))
-        rgb = rgb + clear[..., None] * behind.to(rgb.dtype)
+        rgb = torch.addcmul(rgb, clear, behind.to(rgb.dtype))
     depth = distance / alpha.clamp(min=MIN_ALPHA)
     if frame.ray_z is not None:
         depth = (depth * torch.from_numpy(frame.ray_z)).clamp(min=0)
     depth = torch.where(alpha >= SURFACE_ALPHA, depth, 0)
-    return CameraImages(rgb, depth, alpha)
+    return CameraImages(rgb.permute(1, 2, 0), depth, alpha)
 
 
 def render_lidar(
@@ -174,9 +173,9 @@ def render_lidar(
     """
     if not isinstance(lidar, LidarModel):
         raise RequestError(f"render_lidar needs a LidarModel, got {type(lidar).__name__}")
-    sensor = sensor_tables(lidar)
-    reference, pair = _poses(world_from_lidar, sensor)
     _check(gaussians)
+    sensor = _sensor(lidar, sensors.check_lidar)
+    reference, pair = _poses(world_from_lidar, sensor)
     value = gaussians.intensity
     if value is None:
         value = torch.full_like(gaussians.opacity, torch.nan)
@@ -194,10 +193,9 @@ class _Draw(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, mean, quat, scale, opacity, features, world_from_sensor, frame: Frame):
-        arrays = [_array(tensor) for tensor in (mean, quat, scale, opacity, features)]
-        frame.draw(*arrays)
-        ctx.frame = frame
-        ctx.like = mean, quat, scale, opacity, features, world_from_sensor
+        frame.draw(*(_array(tensor) for tensor in (mean, quat, scale, opacity, features)))
+        ctx.save_for_backward(mean, quat, scale, opacity)
+        ctx.frame, ctx.dtypes = frame, [t.dtype for t in (mean, quat, scale, opacity, features, world_from_sensor)]
         ctx.set_materialize_grads(False)
         height, width = frame.sensor.grid.valid.shape
         planes = torch.from_numpy(frame.planes)[:, :height, :width]
@@ -207,10 +205,23 @@ class _Draw(torch.autograd.Function):
     def backward(ctx, by_features, by_alpha, by_distance, by_half):
         parts = {1: by_features, 0: by_alpha, 4: by_distance, 5: by_half}
         by_planes = {plane: part.numpy() for plane, part in parts.items() if part is not None}
-        *gradients, pose = ctx.frame.draw_back(by_planes)
-        results = [torch.from_numpy(g) for g in (*gradients, pose)]
-        needed = zip(results, ctx.like, ctx.needs_input_grad, strict=False)
-        return *(g.to(like.dtype) if need else None for g, like, need in needed), None
+        results = ctx.frame.draw_back(*(_array(tensor) for tensor in ctx.saved_tensors), by_planes)
+        return *(torch.from_numpy(g).to(dtype) for g, dtype in zip(results, ctx.dtypes, strict=True)), None
+
+
+class _Sky(torch.autograd.Function):
+    """Colours of a cubemap behind the rays, by the cubemap and the reference pose."""
+
+    @staticmethod
+    def forward(ctx, sky, world_from_sensor, frame: Frame):
+        ctx.save_for_backward(sky)
+        ctx.frame, ctx.dtypes = frame, (sky.dtype, world_from_sensor.dtype)
+        return torch.from_numpy(frame.draw_sky(_array(sky)))
+
+    @staticmethod
+    def backward(ctx, by_behind):
+        results = ctx.frame.draw_sky_back(_array(ctx.saved_tensors[0]), by_behind.contiguous().numpy())
+        return *(torch.from_numpy(g).to(dtype) for g, dtype in zip(results, ctx.dtypes, strict=True)), None
 
 
 def _draw(
@@ -226,6 +237,14 @@ def _draw(
         return planes
     valid = torch.from_numpy(frame.sensor.grid.valid > 0)
     return tuple(torch.where(valid, plane, 0) for plane in planes)
+
+
+def _sensor(model: CameraModel | LidarModel, check: Callable[..., None]) -> Sensor:
+    try:
+        check(model)
+    except ValueError as error:
+        raise RequestError(str(error)) from None
+    return sensor_tables(model)
 
 
 def _poses(poses: Tensor, sensor: Sensor) -> tuple[Float[Tensor, "4 4"], Float[np.ndarray, "2 4 4"]]:
@@ -244,22 +263,31 @@ def _poses(poses: Tensor, sensor: Sensor) -> tuple[Float[Tensor, "4 4"], Float[n
     return moved[0] * (1 - fraction) + moved[1] * fraction, pair
 
 
-def _check(gaussians: GaussianTensors) -> None:
+def _check(gaussians: GaussianTensors, sky: Tensor | None = None) -> None:
     n = len(gaussians.mean_m)
-    widths = {"mean_m": (3,), "quat_wxyz": (4,), "scale_m": (3,), "opacity": (), "rgb": (3,), "intensity": ()}
-    for field in fields(gaussians):
-        value = getattr(gaussians, field.name)
+    allowed: dict[str, list[list]] = {
+        "mean_m": [[n, 3]],
+        "quat_wxyz": [[n, 4]],
+        "scale_m": [[n, 3]],
+        "opacity": [[n]],
+        "rgb": [[n, 3]],
+        "sh_rest": [[n, 3, 3], [n, 8, 3], [n, 15, 3]],
+        "intensity": [[n]],
+        "sky": [[3], [6, "s", "s", 3]],
+    }
+    values = {**{field.name: getattr(gaussians, field.name) for field in fields(gaussians)}, "sky": sky}
+    for name, value in values.items():
         if value is None:
             continue
         if value.device.type != "cpu" or not value.is_floating_point():
             raise RequestError(
-                f"{field.name} must be a floating-point tensor on the CPU, got {value.dtype} on {value.device}"
+                f"{name} must be a floating-point tensor on the CPU, got {value.dtype} on {value.device}"
             )
-        allowed = [(n, *widths[field.name])] if field.name in widths else [(n, k, 3) for k in (3, 8, 15)]
-        if tuple(value.shape) not in allowed:
-            raise RequestError(
-                f"{field.name} must be {' or '.join(str(list(a)) for a in allowed)}, got {list(value.shape)}"
-            )
+        shape = list(value.shape)
+        if name == "sky" and value.ndim == 4 and shape == [6, shape[1], shape[1], 3]:
+            continue
+        if shape not in allowed[name]:
+            raise RequestError(f"{name} must be {' or '.join(map(str, allowed[name]))}, got {shape}")
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -45,7 +45,7 @@ def drawable(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
     """Which Gaussians can be drawn at all: finite, with extent, at least 1/255 opaque."""
     columns = (gaussians.mean_m, gaussians.quat_wxyz, gaussians.scale_m, gaussians.rgb, gaussians.opacity[:, None])
     sound = np.all([(np.abs(column) <= LARGEST).all(axis=1) for column in columns], axis=0)  # NaN is not
-    sound &= np.linalg.norm(gaussians.quat_wxyz, axis=1) > 1e-12
+    sound &= np.linalg.norm(gaussians.quat_wxyz.astype(np.float64), axis=1) > 1e-12
     if gaussians.sh_rest is not None:
         sound &= np.isfinite(gaussians.sh_rest).all(axis=(1, 2))
     return sound & (gaussians.scale_m > 0).all(axis=1) & (gaussians.opacity >= np.float32(MIN_ALPHA))

@@ -24,9 +24,14 @@ CHUNK = 2048
 COLOUR_WEIGHT, NORMAL_WEIGHT, LABEL_WEIGHT = 12.0, 1.5, 4.0
 """What differences of colour (0..1), normal and label weigh in grouping, against one standard deviation of distance."""
 
+MOST_DIFFERENT = 1e6
+"""Features beyond this are cut off; their squares must fit float32."""
+
 NEIGHBOURS = 64
 BASE_CONTRAST = 0.05
 """Contrast of a Gaussian to what is behind it where all its neighbours have one colour."""
+BACKDROP = 0.3
+"""Contrast of a surface to what is behind it."""
 ORDER_SHARE = 0.3
 """Which part of a Gaussian's contrast to its neighbours shows when merging changes the order of their depths."""
 
@@ -71,14 +76,24 @@ def as_surfels(gaussians: Gaussians, contrast2: Float64[np.ndarray, " n"]) -> Su
 
 
 def local_contrast(gaussians: Gaussians) -> Float64[np.ndarray, " n"]:
-    """Variance of colour (mean of the channels) among runs of ``NEIGHBOURS`` Gaussians, which are sorted by place."""
+    """Squared contrast of Gaussians, which are sorted by place, to what is around them and behind.
+
+    Of runs of ``NEIGHBOURS``: the variance of their colours (mean of the channels), and what shines through all of
+    them, taken to cover a flat patch evenly, of a background that differs by ``BACKDROP``.
+    """
     n = len(gaussians)
     rows = np.minimum(np.arange(-(-n // NEIGHBOURS) * NEIGHBOURS), n - 1).reshape(-1, NEIGHBOURS)
     mass = (gaussians.opacity * np.sort(gaussians.scale_m, axis=1)[:, 1:].prod(axis=1)).astype(np.float64)
-    weight = mass[rows] / np.maximum(mass[rows].sum(axis=1, keepdims=True), 1e-30)
-    colour = gaussians.rgb[rows].astype(np.float64)
-    offset = colour - np.einsum("rk,rkc->rc", weight, colour)[:, None]
-    return np.repeat(np.einsum("rk,rkc->r", weight, offset**2) / 3, NEIGHBOURS)[:n]
+    total = np.maximum(mass[rows].sum(axis=1), 1e-30)
+    weight = mass[rows] / total[:, None]
+    colour, place = gaussians.rgb[rows].astype(np.float64), gaussians.mean_m[rows].astype(np.float64)
+    colour -= np.einsum("rk,rkc->rc", weight, colour)[:, None]
+    place -= place.mean(axis=1, keepdims=True)
+    spread = np.linalg.eigvalsh(np.einsum("rki,rkj->rij", place, place) / NEIGHBOURS)[:, 1:].clip(min=0)
+    patch = 12 * np.sqrt(spread.prod(axis=1))  # area of an even rectangle of this spread
+    layers = 2 * np.pi * total / np.maximum(patch, 1e-30)
+    contrast2 = np.einsum("rk,rkc->r", weight, colour**2) / 3 + (BACKDROP * np.exp(-layers)) ** 2
+    return np.repeat(contrast2, NEIGHBOURS)[:n]
 
 
 def grouped(surfels: Surfels, span: int) -> Int64[np.ndarray, "groups 4"]:
@@ -111,7 +126,7 @@ def _features(
     own = np.concatenate(
         [COLOUR_WEIGHT * g.rgb, turned, np.log(size)[:, None], LABEL_WEIGHT * g.label[:, None]], axis=1
     ).astype(np.float32)
-    features = np.concatenate([mean.astype(np.float32), own[rows]], axis=2)
+    features = np.concatenate([mean.astype(np.float32), own[rows]], axis=2).clip(-MOST_DIFFERENT, MOST_DIFFERENT)
     features[~real] = np.inf
     return features
 
@@ -219,7 +234,7 @@ def _profiles(
         [a * x * x + 2 * b * x * y + c * y * y, -2 * (a * x + b * y), -2 * (b * x + c * y), a, 2 * b, c], axis=-1
     )
     basis = np.stack([np.ones_like(GRID_X), GRID_X, GRID_Y, GRID_X**2, GRID_X * GRID_Y, GRID_Y**2])
-    return opacity[..., None] * np.exp(-0.5 * (terms @ basis))
+    return opacity[..., None] * np.exp(-0.5 * np.maximum(terms @ basis, 0))
 
 
 def _heaviest(label: np.ndarray, mass: Float64[np.ndarray, "g 4"]) -> tuple[np.ndarray, Float64[np.ndarray, " g"]]:

@@ -45,7 +45,7 @@ def ray_grid(sensor: CameraModel | LidarModel) -> RayGrid:
         return RayGrid(direction, valid, fraction, _reference(fraction), True, max(NEAR_M, sensor.range_m[0]))
     direction, valid = sensors.pixel_rays(sensor)
     by_column = sensor.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
-    line = np.arange(valid.shape[1] if by_column else valid.shape[0]) + 0.5
+    line = np.arange(sensor.width_px if by_column else sensor.height_px) + 0.5
     shared = np.asarray(sensors.shutter_fraction(sensor, np.stack([line, line], axis=-1)))
     fraction = np.broadcast_to(shared if by_column else shared[:, None], valid.shape)
     direction = np.where(valid[..., None], direction, (0.0, 0.0, 1.0))

@@ -75,23 +75,3 @@ def sh_basis(direction: Float[Tensor, "n 3"], k: int) -> Float[Tensor, "n k"]:
             -0.5900435899266435 * x * (xx - 3 * yy),
         ]
     return torch.stack(basis, dim=-1)
-
-
-def sky_colour(sky: Float[Tensor, "6 s s 3"], direction: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """``spec.sky_colour``: bilinear lookup of a cubemap, clamped within a face (``geometry.cubemap_coordinates``)."""
-    gx, gy, gz = -direction[..., 1], direction[..., 2], -direction[..., 0]
-    ax, ay, az = gx.abs(), gy.abs(), gz.abs()
-    by_z = (az > ax) & (az > ay)
-    by_y = ~by_z & (ay > ax)
-    major = torch.where(by_z, az, torch.where(by_y, ay, ax))
-    face = torch.where(by_z, 4 + (gz <= 0).long(), torch.where(by_y, 2 + (gy <= 0).long(), (gx <= 0).long()))
-    s = torch.where(by_z, torch.where(gz > 0, gx, -gx), torch.where(by_y, gx, torch.where(gx > 0, -gz, gz)))
-    t = torch.where(by_y, torch.where(gy > 0, gz, -gz), -gy)
-    size = sky.shape[1]
-    x, y = (((part / major + 1) / 2 * size - 0.5).clamp(0, size - 1) for part in (s, t))
-    x0, y0 = x.detach().long(), y.detach().long()
-    x1, y1 = (x0 + 1).clamp(max=size - 1), (y0 + 1).clamp(max=size - 1)
-    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
-    top = sky[face, y0, x0] * (1 - fx) + sky[face, y0, x1] * fx
-    bottom = sky[face, y1, x0] * (1 - fx) + sky[face, y1, x1] * fx
-    return top * (1 - fy) + bottom * fy

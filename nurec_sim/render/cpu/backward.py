@@ -23,7 +23,7 @@ from nurec_sim.render.cpu.blend import CAMERA, RAY_PLANES
 from nurec_sim.render.cpu.draw import aligned, prepare
 from nurec_sim.render.cpu.kernel import f4, inner, keep_alive, kernel
 from nurec_sim.render.cpu.rays import pinhole_basis, table_basis, turn_rays
-from nurec_sim.render.cpu.records import MACRO, RECORD, TAG
+from nurec_sim.render.cpu.records import MACRO, RECORD
 from nurec_sim.render.cpu.simd import LANES, prefetch
 from nurec_sim.render.cpu.tiles import (
     AFFINE,
@@ -123,7 +123,6 @@ def draw_tiles_back(
     )
     sums = aligned(BATCH * SUMS).reshape(BATCH, SUMS)
     chosen, listed = np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
-    tags = records.view(np.int32)
     turned = rays.reshape(BLOCKS, RAY_PLANES, RAYS)
     columns = (width + MACRO - 1) // MACRO
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
@@ -165,18 +164,17 @@ def draw_tiles_back(
             if alive != 0:
                 for block in range(BLOCKS):
                     listed[block] = 0
-                close = False
+                close = np.int64(0)
                 for j in range(first, last, LANES):
                     for ahead in range(j + LANES, min(j + 2 * LANES, end)):
                         prefetch(records_at + np.int64(lists[ahead]) * (4 * RECORD))
-                    prepare(way, lists_at + 4 * j, records_at, min(last - j, LANES), alive, basis_at,
-                            coefficients_at, chosen_at, listed_at, j - first)  # fmt: skip
-                for j in range(first, last):
-                    close |= tags[np.uint64(lists[j]), TAG] < 0
+                    close |= prepare(way, lists_at + 4 * j, records_at, min(last - j, LANES), alive, basis_at,
+                                     coefficients_at, chosen_at, listed_at, j - first)  # fmt: skip
                 for block in range(BLOCKS):
-                    if listed[block] > 0:
+                    n = listed[block]
+                    if n > 0:
                         more = _carry_back(
-                            way, kind, close, state_at + block * block_bytes, chosen_at + block * LIST, listed[block],
+                            way, kind, close != 0, state_at + block * block_bytes, chosen_at + block * LIST, n,
                             coefficients_at, rays_at + block * ray_bytes, basis_at, sums_at,
                             f4(block % PER_SIDE * SIDE) - f4(15.5), f4(block // PER_SIDE * SIDE) - f4(15.5), near,
                         )  # fmt: skip

@@ -247,7 +247,7 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
             )
 
             def plane_of(base: ir.Value, plane: int, offsets: list[int] = offsets) -> Bundle:
-                return Bundle(v.load(base, 4 * RAYS * plane + offset, align=32) for offset in offsets)
+                return Bundle(v.load(base, 4 * RAYS * plane + offset) for offset in offsets)
 
             def body(
                 i: ir.Value, values: list[Vector], x: Vector = x, y: Bundle = y, plane_of: Any = plane_of
@@ -265,11 +265,12 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                 else:
                     d = [plane_of(rays, plane) for plane in (DX, DY, DZ)]
                     place = [d[0] * row[0] + d[1] * row[1] + d[2] * row[2] for row in rows]
+                big_x, big_y, big_w = place
                 if way == MOVING:
                     drift = [Bundle([coefficient(C_DRIFT + c)] * AT_ONCE) for c in range(3)]
-                    meeting: Any = _Moved(*place, flat, plane_of(rays, PLACE), drift)
+                    meeting: Any = _Moved(big_x, big_y, big_w, flat, plane_of(rays, PLACE), drift)
                 else:
-                    meeting = _Still(*place, flat)
+                    meeting = _Still(big_x, big_y, big_w, flat)
                 exponent = meeting.exponent + fade
                 hit = exponent < CUT
                 if check_near:
@@ -295,15 +296,15 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                 totals += [v.number(0)] * (SUMS - len(totals))
                 place_of_sums = v.address(sums, b.shl(number, ir.Constant(I64, 6)))
                 for first in range(0, SUMS, LANES):
-                    old = v.load(place_of_sums, 4 * first, align=32)
-                    v.store(old + v.sums(totals[first : first + LANES]), place_of_sums, 4 * first, align=32)
+                    old = v.load(place_of_sums, 4 * first)
+                    v.store(old + v.sums(totals[first : first + LANES]), place_of_sums, 4 * first)
                 return after.parts + rest.parts
 
             initial = plane_of(state, T).parts + plane_of(state, REST).parts
             final = v.repeat(count, initial, body)
             for plane in (T, REST):
                 for k, offset in enumerate(offsets):
-                    v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset, align=32)
+                    v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset)
             most = final[0]
             for other in final[1:AT_ONCE]:
                 most = most.max(other)
@@ -362,10 +363,10 @@ def open_gradients(
         total = v.number(0)
         for plane in range(IMAGE_PLANES - 1):
             total = total + image[plane] * gradient[plane]
-        valid = v.load(source, offset, align=32)
+        valid = v.load(source, offset)
         one = b.select(table, valid.value, v.number(1).value)
         values = [Vector(b, one), total, *gradient]
         for plane, value in zip(
             (T, REST, G_ALPHA, *(G_FEATURE + c for c in range(3)), G_DISTANCE, G_HALF), values, strict=True
         ):
-            v.store(value, state, 4 * RAYS * plane + offset, align=32)
+            v.store(value, state, 4 * RAYS * plane + offset)

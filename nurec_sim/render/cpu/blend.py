@@ -6,6 +6,7 @@ whose lowest bits hold the label it came with, for LiDARs the distance at which 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -171,7 +172,7 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
             ]
 
             def plane_of(base: ir.Value, plane: int, offsets: list[int] = offsets) -> list[Vector]:
-                return [v.load(base, 4 * RAYS * plane + offset, align=32) for offset in offsets]
+                return [v.load(base, 4 * RAYS * plane + offset) for offset in offsets]
 
             def body(
                 i: ir.Value, values: list[Vector], x: Vector = x, y: list[Vector] = y, plane_of: Any = plane_of
@@ -183,7 +184,8 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                     return v.broadcast(where, 4 * BATCH * k)
 
                 planes = [values[k : k + AT_ONCE] for k in range(0, len(values), AT_ONCE)]
-                exponent, distance = responses(v, way, coefficient, lambda plane: plane_of(rays, plane), x, y, kind == LIDAR)
+                own_rays = functools.partial(plane_of, rays)
+                exponent, distance = responses(v, way, coefficient, own_rays, x, y, kind == LIDAR)
                 hits = [e < CUT for e in exponent]
                 if check_near:
                     least = v.spread(near)
@@ -224,7 +226,7 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
             final = v.repeat(count, initial, body)
             for plane in range(PLANES[kind]):
                 for k, offset in enumerate(offsets):
-                    v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset, align=32)
+                    v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset)
             most = final[0]
             for other in final[1:AT_ONCE]:
                 most = most.max(other)
@@ -254,12 +256,12 @@ def open_block(v: Lanes, state: ir.Value, planes: ir.Value, rays: ir.Value) -> N
     table = b.icmp_signed("!=", rays, ir.Constant(I64, 0))
     source = b.select(table, b.add(rays, ir.Constant(I64, 4 * RAYS * VALID)), state)
     for k in range(VECTORS):
-        valid = v.load(source, 4 * LANES * k, align=32)
+        valid = v.load(source, 4 * LANES * k)
         one = b.select(spread(b, table, ir.VectorType(ir.IntType(1), LANES)), valid.value, v.number(1).value)
-        v.store(Vector(b, one), state, 4 * LANES * k, align=32)
+        v.store(Vector(b, one), state, 4 * LANES * k)
 
     def clear(i: ir.Value, values: list[Vector]) -> list[Vector]:
-        v.store(v.number(0), state, b.mul(b.add(i, ir.Constant(I64, VECTORS)), ir.Constant(I64, 4 * LANES)), align=32)
+        v.store(v.number(0), state, b.mul(b.add(i, ir.Constant(I64, VECTORS)), ir.Constant(I64, 4 * LANES)))
         return values
 
     v.repeat(b.mul(b.sub(planes, ir.Constant(I64, 1)), ir.Constant(I64, VECTORS)), [], clear)
@@ -274,7 +276,7 @@ def _writing(count: int) -> Callable[..., Any]:
         for plane in range(count):
             base = b.add(target, b.mul(plane_bytes, ir.Constant(I64, plane)))
             for k in range(VECTORS):
-                x = v.load(state, 4 * (RAYS * plane + LANES * k), align=32)
+                x = v.load(state, 4 * (RAYS * plane + LANES * k))
                 x = 1 - x if plane == T else x
                 for part in range(LANES // SIDE):
                     lanes = ir.Constant(ir.VectorType(I32, SIDE), list(range(SIDE * part, SIDE * part + SIDE)))

@@ -194,8 +194,8 @@ def draw_tiles(
                 if n > 0:
                     evaluations += n * RAYS
                     more = blend_block(
-                        way, kind, close != 0, state_at + block * block_bytes, chosen_at + block * LIST, n, coefficients_at,
-                        rays_at + block * ray_bytes, basis_at, f4(block % PER_SIDE * SIDE) - f4(15.5),
+                        way, kind, close != 0, state_at + block * block_bytes, chosen_at + block * LIST, n,
+                        coefficients_at, rays_at + block * ray_bytes, basis_at, f4(block % PER_SIDE * SIDE) - f4(15.5),
                         f4(block // PER_SIDE * SIDE) - f4(15.5), near,
                     )  # fmt: skip
                     if more == 0:

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from nurec_sim.render.cpu.background import draw_sky, draw_sky_back
 from nurec_sim.render.cpu.backward import draw_tiles_back, number_slots
 from nurec_sim.render.cpu.backward_blend import IMAGE_PLANES, SUMS
 from nurec_sim.render.cpu.backward_project import project_back
@@ -114,8 +115,20 @@ class Frame:
         """Depth per distance along each ray; None where distances are depths already."""
         return None if self.view.way == AFFINE else self.sensor.grid.direction[..., 2]
 
+    def draw_sky(self, sky: Float32[np.ndarray, "6 s s 3"]) -> Float32[np.ndarray, "3 h w"]:
+        """Colours of a cubemap behind every ray."""
+        return draw_sky(self._directions, self.view.world_from_reference[:3, :3], sky, self._workers)
+
+    def draw_sky_back(
+        self, sky: Float32[np.ndarray, "6 s s 3"], by_behind: Float32[np.ndarray, "3 h w"]
+    ) -> tuple[Float64[np.ndarray, "6 s s 3"], Float64[np.ndarray, "4 4"]]:
+        """Gradients by the sky and by the reference pose."""
+        pose = self.view.world_from_reference
+        by_sky, torque = draw_sky_back(self._directions, pose[:3, :3], sky, by_behind, self._workers)
+        return by_sky, pose_gradient(np.zeros(3), torque, pose)
+
     @cached_property
-    def directions(self) -> Float32[np.ndarray, "h w 3"]:
+    def _directions(self) -> Float32[np.ndarray, "h w 3"]:
         """Unit rays in the reference frame."""
         grid, turns = self.sensor.grid, self.view.turns.reshape(-1, 3, 3)
         if self.view.still:
@@ -131,7 +144,6 @@ class Frame:
         features: Float32[np.ndarray, "n 3"],
     ) -> Float32[np.ndarray, "6 h w"]:
         """Blended planes: alpha, three features, distance, half distance; sides are rounded up to whole macro tiles."""
-        self._gaussians = mean, quat, scale, opacity
         blocks = -(-len(mean) // BLOCK)
         packed = self._array("fields", (blocks, FIELDS, BLOCK), np.float32)
         self._workers.run(
@@ -148,11 +160,20 @@ class Frame:
         return self.planes
 
     def draw_back(
-        self, by_planes: Mapping[int, Float32[np.ndarray, "... h w"]]
+        self,
+        mean: Float32[np.ndarray, "n 3"],
+        quat: Float32[np.ndarray, "n 4"],
+        scale: Float32[np.ndarray, "n 3"],
+        opacity: Float32[np.ndarray, " n"],
+        by_planes: Mapping[int, Float32[np.ndarray, "... h w"]],
     ) -> tuple[Float32[np.ndarray, "n c"], ...]:
         """Gradients by mean, quaternion, scale, opacity, features and ``world_from_sensor`` [4,4] at the reference.
 
         Args:
+            mean: what has been drawn, like the following three.
+            quat: see mean.
+            scale: see mean.
+            opacity: see mean.
             by_planes: gradients of the loss by the planes of ``draw``, by the number of the first plane.
         """
         picture, grid = self._picture, self.sensor.grid
@@ -175,23 +196,26 @@ class Frame:
               np.float32(grid.near_m), width, height, self.planes, gradients, slots)
              for tiles in tile_ranges(picture, self._workers.threads)],
         )  # fmt: skip
-        return self._project_back(first_slot, slots)
-
-    def _project_back(
-        self, first_slot: Int64[np.ndarray, " n"], slots: Float32[np.ndarray, "p 16"]
-    ) -> tuple[Float32[np.ndarray, "n c"], ...]:
-        picture, pose = self._picture, self.view.world_from_reference
-        count = len(self._gaussians[0])
-        gradients = tuple(np.zeros((count, *width), np.float32) for width in ((3,), (4,), (3,), (), (3,)))
+        pose, count = view.world_from_reference, len(mean)
+        shares = [np.zeros((count, *width), np.float32) for width in ((3,), (4,), (3,), (), (3,))]
         forces = np.zeros((-(-count // BLOCK), 6))
         self._workers.run(
             project_back,
-            [(first, many, picture.records, picture.spans, picture.sources, first_slot, slots, *self._gaussians,
-              pose, *gradients, forces) for _, first, many in picture.runs],
+            [(first, many, picture.records, picture.spans, picture.sources, first_slot, slots, mean, quat, scale,
+              opacity, pose, *shares, forces) for _, first, many in picture.runs],
         )  # fmt: skip
-        force, (x, y, z) = forces[:, :3].sum(axis=0), forces[:, 3:].sum(axis=0)
-        by_pose = np.zeros((4, 4))
-        # Of all matrices with this torque, the one along rotations.
-        by_pose[:3, :3] = 0.5 * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose[:3, :3]
-        by_pose[:3, 3] = force
-        return *gradients, by_pose
+        return *shares, pose_gradient(forces[:, :3].sum(axis=0), forces[:, 3:].sum(axis=0), pose)
+
+
+def pose_gradient(
+    force: Float64[np.ndarray, " 3"], torque: Float64[np.ndarray, " 3"], pose: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "4 4"]:
+    """The gradient by a pose's matrix, from those by a shift and by a small turn about its origin, both in the world.
+
+    Of all matrices with this torque it is the one along rotations; a change that is no rigid motion has no meaning.
+    """
+    x, y, z = torque
+    gradient = np.zeros((4, 4))
+    gradient[:3, :3] = 0.5 * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose[:3, :3]
+    gradient[:3, 3] = force
+    return gradient

@@ -30,7 +30,7 @@ class Grid:
     residual of the row offsets in columns, smallest and largest row shift (0 included).
     ``table``: LENS place by stereographic direction [s,s,2]; LIDAR [2,t,1]: column by azimuth, row by sine of
     elevation.
-    ``row_shift``: LIDAR rows are rolled by whole columns so that a grid column looks in one azimuth.
+    LIDAR rows are rolled by whole columns so that a grid column looks in one azimuth.
     """
 
     kind: int
@@ -41,7 +41,6 @@ class Grid:
     beam: Int32[np.ndarray, "h w"] | None
     params: Float32[np.ndarray, " p"]
     table: Float32[np.ndarray, "a b c"]
-    row_shift: Int32[np.ndarray, " h"]
     reference: float
     by_range: bool
     near_m: float
@@ -77,19 +76,18 @@ def _camera_grid(camera: CameraModel) -> Grid:
         line = np.indices((height, width), np.int32)[1 if by_column else 0]
         fraction = rays.fraction[0] if by_column else rays.fraction[:, 0]
     field_cos = float(direction[rays.valid][:, 2].min()) if rays.valid.any() else 1.0
-    lens, chart = camera.lens, NO_CHART
-    ideal = isinstance(lens, Pinhole) and not lens.distorted and camera.windshield is None
-    if not ideal or len(fraction) > 1:
-        chart = lens_chart(camera, direction, rays.valid)
-    if isinstance(lens, Pinhole) and not lens.distorted and camera.windshield is None:
+    lens = camera.lens
+    ideal = lens if isinstance(lens, Pinhole) and not lens.distorted and camera.windshield is None else None
+    chart = NO_CHART if ideal and len(fraction) == 1 else lens_chart(camera, direction, rays.valid)
+    if ideal:
         kind, table = PINHOLE, np.zeros((1, 1, 2), np.float32)
-        params = np.array([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px], np.float32)
+        params = np.array([ideal.fx_px, ideal.fy_px, ideal.cx_px, ideal.cy_px], np.float32)
     else:
         half_width = chart.params[MIDDLE] / chart.params[TEXELS]
         kind, table = LENS, np.ascontiguousarray(chart.places[..., :2])
         params = np.array([half_width, np.cos(2 * np.arctan(half_width))], np.float32)
     return Grid(kind, direction, rays.valid.astype(np.uint8), np.ascontiguousarray(line), np.asarray(fraction), None,
-                params, table, np.zeros(height, np.int32), rays.reference, rays.by_range, rays.near_m, field_cos,
+                params, table, rays.reference, rays.by_range, rays.near_m, field_cos,
                 int(by_column), chart)  # fmt: skip
 
 
@@ -123,7 +121,6 @@ def _lidar_grid(lidar: LidarModel) -> Grid:
         beam=(row * columns + fired).astype(np.int32),
         params=np.array(params, np.float32),
         table=np.stack([column_of, row_of])[..., None].astype(np.float32) + np.float32(0.5),
-        row_shift=shift,
         reference=rays.reference,
         by_range=rays.by_range,
         near_m=rays.near_m,

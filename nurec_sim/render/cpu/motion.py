@@ -9,7 +9,6 @@ what moves past less than half as fast as the lines near its box is not seen aga
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float32
@@ -18,7 +17,7 @@ from llvmlite import ir
 from nurec_sim.render.cpu.charts import PER_RADIAN, PERIOD, SHIFTED
 from nurec_sim.render.cpu.outlines import Box, Lens, LensCone, Lidar, LidarCone, Outline, Texels
 from nurec_sim.render.cpu.records import CELLS, CENTRE, LOG_P, ROTATION, SIGMA, STEP, dot
-from nurec_sim.render.cpu.simd import BITS, LANES, Lanes, Mask, Vector, vector_kernel
+from nurec_sim.render.cpu.simd import BITS, I64, LANES, Lanes, Mask, Vector, vector_kernel
 
 # Scratch of a group seen from the pose of its line: as ``records`` lays it out, with these behind LOG_P.
 LINE, VELOCITY = 16, 17
@@ -32,6 +31,8 @@ TO_LINE = 12
 LINE_COLUMNS = 24
 MOST = 1e3
 """Radians that stand for any turn."""
+APART = 16
+"""Bits between masks in one integer."""
 
 
 def motion_parameters(lines: Float32[np.ndarray, "l 24"], line_axis: int) -> Float32[np.ndarray, " 7"]:
@@ -120,80 +121,96 @@ class Motion:
         """Lines away from ``line`` within which all that see a box are looked for; the box is that from ``line``."""
         return (self._beyond(low, high) * 2 + (8 + 2 * self.shifted)).min(self.all_lines)
 
-    def lines_away(self, low: Vector, high: Vector, rate: Vector, lines: Vector) -> Vector:
-        """How far away from ``line`` are lines that see a box, among ``lines`` of them, where ``rate`` holds.
+    def lines_away(self, low: Vector, high: Vector, rate: Vector, lines: Vector) -> tuple[Vector, Mask]:
+        """How far away from ``line`` are the lines that see a box; and where the box moves too fast to tell.
 
-        All lines where the box moves too fast.
+        ``rate`` holds for ``lines`` of them.
         """
         pace = rate * self.turned(lines) / lines
         away = (self._beyond(low, high) + pace * self.shifted) / (1 - pace).max(0.1) + self.shifted
-        return ((pace < 0.9) & (away <= lines)).where(away, self.all_lines)
+        told = (pace < 0.9) & (away <= lines)
+        return told.where(away, lines), ~told
 
     def _beyond(self, low: Vector, high: Vector) -> Vector:
         return (high - self.line).max(self.line - low).max(0)
 
 
-def _widened(ends: tuple[Vector, Vector], by: Vector) -> tuple[Vector, Vector]:
+def widened(ends: tuple[Vector, Vector], by: Vector) -> tuple[Vector, Vector]:
+    """An interval with something added at either end."""
     return ends[0] - by, ends[1] + by
+
+
+def masks(v: Lanes, *several: Mask) -> ir.Value:
+    """Masks in one integer, ``APART`` bits apart."""
+    joined = several[0].integer()
+    for k, mask in enumerate(several[1:], 1):
+        joined = v.b.or_(joined, v.b.shl(mask.integer(), ir.Constant(I64, APART * k)))
+    return joined
+
+
+def mask_of(v: Lanes, integer: ir.Value) -> Mask:
+    """The lowest mask in an integer."""
+    return Mask(v.b, v.b.bitcast(v.b.trunc(integer, ir.IntType(LANES)), BITS))
 
 
 @vector_kernel("iiiiii")
 def moving_lens_boxes(
     v: Lanes, local: ir.Value, params: ir.Value, places: ir.Value, bends: ir.Value, motion: ir.Value, target: ir.Value
 ) -> ir.Value:
-    """Cells that any line of a lens may see Gaussians in; the mask of those in its field."""
+    """Cells that any line of a lens may see Gaussians in; masks of those in its field and of the too fast."""
     outline = Outline(v, local)
     cone = LensCone(Lens(v, params, places, bends), outline)
     motions = Motion(v, motion, local, outline, 1.0)
     by_column = v.broadcast(motion, 4 * BY_COLUMN) > 0.5
 
-    def along(pair: Sequence[Vector], other: Sequence[Vector]) -> list[Vector]:
-        return [by_column.where(a, b) for a, b in zip(pair, other, strict=True)]
+    def along(column: tuple[Vector, Vector], row: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+        return by_column.where(column[0], row[0]), by_column.where(column[1], row[1])
 
     still, _ = cone.box()
     lines = motions.guess(*along(still.column, still.row))
     box, (column_rate, row_rate) = cone.box(motions.turned(lines))
-    lines = motions.lines_away(*along(box.column, box.row), by_column.where(column_rate, row_rate), lines)
+    lines, fast = motions.lines_away(*along(box.column, box.row), by_column.where(column_rate, row_rate), lines)
     turned = motions.turned(lines)
-    Box(_widened(box.column, column_rate * turned), _widened(box.row, row_rate * turned)).store(v, target)
-    return (~cone.outside(motions.turned(motions.all_lines))).integer()
+    Box(widened(box.column, column_rate * turned), widened(box.row, row_rate * turned)).store(v, target)
+    return masks(v, ~cone.outside(motions.turned(motions.all_lines)), fast)
 
 
 @vector_kernel("iiiiii")
 def moving_lidar_boxes(
     v: Lanes, local: ir.Value, params: ir.Value, rows: ir.Value, view: ir.Value, motion: ir.Value, target: ir.Value
 ) -> ir.Value:
-    """Cells that any column of a LiDAR may see Gaussians in, were there no seam; the mask of those that may cross it.
+    """Cells that any column of a LiDAR may see Gaussians in, were there no seam.
 
     The seam is where the last column of a sweep meets the first one, fired from elsewhere.
+
+    Returns:
+        Masks of those that may cross the seam, of those that are too fast, and of those whose box holds columns.
     """
     lidar, outline = Lidar(v, params, rows), Outline(v, local)
-    shifted, period = lidar.param(SHIFTED), lidar.param(PERIOD)
+    shifted, period, width = lidar.param(SHIFTED), lidar.param(PERIOD), v.broadcast(view, 4 * CELLS)
     motions = Motion(v, motion, local, outline, shifted)
     cone = LidarCone(lidar, outline, motions.line)
     lines = motions.guess(*cone.columns)
     rate = cone.rate(motions.turned(lines))
-    lines = motions.lines_away(*cone.columns, rate, lines)
+    lines, fast = motions.lines_away(*cone.columns, rate, lines)
     turned = motions.turned(lines)
-    box = Box(_widened(cone.columns, rate * turned), cone.rows(turned))
+    box = Box(widened(cone.columns, rate * turned), cone.rows(turned))
     box.store(v, target)
     # Over the whole sweep azimuths turn at most as much as directions do that are level.
     level = (cone.flat - outline.f[2].abs() * outline.reach).max(1e-3)
     farthest = motions.turned(motions.all_lines) / level * lidar.param(PER_RADIAN).abs() * 1.5
-    low, high = _widened(box.column, farthest + shifted)
-    return ((low < v.broadcast(view, 4 * CELLS) - period) | (high > period)).integer()
+    low, high = widened(box.column, farthest + shifted)
+    inside = (cone.columns[0] < width + shifted) & (cone.columns[1] > -shifted)
+    return masks(v, (low < width - period) | (high > period), fast, inside)
 
 
-@vector_kernel("iiiii")
-def join_ends(v: Lanes, seam: ir.Value, params: ir.Value, view: ir.Value, box: ir.Value, other: ir.Value) -> None:
-    """Let the boxes in the mask ``seam`` hold what is seen from the other end of the sweep as well, beyond the seam."""
-    chosen = Mask(v.b, v.b.bitcast(v.b.trunc(seam, ir.IntType(LANES)), BITS))
-    period, shifted = v.broadcast(params, 4 * PERIOD), v.broadcast(params, 4 * SHIFTED)
+@vector_kernel("iiii")
+def join_ends(v: Lanes, chosen: ir.Value, params: ir.Value, box: ir.Value, other: ir.Value) -> None:
+    """Let the boxes in the mask ``chosen`` hold what is seen from the other end of the sweep as well."""
+    period = v.broadcast(params, 4 * PERIOD)
     left, right, top, bottom = (v.load(box, STEP * k) for k in range(4))
     left2, right2, top2, bottom2 = (v.load(other, STEP * k) for k in range(4))
-    # Boxes that lie outside of the sweep as seen from its other end hold none of the cells that fire there.
-    chosen = chosen & (left2 < v.broadcast(view, 4 * CELLS) + shifted) & (right2 > -shifted)
     shift = period * ((left + right - left2 - right2) / (period * 2) + 0.5).floor()
     ends = left.min(left2 + shift), right.max(right2 + shift), top.min(top2), bottom.max(bottom2)
     for k, (own, end) in enumerate(zip((left, right, top, bottom), ends, strict=True)):
-        v.store(chosen.where(end, own), box, STEP * k)
+        v.store(mask_of(v, chosen).where(end, own), box, STEP * k)

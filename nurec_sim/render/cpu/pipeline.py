@@ -220,9 +220,10 @@ def _bin(pictures: Sequence[Picture], workers: Workers) -> None:
         picture.stats.pairs = int(picture.starts[-1])
         picture.lists = picture.array("lists", (picture.stats.pairs + LANES,), np.int32)
         calls += [
-            (fill_tiles, picture.sorted_spans, picture.order, first, last, picture.tile_columns, position[k], picture.lists)
+            (fill_tiles, picture.sorted_spans, picture.order, first, last, picture.tile_columns, position[k],
+             picture.lists)
             for k, (first, last) in enumerate(ranges)
-        ]
+        ]  # fmt: skip
     workers.run_calls(calls)
 
 

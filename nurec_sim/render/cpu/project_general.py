@@ -6,11 +6,13 @@ import numpy as np
 from llvmlite import ir
 
 from nurec_sim.render.cpu.charts import PERIOD
-from nurec_sim.render.cpu.kernel import keep_alive, kernel
+from nurec_sim.render.cpu.kernel import kernel
 from nurec_sim.render.cpu.motion import (
+    APART,
     join_ends,
     lens_lines,
     lidar_lines,
+    masks,
     moving_lens_boxes,
     moving_lidar_boxes,
     other_ends,
@@ -18,6 +20,7 @@ from nurec_sim.render.cpu.motion import (
 )
 from nurec_sim.render.cpu.outlines import Box, Lens, LensCone, Lidar, LidarCone, Outline
 from nurec_sim.render.cpu.pack import BLOCK, FIELDS
+from nurec_sim.render.cpu.parts import PARTS, add_lens_part, add_lidar_part, part_lines
 from nurec_sim.render.cpu.project_pinhole import take_features
 from nurec_sim.render.cpu.records import (
     CELLS,
@@ -29,10 +32,7 @@ from nurec_sim.render.cpu.records import (
     emit,
     place,
 )
-from nurec_sim.render.cpu.simd import I64, LANES, Lanes, Mask, Vector, vector_kernel
-
-SECOND = 32
-"""Bit of a LiDAR's mask from which on it tells of second boxes."""
+from nurec_sim.render.cpu.simd import LANES, Lanes, Vector, vector_kernel
 
 
 @vector_kernel("iiiii")
@@ -80,7 +80,7 @@ def lens_tiles(v: Lanes, box: ir.Value, view: ir.Value, tiles: ir.Value) -> ir.V
 def lidar_tiles(
     v: Lanes, box: ir.Value, view: ir.Value, params: ir.Value, tiles: ir.Value, others: ir.Value
 ) -> ir.Value:
-    """Macro tiles of boxes, and (``others``, mask from bit ``SECOND`` on) of what a full turn brings back.
+    """Macro tiles of boxes, and (``others``, mask ``APART`` bits on) of what a full turn brings back.
 
     What leaves one side of the grid enters at the other. The two never share a tile.
     """
@@ -97,8 +97,7 @@ def lidar_tiles(
     touch = first & second & (p0 <= x1) & (x0 <= p1)
     _store_tiles(v, (touch.where(x0.min(p0), x0), touch.where(x1.max(p1), x1), _tile(y0), _tile(y1)), tiles)
     _store_tiles(v, (p0, p1, _tile(y0), _tile(y1)), others)
-    again: Mask = second & ~touch
-    return v.b.or_(first.integer(), v.b.shl(again.integer(), ir.Constant(I64, SECOND)))
+    return masks(v, first, second & ~touch)
 
 
 @kernel
@@ -137,6 +136,7 @@ def project_general(
     here, there, around = scratch.ctypes.data, local.ctypes.data, view.ctypes.data
     chart, table, bend, path = params.ctypes.data, places.ctypes.data, bends.ctypes.data, motion.ctypes.data
 
+    cells, other_cells, poses = box.ctypes.data, other_box.ctypes.data, lines.ctypes.data
     moving = lines.shape[0] > 1
     n = base
     for k in range(first, last):
@@ -150,28 +150,44 @@ def project_general(
             if is_lidar:
                 if moving:
                     lidar_lines(here, chart, around, path, there)
-                    to_lines(here, lines.ctypes.data, path, there)
-                    seam = mask & moving_lidar_boxes(there, chart, table, around, path, box.ctypes.data)
+                    to_lines(here, poses, path, there)
+                    found = moving_lidar_boxes(there, chart, table, around, path, cells)
+                    fast = mask & (found >> APART)
+                    seam = mask & found & ~fast
                     if seam != 0:
                         other_ends(path, there)
-                        to_lines(here, lines.ctypes.data, path, there)
-                        moving_lidar_boxes(there, chart, table, around, path, other_box.ctypes.data)
-                        join_ends(seam, chart, around, box.ctypes.data, other_box.ctypes.data)
+                        to_lines(here, poses, path, there)
+                        found = moving_lidar_boxes(there, chart, table, around, path, other_cells)
+                        seam &= found >> (2 * APART)
+                        fast |= seam & (found >> APART)
+                        join_ends(seam, chart, cells, other_cells)
+                    if fast != 0:
+                        for part in range(PARTS):
+                            part_lines(part, path, there)
+                            to_lines(here, poses, path, there)
+                            add_lidar_part(part, fast, there, chart, table, path, around, cells)
                 else:
-                    lidar_boxes(here, chart, table, around, box.ctypes.data)
-                both = lidar_tiles(box.ctypes.data, around, chart, tiles.ctypes.data, other_tiles.ctypes.data)
-                again = mask & (both >> SECOND)
+                    lidar_boxes(here, chart, table, around, cells)
+                both = lidar_tiles(cells, around, chart, tiles.ctypes.data, other_tiles.ctypes.data)
+                again = mask & (both >> APART)
                 mask &= both
             else:
                 if moving:
                     lens_lines(here, chart, table, path, there)
-                    to_lines(here, lines.ctypes.data, path, there)
+                    to_lines(here, poses, path, there)
                     lens_lines(there, chart, table, path, there)
-                    to_lines(here, lines.ctypes.data, path, there)
-                    mask &= moving_lens_boxes(there, chart, table, bend, path, box.ctypes.data)
+                    to_lines(here, poses, path, there)
+                    found = moving_lens_boxes(there, chart, table, bend, path, cells)
+                    mask &= found
+                    fast = mask & (found >> APART)
+                    if fast != 0:
+                        for part in range(PARTS):
+                            part_lines(part, path, there)
+                            to_lines(here, poses, path, there)
+                            add_lens_part(part, fast, there, chart, table, bend, path, around, cells)
                 else:
-                    mask &= lens_boxes(here, chart, table, bend, box.ctypes.data)
-                mask &= lens_tiles(box.ctypes.data, around, tiles.ctypes.data)
+                    mask &= lens_boxes(here, chart, table, bend, cells)
+                mask &= lens_tiles(cells, around, tiles.ctypes.data)
             if mask | again == 0:
                 continue
             take_features(block, sh_rest, number, lane, around, here, is_lidar)
@@ -179,5 +195,4 @@ def project_general(
             source = number * BLOCK + lane
             n = emit(mask, rows, scratch, tiles, source, n, records, keys, spans, sources)
             n = emit(again, rows, scratch, other_tiles, source, n, records, keys, spans, sources)
-    keep_alive(local)
     return n - base

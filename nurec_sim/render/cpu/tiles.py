@@ -69,7 +69,7 @@ def _load_records(v: Lanes, ids: ir.Value, records: ir.Value, count: ir.Value) -
     return [
         column
         for first in range(0, RECORD, LANES)
-        for column in v.transpose([v.load(row, 4 * first, align=32) for row in rows])
+        for column in v.transpose([v.load(row, 4 * first) for row in rows])
     ]
 
 

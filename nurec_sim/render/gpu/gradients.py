@@ -22,6 +22,7 @@ from nurec_sim.render.cpu.grid import make_grid
 from nurec_sim.render.cpu.pack import MAX_OPACITY, MIN_SCALE_M
 from nurec_sim.render.gpu.launcher import CudaLauncher, Launcher
 from nurec_sim.render.gpu.pipeline import ALPHA, DISTANCE, HALF, Blocks, draw, draw_backward
+from nurec_sim.render.gpu.sky import sky_colour
 from nurec_sim.render.gpu.tensors import blocks_of
 from nurec_sim.render.gpu.views import Batch, GridTensors, SensorView, make_batch, rotation_vector
 from nurec_sim.render.gradients import CameraImages, GaussianTensors, LidarImages
@@ -112,7 +113,7 @@ def _image(
         direction, instant = tensors.rays[..., :3], tensors.rays[..., 3:]
         swing = torch.as_tensor(rotation_vector(pair[0, :3, :3].T @ pair[1, :3, :3]), device=planes.device)
         turned = _turned(direction.double(), instant.double() * swing) @ reference[:3, :3].T.to(planes.device)
-        behind = sky if sky.ndim == 1 else torch_maths.sky_colour(sky, turned.to(sky.dtype))
+        behind = sky if sky.ndim == 1 else sky_colour(sky, turned.to(sky.dtype))
         lit = (direction != 0).any(dim=-1)
         rgb = rgb + (lit * (1 - alpha))[..., None] * behind.to(rgb.dtype)
     depth = (distance / alpha.clamp(min=MIN_ALPHA) * tensors.rays[..., 2]).clamp(min=0)

@@ -40,7 +40,7 @@ class CudaLauncher:
         device: such as ``cuda`` or ``cuda:1``.
 
     Raises:
-        GpuError: no such device, or the extra ``gpu`` is missing.
+        GpuError: no such device, a driver that is too old, or the extra ``gpu`` is missing.
     """
 
     def __init__(self, device: str = "cuda") -> None:
@@ -49,8 +49,12 @@ class CudaLauncher:
         self._core = core
         self._device = core.Device(self.device.index)
         self._device.set_current()
-        code = core.ObjectCode.from_cubin(cached_cubin(architecture_of(self.device)))
-        self._kernels = {name: code.get_kernel(name) for name in kernel_names()}
+        cubin = cached_cubin(architecture_of(self.device))
+        try:
+            code = core.ObjectCode.from_cubin(cubin)
+            self._kernels = {name: code.get_kernel(name) for name in kernel_names()}
+        except Exception as error:
+            raise GpuError(f"{self.device} cannot load the kernels; its driver may be too old: {error}") from None
 
     def launch(self, kernel: str, grid: tuple[int, int], *arguments: Argument) -> None:
         """See ``Launcher``."""

@@ -1,9 +1,9 @@
 """The stages of a batch on the device: cones of rays, projection, tile lists, blending; and the way back.
 
 Blocks of Gaussians that a sensor cannot see are dropped; the others become records, counted first so that each lands
-in a place of its own. Records are handed out to tiles of 16 x 16 rays as pairs with the key (tile, depth), pairs are
-sorted, and each tile is blended front to back. No kernel adds up in an order that may vary, so the same input gives
-the same bytes.
+in a place of its own. Records are sorted by depth and handed out to tiles of 16 x 16 rays, these pairs are sorted by
+tile, which keeps their order, and each tile is blended front to back. No kernel adds up in an order that may vary, so
+the same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ PLANES = 10
 FEATURES, DISTANCE, ALPHA, HALF = 0, 3, 4, 5
 SUMS, GRADIENTS = 16, 14
 WARPS = 8
+DEPTH_BITS = 5
+"""Column of a span: the depth as an integer that sorts like it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +66,15 @@ class Drawn:
     """What drawing leaves: ``planes`` [10,rays] (features, distance, alpha, half, normal, label) and the way there.
 
     ``row_records`` [views,rows] (if asked for) is the record of each Gaussian in each view, -1 where it has none.
-    ``tile_counts`` and ``tile_ends`` are the number of tiles per record and its running sum; ``slots`` says which pair,
-    in the order of records, each entry of ``lists`` is.
+    ``order`` gives the records front to back; ``tile_counts`` and ``tile_ends`` are, in that order, their numbers of
+    tiles and the running sum; ``slots`` says which of these pairs each entry of ``lists`` is. The list of tile k begins
+    at ``starts[k]``.
     """
 
     planes: torch.Tensor
     cones: torch.Tensor
     records: torch.Tensor
+    order: torch.Tensor
     tile_counts: torch.Tensor
     tile_ends: torch.Tensor
     lists: torch.Tensor
@@ -105,25 +109,26 @@ def draw(launcher: Launcher, batch: Batch, static: Blocks, moving: Blocks, keep_
         counts, records, spans, row_records,
     )  # fmt: skip
 
-    # Pairs of a tile and a record, sorted by tile, then by depth, then by record.
+    # Pairs of a tile and a record: made front to back, then sorted by tile, which keeps that order.
+    order = torch.sort(spans[:, DEPTH_BITS].contiguous(), stable=True)[1]
     tile_counts = empty(seen, dtype=torch.int32)
-    found = (batch.views, records, spans, cones, seen, tile_counts)
+    found = (batch.views, records, spans, cones, order, seen, tile_counts)
     grid = (-(-seen // WARPS), 1)
     launcher.launch("count_tiles", grid, *found)
     tile_ends = torch.cumsum(tile_counts, 0, dtype=torch.int64)
     pairs = int(tile_ends[-1]) if seen else 0
-    keys, owners = empty(pairs, dtype=torch.int64), empty(pairs, dtype=torch.int32)
-    launcher.launch("fill_tiles", grid, *found, tile_ends, keys, owners)
-    keys, slots = torch.sort(keys, stable=True)
+    pair_tiles, owners = empty(pairs, dtype=torch.int32), empty(pairs, dtype=torch.int32)
+    launcher.launch("fill_tiles", grid, *found, tile_ends, pair_tiles, owners)
+    pair_tiles, slots = torch.sort(pair_tiles, stable=True)
     lists = owners[slots]
-    starts = torch.searchsorted(keys, torch.arange(tiles + 1, device=device) << 32)
+    starts = torch.searchsorted(pair_tiles, torch.arange(tiles + 1, dtype=torch.int32, device=device))
 
     planes = empty(PLANES, batch.ray_count)
     launcher.launch(
         "blend", (tiles, 1), batch.views, batch.tile_view, cones, records, lists, starts, np.int64(batch.ray_count),
         planes,
     )  # fmt: skip
-    return Drawn(planes, cones, records, tile_counts, tile_ends, lists, starts, slots, row_records)
+    return Drawn(planes, cones, records, order, tile_counts, tile_ends, lists, starts, slots, row_records)
 
 
 def draw_backward(
@@ -153,11 +158,14 @@ def draw_backward(
         drawn.starts, drawn.slots, np.int64(batch.ray_count), drawn.planes, plane_grads.contiguous(), sums,
     )  # fmt: skip
 
+    place_of_record = torch.empty_like(drawn.order)
+    place_of_record[drawn.order] = torch.arange(len(drawn.order), device=device)
+
     def of_views(first: int, last: int) -> torch.Tensor:
         gradients = torch.empty((GRADIENTS, len(static) * BLOCK), device=device)
         launcher.launch(
             "project_backward", (len(static), 1), batch.views, first, last, static.fields, drawn.row_records,
-            drawn.tile_counts, drawn.tile_ends, sums, gradients,
+            place_of_record, drawn.tile_counts, drawn.tile_ends, sums, gradients,
         )  # fmt: skip
         return gradients
 

@@ -14,6 +14,16 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry
+from nurec_sim.render.cpu.charts import (
+    AZIMUTH,
+    LEAST_AHEAD,
+    MIDDLE,
+    MISFIT,
+    MOST_AHEAD,
+    PER_RADIAN,
+    PERIOD,
+    TEXELS,
+)
 from nurec_sim.render.cpu.grid import LENS, LIDAR, Grid
 
 if TYPE_CHECKING:
@@ -33,7 +43,7 @@ VIEW = np.dtype(
         ("turn", np.float32, 9),
         ("travel", np.float32, 3),
         ("swing", np.float32, 3),
-        ("params", np.float32, 10),
+        ("params", np.float32, 5),
         ("isp", np.float32, 12),
         ("end_from_reference", np.float32, 12),
         ("near_m", np.float32),
@@ -53,12 +63,14 @@ class GridTensors:
     """A sensor's grid of rays on the device; immutable.
 
     ``rays`` [h,w,4] holds unit directions in the sensor (zero where there is no ray) and the instant of each ray, in
-    exposures after the reference instant.
+    exposures after the reference instant. ``table`` leads from directions to places: [s,s,2] of a lens, [t] of a LiDAR;
+    ``params`` are its parameters (``kernels/bounds.cuh``).
     """
 
     grid: Grid
     rays: torch.Tensor
     table: torch.Tensor
+    params: Float32[np.ndarray, " p"]
     beam: torch.Tensor
     timed: bool
 
@@ -75,7 +87,14 @@ class GridTensors:
         def on_device(array: np.ndarray) -> torch.Tensor:
             return torch.from_numpy(np.ascontiguousarray(array)).to(device)
 
-        return cls(grid, on_device(rays), on_device(grid.table), on_device(beam), bool(np.any(instant != 0)))
+        table, params = np.zeros(1, np.float32), grid.params
+        if grid.kind == LENS:
+            table, params = grid.chart.places[..., :2], grid.chart.params[[TEXELS, MIDDLE, MISFIT]]
+        elif grid.kind == LIDAR:
+            table = grid.chart.places.reshape(-1)
+            params = grid.chart.params[[PER_RADIAN, AZIMUTH, PERIOD, LEAST_AHEAD, MOST_AHEAD]]
+        timed = bool(np.any(instant != 0))
+        return cls(grid, on_device(rays), on_device(table), params, on_device(beam), timed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,12 +169,12 @@ def _fill(row: np.void, sensor: SensorView) -> None:
     row["eye"], row["turn"] = world_from_reference[:3, 3], rotation.T.ravel()
     row["end_from_reference"] = (geometry.inverse(pair[1]) @ world_from_reference)[:3].ravel()
     row["rays"], row["table"], row["beam"] = (t.data_ptr() for t in (tensors.rays, tensors.table, tensors.beam))
-    row["params"][: len(grid.params)] = grid.params
+    row["params"][: len(tensors.params)] = tensors.params
     row["isp"] = (np.eye(3, 4) if sensor.isp is None else sensor.isp).ravel()
     height, width = grid.valid.shape
     row["rows"], row["columns"] = height, width
     row["tile_rows"], row["tile_columns"] = -(-height // TILE), -(-width // TILE)
-    row["table_size"] = grid.table.shape[1] if grid.kind in (LENS, LIDAR) else 0
+    row["table_size"] = len(tensors.table)
     row["near_m"], row["field_cos"], row["by_range"] = grid.near_m, grid.field_cos, grid.by_range
     row["kind"], row["intensity"] = grid.kind, grid.kind == LIDAR
     row["first_block"], row["blocks"] = sensor.first_block, sensor.blocks

@@ -16,13 +16,17 @@ INLINE Box around(Box a, Box b) {
     return Box{fminf(a.u0, b.u0), fmaxf(a.u1, b.u1), fminf(a.v0, b.v0), fmaxf(a.v1, b.v1)};
 }
 
-// A direction's pixel, from the table by stereographic direction; params: half-width of the table, cosine of its rim.
+// Parameters of a view (render/cpu/charts.py).
+enum Pinhole { FX, FY, CX, CY };
+enum Lens { TEXELS, MIDDLE, MISFIT };
+enum Lidar { PER_RADIAN, AZIMUTH, PERIOD, LEAST_AHEAD, MOST_AHEAD };
+
+// A direction's pixel, from the table [size, size, 2] by stereographic direction.
 INLINE float2 lens_place(const View& view, float3 p) {
     int size = view.table_size;
-    float scale = 0.5f * (size - 1), far = length(p);
-    float inverse = 1.0f / (fmaxf(far + p.z, 1e-6f * far) * view.params[0]);
-    float s = fminf(fmaxf((p.x * inverse + 1) * scale, 0.0f), size - 1.001f);
-    float t = fminf(fmaxf((p.y * inverse + 1) * scale, 0.0f), size - 1.001f);
+    float far = length(p), scale = view.params[TEXELS] / fmaxf(far + p.z, 1e-6f * far);
+    float s = fminf(fmaxf(p.x * scale + view.params[MIDDLE], 0.0f), size - 1.001f);
+    float t = fminf(fmaxf(p.y * scale + view.params[MIDDLE], 0.0f), size - 1.001f);
     int i = (int)s, j = (int)t;
     float fs = s - i, ft = t - j;
     const float* low = view.table + 2 * (j * size + i);
@@ -32,22 +36,15 @@ INLINE float2 lens_place(const View& view, float3 p) {
     return make_float2(u0 + ft * (u1 - u0), v0 + ft * (v1 - v0));
 }
 
-INLINE float lookup(const float* table, float place, int size) {
-    float s = fminf(fmaxf(place, 0.0f), size - 1.01f);
-    int i = (int)s;
-    return table[i] + (s - i) * (table[i + 1] - table[i]);
-}
-
-// A direction's column and row; params: sense of the spin, azimuth of column 0, half the gap behind the last column.
-INLINE float lidar_column(const View& view, float3 p) {
-    const float two_pi = 6.283185307f;
-    float angle = view.params[0] * (atan2f(p.y, p.x) - view.params[1]) + view.params[2];
-    angle -= two_pi * floorf(angle / two_pi);
-    return lookup(view.table, angle * ((view.table_size - 1) / two_pi), view.table_size);
-}
+// A direction's row, from the table [size] by sine of elevation; and its column, of which whole turns mean nothing.
 INLINE float lidar_row(const View& view, float3 p) {
     float sine = p.z / fmaxf(length(p), 1e-20f);
-    return lookup(view.table + view.table_size, (sine + 1) * 0.5f * (view.table_size - 1), view.table_size);
+    float s = fminf(fmaxf((sine + 1) * 0.5f * (view.table_size - 1), 0.0f), view.table_size - 1.01f);
+    int i = (int)s;
+    return view.table[i] + (s - i) * (view.table[i + 1] - view.table[i]);
+}
+INLINE float lidar_column(const View& view, float3 p) {
+    return view.params[PER_RADIAN] * (atan2f(p.y, p.x) - view.params[AZIMUTH]) + 0.5f;
 }
 
 // Box around the image of the ellipsoid of squared radius k2, exact for an ideal pinhole: tangents of its dual conic
@@ -61,7 +58,7 @@ INLINE Box pinhole_box(const View& view, float3 m, const float3 axes[3], float k
         sxz += axes[k].x * axes[k].z;
         syz += axes[k].y * axes[k].z;
     }
-    float fx = view.params[0], fy = view.params[1], cx = view.params[2], cy = view.params[3];
+    float fx = view.params[FX], fy = view.params[FY], cx = view.params[CX], cy = view.params[CY];
     if (k2 * szz > 0.999f * m.z * m.z) {
         // It reaches the camera plane: everywhere, unless it lies behind a side of the image.
         for (int side = 0; side < 4; ++side) {
@@ -112,7 +109,7 @@ INLINE Box outline_box(const View& view, float3 m, const float3 axes[3], float k
         if (lidar) {
             // Azimuth from the centre's, so that nothing wraps.
             float turn = atan2f(m.x * p.y - m.y * p.x, m.x * p.x + m.y * p.y);
-            at = make_float2(middle.x + view.params[0] * turn * view.params[3], lidar_row(view, p));
+            at = make_float2(middle.x + view.params[PER_RADIAN] * turn, lidar_row(view, p));
         } else {
             at = lens_place(view, p);
         }
@@ -121,7 +118,8 @@ INLINE Box outline_box(const View& view, float3 m, const float3 axes[3], float k
         su += du, suu += du * du, sv += dv, svv += dv * dv;
     }
     // The affine image of a circle reaches sqrt(2) standard deviations of evenly spaced points; the rest is the bend.
-    float mu = su / points, mv = sv / points, pad = lidar ? 0.15f : 0.3f, bend = 1.02f + 0.2f * angle;
+    float mu = su / points, mv = sv / points;
+    float pad = lidar ? 0.15f : 0.3f + view.params[MISFIT], bend = 1.02f + 0.2f * angle;
     float hu = bend * sqrtf(2 * fmaxf(suu / points - mu * mu, 0.0f)) + pad;
     float hv = bend * sqrtf(2 * fmaxf(svv / points - mv * mv, 0.0f)) + pad;
     box = around(Box{box.u0 - pad, box.u1 + pad, box.v0 - pad, box.v1 + pad},
@@ -141,7 +139,6 @@ INLINE Box box_at(const View& view, float instant, float3 m, const float3 axes[3
 
 // The box during an exposure: around those of its start, middle and end, and an eighth more for the bend between them.
 INLINE Box box_of(const View& view, float3 m, const float3 axes[3], float k2, float nearest) {
-    bool turning = view.kind == LIDAR && view.params[4] > 0;
     Box box;
     if (!view.moving) {
         box = view.kind == PINHOLE ? pinhole_box(view, m, axes, k2) : outline_box(view, m, axes, k2);
@@ -151,9 +148,10 @@ INLINE Box box_of(const View& view, float3 m, const float3 axes[3], float k2, fl
         box = middle;
         for (int end = -1; end <= 1; end += 2) {
             Box other = box_at(view, 0.5f * end, m, axes, k2);
-            if (turning) {
-                float turn = floorf((middle.u0 + middle.u1 - other.u0 - other.u1) / (2.0f * view.columns) + 0.5f);
-                other.u0 += turn * view.columns, other.u1 += turn * view.columns;
+            if (view.kind == LIDAR) {
+                float period = view.params[PERIOD];
+                float turn = period * floorf((middle.u0 + middle.u1 - other.u0 - other.u1) / (2 * period) + 0.5f);
+                other.u0 += turn, other.u1 += turn;
             }
             box = around(box, other);
         }
@@ -161,8 +159,8 @@ INLINE Box box_of(const View& view, float3 m, const float3 axes[3], float k2, fl
         box.u0 -= 0.5f + 0.125f * (middle.u0 - box.u0), box.u1 += 0.5f + 0.125f * (box.u1 - middle.u1);
         box.v0 -= 0.5f + 0.125f * (middle.v0 - box.v0), box.v1 += 0.5f + 0.125f * (box.v1 - middle.v1);
     }
-    // Rows of a LiDAR look up to a residual aside of their column.
-    if (view.kind == LIDAR) box.u0 -= view.params[6], box.u1 -= view.params[5];
+    // A LiDAR's beams look somewhat aside of their column.
+    if (view.kind == LIDAR) box.u0 -= view.params[MOST_AHEAD], box.u1 -= view.params[LEAST_AHEAD];
     return box;
 }
 
@@ -173,18 +171,19 @@ INLINE bool span_of(const View& view, Box box, Span* span) {
     int y0 = (int)ceilf(fmaxf(box.v0, 0.0f) - 0.5f), y1 = (int)floorf(fminf(box.v1, high) - 0.5f);
     if (y0 > y1) return false;
     span->y0 = y0 / TILE, span->y1 = y1 / TILE;
-    if (view.kind == LIDAR && view.params[4] > 0) {
-        if (!(box.u1 - box.u0 < wide - 1)) {
+    if (view.kind == LIDAR) {
+        float period = view.params[PERIOD], turn = floorf(box.u0 / period) * period;
+        if (!(box.u1 - box.u0 < period - 1)) {
             span->x0 = 0, span->x1 = view.tile_columns - 1;
             return true;
         }
-        float turn = floorf(box.u0 / wide) * wide;  // what leaves one side of the grid enters at the other
-        int x0 = (int)ceilf(box.u0 - turn - 0.5f), x1 = (int)floorf(box.u1 - turn - 0.5f);
-        if (x0 > x1) return false;
-        x0 %= view.columns, x1 %= view.columns;
-        span->x0 = x0 / TILE, span->x1 = x1 / TILE;
-        if (x0 > x1 && span->x0 <= span->x1) span->x0 = 0, span->x1 = view.tile_columns - 1;
-        return true;
+        // What leaves one end of a turn enters at the other.
+        int x0 = (int)ceilf(box.u0 - turn - 0.5f), x1 = (int)floorf(fminf(box.u1 - turn, wide) - 0.5f);
+        int again = (int)floorf(fminf(box.u1 - turn - period, wide) - 0.5f);
+        span->x0 = x0 <= x1 ? x0 / TILE : 0;
+        span->x1 = again >= 0 ? again / TILE : x1 / TILE;
+        if (x0 <= x1 && again >= 0 && span->x0 <= span->x1) span->x0 = 0, span->x1 = view.tile_columns - 1;
+        return x0 <= x1 || again >= 0;
     }
     if (!(box.u1 > 0 && box.u0 < wide)) return false;
     int x0 = (int)ceilf(fmaxf(box.u0, 0.0f) - 0.5f), x1 = (int)floorf(fminf(box.u1, wide) - 0.5f);

@@ -11,7 +11,8 @@
 // Writes gradients [GRADIENTS][rows]: mean (world), quaternion, scale, log opacity, features.
 extern "C" __global__ void __launch_bounds__(THREADS)
 project_backward(const View* views, int first_view, int last_view, const float* fields, const int* record_of_row,
-                 const int* counts, const long long* ends, const float* sums, float* gradients) {
+                 const long long* place_of_record, const int* counts, const long long* ends, const float* sums,
+                 float* gradients) {
     int row = blockIdx.x * BLOCK + threadIdx.x, rows = gridDim.x * BLOCK;
     const float* f = fields + (size_t)blockIdx.x * FIELDS * BLOCK + threadIdx.x;
     float quat[4], out[GRADIENTS] = {};
@@ -25,7 +26,8 @@ project_backward(const View* views, int first_view, int last_view, const float* 
         if (record < 0) continue;
         const View& view = views[v];
         float g[SUMS] = {};
-        for (long long k = ends[record] - counts[record]; k < ends[record]; ++k) {
+        long long place = place_of_record[record], last = ends[place];
+        for (long long k = last - counts[place]; k < last; ++k) {
             for (int c = 0; c < SUMS; ++c) g[c] += sums[k * SUMS + c];
         }
         float3 offset =

@@ -16,10 +16,13 @@ INLINE bool meets_tile(const View& view, const Record& record, const Cone* cones
     return may_meet(record, cones[tile * CONES], travel, view.moving ? length(travel) : 0.0f);
 }
 
+// Tiles of each record, the records in `order`, front to back.
 extern "C" __global__ void __launch_bounds__(THREADS)
-count_tiles(const View* views, const Record* records, const Span* spans, const Cone* cones, int n, int* counts) {
-    int index = blockIdx.x * WARPS + threadIdx.x / 32, lane = threadIdx.x % 32, count = 0;
-    if (index >= n) return;
+count_tiles(const View* views, const Record* records, const Span* spans, const Cone* cones, const long long* order,
+            int n, int* counts) {
+    int place = blockIdx.x * WARPS + threadIdx.x / 32, lane = threadIdx.x % 32, count = 0;
+    if (place >= n) return;
+    long long index = order[place];
     Span span = spans[index];
     const View& view = views[span.view];
     for (int step = lane;; step += 32) {
@@ -27,29 +30,28 @@ count_tiles(const View* views, const Record* records, const Span* spans, const C
         count += __popc(__ballot_sync(FULL_WARP, meets_tile(view, records[index], cones, tile)));
         if (!__any_sync(FULL_WARP, tile >= 0)) break;
     }
-    if (lane == 0) counts[index] = count;
+    if (lane == 0) counts[place] = count;
 }
 
-// Writes a key (tile, then depth) and the record for each tile that a record may be seen in; `ends` are the running sums
-// of the counts.
+// Writes the tiles of each record, and the record beside each of them; `ends` are the running sums of the counts.
 extern "C" __global__ void __launch_bounds__(THREADS)
-fill_tiles(const View* views, const Record* records, const Span* spans, const Cone* cones, int n, const int* counts,
-           const long long* ends, long long* keys, int* owners) {
-    int index = blockIdx.x * WARPS + threadIdx.x / 32, lane = threadIdx.x % 32;
-    if (index >= n) return;
+fill_tiles(const View* views, const Record* records, const Span* spans, const Cone* cones, const long long* order,
+           int n, const int* counts, const long long* ends, int* tiles, int* owners) {
+    int place = blockIdx.x * WARPS + threadIdx.x / 32, lane = threadIdx.x % 32;
+    if (place >= n) return;
+    long long index = order[place], next = ends[place] - counts[place];
     Span span = spans[index];
     const View& view = views[span.view];
-    long long place = ends[index] - counts[index];
     for (int step = lane;; step += 32) {
         int tile = tile_at(view, span, step);
         bool meets = meets_tile(view, records[index], cones, tile);
         unsigned mask = __ballot_sync(FULL_WARP, meets);
         if (meets) {
-            long long at = place + __popc(mask & ((1u << lane) - 1));
-            keys[at] = ((long long)tile << 32) | (unsigned)span.depth_bits;
-            owners[at] = index;
+            long long at = next + __popc(mask & ((1u << lane) - 1));
+            tiles[at] = tile;
+            owners[at] = (int)index;
         }
-        place += __popc(mask);
+        next += __popc(mask);
         if (!__any_sync(FULL_WARP, tile >= 0)) break;
     }
 }

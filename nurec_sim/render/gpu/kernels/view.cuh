@@ -38,7 +38,7 @@ struct View {
     float turn[9];              // reference_from_world
     float travel[3];            // metres moved during an exposure, in the reference frame
     float swing[3];             // rotation vector of an exposure
-    float params[10];           // of the grid (render/cpu/grid.py)
+    float params[5];            // of the table; see there
     float isp[12];              // colour correction [3,4]
     float end_from_reference[12];
     float near_m;
