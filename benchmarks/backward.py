@@ -19,7 +19,15 @@ from scenes import BenchScene
 from nurec_sim.render import gradients
 from nurec_sim.render.cpu.pack import morton_order
 from nurec_sim.render.spec import to_uint8
-from nurec_sim.types import CameraFrame, CameraModel, DynamicGaussians, SensorRequest
+from nurec_sim.types import (
+    CameraFrame,
+    CameraModel,
+    DynamicGaussians,
+    LidarFilter,
+    LidarFrame,
+    SensorFrame,
+    SensorRequest,
+)
 
 BACKWARD_SENSORS = ("pinhole-640", "pinhole-960", "lidar-128")
 TRAINED = ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb")
@@ -49,9 +57,7 @@ def rows(name: str, built: BenchScene, options: Options, tick: Callable[[str], N
         width, height = SENSORS[sensor].size
         asked = ticks[len(ticks) // 2][0]
         frame = _step(tensors, scene, asked, threads)[3]
-        against = (
-            parity.against_spec(scene, [asked], [frame], options.parity_rays) if frame and options.parity_rays else {}
-        )
+        against = parity.against_spec(scene, [asked], [frame], options.parity_rays) if options.parity_rays else {}
         yield {
             **parity.NOTHING,
             "name": f"{name} {sensor} {path} backward",
@@ -77,8 +83,8 @@ def rows(name: str, built: BenchScene, options: Options, tick: Callable[[str], N
 
 def _step(
     tensors: gradients.GaussianTensors, scene, asked: SensorRequest, threads: int
-) -> tuple[float, float, float, CameraFrame | None]:
-    """Milliseconds forward, backward and backward's CPU time; and the image, if it is one."""
+) -> tuple[float, float, float, SensorFrame]:
+    """Milliseconds forward, backward and backward's CPU time; and the frame."""
     for column in TRAINED:
         getattr(tensors, column).grad = None
     pose = torch.from_numpy(np.asarray(asked.world_from_sensor, np.float64))
@@ -96,8 +102,16 @@ def _step(
     ready, cpu = time.perf_counter(), time.process_time()
     loss.backward()
     done = time.perf_counter()
-    frame = None
-    if isinstance(asked.sensor, CameraModel):
-        rgb, depth, alpha = (image.detach().numpy() for image in outputs)
-        frame = CameraFrame(asked.sensor, asked.start_us, asked.end_us, to_uint8(rgb), depth, alpha)
+    frame = _frame(asked, *(image.detach().numpy() for image in outputs))
     return (drawn - began) * 1e3, (done - ready) * 1e3, (time.process_time() - cpu) * 1e3, frame
+
+
+def _frame(asked: SensorRequest, values: np.ndarray, second: np.ndarray, alpha: np.ndarray) -> SensorFrame:
+    """What was drawn, as the renderer would return it: colour, depth and alpha, or range, intensity and alpha."""
+    if isinstance(asked.sensor, CameraModel):
+        return CameraFrame(asked.sensor, asked.start_us, asked.end_us, to_uint8(values), second, alpha)
+    nearest, farthest = asked.sensor.range_m
+    returns = (alpha > LidarFilter().opacity_threshold) & (values >= nearest) & (values <= farthest)
+    beam = np.flatnonzero(returns).astype(np.int32)
+    nowhere = np.full((len(beam), 3), np.nan, np.float32)
+    return LidarFrame(asked.sensor, asked.start_us, asked.end_us, nowhere, values[returns], second[returns], beam)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ FEWER_FRAMES = {"2m": 0.5, "6m": 0.25}
 ALL_PATHS_SENSOR = "pinhole-960"
 """The sensor that is driven along every path of a scene; all others along the first one."""
 DETAIL_SENSORS = ("pinhole-960", "pinhole-1920")
-DETAIL_PX = 1.0
+DETAIL_SCENES = ("driving", "real", "2m", "6m")
 LESSER_KERNELS = ("avx2", "plain")
 LESSER_SENSORS = ("pinhole-640", "pinhole-960", "lidar-128")
 PEER_SENSOR = "pinhole-640"
@@ -62,6 +61,7 @@ class Options:
         threads: render threads; all that the process may use if not given.
         gaussians: make the seeded scenes of this many Gaussians instead of their own number.
         parity_rays: pixels or beams per row that the reference draws; 0 leaves it out.
+        detail_px: what the rows with level of detail ask for; 0 leaves them out.
         extras: with the driving scene also run the plain torch renderer, gsplat where it runs, gradients, the first
             frame of a new process, and our kernels for lesser machines.
         output: the results, as JSON.
@@ -75,6 +75,7 @@ class Options:
     threads: int | None = None
     gaussians: int | None = None
     parity_rays: int = 600
+    detail_px: float = 0.15
     extras: bool = True
     output: Path = BUILD / "bench.json"
 
@@ -135,9 +136,10 @@ def entries(name: str, built: BenchScene, renderer: Renderer, options: Options) 
             continue
         for path in paths if sensor == ALL_PATHS_SENSOR or options.paths else (first,):
             add(sensor, path, "ours", each(renderer, SENSORS[sensor].outputs), renderer)
-    if "detail_px" in inspect.signature(Renderer.__init__).parameters:
-        coarse = Renderer(built.scene, threads=options.thread_count, detail_px=DETAIL_PX)
-        for sensor in set(chosen) & set(DETAIL_SENSORS):
+    detailed = [sensor for sensor in chosen if sensor in DETAIL_SENSORS]
+    if detailed and options.detail_px > 0 and name in DETAIL_SCENES:
+        coarse = Renderer(built.scene, threads=options.thread_count, detail_px=options.detail_px)
+        for sensor in detailed:
             full = row_name(name, sensor, first, "ours")
             add(sensor, first, "ours lod", each(coarse, SENSORS[sensor].outputs), coarse, full=full)
     notes = []

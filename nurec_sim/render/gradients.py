@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
@@ -202,6 +203,7 @@ class _Draw(torch.autograd.Function):
         return planes[1:4], planes[0], planes[4], planes[5]
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, by_features, by_alpha, by_distance, by_half):
         parts = {1: by_features, 0: by_alpha, 4: by_distance, 5: by_half}
         by_planes = {plane: part.numpy() for plane, part in parts.items() if part is not None}
@@ -219,6 +221,7 @@ class _Sky(torch.autograd.Function):
         return torch.from_numpy(frame.draw_sky(_array(sky)))
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, by_behind):
         results = ctx.frame.draw_sky_back(_array(ctx.saved_tensors[0]), by_behind.contiguous().numpy())
         return *(torch.from_numpy(g).to(dtype) for g, dtype in zip(results, ctx.dtypes, strict=True)), None

@@ -11,7 +11,8 @@ centre lies nearer than the near plane are culled; those with values that are no
 extent, are not drawn; standard deviations below 1e-5 m count as that. Order: front to back by centre at the reference
 instant (``rays.RayGrid.by_range``); back ends may swap centres whose depths differ by less than float32 resolves. Each
 hit weighs alpha times the transmittance before it. A ray ends with the hit that brings its transmittance to 1e-4 or
-below; back ends may go on, what follows weighs 1e-4 at most.
+below, back ends may go on, what follows weighs 1e-4 at most; a LiDAR's beam, which only reports what it meets first,
+ends at 1e-2.
 
 Outputs of a ray: ``alpha`` is the sum of the weights; ``depth`` the weighted mean of t, times the ray's z in the
 camera; ``half`` the t at which the transmittance first falls to a half or below, 0 where it does not: the range of a
@@ -49,7 +50,7 @@ from nurec_sim.types import (
 )
 
 MAX_OPACITY = 0.99
-MIN_TRANSMITTANCE = 1e-4
+MIN_TRANSMITTANCE, LIDAR_MIN_TRANSMITTANCE = 1e-4, 1e-2
 MIN_SCALE_M = 1e-5
 SURFACE_ALPHA = 0.5
 """Below this alpha a pixel has no depth and no normal and is labelled SKY."""
@@ -137,7 +138,9 @@ def render_lidar(
     if beams is not None:
         fired[:] = False
         fired.reshape(-1)[beams] = True
-    sums = blend_rays(gaussians, features, order, origin, direction, grid.near_m, fired)
+    sums = blend_rays(
+        gaussians, features, order, origin, direction, grid.near_m, fired, min_transmittance=LIDAR_MIN_TRANSMITTANCE
+    )
     return sweep_frame(request, sums, origin, direction, filter or LidarFilter())
 
 
@@ -186,6 +189,7 @@ def blend_rays(
     direction: Float64[np.ndarray, "*rays 3"],
     near_m: float,
     valid: Bool[np.ndarray, "*rays"] | None = None,
+    min_transmittance: float = MIN_TRANSMITTANCE,
 ) -> RaySums:
     """Blend Gaussians along rays.
 
@@ -197,6 +201,7 @@ def blend_rays(
         direction: their unit directions.
         near_m: hits nearer than this do not count.
         valid: rays to blend; all others meet nothing. All if None.
+        min_transmittance: where a ray ends.
     """
     shape = direction.shape[:-1]
     count = int(np.prod(shape))
@@ -219,7 +224,7 @@ def blend_rays(
         if not hit.any():
             continue
         ray, row, alpha, t = ray[hit], order[row[hit]], alpha[hit], t[hit]
-        weight, before, after = composite(ray, alpha)
+        weight, before, after = composite(ray, alpha, min_transmittance)
         half = np.where((before > 0.5) & (after <= 0.5), t, 0)
         columns = np.column_stack([weight[:, None] * features[row], weight, weight * t, half])
         for c, column in enumerate(columns.T):
@@ -231,19 +236,22 @@ def blend_rays(
     return RaySums(sums[:, :-3].reshape(*shape, -1), distance, half, alpha, label.reshape(shape))
 
 
-def composite(ray: Int64[np.ndarray, " n"], alpha: Values) -> tuple[Values, Values, Values]:
+def composite(
+    ray: Int64[np.ndarray, " n"], alpha: Values, min_transmittance: float
+) -> tuple[Values, Values, Values]:
     """Weights of hits, and the transmittance before and after each.
 
     Args:
         ray: to which ray each hit belongs, rising.
         alpha: of the hits, front to back within a ray.
+        min_transmittance: hits behind this weigh nothing.
     """
     place = np.arange(len(ray)) - np.searchsorted(ray, ray)
     clear = np.ones((ray[-1] + 1, place.max() + 2))
     clear[ray, place + 1] = 1 - alpha
     transmittance = np.cumprod(clear, axis=1)
     before, after = transmittance[ray, place], transmittance[ray, place + 1]
-    return np.where(before > MIN_TRANSMITTANCE, alpha * before, 0.0), before, after
+    return np.where(before > min_transmittance, alpha * before, 0.0), before, after
 
 
 def response(

@@ -58,17 +58,18 @@ def _frame(axes, scale, ball, records, i, world_from_sensor, frame):
     x, y, z = records[i, XROW], records[i, XROW + 1], records[i, XROW + 2]
     x, y, z = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z, m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
                m[2, 0] * x + m[2, 1] * y + m[2, 2] * z)  # fmt: skip
+    away = 1 / n
     for k in range(3):
-        frame[2, k] = ball[k] / n
+        frame[2, k] = ball[k] * away
         frame[0, k] = (axes[0, k] * x + axes[1, k] * y + axes[2, k] * z) * scale[k]
         along += frame[0, k] * frame[2, k]
     length = 0.0
     for k in range(3):
         frame[0, k] -= along * frame[2, k]
         length += frame[0, k] ** 2
-    length = math.sqrt(length)
+    inverse = 1 / math.sqrt(max(length, 1e-300))
     for k in range(3):
-        frame[0, k] /= length
+        frame[0, k] *= inverse
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         frame[1, k] = frame[2, i] * frame[0, j] - frame[2, j] * frame[0, i]
@@ -76,10 +77,11 @@ def _frame(axes, scale, ball, records, i, world_from_sensor, frame):
 
 
 @inner
-def _kernel_matrix(sums, n, frame, out):
+def _kernel_matrix(sums, inverse_n, frame, out):
     """K in the Gaussian's axes."""
     xx, xy, yy = sums[S_XX], sums[S_XY], sums[S_YY]
-    xb, yb, bb = 4 * sums[S_WX] / n, 4 * sums[S_WY] / n, -32 * sums[S_FLAT] / (n * n)
+    xb, yb = 4 * sums[S_WX] * inverse_n, 4 * sums[S_WY] * inverse_n
+    bb = -32 * sums[S_FLAT] * inverse_n * inverse_n
     for j in range(3):
         e1, e2, e3 = frame[0, j], frame[1, j], frame[2, j]
         a, b, c = xx * e1 + xy * e2 + xb * e3, xy * e1 + yy * e2 + yb * e3, xb * e1 + yb * e2 + bb * e3
@@ -116,7 +118,7 @@ def project_back(
     """
     sums, axes, frame = np.empty(SUMS), np.empty((3, 3)), np.empty((3, 3))
     offset, ball, by_ball, force, s = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    k_ = np.empty((3, 3))
+    inverse_s, k_ = np.empty(3), np.empty((3, 3))
     for i in range(first, first + count):
         tiles = (np.int64(spans[i, 1]) - spans[i, 0] + 1) * (np.int64(spans[i, 3]) - spans[i, 2] + 1)
         sums[:] = 0.0
@@ -133,34 +135,37 @@ def project_back(
             np.float64(quat[g, 0]) ** 2 + np.float64(quat[g, 1]) ** 2
             + np.float64(quat[g, 2]) ** 2 + np.float64(quat[g, 3]) ** 2
         )  # fmt: skip
-        q = (quat[g, 0] / norm, quat[g, 1] / norm, quat[g, 2] / norm, quat[g, 3] / norm)
+        shrink = 1 / norm
+        q = (quat[g, 0] * shrink, quat[g, 1] * shrink, quat[g, 2] * shrink, quat[g, 3] * shrink)
         _axes(q, axes)
         for k in range(3):
             offset[k] = mean[g, k] - world_from_sensor[k, 3]
             s[k] = max(np.float64(scale[g, k]), MIN_SCALE_M)
+            inverse_s[k] = 1 / s[k]
         for k in range(3):
-            ball[k] = (axes[0, k] * offset[0] + axes[1, k] * offset[1] + axes[2, k] * offset[2]) / s[k]
+            ball[k] = (axes[0, k] * offset[0] + axes[1, k] * offset[1] + axes[2, k] * offset[2]) * inverse_s[k]
         n = _frame(axes, s, ball, records, i, world_from_sensor, frame)
-        inverse = 1 / (n * n)
+        inverse_n = 1 / n
+        inverse = inverse_n * inverse_n
         across = 4 * sums[S_WX] * inverse - sums[S_XW] / 4
         down = 4 * sums[S_WY] * inverse - sums[S_YW] / 4
-        along = -(sums[S_WW] + 32 * sums[S_FLAT] * inverse) / n
+        along = -(sums[S_WW] + 32 * sums[S_FLAT] * inverse) * inverse_n
         for k in range(3):
-            by_ball[k] = (frame[0, k] * across + frame[1, k] * down + frame[2, k] * along) / s[k]
+            by_ball[k] = (frame[0, k] * across + frame[1, k] * down + frame[2, k] * along) * inverse_s[k]
         for k in range(3):
             force[k] = axes[k, 0] * by_ball[0] + axes[k, 1] * by_ball[1] + axes[k, 2] * by_ball[2]
-        _kernel_matrix(sums, n, frame, k_)
-        tx = k_[1, 2] * (s[2] / s[1] - s[1] / s[2])
-        ty = k_[2, 0] * (s[0] / s[2] - s[2] / s[0])
-        tz = k_[0, 1] * (s[1] / s[0] - s[0] / s[1])
-        by_quat[g, 0] += (-q[1] * tx - q[2] * ty - q[3] * tz) * 2 / norm
-        by_quat[g, 1] += (q[0] * tx + q[2] * tz - q[3] * ty) * 2 / norm
-        by_quat[g, 2] += (q[0] * ty + q[3] * tx - q[1] * tz) * 2 / norm
-        by_quat[g, 3] += (q[0] * tz + q[1] * ty - q[2] * tx) * 2 / norm
+        _kernel_matrix(sums, inverse_n, frame, k_)
+        tx = k_[1, 2] * (s[2] * inverse_s[1] - s[1] * inverse_s[2])
+        ty = k_[2, 0] * (s[0] * inverse_s[2] - s[2] * inverse_s[0])
+        tz = k_[0, 1] * (s[1] * inverse_s[0] - s[0] * inverse_s[1])
+        by_quat[g, 0] += (-q[1] * tx - q[2] * ty - q[3] * tz) * 2 * shrink
+        by_quat[g, 1] += (q[0] * tx + q[2] * tz - q[3] * ty) * 2 * shrink
+        by_quat[g, 2] += (q[0] * ty + q[3] * tx - q[1] * tz) * 2 * shrink
+        by_quat[g, 3] += (q[0] * tz + q[1] * ty - q[2] * tx) * 2 * shrink
         for k in range(3):
             by_mean[g, k] += force[k]
             if scale[g, k] >= MIN_SCALE_M:
-                by_scale[g, k] -= k_[k, k] / s[k]
+                by_scale[g, k] -= k_[k, k] * inverse_s[k]
             by_features[g, k] += sums[S_FEATURE + k]
         if opacity[g] < MAX_OPACITY:
             by_opacity[g] -= sums[S_FADE] / (8 * np.float64(opacity[g]))

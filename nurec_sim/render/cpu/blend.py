@@ -51,7 +51,9 @@ DX, DY, DZ, VALID, PLACE = 0, 1, 2, 3, 4
 RAY_PLANES = 5
 
 CUT = math.log(255.0) / 8
-MIN_TRANSMITTANCE = 1e-4
+MIN_TRANSMITTANCE, LIDAR_MIN_TRANSMITTANCE = 1e-4, 1e-2
+HALF_BYTES = 4 * RAYS // 2
+"""Offset of a block's lower half within each plane: what LiDARs' kernels blend at once."""
 VECTORS = RAYS // LANES
 """Vectors that cover a block."""
 AT_ONCE = 4 if LANES == 16 else 2
@@ -131,7 +133,9 @@ def responses(
     return exponents, distances
 
 
-def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
+def _blending(way: int, kind: int, check_near: bool, vectors: int = VECTORS) -> Callable[..., Any]:
+    at_once = min(AT_ONCE, vectors)
+
     @vector_kernel("iiiiiifff")
     def blend(
         v: Lanes,
@@ -145,7 +149,7 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
         y0: ir.Value,
         near: ir.Value,
     ) -> ir.Value:
-        """Blend records into a block; returns 1 while any of its rays still has transmittance.
+        """Blend records into a block, or half of one; returns 1 while any of its rays still has transmittance.
 
         Args:
             v: vectors.
@@ -161,14 +165,14 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
         """
         b = v.b
         alive: ir.Value | None = None
-        for part in range(0, VECTORS, AT_ONCE):
+        for part in range(0, vectors, at_once):
             row = SIDE * 4  # bytes of 8 rays
-            offsets = [4 * LANES * (part + k) for k in range(AT_ONCE)]
+            offsets = [4 * LANES * (part + k) for k in range(at_once)]
             assert row * SIDE == 4 * RAYS
             x = v.numbers([lane % SIDE for lane in range(LANES)]) + v.spread(x0)
             y = [
                 v.numbers([((part + k) * LANES + lane) // SIDE for lane in range(LANES)]) + v.spread(y0)
-                for k in range(AT_ONCE)
+                for k in range(at_once)
             ]
 
             def plane_of(base: ir.Value, plane: int, offsets: list[int] = offsets) -> list[Vector]:
@@ -183,7 +187,7 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                 def coefficient(k: int) -> Vector:
                     return v.broadcast(where, 4 * BATCH * k)
 
-                planes = [values[k : k + AT_ONCE] for k in range(0, len(values), AT_ONCE)]
+                planes = [values[k : k + at_once] for k in range(0, len(values), at_once)]
                 own_rays = functools.partial(plane_of, rays)
                 exponent, distance = responses(v, way, coefficient, own_rays, x, y, kind == LIDAR)
                 hits = [e < CUT for e in exponent]
@@ -191,7 +195,7 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                     least = v.spread(near)
                     if way == AFFINE:
                         d = [[v.broadcast(basis, 4 * (start + c)) for start in (B_D0, B_DX, B_DY)] for c in range(3)]
-                        for k in range(AT_ONCE):
+                        for k in range(at_once):
                             lengths = [c[0] + c[1] * x + c[2] * y[k] for c in d]
                             length = (
                                 lengths[0] * lengths[0] + lengths[1] * lengths[1] + lengths[2] * lengths[2]
@@ -202,6 +206,8 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                 distance = [hit.where(t, 0) for hit, t in zip(hits, distance, strict=True)]  # no NaN from a miss
                 alpha = fading(exponent)
                 before = planes[T]
+                if kind == LIDAR:
+                    hits = [hit & (t > LIDAR_MIN_TRANSMITTANCE) for hit, t in zip(hits, before, strict=True)]
                 weight = [hit.where(a * t, 0) for hit, a, t in zip(hits, alpha, before, strict=True)]
                 after = [t - w for t, w in zip(before, weight, strict=True)]
                 result = [after]
@@ -226,11 +232,11 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
             final = v.repeat(count, initial, body)
             for plane in range(PLANES[kind]):
                 for k, offset in enumerate(offsets):
-                    v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset)
+                    v.store(final[plane * at_once + k], state, 4 * RAYS * plane + offset)
             most = final[0]
-            for other in final[1:AT_ONCE]:
+            for other in final[1:at_once]:
                 most = most.max(other)
-            left = (most > MIN_TRANSMITTANCE).any()
+            left = (most > (LIDAR_MIN_TRANSMITTANCE if kind == LIDAR else MIN_TRANSMITTANCE)).any()
             alive = left if alive is None else b.or_(alive, left)
         assert alive is not None
         return alive
@@ -243,10 +249,10 @@ blend_affine_camera_near = _blending(AFFINE, CAMERA, True)
 blend_affine_normals = _blending(AFFINE, NORMALS, True)
 blend_table_camera = _blending(TABLE, CAMERA, True)
 blend_table_normals = _blending(TABLE, NORMALS, True)
-blend_table_lidar = _blending(TABLE, LIDAR, True)
+blend_table_lidar = _blending(TABLE, LIDAR, True, VECTORS // 2)
 blend_moving_camera = _blending(MOVING, CAMERA, True)
 blend_moving_normals = _blending(MOVING, NORMALS, True)
-blend_moving_lidar = _blending(MOVING, LIDAR, True)
+blend_moving_lidar = _blending(MOVING, LIDAR, True, VECTORS // 2)
 
 
 @vector_kernel("iii")

@@ -6,6 +6,8 @@ import numpy as np
 
 from nurec_sim.render.cpu.blend import (
     CAMERA,
+    HALF_BYTES,
+    LIDAR,
     MOST_PLANES,
     NORMALS,
     RAY_PLANES,
@@ -44,8 +46,10 @@ from nurec_sim.render.cpu.tiles import (
     TABLE,
     prepare_affine,
     prepare_moving,
+    prepare_moving_halves,
     prepare_rolling,
     prepare_table,
+    prepare_table_halves,
 )
 
 LINE_BYTES = 64
@@ -62,12 +66,16 @@ def aligned(count):
 
 
 @inner
-def prepare(way, ids, records, count, alive, basis, coefficients, lists, counts, entry):
+def prepare(way, kind, ids, records, count, alive, basis, coefficients, lists, counts, entry):
     """The preparation of a way; see ``tiles``."""
     if way == AFFINE:
         return prepare_affine(ids, records, count, alive, basis, coefficients, lists, counts, entry)
     if way == ROLLING:
         return prepare_rolling(ids, records, count, alive, basis, coefficients, lists, counts, entry)
+    if kind == LIDAR:
+        if way == TABLE:
+            return prepare_table_halves(ids, records, count, alive, basis, coefficients, lists, counts, entry)
+        return prepare_moving_halves(ids, records, count, alive, basis, coefficients, lists, counts, entry)
     if way == TABLE:
         return prepare_table(ids, records, count, alive, basis, coefficients, lists, counts, entry)
     return prepare_moving(ids, records, count, alive, basis, coefficients, lists, counts, entry)
@@ -129,7 +137,8 @@ def draw_tiles(
         aligned(COEFFICIENTS * BATCH).reshape(COEFFICIENTS, BATCH),
         np.zeros((PER_SIDE, BASIS), np.float32),
     )
-    chosen, listed = np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
+    parts = 2 if kind == LIDAR else 1
+    chosen, listed = np.empty((BLOCKS * parts, LIST), np.uint8), np.zeros(BLOCKS * parts, np.int64)
     turned = rays.reshape(BLOCKS, RAY_PLANES, RAYS)
     columns = (width + MACRO - 1) // MACRO
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
@@ -166,12 +175,14 @@ def draw_tiles(
             open_block(state_at + block * block_bytes, count_planes, rays_at + block * ray_bytes if rays_at else 0)
             if block % PER_SIDE * SIDE < wide and block // PER_SIDE * SIDE < high:
                 alive |= 1 << block
-        alive_now = alive
+        alive_now = 0
+        for item in range(BLOCKS * parts):
+            alive_now |= ((alive >> (item // parts)) & 1) << item
         j, end = np.int64(starts[tile]), np.int64(starts[tile + 1])
         while j < end and alive_now != 0:
             batch_end = min(end, j + BATCH)
-            for block in range(BLOCKS):
-                listed[block] = 0
+            for item in range(BLOCKS * parts):
+                listed[item] = 0
             entry = 0
             first = j
             close = np.int64(0)
@@ -179,7 +190,7 @@ def draw_tiles(
                 for ahead in range(j + LANES, min(j + 2 * LANES, end)):
                     prefetch(records_at + np.int64(lists[ahead]) * (4 * RECORD))
                 some_count = min(batch_end - j, LANES)
-                close |= prepare(way, lists_at + 4 * j, records_at, some_count, alive_now, basis_at, coefficients_at,
+                close |= prepare(way, kind, lists_at + 4 * j, records_at, some_count, alive_now, basis_at, coefficients_at,
                                  chosen_at, listed_at, entry)  # fmt: skip
                 entry += LANES
                 j += LANES
@@ -189,17 +200,18 @@ def draw_tiles(
                         coefficients[C_NORMAL + c, k - first] = normals[np.uint64(lists[k]), c]
             visits += batch_end - first
             j = batch_end
-            for block in range(BLOCKS):
-                n = listed[block]
+            for item in range(BLOCKS * parts):
+                n = listed[item]
                 if n > 0:
-                    evaluations += n * RAYS
+                    block, shift = item // parts, item % parts * HALF_BYTES
+                    evaluations += n * (RAYS // parts)
                     more = blend_block(
-                        way, kind, close != 0, state_at + block * block_bytes, chosen_at + block * LIST, n,
-                        coefficients_at, rays_at + block * ray_bytes, basis_at, f4(block % PER_SIDE * SIDE) - f4(15.5),
-                        f4(block // PER_SIDE * SIDE) - f4(15.5), near,
+                        way, kind, close != 0, state_at + block * block_bytes + shift, chosen_at + item * LIST, n,
+                        coefficients_at, rays_at + block * ray_bytes + shift, basis_at,
+                        f4(block % PER_SIDE * SIDE) - f4(15.5), f4(block // PER_SIDE * SIDE) - f4(15.5), near,
                     )  # fmt: skip
                     if more == 0:
-                        alive_now &= ~(1 << block)
+                        alive_now &= ~(1 << item)
         for block in range(BLOCKS):
             if (alive >> block) & 1:
                 y, x = row * MACRO + block // PER_SIDE * SIDE, column * MACRO + block % PER_SIDE * SIDE

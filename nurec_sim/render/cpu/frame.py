@@ -77,6 +77,8 @@ def sensor_tables(model: CameraModel | LidarModel) -> Sensor:
 @functools.cache
 def shared_workers(threads: int | None) -> Workers:
     """Threads shared by all frames that ask for as many; as many as the process may use if None."""
+    if threads is not None and threads < 1:
+        raise ValueError(f"rendering needs at least 1 thread, got {threads}")
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return Workers(threads or usable)
 
