@@ -31,7 +31,8 @@ from nurec_sim.render.requests import CAMERA_OUTPUTS, check_request
 from nurec_sim.types import CameraFrame, CameraModel, GaussianScene, LidarFilter, LidarFrame, SensorFrame, SensorRequest
 
 IDENTITY_ISP = np.eye(3, 4, dtype=np.float32)
-KEPT_GRIDS = 24
+KEPT_RAYS = 50_000_000
+"""Rays of the sensors whose tables are kept, in all; some 60 bytes each."""
 SENSED_OUTPUTS = ("rgb", "depth", "alpha", "label")
 """What ``sense`` asks of cameras."""
 
@@ -233,7 +234,7 @@ class Renderer:
         return layers
 
     def _sensor(self, request: SensorRequest) -> _Sensor:
-        """Tables of the request's sensor, the latest ``KEPT_GRIDS`` kept."""
+        """Tables of the request's sensor, the latest kept up to ``KEPT_RAYS``."""
         key = grid_key(request.sensor)
         with self._sensors_lock:
             sensor = self._sensors.get(key)
@@ -246,7 +247,7 @@ class Renderer:
         sensor = _Sensor(grid, rays, heights, ray_spacing(grid.direction))
         with self._sensors_lock:
             self._sensors[key] = sensor
-            while len(self._sensors) > KEPT_GRIDS:
+            while len(self._sensors) > 1 and sum(kept.grid.valid.size for kept in self._sensors.values()) > KEPT_RAYS:
                 self._sensors.popitem(last=False)
         return sensor
 

@@ -236,9 +236,7 @@ def blend_rays(
     return RaySums(sums[:, :-3].reshape(*shape, -1), distance, half, alpha, label.reshape(shape))
 
 
-def composite(
-    ray: Int64[np.ndarray, " n"], alpha: Values, min_transmittance: float
-) -> tuple[Values, Values, Values]:
+def composite(ray: Int64[np.ndarray, " n"], alpha: Values, min_transmittance: float) -> tuple[Values, Values, Values]:
     """Weights of hits, and the transmittance before and after each.
 
     Args:

@@ -19,7 +19,7 @@ from nurec_sim.render.cpu.backward_blend import (
     back_table_lidar,
     open_gradients,
 )
-from nurec_sim.render.cpu.blend import CAMERA, RAY_PLANES
+from nurec_sim.render.cpu.blend import CAMERA, HALF_BYTES, LIDAR, RAY_PLANES
 from nurec_sim.render.cpu.draw import aligned, prepare
 from nurec_sim.render.cpu.kernel import f4, inner, keep_alive, kernel
 from nurec_sim.render.cpu.rays import pinhole_basis, table_basis, turn_rays
@@ -122,7 +122,8 @@ def draw_tiles_back(
         np.zeros((PER_SIDE, BASIS), np.float32),
     )
     sums = aligned(BATCH * SUMS).reshape(BATCH, SUMS)
-    chosen, listed = np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
+    chosen, listed = np.empty((2 * BLOCKS, LIST), np.uint8), np.zeros(2 * BLOCKS, np.int64)
+    parts = 2 if kind == LIDAR else 1
     turned = rays.reshape(BLOCKS, RAY_PLANES, RAYS)
     columns = (width + MACRO - 1) // MACRO
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
@@ -157,29 +158,33 @@ def draw_tiles_back(
                     state_at + block * block_bytes, planes.ctypes.data + offset, gradients.ctypes.data + offset,
                     rays_at + block * ray_bytes if rays_at else 0, row_bytes, plane_bytes,
                 )  # fmt: skip
+        alive_now = 0
+        for item in range(BLOCKS * parts):
+            alive_now |= ((alive >> (item // parts)) & 1) << item
         first, end = np.int64(starts[tile]), np.int64(starts[tile + 1])
         while first < end:
             last = min(end, first + BATCH)
             sums[:] = f4(0)
-            if alive != 0:
-                for block in range(BLOCKS):
-                    listed[block] = 0
+            if alive_now != 0:
+                for item in range(BLOCKS * parts):
+                    listed[item] = 0
                 close = np.int64(0)
                 for j in range(first, last, LANES):
                     for ahead in range(j + LANES, min(j + 2 * LANES, end)):
                         prefetch(records_at + np.int64(lists[ahead]) * (4 * RECORD))
-                    close |= prepare(way, lists_at + 4 * j, records_at, min(last - j, LANES), alive, basis_at,
+                    close |= prepare(way, kind, lists_at + 4 * j, records_at, min(last - j, LANES), alive_now, basis_at,
                                      coefficients_at, chosen_at, listed_at, j - first)  # fmt: skip
-                for block in range(BLOCKS):
-                    n = listed[block]
+                for item in range(BLOCKS * parts):
+                    n = listed[item]
                     if n > 0:
+                        block, shift = item // parts, item % parts * HALF_BYTES
                         more = _carry_back(
-                            way, kind, close != 0, state_at + block * block_bytes, chosen_at + block * LIST, n,
-                            coefficients_at, rays_at + block * ray_bytes, basis_at, sums_at,
+                            way, kind, close != 0, state_at + block * block_bytes + shift, chosen_at + item * LIST, n,
+                            coefficients_at, rays_at + block * ray_bytes + shift, basis_at, sums_at,
                             f4(block % PER_SIDE * SIDE) - f4(15.5), f4(block // PER_SIDE * SIDE) - f4(15.5), near,
                         )  # fmt: skip
                         if more == 0:
-                            alive &= ~(1 << block)
+                            alive_now &= ~(1 << item)
             _keep_sums(sums, lists, first, last, spans, first_slot, row, column, slots)
             first = last
     keep_alive(state)

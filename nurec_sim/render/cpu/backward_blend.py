@@ -26,6 +26,7 @@ from nurec_sim.render.cpu.blend import (
     DY,
     DZ,
     LIDAR,
+    LIDAR_MIN_TRANSMITTANCE,
     MIN_TRANSMITTANCE,
     PLACE,
     VALID,
@@ -116,9 +117,9 @@ class Bundle:
         """Square root."""
         return self._with(lambda x: x.sqrt())
 
-    def reciprocal(self) -> Bundle:
-        """1 / x to about 1e-7."""
-        return self._with(lambda x: x.reciprocal())
+    def reciprocal(self, refined: bool) -> Bundle:
+        """1 / x, to 14 bits at least unless refined."""
+        return self._with(lambda x: x.reciprocal(refined))
 
     def total(self) -> Vector:
         """The sum of the vectors."""
@@ -128,10 +129,10 @@ class Bundle:
 class _Still:
     """A record along rays from the reference point, and the way back."""
 
-    def __init__(self, x: Bundle, y: Bundle, w: Bundle, flat: Bundle) -> None:
+    def __init__(self, x: Bundle, y: Bundle, w: Bundle, flat: Bundle, refined: bool) -> None:
         self.x, self.y, self.w, self.flat = x, y, w, flat
         self.q1 = x * x + y * y
-        self.inverse = (flat * self.q1 + w * w).reciprocal()
+        self.inverse = (flat * self.q1 + w * w).reciprocal(refined)
         self.exponent, self.distance = self.q1 * self.inverse, w * self.inverse
 
     def forget_misses(self, hit: Bundle) -> None:
@@ -153,13 +154,15 @@ class _Still:
 class _Moved:
     """The same along rays that start at s v, v being the record's (xv, yv, wv)."""
 
-    def __init__(self, x: Bundle, y: Bundle, w: Bundle, flat: Bundle, s: Bundle, drift: list[Bundle]) -> None:
+    def __init__(
+        self, x: Bundle, y: Bundle, w: Bundle, flat: Bundle, s: Bundle, drift: list[Bundle], refined: bool
+    ) -> None:
         self.x, self.y, self.w, self.flat, self.s, self.drift = x, y, w, flat, s, drift
         xv, yv, wv = drift
         self.left = 1 - s * wv
         step = s * w
         self.a, self.b, self.c = x * self.left + xv * step, y * self.left + yv * step, s * (x * yv - y * xv)
-        self.inverse = (flat * (x * x + y * y) + w * w).reciprocal()
+        self.inverse = (flat * (x * x + y * y) + w * w).reciprocal(refined)
         self.exponent = (self.a * self.a + self.b * self.b + flat * self.c * self.c) * self.inverse
         self.along = w * self.left - s * flat * (x * xv + y * yv)
         self.distance = self.along * self.inverse
@@ -206,7 +209,10 @@ def _far_enough(v: Lanes, way: int, basis: ir.Value, x: Vector, y: Bundle, dista
     return distance * length >= v.spread(near)
 
 
-def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
+def _carrying_back(way: int, kind: int, check_near: bool, vectors: int = VECTORS) -> Callable[..., Any]:
+    at_once = min(AT_ONCE, vectors)
+    dark = LIDAR_MIN_TRANSMITTANCE if kind == LIDAR else MIN_TRANSMITTANCE
+
     @vector_kernel("iiiiiiifff")
     def carry_back(
         v: Lanes,
@@ -221,7 +227,7 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
         y0: ir.Value,
         near: ir.Value,
     ) -> ir.Value:
-        """Add a block's part to the sums of its records; returns 1 while any ray still has transmittance.
+        """Add a block's part (or that of half of one) to its records; returns 1 while any ray has transmittance left.
 
         Args:
             v: vectors.
@@ -238,12 +244,12 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
         """
         b = v.b
         alive: ir.Value | None = None
-        for part in range(0, VECTORS, AT_ONCE):
-            offsets = [4 * LANES * (part + k) for k in range(AT_ONCE)]
+        for part in range(0, vectors, at_once):
+            offsets = [4 * LANES * (part + k) for k in range(at_once)]
             x = v.numbers([lane % SIDE for lane in range(LANES)]) + v.spread(x0)
             y = Bundle(
                 v.numbers([((part + k) * LANES + lane) // SIDE for lane in range(LANES)]) + v.spread(y0)
-                for k in range(AT_ONCE)
+                for k in range(at_once)
             )
 
             def plane_of(base: ir.Value, plane: int, offsets: list[int] = offsets) -> Bundle:
@@ -259,7 +265,7 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                     return v.broadcast(where, 4 * BATCH * k)
 
                 rows = [[coefficient(start + k) for k in range(3)] for start in (C_X, C_Y, C_W)]
-                flat, fade = Bundle([coefficient(C_FLAT)] * AT_ONCE), coefficient(C_FADE)
+                flat, fade = Bundle([coefficient(C_FLAT)] * at_once), coefficient(C_FADE)
                 if way == AFFINE:
                     place = [y * row[2] + (row[0] + row[1] * x) for row in rows]
                 else:
@@ -267,16 +273,18 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                     place = [d[0] * row[0] + d[1] * row[1] + d[2] * row[2] for row in rows]
                 big_x, big_y, big_w = place
                 if way == MOVING:
-                    drift = [Bundle([coefficient(C_DRIFT + c)] * AT_ONCE) for c in range(3)]
-                    meeting: Any = _Moved(big_x, big_y, big_w, flat, plane_of(rays, PLACE), drift)
+                    drift = [Bundle([coefficient(C_DRIFT + c)] * at_once) for c in range(3)]
+                    meeting: Any = _Moved(big_x, big_y, big_w, flat, plane_of(rays, PLACE), drift, kind == LIDAR)
                 else:
-                    meeting = _Still(big_x, big_y, big_w, flat)
+                    meeting = _Still(big_x, big_y, big_w, flat, kind == LIDAR)
                 exponent = meeting.exponent + fade
                 hit = exponent < CUT
                 if check_near:
                     hit = hit & _far_enough(v, way, basis, x, y, meeting.distance, near)
+                before, left = Bundle(values[:at_once]), Bundle(values[at_once:])
+                if kind == LIDAR:
+                    hit = hit & (before > dark)
                 meeting.forget_misses(hit)
-                before, left = Bundle(values[:AT_ONCE]), Bundle(values[AT_ONCE:])
                 alpha = hit.where(Bundle(fading(exponent.parts)), 0)
                 weight = alpha * before
                 after = before - weight
@@ -285,7 +293,7 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
                 for c in range(3):
                     q = q + plane_of(state, G_FEATURE + c) * coefficient(C_FEATURE + c)
                 rest = left - weight * q
-                by_alpha = before * q - rest * (1 - alpha).reciprocal()
+                by_alpha = before * q - rest * (1 - alpha).reciprocal(False)
                 by_exponent, by_distance = alpha * by_alpha * -8, weight * by_mean
                 if kind == LIDAR:
                     crossing = (before > 0.5) & (after <= 0.5)
@@ -304,11 +312,11 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
             final = v.repeat(count, initial, body)
             for plane in (T, REST):
                 for k, offset in enumerate(offsets):
-                    v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset)
+                    v.store(final[plane * at_once + k], state, 4 * RAYS * plane + offset)
             most = final[0]
-            for other in final[1:AT_ONCE]:
+            for other in final[1:at_once]:
                 most = most.max(other)
-            left = (most > MIN_TRANSMITTANCE).any()
+            left = (most > dark).any()
             alive = left if alive is None else b.or_(alive, left)
         assert alive is not None
         return alive
@@ -319,9 +327,9 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
 back_affine_camera = _carrying_back(AFFINE, CAMERA, False)
 back_affine_camera_near = _carrying_back(AFFINE, CAMERA, True)
 back_table_camera = _carrying_back(TABLE, CAMERA, True)
-back_table_lidar = _carrying_back(TABLE, LIDAR, True)
+back_table_lidar = _carrying_back(TABLE, LIDAR, True, VECTORS // 2)
 back_moving_camera = _carrying_back(MOVING, CAMERA, True)
-back_moving_lidar = _carrying_back(MOVING, LIDAR, True)
+back_moving_lidar = _carrying_back(MOVING, LIDAR, True, VECTORS // 2)
 
 
 @vector_kernel("iiiiii")

@@ -46,7 +46,8 @@ def _harmonics(k: int) -> Callable[..., Any]:
             for c in range(3)
         ]
         inverse = 1 / dot(offset, offset).sqrt().max(1e-12)
-        basis = _basis(*(component * inverse for component in offset), k)
+        x, y, z = (component * inverse for component in offset)
+        basis = _basis(x, y, z, k)
         for c in range(3):
             colour = v.load(block, 4 * BLOCK * (COLOUR + c))
             for j, function in enumerate(basis):

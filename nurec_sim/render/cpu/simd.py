@@ -33,8 +33,9 @@ def _instruction_set() -> str:
         if asked not in SETS:
             raise ValueError(f"NUREC_SIM_SIMD must be one of {', '.join(SETS)}, got {asked!r}")
         return asked
-    if config.CPU_NAME or config.CPU_FEATURES is not None:  # compiling for another machine than this one
-        text = f"{config.CPU_NAME} {config.CPU_FEATURES}"
+    other, features_asked = (getattr(config, name, None) for name in ("CPU_NAME", "CPU_FEATURES"))
+    if other or features_asked is not None:  # compiling for another machine than this one
+        text = f"{other} {features_asked}"
         return "avx2" if "avx2" in text or "haswell" in text else "plain"
     features = binding.get_host_cpu_features()
     if all(features.get(name) for name in ("avx512f", "avx512vl", "avx512bw", "avx512dq")):

@@ -67,9 +67,7 @@ def _load_records(v: Lanes, ids: ir.Value, records: ir.Value, count: ir.Value) -
         number = v.b.zext(v.b.load(v.pointer(ids, place), typ=I32, align=4), I64)
         rows.append(v.b.add(records, v.b.mul(number, ir.Constant(I64, 4 * RECORD))))
     return [
-        column
-        for first in range(0, RECORD, LANES)
-        for column in v.transpose([v.load(row, 4 * first) for row in rows])
+        column for first in range(0, RECORD, LANES) for column in v.transpose([v.load(row, 4 * first) for row in rows])
     ]
 
 

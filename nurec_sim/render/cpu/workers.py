@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import numpy as np
 
@@ -26,10 +26,12 @@ class Workers:
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="render") if threads > 1 else None
 
     def run_calls(self, calls: Sequence[tuple]) -> list:
-        """The results of calls (function, argument, ...), in order."""
+        """The results of calls (function, argument, ...), in order; nothing runs any more when this returns or fails."""
         if self._pool is None or len(calls) <= 1:
             return [function(*arguments) for function, *arguments in calls]
-        return [future.result() for future in [self._pool.submit(*call) for call in calls]]
+        futures = [self._pool.submit(*call) for call in calls]
+        wait(futures)
+        return [future.result() for future in futures]
 
     def run(self, function: Callable, arguments: Sequence[tuple]) -> list:
         """``function`` of each tuple of arguments, in order."""

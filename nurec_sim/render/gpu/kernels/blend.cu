@@ -10,6 +10,7 @@ blend(const View* views, const int* tile_view, const Cone* cones, const Record* 
     __shared__ Loaded batch[THREADS];
     int tile = blockIdx.x, warp = threadIdx.x / 32, lane = threadIdx.x % 32;
     const View& view = views[tile_view[tile]];
+    float least = least_transmittance(view);
     int cell = cell_of(view, tile);
     Ray ray = ray_of(view, cell);
     Cone cone = cones[tile * CONES + 1 + warp];
@@ -23,18 +24,18 @@ blend(const View* views, const int* tile_view, const Cone* cones, const Record* 
     int label = SKY;
     for (long long first = starts[tile], last = starts[tile + 1]; first < last; first += THREADS) {
         // Also keeps the batch until every warp is done with it.
-        if (!__syncthreads_or(transmittance > MIN_TRANSMITTANCE)) break;
+        if (!__syncthreads_or(transmittance > least)) break;
         int size = last - first < THREADS ? (int)(last - first) : THREADS;
         if ((int)threadIdx.x < size) batch[threadIdx.x] = loaded(records[lists[first + threadIdx.x]], travel);
         __syncthreads();
         for (int group = 0; group < size; group += 32) {
-            if (!__any_sync(FULL_WARP, transmittance > MIN_TRANSMITTANCE)) break;
+            if (!__any_sync(FULL_WARP, transmittance > least)) break;
             bool chosen = group + lane < size && may_meet(batch[group + lane].record, cone, travel, travel_m);
             for (unsigned left = __ballot_sync(FULL_WARP, chosen); left; left &= left - 1) {
                 const Loaded& entry = batch[group + __ffs(left) - 1];
                 Hit hit;
                 if (!(meet(entry.record, xyz(entry.drift), moving, ray, near_m, &hit) &&
-                      transmittance > MIN_TRANSMITTANCE)) {
+                      transmittance > least)) {
                     continue;
                 }
                 float weight = hit.alpha * transmittance;

@@ -47,6 +47,7 @@ blend_backward(const View* views, const int* tile_view, const Cone* cones, const
     __shared__ float partial[WARPS][PART][SUMS];
     int tile = blockIdx.x, warp = threadIdx.x / 32, lane = threadIdx.x % 32;
     const View& view = views[tile_view[tile]];
+    float least = least_transmittance(view);
     int cell = cell_of(view, tile);
     Ray ray = ray_of(view, cell);
     Cone cone = cones[tile * CONES + 1 + warp];
@@ -65,7 +66,7 @@ blend_backward(const View* views, const int* tile_view, const Cone* cones, const
                 g_distance * plane[DISTANCE * rays] + g_alpha * plane[ALPHA * rays];
     }
     for (long long first = starts[tile], last = starts[tile + 1]; first < last; first += PART) {
-        if (!__syncthreads_or(transmittance > MIN_TRANSMITTANCE)) break;
+        if (!__syncthreads_or(transmittance > least)) break;
         int size = last - first < PART ? (int)(last - first) : PART;
         for (int k = threadIdx.x; k < WARPS * PART * SUMS; k += THREADS) (&partial[0][0][0])[k] = 0;
         if ((int)threadIdx.x < size) batch[threadIdx.x] = loaded(records[lists[first + threadIdx.x]], travel);
@@ -76,7 +77,7 @@ blend_backward(const View* views, const int* tile_view, const Cone* cones, const
             const Record& record = batch[entry].record;
             float3 drift = xyz(batch[entry].drift);
             Hit hit;
-            bool met = transmittance > MIN_TRANSMITTANCE &&
+            bool met = transmittance > least &&
                        meet(record, drift, view.moving, ray, view.near_m, &hit);
             if (!__any_sync(FULL_WARP, met)) continue;
             float g[SUMS] = {};

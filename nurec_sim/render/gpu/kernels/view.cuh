@@ -16,6 +16,7 @@
 
 #define LOG_255 5.541263545158426f
 #define MIN_TRANSMITTANCE 1e-4f
+#define LIDAR_MIN_TRANSMITTANCE 1e-2f
 #define SURFACE_ALPHA 0.5f
 #define SKY 3
 
@@ -75,6 +76,11 @@ struct Ray {
     float3 direction;           // in the reference frame, unit length; zero where the cell has no ray
     float instant;
 };
+
+// The transmittance at which a ray ends.
+INLINE float least_transmittance(const View& view) {
+    return view.kind == LIDAR ? LIDAR_MIN_TRANSMITTANCE : MIN_TRANSMITTANCE;
+}
 
 // The cell that a thread of a tile's block looks at; -1 outside of the grid.
 INLINE int cell_of(const View& view, int tile) {
