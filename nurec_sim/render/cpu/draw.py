@@ -190,8 +190,8 @@ def draw_tiles(
                 for ahead in range(j + LANES, min(j + 2 * LANES, end)):
                     prefetch(records_at + np.int64(lists[ahead]) * (4 * RECORD))
                 some_count = min(batch_end - j, LANES)
-                close |= prepare(way, kind, lists_at + 4 * j, records_at, some_count, alive_now, basis_at, coefficients_at,
-                                 chosen_at, listed_at, entry)  # fmt: skip
+                close |= prepare(way, kind, lists_at + 4 * j, records_at, some_count, alive_now, basis_at,
+                                 coefficients_at, chosen_at, listed_at, entry)  # fmt: skip
                 entry += LANES
                 j += LANES
             if kind == NORMALS:

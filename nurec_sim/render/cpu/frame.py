@@ -194,7 +194,7 @@ class Frame:
         self._workers.run(
             draw_tiles_back,
             [(view.way, picture.kind, tiles, picture.starts, picture.lists, picture.records, picture.spans, first_slot,
-              grid.params, rays.table, rays.line, rays.basis, view.turns, view.places, view.motion,
+              grid.intrinsics, rays.table, rays.line, rays.basis, view.turns, view.places, view.motion,
               np.float32(grid.near_m), width, height, self.planes, gradients, slots)
              for tiles in tile_ranges(picture, self._workers.threads)],
         )  # fmt: skip

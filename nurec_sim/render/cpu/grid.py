@@ -1,7 +1,7 @@
-"""A sensor's ray grid as the kernels want it: float32 rays, lines of equal time, and tables from direction to place.
+"""A sensor's ray grid as the kernels want it: float32 rays, lines of equal time, a chart from direction to place.
 
 A place is (column, row) with cell centres at +0.5. A *line* is a set of rays fired at one instant (an image row or
-column, a LiDAR column). Tables are only used to bound where a Gaussian can be seen, never to weigh it.
+column, a LiDAR column). Charts are only used to bound where a Gaussian can be seen, never to weigh it.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from nurec_sim import sensors
-from nurec_sim.render.cpu.charts import MIDDLE, PARAMETERS, TEXELS, Chart, extrapolated, lens_chart, lidar_chart
+from nurec_sim.render.cpu.charts import PARAMETERS, Chart, lens_chart, lidar_chart
 from nurec_sim.render.rays import ray_grid
 from nurec_sim.types import CameraModel, LidarModel, Pinhole, Shutter, Spin
 
 PINHOLE, LENS, LIDAR = 0, 1, 2
-LIDAR_TABLE_SIZE = 8193
 NO_CHART = Chart(np.zeros(PARAMETERS, np.float32), np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.float32))
 
 
@@ -25,11 +24,7 @@ NO_CHART = Chart(np.zeros(PARAMETERS, np.float32), np.zeros((0, 0, 0), np.float3
 class Grid:
     """One sensor for the kernels; immutable, shared between threads.
 
-    ``params``: PINHOLE fx fy cx cy; LENS half-width of the table, cosine of its rim; LIDAR sign of the spin, azimuth
-    of column 0, half the gap behind the last column, columns per radian, whether full circle, smallest and largest
-    residual of the row offsets in columns, smallest and largest row shift (0 included).
-    ``table``: LENS place by stereographic direction [s,s,2]; LIDAR [2,t,1]: column by azimuth, row by sine of
-    elevation.
+    ``intrinsics`` are fx, fy, cx and cy of an ideal pinhole, zeros otherwise.
     LIDAR rows are rolled by whole columns so that a grid column looks in one azimuth.
     """
 
@@ -39,8 +34,7 @@ class Grid:
     line: Int32[np.ndarray, "h w"]
     line_fraction: np.ndarray
     beam: Int32[np.ndarray, "h w"] | None
-    params: Float32[np.ndarray, " p"]
-    table: Float32[np.ndarray, "a b c"]
+    intrinsics: Float32[np.ndarray, " 4"]
     reference: float
     by_range: bool
     near_m: float
@@ -79,15 +73,11 @@ def _camera_grid(camera: CameraModel) -> Grid:
     lens = camera.lens
     ideal = lens if isinstance(lens, Pinhole) and not lens.distorted and camera.windshield is None else None
     chart = NO_CHART if ideal and len(fraction) == 1 else lens_chart(camera, direction, rays.valid)
+    kind, intrinsics = LENS, np.zeros(4, np.float32)
     if ideal:
-        kind, table = PINHOLE, np.zeros((1, 1, 2), np.float32)
-        params = np.array([ideal.fx_px, ideal.fy_px, ideal.cx_px, ideal.cy_px], np.float32)
-    else:
-        half_width = chart.params[MIDDLE] / chart.params[TEXELS]
-        kind, table = LENS, np.ascontiguousarray(chart.places[..., :2])
-        params = np.array([half_width, np.cos(2 * np.arctan(half_width))], np.float32)
+        kind, intrinsics = PINHOLE, np.array([ideal.fx_px, ideal.fy_px, ideal.cx_px, ideal.cy_px], np.float32)
     return Grid(kind, direction, rays.valid.astype(np.uint8), np.ascontiguousarray(line), np.asarray(fraction), None,
-                params, table, rays.reference, rays.by_range, rays.near_m, field_cos,
+                intrinsics, rays.reference, rays.by_range, rays.near_m, field_cos,
                 int(by_column), chart)  # fmt: skip
 
 
@@ -103,14 +93,6 @@ def _lidar_grid(lidar: LidarModel) -> Grid:
     shift = np.rint(offset).astype(np.int32) if full_circle else np.zeros(rows, np.int32)
     fired = (np.arange(columns)[None, :] - shift[:, None]) % columns
     row = np.arange(rows)[:, None]
-    low, high = -gap / 2, 2 * np.pi - gap / 2
-    column_of = extrapolated(np.linspace(low, high, LIDAR_TABLE_SIZE), azimuth, steps.mean())
-    sines = np.linspace(-1, 1, LIDAR_TABLE_SIZE)
-    down = -np.asarray(lidar.elevation_rad, np.float64)
-    row_of = extrapolated(-np.arcsin(sines), down, steps.mean())
-    residual = offset - shift
-    params = [sign, lidar.azimuth_rad[0], gap / 2, 1 / steps.min(), full_circle, residual.min(), residual.max(),
-              min(shift.min(), 0), max(shift.max(), 0)]  # fmt: skip
     direction = np.ascontiguousarray(rays.direction[row, fired], np.float32)
     return Grid(
         kind=LIDAR,
@@ -119,8 +101,7 @@ def _lidar_grid(lidar: LidarModel) -> Grid:
         line=fired.astype(np.int32),
         line_fraction=np.asarray(sensors.column_fraction(lidar), np.float64),
         beam=(row * columns + fired).astype(np.int32),
-        params=np.array(params, np.float32),
-        table=np.stack([column_of, row_of])[..., None].astype(np.float32) + np.float32(0.5),
+        intrinsics=np.zeros(4, np.float32),
         reference=rays.reference,
         by_range=rays.by_range,
         near_m=rays.near_m,

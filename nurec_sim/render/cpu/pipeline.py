@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
 from nurec_sim.render.cpu.binning import count_tiles, depth_cuts, fill_tiles, sort_by_depth
-from nurec_sim.render.cpu.blend import CAMERA, LIDAR, NORMALS
+from nurec_sim.render.cpu.blend import LIDAR, NORMALS
 from nurec_sim.render.cpu.draw import EVALUATIONS, VISITS, draw_tiles, record_normals
 from nurec_sim.render.cpu.grid import LIDAR as LIDAR_GRID
 from nurec_sim.render.cpu.pack import BLOCK, PackedGaussians
@@ -25,7 +25,7 @@ from nurec_sim.render.cpu.project_pinhole import project_pinhole
 from nurec_sim.render.cpu.rays import RayTiles
 from nurec_sim.render.cpu.records import MACRO, RECORD
 from nurec_sim.render.cpu.simd import LANES
-from nurec_sim.render.cpu.tiles import AFFINE, MOVING, ROLLING
+from nurec_sim.render.cpu.tiles import AFFINE, ROLLING
 from nurec_sim.render.cpu.view import View
 from nurec_sim.render.cpu.workers import SPLIT, Lend, Workers
 
@@ -132,7 +132,7 @@ def blend_arguments(picture: Picture, tiles: Int64[np.ndarray, " t"]) -> tuple:
     normals = picture.array("no normals", (1, 4), np.float32)
     if picture.kind == NORMALS:
         normals = picture.array("normals", (len(picture.records), 4), np.float32)
-    return (view.way, picture.kind, tiles, picture.starts, picture.lists, picture.records, normals, grid.params,
+    return (view.way, picture.kind, tiles, picture.starts, picture.lists, picture.records, normals, grid.intrinsics,
             picture.rays.table, picture.rays.line, picture.rays.basis, view.turns, view.places, view.motion,
             np.float32(grid.near_m), *picture.cells)  # fmt: skip
 
@@ -248,5 +248,3 @@ def blocks_in_view(view: View, layer: PackedGaussians) -> Int64[np.ndarray, " b"
     field = np.arccos(view.grid.field_cos) + view.swing_rad + 0.02
     return np.flatnonzero((distance <= radius) | (angle <= field + reach))
 
-
-__all__ = ["CAMERA", "LIDAR", "MOVING", "NORMALS", "Picture", "FrameStats", "bin_pictures", "blocks_in_view", "draw"]

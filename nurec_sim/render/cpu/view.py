@@ -109,10 +109,9 @@ class View:
     def parameters(self) -> Float32[np.ndarray, " 25"]:
         """See ``records.view_parameters``."""
         grid = self.grid
-        intrinsics = grid.params[:4].tolist() if grid.kind == PINHOLE else [0.0] * 4
         height, width = grid.valid.shape
         return view_parameters(self.world_from_reference, grid.near_m, grid.by_range, self.travel_m, self.swing_rad,
-                               intrinsics, (width, height))  # fmt: skip
+                               grid.intrinsics.tolist(), (width, height))  # fmt: skip
 
 
 def _rotation_vector(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 3"]:

@@ -26,7 +26,7 @@ class Workers:
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="render") if threads > 1 else None
 
     def run_calls(self, calls: Sequence[tuple]) -> list:
-        """The results of calls (function, argument, ...), in order; nothing runs any more when this returns or fails."""
+        """The results of calls (function, argument, ...), in order; all have ended when this returns or fails."""
         if self._pool is None or len(calls) <= 1:
             return [function(*arguments) for function, *arguments in calls]
         futures = [self._pool.submit(*call) for call in calls]

@@ -87,7 +87,7 @@ class GridTensors:
         def on_device(array: np.ndarray) -> torch.Tensor:
             return torch.from_numpy(np.ascontiguousarray(array)).to(device)
 
-        table, params = np.zeros(1, np.float32), grid.params
+        table, params = np.zeros(1, np.float32), grid.intrinsics
         if grid.kind == LENS:
             table, params = grid.chart.places[..., :2], grid.chart.params[[TEXELS, MIDDLE, MISFIT]]
         elif grid.kind == LIDAR:
