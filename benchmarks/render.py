@@ -51,6 +51,7 @@ def main() -> None:
                 rows.append({**row, **facts} | {"simd": row.get("simd", facts["simd"])})
                 write(rows, options.output)
     except KeyboardInterrupt:
+        write(rows, options.output)
         err.print(f"interrupted: the {len(rows)} rows that were done are in {options.output}", **PLAIN)
         raise SystemExit(130) from None
     for line in bars.verdicts(rows):
@@ -104,6 +105,9 @@ def all_timed(name: str, entries: Sequence[timing.Entry]) -> bool:
             advance(f"{entry.facts['sensor']} {entry.facts['backend']}", done / total)
 
         try:
+            timing.warm_up(entries, tick)
+            first_s = sum(entry.first_ms or 0.0 for entry in entries) / 1e3
+            out.print(f"warmed up: the first frames of {len(entries)} rows took {first_s:.1f} s", **PLAIN)
             timing.take_turns(entries, tick)
         except KeyboardInterrupt:
             return False

@@ -48,11 +48,15 @@ class Entry:
         }
 
 
-def take_turns(entries: Sequence[Entry], tick: Callable[[Entry], None]) -> None:
-    """Warm every entry up, then time its frames in turns; ``tick`` is called after every frame."""
+def warm_up(entries: Sequence[Entry], tick: Callable[[Entry], None]) -> None:
+    """Draw and time the first frame of every entry; ``tick`` is called after every frame."""
     for entry in entries:
         entry.first_ms = _timed(entry.draw, entry.ticks[0])[0]
         tick(entry)
+
+
+def take_turns(entries: Sequence[Entry], tick: Callable[[Entry], None]) -> None:
+    """Time the frames of all entries in turns."""
     for number in range(max((len(entry.ticks) for entry in entries), default=0)):
         for entry in entries:
             if number < len(entry.ticks):

@@ -1,4 +1,4 @@
-"""The few formulas of ``geometry``, ``layers`` and ``spec`` that gradients must pass through, in torch."""
+"""The few formulas of ``geometry`` and ``layers`` that gradients must pass through, in torch."""
 
 from __future__ import annotations
 

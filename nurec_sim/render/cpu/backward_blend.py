@@ -118,7 +118,7 @@ class Bundle:
         return self._with(lambda x: x.sqrt())
 
     def reciprocal(self, refined: bool) -> Bundle:
-        """1 / x, to 14 bits at least unless refined."""
+        """1 / x, to at least 14 bits, to 1e-7 if ``refined``."""
         return self._with(lambda x: x.reciprocal(refined))
 
     def total(self) -> Vector:

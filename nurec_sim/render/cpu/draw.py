@@ -222,6 +222,8 @@ def draw_tiles(
                     write_block_6(state_at + block * block_bytes, target, row_bytes, plane_bytes)
     keep_alive(state)
     keep_alive(chosen)
+    keep_alive(rays)
+    keep_alive(coefficients)
     counts[VISITS] += visits
     counts[EVALUATIONS] += evaluations
 

@@ -6,7 +6,7 @@ import numpy as np
 from llvmlite import ir
 
 from nurec_sim.render.cpu.charts import PERIOD
-from nurec_sim.render.cpu.kernel import kernel
+from nurec_sim.render.cpu.kernel import keep_alive, kernel
 from nurec_sim.render.cpu.motion import (
     APART,
     join_ends,
@@ -135,7 +135,6 @@ def project_general(
     tiles, other_tiles = np.empty((4, LANES), np.float32), np.empty((4, LANES), np.float32)
     here, there, around = scratch.ctypes.data, local.ctypes.data, view.ctypes.data
     chart, table, bend, path = params.ctypes.data, places.ctypes.data, bends.ctypes.data, motion.ctypes.data
-
     cells, other_cells, poses = box.ctypes.data, other_box.ctypes.data, lines.ctypes.data
     moving = lines.shape[0] > 1
     n = base
@@ -195,4 +194,7 @@ def project_general(
             source = number * BLOCK + lane
             n = emit(mask, rows, scratch, tiles, source, n, records, keys, spans, sources)
             n = emit(again, rows, scratch, other_tiles, source, n, records, keys, spans, sources)
+    keep_alive(local)
+    keep_alive(box)
+    keep_alive(other_box)
     return n - base
