@@ -31,6 +31,7 @@ from nurec_sim.render.cpu.tiles import (
     BASIS,
     BATCH,
     BLOCKS,
+    CAMERA_BATCH,
     COEFFICIENTS,
     LIST,
     PER_SIDE,
@@ -123,7 +124,7 @@ def draw_tiles_back(
     )
     sums = aligned(BATCH * SUMS).reshape(BATCH, SUMS)
     chosen, listed = np.empty((2 * BLOCKS, LIST), np.uint8), np.zeros(2 * BLOCKS, np.int64)
-    parts = 2 if kind == LIDAR else 1
+    parts, batch = (2, BATCH) if kind == LIDAR else (1, CAMERA_BATCH)
     turned = rays.reshape(BLOCKS, RAY_PLANES, RAYS)
     columns = (width + MACRO - 1) // MACRO
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
@@ -163,7 +164,7 @@ def draw_tiles_back(
             alive_now |= ((alive >> (item // parts)) & 1) << item
         first, end = np.int64(starts[tile]), np.int64(starts[tile + 1])
         while first < end:
-            last = min(end, first + BATCH)
+            last = min(end, first + batch)
             sums[:] = f4(0)
             if alive_now != 0:
                 for item in range(BLOCKS * parts):

@@ -36,6 +36,7 @@ from nurec_sim.render.cpu.tiles import (
     BATCH,
     BLOCKS,
     C_NORMAL,
+    CAMERA_BATCH,
     COEFFICIENTS,
     LIST,
     MOVING,
@@ -137,7 +138,7 @@ def draw_tiles(
         aligned(COEFFICIENTS * BATCH).reshape(COEFFICIENTS, BATCH),
         np.zeros((PER_SIDE, BASIS), np.float32),
     )
-    parts = 2 if kind == LIDAR else 1
+    parts, batch = (2, BATCH) if kind == LIDAR else (1, CAMERA_BATCH)
     chosen, listed = np.empty((BLOCKS * parts, LIST), np.uint8), np.zeros(BLOCKS * parts, np.int64)
     turned = rays.reshape(BLOCKS, RAY_PLANES, RAYS)
     columns = (width + MACRO - 1) // MACRO
@@ -180,7 +181,7 @@ def draw_tiles(
             alive_now |= ((alive >> (item // parts)) & 1) << item
         j, end = np.int64(starts[tile]), np.int64(starts[tile + 1])
         while j < end and alive_now != 0:
-            batch_end = min(end, j + BATCH)
+            batch_end = min(end, j + batch)
             for item in range(BLOCKS * parts):
                 listed[item] = 0
             entry = 0

@@ -247,4 +247,3 @@ def blocks_in_view(view: View, layer: PackedGaussians) -> Int64[np.ndarray, " b"
     reach = np.arcsin(np.clip(radius / np.maximum(distance, 1e-9), 0, 1))
     field = np.arccos(view.grid.field_cos) + view.swing_rad + 0.02
     return np.flatnonzero((distance <= radius) | (angle <= field + reach))
-

@@ -35,8 +35,10 @@ SIDE = 8
 PER_SIDE = MACRO // SIDE
 BLOCKS = PER_SIDE * PER_SIDE
 RAYS = SIDE * SIDE
-BATCH = 64
-"""Records that are prepared at once; their coefficients stay in the first-level cache."""
+BATCH = 128
+"""Most records that are prepared at once; their coefficients stay in the first-level cache."""
+CAMERA_BATCH = 64
+"""How many for cameras, whose blocks see more of a batch: the sooner they are found to be opaque."""
 LIST = BATCH + LANES
 """Room for the numbers of a batch's records that a block sees, a byte each."""
 

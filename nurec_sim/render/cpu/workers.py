@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 
 import numpy as np
 
-SPLIT = 6
+SPLIT = 16
 """Ranges per thread: enough to even out tiles of very different cost."""
 KEPT = 4
 """Sets of scratch arrays that are kept for later frames."""
@@ -19,19 +20,31 @@ Lend = Callable[[str, tuple[int, ...], type], np.ndarray]
 
 
 class Workers:
-    """Threads that run kernel calls; safe to use from many threads at once."""
+    """Threads that run kernel calls, the caller's among them; safe to use from many threads at once."""
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="render") if threads > 1 else None
+        self._pool = ThreadPoolExecutor(threads - 1, thread_name_prefix="render") if threads > 1 else None
 
     def run_calls(self, calls: Sequence[tuple]) -> list:
         """The results of calls (function, argument, ...), in order; all have ended when this returns or fails."""
-        if self._pool is None or len(calls) <= 1:
-            return [function(*arguments) for function, *arguments in calls]
-        futures = [self._pool.submit(*call) for call in calls]
-        wait(futures)
-        return [future.result() for future in futures]
+        results: list = [None] * len(calls)
+        numbers = itertools.count()  # next() of it is atomic
+
+        def work() -> None:
+            while (number := next(numbers)) < len(calls):
+                function, *arguments = calls[number]
+                results[number] = function(*arguments)
+
+        helpers = min(self.threads, len(calls)) - 1
+        futures = [self._pool.submit(work) for _ in range(helpers)] if self._pool is not None else []
+        try:
+            work()
+        finally:
+            wait(futures)
+        for future in futures:
+            future.result()
+        return results
 
     def run(self, function: Callable, arguments: Sequence[tuple]) -> list:
         """``function`` of each tuple of arguments, in order."""
