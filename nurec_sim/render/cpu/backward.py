@@ -19,25 +19,27 @@ from nurec_sim.render.cpu.backward_blend import (
     back_table_lidar,
     open_gradients,
 )
-from nurec_sim.render.cpu.blend import CAMERA, HALF_BYTES, LIDAR, RAY_PLANES
+from nurec_sim.render.cpu.blend import CAMERA, LIDAR, RAY_PLANES
 from nurec_sim.render.cpu.draw import aligned, prepare
 from nurec_sim.render.cpu.kernel import f4, inner, keep_alive, kernel
 from nurec_sim.render.cpu.rays import pinhole_basis, table_basis, turn_rays
 from nurec_sim.render.cpu.records import MACRO, RECORD
 from nurec_sim.render.cpu.simd import LANES, prefetch
 from nurec_sim.render.cpu.tiles import (
+    ACROSS,
     AFFINE,
     B_MOTION,
+    BANDS,
     BASIS,
     BATCH,
     BLOCKS,
     CAMERA_BATCH,
     COEFFICIENTS,
+    HIGH,
     LIST,
-    PER_SIDE,
     RAYS,
-    SIDE,
     TABLE,
+    WIDE,
 )
 
 
@@ -120,11 +122,11 @@ def draw_tiles_back(
     state, rays = aligned(BLOCKS * STATE_PLANES * RAYS), aligned(BLOCKS * RAY_PLANES * RAYS)
     coefficients, basis = (
         aligned(COEFFICIENTS * BATCH).reshape(COEFFICIENTS, BATCH),
-        np.zeros((PER_SIDE, BASIS), np.float32),
+        np.zeros((BANDS, BASIS), np.float32),
     )
     sums = aligned(BATCH * SUMS).reshape(BATCH, SUMS)
-    chosen, listed = np.empty((2 * BLOCKS, LIST), np.uint8), np.zeros(2 * BLOCKS, np.int64)
-    parts, batch = (2, BATCH) if kind == LIDAR else (1, CAMERA_BATCH)
+    chosen, listed = np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
+    batch = BATCH if kind == LIDAR else CAMERA_BATCH
     turned = rays.reshape(BLOCKS, RAY_PLANES, RAYS)
     columns = (width + MACRO - 1) // MACRO
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
@@ -139,53 +141,50 @@ def draw_tiles_back(
         rays_at = np.int64(0)
         if way == TABLE:
             rays_at = table.ctypes.data + tile * (BLOCKS * ray_bytes)
-            basis_at = bases.ctypes.data + tile * (4 * PER_SIDE * BASIS)
+            basis_at = bases.ctypes.data + tile * (4 * BANDS * BASIS)
         elif way == AFFINE:
             pinhole_basis(intrinsics, column, row, basis[0])
         else:
             turn_rays(table[tile], line[tile], turns, places, turned)
             rays_at = rays.ctypes.data
-            for band in range(PER_SIDE):
+            for band in range(BANDS):
                 table_basis(turned, wide, high, band, basis[band])
                 for k in range(3):
                     basis[band, B_MOTION + k] = motion[k]
         alive = 0
         for block in range(BLOCKS):
-            if block % PER_SIDE * SIDE < wide and block // PER_SIDE * SIDE < high:
+            if block % ACROSS * WIDE < wide and block // ACROSS * HIGH < high:
                 alive |= 1 << block
-                y, x = row * MACRO + block // PER_SIDE * SIDE, column * MACRO + block % PER_SIDE * SIDE
+                y, x = row * MACRO + block // ACROSS * HIGH, column * MACRO + block % ACROSS * WIDE
                 offset = y * row_bytes + 4 * x
                 open_gradients(
                     state_at + block * block_bytes, planes.ctypes.data + offset, gradients.ctypes.data + offset,
                     rays_at + block * ray_bytes if rays_at else 0, row_bytes, plane_bytes,
                 )  # fmt: skip
-        alive_now = 0
-        for item in range(BLOCKS * parts):
-            alive_now |= ((alive >> (item // parts)) & 1) << item
+        alive_now = alive
         first, end = np.int64(starts[tile]), np.int64(starts[tile + 1])
         while first < end:
             last = min(end, first + batch)
             sums[:] = f4(0)
             if alive_now != 0:
-                for item in range(BLOCKS * parts):
-                    listed[item] = 0
+                for block in range(BLOCKS):
+                    listed[block] = 0
                 close = np.int64(0)
                 for j in range(first, last, LANES):
                     for ahead in range(j + LANES, min(j + 2 * LANES, end)):
                         prefetch(records_at + np.int64(lists[ahead]) * (4 * RECORD))
-                    close |= prepare(way, kind, lists_at + 4 * j, records_at, min(last - j, LANES), alive_now, basis_at,
+                    close |= prepare(way, lists_at + 4 * j, records_at, min(last - j, LANES), alive_now, basis_at,
                                      coefficients_at, chosen_at, listed_at, j - first)  # fmt: skip
-                for item in range(BLOCKS * parts):
-                    n = listed[item]
+                for block in range(BLOCKS):
+                    n = listed[block]
                     if n > 0:
-                        block, shift = item // parts, item % parts * HALF_BYTES
                         more = _carry_back(
-                            way, kind, close != 0, state_at + block * block_bytes + shift, chosen_at + item * LIST, n,
-                            coefficients_at, rays_at + block * ray_bytes + shift, basis_at, sums_at,
-                            f4(block % PER_SIDE * SIDE) - f4(15.5), f4(block // PER_SIDE * SIDE) - f4(15.5), near,
+                            way, kind, close != 0, state_at + block * block_bytes, chosen_at + block * LIST, n,
+                            coefficients_at, rays_at + block * ray_bytes, basis_at, sums_at,
+                            f4(block % ACROSS * WIDE) - f4(15.5), f4(block // ACROSS * HIGH) - f4(15.5), near,
                         )  # fmt: skip
                         if more == 0:
-                            alive_now &= ~(1 << item)
+                            alive_now &= ~(1 << block)
             _keep_sums(sums, lists, first, last, spans, first_slot, row, column, slots)
             first = last
     keep_alive(state)

@@ -1,6 +1,6 @@
 """Vector code that carries gradients of a block's 8 x 8 rays back to a list of records, front to back once more.
 
-A block's state is [STATE_PLANES,64] float32. With q = sum of (gradient of a sum times what the record adds to it per
+A block's state is [STATE_PLANES,32] float32. With q = sum of (gradient of a sum times what the record adds to it per
 weight) and G = the sum of all weights times q, which the forward's sums give, one pass suffices:
 
     gradient of alpha = T q - (G - what has been added so far) / (1 - alpha)
@@ -49,8 +49,8 @@ from nurec_sim.render.cpu.tiles import (
     C_Y,
     MOVING,
     RAYS,
-    SIDE,
     TABLE,
+    WIDE,
 )
 
 # Planes of a block's state: transmittance, G less what has been added so far, and the gradients of the sums.
@@ -209,8 +209,7 @@ def _far_enough(v: Lanes, way: int, basis: ir.Value, x: Vector, y: Bundle, dista
     return distance * length >= v.spread(near)
 
 
-def _carrying_back(way: int, kind: int, check_near: bool, vectors: int = VECTORS) -> Callable[..., Any]:
-    at_once = min(AT_ONCE, vectors)
+def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
     dark = LIDAR_MIN_TRANSMITTANCE if kind == LIDAR else MIN_TRANSMITTANCE
 
     @vector_kernel("iiiiiiifff")
@@ -227,15 +226,15 @@ def _carrying_back(way: int, kind: int, check_near: bool, vectors: int = VECTORS
         y0: ir.Value,
         near: ir.Value,
     ) -> ir.Value:
-        """Add a block's part (or that of half of one) to its records; returns 1 while any ray has transmittance left.
+        """Add a block's part to its records; returns 1 while any ray has transmittance left.
 
         Args:
             v: vectors.
-            state: address of [STATE_PLANES,64].
+            state: address of [STATE_PLANES,32].
             numbers: address of the records' numbers in the batch, a byte each.
             count: how many, at least 1.
             coefficients: address of [COEFFICIENTS,BATCH].
-            rays: address of the block's [RAY_PLANES,64].
+            rays: address of the block's [RAY_PLANES,32].
             basis: address of the tile's basis.
             sums: address of [BATCH,SUMS].
             x0: first cell's x from the tile's centre.
@@ -244,12 +243,12 @@ def _carrying_back(way: int, kind: int, check_near: bool, vectors: int = VECTORS
         """
         b = v.b
         alive: ir.Value | None = None
-        for part in range(0, vectors, at_once):
-            offsets = [4 * LANES * (part + k) for k in range(at_once)]
-            x = v.numbers([lane % SIDE for lane in range(LANES)]) + v.spread(x0)
+        for part in range(0, VECTORS, AT_ONCE):
+            offsets = [4 * LANES * (part + k) for k in range(AT_ONCE)]
+            x = v.numbers([lane % WIDE for lane in range(LANES)]) + v.spread(x0)
             y = Bundle(
-                v.numbers([((part + k) * LANES + lane) // SIDE for lane in range(LANES)]) + v.spread(y0)
-                for k in range(at_once)
+                v.numbers([((part + k) * LANES + lane) // WIDE for lane in range(LANES)]) + v.spread(y0)
+                for k in range(AT_ONCE)
             )
 
             def plane_of(base: ir.Value, plane: int, offsets: list[int] = offsets) -> Bundle:
@@ -265,7 +264,7 @@ def _carrying_back(way: int, kind: int, check_near: bool, vectors: int = VECTORS
                     return v.broadcast(where, 4 * BATCH * k)
 
                 rows = [[coefficient(start + k) for k in range(3)] for start in (C_X, C_Y, C_W)]
-                flat, fade = Bundle([coefficient(C_FLAT)] * at_once), coefficient(C_FADE)
+                flat, fade = Bundle([coefficient(C_FLAT)] * AT_ONCE), coefficient(C_FADE)
                 if way == AFFINE:
                     place = [y * row[2] + (row[0] + row[1] * x) for row in rows]
                 else:
@@ -273,7 +272,7 @@ def _carrying_back(way: int, kind: int, check_near: bool, vectors: int = VECTORS
                     place = [d[0] * row[0] + d[1] * row[1] + d[2] * row[2] for row in rows]
                 big_x, big_y, big_w = place
                 if way == MOVING:
-                    drift = [Bundle([coefficient(C_DRIFT + c)] * at_once) for c in range(3)]
+                    drift = [Bundle([coefficient(C_DRIFT + c)] * AT_ONCE) for c in range(3)]
                     meeting: Any = _Moved(big_x, big_y, big_w, flat, plane_of(rays, PLACE), drift, kind == LIDAR)
                 else:
                     meeting = _Still(big_x, big_y, big_w, flat, kind == LIDAR)
@@ -281,7 +280,7 @@ def _carrying_back(way: int, kind: int, check_near: bool, vectors: int = VECTORS
                 hit = exponent < CUT
                 if check_near:
                     hit = hit & _far_enough(v, way, basis, x, y, meeting.distance, near)
-                before, left = Bundle(values[:at_once]), Bundle(values[at_once:])
+                before, left = Bundle(values[:AT_ONCE]), Bundle(values[AT_ONCE:])
                 if kind == LIDAR:
                     hit = hit & (before > dark)
                 meeting.forget_misses(hit)
@@ -312,9 +311,9 @@ def _carrying_back(way: int, kind: int, check_near: bool, vectors: int = VECTORS
             final = v.repeat(count, initial, body)
             for plane in (T, REST):
                 for k, offset in enumerate(offsets):
-                    v.store(final[plane * at_once + k], state, 4 * RAYS * plane + offset)
+                    v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset)
             most = final[0]
-            for other in final[1:at_once]:
+            for other in final[1:AT_ONCE]:
                 most = most.max(other)
             left = (most > dark).any()
             alive = left if alive is None else b.or_(alive, left)
@@ -327,9 +326,9 @@ def _carrying_back(way: int, kind: int, check_near: bool, vectors: int = VECTORS
 back_affine_camera = _carrying_back(AFFINE, CAMERA, False)
 back_affine_camera_near = _carrying_back(AFFINE, CAMERA, True)
 back_table_camera = _carrying_back(TABLE, CAMERA, True)
-back_table_lidar = _carrying_back(TABLE, LIDAR, True, VECTORS // 2)
+back_table_lidar = _carrying_back(TABLE, LIDAR, True)
 back_moving_camera = _carrying_back(MOVING, CAMERA, True)
-back_moving_lidar = _carrying_back(MOVING, LIDAR, True, VECTORS // 2)
+back_moving_lidar = _carrying_back(MOVING, LIDAR, True)
 
 
 @vector_kernel("iiiiii")
@@ -347,13 +346,13 @@ def open_gradients(
     Rays that are not valid need gradients of 0. ``rays`` is the address of the block's rays, 0 where all are valid.
     """
     b = v.b
-    half = ir.VectorType(F32, SIDE)
+    half = ir.VectorType(F32, WIDE)
     table = b.icmp_signed("!=", rays, ir.Constant(I64, 0))
     source = b.select(table, b.add(rays, ir.Constant(I64, 4 * RAYS * VALID)), state)
 
     def cells(base: ir.Value, plane: int, k: int) -> Vector:
         """Vector k of a block, from rows of 8 cells of an image."""
-        rows = LANES // SIDE
+        rows = LANES // WIDE
         start = b.add(base, b.mul(plane_bytes, ir.Constant(I64, plane)))
         pieces = [
             b.load(v.pointer(start, b.mul(row_bytes, ir.Constant(I64, k * rows + r))), typ=half, align=4)

@@ -1,6 +1,6 @@
-"""Vector code that blends a list of records into a block of 8 x 8 rays, whose sums stay in registers.
+"""Vector code that blends a list of records into a block of 8 x 4 rays, whose sums stay in registers.
 
-A block's state is [planes, 64] float32: transmittance, features, distance, and for cameras the largest weight so far,
+A block's state is [planes, 32] float32: transmittance, features, distance, and for cameras the largest weight so far,
 whose lowest bits hold the label it came with, for LiDARs the distance at which the transmittance fell to a half.
 """
 
@@ -33,8 +33,8 @@ from nurec_sim.render.cpu.tiles import (
     C_Y,
     MOVING,
     RAYS,
-    SIDE,
     TABLE,
+    WIDE,
 )
 
 CAMERA, NORMALS, LIDAR = 0, 1, 2
@@ -52,11 +52,9 @@ RAY_PLANES = 5
 
 CUT = math.log(255.0) / 8
 MIN_TRANSMITTANCE, LIDAR_MIN_TRANSMITTANCE = 1e-4, 1e-2
-HALF_BYTES = 4 * RAYS // 2
-"""Offset of a block's lower half within each plane: what LiDARs' kernels blend at once."""
 VECTORS = RAYS // LANES
 """Vectors that cover a block."""
-AT_ONCE = 4 if LANES == 16 else 2
+AT_ONCE = 2
 """Vectors of rays that are blended at once: as many as the registers hold."""
 
 
@@ -133,9 +131,7 @@ def responses(
     return exponents, distances
 
 
-def _blending(way: int, kind: int, check_near: bool, vectors: int = VECTORS) -> Callable[..., Any]:
-    at_once = min(AT_ONCE, vectors)
-
+def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
     @vector_kernel("iiiiiifff")
     def blend(
         v: Lanes,
@@ -149,15 +145,15 @@ def _blending(way: int, kind: int, check_near: bool, vectors: int = VECTORS) -> 
         y0: ir.Value,
         near: ir.Value,
     ) -> ir.Value:
-        """Blend records into a block, or half of one; returns 1 while any of its rays still has transmittance.
+        """Blend records into a block; returns 1 while any of its rays still has transmittance.
 
         Args:
             v: vectors.
-            state: address of [planes,64].
+            state: address of [planes,32].
             numbers: address of the records' numbers in the batch, a byte each.
             count: how many, at least 1.
             coefficients: address of [COEFFICIENTS,BATCH].
-            rays: address of the block's [RAY_PLANES,64].
+            rays: address of the block's [RAY_PLANES,32].
             basis: address of the tile's basis.
             x0: first cell's x from the tile's centre.
             y0: the same for y.
@@ -165,14 +161,12 @@ def _blending(way: int, kind: int, check_near: bool, vectors: int = VECTORS) -> 
         """
         b = v.b
         alive: ir.Value | None = None
-        for part in range(0, vectors, at_once):
-            row = SIDE * 4  # bytes of 8 rays
-            offsets = [4 * LANES * (part + k) for k in range(at_once)]
-            assert row * SIDE == 4 * RAYS
-            x = v.numbers([lane % SIDE for lane in range(LANES)]) + v.spread(x0)
+        for part in range(0, VECTORS, AT_ONCE):
+            offsets = [4 * LANES * (part + k) for k in range(AT_ONCE)]
+            x = v.numbers([lane % WIDE for lane in range(LANES)]) + v.spread(x0)
             y = [
-                v.numbers([((part + k) * LANES + lane) // SIDE for lane in range(LANES)]) + v.spread(y0)
-                for k in range(at_once)
+                v.numbers([((part + k) * LANES + lane) // WIDE for lane in range(LANES)]) + v.spread(y0)
+                for k in range(AT_ONCE)
             ]
 
             def plane_of(base: ir.Value, plane: int, offsets: list[int] = offsets) -> list[Vector]:
@@ -187,7 +181,7 @@ def _blending(way: int, kind: int, check_near: bool, vectors: int = VECTORS) -> 
                 def coefficient(k: int) -> Vector:
                     return v.broadcast(where, 4 * BATCH * k)
 
-                planes = [values[k : k + at_once] for k in range(0, len(values), at_once)]
+                planes = [values[k : k + AT_ONCE] for k in range(0, len(values), AT_ONCE)]
                 own_rays = functools.partial(plane_of, rays)
                 exponent, distance = responses(v, way, coefficient, own_rays, x, y, kind == LIDAR)
                 hits = [e < CUT for e in exponent]
@@ -195,7 +189,7 @@ def _blending(way: int, kind: int, check_near: bool, vectors: int = VECTORS) -> 
                     least = v.spread(near)
                     if way == AFFINE:
                         d = [[v.broadcast(basis, 4 * (start + c)) for start in (B_D0, B_DX, B_DY)] for c in range(3)]
-                        for k in range(at_once):
+                        for k in range(AT_ONCE):
                             lengths = [c[0] + c[1] * x + c[2] * y[k] for c in d]
                             length = (
                                 lengths[0] * lengths[0] + lengths[1] * lengths[1] + lengths[2] * lengths[2]
@@ -232,9 +226,9 @@ def _blending(way: int, kind: int, check_near: bool, vectors: int = VECTORS) -> 
             final = v.repeat(count, initial, body)
             for plane in range(PLANES[kind]):
                 for k, offset in enumerate(offsets):
-                    v.store(final[plane * at_once + k], state, 4 * RAYS * plane + offset)
+                    v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset)
             most = final[0]
-            for other in final[1:at_once]:
+            for other in final[1:AT_ONCE]:
                 most = most.max(other)
             left = (most > (LIDAR_MIN_TRANSMITTANCE if kind == LIDAR else MIN_TRANSMITTANCE)).any()
             alive = left if alive is None else b.or_(alive, left)
@@ -249,10 +243,10 @@ blend_affine_camera_near = _blending(AFFINE, CAMERA, True)
 blend_affine_normals = _blending(AFFINE, NORMALS, True)
 blend_table_camera = _blending(TABLE, CAMERA, True)
 blend_table_normals = _blending(TABLE, NORMALS, True)
-blend_table_lidar = _blending(TABLE, LIDAR, True, VECTORS // 2)
+blend_table_lidar = _blending(TABLE, LIDAR, True)
 blend_moving_camera = _blending(MOVING, CAMERA, True)
 blend_moving_normals = _blending(MOVING, NORMALS, True)
-blend_moving_lidar = _blending(MOVING, LIDAR, True, VECTORS // 2)
+blend_moving_lidar = _blending(MOVING, LIDAR, True)
 
 
 @vector_kernel("iii")
@@ -276,17 +270,17 @@ def open_block(v: Lanes, state: ir.Value, planes: ir.Value, rays: ir.Value) -> N
 def _writing(count: int) -> Callable[..., Any]:
     @vector_kernel("iiii")
     def write_block(v: Lanes, state: ir.Value, target: ir.Value, row_bytes: ir.Value, plane_bytes: ir.Value) -> None:
-        """Copy a block's state to image planes [planes,h,w] whose sides are multiples of 8; T becomes alpha."""
+        """Copy a block's state to image planes [planes,h,w] whose sides are multiples of a block's; T becomes alpha."""
         b = v.b
-        half = ir.VectorType(ir.FloatType(), SIDE)
+        half = ir.VectorType(ir.FloatType(), WIDE)
         for plane in range(count):
             base = b.add(target, b.mul(plane_bytes, ir.Constant(I64, plane)))
             for k in range(VECTORS):
                 x = v.load(state, 4 * (RAYS * plane + LANES * k))
                 x = 1 - x if plane == T else x
-                for part in range(LANES // SIDE):
-                    lanes = ir.Constant(ir.VectorType(I32, SIDE), list(range(SIDE * part, SIDE * part + SIDE)))
-                    row = k * (LANES // SIDE) + part
+                for part in range(LANES // WIDE):
+                    lanes = ir.Constant(ir.VectorType(I32, WIDE), list(range(WIDE * part, WIDE * part + WIDE)))
+                    row = k * (LANES // WIDE) + part
                     piece = b.shuffle_vector(x.value, x.value, lanes)
                     assert piece.type == half
                     b.store(piece, v.pointer(base, b.mul(row_bytes, ir.Constant(I64, row))), align=4)

@@ -6,7 +6,6 @@ import numpy as np
 
 from nurec_sim.render.cpu.blend import (
     CAMERA,
-    HALF_BYTES,
     LIDAR,
     MOST_PLANES,
     NORMALS,
@@ -30,27 +29,27 @@ from nurec_sim.render.cpu.rays import pinhole_basis, rolling_basis, table_basis,
 from nurec_sim.render.cpu.records import MACRO, RECORD
 from nurec_sim.render.cpu.simd import LANES, prefetch
 from nurec_sim.render.cpu.tiles import (
+    ACROSS,
     AFFINE,
     B_MOTION,
+    BANDS,
     BASIS,
     BATCH,
     BLOCKS,
     C_NORMAL,
     CAMERA_BATCH,
     COEFFICIENTS,
+    HIGH,
     LIST,
     MOVING,
-    PER_SIDE,
     RAYS,
     ROLLING,
-    SIDE,
     TABLE,
+    WIDE,
     prepare_affine,
     prepare_moving,
-    prepare_moving_halves,
     prepare_rolling,
     prepare_table,
-    prepare_table_halves,
 )
 
 LINE_BYTES = 64
@@ -67,16 +66,12 @@ def aligned(count):
 
 
 @inner
-def prepare(way, kind, ids, records, count, alive, basis, coefficients, lists, counts, entry):
+def prepare(way, ids, records, count, alive, basis, coefficients, lists, counts, entry):
     """The preparation of a way; see ``tiles``."""
     if way == AFFINE:
         return prepare_affine(ids, records, count, alive, basis, coefficients, lists, counts, entry)
     if way == ROLLING:
         return prepare_rolling(ids, records, count, alive, basis, coefficients, lists, counts, entry)
-    if kind == LIDAR:
-        if way == TABLE:
-            return prepare_table_halves(ids, records, count, alive, basis, coefficients, lists, counts, entry)
-        return prepare_moving_halves(ids, records, count, alive, basis, coefficients, lists, counts, entry)
     if way == TABLE:
         return prepare_table(ids, records, count, alive, basis, coefficients, lists, counts, entry)
     return prepare_moving(ids, records, count, alive, basis, coefficients, lists, counts, entry)
@@ -136,10 +131,10 @@ def draw_tiles(
     state, rays = aligned(BLOCKS * MOST_PLANES * RAYS), aligned(BLOCKS * RAY_PLANES * RAYS)
     coefficients, basis = (
         aligned(COEFFICIENTS * BATCH).reshape(COEFFICIENTS, BATCH),
-        np.zeros((PER_SIDE, BASIS), np.float32),
+        np.zeros((BANDS, BASIS), np.float32),
     )
-    parts, batch = (2, BATCH) if kind == LIDAR else (1, CAMERA_BATCH)
-    chosen, listed = np.empty((BLOCKS * parts, LIST), np.uint8), np.zeros(BLOCKS * parts, np.int64)
+    batch = BATCH if kind == LIDAR else CAMERA_BATCH
+    chosen, listed = np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
     turned = rays.reshape(BLOCKS, RAY_PLANES, RAYS)
     columns = (width + MACRO - 1) // MACRO
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
@@ -159,11 +154,11 @@ def draw_tiles(
         rays_at = np.int64(0)
         if way == TABLE:
             rays_at = table.ctypes.data + tile * (BLOCKS * ray_bytes)
-            basis_at = bases.ctypes.data + tile * (4 * PER_SIDE * BASIS)
+            basis_at = bases.ctypes.data + tile * (4 * BANDS * BASIS)
         elif way == MOVING:
             turn_rays(table[tile], line[tile], turns, places, turned)
             rays_at = rays.ctypes.data
-            for band in range(PER_SIDE):
+            for band in range(BANDS):
                 table_basis(turned, wide, high, band, basis[band])
                 for k in range(3):
                     basis[band, B_MOTION + k] = motion[k]
@@ -174,16 +169,14 @@ def draw_tiles(
         alive = 0
         for block in range(BLOCKS):
             open_block(state_at + block * block_bytes, count_planes, rays_at + block * ray_bytes if rays_at else 0)
-            if block % PER_SIDE * SIDE < wide and block // PER_SIDE * SIDE < high:
+            if block % ACROSS * WIDE < wide and block // ACROSS * HIGH < high:
                 alive |= 1 << block
-        alive_now = 0
-        for item in range(BLOCKS * parts):
-            alive_now |= ((alive >> (item // parts)) & 1) << item
+        alive_now = alive
         j, end = np.int64(starts[tile]), np.int64(starts[tile + 1])
         while j < end and alive_now != 0:
             batch_end = min(end, j + batch)
-            for item in range(BLOCKS * parts):
-                listed[item] = 0
+            for block in range(BLOCKS):
+                listed[block] = 0
             entry = 0
             first = j
             close = np.int64(0)
@@ -191,7 +184,7 @@ def draw_tiles(
                 for ahead in range(j + LANES, min(j + 2 * LANES, end)):
                     prefetch(records_at + np.int64(lists[ahead]) * (4 * RECORD))
                 some_count = min(batch_end - j, LANES)
-                close |= prepare(way, kind, lists_at + 4 * j, records_at, some_count, alive_now, basis_at,
+                close |= prepare(way, lists_at + 4 * j, records_at, some_count, alive_now, basis_at,
                                  coefficients_at, chosen_at, listed_at, entry)  # fmt: skip
                 entry += LANES
                 j += LANES
@@ -201,21 +194,20 @@ def draw_tiles(
                         coefficients[C_NORMAL + c, k - first] = normals[np.uint64(lists[k]), c]
             visits += batch_end - first
             j = batch_end
-            for item in range(BLOCKS * parts):
-                n = listed[item]
+            for block in range(BLOCKS):
+                n = listed[block]
                 if n > 0:
-                    block, shift = item // parts, item % parts * HALF_BYTES
-                    evaluations += n * (RAYS // parts)
+                    evaluations += n * RAYS
                     more = blend_block(
-                        way, kind, close != 0, state_at + block * block_bytes + shift, chosen_at + item * LIST, n,
-                        coefficients_at, rays_at + block * ray_bytes + shift, basis_at,
-                        f4(block % PER_SIDE * SIDE) - f4(15.5), f4(block // PER_SIDE * SIDE) - f4(15.5), near,
+                        way, kind, close != 0, state_at + block * block_bytes, chosen_at + block * LIST, n,
+                        coefficients_at, rays_at + block * ray_bytes, basis_at, f4(block % ACROSS * WIDE) - f4(15.5),
+                        f4(block // ACROSS * HIGH) - f4(15.5), near,
                     )  # fmt: skip
                     if more == 0:
-                        alive_now &= ~(1 << item)
+                        alive_now &= ~(1 << block)
         for block in range(BLOCKS):
             if (alive >> block) & 1:
-                y, x = row * MACRO + block // PER_SIDE * SIDE, column * MACRO + block % PER_SIDE * SIDE
+                y, x = row * MACRO + block // ACROSS * HIGH, column * MACRO + block % ACROSS * WIDE
                 target = planes.ctypes.data + y * row_bytes + 4 * x
                 if kind == NORMALS:
                     write_block_9(state_at + block * block_bytes, target, row_bytes, plane_bytes)

@@ -1,4 +1,4 @@
-"""Kernels that lay a sensor's rays out by blocks of 8 x 8 and describe each macro tile's directions by bases.
+"""Kernels that lay a sensor's rays out by blocks of 8 x 4 and describe each macro tile's directions by bases.
 
 A pinhole needs no table: its directions are linear in the cell, also, to first order about the middle of a macro tile,
 with a shutter that rolls along y.
@@ -17,6 +17,7 @@ from nurec_sim.render.cpu.grid import Grid
 from nurec_sim.render.cpu.kernel import f4, inner, kernel
 from nurec_sim.render.cpu.records import MACRO
 from nurec_sim.render.cpu.tiles import (
+    ACROSS,
     B_BEND,
     B_D0,
     B_DX,
@@ -25,11 +26,14 @@ from nurec_sim.render.cpu.tiles import (
     B_MIDDLE,
     B_MOTION,
     B_RATE,
+    BAND,
+    BANDS,
     BASIS,
     BLOCKS,
-    PER_SIDE,
+    DOWN,
+    HIGH,
     RAYS,
-    SIDE,
+    WIDE,
 )
 
 
@@ -40,8 +44,8 @@ class RayTiles:
     ``line`` numbers the line (instant) of each ray.
     """
 
-    table: Float32[np.ndarray, "tiles 16 5 64"]
-    line: Int16[np.ndarray, "tiles 16 64"]
+    table: Float32[np.ndarray, "tiles 32 5 32"]
+    line: Int16[np.ndarray, "tiles 32 32"]
     basis: Float32[np.ndarray, "tiles 4 16"]
 
 
@@ -53,21 +57,21 @@ def tile_rays(grid: Grid) -> RayTiles:
     def by_block(plane: np.ndarray) -> np.ndarray:
         full = np.zeros((rows * MACRO, columns * MACRO), plane.dtype)
         full[:height, :width] = plane
-        parts = full.reshape(rows, PER_SIDE, SIDE, columns, PER_SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5)
+        parts = full.reshape(rows, DOWN, HIGH, columns, ACROSS, WIDE).transpose(0, 3, 1, 4, 2, 5)
         return parts.reshape(rows * columns, BLOCKS, RAYS)
 
     table = np.zeros((rows * columns, BLOCKS, RAY_PLANES, RAYS), np.float32)
     for plane in range(3):
         table[:, :, DX + plane] = by_block(np.ascontiguousarray(grid.direction[..., plane]))
     table[:, :, VALID] = by_block(grid.valid.astype(np.float32))
-    basis = np.zeros((rows * columns, PER_SIDE, BASIS), np.float32)
+    basis = np.zeros((rows * columns, BANDS, BASIS), np.float32)
     _all_bases(table, columns, width, height, basis)
     return RayTiles(table, by_block(grid.line.astype(np.int16)), basis)
 
 
 @inner
 def _ray(rays, x, y, plane):
-    return rays[(y >> 3) * PER_SIDE + (x >> 3), plane, (y & 7) * SIDE + (x & 7)]
+    return rays[y // HIGH * ACROSS + x // WIDE, plane, y % HIGH * WIDE + x % WIDE]
 
 
 @inner
@@ -78,7 +82,7 @@ def table_basis(rays, wide, high, band, basis):
     constant.
     """
     low_s, high_s = f4(1e30), f4(-1e30)
-    first, last_y = band * SIDE, min(high, (band + 1) * SIDE) - 1
+    first, last_y = band * BAND, min(high, (band + 1) * BAND) - 1
     last_x = wide - 1
     for k in range(BASIS):
         basis[k] = f4(0)
@@ -124,7 +128,7 @@ def _all_bases(table, columns, width, height, basis):
     for tile in range(table.shape[0]):
         wide = min(MACRO, width - tile % columns * MACRO)
         high = min(MACRO, height - tile // columns * MACRO)
-        for band in range(PER_SIDE):
+        for band in range(BANDS):
             table_basis(table[tile], wide, high, band, basis[tile, band])
 
 

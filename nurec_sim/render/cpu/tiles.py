@@ -30,11 +30,13 @@ from nurec_sim.render.cpu.simd import (
     vector_kernel,
 )
 
-SIDE = 8
-"""Side of a block, in cells."""
-PER_SIDE = MACRO // SIDE
-BLOCKS = PER_SIDE * PER_SIDE
-RAYS = SIDE * SIDE
+WIDE, HIGH = 8, 4
+"""Sides of a block, in cells."""
+ACROSS, DOWN = MACRO // WIDE, MACRO // HIGH
+BLOCKS, RAYS = ACROSS * DOWN, WIDE * HIGH
+BAND = 8
+"""Rows of a band."""
+BANDS = MACRO // BAND
 BATCH = 128
 """Most records that are prepared at once; their coefficients stay in the first-level cache."""
 CAMERA_BATCH = 64
@@ -125,11 +127,8 @@ def _rolled(
     return [centre, along_x, [a + change for a, change in zip(along_y, shear, strict=True)]], flat
 
 
-def _least_over_blocks(at: list[list[Vector]], rows: int, height: int, v: Lanes) -> tuple[list[Vector], Mask]:
-    """The least X^2 + Y^2 over each block of ``rows`` rows of four, and where it could not be found.
-
-    Blocks are ``SIDE`` cells wide and ``height`` cells high.
-    """
+def _least_over_blocks(at: list[list[Vector]], rows: int, v: Lanes) -> tuple[list[Vector], Mask]:
+    """The least X^2 + Y^2 over each block of ``rows`` rows of them, and where it could not be found."""
     (x0, y0, _), (xx, yx, _), (xy, yy, _) = at
     a, c, b2 = xx * xx + yx * yx, xy * xy + yy * yy, (xx * xy + yx * yy) * 2
     det = xx * yy - xy * yx
@@ -143,7 +142,7 @@ def _least_over_blocks(at: list[list[Vector]], rows: int, height: int, v: Lanes)
         low = [size * (k - count / 2) + 0.5 for k in range(count)]
         return [(edge - middle, edge + (size - 1) - middle) for edge in low]
 
-    span_x, span_y = spans(PER_SIDE, SIDE, mx), spans(rows, height, my)
+    span_x, span_y = spans(ACROSS, WIDE, mx), spans(rows, HIGH, my)
     zero = v.number(0)
     # Candidates: the side of the square nearest to the centre along one axis, the best place along the other.
     near_x = [x.max(zero.min(x1)) for x, x1 in span_x]
@@ -153,7 +152,7 @@ def _least_over_blocks(at: list[list[Vector]], rows: int, height: int, v: Lanes)
     cy2, by = [c * y * y for y in near_y], [b2 * y for y in near_y]
     least = []
     for row in range(rows):
-        for column in range(PER_SIDE):
+        for column in range(ACROSS):
             y = best_y[column].max(span_y[row][0]).min(span_y[row][1])
             x = best_x[row].max(span_x[column][0]).min(span_x[column][1])
             first = ax2[column] + (bx[column] + c * y) * y
@@ -191,7 +190,7 @@ def _append(v: Lanes, mask: ir.Value, numbers: ir.Value, lists: ir.Value, counts
     b.store(b.add(count, b.zext(b.call(count_bits, [b.bitcast(mask, bits)]), I64)), counter, align=8)
 
 
-def _preparation(way: int, parts: int = 1) -> Callable[..., Any]:
+def _preparation(way: int) -> Callable[..., Any]:
     linear, moving = way in (AFFINE, ROLLING), way in (ROLLING, MOVING)
 
     @vector_kernel("iiiiiiiii")
@@ -216,11 +215,11 @@ def _preparation(way: int, parts: int = 1) -> Callable[..., Any]:
             ids: address of their record numbers (int32).
             records: address of the records.
             count: how many there are, at least 1.
-            alive: bit k is set while list k still wants records: that of block k, or of a half of block k // 2.
+            alive: bit k is set while block k still wants records.
             basis: address of the tile's basis, or of those of its bands.
             coefficients: address of [COEFFICIENTS,BATCH].
-            lists: address of [BLOCKS or twice as many,LIST] bytes.
-            counts: address of as many int64.
+            lists: address of [BLOCKS,LIST] bytes.
+            counts: address of [BLOCKS] int64.
             entry: number of the first record within the batch.
         """
         b = v.b
@@ -230,7 +229,7 @@ def _preparation(way: int, parts: int = 1) -> Callable[..., Any]:
         lane = ir.Constant(INTS, list(range(LANES)))
         given = b.icmp_signed("<", lane, spread(b, b.trunc(count, I32), INTS))
         numbers = b.add(spread(b, b.trunc(entry, I32), INTS), lane)
-        bands = 1 if linear else PER_SIDE
+        bands = 1 if linear else BANDS
         flat, shown = column[FLAT], [row[k] for row in rows for k in range(3)]
         for band in range(bands):
             base = [v.broadcast(basis, 4 * (BASIS * band + k)) for k in range(BASIS)]
@@ -255,12 +254,11 @@ def _preparation(way: int, parts: int = 1) -> Callable[..., Any]:
                 slack = slack + base[B_HALF] * sideways * widest.max(0)
                 slack = slack + reach * drift[2].abs() * (limit.min(1e6).sqrt() * widest.max(0))
             room = limit.min(INSIDE).sqrt() * widest.max(0) * 1.01 + slack
-            least, unsure = _least_over_blocks(at, PER_SIDE // bands * parts, SIDE // parts, v)
+            least, unsure = _least_over_blocks(at, DOWN // bands, v)
             always = unsure | (limit >= INSIDE)
             seen = widest > 0
             for k, value in enumerate(least):
-                part, column_of = divmod(k, PER_SIDE) if parts > 1 else (0, k)
-                block = (band * PER_SIDE + column_of) * parts + part
+                block = BLOCKS // bands * band + k
                 open_ = spread(b, b.trunc(b.lshr(alive, ir.Constant(I64, block)), I1), BITS)
                 mask = (((value < room * room) & seen) | always).value
                 _append(v, b.and_(b.and_(mask, given), open_), numbers, lists, counts, block)
@@ -280,5 +278,3 @@ def _preparation(way: int, parts: int = 1) -> Callable[..., Any]:
 
 
 prepare_affine, prepare_rolling, prepare_table, prepare_moving = (_preparation(way) for way in range(4))
-prepare_table_halves, prepare_moving_halves = _preparation(TABLE, 2), _preparation(MOVING, 2)
-"""LiDARs see most Gaussians with few beams: each block has a list for its upper and one for its lower half."""
