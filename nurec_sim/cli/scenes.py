@@ -111,7 +111,7 @@ def render(
     frame: int = 0,
     left_m: float = 0.0,
     yaw_deg: float = 0.0,
-    layer: Literal["rgb", "depth", "alpha", "label"] = "rgb",
+    layer: Literal["rgb", "depth", "alpha", "label", "normal"] = "rgb",
     width: int | None = None,
 ) -> None:
     """Render one camera image of a scene to a PNG, from where it was recorded or beside it.

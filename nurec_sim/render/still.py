@@ -14,7 +14,7 @@ from nurec_sim.render.encode import encode_image
 from nurec_sim.render.renderer import Renderer
 from nurec_sim.types import CameraFrame, GaussianScene, Label, SensorRequest
 
-Layer = Literal["rgb", "depth", "alpha", "label"]
+Layer = Literal["rgb", "depth", "alpha", "label", "normal"]
 FAR_M = 80.0
 LABEL_RGB = {
     Label.OTHER: (120, 120, 120),
@@ -45,7 +45,7 @@ def render_still(
         frame: which of the camera's recorded times to take; the ego stands where it was then.
         left_m: the car moved to its left.
         yaw_deg: the car turned to its left.
-        layer: what to draw; depth is grey from near to ``FAR_M``.
+        layer: what to draw; depth is grey from near to ``FAR_M``, normals are coloured by their x, y and z in the world.
         width_px: image width, height follows; the camera's own size if None.
 
     Raises:
@@ -66,7 +66,7 @@ def render_still(
     moved = geometry.pose_from_xyyaw(0.0, left_m, np.radians(yaw_deg))
     poses = scene.ego.at(np.array([start_us, end_us])) @ moved @ camera.rig_from_camera
     request = SensorRequest(scene.id, camera, start_us, max(end_us, start_us + 1), poses)
-    shown = picture(Renderer(scene).render_camera(request), layer)
+    shown = picture(Renderer(scene).render_camera(request, ("rgb", layer)), layer)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode_image(shown))
 
@@ -81,5 +81,8 @@ def picture(frame: CameraFrame, layer: Layer) -> UInt8[np.ndarray, "h w 3"]:
         for label, colour in LABEL_RGB.items():
             table[label] = colour
         return table[plane]
+    if layer == "normal":
+        known = np.any(plane != 0, axis=-1, keepdims=True)
+        return np.where(known, (plane + 1) * 127.5 + 0.5, 0).astype(np.uint8)
     shade = np.clip(plane / FAR_M, 0, 1) ** 0.5 if layer == "depth" else np.clip(plane, 0, 1)
     return np.repeat((255 * shade + 0.5).astype(np.uint8)[..., None], 3, axis=2)

@@ -1,4 +1,4 @@
-"""Vector code that carries gradients of a block's 8 x 8 rays back to a list of records, front to back once more.
+"""Vector code that carries gradients of a block's 8 x 4 rays back to a list of records, front to back once more.
 
 A block's state is [STATE_PLANES,32] float32. With q = sum of (gradient of a sum times what the record adds to it per
 weight) and G = the sum of all weights times q, which the forward's sums give, one pass suffices:

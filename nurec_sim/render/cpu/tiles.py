@@ -1,4 +1,4 @@
-"""Vector code that prepares the records of a macro tile for its 8 x 8 blocks of rays, LANES records at a time.
+"""Vector code that prepares the records of a macro tile for its 8 x 4 blocks of rays, LANES records at a time.
 
 In a macro tile of 32 x 32 cells of a pinhole a ray's direction is d0 + x dx + y dy for cells x, y from the tile's
 centre. A record's X, Y and W are then linear in (x, y), and the least Q1 over a block is that of a parabola over a
