@@ -12,14 +12,16 @@ from nurec_sim.render.cpu.grid import make_grid
 from nurec_sim.render.cpu.pack import BLOCK
 from nurec_sim.render.lod import Detail, choose_blocks, merge_levels, ray_spacing
 from nurec_sim.render.merging import GROUP, as_surfels, grouped, merge
-from nurec_sim.types import Gaussians, Label, Pinhole
+from nurec_sim.sensors import lidar_model
+from nurec_sim.types import Label, Pinhole
 
 
 def wall(n=30_000, seed=0, far=20.0, sigma_m=0.05, **fields):
     """Overlapping flat Gaussians, a pixel or two wide, on a wall across the view and the road before it."""
     rng = np.random.default_rng(seed)
     upright = np.arange(n) < n // 2
-    mean = np.stack([np.full(n, far), rng.uniform(-12, 12, n), rng.uniform(-1.6, 6, n)], axis=1)
+    # Not quite a plane: the order of Gaussians at exactly one depth would depend on how they are stored.
+    mean = np.stack([rng.normal(far, 0.02, n), rng.uniform(-12, 12, n), rng.uniform(-1.6, 6, n)], axis=1)
     mean[~upright, 0], mean[~upright, 2] = rng.uniform(3, far, n - n // 2), -1.6
     scale = np.repeat(sigma_m * np.exp(0.3 * rng.normal(size=(n, 1))), 3, axis=1)
     scale[upright, 0] *= 0.1
@@ -155,35 +157,49 @@ def test_blocks_out_of_view_are_left_out_and_nearer_ones_are_finer():
     assert drawn[0] > drawn[1] > drawn[2]
 
 
-def drawn_with(detail, asked):
-    """A picture of the chosen blocks of a layer, and how many Gaussians they hold."""
-    spacing = ray_spacing(make_grid(asked.sensor).direction)
-    chosen = choose_blocks(detail.levels, asked.world_from_sensor[0][:3, 3], spacing, detail.tolerance_px)
-    parts = [
-        level.gaussians[np.isin(np.arange(len(level.gaussians)) // BLOCK, blocks)]
-        for level, blocks in zip(detail.levels, chosen, strict=True)
-    ]
-    some = Gaussians.concatenate(parts)
-    return Renderer(scene(some), threads=2).render_camera(asked), len(some)
+def drawn(full, asked, detail_px, threads=2):
+    """A picture at a level of detail, and how many Gaussians it took."""
+    (picture,), (stats,) = Renderer(scene(full), threads=threads, detail_px=detail_px).measure([asked])
+    return picture, stats.visible
 
 
 def test_fewer_gaussians_draw_nearly_the_same_picture():
     full, asked = wall(60_000, far=35.0, sigma_m=0.1), request(camera(240, 136))
-    reference = Renderer(scene(full), threads=2).render_camera(asked)
-    picture, count = drawn_with(Detail.of(full, 0.15), asked)
-    assert 0.3 * len(full) < count < 0.75 * len(full)
+    reference, all_visible = drawn(full, asked, 0.0)
+    picture, visible = drawn(full, asked, 0.035)
+    assert visible < 0.95 * all_visible
     assert psnr_db(picture.rgb, reference.rgb) >= 50
     assert (picture.label != reference.label).mean() < 0.01
     assert np.abs(picture.depth_m - reference.depth_m)[reference.alpha > 0.99].mean() < 0.05
-    coarse, fewer = drawn_with(Detail.of(full, 0.6), asked)
-    assert fewer < 0.75 * count and 40 < psnr_db(coarse.rgb, reference.rgb) < psnr_db(picture.rgb, reference.rgb)
+    coarse, fewer = drawn(full, asked, 0.6)
+    assert fewer < 0.6 * visible and 40 < psnr_db(coarse.rgb, reference.rgb) < psnr_db(picture.rgb, reference.rgb)
+    again, _ = drawn(full, asked, 0.035, threads=1)
+    assert np.array_equal(again.rgb, picture.rgb) and np.array_equal(again.depth_m, picture.depth_m)
 
 
-def test_no_tolerance_draws_the_same_picture():
+def test_no_tolerance_draws_everything():
     full, asked = wall(5000), request(camera())
-    picture, count = drawn_with(Detail.of(full, 0.0), asked)
-    assert count == len(full)
-    assert psnr_db(picture.rgb, Renderer(scene(full), threads=2).render_camera(asked).rgb) > 70
+    detail = Detail.of(full, 0.0)
+    layers = detail.layers(np.zeros(3), 0.01, lambda packed: np.arange(len(packed)))
+    assert len(layers) == 1 and (layers[0][0].index >= 0).sum() == len(full)
+    default = Renderer(scene(full)).render_camera(asked)
+    assert np.array_equal(drawn(full, asked, 0.0)[0].rgb, default.rgb)
+
+
+def test_a_sweep_at_a_level_of_detail_finds_the_same_wall():
+    world, asked = scene(wall(60_000, far=35.0, sigma_m=0.1)), request(lidar_model("VLP-16", np.eye(4), columns=360))
+    full = Renderer(world).render_lidar(asked)
+    (some,), (stats,) = Renderer(world, detail_px=0.3).measure([asked])
+    assert stats.visible < 50_000
+    _, mine, theirs = np.intersect1d(some.beam, full.beam, return_indices=True)
+    assert len(mine) > 0.98 * len(full.beam)
+    assert np.median(np.abs(some.range_m[mine] - full.range_m[theirs])) < 0.05
+
+
+@pytest.mark.parametrize("detail_px", [-1.0, np.nan, np.inf])
+def test_nonsense_tolerances_are_refused(detail_px):
+    with pytest.raises(ValueError, match="detail_px must be finite and not negative, got"):
+        Renderer(scene(wall(10)), detail_px=detail_px)
 
 
 def test_layers_hold_the_chosen_blocks_in_view():

@@ -58,8 +58,8 @@ class Renderer:
         threads: of this renderer; as many as the process may use if None.
         apply_isp: whether ``scene.isp`` of the request's sensor id is applied.
         detail_px: level of detail: distant static Gaussians are drawn merged where that paints no more than about a
-            square of this side wrong, in pixels or beams; 0 draws all of them. 0.15 keeps some 50 dB (``lod``).
-            Merging takes seconds per million Gaussians.
+            square of this side wrong, in pixels or beams; 0 draws all of them. 0.15 keeps 50 dB where surfaces have
+            several layers and 45 where they have one (``lod``). Merging takes seconds per million Gaussians.
 
     Raises:
         ValueError: less than one thread, or a negative or infinite ``detail_px``.
