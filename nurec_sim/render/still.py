@@ -45,7 +45,7 @@ def render_still(
         frame: which of the camera's recorded times to take; the ego stands where it was then.
         left_m: the car moved to its left.
         yaw_deg: the car turned to its left.
-        layer: what to draw; depth is grey from near to ``FAR_M``, normals are coloured by their x, y and z in the world.
+        layer: what to draw; depth is grey from near to ``FAR_M``, normals are coloured by x, y and z in the world.
         width_px: image width, height follows; the camera's own size if None.
 
     Raises:
