@@ -55,7 +55,7 @@ class Renderer:
 
     Args:
         scene: the world.
-        threads: of this renderer; as many as the process may use if None.
+        threads: that work on a frame, the caller's own among them; as many as the process may use if None.
         apply_isp: whether ``scene.isp`` of the request's sensor id is applied.
         detail_px: level of detail: distant static Gaussians are drawn merged where that paints no more than about a
             square of this side wrong, in pixels or beams; 0 draws all of them. 0.15 keeps 50 dB where surfaces have
