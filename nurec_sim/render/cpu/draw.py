@@ -53,8 +53,6 @@ from nurec_sim.render.cpu.tiles import (
 )
 
 LINE_BYTES = 64
-VISITS, EVALUATIONS = 0, 1
-"""What ``counts`` holds: records prepared, and responses evaluated."""
 
 
 @inner
@@ -125,7 +123,7 @@ def draw_tiles(
         width: columns of the grid.
         height: rows of the grid.
         planes: [6 or 9,h,w] output, sides rounded up to whole blocks: alpha, features, distance, tagged weight or half.
-        counts: [2] int64, what was done is added.
+        counts: [1] int64, the number of responses evaluated is added.
     """
     count_planes = 9 if kind == NORMALS else 6
     state, rays = aligned(BLOCKS * MOST_PLANES * RAYS), aligned(BLOCKS * RAY_PLANES * RAYS)
@@ -146,7 +144,7 @@ def draw_tiles(
         lists.ctypes.data,
         records.ctypes.data,
     )
-    visits = evaluations = 0
+    evaluations = 0
     for index in range(tiles.shape[0]):
         tile = np.int64(tiles[index])
         row, column = tile // columns, tile % columns
@@ -192,7 +190,6 @@ def draw_tiles(
                 for k in range(first, batch_end):
                     for c in range(3):
                         coefficients[C_NORMAL + c, k - first] = normals[np.uint64(lists[k]), c]
-            visits += batch_end - first
             j = batch_end
             for block in range(BLOCKS):
                 n = listed[block]
@@ -217,8 +214,7 @@ def draw_tiles(
     keep_alive(chosen)
     keep_alive(rays)
     keep_alive(coefficients)
-    counts[VISITS] += visits
-    counts[EVALUATIONS] += evaluations
+    counts[0] += evaluations
 
 
 @kernel

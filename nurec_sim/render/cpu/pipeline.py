@@ -17,7 +17,7 @@ from jaxtyping import Float32, Int32, Int64
 
 from nurec_sim.render.cpu.binning import count_tiles, depth_cuts, fill_tiles, sort_by_depth
 from nurec_sim.render.cpu.blend import LIDAR, NORMALS
-from nurec_sim.render.cpu.draw import EVALUATIONS, VISITS, draw_tiles, record_normals
+from nurec_sim.render.cpu.draw import draw_tiles, record_normals
 from nurec_sim.render.cpu.grid import LIDAR as LIDAR_GRID
 from nurec_sim.render.cpu.pack import BLOCK, PackedGaussians
 from nurec_sim.render.cpu.project_general import project_general
@@ -42,7 +42,6 @@ class FrameStats:
 
     visible: int = 0
     pairs: int = 0
-    visits: int = 0
     evaluations: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -98,13 +97,12 @@ def draw(pictures: Sequence[Picture], workers: Workers) -> list[Float32[np.ndarr
             planes = _empty_planes(picture)
             results.append(planes)
             for tiles in tile_ranges(picture, workers.threads):
-                done = np.zeros(2, np.int64)
+                done = np.zeros(1, np.int64)
                 counts.append((picture, done))
                 calls.append((draw_tiles, *blend_arguments(picture, tiles), planes, done))
         workers.run_calls(calls)
     for picture, done in counts:
-        picture.stats.visits += int(done[VISITS])
-        picture.stats.evaluations += int(done[EVALUATIONS])
+        picture.stats.evaluations += int(done[0])
     return results
 
 
