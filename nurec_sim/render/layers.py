@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -147,6 +148,11 @@ def sh_basis(direction: Float64[np.ndarray, "n 3"], k: int) -> Float64[np.ndarra
         k: 3, 8 or 15 functions (degree 1, 2 or 3).
     """
     x, y, z = np.moveaxis(np.asarray(direction, np.float64), -1, 0)
+    return np.stack(sh_functions(x, y, z, k), axis=-1)
+
+
+def sh_functions(x: Any, y: Any, z: Any, k: int) -> list[Any]:
+    """The functions of ``sh_basis`` at unit vectors (x, y, z), which may be arrays or tensors."""
     xx, yy, zz = x * x, y * y, z * z
     basis = [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if k > 3:
@@ -167,4 +173,4 @@ def sh_basis(direction: Float64[np.ndarray, "n 3"], k: int) -> Float64[np.ndarra
             1.445305721320277 * z * (xx - yy),
             -0.5900435899266435 * x * (xx - 3 * yy),
         ]
-    return np.stack(basis, axis=-1)
+    return basis

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nurec_sim.render.layers import sh_functions
+
 
 def quat_multiply(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
     """Product of quaternions (wxyz)."""
@@ -54,24 +56,4 @@ def view_colour(
 def sh_basis(direction: Float[Tensor, "n 3"], k: int) -> Float[Tensor, "n k"]:
     """``layers.sh_basis``: real spherical harmonics of degree 1 and up at unit directions."""
     x, y, z = direction.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    basis = [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-    if k > 3:
-        basis += [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * zz - xx - yy),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-        ]
-    if k > 8:
-        basis += [
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ]
-    return torch.stack(basis, dim=-1)
+    return torch.stack(sh_functions(x, y, z, k), dim=-1)
