@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from nurec_sim import geometry
-from nurec_sim.errors import RequestError
 from nurec_sim.render.cpu.blend import CAMERA, LIDAR, NORMALS
 from nurec_sim.render.cpu.composite import composite
 from nurec_sim.render.cpu.grid import PINHOLE, Grid, grid_key, make_grid
@@ -27,14 +26,12 @@ from nurec_sim.render.cpu.view import View
 from nurec_sim.render.cpu.workers import Buffers, Lend, Workers
 from nurec_sim.render.lod import Detail, ray_spacing
 from nurec_sim.render.rays import reference_pose
-from nurec_sim.render.requests import CAMERA_OUTPUTS, check_request
+from nurec_sim.render.requests import SENSED_OUTPUTS, check_camera_call, check_lidar_call, check_request
 from nurec_sim.types import CameraFrame, CameraModel, GaussianScene, LidarFilter, LidarFrame, SensorFrame, SensorRequest
 
 IDENTITY_ISP = np.eye(3, 4, dtype=np.float32)
 KEPT_RAYS = 50_000_000
 """Rays of the sensors whose tables are kept, in all; some 60 bytes each."""
-SENSED_OUTPUTS = ("rgb", "depth", "alpha", "label")
-"""What ``sense`` asks of cameras."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +94,7 @@ class Renderer:
         Raises:
             RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or an unknown output.
         """
-        unknown = sorted(set(outputs) - set(CAMERA_OUTPUTS))
-        if unknown:
-            raise RequestError(f"unknown outputs {unknown}; have {list(CAMERA_OUTPUTS)}")
-        if not isinstance(request.sensor, CameraModel):
-            raise RequestError("render_camera needs a camera, the request's sensor is a LiDAR")
+        check_camera_call(request, outputs)
         frame = self.measure([request], outputs)[0][0]
         assert isinstance(frame, CameraFrame)
         return frame
@@ -112,8 +105,7 @@ class Renderer:
         Raises:
             RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
         """
-        if isinstance(request.sensor, CameraModel):
-            raise RequestError(f"render_lidar needs a LiDAR, sensor {request.sensor.id!r} is a camera")
+        check_lidar_call(request)
         frame = self.measure([request], filter=filter)[0][0]
         assert isinstance(frame, LidarFrame)
         return frame

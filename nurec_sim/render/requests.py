@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from nurec_sim import geometry, sensors
@@ -11,6 +13,8 @@ from nurec_sim.types import CameraModel, GaussianScene, LidarModel, SensorReques
 MAX_SIDE_PX = 8192
 MAX_RAYS = 7680 * 4320
 CAMERA_OUTPUTS = ("rgb", "depth", "alpha", "label", "normal")
+SENSED_OUTPUTS = ("rgb", "depth", "alpha", "label")
+"""What ``sense`` asks of cameras."""
 
 
 def check_request(request: SensorRequest, scene: GaussianScene) -> None:
@@ -51,6 +55,29 @@ def check_request(request: SensorRequest, scene: GaussianScene) -> None:
             f"scene {scene.id!r} covers [{first}, {end}] us, the request asks for "
             f"[{request.start_us}, {request.end_us})"
         )
+
+
+def check_camera_call(request: SensorRequest, outputs: Sequence[str]) -> None:
+    """Check that a camera is asked for, and for outputs that there are.
+
+    Raises:
+        RequestError: it is a LiDAR, or an output is unknown.
+    """
+    unknown = sorted(set(outputs) - set(CAMERA_OUTPUTS))
+    if unknown:
+        raise RequestError(f"unknown outputs {unknown}; have {list(CAMERA_OUTPUTS)}")
+    if isinstance(request.sensor, LidarModel):
+        raise RequestError(f"render_camera needs a camera, sensor {request.sensor.id!r} is a LiDAR")
+
+
+def check_lidar_call(request: SensorRequest) -> None:
+    """Check that a LiDAR is asked for.
+
+    Raises:
+        RequestError: it is a camera.
+    """
+    if isinstance(request.sensor, CameraModel):
+        raise RequestError(f"render_lidar needs a LiDAR, sensor {request.sensor.id!r} is a camera")
 
 
 def check_pose_pair(name: str, pair: np.ndarray) -> None:

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nurec_sim.errors import RequestError, TooLargeError
+from nurec_sim.errors import TooLargeError
 from nurec_sim.render.cpu.grid import grid_key, make_grid
 from nurec_sim.render.cpu.pack import pack
 from nurec_sim.render.gpu.launcher import THREADS, CudaLauncher, Launcher
 from nurec_sim.render.gpu.moving import MovingLayer
 from nurec_sim.render.gpu.pipeline import ALPHA, Blocks, draw
 from nurec_sim.render.gpu.views import Batch, GridTensors, SensorView, make_batch
-from nurec_sim.render.requests import CAMERA_OUTPUTS, check_request
+from nurec_sim.render.requests import SENSED_OUTPUTS, check_camera_call, check_lidar_call, check_request
 from nurec_sim.types import (
     CameraFrame,
     CameraModel,
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     import torch
 
 KEPT_GRIDS = 24
-SENSED_OUTPUTS = ("rgb", "depth", "alpha", "label")
-"""What ``sense`` asks of cameras."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +95,7 @@ class GpuRenderer:
         Raises:
             RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or an unknown output.
         """
-        unknown = sorted(set(outputs) - set(CAMERA_OUTPUTS))
-        if unknown:
-            raise RequestError(f"unknown outputs {unknown}; have {list(CAMERA_OUTPUTS)}")
-        if isinstance(request.sensor, LidarModel):
-            raise RequestError(f"render_camera needs a camera, sensor {request.sensor.id!r} is a LiDAR")
+        check_camera_call(request, outputs)
         frame = self._frames([request], outputs, LidarFilter())[0]
         assert isinstance(frame, CameraFrame)
         return frame
@@ -112,8 +106,7 @@ class GpuRenderer:
         Raises:
             RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
         """
-        if isinstance(request.sensor, CameraModel):
-            raise RequestError(f"render_lidar needs a LiDAR, sensor {request.sensor.id!r} is a camera")
+        check_lidar_call(request)
         frame = self._frames([request], (), filter or LidarFilter())[0]
         assert isinstance(frame, LidarFrame)
         return frame
