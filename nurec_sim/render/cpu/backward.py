@@ -22,13 +22,12 @@ from nurec_sim.render.cpu.backward_blend import (
 from nurec_sim.render.cpu.blend import CAMERA, LIDAR, RAY_PLANES
 from nurec_sim.render.cpu.draw import aligned, prepare
 from nurec_sim.render.cpu.kernel import f4, inner, keep_alive, kernel
-from nurec_sim.render.cpu.rays import pinhole_basis, table_basis, turn_rays
+from nurec_sim.render.cpu.rays import moving_tile, pinhole_basis
 from nurec_sim.render.cpu.records import MACRO, RECORD
 from nurec_sim.render.cpu.simd import LANES, prefetch
 from nurec_sim.render.cpu.tiles import (
     ACROSS,
     AFFINE,
-    B_MOTION,
     BANDS,
     BASIS,
     BATCH,
@@ -145,12 +144,8 @@ def draw_tiles_back(
         elif way == AFFINE:
             pinhole_basis(intrinsics, column, row, basis[0])
         else:
-            turn_rays(table[tile], line[tile], turns, places, turned)
+            moving_tile(table[tile], line[tile], turns, places, wide, high, motion, turned, basis)
             rays_at = rays.ctypes.data
-            for band in range(BANDS):
-                table_basis(turned, wide, high, band, basis[band])
-                for k in range(3):
-                    basis[band, B_MOTION + k] = motion[k]
         alive = 0
         for block in range(BLOCKS):
             if block % ACROSS * WIDE < wide and block // ACROSS * HIGH < high:

@@ -32,6 +32,7 @@ from nurec_sim.render.cpu.blend import (
     VALID,
     VECTORS,
     fading,
+    still_open,
 )
 from nurec_sim.render.cpu.simd import F32, I8, I32, I64, LANES, Lanes, Vector, vector_kernel
 from nurec_sim.render.cpu.tiles import (
@@ -312,10 +313,7 @@ def _carrying_back(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
             for plane in (T, REST):
                 for k, offset in enumerate(offsets):
                     v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset)
-            most = final[0]
-            for other in final[1:AT_ONCE]:
-                most = most.max(other)
-            left = (most > dark).any()
+            left = still_open(final[:AT_ONCE], kind)
             alive = left if alive is None else b.or_(alive, left)
         assert alive is not None
         return alive

@@ -131,6 +131,12 @@ def responses(
     return exponents, distances
 
 
+def still_open(transmittance: list[Vector], kind: int) -> ir.Value:
+    """An int64: 1 while any of the rays of a CAMERA or LIDAR goes on, else 0."""
+    most = functools.reduce(Vector.max, transmittance)
+    return (most > (LIDAR_MIN_TRANSMITTANCE if kind == LIDAR else MIN_TRANSMITTANCE)).any()
+
+
 def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
     @vector_kernel("iiiiiifff")
     def blend(
@@ -227,10 +233,7 @@ def _blending(way: int, kind: int, check_near: bool) -> Callable[..., Any]:
             for plane in range(PLANES[kind]):
                 for k, offset in enumerate(offsets):
                     v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset)
-            most = final[0]
-            for other in final[1:AT_ONCE]:
-                most = most.max(other)
-            left = (most > (LIDAR_MIN_TRANSMITTANCE if kind == LIDAR else MIN_TRANSMITTANCE)).any()
+            left = still_open(final[:AT_ONCE], kind)
             alive = left if alive is None else b.or_(alive, left)
         assert alive is not None
         return alive

@@ -25,13 +25,12 @@ from nurec_sim.render.cpu.blend import (
 )
 from nurec_sim.render.cpu.kernel import f4, inner, keep_alive, kernel
 from nurec_sim.render.cpu.pack import BLOCK, MEAN, NORMAL
-from nurec_sim.render.cpu.rays import pinhole_basis, rolling_basis, table_basis, turn_rays
+from nurec_sim.render.cpu.rays import moving_tile, pinhole_basis, rolling_basis
 from nurec_sim.render.cpu.records import MACRO, RECORD
 from nurec_sim.render.cpu.simd import LANES, prefetch
 from nurec_sim.render.cpu.tiles import (
     ACROSS,
     AFFINE,
-    B_MOTION,
     BANDS,
     BASIS,
     BATCH,
@@ -154,12 +153,8 @@ def draw_tiles(
             rays_at = table.ctypes.data + tile * (BLOCKS * ray_bytes)
             basis_at = bases.ctypes.data + tile * (4 * BANDS * BASIS)
         elif way == MOVING:
-            turn_rays(table[tile], line[tile], turns, places, turned)
+            moving_tile(table[tile], line[tile], turns, places, wide, high, motion, turned, basis)
             rays_at = rays.ctypes.data
-            for band in range(BANDS):
-                table_basis(turned, wide, high, band, basis[band])
-                for k in range(3):
-                    basis[band, B_MOTION + k] = motion[k]
         else:
             pinhole_basis(intrinsics, column, row, basis[0])
             if way == ROLLING:

@@ -147,6 +147,16 @@ def turn_rays(rays, line, turns, places, out):
 
 
 @inner
+def moving_tile(rays, line, turns, places, wide, high, motion, out, bases):
+    """Turn a macro tile's rays and describe its bands, for a sensor whose velocity is ``motion[:3]``."""
+    turn_rays(rays, line, turns, places, out)
+    for band in range(BANDS):
+        table_basis(out, wide, high, band, bases[band])
+        for k in range(3):
+            bases[band, B_MOTION + k] = motion[k]
+
+
+@inner
 def pinhole_basis(intrinsics, column, row, basis):
     """The basis of a pinhole's macro tile, exact: directions with z = 1."""
     for k in range(BASIS):
