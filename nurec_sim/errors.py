@@ -6,6 +6,7 @@
     ├── ClipError        a driving log is missing something or contradicts itself
     ├── ArchiveError     a scene archive cannot be read, or must not be
     ├── ReconstructError a clip lacks what the reconstruction method needs
+    ├── WeightsError     weights of the network are missing, damaged, or of another network
     ├── RequestError     a render request is malformed                (gRPC INVALID_ARGUMENT)
     │   ├── UnknownSceneError  no such scene                          (gRPC NOT_FOUND)
     │   ├── OutOfRangeError    a time outside the scene               (gRPC OUT_OF_RANGE)
@@ -34,6 +35,10 @@ class ArchiveError(NurecSimError):
 
 class ReconstructError(NurecSimError):
     """A clip lacks what the reconstruction method needs."""
+
+
+class WeightsError(NurecSimError):
+    """Weights of the network are missing, damaged, or of another network."""
 
 
 class RequestError(NurecSimError):

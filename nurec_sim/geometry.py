@@ -241,13 +241,28 @@ def cubemap_directions(size: int) -> Float64[np.ndarray, "6 size size 3"]:
     Faces in OpenGL order +X -X +Y -Y +Z -Z, looked up with GL axes x = -y_world, y = z_world, z = -x_world
     (docs/scene_format.md), so face 5 (-Z) looks along the world's x axis and face 2 (+Y) up.
     """
+    gl = _opengl_texels(size)
+    world = np.stack([-gl[..., 2], -gl[..., 0], gl[..., 1]], axis=-1)
+    return world / np.linalg.norm(world, axis=-1, keepdims=True)
+
+
+def released_cubemap_directions(size: int) -> Float64[np.ndarray, "6 size size 3"]:
+    """Directions of the texel centres of a cubemap as the released network and its sky files lay it out.
+
+    Faces +X -X -Y +Y +Z -Z of the frame that the cubemap is in, whatever that is: OpenGL's layout with y turned
+    round, made for camera frames (x right, y down, z forward), in which every face is upright.
+    """
+    direction = _opengl_texels(size) * np.array([1.0, -1.0, 1.0])
+    return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def _opengl_texels(size: int) -> Float64[np.ndarray, "6 size size 3"]:
+    """Points on the cube [-1, 1]^3 in OpenGL's axes, at the texel centres of its faces +X -X +Y -Y +Z -Z."""
     c = (np.arange(size) + 0.5) / size * 2 - 1
     t, s = np.meshgrid(c, c, indexing="ij")
     one = np.ones_like(s)
     faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
-    gl = np.stack([np.stack(face, axis=-1) for face in faces])
-    world = np.stack([-gl[..., 2], -gl[..., 0], gl[..., 1]], axis=-1)
-    return world / np.linalg.norm(world, axis=-1, keepdims=True)
+    return np.stack([np.stack(face, axis=-1) for face in faces])
 
 
 def cubemap_coordinates(

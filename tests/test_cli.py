@@ -10,7 +10,21 @@ import pytest
 from nurec_sim import cli
 
 REPO = Path(__file__).parent.parent
-VERBS = ("inspect", "world", "reconstruct", "render", "serve", "run", "demo", "evaluate", "report", "policies")
+VERBS = (
+    "inspect",
+    "world",
+    "reconstruct",
+    "render",
+    "serve",
+    "run",
+    "demo",
+    "evaluate",
+    "report",
+    "policies",
+    "weights",
+    "export",
+    "import",
+)
 
 
 def run_cli(*arguments: str) -> subprocess.CompletedProcess[str]:

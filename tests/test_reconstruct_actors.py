@@ -4,9 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.actors import emit, tracks_of, windows_of
-from nurec_sim.reconstruct.points import actors_of
-from nurec_sim.reconstruct.settings import LiftSettings, PointSettings
+from nurec_sim.reconstruct.lift.actors import emit, tracks_of, windows_of
+from nurec_sim.reconstruct.lift.points import actors_of
+from nurec_sim.reconstruct.lift.settings import LiftSettings, PointSettings
 from nurec_sim.types import Gaussians, Track, Trajectory
 
 SPAN_US = (1_000_000, 6_000_000)

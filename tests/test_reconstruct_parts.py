@@ -5,13 +5,13 @@ from hypothesis import strategies as st
 from reconstruct_street import KERB_M, STEP_M, Street, camera
 
 from nurec_sim import geometry, sensors
-from nurec_sim.reconstruct import colour, depth, lifting, splat
-from nurec_sim.reconstruct.ground import find_ground
-from nurec_sim.reconstruct.points import Cloud, actors_of, gather, seen_through, spherical_ranges
-from nurec_sim.reconstruct.settings import GroundSettings, PointSettings, ViewSettings
-from nurec_sim.reconstruct.sky import make_sky
-from nurec_sim.reconstruct.surfaces import footprints, surface_of
-from nurec_sim.reconstruct.views import choose_frames, read_views, tiles_of
+from nurec_sim.reconstruct.lift import colour, depth, lifting, splat
+from nurec_sim.reconstruct.lift.ground import find_ground
+from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, seen_through, spherical_ranges
+from nurec_sim.reconstruct.lift.settings import GroundSettings, PointSettings, ViewSettings
+from nurec_sim.reconstruct.lift.sky import make_sky
+from nurec_sim.reconstruct.lift.surfaces import footprints, surface_of
+from nurec_sim.reconstruct.lift.views import choose_frames, read_views, tiles_of
 from nurec_sim.types import CameraModel, Fisheye, Pinhole, Shutter
 
 

@@ -7,7 +7,7 @@ import pytest
 from render_scenes import START_US, request, scene
 
 from nurec_sim import geometry, sensors
-from nurec_sim.reconstruct import surfaces
+from nurec_sim.reconstruct.lift import surfaces
 from nurec_sim.render import Renderer
 from nurec_sim.types import Label
 

@@ -187,12 +187,12 @@ def test_array_that_promises_too_much(good):
 
 
 def test_array_of_another_shape(good):
-    data = archive._npy(np.zeros((7, 3), np.int64))
+    data = archive.npy_bytes(np.zeros((7, 3), np.int64))
     refused(forge(good, **{archive.KNOT_TIMES: data}), r"knot_t_us must be int64 \(53, 3\), got int64 \(7, 3\)")
 
 
 def test_array_of_another_type(good):
-    data = archive._npy(np.zeros((6, 8, 8, 3), np.float64))
+    data = archive.npy_bytes(np.zeros((6, 8, 8, 3), np.float64))
     refused(forge(good, **{archive.SKY: data}), "sky must be float32")
 
 

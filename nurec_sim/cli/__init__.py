@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
-from nurec_sim.cli import driving, scenes
+from nurec_sim.cli import driving, exchange, scenes, weights
 from nurec_sim.cli.console import app, err
 from nurec_sim.errors import NurecSimError
 
-__all__ = ["driving", "main", "scenes"]
+__all__ = ["driving", "exchange", "main", "scenes", "weights"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -6,14 +6,23 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from nurec_sim.errors import ReconstructError
-from nurec_sim.reconstruct.settings import GroundSettings, LiftSettings, PointSettings, ViewSettings
+from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
+from nurec_sim.reconstruct.lift.settings import GroundSettings, LiftSettings, PointSettings, ViewSettings
 
 if TYPE_CHECKING:
     from nurec_sim.types import Clip, GaussianScene
 
-METHODS = ("lift",)
+METHODS = ("lift", "dense", "selective")
 
-__all__ = ["METHODS", "GroundSettings", "LiftSettings", "PointSettings", "ViewSettings", "reconstruct"]
+__all__ = [
+    "METHODS",
+    "FeedForwardSettings",
+    "GroundSettings",
+    "LiftSettings",
+    "PointSettings",
+    "ViewSettings",
+    "reconstruct",
+]
 
 
 def reconstruct(
@@ -23,20 +32,22 @@ def reconstruct(
     cameras: Sequence[str] | None = None,
     hold_out_sweeps: Sequence[int] = (),
     progress: Callable[[str, float], None] | None = None,
-    settings: LiftSettings | None = None,
+    settings: LiftSettings | FeedForwardSettings | None = None,
 ) -> GaussianScene:
     """Build a Gaussian scene from a clip.
 
     Args:
         clip: the driving log.
         method: one of ``METHODS``.
-        cameras: ids of the cameras to use; all if None.
+        cameras: ids of the cameras to use; if None all, or as many as the network's profile takes.
         hold_out_sweeps: indices of sweeps that must not be read, of every LiDAR.
         progress: called with the stage's name and the fraction of it that is done.
-        settings: settings of the method; its defaults if None.
+        settings: ``LiftSettings`` for ``lift``, ``FeedForwardSettings`` for the others; the defaults if None.
 
     Raises:
-        ReconstructError: no such method, camera or sweep, or the clip lacks what the method needs.
+        ReconstructError: no such method, camera or sweep, settings of another method, or the clip lacks what the
+            method needs.
+        WeightsError: the network's weights are not there or cannot be used.
     """
     if method not in METHODS:
         raise ReconstructError(f"no reconstruction method {method!r}; have {list(METHODS)}")
@@ -49,7 +60,17 @@ def reconstruct(
     if wrong:
         raise ReconstructError(f"clip {clip.id!r} has no sweeps {wrong} to hold out; have 0..{most - 1}")
 
-    from nurec_sim.reconstruct.lift import lift
-
     held = {int(index) for index in hold_out_sweeps}
-    return lift(clip, chosen, held, progress or (lambda stage, fraction: None), settings or LiftSettings())
+    report = progress or (lambda stage, fraction: None)
+    wanted = LiftSettings if method == "lift" else FeedForwardSettings
+    if settings is None:
+        settings = wanted()
+    if isinstance(settings, LiftSettings) and method == "lift":
+        from nurec_sim.reconstruct.lift.method import lift
+
+        return lift(clip, chosen, held, report, settings)
+    if isinstance(settings, FeedForwardSettings) and method != "lift":
+        from nurec_sim.reconstruct.feedforward.method import feedforward
+
+        return feedforward(clip, method, cameras, held, report, settings)
+    raise ReconstructError(f"method {method!r} takes {wanted.__name__}, got {type(settings).__name__}")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from nurec_sim import geometry
 from nurec_sim.render.rays import RayGrid, reference_pose
+from nurec_sim.scene.harmonics import sh_basis
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, SensorRequest, Track
 
 MIN_ALPHA = 1 / 255
@@ -80,23 +80,12 @@ def moving_gaussians(
     Returns:
         Gaussians with their position, rotation and faded opacity of the instant.
     """
-    knots = dynamic.knot_t_us
-    alive = np.flatnonzero((knots[:, 0] <= t_us) & (t_us <= knots[:, 2]))
-    knots = knots[alive]
-    after = t_us >= knots[:, 1]
-    rows = np.arange(len(alive))
-    low = np.where(after, 1, 0)
-    start_us, end_us = knots[rows, low], knots[rows, low + 1]
-    fraction = (t_us - start_us) / np.maximum(end_us - start_us, 1)
-    fade = np.exp(-(np.where(after, fraction, 1 - fraction) ** 10))
+    alive, mean, fade = dynamic.at(t_us)
     opacity = dynamic.gaussians.opacity[alive] * fade
     seen = (opacity >= MIN_ALPHA) & drawable(dynamic.gaussians[alive])
     seen &= np.isfinite(dynamic.knot_m[alive]).all(axis=(1, 2))
-    alive, rows, low, fraction, opacity = alive[seen], rows[seen], low[seen], fraction[seen], opacity[seen]
-
-    gaussians, knot_m = dynamic.gaussians[alive], dynamic.knot_m[alive].astype(np.float64)
-    rows = np.arange(len(alive))
-    mean = knot_m[rows, low] * (1 - fraction[:, None]) + knot_m[rows, low + 1] * fraction[:, None]
+    alive, mean, opacity = alive[seen], mean[seen], opacity[seen]
+    gaussians = dynamic.gaussians[alive]
     quat, normal = gaussians.quat_wxyz.astype(np.float64), gaussians.normal.astype(np.float64)
     eye = np.broadcast_to(np.asarray(eye_m, np.float64), mean.shape).copy()
     recorded_mean = mean.copy()
@@ -138,39 +127,3 @@ def view_colour(
     length = np.linalg.norm(eye_to_mean, axis=-1, keepdims=True)
     basis = sh_basis(eye_to_mean / np.maximum(length, 1e-12), sh_rest.shape[1])
     return np.maximum(rgb + np.einsum("nk,nkc->nc", basis, sh_rest.astype(np.float64)), 0.0)
-
-
-def sh_basis(direction: Float64[np.ndarray, "n 3"], k: int) -> Float64[np.ndarray, "n k"]:
-    """Real spherical harmonics of degree 1 and up at unit directions, in the order and with the signs of 3DGS files.
-
-    Args:
-        direction: unit vectors in the world.
-        k: 3, 8 or 15 functions (degree 1, 2 or 3).
-    """
-    x, y, z = np.moveaxis(np.asarray(direction, np.float64), -1, 0)
-    return np.stack(sh_functions(x, y, z, k), axis=-1)
-
-
-def sh_functions(x: Any, y: Any, z: Any, k: int) -> list[Any]:
-    """The functions of ``sh_basis`` at unit vectors (x, y, z), which may be arrays or tensors."""
-    xx, yy, zz = x * x, y * y, z * z
-    basis = [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-    if k > 3:
-        basis += [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * zz - xx - yy),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-        ]
-    if k > 8:
-        basis += [
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ]
-    return basis

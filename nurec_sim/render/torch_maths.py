@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nurec_sim.render.layers import sh_functions
+from nurec_sim.scene.harmonics import sh_functions
 
 
 def quat_multiply(a: Float[Tensor, "*n 4"], b: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
@@ -54,6 +54,6 @@ def view_colour(
 
 
 def sh_basis(direction: Float[Tensor, "n 3"], k: int) -> Float[Tensor, "n k"]:
-    """``layers.sh_basis``: real spherical harmonics of degree 1 and up at unit directions."""
+    """``harmonics.sh_basis``: real spherical harmonics of degree 1 and up at unit directions."""
     x, y, z = direction.unbind(-1)
     return torch.stack(sh_functions(x, y, z, k), dim=-1)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import io
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from nurec_sim.scene import codec
 from nurec_sim.scene.checks import check_scene
 from nurec_sim.scene.describe import scene_hash
 from nurec_sim.scene.facts import facts_from_json, scene_facts
+from nurec_sim.scene.npy import array_from_npy, npy_bytes
 from nurec_sim.scene.sidecars import ftheta_fits, sidecars
 from nurec_sim.scene.sky import latlong_exr
 from nurec_sim.scene.usd_actors import actors_layer, field_paths
@@ -79,10 +79,10 @@ def write_scene(scene: GaussianScene, path: Path | str, *, overwrite: bool = Fal
         **sidecars(scene, digest, fits),
         FACTS: codec.dump(scene_facts(scene), FACTS),
         ISP: codec.dump(scene.isp, ISP, indent=2),
-        SKY: _npy(scene.sky),
-        KNOT_TIMES: _npy(scene.dynamic.knot_t_us),
-        KNOTS: _npy(scene.dynamic.knot_m),
-        OWNERS: _npy(scene.dynamic.track),
+        SKY: npy_bytes(scene.sky),
+        KNOT_TIMES: npy_bytes(scene.dynamic.knot_t_us),
+        KNOTS: npy_bytes(scene.dynamic.knot_m),
+        OWNERS: npy_bytes(scene.dynamic.track),
     }
     members[MANIFEST] = codec.dump(_manifest(scene, digest, members), MANIFEST, indent=2)
     write_package(path, members)
@@ -112,10 +112,10 @@ def read_scene(path: Path | str) -> GaussianScene:
             harmonics = np.zeros((0, counts["dynamic_sh_rest"], 3), np.float32) if counts["dynamic_sh_rest"] else None
             drop = np.zeros(0, np.float32) if counts.get("dynamic_ray_drop") else None
             moving = dataclasses.replace(moving, sh_rest=harmonics, ray_drop=drop)
-        dynamic = DynamicGaussians(moving, *(_read_npy(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS)))
+        dynamic = DynamicGaussians(moving, *(_array(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS)))
         isp_json = codec.load(package.read(ISP, MAX_JSON_BYTES), f"{path}: {ISP}")
         isp = codec.from_json(codec.mapping(codec.array(np.float64, 3, 4)), isp_json, f"{path}: {ISP}")
-        scene = GaussianScene(static=static, dynamic=dynamic, sky=_read_npy(package, SKY), isp=isp, **facts)
+        scene = GaussianScene(static=static, dynamic=dynamic, sky=_array(package, SKY), isp=isp, **facts)
     try:
         check_scene(scene)
     except ArchiveError as error:
@@ -210,26 +210,5 @@ def _read_fields(layer, paths: list[str], count: int, what: str) -> Gaussians:
         raise ArchiveError(f"{what}: the USD layer is damaged") from error
 
 
-def _npy(array: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
-    return buffer.getvalue()
-
-
-def _read_npy(package: Package, name: str) -> np.ndarray:
-    """An array of plain numbers; its size is checked against the member before memory is taken."""
-    where = f"{package.path}: {name}"
-    data = package.read(name)
-    buffer = io.BytesIO(data)
-    try:
-        if np.lib.format.read_magic(buffer) != (1, 0):
-            raise ValueError("npy version 1.0 is needed")
-        shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(buffer)
-    except ValueError as error:
-        raise ArchiveError(f"{where} is no array file: {error}") from error
-    if dtype.hasobject or dtype.kind not in "iuf" or fortran_order:
-        raise ArchiveError(f"{where} must hold plain numbers in C order, got {dtype}")
-    body = data[buffer.tell() :]
-    if int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize != len(body):
-        raise ArchiveError(f"{where} promises {dtype} {shape} but holds {len(body):,} bytes")
-    return np.frombuffer(body, dtype).reshape(shape).copy()
+def _array(package: Package, name: str) -> np.ndarray:
+    return array_from_npy(package.read(name), f"{package.path}: {name}")

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.harmonics import SH_C0
 from nurec_sim.types import Gaussians, GaussianScene, Label
 
-SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 NAMESPACE = "nurec_sim"
 STATIC_LAYER, ACTORS_LAYER, CAMERAS_LAYER = "splats_static.usdc", "splats_actors.usdc", "cameras.usdc"
 SKY_TEXTURE = "sky/envmap_latlong.exr"

@@ -11,7 +11,6 @@ import hashlib
 import mmap
 import os
 import struct
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -19,6 +18,7 @@ from pathlib import Path, PurePosixPath
 from types import TracebackType
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.new_file import new_file
 
 ALIGNMENT = 64
 MAX_PACKAGE_BYTES = 2**32 - 1
@@ -39,21 +39,11 @@ def write_package(path: Path, members: Mapping[str, bytes]) -> None:
     total = sum(len(data) + 2 * len(name) + 256 for name, data in members.items())
     if total > MAX_PACKAGE_BYTES:
         raise ArchiveError(f"the archive would take {total:,} bytes; USDZ packages end at {MAX_PACKAGE_BYTES:,}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            central = b"".join(_write_member(file, name, data) for name, data in members.items())
-            start = file.tell()
-            file.write(central)
-            file.write(_END.pack(0x06054B50, 0, 0, len(members), len(members), len(central), start, 0))
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    with new_file(path) as file:
+        central = b"".join(_write_member(file, name, data) for name, data in members.items())
+        start = file.tell()
+        file.write(central)
+        file.write(_END.pack(0x06054B50, 0, 0, len(members), len(members), len(central), start, 0))
 
 
 def _write_member(file, name: str, data: bytes) -> bytes:

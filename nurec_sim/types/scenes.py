@@ -113,6 +113,19 @@ class DynamicGaussians:
     def __len__(self) -> int:
         return len(self.gaussians)
 
+    def at(self, t_us: int) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 3"], Float64[np.ndarray, " k"]]:
+        """Which Gaussians live at ``t_us``, where they are (metres, world, as recorded), and their fade in 0..1."""
+        rows = np.flatnonzero((self.knot_t_us[:, 0] <= t_us) & (t_us <= self.knot_t_us[:, 2]))
+        times, each = self.knot_t_us[rows], np.arange(len(rows))
+        after = t_us >= times[:, 1]
+        low = np.where(after, 1, 0)
+        start_us, end_us = times[each, low], times[each, low + 1]
+        fraction = (t_us - start_us) / np.maximum(end_us - start_us, 1)
+        fade = np.exp(-(np.where(after, fraction, 1 - fraction) ** 10))
+        before_m, after_m = (self.knot_m[rows, low + k].astype(np.float64) for k in (0, 1))
+        with np.errstate(invalid="ignore"):  # knots that are not finite stay so
+            return rows, before_m * (1 - fraction[:, None]) + after_m * fraction[:, None], fade
+
     @classmethod
     def empty(cls) -> DynamicGaussians:
         """No Gaussians."""

@@ -1,4 +1,4 @@
-"""Vector code for view-dependent colours: real spherical harmonics up to degree 3 (``layers.sh_basis``)."""
+"""Vector code for view-dependent colours: real spherical harmonics up to degree 3 (``scene.harmonics.sh_basis``)."""
 
 from __future__ import annotations
 

@@ -1,0 +1,96 @@
+"""Verbs that trade scenes with other programs: export, import."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from nurec_sim.cli.console import OnePath, app, err, out, print_table, progress
+from nurec_sim.cli.scenes import load_scene
+from nurec_sim.errors import NurecSimError
+
+
+@app.command
+def export(
+    scene: OnePath,
+    *,
+    out_path: Annotated[Path, tyro.conf.arg(name="out")],
+    at_us: int | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write a scene as a 3DGS PLY, for viewers and other simulators, with its sky beside it.
+
+    Three files: X.ply holds the Gaussians, X.sky.npz the sky cubemap and the cameras' colour corrections, X.sky.png the
+    sky as a picture. The layout is that of the public Instant NuRec release; most 3DGS viewers open the PLY as it is
+    (docs/exchange.md). A PLY holds one instant: without --at-us the moving Gaussians are left out.
+
+    Args:
+        scene: a scene archive or a clip.
+        out_path: the PLY to write.
+        at_us: also write the moving Gaussians, where and as opaque as they are at this time.
+        overwrite: replace files that are there.
+    """
+    from nurec_sim.scene import export_scene
+
+    world = load_scene(scene)
+    with progress("exporting") as advance:
+        exported = export_scene(world, out_path, at_us=at_us, overwrite=overwrite, progress=advance)
+    left_out = [("left out: not finite, or without extent", f"{exported.not_finite:,}")] if exported.not_finite else []
+    if exported.moving_left_out:
+        start_us, end_us = world.span_us
+        hint = f"{exported.moving_left_out:,} (--at-us {start_us} to {end_us - 1} has them as they are then)"
+        left_out.append(("left out: moving", hint))
+    sky = f"6 x {world.sky.shape[1]} x {world.sky.shape[2]}"
+    rows = [("Gaussians", f"{exported.written:,}"), *left_out, ("sky", sky),
+            ("colour correction", ", ".join(world.isp) or "none")]  # fmt: skip
+    print_table(f"scene {world.id}", rows)
+    for path in exported.paths:
+        out.print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+
+
+@app.command(name="import")
+def import_(
+    ply: OnePath,
+    *,
+    out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+    sky: Path | None = None,
+    like: Path | None = None,
+    up: Literal["z", "-z", "y", "-y", "x", "-x"] = "z",
+    overwrite: bool = False,
+) -> None:
+    """Make a scene archive (.usdz) from a 3DGS PLY: ours, the Instant NuRec release's, or any trained one.
+
+    A PLY knows colours and shapes, but no sensors, path, times, boxes or map. Those come from --like; without it the
+    car stands at the origin for one second with one camera that looks along x. What is not known is listed below the
+    table. Lengths are taken for metres.
+
+    Ours again: nurec-sim import demo.ply --like scenarios/demo_clip.zip
+
+    Trained on COLMAP poses: nurec-sim import garden.ply --up=-y
+
+    Args:
+        ply: the PLY file (docs/exchange.md lists the properties that it must have).
+        out_path: the archive to write; the PLY's name with .usdz in the current folder if not given.
+        sky: a .sky.npz file; X.sky.npz beside X.ply if not given and it is there.
+        like: a scene archive or a clip of the same place.
+        up: which axis of the file points up; -y for most trained files, y for those made for OpenGL.
+        overwrite: replace an archive that is there.
+    """
+    from nurec_sim import logs, scene
+
+    target = out_path or Path(f"{ply.stem}.usdz")
+    if target.exists() and not overwrite:
+        raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
+    with err.status(f"reading {ply.name}"):
+        known = None if like is None else scene.read_scene(like) if like.suffix == ".usdz" else logs.open_clip(like)
+        world = scene.import_scene(ply, sky=sky, like=known, up=up)
+    with err.status(f"writing {target.name}"):
+        scene.write_scene(world, target, overwrite=overwrite)
+    dropped = world.provenance["dropped"]
+    rows = [("dropped: not finite, or without extent", f"{dropped:,}")] if dropped else []
+    print_table(f"scene {world.id}", [*scene.summary(world), *rows])
+    for text in world.provenance["unknown"]:
+        out.print(f"not known: {text}", markup=False)
+    out.print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)

@@ -1,0 +1,103 @@
+"""Verbs about the weights of the network: weights list, fetch, check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from nurec_sim.cli.console import OnePath, app, err, out, print_faults, print_table
+
+weights = tyro.extras.SubcommandApp()
+app.command(
+    weights,
+    name="weights",
+    help="Weights of the network: list what there is, fetch released ones, check a file.",
+)
+
+Fetchable = Literal["pa-front", "pa-multiview", "pq-front", "da3-base"]
+Checkable = Literal["pa-front", "pa-multiview", "pq-front", "pa-full", "tiny", "tiny-selective"]
+
+
+@weights.command(name="list")
+def list_weights() -> None:
+    """Show every profile of the network, its size, and where its weights are.
+
+    `reconstruct` takes the first of: --checkpoint PATH, the file that $INSTANT_NUREC_FULL_PT names, weights that come
+    with this package, released weights that were fetched.
+    """
+    from nurec_sim.network import PROFILES, download
+    from nurec_sim.network.released import RELEASED
+
+    with err.status("counting parameters"):
+        from nurec_sim.network.weights_check import count_parameters
+
+        parameters = {name: f"{count_parameters(name) / 1e6:.1f} M" for name in PROFILES}
+    rows = []
+    for name in (*PROFILES, *(name for name in RELEASED if name not in PROFILES)):
+        released, shipped = RELEASED.get(name), download.shipped_weights(name)
+        if shipped is not None:
+            facts = (shipped.name, f"{shipped.stat().st_size:,}", "", "part of this package")
+        elif released is None:
+            facts = ("", "", "", "none published")
+        else:
+            digest = released.sha256[:12] if released.sha256 else "not published"
+            cached = download.cached_file(released)
+            is_whole = cached is not None and cached.stat().st_size == released.size_bytes
+            place = "missing" if cached is None else "fetched" if is_whole else "wrong size"
+            facts = (released.filename.rsplit("/")[-1], f"{released.size_bytes:,}", digest, place)
+        rows.append((name, parameters.get(name, ""), *facts))
+    print_table("weights", rows, ("profile", "parameters", "file", "bytes", "SHA-256", "here"))
+    repositories = ", ".join(dict.fromkeys(released.repository for released in RELEASED.values()))
+    out.print(f"`nurec-sim weights fetch PROFILE` gets missing files from {repositories} on Hugging Face;")
+    out.print("da3-base is what training starts from.")
+
+
+@weights.command
+def fetch(
+    profile: Annotated[Fetchable, tyro.conf.Positional],
+    *,
+    revision: str | None = None,
+    to: Path | None = None,
+) -> None:
+    """Download released weights from Hugging Face and check their size and digest.
+
+    Needs the extra: pip install 'nurec-sim[hub]'. Interrupted downloads go on where they stopped. The weights are their
+    owner's, under the licence that is printed. Exit status 1 if the file is not the released one.
+
+    Args:
+        profile: whose weights; da3-base is the file that training starts from.
+        revision: commit, tag or branch of the repository; its main branch if not given.
+        to: put the file into this folder instead of the cache of Hugging Face ($HF_HOME); use it with --checkpoint.
+    """
+    from nurec_sim.network import download
+    from nurec_sim.network.released import RELEASED
+
+    released = RELEASED[profile]
+    out.print(f"{released.repository}: {released.filename}, {released.size_bytes:,} bytes ({released.license})")
+    path = download.fetch(released, revision, to)
+    known_by = "size and SHA-256 are" if released.sha256 else "size is"
+    out.print(f"{known_by} right: {path}", soft_wrap=True, markup=False)
+    if profile != "da3-base" and (revision or to):
+        out.print(f"use it with --checkpoint {path}", soft_wrap=True, markup=False)
+
+
+@weights.command
+def check(path: OnePath, *, profile: Checkable | None = None) -> None:
+    """Say what a weights file is, which profile it fits, and what is wrong with it.
+
+    Reads .pth files of torch.save, training checkpoints (.ckpt) and .safetensors; nothing in them is run. Prints a
+    table, then every fault as one line. Exit status 1 if there are faults.
+
+    Args:
+        path: the file.
+        profile: what it should fit; whichever it does if not given.
+    """
+    with err.status(f"reading {path.name}"):
+        from nurec_sim.network.weights_check import check_weights
+
+        report = check_weights(path, profile)
+    print_table(path.name, report.facts)
+    print_faults(report.faults)
+    out.print("no faults")

@@ -1,0 +1,203 @@
+"""The context decoders and the two ways to make Gaussians of what they say: dense and selective (paper section 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+
+from nurec_sim.network.attention import KeyValueProjector, QueryBlock
+from nurec_sim.network.dpt import DptHead
+from nurec_sim.network.encoder import Features
+from nurec_sim.network.motion import MotionDecoder
+from nurec_sim.network.profiles import Profile
+from nurec_sim.network.tensors import SCENE_RESCALE, ContextMaps, NetworkInputs, QueryGaussians, SemanticClass
+
+LARGEST_SCALE = 0.045
+"""In the network's unit; 0.30 m."""
+SCALE_SHIFT = 2.9
+OPACITY_SHIFT = 2.0
+GAUSSIAN_CHANNELS = 8
+"""Scale 3, quaternion 4, opacity 1."""
+
+
+class ContextDecoder(nn.Module):
+    """Depth, colour, normals, classes and motion of every input pixel; what both decoders begin with."""
+
+    cuboids_dims_padding: Tensor
+
+    def __init__(self, profile: Profile) -> None:
+        super().__init__()
+        width = 2 * profile.encoder.width
+        # Margin around cuboids, metres; kept in the released state dicts, read by nothing here.
+        self.register_buffer("cuboids_dims_padding", torch.ones(3))
+        self.depth_head = DptHead(width, profile.head, out=2)
+        half = profile.head.fused // 2
+        self.rgb_fusion = nn.Sequential(
+            nn.Conv2d(3, half // 4, 3, 1, 1), nn.GELU(),
+            nn.Conv2d(half // 4, half // 2, 3, 1, 1), nn.GELU(),
+            nn.Conv2d(half // 2, half, 3, 1, 1), nn.GELU(),
+        )  # fmt: skip
+        self.context_head = DptHead(width, profile.head, out=3 + 3 + len(SemanticClass))
+        self.context_motion_head = MotionDecoder(profile)
+
+    def context(self, features: Sequence[Features], inputs: NetworkInputs, motion: bool) -> ContextMaps:
+        """Maps of all images."""
+        clips, size = inputs.rgb.shape[:2], (inputs.rgb.shape[2], inputs.rgb.shape[3])
+        levels = [feature.patches.flatten(0, 1) for feature in features]
+        images = inputs.rgb.flatten(0, 1).permute(0, 3, 1, 2)
+        depth = self.depth_head(levels, size)[:, 0].float()
+        context = self.context_head(levels, size, self.rgb_fusion, images).float().permute(0, 2, 3, 1)
+        rgb, normal, logits = context.split([3, 3, len(SemanticClass)], dim=-1)
+        moved = None
+        if motion:
+            moved = self.context_motion_head(features, size, inputs.time, inputs.time_before, inputs.time_after)
+        return ContextMaps(
+            depth_m=(depth.exp() / SCENE_RESCALE).unflatten(0, clips),
+            rgb=torch.sigmoid(2 * rgb).unflatten(0, clips),
+            normal=functional.normalize(normal, dim=-1).unflatten(0, clips),
+            logits=logits.unflatten(0, clips),
+            motion_m=moved,
+        )
+
+
+class DenseDecoder(ContextDecoder):
+    """One Gaussian for every input pixel."""
+
+    def __init__(self, profile: Profile) -> None:
+        super().__init__(profile)
+        self.gaussians_head = DptHead(2 * profile.encoder.width, profile.head, out=GAUSSIAN_CHANNELS)
+
+    def gaussians(self, features: Sequence[Features], context: ContextMaps, inputs: NetworkInputs) -> QueryGaussians:
+        """Gaussians of all pixels, in the order of (v, h, w)."""
+        b, v, h, w = context.depth_m.shape
+        raw = self.gaussians_head([feature.patches.flatten(0, 1) for feature in features], (h, w))
+        raw = raw.float().permute(0, 2, 3, 1).reshape(b, v * h * w, GAUSSIAN_CHANNELS)
+        source = torch.arange(v * h * w, device=raw.device).expand(b, -1)
+        visible = (outside_probability(context.logits) > 0.5).reshape(b, -1).to(raw.dtype)
+        return gaussians_at(source, raw, visible, lifted_points(context, inputs), context)
+
+
+class SelectiveDecoder(ContextDecoder):
+    """Clusters of Gaussians around chosen points that look at the features (point queries).
+
+    Attributes:
+        fill_road_slots: the release's rule instead of ours. It always has ``road_slots`` road tokens per image; those
+            left over hold cells that are not road, are shown to all other tokens, and get opacity 0.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        super().__init__(profile)
+        self.size = profile.selective
+        self.fill_road_slots = False
+        width, points = 2 * profile.encoder.width, self.size.cell**2
+        self.xyz_embed = nn.Sequential(nn.Linear(3 * points, width), nn.LayerNorm(width))
+        self.ca_feature_norm = nn.LayerNorm(width)
+        self.ca_kv_projector = KeyValueProjector(width, self.size.heads, normed=True)
+        self.ca_blocks = nn.ModuleList(QueryBlock(width, self.size.heads, scale=1e-4) for _ in range(self.size.depth))
+        self.ca_kv_proj = nn.Linear(len(profile.encoder.taps) * width, width, bias=False)
+        self.gs_linear = nn.Linear(width, points * GAUSSIAN_CHANNELS)
+
+    def gaussians(self, features: Sequence[Features], context: ContextMaps, inputs: NetworkInputs) -> QueryGaussians:
+        """Clusters of strided points of all images, then full clusters on the road of all images.
+
+        Raises:
+            ValueError: more than one clip, whose numbers of clusters would differ.
+        """
+        if len(context.depth_m) != 1:
+            raise ValueError(f"the selective decoder takes one clip at a time, got {len(context.depth_m)}")
+        road, filled = self.road_cells(context.logits[0])
+        source = torch.cat([self.regular_cells(context.depth_m[0]), road]).flatten()[None]
+        points = lifted_points(context, inputs)
+        raw = self.decode(points.gather(1, source[..., None].expand(-1, -1, 3)), features)
+        visible = outside_probability(context.logits).reshape(1, -1).gather(1, source)
+        visible[:, source.shape[1] - road.numel() :] *= filled.repeat_interleave(self.size.cell**2)
+        return gaussians_at(source, raw, visible, points, context)
+
+    def decode(self, points: Float[Tensor, "b n 3"], features: Sequence[Features]) -> Float[Tensor, "b n 8"]:
+        """Raw attributes of the Gaussians at points, whole clusters of ``cell``**2 after each other."""
+        stacked = torch.cat([feature.patches.flatten(1, 3) for feature in features], dim=-1)
+        k, v = self.ca_kv_projector(self.ca_feature_norm(self.ca_kv_proj(stacked)))
+        x = self.xyz_embed(points.reshape(len(points), -1, 3 * self.size.cell**2))
+        for block in self.ca_blocks:
+            x = block(x, k, v)
+        return self.gs_linear(x).float().reshape(*points.shape[:2], GAUSSIAN_CHANNELS)
+
+    def regular_cells(self, like: Float[Tensor, "v h w"]) -> Int64[Tensor, "tokens points"]:
+        """Pixels of the strided clusters; what is left over at the right and the bottom is not used."""
+        index = torch.arange(like.numel(), device=like.device).reshape(like.shape)
+        return _cells(index[:, :: self.size.stride, :: self.size.stride], self.size.cell).flatten(0, 1)
+
+    def road_cells(
+        self, logits: Float[Tensor, "v h w 5"]
+    ) -> tuple[Int64[Tensor, "tokens points"], Bool[Tensor, " tokens"]]:
+        """Pixels of the clusters on the road, and which of them are: all, but for ``fill_road_slots``.
+
+        A cell qualifies if every pixel of it is road. Where more do than there are slots, they are taken evenly.
+        """
+        index = torch.arange(logits[..., 0].numel(), device=logits.device).reshape(logits.shape[:-1])
+        cells = _cells(index, self.size.cell)
+        road = _cells(logits.argmax(-1) == SemanticClass.ROAD, self.size.cell).all(-1)
+        slots = min(self.size.road_slots, cells.shape[1])
+        chosen, filled = [], []
+        for image_cells, is_road in zip(cells, road, strict=True):
+            ranked = torch.argsort(~is_road, stable=True)
+            count = int(is_road.sum())
+            if count > slots:
+                ranked = ranked[torch.arange(slots, device=ranked.device) * count // slots]
+            taken = ranked[:slots] if self.fill_road_slots else ranked[: min(count, slots)]
+            chosen.append(image_cells[taken])
+            filled.append(is_road[taken])
+        return torch.cat(chosen), torch.cat(filled)
+
+
+def _cells(maps: Tensor, cell: int) -> Tensor:
+    """Maps [v, h, w] as [v, cells, cell * cell], both in rows; incomplete cells are left out."""
+    v, h, w = maps.shape
+    rows, columns = h // cell, w // cell
+    whole = maps[:, : rows * cell, : columns * cell].reshape(v, rows, cell, columns, cell)
+    return whole.permute(0, 1, 3, 2, 4).reshape(v, rows * columns, cell * cell)
+
+
+def lifted_points(context: ContextMaps, inputs: NetworkInputs) -> Float[Tensor, "b n 3"]:
+    """Where each pixel's ray reaches its depth, scene frame, metres."""
+    distance = context.depth_m[..., None] / inputs.distance_to_depth_scale
+    return (inputs.rays[..., :3] + inputs.rays[..., 3:] * distance).flatten(1, 3)
+
+
+def outside_probability(logits: Float[Tensor, "*n 5"]) -> Float[Tensor, "*n"]:
+    """How probably a pixel shows something that Gaussians should show: neither the own car nor the sky."""
+    probability = logits.softmax(-1)
+    return 1 - probability[..., SemanticClass.EGO] - probability[..., SemanticClass.SKY]
+
+
+def gaussians_at(
+    source: Int64[Tensor, "b n"],
+    raw: Float[Tensor, "b n 8"],
+    visible: Float[Tensor, "b n"],
+    points: Float[Tensor, "b pixels 3"],
+    context: ContextMaps,
+) -> QueryGaussians:
+    """Activated Gaussians at source pixels, with the pixels' colour, normal, class and motion."""
+    scale, quaternion, opacity = raw.split([3, 4, 1], dim=-1)
+    scale = (scale + (torch.tensor(LARGEST_SCALE).log() - SCALE_SHIFT)).exp().clamp(max=LARGEST_SCALE)
+
+    def at_source(values: Tensor) -> Tensor:
+        flat = values.reshape(source.shape[0], -1, *values.shape[4:])
+        index = source.reshape(*source.shape, *[1] * (flat.ndim - 2)).expand(-1, -1, *flat.shape[2:])
+        return flat.gather(1, index)
+
+    return QueryGaussians(
+        position_m=points.gather(1, source[..., None].expand(-1, -1, 3)),
+        quat_wxyz=functional.normalize(quaternion, dim=-1),
+        scale_m=scale / SCENE_RESCALE,
+        opacity=torch.sigmoid(opacity[..., 0] - OPACITY_SHIFT) * visible,
+        rgb=at_source(context.rgb),
+        normal=at_source(context.normal),
+        semantic=at_source(context.logits.argmax(-1)),
+        source=source,
+        motion_m=None if context.motion_m is None else at_source(context.motion_m),
+    )

@@ -1,0 +1,110 @@
+"""The whole network: a clip of images in, a layered Gaussian world out, in one forward pass."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
+from nurec_sim.network.encoder import Encoder
+from nurec_sim.network.isp import IspDecoder
+from nurec_sim.network.learned_sky import SkyDecoder
+from nurec_sim.network.observed_sky import observed_sky
+from nurec_sim.network.profiles import PATCH_PX, Profile
+from nurec_sim.network.tensors import NetworkInputs, NetworkOutputs
+
+Precision = Literal["float32", "bfloat16", "float16"]
+
+
+class InstantNuRec(nn.Module):
+    """The Instant NuRec network (paper section 3, its Figure 2).
+
+    Attributes:
+        profile: the sizes that it was built with.
+        precision: of matrix products and convolutions; parameters, norms and results stay float32.
+    """
+
+    cuboids_dims_padding: Tensor
+
+    def __init__(self, profile: Profile) -> None:
+        super().__init__()
+        self.profile = profile
+        self.precision: Precision = "float32"
+        if profile.legacy_buffer:
+            self.register_buffer("cuboids_dims_padding", torch.ones(3))
+        self.encoder = Encoder(profile.encoder)
+        self.decoder = DenseDecoder(profile) if profile.decoder == "dense" else SelectiveDecoder(profile)
+        self.sky = SkyDecoder(profile, profile.sky) if profile.sky else None
+        self.post_processing = IspDecoder(2 * profile.encoder.width, profile.isp_heads)
+
+    def forward(self, inputs: NetworkInputs, motion: bool = True) -> NetworkOutputs:
+        """One pass over a batch of clips.
+
+        Args:
+            inputs: images, poses, rays and times; h and w are multiples of 14.
+            motion: whether to run the motion decoder.
+
+        Raises:
+            ValueError: sizes that are no multiples of 14 or too small, images not sorted by camera, or more than one
+                clip for a selective decoder.
+        """
+        self._check(inputs)
+        with self._half_precision(inputs.rgb.device):
+            # Images and cameras become features that all decoders share.
+            features = self.encoder(inputs.rgb, inputs.c2w, inputs.fov)
+            deepest = features[-1].patches
+            # What every pixel shows: depth, colour, normal, class, and where its point moves.
+            context = self.decoder.context(features, inputs, motion)
+            # Pixels lifted to points, points grown to Gaussians.
+            gaussians = self.decoder.gaussians(features, context, inputs)
+            # What lies behind everything.
+            directions = inputs.rays[..., 3:]
+            if self.sky is None:
+                sky, seen = observed_sky(context.rgb, context.logits, inputs.rays, self.profile.observed_sky_px)
+            else:
+                sky = self.sky(deepest, inputs.rgb, directions)
+                seen = torch.ones_like(sky[..., :1])
+            # How each camera shows these colours.
+            isp = self.post_processing(deepest, inputs.camera_idxs)
+        return NetworkOutputs(context, gaussians, sky, seen, self.sky is not None, isp)
+
+    def _half_precision(self, device: torch.device) -> contextlib.AbstractContextManager:
+        if self.precision == "float32":
+            return contextlib.nullcontext()
+        return torch.autocast(device.type, getattr(torch, self.precision))
+
+    def _check(self, inputs: NetworkInputs) -> None:
+        height, width = inputs.rgb.shape[2:4]
+        least = PATCH_PX
+        if self.profile.decoder == "selective":
+            least = self.profile.selective.stride * self.profile.selective.cell
+        if height % PATCH_PX or width % PATCH_PX or min(height, width) < least:
+            raise ValueError(
+                f"images must be multiples of {PATCH_PX} px wide and high and at least {least} px, "
+                f"got {width} x {height}"
+            )
+
+
+def initialize(model: nn.Module, seed: int) -> None:
+    """Random parameters as training starts from them: small normal weights, zero biases, tokens and positions small."""
+    generator = torch.Generator().manual_seed(seed)
+    for name, module in model.named_modules():
+        if isinstance(module, (nn.Linear, nn.Conv2d, nn.ConvTranspose2d)):
+            fan_in = module.weight[0].numel()
+            if isinstance(module, nn.ConvTranspose2d):
+                fan_in = module.weight.shape[0]
+            nn.init.trunc_normal_(module.weight, std=min(0.02, fan_in**-0.5) if "blocks" in name else fan_in**-0.5,
+                                  generator=generator)  # fmt: skip
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    for name, parameter in model.named_parameters():
+        if name.rsplit(".", 1)[-1] in ("cls_tokens", "cls_pos_embed", "img_pos_embed", "affine_token", "token"):
+            nn.init.trunc_normal_(parameter, std=0.02, generator=generator)
+    with torch.no_grad():
+        # Camera responses begin as the identity.
+        for module in model.modules():
+            if isinstance(module, IspDecoder):
+                module.affine_linear.weight.zero_()

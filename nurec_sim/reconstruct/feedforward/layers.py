@@ -1,0 +1,243 @@
+"""What the network says of a chunk, as layers of the world: pruned, moved out of the scene frame, split by motion.
+
+Movable points are dynamic (paper section 3.3). Their middle knot is where and when their own pixel saw them, the outer
+ones the camera's frames before and after, where the motion head puts them, or the track that they belong to. So at the
+instant of one frame the points of three are there: its own in full, and those of its neighbours as they fade out
+(exp(-1) at their outer knots); displacements that the head got wrong show as doubled edges.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from torch import Tensor
+
+from nurec_sim import geometry, sensors
+from nurec_sim.network.tensors import NetworkOutputs, QueryGaussians, SemanticClass
+from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ChunkLayers, ContextImage
+from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
+from nurec_sim.reconstruct.feedforward.sky import observed_world_sky, world_sky
+from nurec_sim.reconstruct.feedforward.tracks import knots_along, owners_of_points, owners_of_rays, scene_actors
+from nurec_sim.reconstruct.lift.actors import join
+from nurec_sim.reconstruct.lift.points import Actor
+from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Label
+
+MIN_DYNAMIC_OPACITY = 0.75
+"""Dynamic Gaussians are at least this opaque, as in the released model."""
+_LABELS = {
+    SemanticClass.OTHERS: Label.OTHER,
+    SemanticClass.EGO: Label.EGO,
+    SemanticClass.SKY: Label.SKY,
+    SemanticClass.ROAD: Label.ROAD,
+    SemanticClass.MOVABLE: Label.MOVABLE,
+}
+LABEL_OF_CLASS = np.array([_LABELS[each] for each in SemanticClass], np.uint8)
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Gaussians of a chunk in the world; ``query`` is their place in the ``QueryGaussians``, ``source`` as there."""
+
+    gaussians: Gaussians
+    position_m: Float64[np.ndarray, "n 3"]
+    query: Int64[np.ndarray, " n"]
+    source: Int64[np.ndarray, " n"]
+
+    def __getitem__(self, index: np.ndarray) -> _Points:
+        return _Points(self.gaussians[index], self.position_m[index], self.query[index], self.source[index])
+
+
+def chunk_layers(clip: Clip, chunk: ChunkInputs, outputs: NetworkOutputs, settings: FeedForwardSettings) -> ChunkLayers:
+    """A chunk's contribution to the scene, in the world frame.
+
+    Dropped is what is not more opaque than ``settings.min_opacity`` (sky and ego car are not, by the network's mask),
+    not finite, or on pixels where the log's own mask shows the ego car. Dynamic is every movable point, with or without
+    tracks, and every other point off the road that lies in a track's box. Without a motion head a movable point that no
+    track explains stands still between its knots.
+
+    Args:
+        clip: the driving log; its movable tracks, of any source, carry the points in their boxes.
+        chunk: what went into the network.
+        outputs: what came out (b = 1), on any device.
+        settings: ``min_opacity``, ``learned_sky`` and ``sky_px`` are used.
+
+    Returns:
+        The layers; ``dynamic.track`` indexes ``clip.tracks``, -1 where the motion head moves a point.
+    """
+    points = _points_in_world(chunk, outputs.gaussians, settings.min_opacity)
+    dynamic, moving = _dynamic(clip, chunk, points, outputs.gaussians)
+    sky, seen = _sky(chunk, outputs, settings)
+    isp = _numpy(outputs.isp[0].double())
+    return ChunkLayers(
+        images=chunk.images,
+        static=points.gaussians[~moving],
+        dynamic=dynamic,
+        sky=sky,
+        sky_seen=seen,
+        isp={name: isp[number] for number, name in enumerate(chunk.camera_ids)},
+    )
+
+
+def _sky(
+    chunk: ChunkInputs, outputs: NetworkOutputs, settings: FeedForwardSettings
+) -> tuple[Float32[np.ndarray, "6 s s 3"], Float32[np.ndarray, "6 s s"]]:
+    """The learned sky, which knows every direction, turned to the world; or what the images show of it."""
+    if settings.learned_sky and bool((outputs.sky_seen == 1).all()):
+        sky, seen = (_float32(values[0]) for values in (outputs.sky, outputs.sky_seen))
+        return world_sky(sky, seen[..., 0], chunk.world_from_scene, settings.sky_px)
+    rays = chunk.tensors.rays.to(outputs.context.rgb.device)
+    return observed_world_sky(outputs.context, rays, chunk.world_from_scene, settings.sky_px, chunk.ego)
+
+
+# ------------------------------------------------------------------------------------------------- scene to world
+
+
+def _points_in_world(chunk: ChunkInputs, query: QueryGaussians, min_opacity: float) -> _Points:
+    """The Gaussians worth keeping; the work is done where the tensors are, so that only these leave a GPU."""
+    ego = torch.from_numpy(np.ascontiguousarray(chunk.ego).reshape(-1)).to(query.source.device)
+    rows = ((query.opacity[0] > min_opacity) & ~ego[query.source[0]]).nonzero()[:, 0]
+    rows = rows[_sound(query, rows)]
+    turn, shift = chunk.world_from_scene[:3, :3], chunk.world_from_scene[:3, 3]
+    # Row k of the products is turn * e_k, so its transpose multiplies by the turn from the left.
+    turn_quat = geometry.quat_multiply(np.tile(geometry.quat_from_matrix(turn), (4, 1)), np.eye(4)).T
+    quat = _multiplied(turn_quat, query.quat_wxyz[0, rows])
+    quat = quat / torch.linalg.vector_norm(quat, dim=-1, keepdim=True)
+    position = _multiplied(turn, query.position_m[0, rows], shift)
+    semantic = _numpy(query.semantic[0, rows])
+    gaussians = Gaussians(
+        mean_m=_float32(position),
+        quat_wxyz=_float32(torch.where(quat[:, :1] < 0, -quat, quat)),
+        scale_m=_float32(query.scale_m[0, rows]),
+        opacity=_float32(query.opacity[0, rows]),
+        rgb=_float32(query.rgb[0, rows]),
+        normal=_float32(_multiplied(turn, query.normal[0, rows])),
+        label=LABEL_OF_CLASS[semantic],
+        intensity=np.full(len(semantic), np.nan, np.float32),
+    )
+    return _Points(gaussians, _numpy(position), _numpy(rows), _numpy(query.source[0, rows]))
+
+
+def _sound(query: QueryGaussians, rows: Int64[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Which rows are finite and have a rotation."""
+    sound = torch.isfinite(query.opacity[0, rows]) & (query.quat_wxyz[0, rows] != 0).any(dim=-1)
+    for values in (query.position_m, query.quat_wxyz, query.scale_m, query.rgb, query.normal):
+        sound &= torch.isfinite(values[0, rows]).all(dim=-1)
+    return sound
+
+
+def _multiplied(
+    matrix: Float64[np.ndarray, "k k"], vectors: Float[Tensor, "n k"], shift: Float64[np.ndarray, " k"] | None = None
+) -> Float64[Tensor, "n k"]:
+    """``matrix @ vector + shift``, written out: library products may round differently at other thread counts."""
+    columns = [column.double() for column in vectors.unbind(dim=-1)]
+    rows = []
+    for number, factors in enumerate(matrix.tolist()):
+        total = factors[0] * columns[0]
+        for factor, column in zip(factors[1:], columns[1:], strict=True):
+            total += factor * column
+        rows.append(total if shift is None else total + float(shift[number]))
+    return torch.stack(rows, dim=-1)
+
+
+def _numpy(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().numpy()
+
+
+def _float32(values: Tensor) -> np.ndarray:
+    return _numpy(values.float())
+
+
+# ---------------------------------------------------------------------------------------------- static and dynamic
+
+
+def _dynamic(
+    clip: Clip, chunk: ChunkInputs, points: _Points, query: QueryGaussians
+) -> tuple[DynamicGaussians, Bool[np.ndarray, " n"]]:
+    """The dynamic layer, and which points went into it."""
+    actors = scene_actors(clip)
+    label = points.gaussians.label
+    candidates = np.flatnonzero(label != Label.ROAD if actors else label == Label.MOVABLE)
+    pixels = chunk.ego[0].size
+    image_of = points.source[candidates] // pixels
+    order = np.argsort(image_of, kind="stable")
+    starts = np.searchsorted(image_of[order], np.arange(len(chunk.images) + 1))
+    moving, parts = np.zeros(len(label), bool), []
+    for number, image in enumerate(chunk.images):
+        rows = candidates[order[starts[number] : starts[number + 1]]]
+        t_us = pixel_times_us(image, points.source[rows] % pixels)
+        owner = _owners(actors, chunk, number, points[rows], t_us)
+        dynamic = (label[rows] == Label.MOVABLE) | (owner >= 0)
+        rows, t_us, owner = rows[dynamic], t_us[dynamic], owner[dynamic]
+        moving[rows] = True
+        motion = _motion(chunk, query, points.query[rows])
+        parts.append(_moving_points(actors, image, points[rows], t_us, owner, motion, clip.span_us))
+    return join(parts), moving
+
+
+def pixel_times_us(image: ContextImage, pixel: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+    """When pixels, given by their flat index, were exposed."""
+    row, column = np.divmod(pixel, image.camera.width_px)
+    fraction = sensors.shutter_fraction(image.camera, np.stack([column, row], axis=-1) + 0.5)
+    start_us, end_us = image.t_us
+    return start_us + np.rint(fraction * (end_us - start_us)).astype(np.int64)
+
+
+def _owners(actors: Sequence[Actor], chunk: ChunkInputs, number: int, points: _Points, t_us: np.ndarray) -> np.ndarray:
+    """Place in ``actors`` of the one that each point of image ``number`` belongs to: by its box, else by its ray."""
+    movable = points.gaussians.label == Label.MOVABLE
+    owner = owners_of_points(actors, points.position_m, t_us, movable)
+    lost = np.flatnonzero(movable & (owner < 0))
+    if actors and len(lost):
+        rays = _rays(chunk, number, points.source[lost] % chunk.ego[0].size)
+        origin = geometry.transform_points(chunk.world_from_scene, rays[:, :3])
+        direction = rays[:, 3:] @ chunk.world_from_scene[:3, :3].T
+        owner[lost] = owners_of_rays(actors, origin, direction, t_us[lost])
+    return owner
+
+
+def _motion(chunk: ChunkInputs, query: QueryGaussians, rows: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 2 3"]:
+    """Displacements to the outer knots in world axes; none without a motion head."""
+    if query.motion_m is None:
+        return np.zeros((len(rows), 2, 3))
+    motion = _numpy(query.motion_m[0, torch.from_numpy(rows).to(query.motion_m.device)])
+    return np.einsum("ij,nkj->nki", chunk.world_from_scene[:3, :3], motion)
+
+
+def _rays(chunk: ChunkInputs, number: int, pixel: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
+    """Origins and directions of some pixels of an image, in the scene frame."""
+    rays = chunk.tensors.rays[0, number].reshape(-1, 6)
+    return _numpy(rays[torch.from_numpy(pixel).to(rays.device)].double())
+
+
+def _moving_points(
+    actors: Sequence[Actor],
+    image: ContextImage,
+    points: _Points,
+    t_us: np.ndarray,
+    owner: np.ndarray,
+    motion_m: Float64[np.ndarray, "n 2 3"],
+    span_us: tuple[int, int],
+) -> DynamicGaussians:
+    """Dynamic points of one image with their knots."""
+    before, after = image.target_t_us
+    times = np.stack([np.minimum(before, t_us - 1), t_us, np.maximum(after, t_us + 1)], axis=1)
+    knots = np.repeat(points.position_m[:, None], 3, axis=1)
+    knots[:, [0, 2]] += motion_m
+    track = np.full(len(owner), -1, np.int32)
+    for number in np.unique(owner[owner >= 0]):
+        mine = np.flatnonzero(owner == number)
+        actor = actors[number]
+        track[mine] = actor.index
+        times[mine], knots[mine] = knots_along(actor, points.position_m[mine], t_us[mine], image.target_t_us, span_us)
+    gaussians = dataclasses.replace(
+        points.gaussians,
+        opacity=np.maximum(points.gaussians.opacity, np.float32(MIN_DYNAMIC_OPACITY)),
+        label=np.full(len(owner), Label.MOVABLE, np.uint8),
+    )
+    sound = np.isfinite(knots).all(axis=(1, 2))
+    return DynamicGaussians(gaussians[sound], times[sound], knots[sound].astype(np.float32), track[sound])

@@ -1,0 +1,52 @@
+"""Settings of the feed-forward reconstruction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class FeedForwardSettings:
+    """How a clip goes through the network.
+
+    Attributes:
+        profile: size of the network, one that ``nurec-sim weights list`` shows; None takes the method's small one.
+        checkpoint: file with weights; None takes the profile's own (docs/network.md).
+        random_weights: seed of random weights instead of any file, for tests and timings; None reads weights.
+        device: ``auto`` takes a GPU if there is one.
+        precision: of matrix products and convolutions; ``auto`` is float32 on a CPU and half precision on a GPU.
+        chunking: ``overlapping`` chunks as in the paper, or the release's ``non-overlapping`` sampling.
+        overlap: share of a chunk that the next one repeats, 0 up to 0.5 (only ``overlapping``).
+        frames: most frames per camera and chunk; None takes the profile's.
+        max_chunks: refuse longer clips instead of running for hours.
+        min_opacity: Gaussians below are dropped (paper section 3.4).
+        merge: ``ownership`` keeps each static Gaussian only where its chunk saw it from nearest; ``concatenate`` keeps
+            all of them.
+        ownership_tolerance_m: how much farther than the nearest chunk an owner may be.
+        max_gaussians: static Gaussians are merged into voxels until at most so many are left; None keeps all.
+        lidar_depth: how predicted depth is fitted to the log's sweeps, per frame: not at all (``off``), by a factor
+            (``scale``), or by a factor and a slope over inverse depth (``affine``).
+        ego_masks: folder with ``<camera>.png``: pixels of the car's own body, not black where it covers the view.
+        sky_px: edge of the scene's sky cubemap.
+        learned_sky: whether to use the learned sky decoder where the profile has one.
+    """
+
+    profile: str | None = None
+    checkpoint: Path | None = None
+    random_weights: int | None = None
+    device: str = "auto"
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
+    chunking: Literal["overlapping", "non-overlapping"] = "overlapping"
+    overlap: float = 0.25
+    frames: int | None = None
+    max_chunks: int = 16
+    min_opacity: float = 0.01
+    merge: Literal["ownership", "concatenate"] = "ownership"
+    ownership_tolerance_m: float = 5.0
+    max_gaussians: int | None = 2_000_000
+    lidar_depth: Literal["off", "scale", "affine"] = "off"
+    ego_masks: Path | None = None
+    sky_px: int = 256
+    learned_sky: bool = True

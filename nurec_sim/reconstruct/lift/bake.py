@@ -1,0 +1,162 @@
+"""Gaussians of one body: its pixels lifted and owned, and the surfels that no view saw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from nurec_sim import geometry
+from nurec_sim.reconstruct.lift import colour, lifting, surfaces
+from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.ground import Ground
+from nurec_sim.reconstruct.lift.lifting import Lifted
+from nurec_sim.reconstruct.lift.pictures import DepthPicture
+from nurec_sim.reconstruct.lift.settings import THREADS, LiftSettings
+from nurec_sim.reconstruct.lift.views import View
+from nurec_sim.types import Gaussians, Label
+
+KEPT_SHARE = 0.4
+"""Share of the pixels of all views that owns a surface, about; to meet the budget before ownership is known."""
+
+
+def camera_isp(
+    views: Sequence[View], pictures: Sequence[DepthPicture], bodies: Sequence[Surfels], cameras: Sequence[str]
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Affine response of each camera, from the static surfels that several cameras see."""
+    cameras = [camera for camera in cameras if any(view.camera_id == camera for view in views)]
+    world = bodies[0]
+    some = slice(None, None, max(1, len(world.cloud) // 100_000))
+    colours = {}
+    for camera in cameras:
+        mine = [k for k, view in enumerate(views) if view.camera_id == camera]
+        rgb, pixel, _ = _look_up(world.cloud.xyz_m[some], world.normal[some], [views[k] for k in mine],
+                              [pictures[k] for k in mine], [views[k].rgb for k in mine], None)  # fmt: skip
+        colours[camera] = rgb / 255, np.isfinite(pixel)
+    return colour.solve_isp(cameras, colours)
+
+
+def _look_up(xyz, normal, views, pictures, rgb, body: Surfels | None) -> tuple[np.ndarray, ...]:
+    """Colours of points of a body (None: the world), the pixel size they were seen with, views looking through."""
+    if not views or not len(xyz):
+        return np.zeros((len(xyz), 3), np.float32), np.full(len(xyz), np.inf, np.float32), np.zeros(len(xyz), np.int32)
+    packed, present = _packed(views, body)
+    depths, stack = lifting.stacked([p.inverse_depth for p in pictures]), lifting.stacked(rgb)
+    parts = np.array_split(np.arange(len(xyz)), THREADS)
+    with ThreadPoolExecutor(THREADS) as pool:
+        results = list(
+            pool.map(
+                lambda part: colour.seen_colours(xyz[part], normal[part], packed, depths, stack, present, 0.002), parts
+            )
+        )
+    return tuple(np.concatenate(items) for items in zip(*results, strict=True))
+
+
+def _packed(views: Sequence[View], body: Surfels | None) -> tuple[np.ndarray, np.ndarray]:
+    if body is None or body.actor is None:
+        return colour.packed_views(views), np.ones(len(views), bool)
+    poses = [body.world_from_body(view.t_us) for view in views]
+    return colour.packed_views(views, poses), np.array([body.present(view.t_us) for view in views])
+
+
+def body_gaussians(
+    number: int,
+    body: Surfels,
+    ground: Ground,
+    views: Sequence[View],
+    pictures: Sequence[DepthPicture],
+    rgb: Sequence[np.ndarray],
+    settings: LiftSettings,
+) -> tuple[Gaussians, int]:
+    """Gaussians of one body in its frame, and how many of them were lifted from pixels."""
+    cloud = body.cloud
+    seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
+    shown = colour.fill_unseen(cloud.xyz_m, seen_rgb / 255, np.isfinite(pixel), cloud.intensity)
+    # A view replaces surfels by its pixels unless it sees them so obliquely that surfels are the finer of the two.
+    keep = (pixel > 3 * body.spacing_m) & (np.isfinite(pixel) | (through == 0))
+    parts = [
+        surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.spacing_m[keep], shown[keep], cloud.intensity[keep],
+                       body.label[keep], settings.opacity)
+    ]  # fmt: skip
+    lifted = _lifted(number, body, views, pictures, rgb, settings)
+    if len(lifted):
+        parts.append(_lifted_gaussians(lifted, body, ground, settings))
+    return Gaussians.concatenate(parts), len(lifted)
+
+
+def _lifted(
+    number: int,
+    body: Surfels,
+    views: Sequence[View],
+    pictures: Sequence[DepthPicture],
+    rgb: Sequence[np.ndarray],
+    settings: LiftSettings,
+) -> Lifted:
+    """The pixels of all views that show a body and that no other view owns."""
+    parts, depths = [], []
+    pixels = sum(view.rgb.shape[0] * view.rgb.shape[1] for view in views)
+    thinning = 2 ** max(0, int(np.ceil(np.log2(max(KEPT_SHARE * pixels / settings.views.budget, 1)))))
+    for k, (view, picture) in enumerate(zip(views, pictures, strict=True)):
+        mask = (picture.body == number) & (picture.inverse_depth > 1 / settings.views.max_depth_m) & view.tile.valid
+        mask &= lifting.lattice(mask.shape, thinning)
+        if not mask.any():
+            continue
+        body_from_world = geometry.inverse(body.world_from_body(view.t_us))
+        xyz = geometry.transform_points(body_from_world, lifting.points_of(view, picture.inverse_depth)[mask])
+        surfel = picture.surfel[mask]
+        normal = lifting.normals_of(view, picture.inverse_depth)[mask] @ body_from_world[:3, :3].T
+        normal = np.where((surfel >= 0)[:, None], body.normal[surfel] if len(body.cloud) else normal, normal)
+        ray = lifting.rays_of(view)[mask]
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        ray = ray @ (body_from_world @ view.world_from_view)[:3, :3].T
+        z = 1 / picture.inverse_depth[mask].astype(np.float64)
+        pixel_m = np.sqrt(thinning) * z / view.tile.focal_px
+        mine = np.full(len(z), k, np.int32)
+        parts.append(Lifted(xyz, normal, ray, pixel_m, rgb[k][mask].astype(np.float32), surfel, mine))
+        depths.append(z)
+    if not parts:
+        return Lifted(
+            *(np.zeros((0, 3)),) * 3, np.zeros(0), np.zeros((0, 3), np.float32), *(np.zeros(0, np.int32),) * 2
+        )
+    everything, z = Lifted.concatenate(parts), np.concatenate(depths)
+    packed, present = _packed(views, body)
+    step = 1 / settings.views.min_depth_m / (settings.views.levels - 1)
+    depth_stack, rgb_stack = lifting.stacked([picture.inverse_depth for picture in pictures]), lifting.stacked(rgb)
+    middle = len(everything) // 2
+    chunks = [slice(0, middle), slice(middle, None)]
+    with ThreadPoolExecutor(THREADS) as pool:
+        jobs = [
+            pool.submit(
+                lifting.owned,
+                everything.xyz_m[part],
+                z[part],
+                everything.view[part],
+                everything.rgb[part],
+                packed,
+                depth_stack,
+                rgb_stack,
+                present,
+                0.3 * step,
+                lifting.OWNER_RING,
+                lifting.OWNER_BORDER,
+            )
+            for part in chunks
+        ]
+        kept = [job.result() for job in jobs]  # fmt: skip
+    return everything[np.concatenate(kept)]
+
+
+def _lifted_gaussians(lifted: Lifted, body: Surfels, ground: Ground, settings: LiftSettings) -> Gaussians:
+    """Footprint Gaussians; label and intensity from the surfel that gave the depth, or from the ground below."""
+    from_surfel = lifted.surfel >= 0
+    n = len(lifted)
+    label = np.full(n, Label.OTHER if body.actor is None else Label.MOVABLE, np.uint8)
+    intensity = np.full(n, np.nan, np.float32)
+    if len(body.cloud):
+        label = np.where(from_surfel, body.label[lifted.surfel], label)
+        intensity = np.where(from_surfel, body.cloud.intensity[lifted.surfel], intensity)
+    if body.actor is None:
+        label = np.where(~from_surfel & ground.is_road(lifted.xyz_m), Label.ROAD, label)
+    return surfaces.footprints(lifted.xyz_m, lifted.normal, lifted.ray, lifted.pixel_m, lifted.rgb / 255, intensity,
+                               label, settings.opacity)  # fmt: skip

@@ -1,0 +1,76 @@
+"""The rigid bodies of a clip, the static world and each actor, as measured surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from nurec_sim.reconstruct.lift import points, surfaces
+from nurec_sim.reconstruct.lift.ground import Ground, find_ground
+from nurec_sim.reconstruct.lift.points import Actor, Cloud, Gathered
+from nurec_sim.reconstruct.lift.settings import LiftSettings
+from nurec_sim.types import Clip, Label
+
+
+@dataclass(frozen=True)
+class Surfels:
+    """The measured surface of one rigid body (``actor`` None: the static world), in its frame."""
+
+    actor: Actor | None
+    cloud: Cloud
+    normal: Float32[np.ndarray, "n 3"]
+    spacing_m: Float32[np.ndarray, " n"]
+    label: UInt8[np.ndarray, " n"]
+
+    def world_from_body(self, t_us: int) -> np.ndarray:
+        """Where the body is."""
+        return np.eye(4) if self.actor is None else self.actor.path.at(t_us)
+
+    @property
+    def box_size_m(self) -> tuple[float, float, float]:
+        """Size of the actor's box; infinite for the world."""
+        return (np.inf,) * 3 if self.actor is None else self.actor.track.size_m
+
+    def present(self, t_us: int) -> bool:
+        """Whether the body is known to be there."""
+        return self.actor is None or bool(self.actor.present(np.array(t_us)))
+
+
+def surfels_of(
+    clip: Clip, actors: Sequence[Actor], gathered: Gathered, settings: LiftSettings
+) -> tuple[list[Surfels], Ground]:
+    """Surfels of the static world and of each actor; ground within reach is one regular sheet."""
+    feet = [world for _, world in gathered.feet.values()]
+    everything = np.concatenate([gathered.static.xyz_m, *feet])
+    ground = find_ground(everything, clip.ego.world_from_body, settings.ground)
+    static, ghosts = gathered.static, np.zeros(len(gathered.static), bool)
+    above = ground.above(static.xyz_m)
+    if settings.points.carve and gathered.sweep_count > settings.points.carve_votes:
+        ghosts = points.seen_through(static, gathered.range_images, settings.points.carve_votes) & ~(above < 0.25)
+    sheet = ground.sheet(static)
+    standing = static[~ghosts & ~(np.abs(above) < 0.08)]
+    standing, normal, spacing = surfaces.surface_of(standing)
+    row, column, _ = ground.cells(sheet.xyz_m)
+    road = ground.road[row, column]
+    bodies = [
+        Surfels(
+            None,
+            Cloud.concatenate([standing, sheet]),
+            np.concatenate([normal, ground.normals()[row, column].astype(np.float32)]),
+            np.concatenate([spacing, sheet.spacing_m]),
+            np.concatenate([np.full(len(standing), Label.OTHER), np.where(road, Label.ROAD, Label.OTHER)]).astype(
+                np.uint8
+            ),
+        )
+    ]
+    for actor in actors:
+        cloud = gathered.actors[actor.index]
+        if actor.index in gathered.feet:
+            box_feet, world_feet = gathered.feet[actor.index]
+            cloud = Cloud.concatenate([cloud, points.thinned(box_feet[~(np.abs(ground.above(world_feet)) < 0.08)])])
+        cloud, normal, spacing = surfaces.surface_of(cloud)
+        bodies.append(Surfels(actor, cloud, normal, spacing, np.full(len(cloud), Label.MOVABLE, np.uint8)))
+    return bodies, ground

@@ -1,0 +1,166 @@
+"""Colours of surfels from the views that see them, and the affine colour response of each camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+from numba import njit
+
+from nurec_sim.reconstruct.lift.splat import project_point
+from nurec_sim.reconstruct.lift.views import View
+
+ENOUGH_SHARED = 300
+"""Points that two cameras must share before their colours are compared."""
+
+
+@njit(cache=True, nogil=True)
+def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, tolerance):
+    """Colour of each point as its three best views show it, and how well the best of them resolves it.
+
+    A view counts if it sees the point: inside the picture, and the picture's inverse depth agrees within
+    ``tolerance`` (1/m) plus 8 %. Nearer views and views that face the surface weigh more.
+
+    Returns:
+        rgb [n,3] (0..255); the smallest length of a pixel along the surface in metres [n], infinite if unseen; and
+        the number of views that look through the point [n].
+    """
+    n = len(xyz)
+    rgb, pixel = np.zeros((n, 3), np.float32), np.full(n, np.inf, np.float32)
+    through = np.zeros(n, np.int32)
+    for i in range(n):
+        weights = np.zeros(3)
+        best = np.zeros((3, 3))
+        for k in range(len(packed)):
+            view = packed[k]
+            if not present[k]:
+                continue
+            u, v, z = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+            if z <= 0.3 or u < 1 or v < 1 or u >= view[3] - 1 or v >= view[4] - 1:
+                continue
+            row, column = int(v), int(u)
+            # Written so that a masked pixel, NaN, neither agrees nor is looked through.
+            if not abs(inverse_depth[k, row, column] - 1.0 / z) <= tolerance + 0.08 / z:
+                through[i] += inverse_depth[k, row, column] < 1.0 / z
+                continue
+            rx, ry = (u - view[1]) / view[0], (v - view[2]) / view[0]
+            length = np.sqrt(rx * rx + ry * ry + 1)
+            facing = 0.0
+            for j in range(3):
+                facing += normal[i, j] * (view[5 + j] * rx + view[8 + j] * ry + view[11 + j])
+            facing = max(abs(facing) / length, 0.02)
+            size = z / view[0] / facing
+            if size < pixel[i]:
+                pixel[i] = size
+            weight = facing / (z * z)
+            slot = np.argmin(weights)
+            if weight > weights[slot]:
+                weights[slot] = weight
+                for j in range(3):
+                    best[slot, j] = pictures[k, row, column, j]
+        total = weights.sum()
+        if total > 0:
+            for j in range(3):
+                rgb[i, j] = (weights * best[:, j]).sum() / total
+    return rgb, pixel, through
+
+
+def fill_unseen(
+    xyz_m: Float64[np.ndarray, "n 3"],
+    rgb: Float32[np.ndarray, "n 3"],
+    seen: Bool[np.ndarray, " n"],
+    intensity: Float32[np.ndarray, " n"],
+    reach_m: float = 2.0,
+) -> Float32[np.ndarray, "n 3"]:
+    """Give unseen points the mean colour of the seen ones within reach, else grey by their LiDAR intensity."""
+    from scipy.spatial import cKDTree
+
+    result = rgb.copy()
+    unseen = np.flatnonzero(~seen)
+    if not len(unseen):
+        return result
+    known = np.isfinite(intensity)
+    level = np.nanpercentile(intensity[known], 90) if known.any() else 1.0
+    grey = 0.2 + 0.4 * np.clip(np.where(known, intensity, 0.5 * level) / max(level, 1e-6), 0, 1)
+    result[unseen] = grey[unseen, None]
+    if seen.any():
+        source = np.flatnonzero(seen)
+        distance, index = cKDTree(xyz_m[source]).query(xyz_m[unseen], k=min(4, len(source)), workers=2)
+        distance, index = distance.reshape(len(unseen), -1), index.reshape(len(unseen), -1)
+        near = distance[:, 0] < reach_m
+        weight = 1 / (distance[near] + 0.05)
+        mixed = np.einsum("nk,nkc->nc", weight, rgb[source][index[near]]) / weight.sum(axis=1, keepdims=True)
+        result[unseen[near]] = mixed
+    return result
+
+
+def solve_isp(
+    cameras: Sequence[str], colours: dict[str, tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]]
+) -> tuple[dict[str, Float64[np.ndarray, "3 4"]], list[str]]:
+    """Affine response of each camera relative to the first, from points that cameras share.
+
+    ``colours`` holds each camera's colour (0..1) of every point and which points it sees. Cameras are joined one after
+    the other to those already solved, by robust least squares pulled towards the identity.
+
+    Returns:
+        isp per camera (shown = M @ canonical + b), and the cameras that share too little with any other.
+    """
+    identity = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
+    isp = {camera: identity.copy() for camera in cameras}
+    total = np.zeros_like(next(iter(colours.values()))[0], dtype=np.float64) if colours else np.zeros((0, 3))
+    count = np.zeros(len(total))
+    waiting, joined = list(cameras), list[str]()
+    while waiting:
+        shared = {camera: int((colours[camera][1] & (count > 0)).sum()) for camera in waiting}
+        camera = waiting[0] if not joined else max(waiting, key=lambda name: shared[name])
+        if joined and shared[camera] < ENOUGH_SHARED:
+            break
+        rgb, seen = colours[camera]
+        if joined:
+            both = seen & (count > 0)
+            isp[camera] = _affine(total[both] / count[both, None], rgb[both].astype(np.float64))
+        inverse = np.linalg.inv(isp[camera][:, :3])
+        total[seen] += (rgb[seen] - isp[camera][:, 3]) @ inverse.T
+        count[seen] += 1
+        waiting.remove(camera)
+        joined.append(camera)
+    return isp, waiting
+
+
+def _affine(canonical: np.ndarray, shown: np.ndarray, rounds: int = 6) -> np.ndarray:
+    weight = np.ones(len(canonical))
+    basis = np.column_stack([canonical, np.ones(len(canonical))])
+    pull = 0.02 * len(canonical)
+    target = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
+    result = target
+    for _ in range(rounds):
+        left = (basis * weight[:, None]).T @ basis + pull * np.diag([1.0, 1.0, 1.0, 1.0])
+        right = (basis * weight[:, None]).T @ shown + pull * target.T
+        result = np.linalg.solve(left, right).T
+        error = np.linalg.norm(shown - basis @ result.T, axis=1)
+        weight = 1 / (1 + (error / 0.08) ** 2)
+    # A camera that turned colours inside out would be a failed fit, not a camera.
+    if np.linalg.det(result[:, :3]) < 0.1:
+        return target
+    return result
+
+
+def to_canonical(rgb: np.ndarray, isp: Float64[np.ndarray, "3 4"]) -> np.ndarray:
+    """Colours 0..255 of a camera as canonical colours 0..255."""
+    shown = rgb.astype(np.float64) / 255 - isp[:, 3]
+    return np.clip(shown @ np.linalg.inv(isp[:, :3]).T * 255, 0, 255)
+
+
+def packed_views(views: Sequence[View], body_poses: Sequence[np.ndarray] | None = None) -> Float64[np.ndarray, "k 23"]:
+    """Packed projections of views from the world, or from a body with the given ``world_from_body`` at each view."""
+    from nurec_sim import geometry
+
+    if body_poses is None:
+        return np.stack([view.packed for view in views])
+    return np.stack(
+        [
+            view.packed_from(geometry.inverse(view.world_from_view) @ pose)
+            for view, pose in zip(views, body_poses, strict=True)
+        ]
+    )

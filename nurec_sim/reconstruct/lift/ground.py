@@ -1,0 +1,262 @@
+"""The ground as a height grid, and the road grown in it from the driven path up to the kerbs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from nurec_sim.reconstruct.lift.points import Cloud
+from nurec_sim.reconstruct.lift.settings import GroundSettings
+
+MAX_CELLS = 16_000_000
+"""Larger grids get larger cells."""
+BAND_M, BAND_SLOPE = 0.4, 0.08
+"""Ground is looked for this far above and below the driven path, and this much more per metre away from it."""
+FILL_M = 3.0
+"""Holes are filled up to this far from measured ground."""
+
+SEEN_M = 0.4
+"""Ground this close to a measured cell counts as seen."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Heights over a grid of the world's x, y; row and column 0 start at ``corner_m``.
+
+    ``height_m`` is smooth and has no holes; ``known`` says where it was measured, ``near`` where it is measured or
+    filled over a short distance, ``road`` where a car can drive to from the path without meeting a step, ``stride`` how
+    many cells one point of the sheet stands for.
+    """
+
+    corner_m: Float64[np.ndarray, " 2"]
+    cell_m: float
+    height_m: Float32[np.ndarray, "rows columns"]
+    known: Bool[np.ndarray, "rows columns"]
+    near: Bool[np.ndarray, "rows columns"]
+    road: Bool[np.ndarray, "rows columns"]
+    stride: UInt8[np.ndarray, "rows columns"]
+
+    def cells(self, xyz_m: Float64[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, " n"]]:
+        """Row and column (clipped to the grid) of points, and whether they lie in it."""
+        index = np.floor((np.asarray(xyz_m)[:, :2] - self.corner_m) / self.cell_m).astype(np.int64)
+        rows, columns = self.height_m.shape
+        inside = (index[:, 1] >= 0) & (index[:, 1] < rows) & (index[:, 0] >= 0) & (index[:, 0] < columns)
+        return np.clip(index[:, 1], 0, rows - 1), np.clip(index[:, 0], 0, columns - 1), inside
+
+    def above(self, xyz_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+        """Height of points above the ground; infinite outside of the known ground and its short fills."""
+        row, column, inside = self.cells(xyz_m)
+        height = np.asarray(xyz_m)[:, 2] - self.height_m[row, column]
+        return np.where(inside & self.near[row, column], height, np.inf)
+
+    def is_road(self, xyz_m: Float64[np.ndarray, "n 3"], tolerance_m: float = 0.12) -> Bool[np.ndarray, " n"]:
+        """Points on the road surface."""
+        row, column, inside = self.cells(xyz_m)
+        flat = np.abs(np.asarray(xyz_m)[:, 2] - self.height_m[row, column]) < tolerance_m
+        return inside & flat & self.road[row, column]
+
+    def sheet(self, static: Cloud) -> Cloud:
+        """The ground as one regular cloud wherever it is known or filled over a short distance.
+
+        One point per cell near the driven path, per 2 x 2 cells from 8 m on and per 4 x 4 from 16 m on. Intensity
+        is the mean of the points in the cell, or in its surroundings; NaN where there are none.
+        """
+        size = self.stride
+        rows, columns = np.arange(size.shape[0])[:, None], np.arange(size.shape[1])[None]
+        row, column = np.nonzero(self.near & (rows % size == 0) & (columns % size == 0))
+        size = size[row, column]
+        row, column = (
+            np.minimum(i + size // 2, n - 1) for i, n in zip((row, column), self.height_m.shape, strict=True)
+        )
+        xyz = np.column_stack([self.corner_m + (np.column_stack([column, row]) + (size % 2)[:, None] / 2) * self.cell_m,
+                               self.height_m[row, column]])  # fmt: skip
+        source = static[np.abs(self.above(static.xyz_m)) < 0.1]
+        known = np.isfinite(source.intensity)
+        r, c, _ = self.cells(source.xyz_m[known])
+        total, count = np.zeros(self.height_m.shape, np.float32), np.zeros(self.height_m.shape, np.float32)
+        np.add.at(total, (r, c), source.intensity[known])
+        np.add.at(count, (r, c), 1)
+        for width in (5, 21, 61):
+            soft_total, soft_count = cv2.blur(total, (width, width)), cv2.blur(count, (width, width))
+            empty = count == 0
+            total, count = np.where(empty, soft_total, total), np.where(empty, soft_count, count)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            intensity = np.where(count > 1e-6, total / count, np.nan)[row, column]
+        spacing = (size * self.cell_m).astype(np.float32)
+        eye = xyz + (0, 0, 2.0)
+        return Cloud(xyz, eye, spacing, intensity.astype(np.float32), np.ones(len(xyz), np.int32))
+
+    def normals(self) -> Float64[np.ndarray, "rows columns 3"]:
+        """Upward unit normals of the smoothed surface."""
+        smooth = cv2.GaussianBlur(self.height_m, (0, 0), 3.0)
+        slope_y, slope_x = np.gradient(smooth.astype(np.float64), self.cell_m)
+        normal = np.stack([-slope_x, -slope_y, np.ones_like(slope_x)], axis=-1)
+        return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def find_ground(
+    xyz_m: Float64[np.ndarray, "n 3"], world_from_rig: Float64[np.ndarray, "k 4 4"], settings: GroundSettings
+) -> Ground:
+    """Fit the height grid to the lowest points near the driven path and grow the road from it."""
+    from scipy.spatial import cKDTree
+
+    path = densify_path(world_from_rig)
+    low, high = path[:, :2].min(axis=0) - settings.reach_m, path[:, :2].max(axis=0) + settings.reach_m
+    cell = max(settings.cell_m, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
+    columns, rows = (np.ceil((high - low) / cell)).astype(int)
+    centres_x, centres_y = low[0] + (np.arange(columns) + 0.5) * cell, low[1] + (np.arange(rows) + 0.5) * cell
+    # Distance to the path and its height at each cell, on a grid four times coarser: both change slowly.
+    coarse = np.stack(np.meshgrid(centres_x[::4], centres_y[::4]), axis=-1)
+    distance, nearest = cKDTree(path[:, :2]).query(coarse)
+    distance = cv2.resize(distance.astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
+    expected = cv2.resize(path[nearest, 2].astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
+
+    index = np.floor((xyz_m[:, :2] - low) / cell).astype(np.int64)
+    inside = np.all((index >= 0) & (index < (columns, rows)), axis=1)
+    points, flat = xyz_m[inside], index[inside, 1] * columns + index[inside, 0]
+    offset = points[:, 2] - expected.reshape(-1)[flat]
+    band = np.abs(offset) < BAND_M + BAND_SLOPE * distance.reshape(-1)[flat]
+    height, known = _low_heights(points[band, 2], flat[band], rows, columns)
+    for x, y, z in path:
+        row, column = int((y - low[1]) / cell), int((x - low[0]) / cell)
+        if not known[row, column]:
+            height[row, column], known[row, column] = z, True
+    known &= distance <= settings.reach_m
+    known = _drop_raised(height, known, cell)
+    filled = _fill(height, known)
+    steps = _steps(filled, cell, settings)
+    tall = _tall(points, flat, filled, rows, columns)
+    near = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) * cell <= FILL_M
+    free = ~steps & ~tall & near & (distance <= settings.road_reach_m)
+    seen = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) * cell <= SEEN_M
+    road = _grow(free, seen | (distance < 1.2), filled, distance, cell, settings)
+    stride = np.where(distance < 8, 1, np.where(distance < 16, 2, 4)).astype(np.uint8)
+    return Ground(low, cell, filled, known, near | (distance < 1.2), road, stride)
+
+
+def densify_path(world_from_rig: Float64[np.ndarray, "k 4 4"], step_m: float = 0.1) -> Float64[np.ndarray, "m 3"]:
+    """Contact points of a car driving along the poses: a footprint of 4 x 1.6 m at each end, its middle between."""
+    position = world_from_rig[:, :3, 3]
+    pieces = [position[:1]]
+    for a, b in zip(position[:-1], position[1:], strict=True):
+        count = max(int(np.linalg.norm(b - a) / step_m), 1)
+        pieces.append(a + (b - a) * np.arange(1, count + 1)[:, None] / count)
+    along, across = np.meshgrid(np.arange(-0.8, 3.2, step_m), np.arange(-0.8, 0.81, 0.2))
+    footprint = np.column_stack([along.ravel(), across.ravel(), np.zeros(along.size)])
+    for end in (world_from_rig[0], world_from_rig[-1]):
+        pieces.append(footprint @ end[:3, :3].T + end[:3, 3])
+    return np.concatenate(pieces)
+
+
+def _low_heights(z: np.ndarray, flat: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean height of the lowest centimetres in each cell: less noisy than a quantile, blind to what stands there."""
+    height = np.zeros(rows * columns, np.float32)
+    known = np.zeros(rows * columns, bool)
+    if len(z):
+        order = np.lexsort((z, flat))
+        z, flat = z[order], flat[order]
+        first = np.flatnonzero(np.concatenate([[True], flat[1:] != flat[:-1]]))
+        count = np.diff(np.append(first, len(flat)))
+        low = z[first + count // 5]
+        close = np.abs(z - np.repeat(low, count)) < 0.06
+        total, number = np.add.reduceat(np.where(close, z, 0.0), first), np.add.reduceat(close.astype(float), first)
+        height[flat[first]], known[flat[first]] = total / number, True
+    return height.reshape(rows, columns), known.reshape(rows, columns)
+
+
+def _drop_raised(height: np.ndarray, known: np.ndarray, cell_m: float) -> np.ndarray:
+    """Cells far above the lowest ground around them are tops of things, not ground."""
+    low = np.where(known, height, 1e6).astype(np.float32)
+    for edge_m, rise_m in ((1.0, 0.3), (4.0, 0.5)):
+        size = 2 * int(edge_m / cell_m / 2) + 1
+        low = np.where(known, low, 1e6).astype(np.float32)
+        around = cv2.erode(low, np.ones((size, size), np.uint8))
+        known = known & (height - around < rise_m)
+    return known
+
+
+def _fill(height: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Normalised smoothing with ever wider Gaussians: each cell takes the finest that saw enough."""
+    weight, value = known.astype(np.float32), np.where(known, height, 0).astype(np.float32)
+    result, done = np.zeros_like(value), np.zeros(value.shape, bool)
+    for sigma in (0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 102.4):
+        shrink = max(1, int(sigma / 3))
+        size = (max(value.shape[1] // shrink, 1), max(value.shape[0] // shrink, 1))
+        small = [cv2.resize(a, size, interpolation=cv2.INTER_AREA) for a in (value, weight)]
+        small = [cv2.GaussianBlur(a, (0, 0), sigma / shrink, borderType=cv2.BORDER_CONSTANT) for a in small]
+        total, mass = (cv2.resize(a, value.shape[::-1], interpolation=cv2.INTER_LINEAR) for a in small)
+        take = ~done & (mass > 0.12)
+        result[take], done = total[take] / mass[take], done | take
+    if done.any() and not done.all():
+        result[~done] = np.median(result[done])
+    return result
+
+
+def _steps(height: np.ndarray, cell_m: float, settings: GroundSettings) -> np.ndarray:
+    """Cells with a height step across 0.4 m in any of four directions."""
+    reach = max(int(round(0.2 / cell_m)), 1)
+    limit = settings.step_m + settings.slope * 2 * reach * cell_m
+    steps = np.zeros(height.shape, bool)
+    for dy, dx, stretch in ((0, reach, 1.0), (reach, 0, 1.0), (reach, reach, 1.4), (reach, -reach, 1.4)):
+        rise = np.roll(height, (-dy, -dx), (0, 1)) - np.roll(height, (dy, dx), (0, 1))
+        steps |= np.abs(rise) > (limit if stretch == 1.0 else settings.step_m + settings.slope * 2.8 * reach * cell_m)
+    return steps
+
+
+def _tall(points: np.ndarray, flat: np.ndarray, filled: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Cells in which something stands: two or more points between 0.2 and 1.5 m above the ground."""
+    above = points[:, 2] - filled.reshape(-1)[flat]
+    count = np.bincount(flat[(above > 0.2) & (above < 1.5)], minlength=rows * columns)
+    return (count >= 2).reshape(rows, columns)
+
+
+def _grow(
+    free: np.ndarray,
+    seen: np.ndarray,
+    height: np.ndarray,
+    distance: np.ndarray,
+    cell_m: float,
+    settings: GroundSettings,
+) -> np.ndarray:
+    """The part of the free cells that the path reaches, out to the kerb.
+
+    Through seen cells only, because interpolation under a parked car turns a kerb into a ramp; through gaps wider than
+    twice the opening; and no cell may lie far above or below the road beside it, which stops what leaks all the same.
+    """
+    driven = distance < 0.9
+    room = cv2.distanceTransform((free & seen | driven).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
+    wide = (room > settings.opening_m) | driven
+    reached = driven.copy()
+    ring = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(round(0.4 / cell_m), 1) + 1,) * 2)
+    for _ in range(round(settings.road_reach_m / 0.4)):
+        level = _beside(height, reached, 0.5 / cell_m)
+        grown = wide & (cv2.dilate(reached.astype(np.uint8), ring) > 0) & (np.abs(height - level) < settings.step_m)
+        if not (grown & ~reached).any():
+            break
+        reached |= grown
+    away = cv2.distanceTransform((~reached).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
+    road = reached | (free & seen & (away <= settings.opening_m + 1.5 * cell_m))
+    # The step test reaches 0.2 m across the kerb: give back what still lies as low as the road beside it.
+    away = cv2.distanceTransform((~road).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
+    road |= seen & (away <= 0.3) & (np.abs(height - _beside(height, road, 0.15 / cell_m)) < settings.step_m)
+    # What nobody saw belongs to whatever lies next to it.
+    unseen, nearest = cv2.distanceTransformWithLabels(
+        (~seen).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    is_road = np.zeros(nearest.max() + 1, bool)
+    is_road[nearest[seen & road]] = True
+    road |= ~seen & is_road[nearest] & (unseen * cell_m <= FILL_M)
+    count, part, stats, _ = cv2.connectedComponentsWithStats((~road).astype(np.uint8), connectivity=4)
+    small = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] * cell_m**2 < 1.0)
+    return road | np.isin(part, small)
+
+
+def _beside(height: np.ndarray, part: np.ndarray, sigma: float) -> np.ndarray:
+    """Height of the nearest cells of a part: their mean under a Gaussian, infinite where none is near."""
+    weight = part.astype(np.float32)
+    total = cv2.GaussianBlur(np.where(part, height, 0).astype(np.float32), (0, 0), sigma)
+    mass = cv2.GaussianBlur(weight, (0, 0), sigma)
+    return np.where(mass > 1e-3, total / np.maximum(mass, 1e-3), np.inf)

@@ -1,0 +1,169 @@
+"""Pixels lifted to points: every surface is taken from the view that saw it from nearest, and coloured by that view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32
+from numba import njit
+
+from nurec_sim.reconstruct.lift.splat import project_point
+from nurec_sim.reconstruct.lift.views import View
+
+STATIC, NOBODY = -1, -2
+OWNER_RING = 0.1
+"""Views own by rings of distance, each larger by exp of this."""
+MIXING = 0.3
+"""Weight of another view's colour for a surface, next to 1 for the owner's."""
+OWNER_BORDER = 0.04
+"""Views own nothing in this part of their width at the border, where nothing checks their depth."""
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """Points lifted from views, in the frame of their body: world or box.
+
+    ``ray`` is the unit direction from the camera, ``pixel_m`` the width of one pixel there, ``surfel`` the row of the
+    surfel that gave the depth, or -1.
+    """
+
+    xyz_m: Float64[np.ndarray, "n 3"]
+    normal: Float64[np.ndarray, "n 3"]
+    ray: Float64[np.ndarray, "n 3"]
+    pixel_m: Float64[np.ndarray, " n"]
+    rgb: Float32[np.ndarray, "n 3"]
+    surfel: Int32[np.ndarray, " n"]
+    view: Int32[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.xyz_m)
+
+    def __getitem__(self, index: np.ndarray) -> Lifted:
+        return Lifted(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Lifted]) -> Lifted:
+        """All points one after the other."""
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in cls.__dataclass_fields__))
+
+
+def rays_of(view: View) -> Float64[np.ndarray, "h w 3"]:
+    """Rays through the pixel centres with depth 1, in the view's frame."""
+    tile = view.tile
+    u, v = np.meshgrid(np.arange(tile.width) + 0.5, np.arange(tile.height) + 0.5)
+    return np.stack(
+        [(u - tile.center_px[0]) / tile.focal_px, (v - tile.center_px[1]) / tile.focal_px, np.ones_like(u)], axis=-1
+    )
+
+
+def points_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
+    """World points of all pixels; pixels at infinity lie at 1000 m."""
+    depth = 1.0 / np.maximum(inverse_depth.astype(np.float64), 1e-3)
+    local = rays_of(view) * depth[..., None]
+    if view.drift_m.any():
+        v, u = np.mgrid[0 : view.tile.height, 0 : view.tile.width] + 0.5
+        a, b, c = view.tile.fraction
+        local = local + np.clip(a * u + b * v + c, -0.5, 0.5)[..., None] * view.drift_m
+    pose = view.world_from_view
+    return local @ pose[:3, :3].T + pose[:3, 3]
+
+
+def normals_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
+    """World normals from the depth of neighbouring pixels; where these lie on other surfaces, facing the camera.
+
+    In inverse depth a plane is linear in the pixel: w = n.ray / d, so its gradient gives the normal without noise
+    growing with distance.
+    """
+    w = inverse_depth.astype(np.float64)
+    tile = view.tile
+    pad = np.pad(w, 2, mode="edge")
+    height, width = w.shape
+
+    def shifted(dy: int, dx: int) -> np.ndarray:
+        return pad[2 + dy : 2 + dy + height, 2 + dx : 2 + dx + width]
+
+    slope_u = (shifted(0, 2) - shifted(0, -2)) / 4 * tile.focal_px
+    slope_v = (shifted(2, 0) - shifted(-2, 0)) / 4 * tile.focal_px
+    rays = rays_of(view)
+    normal = np.stack([slope_u, slope_v, w - slope_u * rays[..., 0] - slope_v * rays[..., 1]], axis=-1)
+    bend = np.maximum(np.abs(shifted(0, 2) + shifted(0, -2) - 2 * w), np.abs(shifted(2, 0) + shifted(-2, 0) - 2 * w))
+    size = np.linalg.norm(normal, axis=-1, keepdims=True)
+    unit_ray = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    smooth = (bend < 0.05 * w) & (size[..., 0] > 1e-9)
+    normal = np.where(smooth[..., None], normal / np.maximum(size, 1e-12), unit_ray)
+    return -normal @ view.world_from_view[:3, :3].T
+
+
+@njit(cache=True, nogil=True)
+def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, tolerance, ring, border):
+    """Which points no other view owns, and that few views look through.
+
+    The owner of a surface is the view in the nearest ring of distance, rings growing by the factor ``exp(ring)``, and
+    the first of these; a strict order, so that exactly one view owns it. ``rgb`` (0..255) of the points that stay is
+    mixed with the colours that the agreeing views show, weighted by their nearness: exposure drifts and reflections
+    even out.
+
+    A view agrees with a point that projects well inside it if its inverse depth there is the same within ``tolerance``
+    (1/m) plus 10 %; it looks through the point if it is clearly smaller. Points go if more than half as many views look
+    through them as agree.
+    ``packed[k]`` projects from the points' frame into view k.
+    """
+    keep = np.ones(len(xyz), np.bool_)
+    for i in range(len(xyz)):
+        agree, through, total = 0, 0, 1.0
+        own_ring = np.floor(np.log(depth[i]) / ring)
+        mixed = rgb[i].copy()
+        for k in range(len(packed)):
+            if k == own_view[i] or not present[k]:
+                continue
+            view = packed[k]
+            u, v, z = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+            if z <= 0.3 or z > 1.5 * depth[i] or u < 0 or v < 0 or u >= view[3] or v >= view[4]:
+                continue
+            here, w = 1.0 / z, inverse_depth[k, int(v), int(u)]
+            if abs(w - here) < tolerance + 0.1 * here:
+                agree += 1
+                margin = border * view[3]
+                inside = margin < u < view[3] - margin and 0.5 * margin < v < view[4] - 0.5 * margin
+                if inside and (np.floor(np.log(z) / ring), k) < (own_ring, own_view[i]):
+                    keep[i] = False
+                    break
+                share = MIXING * (depth[i] / max(z, depth[i])) ** 2
+                total += share
+                for c in range(3):
+                    mixed[c] += share * pictures[k, int(v), int(u), c]
+            elif w < here:
+                through += 1
+        if 2 * through > agree:
+            keep[i] = False
+        rgb[i] = mixed / total
+    return keep
+
+
+def lattice(shape: tuple[int, int], thinning: int) -> Bool[np.ndarray, "h w"]:
+    """One pixel in ``thinning`` (a power of two), on a square lattice, turned by 45 degrees for 2, 8, 32, ..."""
+    row, column = np.indices(shape, sparse=True)
+    while thinning >= 4:
+        row, column, thinning = np.where(row % 2, -1, row // 2), np.where(column % 2, -1, column // 2), thinning // 4
+    mask = (row >= 0) & (column >= 0)
+    return mask & ((row + column) % 2 == 0) if thinning == 2 else mask
+
+
+def stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Pictures of different sizes in one array, padded at the right and the bottom."""
+    height, width = max(p.shape[0] for p in pictures), max(p.shape[1] for p in pictures)
+    result = np.zeros((len(pictures), height, width, *pictures[0].shape[2:]), pictures[0].dtype)
+    for k, picture in enumerate(pictures):
+        result[k, : picture.shape[0], : picture.shape[1]] = picture
+    return result
+
+
+def sky_coloured(view: View, prior: Float32[np.ndarray, "h w"], bright: float) -> Bool[np.ndarray, "h w"]:
+    """Pixels that look like sky: above the horizon, no surface measured, and bright or clearly blue."""
+    rgb = view.rgb.astype(np.float32)
+    up = rays_of(view) @ view.world_from_view[2, :3]
+    light = rgb.mean(axis=-1)
+    blue = (rgb[..., 2] > 1.15 * rgb[..., 0] + 5) & (light > 0.45 * bright)
+    return (up > 0.0) & (prior <= 0) & ((light > 0.8 * bright) | blue) & view.tile.valid

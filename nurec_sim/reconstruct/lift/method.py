@@ -1,0 +1,148 @@
+"""The `lift` method: coloured LiDAR and lifted pixels as Gaussians, without a network or an optimisation.
+
+Sweeps give the geometry: they are gathered in the world (or in the box frame of their actor), thinned, and get normals.
+Images give the detail: each frame gets a dense depth, measured where surfels lie in it and matched against its
+neighbours elsewhere, and its pixels are lifted. Every surface is owned by the view that saw it from nearest; surfels
+stay where no view saw them. What nothing covers is sky.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from nurec_sim.errors import ReconstructError
+from nurec_sim.reconstruct.lift import actors as actor_layer
+from nurec_sim.reconstruct.lift import colour, points
+from nurec_sim.reconstruct.lift.bake import body_gaussians, camera_isp
+from nurec_sim.reconstruct.lift.bodies import surfels_of
+from nurec_sim.reconstruct.lift.pictures import DepthPicture, depth_pictures
+from nurec_sim.reconstruct.lift.points import Actor
+from nurec_sim.reconstruct.lift.settings import LiftSettings
+from nurec_sim.reconstruct.lift.sky import make_sky
+from nurec_sim.reconstruct.lift.views import View, read_views
+from nurec_sim.types import Clip, Gaussians, GaussianScene
+
+Progress = Callable[[str, float], None]
+
+
+def lift(
+    clip: Clip, cameras: Sequence[str], hold_out: set[int], progress: Progress, settings: LiftSettings
+) -> GaussianScene:
+    """Reconstruct a clip from its sweeps and the frames of the given cameras.
+
+    Raises:
+        ReconstructError: the clip has no LiDAR sweep to build from.
+    """
+    stages = _Stages(progress)
+    stages.start("sweeps")
+    actors = points.actors_of(clip, settings.points)
+    gathered = points.gather(clip, actors, hold_out, settings.points, stages.fraction)
+    if gathered.point_count == 0:
+        raise ReconstructError(
+            f"clip {clip.id!r}: method 'lift' needs LiDAR sweeps; have lidars {list(clip.rig.lidars)} "
+            f"with no usable points after holding out sweeps {sorted(hold_out)}"
+        )
+    stages.start("ground and surfaces")
+    bodies, ground = surfels_of(clip, actors, gathered, settings)
+    stages.start("images")
+    views = read_views(clip, cameras, settings.views, stages.fraction)
+    stages.start("depth")
+    pictures = depth_pictures(views, bodies, settings, stages.fraction)
+    views = [view for view in views if view.key]
+    stages.start("colours")
+    isp, lonely = camera_isp(views, pictures, bodies, cameras)
+    canonical = [colour.to_canonical(view.rgb, isp[view.camera_id]).astype(np.uint8) for view in views]
+    stages.start("lifting")
+    static, moving, lifted = Gaussians.empty(), [], 0
+    for number, body in enumerate(bodies):
+        stages.fraction(number / len(bodies))
+        gaussians, count = body_gaussians(number, body, ground, views, pictures, canonical, settings)
+        lifted += count
+        if body.actor is None:
+            static = gaussians
+        elif len(gaussians):
+            windows = actor_layer.windows_of(body.actor, clip.span_us, settings)
+            moving.append(actor_layer.emit(body.actor, gaussians, windows))
+    stages.start("sky")
+    sky = make_sky(views, canonical, [_sky_weight(p, v, settings) for p, v in zip(pictures, views, strict=True)],
+                   settings.sky_px)  # fmt: skip
+    dynamic = actor_layer.join(moving)
+    stages.stop()
+    counts = {
+        "sweeps": gathered.sweep_count,
+        "points": gathered.point_count,
+        "views": len(views),
+        "lifted": lifted,
+        "static": len(static),
+        "dynamic": len(dynamic),
+    }
+    provenance = {
+        "method": "lift",
+        "settings": dataclasses.asdict(settings),
+        "cameras": list(cameras),
+        "held_out_sweeps": sorted(hold_out),
+        "counts": counts,
+        "unknown": _unknown(clip, cameras, actors, gathered, lonely),
+    }
+    return GaussianScene(
+        id=clip.id,
+        static=static,
+        dynamic=dynamic,
+        sky=sky,
+        isp=isp,
+        rig=clip.rig,
+        ego=clip.ego,
+        tracks=actor_layer.tracks_of(clip, actors),
+        road_map=clip.road_map,
+        span_us=clip.span_us,
+        camera_times_us={camera: clip.camera_times_us(camera) for camera in clip.rig.cameras},
+        provenance=provenance,
+    )
+
+
+def _sky_weight(picture: DepthPicture, view: View, settings: LiftSettings) -> np.ndarray:
+    """How much each pixel tells of the sky: 1 if it is far and looks like sky, little if it is merely far."""
+    far = (picture.inverse_depth < 1 / settings.views.max_depth_m) & view.tile.valid
+    return np.where(far, np.where(picture.sky, 1.0, 0.02), 0.0)
+
+
+class _Stages:
+    """Tells the caller which stage runs. Times are the caller's business: a scene must not depend on the clock."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.progress, self.stage = progress, ""
+
+    def start(self, stage: str) -> None:
+        self.stop()
+        self.stage = stage
+        self.progress(stage, 0.0)
+
+    def fraction(self, fraction: float) -> None:
+        self.progress(self.stage, fraction)
+
+    def stop(self) -> None:
+        if self.stage:
+            self.progress(self.stage, 1.0)
+
+
+def _unknown(
+    clip: Clip, cameras: Sequence[str], actors: Sequence[Actor], gathered: points.Gathered, lonely: Sequence[str]
+) -> list[str]:
+    """What the log did not tell, in plain words."""
+    notes = []
+    if clip.road_map is None:
+        notes.append("no map: the road is grown from the driven path up to height steps")
+    if not actors:
+        notes.append("no boxes: moving objects are baked into the static layer where they were not carved away")
+    if not gathered.intensity_known:
+        notes.append("no LiDAR intensity: simulated returns have none")
+    if not cameras:
+        notes.append("no cameras: colours are grey")
+    if len(cameras) > 1 and lonely:
+        notes.append(f"no shared points: colours of {', '.join(lonely)} are not aligned with the other cameras")
+    if gathered.sweep_count == 1:
+        notes.append("one sweep only: surfaces behind what it saw are missing")
+    return notes

@@ -1,0 +1,121 @@
+"""Dense depth pictures of the key views, and which body each of their pixels shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32
+
+from nurec_sim import geometry
+from nurec_sim.reconstruct.lift import depth, lifting
+from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
+from nurec_sim.reconstruct.lift.settings import THREADS, LiftSettings
+from nurec_sim.reconstruct.lift.splat import draw_surfels, trim_silhouettes
+from nurec_sim.reconstruct.lift.views import View
+
+
+@dataclass(frozen=True)
+class DepthPicture:
+    """Inverse depth of a view; the body that each pixel shows, the surfel that gave its depth (-1: none); sky."""
+
+    inverse_depth: Float32[np.ndarray, "h w"]
+    body: Int32[np.ndarray, "h w"]
+    surfel: Int32[np.ndarray, "h w"]
+    sky: Bool[np.ndarray, "h w"]
+
+
+def depth_pictures(
+    views: Sequence[View], bodies: Sequence[Surfels], settings: LiftSettings, progress: Callable[[float], None]
+) -> list[DepthPicture]:
+    """Dense depth of the key views, matched against all views."""
+    keys = [k for k, view in enumerate(views) if view.key]
+    options = settings.views
+    step = 1 / options.min_depth_m / (options.levels - 1)
+    bright = (
+        float(np.percentile(np.concatenate([v.rgb[::8, ::8].mean(axis=-1).ravel() for v in views]), 98)) if views else 0
+    )
+    grays = [v.rgb.mean(axis=-1).astype(np.uint8) for v in views]
+    with ThreadPoolExecutor(THREADS) as pool:
+        codes = list(pool.map(depth.census, grays))
+
+        def one(k: int) -> DepthPicture:
+            view = views[k]
+            prior, index, body = _draw(view, bodies)
+            trim_silhouettes(prior, index, grays[k])
+            sky = lifting.sky_coloured(view, prior, bright)
+            around = [(views[n].packed, views[n].rgb, codes[n]) for n in neighbours_of(views, k, options.neighbours)]
+            dense = depth.dense_inverse_depth(
+                view.packed, view.world_from_view, view.rgb, prior, sky, around, options.levels, step
+            )
+            # Pixels that show nothing of the world neither agree with a point nor look through it.
+            dense[~view.tile.valid] = np.nan
+            index[dense != prior] = -1
+            drawn = np.where(index >= 0, body, STATIC)
+            body = _bodies_of_pixels(view, bodies, dense, drawn)
+            index[body != drawn] = -1
+            return DepthPicture(dense, body, index, sky)
+
+        pictures = []
+        for done, picture in enumerate(pool.map(one, keys)):
+            progress(done / len(keys))
+            pictures.append(picture)
+    return pictures
+
+
+def _draw(view: View, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Splat all bodies: inverse depth, surfel row within its body, and body number per pixel."""
+    offset, starts, jobs = 0, [], []
+    for surfels in bodies:
+        starts.append(offset)
+        if surfels.present(view.t_us) and len(surfels.cloud):
+            pose = geometry.inverse(view.world_from_view) @ surfels.world_from_body(view.t_us)
+            jobs.append((view.packed_from(pose), surfels.cloud.xyz_m, surfels.normal, surfels.spacing_m, offset))
+        offset += len(surfels.cloud)
+    inverse_depth, index = draw_surfels(view.rgb.shape[:2], jobs)
+    body = np.zeros(index.shape, np.int32)
+    drawn = index >= 0
+    body[drawn] = np.searchsorted(starts, index[drawn], side="right") - 1
+    # Bodies without surfels share their start with the next one: searchsorted picks the last, which holds the row.
+    index[drawn] -= np.asarray(starts, np.int32)[body[drawn]]
+    return inverse_depth, index, body
+
+
+def _bodies_of_pixels(view: View, bodies: Sequence[Surfels], dense: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """Body number per pixel: that of the actor's surfel, else of the box that the pixel lies in, else the world (0)."""
+    body = np.where(drawn >= 0, drawn, 0).astype(np.int32)
+    open_pixels = (drawn <= 0) & (dense > 0)
+    if len(bodies) > 1 and open_pixels.any():
+        xyz = lifting.points_of(view, dense)[open_pixels]
+        found, unmeasured = np.zeros(len(xyz), np.int32), (drawn < 0)[open_pixels]
+        for number, surfels in enumerate(bodies[1:], start=1):
+            if not surfels.present(view.t_us):
+                continue
+            box = geometry.transform_points(geometry.inverse(surfels.world_from_body(view.t_us)), xyz)
+            size = surfels.box_size_m
+            upper = box[:, 2] > -size[2] / 2 + 0.15
+            inside = geometry.points_in_box(box, size, 0.1) & upper
+            found[inside & (found <= 0)] = number
+            # Unmeasured pixels just outside a box are its silhouette at a wrong depth: nobody's.
+            found[~inside & (found == 0) & unmeasured & geometry.points_in_box(box, size, 0.6) & upper] = NOBODY
+        body[open_pixels] = found
+    return body
+
+
+def neighbours_of(views: Sequence[View], k: int, count: int) -> list[int]:
+    """Views to match view k against: alike in direction and time, 0.25 to 8 m away and best about 1.5 m."""
+    mine = views[k]
+    scored = []
+    for n, other in enumerate(views):
+        move = other.world_from_view[:3, 3] - mine.world_from_view[:3, 3]
+        base = float(np.linalg.norm(move))
+        facing = float(other.world_from_view[:3, 2] @ mine.world_from_view[:3, 2])
+        if n == k or not 0.25 < base < 8.0 or facing < 0.9:
+            continue
+        ahead = float(move @ mine.world_from_view[:3, 2])
+        score = abs(np.log(base / 1.5)) + 2 * (1 - facing) + 0.3 * abs(other.t_us - mine.t_us) / 1e6
+        scored.append((score + (0.05 if ahead > 0 else 0.0), n))
+    return [n for _, n in sorted(scored)[:count]]

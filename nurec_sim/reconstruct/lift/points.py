@@ -1,0 +1,300 @@
+"""Sweeps gathered into one thinned cloud per rigid body: the static world, and each actor in its own box frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from numba import njit
+
+from nurec_sim import geometry
+from nurec_sim.reconstruct.lift.settings import PointSettings
+from nurec_sim.types import MOVABLE_LABELS, Clip, Track, Trajectory
+
+FOOT_M = 0.3
+"""Points this close to the bottom of a box may be road; the ground decides."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Thinned points of one rigid body, in the world or in the box frame.
+
+    ``spacing_m`` is the edge of the voxel that each point stands for, ``eye_m`` the mean position of the sensor that
+    saw it, ``sweeps`` the number of sweeps that hit it; ``intensity`` is NaN where no sweep recorded one.
+    """
+
+    xyz_m: Float64[np.ndarray, "n 3"]
+    eye_m: Float64[np.ndarray, "n 3"]
+    spacing_m: Float32[np.ndarray, " n"]
+    intensity: Float32[np.ndarray, " n"]
+    sweeps: Int32[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.xyz_m)
+
+    def __getitem__(self, index: np.ndarray | slice) -> Cloud:
+        return Cloud(*(getattr(self, name)[index] for name in CLOUD_FIELDS))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Cloud]) -> Cloud:
+        """All points one after the other."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in CLOUD_FIELDS))
+
+    @classmethod
+    def empty(cls) -> Cloud:
+        """No points."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros(0, np.float32),
+                   np.zeros(0, np.int32))  # fmt: skip
+
+
+CLOUD_FIELDS = ("xyz_m", "eye_m", "spacing_m", "intensity", "sweeps")
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A labelled object, ``clip.tracks[index]``; one that stands has one pose, and is there over the whole clip."""
+
+    index: int
+    track: Track
+    standing: bool
+    path: Trajectory
+
+    def present(self, t_us: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Whether the actor is known to be where its path says."""
+        if self.standing:
+            return np.ones(np.shape(t_us), bool)
+        return (t_us >= self.path.start_us) & (t_us <= self.path.end_us)
+
+
+def actors_of(clip: Clip, settings: PointSettings) -> list[Actor]:
+    """The movable tracks of a clip, each known to stand or to move."""
+    actors = []
+    for index, track in enumerate(clip.tracks):
+        if track.label not in MOVABLE_LABELS:
+            continue
+        moved = np.linalg.norm(track.path.position_m - np.median(track.path.position_m, axis=0), axis=1).max()
+        third = max(len(track.path.t_us) // 3, 1)
+        shift = np.median(track.path.position_m[-third:], axis=0) - np.median(track.path.position_m[:third], axis=0)
+        # Labels of far objects jitter: without a net shift they stand even if single labels are farther off.
+        standing = bool(moved < settings.standing_m or (moved < 1.0 and np.linalg.norm(shift) < settings.standing_m))
+        standing &= len(track.path.t_us) > 1
+        path = track.path
+        if standing:
+            middle = int(np.argmin(np.linalg.norm(path.position_m - np.median(path.position_m, axis=0), axis=1)))
+            path = Trajectory(path.t_us[middle : middle + 1], path.world_from_body[middle : middle + 1])
+        actors.append(Actor(index, track, standing, path))
+    return actors
+
+
+class _Voxels:
+    """Running voxel means; each entry of a voxel counts as one sweep."""
+
+    def __init__(self) -> None:
+        self.keys: list[np.ndarray] = []
+        self.sums: list[np.ndarray] = []
+        self.pending = 0
+
+    def add(self, xyz: np.ndarray, eye: np.ndarray, edge: np.ndarray, intensity: np.ndarray) -> None:
+        """Add the points of one sweep; ``edge`` is the voxel edge of each, a power of two times a constant."""
+        if not len(xyz):
+            return
+        cell = np.floor(xyz / edge[:, None]).astype(np.int64) + (1 << 18)
+        level = np.clip(np.round(np.log2(edge / 0.001)).astype(np.int64), 0, 31)
+        key = ((level << 57) | (cell[:, 0] << 38) | (cell[:, 1] << 19) | cell[:, 2]).astype(np.int64)
+        known = np.isfinite(intensity)
+        ones = np.ones(len(xyz))
+        rows = np.column_stack([xyz, eye, edge, np.where(known, intensity, 0.0), known, ones, np.zeros(len(xyz))])
+        key, sums = _sum_by_key(key, rows)
+        sums[:, -1] = 1
+        self.keys.append(key)
+        self.sums.append(sums)
+        self.pending += len(key)
+        if self.pending > 3_000_000:
+            self._merge()
+
+    def _merge(self) -> None:
+        if len(self.keys) > 1:
+            key, sums = _sum_by_key(np.concatenate(self.keys), np.concatenate(self.sums))
+            self.keys, self.sums = [key], [sums]
+        self.pending = 0
+
+    def cloud(self) -> Cloud:
+        """The means."""
+        self._merge()
+        if not self.keys:
+            return Cloud.empty()
+        sums = self.sums[0]
+        mean = sums / sums[:, 9:10]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            intensity = np.where(sums[:, 8] > 0, sums[:, 7] / sums[:, 8], np.nan)
+        return Cloud(mean[:, :3], mean[:, 3:6], mean[:, 6].astype(np.float32), intensity.astype(np.float32),
+                     sums[:, 10].astype(np.int32))  # fmt: skip
+
+
+def _unthinned(xyz: np.ndarray, eye: np.ndarray, edge: np.ndarray, intensity: np.ndarray) -> Cloud:
+    return Cloud(xyz, eye, edge.astype(np.float32), intensity.astype(np.float32), np.ones(len(xyz), np.int32))
+
+
+def thinned(cloud: Cloud) -> Cloud:
+    """One point per voxel of the cloud's own spacing."""
+    voxels = _Voxels()
+    voxels.add(cloud.xyz_m, cloud.eye_m, cloud.spacing_m.astype(np.float64), cloud.intensity.astype(np.float64))
+    return voxels.cloud()
+
+
+def _sum_by_key(key: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+    return key[first], np.add.reduceat(rows[order], first, axis=0)
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """What the sweeps gave: the static cloud, one cloud per actor (box frame), and the undecided feet of boxes.
+
+    ``feet`` holds, per actor, the points near its box's bottom in the box frame, and their world positions.
+    ``range_images`` are (lidar_from_world, coarse spherical range image) of the sweeps, for carving.
+    """
+
+    static: Cloud
+    actors: dict[int, Cloud]
+    feet: dict[int, tuple[Cloud, Float64[np.ndarray, "n 3"]]]
+    range_images: list[tuple[Float64[np.ndarray, "4 4"], Float32[np.ndarray, "e a"]]]
+    sweep_count: int
+    point_count: int
+    intensity_known: bool
+
+
+def voxel_edge_m(
+    xyz_m: Float64[np.ndarray, "n 3"], path_m: Float64[np.ndarray, "k 3"], settings: PointSettings
+) -> Float64[np.ndarray, " n"]:
+    """Edge of the voxel that a point falls into: larger far from the driven path, in powers of two."""
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(path_m).query(xyz_m)
+    edge = np.clip(settings.voxel_per_distance * distance, settings.min_voxel_m, settings.max_voxel_m)
+    return settings.min_voxel_m * 2.0 ** np.floor(np.log2(edge / settings.min_voxel_m) + 1e-9)
+
+
+def gather(
+    clip: Clip,
+    actors: Sequence[Actor],
+    hold_out: set[int],
+    settings: PointSettings,
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> Gathered:
+    """Read all sweeps but the held out ones, take out the ego car and the boxes, and thin the rest."""
+    path = clip.ego.position_m
+    static, clouds = _Voxels(), {actor.index: _Voxels() for actor in actors}
+    feet: dict[int, list[Cloud]] = {actor.index: [] for actor in actors}
+    feet_world: dict[int, list[np.ndarray]] = {actor.index: [] for actor in actors}
+    range_images, sweeps, points, known = [], 0, 0, False
+    jobs = [(lidar, i) for lidar in clip.rig.lidars for i in range(len(clip.sweep_times_us(lidar)))]
+    for done, (lidar, i) in enumerate(jobs):
+        progress(done / len(jobs))
+        if i in hold_out:
+            continue
+        sweep = clip.sweep(lidar, i)
+        distance = np.linalg.norm(sweep.xyz_m, axis=1)
+        keep = np.isfinite(sweep.xyz_m).all(axis=1) & (distance < settings.max_range_m) & (distance > 0.5)
+        xyz = sweep.xyz_world_m
+        rig_from_world = geometry.inverse(clip.ego.at(sweep.t_us))
+        body = clip.rig.body
+        keep &= ~geometry.points_in_box(
+            geometry.transform_points(rig_from_world, xyz) - body.center_m, body.size_m, 0.3
+        )
+        xyz, t_us, local = xyz[keep], sweep.point_t_us[keep], sweep.xyz_m[keep]
+        intensity = np.full(len(xyz), np.nan) if sweep.intensity is None else sweep.intensity[keep].astype(np.float64)
+        known |= bool(np.isfinite(intensity).any())
+        eye = np.broadcast_to(sweep.world_from_lidar[:3, 3], xyz.shape)
+        range_images.append((geometry.inverse(sweep.world_from_lidar), spherical_ranges(local)))
+        sweeps, points = sweeps + 1, points + len(xyz)
+        free = np.ones(len(xyz), bool)
+        for actor in actors:
+            inside, box_xyz, box_eye, foot = _inside(actor, xyz, eye, t_us, free, settings.box_margin_m)
+            if not len(inside):
+                continue
+            free[inside] = False
+            edge = np.full(len(inside), settings.min_voxel_m)
+            up = ~foot
+            clouds[actor.index].add(box_xyz[up], box_eye[up], edge[up], intensity[inside][up])
+            feet[actor.index].append(_unthinned(box_xyz[foot], box_eye[foot], edge[foot], intensity[inside][foot]))
+            feet_world[actor.index].append(xyz[inside][foot])
+        static.add(xyz[free], eye[free], voxel_edge_m(xyz[free], path, settings), intensity[free])
+    return Gathered(
+        static.cloud(),
+        {index: voxels.cloud() for index, voxels in clouds.items()},
+        {i: (Cloud.concatenate(feet[i]), np.concatenate(feet_world[i])) for i in feet if feet[i]},
+        range_images,
+        sweeps,
+        points,
+        known,
+    )
+
+
+def _inside(
+    actor: Actor, xyz: np.ndarray, eye: np.ndarray, t_us: np.ndarray, free: np.ndarray, margin_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Indices of the points in an actor's box at their own times; the points and eyes in the box; which are feet."""
+    size = np.asarray(actor.track.size_m)
+    radius = np.linalg.norm(size) / 2 + margin_m
+    low, high = actor.path.position_m.min(axis=0) - radius, actor.path.position_m.max(axis=0) + radius
+    near = np.flatnonzero(free & np.all((xyz > low) & (xyz < high), axis=1) & actor.present(t_us))
+    if not len(near):
+        return near, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)
+    box_from_world = geometry.inverse(actor.path.at(t_us[near]))
+    box = np.einsum("nij,nj->ni", box_from_world[:, :3, :3], xyz[near]) + box_from_world[:, :3, 3]
+    hit = geometry.points_in_box(box, actor.track.size_m, margin_m)
+    near, box, box_from_world = near[hit], box[hit], box_from_world[hit]
+    box_eye = np.einsum("nij,nj->ni", box_from_world[:, :3, :3], eye[near]) + box_from_world[:, :3, 3]
+    return near, box, box_eye, box[:, 2] < -size[2] / 2 + FOOT_M
+
+
+# ----------------------------------------------------------------------------------------------------- free space
+
+AZIMUTHS, ELEVATIONS, LOWEST_DEG, STEP_DEG = 1440, 160, -30.0, 0.5
+
+
+def spherical_ranges(xyz_lidar_m: Float64[np.ndarray, "n 3"]) -> Float32[np.ndarray, "e a"]:
+    """Smallest range per bin of 0.5 deg elevation by 0.25 deg azimuth; infinite where no return."""
+    distance = np.linalg.norm(xyz_lidar_m, axis=1)
+    azimuth = np.arctan2(xyz_lidar_m[:, 1], xyz_lidar_m[:, 0])
+    elevation = np.degrees(np.arcsin(xyz_lidar_m[:, 2] / np.maximum(distance, 1e-9)))
+    column = np.floor((azimuth / (2 * np.pi) + 0.5) * AZIMUTHS).astype(np.int64) % AZIMUTHS
+    row = np.clip(np.floor((elevation - LOWEST_DEG) / STEP_DEG).astype(np.int64), 0, ELEVATIONS - 1)
+    image = np.full((ELEVATIONS, AZIMUTHS), np.inf, np.float32)
+    np.minimum.at(image, (row, column), distance.astype(np.float32))
+    return image
+
+
+def seen_through(cloud: Cloud, range_images: list[tuple[np.ndarray, np.ndarray]], votes: int) -> Bool[np.ndarray, " n"]:
+    """Points that sweeps look through: at least ``votes`` and twice as many as those that hit them.
+
+    A sweep looks through a point when every return in the 3x3 bins around its direction lies well behind it.
+    """
+    through = np.zeros(len(cloud), np.int32)
+    for lidar_from_world, image in range_images:
+        nearest = np.minimum(image, np.minimum(np.roll(image, 1, 0), np.roll(image, -1, 0)))
+        nearest = np.minimum(nearest, np.minimum(np.roll(nearest, 1, 1), np.roll(nearest, -1, 1)))
+        _count_through(cloud.xyz_m, lidar_from_world, nearest, through)
+    return (through >= votes) & (through >= 2 * cloud.sweeps)
+
+
+@njit(cache=True, nogil=True)
+def _count_through(xyz, lidar_from_world, nearest, through):
+    m = lidar_from_world
+    for i in range(len(xyz)):
+        x = m[0, 0] * xyz[i, 0] + m[0, 1] * xyz[i, 1] + m[0, 2] * xyz[i, 2] + m[0, 3]
+        y = m[1, 0] * xyz[i, 0] + m[1, 1] * xyz[i, 1] + m[1, 2] * xyz[i, 2] + m[1, 3]
+        z = m[2, 0] * xyz[i, 0] + m[2, 1] * xyz[i, 1] + m[2, 2] * xyz[i, 2] + m[2, 3]
+        distance = np.sqrt(x * x + y * y + z * z)
+        if distance > 60.0 or distance < 0.5:
+            continue
+        row = int(np.floor((np.degrees(np.arcsin(z / distance)) - LOWEST_DEG) / STEP_DEG))
+        column = int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * AZIMUTHS) % AZIMUTHS
+        if 1 <= row < ELEVATIONS - 1:
+            seen = nearest[row, column]
+            through[i] += np.isfinite(seen) and seen > 1.05 * distance + 0.7

@@ -1,0 +1,133 @@
+"""Local surface of a point cloud: normals and spacing from neighbours, and Gaussians as thin discs along it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from nurec_sim import geometry
+from nurec_sim.reconstruct.lift.points import Cloud
+from nurec_sim.types import Gaussians, Label
+
+NEIGHBOURS = 20
+PLANE_RATIO = 0.15
+"""First over second variance below which neighbours lie on a plane, and points are moved onto it."""
+LINE_RATIO = 0.02
+"""Second over first variance below which neighbours lie on one scan line and say nothing about the surface."""
+DISC_SIGMA = 0.45
+"""Standard deviation of a disc per metre of point spacing: discs on a square lattice then leave no visible gaps."""
+PIXEL_SIGMA = 0.6
+"""The same for footprints of pixels, whose lattice shears where the surface is curved."""
+THINNEST_M = 0.003
+"""Thicker discs would catch grazing LiDAR beams far in front of the ground."""
+
+
+def surface_of(cloud: Cloud, chunk: int = 200_000) -> tuple[Cloud, np.ndarray, np.ndarray]:
+    """The cloud moved onto its local planes, unit normals that face the sensor, and the spacing between points (m).
+
+    Sweeps of a moving car disagree by centimetres, so that walls are thick; a grazing beam would end at their near
+    side. The normal is the direction of least variance of the nearest points. Where these lie on a line (one scan
+    ring), the surface is taken to contain the line and to face the sensor as well as it can.
+    """
+    from scipy.spatial import cKDTree
+
+    n = len(cloud)
+    xyz = cloud.xyz_m.copy()
+    normals, spacing = np.zeros((n, 3), np.float32), cloud.spacing_m.astype(np.float32).copy()
+    to_eye = cloud.eye_m - cloud.xyz_m
+    to_eye /= np.maximum(np.linalg.norm(to_eye, axis=1, keepdims=True), 1e-9)
+    if n < 4:
+        return cloud, to_eye.astype(np.float32), spacing
+    k = min(NEIGHBOURS, n - 1)
+    tree = cKDTree(cloud.xyz_m)
+    for start in range(0, n, chunk):
+        part = slice(start, min(start + chunk, n))
+        distance, index = tree.query(cloud.xyz_m[part], k=k + 1, workers=2)
+        offset = cloud.xyz_m[index] - cloud.xyz_m[part][:, None]
+        # Neighbours across a gap belong to another surface.
+        close = distance < np.maximum(4 * distance[:, 3:4], 4 * cloud.spacing_m[part, None])
+        weight = close / close.sum(axis=1, keepdims=True)
+        mean = np.einsum("nk,nkd->nd", weight, offset)
+        centred = offset - mean[:, None]
+        covariance = np.einsum("nk,nki,nkj->nij", weight, centred, centred)
+        variance, axes = np.linalg.eigh(covariance)
+        normal = axes[:, :, 0]
+        line = variance[:, 1] < LINE_RATIO * variance[:, 2]
+        along = axes[:, :, 2]
+        facing = to_eye[part] - np.sum(to_eye[part] * along, axis=1, keepdims=True) * along
+        facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
+        normal = np.where(line[:, None], facing, normal)
+        plane = ~line & (variance[:, 0] < PLANE_RATIO * variance[:, 1])
+        height = np.where(plane, np.sum(normal * mean, axis=1), 0.0)
+        xyz[part] += height[:, None] * normal
+        flip = np.sum(normal * to_eye[part], axis=1) < 0
+        normals[part] = np.where(flip[:, None], -normal, normal)
+        spacing[part] = np.clip(distance[:, min(4, k)] * 0.7, cloud.spacing_m[part], 3 * cloud.spacing_m[part])
+    return dataclasses.replace(cloud, xyz_m=xyz), normals, spacing
+
+
+def rotation_onto(normal: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
+    """Rotations whose third axis is the given unit normal."""
+    normal = np.asarray(normal, np.float64)
+    helper = np.where(np.abs(normal[:, 2:3]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(helper, normal)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normal, first), normal], axis=-1)
+
+
+def discs(
+    xyz_m: Float64[np.ndarray, "n 3"],
+    normal: Float32[np.ndarray, "n 3"],
+    spacing_m: Float32[np.ndarray, " n"],
+    rgb: Float32[np.ndarray, "n 3"],
+    intensity: Float32[np.ndarray, " n"],
+    label: UInt8[np.ndarray, " n"],
+    opacity: float,
+) -> Gaussians:
+    """Gaussians as round discs in the surface, one per point, thin along the normal."""
+    across = np.asarray(spacing_m, np.float64) * DISC_SIGMA
+    scale = np.column_stack([across, across, np.maximum(0.05 * across, THINNEST_M)])
+    return _gaussians(xyz_m, rotation_onto(normal), scale, normal, rgb, intensity, label, opacity)
+
+
+def footprints(
+    xyz_m: Float64[np.ndarray, "n 3"],
+    normal: Float64[np.ndarray, "n 3"],
+    ray: Float64[np.ndarray, "n 3"],
+    pixel_m: Float64[np.ndarray, " n"],
+    rgb: Float32[np.ndarray, "n 3"],
+    intensity: Float32[np.ndarray, " n"],
+    label: UInt8[np.ndarray, " n"],
+    opacity: float,
+    stretch_limit: float = 5.0,
+) -> Gaussians:
+    """Gaussians as the shadows of pixels on the surface: ``pixel_m`` wide across ``ray``, stretched along its slope."""
+    facing = np.abs(np.sum(normal * ray, axis=1))
+    # First axis: along the slope, where the footprint is stretched; second: across it.
+    across = np.cross(normal, ray)
+    size = np.linalg.norm(across, axis=1, keepdims=True)
+    fallback = rotation_onto(normal)[:, :, 0]
+    across = np.where(size > 1e-3, across / np.maximum(size, 1e-9), fallback)
+    along = np.cross(across, normal)
+    rotation = np.stack([along, across, normal], axis=-1)
+    sigma = pixel_m * PIXEL_SIGMA
+    stretch = np.minimum(1 / np.maximum(facing, 1e-3), stretch_limit)
+    scale = np.column_stack([sigma * stretch, sigma, np.minimum(np.maximum(0.1 * sigma, THINNEST_M), sigma)])
+    return _gaussians(xyz_m, rotation, scale, normal, rgb, intensity, label, opacity)
+
+
+def _gaussians(xyz_m, rotation, scale, normal, rgb, intensity, label, opacity) -> Gaussians:
+    n = len(xyz_m)
+    quat = geometry.quat_from_matrix(rotation) if n else np.zeros((0, 4))
+    return Gaussians(
+        np.asarray(xyz_m, np.float32),
+        quat.astype(np.float32),
+        scale.astype(np.float32),
+        np.full(n, opacity, np.float32),
+        np.clip(rgb, 0, 1).astype(np.float32),
+        np.asarray(normal, np.float32),
+        np.asarray(label, np.uint8) if n else np.full(0, Label.OTHER, np.uint8),
+        np.asarray(intensity, np.float32),
+    )

@@ -1,0 +1,218 @@
+"""Working views: camera frames resampled to plain pinhole pictures of modest size, with pose and shutter drift.
+
+All kernels of the reconstruction then know one lens only. A frame's pose is the one at mid exposure; what the camera
+moves during the exposure is kept as ``drift_m``, scaled by a shutter fraction that is linear in the pixel.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from nurec_sim import geometry, sensors
+from nurec_sim.reconstruct.lift.settings import ViewSettings
+from nurec_sim.types import Box, CameraModel, Clip, Pinhole, Shutter
+
+EGO_HEIGHT_M = 0.75
+"""Bonnet and boot of a car lie at about this height: what is lower within its outline is the car itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """A pinhole window into a camera: its size and matrix, how it is turned, and where its pixels lie in the image."""
+
+    width: int
+    height: int
+    focal_px: float
+    center_px: tuple[float, float]
+    camera_from_tile: Float64[np.ndarray, "3 3"]
+    reduction: int
+    maps: tuple[np.ndarray, np.ndarray] | None
+    valid: Bool[np.ndarray, "h w"]
+    fraction: Float64[np.ndarray, " 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One frame through one tile. ``rgb`` is display colour; pixels of ``key`` views are lifted."""
+
+    camera_id: str
+    frame: int
+    t_us: int
+    key: bool
+    tile: Tile
+    world_from_view: Float64[np.ndarray, "4 4"]
+    drift_m: Float64[np.ndarray, " 3"]
+    rgb: UInt8[np.ndarray, "h w 3"]
+
+    @property
+    def packed(self) -> Float64[np.ndarray, " 24"]:
+        """Everything a kernel needs to project: f, cx, cy, w, h, view_from_world (12), drift (3), fraction (3)."""
+        matrix = geometry.inverse(self.world_from_view)
+        return self.packed_from(matrix)
+
+    def packed_from(self, view_from_body: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, " 23"]:
+        """As ``packed`` for points given in the frame of a body."""
+        tile = self.tile
+        return np.concatenate(
+            [
+                [tile.focal_px, *tile.center_px, tile.width, tile.height],
+                view_from_body[:3, :3].ravel(),
+                view_from_body[:3, 3],
+                self.drift_m,
+                tile.fraction,
+            ]
+        )
+
+
+def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
+    """Cut a camera into pinhole tiles of at most ``max_field_deg``; one exact reduction if it is a plain pinhole."""
+    reduction = max(1, int(np.ceil(camera.width_px / settings.width_px)))
+    if isinstance(camera.lens, Pinhole) and not camera.lens.distorted and camera.windshield is None:
+        lens = camera.lens
+        if abs(lens.fx_px - lens.fy_px) < 1e-3 * lens.fx_px:
+            width, height = camera.width_px // reduction, camera.height_px // reduction
+            center = (lens.cx_px / reduction, lens.cy_px / reduction)
+            valid = np.ones((height, width), bool)
+            tile = Tile(width, height, lens.fx_px / reduction, center, np.eye(3), reduction, None, valid, np.zeros(3))
+            return [_with_fraction(tile, camera)]
+    rays, seen = sensors.pixel_rays(sensors.scaled_camera(camera, camera.width_px // 8, camera.height_px // 8))
+    azimuth, elevation = np.arctan2(rays[..., 0], rays[..., 2])[seen], np.arcsin(np.clip(rays[..., 1], -1, 1))[seen]
+    left, right = np.percentile(azimuth, [0.5, 99.5])
+    top, bottom = np.clip(np.percentile(elevation, [0.5, 99.5]), -0.96, 0.96)
+    limit = np.radians(settings.max_field_deg)
+    count = int(np.ceil((right - left) / limit))
+    focal = _pixels_per_radian(camera) / reduction
+    tiles = []
+    for k in range(count):
+        a, b = left + (right - left) * k / count, left + (right - left) * (k + 1) / count
+        half = np.tan((b - a) / 2 + 0.01)
+        width = int(np.ceil(2 * half * focal))
+        up, down = np.tan(top), np.tan(bottom)
+        height = int(np.ceil((down - up) * focal))
+        turn = np.array(
+            [[np.cos((a + b) / 2), 0, np.sin((a + b) / 2)], [0, 1, 0], [-np.sin((a + b) / 2), 0, np.cos((a + b) / 2)]]
+        )
+        tiles.append(_resampled_tile(camera, reduction, focal, (width / 2, -up * focal), (width, height), turn))
+    return tiles
+
+
+def without_ego(tile: Tile, camera: CameraModel, body: Box) -> Tile:
+    """The tile without the pixels that must show the ego car: their rays pass through its lower body.
+
+    Cameras below ``EGO_HEIGHT_M`` look out of that body, and keep all pixels.
+    """
+    centre, size = np.asarray(body.center_m), np.asarray(body.size_m)
+    low, high = centre - size / 2, centre + size / 2
+    high[2] = min(high[2], low[2] + EGO_HEIGHT_M)
+    origin = camera.rig_from_camera[:3, 3]
+    if np.all((origin >= low) & (origin <= high)):
+        return tile
+    u, v = np.meshgrid(np.arange(tile.width) + 0.5, np.arange(tile.height) + 0.5)
+    rays = np.stack([(u - tile.center_px[0]) / tile.focal_px, (v - tile.center_px[1]) / tile.focal_px, u * 0 + 1], -1)
+    rays = rays @ (camera.rig_from_camera[:3, :3] @ tile.camera_from_tile).T
+    rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
+    near, far = (low - origin) / rays, (high - origin) / rays
+    enter, leave = np.minimum(near, far).max(axis=-1), np.maximum(near, far).min(axis=-1)
+    return dataclasses.replace(tile, valid=tile.valid & ~((enter < leave) & (leave > 0)))
+
+
+def _pixels_per_radian(camera: CameraModel) -> float:
+    middle = np.array(
+        [[camera.width_px / 2 - 8, camera.height_px / 2], [camera.width_px / 2 + 8, camera.height_px / 2]]
+    )
+    rays, _ = sensors.unproject(camera, middle)
+    return 16.0 / float(np.arccos(np.clip(rays[0] @ rays[1], -1, 1)))
+
+
+def _resampled_tile(
+    camera: CameraModel,
+    reduction: int,
+    focal: float,
+    center: tuple[float, float],
+    size: tuple[int, int],
+    camera_from_tile: np.ndarray,
+) -> Tile:
+    width, height = size
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([(u - center[0]) / focal, (v - center[1]) / focal, np.ones_like(u)], axis=-1).reshape(-1, 3)
+    uv, seen = sensors.project(camera, rays @ camera_from_tile.T)
+    seen &= sensors.in_image(camera, uv)
+    uv = np.where(seen[:, None], uv, -1e4) / reduction - 0.5
+    maps = uv[:, 0].reshape(height, width).astype(np.float32), uv[:, 1].reshape(height, width).astype(np.float32)
+    tile = Tile(
+        width, height, focal, center, camera_from_tile, reduction, maps, seen.reshape(height, width), np.zeros(3)
+    )
+    return _with_fraction(tile, camera)
+
+
+def _with_fraction(tile: Tile, camera: CameraModel) -> Tile:
+    """Fit the shutter fraction, less a half, as a linear function of the tile's pixel."""
+    if camera.shutter is Shutter.GLOBAL:
+        return tile
+    v, u = (a.ravel() + 0.5 for a in np.mgrid[0 : tile.height : 8, 0 : tile.width : 8])
+    rays = np.column_stack(
+        [(u - tile.center_px[0]) / tile.focal_px, (v - tile.center_px[1]) / tile.focal_px, u * 0 + 1]
+    )
+    uv, seen = sensors.project(camera, rays @ tile.camera_from_tile.T)
+    seen &= sensors.in_image(camera, uv)
+    target = sensors.shutter_fraction(camera, uv[seen]) - 0.5
+    basis = np.column_stack([u, v, np.ones_like(u)])[seen]
+    solution = np.linalg.lstsq(basis, target, rcond=None)[0]
+    return dataclasses.replace(tile, fraction=solution)
+
+
+def choose_frames(
+    clip: Clip, cameras: Sequence[str], tiles: int, settings: ViewSettings
+) -> list[tuple[str, int, bool]]:
+    """(camera, frame, whether it is a key frame) in order of time, thinned evenly to the limits of the settings."""
+    counts = {camera: len(clip.camera_times_us(camera)) for camera in cameras}
+    total = sum(counts.values()) * tiles / max(len(cameras), 1)
+    skip = max(1, int(np.ceil(total / settings.max_frames)))
+    step = max(1, int(np.ceil(total / skip / settings.max_views)))
+    chosen = [
+        (camera, frame, frame // skip % step == 0) for camera in cameras for frame in range(0, counts[camera], skip)
+    ]
+    return sorted(chosen, key=lambda row: (int(clip.camera_times_us(row[0])[row[1]].sum()), row))
+
+
+def read_views(
+    clip: Clip,
+    cameras: Sequence[str],
+    settings: ViewSettings,
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> list[View]:
+    """Read and resample the chosen frames of the cameras."""
+    tiles = {}
+    for camera in cameras:
+        model = clip.rig.cameras[camera]
+        tiles[camera] = [without_ego(tile, model, clip.rig.body) for tile in tiles_of(model, settings)]
+    frames = choose_frames(clip, cameras, sum(map(len, tiles.values())), settings)
+    views = []
+    for done, (camera, frame, key) in enumerate(frames):
+        progress(done / len(frames))
+        image = clip.image(camera, frame)
+        start_us, end_us = (int(t) for t in clip.camera_times_us(camera)[frame])
+        pair = np.asarray(clip.world_from_camera(camera, frame), np.float64)
+        world_from_camera = geometry.interpolate_pose_pair(pair, np.array(0.5))
+        travel = world_from_camera[:3, :3].T @ (pair[1, :3, 3] - pair[0, :3, 3])
+        for tile in tiles[camera]:
+            pose = world_from_camera @ geometry.pose(tile.camera_from_tile, np.zeros(3))
+            rgb = _resample(image, tile)
+            drift = tile.camera_from_tile.T @ travel if tile.fraction.any() else np.zeros(3)
+            views.append(View(camera, frame, (start_us + end_us) // 2, key, tile, pose, drift, rgb))
+    return views
+
+
+def _resample(image: UInt8[np.ndarray, "h w 3"], tile: Tile) -> UInt8[np.ndarray, "h w 3"]:
+    k = tile.reduction
+    height, width = image.shape[0] // k, image.shape[1] // k
+    small = cv2.resize(image[: height * k, : width * k], (width, height), interpolation=cv2.INTER_AREA)
+    if tile.maps is None:
+        return small
+    return cv2.remap(small, *tile.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -1,0 +1,144 @@
+"""The vertices of a PLY file as columns of numbers: ascii or binary of either byte order, read with suspicion.
+
+Format: Greg Turk, "The PLY Polygon File Format" (1994).
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from jaxtyping import Float32
+
+from nurec_sim.errors import ArchiveError
+
+MAX_HEADER_BYTES = 2**18
+MAX_PROPERTIES = 1000
+TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+"""NumPy's spelling of PLY's types."""
+BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+class VertexTable:
+    """The ``vertex`` element of a PLY file; a binary one is mapped, so that only the columns asked for take memory.
+
+    Attributes:
+        path: the file.
+        names: properties, in the file's order.
+
+    Raises:
+        ArchiveError: not a PLY file, a header that is wrong or not supported, or fewer vertices than promised.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            with path.open("rb") as file:
+                form, count, types = _read_header(file, path)
+                self.names = tuple(types)
+                start, size = file.tell(), os.fstat(file.fileno()).st_size
+                if form == "ascii":
+                    self._rows: np.ndarray = _read_text(file, path, count, len(types), size - start)
+                    return
+        except OSError as error:
+            raise ArchiveError(f"{path}: cannot be opened ({error.strerror or error})") from error
+        dtype = np.dtype([(name, BYTE_ORDERS[form] + kind) for name, kind in types.items()])
+        _check_size(path, count, dtype.itemsize, size - start, "")
+        self._rows = np.memmap(path, dtype, "r", start, (count,)) if count else np.zeros(0, dtype)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def columns(self, names: Sequence[str]) -> Float32[np.ndarray, "n names"]:
+        """Some properties side by side; numbers too large for a float become infinite.
+
+        Raises:
+            ArchiveError: a property is missing; the text lists all that are.
+        """
+        missing = [name for name in names if name not in self.names]
+        if missing:
+            raise ArchiveError(f"{self.path}: the vertices lack {missing}; they have {list(self.names)}")
+        result = np.empty((len(self), len(names)), np.float32)
+        with np.errstate(over="ignore"):
+            for k, name in enumerate(names):
+                result[:, k] = self._rows[name] if self._rows.dtype.names else self._rows[:, self.names.index(name)]
+        return result
+
+
+def _check_size(path: Path, count: int, least_bytes: int, held_bytes: int, at_least: str) -> None:
+    """Refuses a promise that the file cannot keep, before memory is taken for it."""
+    if count * least_bytes > held_bytes:
+        raise ArchiveError(
+            f"{path}: the header promises {count:,} vertices of {at_least}{least_bytes} bytes, but "
+            f"{held_bytes:,} bytes follow it; is the file cut short?"
+        )
+
+
+def _read_text(file: BinaryIO, path: Path, count: int, width: int, held_bytes: int) -> np.ndarray:
+    """Rows of numbers [count, width]; a number takes a digit and a separator at least."""
+    _check_size(path, count, max(2 * width - 1, 1), held_bytes, "at least ")
+    if not count:
+        return np.zeros((0, width))
+    try:
+        with warnings.catch_warnings():  # of no rows: that is found below
+            warnings.simplefilter("ignore", UserWarning)
+            rows = np.loadtxt(file, np.float64, comments=None, max_rows=count, ndmin=2, encoding="latin1")
+    except ValueError as error:
+        raise ArchiveError(f"{path}: a vertex is not readable: {error}") from error
+    if rows.shape != (count, width):
+        raise ArchiveError(f"{path}: {count:,} vertices of {width} numbers are promised, {rows.shape} found")
+    return rows
+
+
+# --------------------------------------------------------------------------------------------------------- header
+
+
+def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, dict[str, str]]:
+    """Format, number of vertices, and their properties with NumPy's types; the file is left at the first vertex."""
+    if file.readline(8).strip() != b"ply":
+        raise ArchiveError(f"{path}: not a PLY file; its first line must be 'ply'")
+    form: str | None = None
+    elements: list[tuple[str, int, dict[str, str]]] = []
+    for line in _header_lines(file, path):
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", name, "1.0"] if name in BYTE_ORDERS and form is None:
+                form = name
+            case ["element", name, count] if count.isdecimal() and len(count) <= 18:
+                elements.append((name, int(count), {}))
+            case ["property", "list", _, _, _] if elements and elements[-1][0] != "vertex":
+                pass
+            case ["property", kind, name] if elements and kind in TYPES and name not in elements[-1][2]:
+                elements[-1][2][name] = TYPES[kind]
+                if len(elements[-1][2]) > MAX_PROPERTIES:
+                    raise ArchiveError(f"{path}: more than {MAX_PROPERTIES} properties of {elements[-1][0]!r}")
+            case _:
+                raise ArchiveError(f"{path}: the header line {line[:80]!r} is wrong or not supported")
+    if form is None:
+        raise ArchiveError(f"{path}: the header names no format; allowed are {list(BYTE_ORDERS)}")
+    if not elements or elements[0][0] != "vertex":
+        raise ArchiveError(f"{path}: the first element must be 'vertex', got {[name for name, _, _ in elements]}")
+    if not elements[0][2]:
+        raise ArchiveError(f"{path}: the vertices have no properties")
+    return form, elements[0][1], elements[0][2]
+
+
+def _header_lines(file: BinaryIO, path: Path) -> Iterator[str]:
+    """Lines up to ``end_header``, as text."""
+    while file.tell() < MAX_HEADER_BYTES:
+        line = file.readline(MAX_HEADER_BYTES)
+        if line.strip() == b"end_header":
+            return
+        if not line.endswith(b"\n"):
+            break
+        yield line.decode("latin1").strip()
+    raise ArchiveError(f"{path}: no 'end_header' line in the first {MAX_HEADER_BYTES:,} bytes")

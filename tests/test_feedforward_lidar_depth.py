@@ -1,0 +1,318 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from nurec_sim import geometry, logs, sensors
+from nurec_sim.errors import ReconstructError
+from nurec_sim.network.tensors import NetworkInputs, QueryGaussians
+from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ContextImage
+from nurec_sim.reconstruct.feedforward.lidar_depth import fit_depth
+from nurec_sim.types import Box, CameraModel, Pinhole, Rig, Shutter, Sweep, Track, Trajectory
+
+EPOCH_US = 1_600_000_000_000_000
+"""Any time cast to float32 here is wrong by minutes."""
+STEP_US = 100_000
+SPEED_MPS = 8.0
+WALLS_X_M = (25.0, 70.0)
+RIG_FROM_CAMERA = np.array([[0.0, 0, 1, 1.6], [-1, 0, 0, 0.1], [0, -1, 0, 1.4], [0, 0, 0, 1]])
+LEFT = geometry.pose(geometry.rotation_from_yaw(1.2), np.zeros(3)) @ RIG_FROM_CAMERA
+
+
+class WallStreet:
+    """A road, a wall across its left half at 25 m and one behind at 70 m, and a car that drives towards them."""
+
+    def __init__(self, frames: int = 4, shutter: Shutter = Shutter.TOP_TO_BOTTOM, tracks: tuple[Track, ...] = ()):
+        lens = Pinhole(130.0, 130.0, 84.0, 49.0, (-0.05, 0.01, 0, 0, 0, 0))
+        self.id, self.frames, self.tracks = "wall-street", frames, tracks
+        self.rig = Rig(
+            {
+                "front": CameraModel("front", 168, 98, lens, RIG_FROM_CAMERA, shutter),
+                "left": CameraModel("left", 168, 98, lens, LEFT, shutter),
+            },
+            {"top": sensors.lidar_model("HDL-64", geometry.pose(np.eye(3), np.array([1.2, 0, 1.9])), columns=600)},
+            Box((1.3, 0, 0.8), (4.6, 1.8, 1.6)),
+        )
+        t_us = EPOCH_US + STEP_US * np.arange(-3, frames + 3)
+        self.ego = Trajectory(
+            t_us, np.array([geometry.pose_from_xyyaw(SPEED_MPS * (t - EPOCH_US) * 1e-6, 0.3, 0.02) for t in t_us])
+        )
+        self.read: list[int] = []
+        self.added = np.zeros((0, 3))
+
+    def sweep_times_us(self, lidar_id: str) -> np.ndarray:
+        start = EPOCH_US + STEP_US * np.arange(self.frames) - STEP_US // 2
+        return np.stack([start, start + STEP_US], axis=1)
+
+    def sweep(self, lidar_id: str, index: int) -> Sweep:
+        self.read.append(index)
+        start, end = self.sweep_times_us(lidar_id)[index].tolist()
+        t_us = (start + end) // 2
+        world_from_lidar = self.ego.at(t_us) @ self.rig.lidars[lidar_id].rig_from_lidar
+        rays = sensors.beam_directions(self.rig.lidars[lidar_id]).reshape(-1, 3) @ world_from_lidar[:3, :3].T
+        distance = distance_m(np.broadcast_to(world_from_lidar[:3, 3], rays.shape), rays)
+        hit = distance < 120
+        xyz = np.concatenate([world_from_lidar[:3, 3] + rays[hit] * distance[hit, None], self.added])
+        xyz = geometry.transform_points(geometry.inverse(world_from_lidar), xyz)
+        return Sweep(t_us, start, end, world_from_lidar, xyz, None, np.full(len(xyz), t_us))
+
+
+def distance_m(origin: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    """How far along unit rays [n,3] the street's road and walls are; infinite in the sky."""
+    best = np.full(len(ray), np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        road = -origin[:, 2] / ray[:, 2]
+        best = np.where(road > 0, road, best)
+        for index, x in enumerate(WALLS_X_M):
+            wall = (x - origin[:, 0]) / ray[:, 0]
+            place = origin + wall[:, None] * ray
+            inside = (wall > 0) & (place[:, 2] < 6) & ((place[:, 1] > 0) | (index == 1))
+            best = np.where(inside & (wall < best), wall, best)
+    return best
+
+
+def chunk_of(images: list[ContextImage]) -> tuple[ChunkInputs, np.ndarray]:
+    """A chunk, its rays as rolling shutters see them, and the world positions and directions of all rays."""
+    world_from_scene = images[0].world_from_camera[1]
+    scene_from_world = geometry.inverse(world_from_scene)
+    rays, depth_scale, world = [], [], []
+    for image in images:
+        camera = image.camera
+        ray, _ = sensors.pixel_rays(camera)
+        columns, rows = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+        fraction = sensors.shutter_fraction(camera, np.stack([columns, rows], -1).reshape(-1, 2))
+        poses = geometry.interpolate_pose_pair(image.world_from_camera, fraction)
+        direction = np.einsum("nij,nj->ni", poses[:, :3, :3], ray.reshape(-1, 3))
+        origin = poses[:, :3, 3]
+        world.append(np.concatenate([origin, direction], axis=1))
+        scene = [geometry.transform_points(scene_from_world, origin), direction @ scene_from_world[:3, :3].T]
+        rays.append(np.concatenate(scene, axis=1).reshape(*ray.shape[:2], 6))
+        depth_scale.append(ray[..., 2:])
+    v, (h, w) = len(images), rays[0].shape[:2]
+    tensors = NetworkInputs(
+        rgb=torch.zeros(1, v, h, w, 3),
+        c2w=torch.eye(4).expand(1, v, 4, 4),
+        fov=torch.ones(1, v, 2),
+        rays=torch.tensor(np.stack(rays)[None], dtype=torch.float32),
+        distance_to_depth_scale=torch.tensor(np.stack(depth_scale)[None], dtype=torch.float32),
+        camera_idxs=torch.zeros(1, v, dtype=torch.int64),
+        time=torch.zeros(1, v),
+        time_before=torch.zeros(1, v),
+        time_after=torch.zeros(1, v),
+    )
+    span = (images[0].t_us[0], images[-1].t_us[1])
+    return ChunkInputs(0, span, tuple(images), world_from_scene, tensors, np.zeros((v, h, w), bool)), np.stack(world)
+
+
+def street_chunk(clip: WallStreet, cameras: tuple[str, ...] = ("front", "left")) -> tuple[ChunkInputs, np.ndarray]:
+    """One image per camera and sweep, exposed for 30 ms, and their true depth; the sky is 500 m away."""
+    images = []
+    for name in cameras:
+        for frame in range(clip.frames):
+            t_us = (EPOCH_US + STEP_US * frame - 15_000, EPOCH_US + STEP_US * frame + 15_000)
+            poses = clip.ego.at(np.array(t_us)) @ clip.rig.cameras[name].rig_from_camera
+            images.append(ContextImage(clip.rig.cameras[name], frame, t_us, t_us, poses))
+    chunk, world = chunk_of(images)
+    distance = np.stack([distance_m(ray[:, :3], ray[:, 3:]) for ray in world]).reshape(chunk.ego.shape)
+    z = chunk.tensors.distance_to_depth_scale[0, ..., 0].numpy()
+    return chunk, np.where(np.isfinite(distance), distance * z, 500.0).astype(np.float32)
+
+
+def pixel_gaussians(chunk: ChunkInputs, depth_m: np.ndarray) -> QueryGaussians:
+    """A Gaussian on every pixel."""
+    inputs = chunk.tensors
+    depth = torch.tensor(depth_m).reshape(1, -1, 1)
+    rays, z = inputs.rays.reshape(1, -1, 6), inputs.distance_to_depth_scale.reshape(1, -1, 1)
+    n = depth.shape[1]
+    return QueryGaussians(
+        position_m=rays[..., :3] + rays[..., 3:] * depth / z,
+        quat_wxyz=torch.eye(4)[:1].expand(1, n, 4),
+        scale_m=0.01 * depth.expand(1, n, 3),
+        opacity=torch.ones(1, n),
+        rgb=torch.zeros(1, n, 3),
+        normal=torch.zeros(1, n, 3),
+        semantic=torch.zeros(1, n, dtype=torch.int64),
+        source=torch.arange(n)[None],
+        motion_m=0.1 * depth[..., None].expand(1, n, 2, 3),
+    )
+
+
+@pytest.mark.parametrize("shutter", [Shutter.GLOBAL, Shutter.TOP_TO_BOTTOM, Shutter.RIGHT_TO_LEFT])
+def test_every_image_gets_its_own_factor_back(shutter):
+    clip = WallStreet(shutter=shutter)
+    chunk, true_m = street_chunk(clip)
+    factors = np.exp(np.linspace(-0.6, 0.6, len(true_m)))
+    fit = fit_depth(clip, chunk, (true_m / factors[:, None, None]).astype(np.float32), set(), "scale")
+    assert all(image.taken_from == "own" and image.points > 200 for image in fit.images)
+    assert np.allclose([image.scale for image in fit.images], factors, rtol=0.002)
+    assert fit.error_before > 0.1 and fit.error_after < 0.003
+    assert (fit.images[1].camera, fit.images[1].frame) == ("front", 1)
+
+
+def test_moved_gaussians_lie_where_the_true_ones_do():
+    clip = WallStreet(frames=2)
+    chunk, true_m = street_chunk(clip)
+    wrong_m = true_m / np.array([0.7, 1.4, 1.1, 0.9], np.float32)[:, None, None]
+    moved = fit_depth(clip, chunk, wrong_m, set(), "scale").apply(pixel_gaussians(chunk, wrong_m), chunk)
+    wanted = pixel_gaussians(chunk, true_m)
+    distance = torch.tensor(true_m).reshape(1, -1, 1)
+    assert ((moved.position_m - wanted.position_m).norm(dim=-1, keepdim=True) / distance).max() < 0.006
+    assert torch.allclose(moved.scale_m, wanted.scale_m, rtol=0.005)
+    assert torch.allclose(moved.motion_m, wanted.motion_m, rtol=0.005)
+    assert torch.equal(moved.quat_wxyz, wanted.quat_wxyz) and torch.equal(moved.opacity, wanted.opacity)
+    still = dataclasses.replace(pixel_gaussians(chunk, wrong_m), motion_m=None)
+    assert fit_depth(clip, chunk, wrong_m, set(), "scale").apply(still, chunk).motion_m is None
+
+
+def test_slopes_are_found_where_points_lie_and_do_not_reach_beyond():
+    clip = WallStreet()
+    chunk, true_m = street_chunk(clip, ("front",))
+    scales, slopes = np.array([0.8, 1.0, 1.2, 1.3]), np.array([0.004, -0.006, 0.0, 0.005])
+    shape = (-1, 1, 1)
+    bent_m = 1 / (scales.reshape(shape) * np.maximum(1 / true_m - slopes.reshape(shape), 1e-4))
+    fit = fit_depth(clip, chunk, bent_m.astype(np.float32), set(), "affine")
+    for index, image in enumerate(fit.images):
+        assert image.scale == pytest.approx(scales[index], rel=0.005)
+        assert image.slope_per_m == pytest.approx(slopes[index], abs=1e-4)
+        near, far = image.range_m
+        inside = (bent_m[index] > near) & (bent_m[index] < far)
+        fitted = bent_m[index] * image.factor(bent_m[index])
+        assert np.abs(fitted / true_m[index] - 1)[inside].max() < 0.005
+        # Positive and rising everywhere, far behind the last point too.
+        depth = np.geomspace(0.1, 1e5, 400)
+        fitted = depth * image.factor(depth)
+        assert (fitted > 0).all() and (np.diff(fitted) > 0).all()
+    moved = fit.apply(pixel_gaussians(chunk, bent_m.astype(np.float32)), chunk)
+    wanted = pixel_gaussians(chunk, true_m).position_m
+    close = torch.tensor((true_m < 60).reshape(1, -1)) & torch.tensor((true_m > 6).reshape(1, -1))
+    error = (moved.position_m - wanted).norm(dim=-1) / torch.tensor(true_m).reshape(1, -1)
+    assert error[close].max() < 0.01
+
+
+def test_a_fifth_of_wrong_depths_does_not_matter():
+    clip = WallStreet()
+    chunk, true_m = street_chunk(clip, ("front",))
+    rng = np.random.default_rng(3)
+    # In blocks, as wrongly predicted objects are; single wrong pixels would only look like edges.
+    wrong = np.kron(rng.random((len(true_m), 14, 24)) < 0.2, np.ones((1, 7, 7), bool))
+    noise = rng.uniform(1.5, 4.0, wrong.shape)
+    predicted = np.where(wrong, noise * true_m, true_m).astype(np.float32) / 1.25
+    for kind in ("scale", "affine"):
+        for image in fit_depth(clip, chunk, predicted, set(), kind).images:
+            assert image.scale == pytest.approx(1.25, rel=0.005)
+            assert abs(image.slope_per_m) < 1e-4
+
+
+def test_points_behind_what_the_camera_sees_are_left_out():
+    clip = WallStreet(frames=1)
+    chunk, true_m = street_chunk(clip, ("front",))
+    # Another sensor saw a plane 10 m behind the near wall: three points for each one of the wall.
+    y, z = np.meshgrid(np.linspace(0.5, 10, 120), np.linspace(0.1, 5.5, 100))
+    clip.added = np.stack([np.full(y.size, 35.0), y.ravel(), z.ravel()], axis=1)
+    image = fit_depth(clip, chunk, true_m, set(), "scale").images[0]
+    assert image.error_before < 0.005 and image.scale == pytest.approx(1, rel=0.005)
+
+
+def test_held_out_sweeps_are_not_read_and_their_images_take_neighbours():
+    clip = WallStreet(frames=6)
+    chunk, true_m = street_chunk(clip, ("front",))
+    fit = fit_depth(clip, chunk, true_m / np.float32(1.5), {1, 2, 3, 4}, "scale")
+    assert set(clip.read) == {0, 5}
+    # Images 2 and 3 are 0.2 s away from any sweep that is left.
+    assert [image.points > 0 for image in fit.images] == [True, True, False, False, True, True]
+    assert [image.taken_from for image in fit.images] == ["own", "own", "camera", "camera", "own", "own"]
+    assert all(image.scale == pytest.approx(1.5, rel=0.005) for image in fit.images)
+    assert fit.images[2].error_after is None
+    report = fit.report()
+    assert report["images_without_own_points"] == 2
+    assert report["images"][2]["taken_from"] == "camera"
+
+
+def test_cameras_without_points_take_the_factor_of_the_chunk_and_without_any_point_it_is_one():
+    clip = WallStreet(frames=2)
+    chunk, true_m = street_chunk(clip)
+    covered = chunk.ego.copy()
+    covered[2:] = True
+    half = fit_depth(clip, dataclasses.replace(chunk, ego=covered), true_m / np.float32(1.5), set(), "affine")
+    assert [image.taken_from for image in half.images] == ["own", "own", "chunk", "chunk"]
+    assert all(image.scale == pytest.approx(1.5, rel=0.005) for image in half.images)
+    nothing = fit_depth(clip, dataclasses.replace(chunk, ego=np.ones_like(covered)), true_m, set(), "scale")
+    assert {(image.taken_from, image.scale, image.points) for image in nothing.images} == {("none", 1.0, 0)}
+    assert (nothing.error_before, nothing.error_after) == (None, None)
+
+
+def test_a_slope_needs_points_at_several_depths():
+    clip = WallStreet()
+    chunk, true_m = street_chunk(clip, ("front",))
+    # Only the near wall is left.
+    chunk = dataclasses.replace(chunk, ego=(np.abs(true_m - 22) > 3) | (np.arange(98)[:, None] > 52))
+    fit = fit_depth(clip, chunk, true_m / np.float32(1.1), set(), "affine")
+    for image in fit.images:
+        assert image.points >= 200 and image.slope_per_m == 0
+        assert image.scale == pytest.approx(1.1, rel=0.005)
+
+
+def test_points_on_moving_objects_go_along_to_the_time_of_the_image():
+    # A truck fills the view and drives ahead at 20 m/s; the only sweep left is 0.1 s older than the image.
+    t_us = EPOCH_US + STEP_US * np.arange(-3, 6)
+    poses = np.array([geometry.pose_from_xyyaw(20 + 20 * (t - EPOCH_US) * 1e-6, 0, 0, z=3) for t in t_us])
+    truck = Track("truck", "heavy_truck", (6.0, 12.0, 5.8), Trajectory(t_us, poses))
+    y, z = np.meshgrid(np.linspace(-5, 5, 80), np.linspace(0.5, 5.5, 60))
+    rear = np.stack([np.full(y.size, 17.0), y.ravel(), z.ravel()], axis=1)
+    for tracks in ((truck,), ()):
+        clip = WallStreet(frames=2, tracks=tracks)
+        clip.added = rear
+        chunk, _ = street_chunk(clip, ("front",))
+        image = chunk.images[1]
+        depth = np.full(chunk.ego.shape, 19.0 - image.world_from_camera[0, 0, 3], np.float32)
+        rows = np.abs(np.arange(98)[:, None] - 40) > 20
+        covered = np.broadcast_to(rows | (np.abs(np.arange(168) - 84) > 30), chunk.ego.shape)
+        fit = fit_depth(clip, dataclasses.replace(chunk, ego=covered), depth, {1}, "scale").images[1]
+        assert fit.points > 300
+        camera_x = image.world_from_camera[:, 0, 3].mean()
+        truth = 1.0 if tracks else (17 - camera_x) / (19 - camera_x)
+        assert fit.scale == pytest.approx(truth, rel=0.01)
+
+
+def test_the_same_input_gives_the_same_report():
+    clip = WallStreet(frames=2)
+    chunk, true_m = street_chunk(clip)
+    first, second = (fit_depth(clip, chunk, true_m, set(), "affine").report() for _ in range(2))
+    assert json.dumps(first) == json.dumps(second)
+
+
+def test_logs_without_sweeps_are_refused():
+    clip = WallStreet(frames=2)
+    chunk, true_m = street_chunk(clip)
+    with pytest.raises(ReconstructError, match="has 2, of which all are held out"):
+        fit_depth(clip, chunk, true_m, {0, 1}, "scale")
+    clip.rig = dataclasses.replace(clip.rig, lidars={})
+    with pytest.raises(ReconstructError, match="lidar_depth='scale' needs LiDAR sweeps, and clip 'wall-street' has"):
+        fit_depth(clip, chunk, true_m, set(), "scale")
+
+
+@pytest.mark.realdata
+def test_real_sweeps_agree_with_the_sweep_that_they_do_not_know(realdata):
+    clip = logs.open_clip(realdata / "kitti_raw_0002")
+    images, depths = [], []
+    for frame in (2, 5):
+        camera = sensors.scaled_camera(clip.rig.cameras["cam_left"], 784, 236)
+        t_us = tuple(int(t) for t in clip.camera_times_us("cam_left")[frame])
+        images.append(ContextImage(camera, frame, t_us, t_us, clip.world_from_camera("cam_left", frame)))
+        # A depth map that only this sweep has made: every pixel takes that of the nearest point.
+        xyz = clip.sweep("lidar", frame).xyz_world_m
+        uv, valid, _ = sensors.project_rolling(camera, images[-1].world_from_camera, xyz)
+        seen = valid & sensors.in_image(camera, uv)
+        depth = geometry.transform_points(geometry.inverse(images[-1].world_from_camera[0]), xyz[seen])[:, 2]
+        pixels = np.stack(np.meshgrid(np.arange(784) + 0.5, np.arange(236) + 0.5), axis=-1)
+        depths.append(depth[cKDTree(uv[seen]).query(pixels)[1]])
+    chunk, _ = chunk_of(images)
+    factors = np.array([1.3, 0.8])
+    predicted = (np.stack(depths) / factors[:, None, None]).astype(np.float32)
+    fit = fit_depth(clip, chunk, predicted, {2, 5}, "scale")
+    assert all(image.points > 3000 for image in fit.images)
+    assert np.allclose([image.scale for image in fit.images], factors, rtol=0.005)
+    assert fit.error_before > 0.15 and fit.error_after < 0.02
