@@ -1,7 +1,7 @@
 """Times the feed-forward network with random weights: floating-point operations against time, and memory.
 
-Every case runs in a process of its own, so that its peak memory is its own; rows that are compared with each other take
-turns in one process.
+Every case runs in a process of its own, so that its peak memory is its own; what is compared with each other takes turns
+in one process.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,52 +22,45 @@ from typing import Any, Literal
 import bars
 import numpy as np
 import tyro
-from network_cases import CASES, QUICK_CASES, QUICK_SLOTS, SLOT_CASES, Case, features_and_context, inputs_of
+from network_cases import CASES, QUICK_CASES, Case, Drive, features_and_context, inputs_of
 from render import PLAIN, machine_name, progress, write
 from scenes import ROOT
 
 from nurec_sim.cli.console import out
 
-HEADING = (
-    f"{'case':30s} {'images':>14s} {'M par':>6s} {'TFLOP':>7s} {'s':>7s} {'cpu s':>7s} {'first':>7s} {'GFLOP/s':>8s}"
-    f" {'/cpu s':>7s} {'GB':>5s} {'Gaussians':>10s} {'load':>5s}"
-)
-SLOT_HEADING = (
-    f"{'slots of the road branch':30s} {'road':>14s} {'tokens':>11s} {'TFLOP':>15s} {'decoder s':>15s} {'ratio':>6s}"
-    f" {'whole pass':>10s}"
-)
 CaseName = Literal[tuple(CASES)]  # type: ignore[valid-type]
 PrecisionName = Literal["float32", "bfloat16", "float16"]
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Options:
-    """Time the network, count its operations and memory, print a table and write build/bench_network.json.
+    """Time the network, count its operations and memory, print tables and write build/bench_network.json.
+
+    Weights are random and seeded. docs/benchmarks.md explains every column.
 
     Examples: "python benchmarks/network.py --quick" takes half a minute; "python benchmarks/network.py --device cuda"
     measures a 20 s clip on a GPU.
 
     Args:
-        cases: what to run.
-        precisions: of matrix products and convolutions, each for every case.
-        slots: also compare the road branch of the selective decoder with the release's rule.
+        cases: what to run; all of the device if not given.
+        precisions: of matrix products and convolutions, each for every pass.
         quick: only the small network, and few images.
         repeats: timed passes of each row, after one that warms up.
         threads: threads of torch; all that the process may use if not given.
-        device: ``cpu``, or a CUDA device for the one case with a limit there.
+        device: ``cpu``, or a CUDA device.
         output: the results, as JSON.
-        only: run one case here and print its rows as JSON; what the processes of the cases are called with.
+        only: run one case here, in this precision, and print its rows as JSON; how a case's own process is called.
     """
 
-    cases: tuple[CaseName, ...] = tuple(name for name, case in CASES.items() if case.device == "cpu")
+    cases: tuple[CaseName, ...] = ()
     precisions: tuple[PrecisionName, ...] = ("float32", "bfloat16")
-    slots: bool = True
     quick: bool = False
     repeats: int = 3
     threads: int | None = None
     device: str = "cpu"
     output: Path = ROOT / "build" / "bench_network.json"
-    only: str | None = None
+    only: tuple[str, str] | None = None
 
     @property
     def thread_count(self) -> int:
@@ -78,20 +72,15 @@ def main() -> int:
     """Run what the command line asks for."""
     options = tyro.cli(Options)
     if options.only is not None:
-        print(json.dumps(measured(options.only, options)))
+        print(json.dumps(measured(*options.only, options)))
         return 0
-    if options.device != "cpu":
-        reason = why_no_gpu(options.device)
-        if reason is not None:
-            out.print(f"nothing measured on {options.device}: {reason}", **PLAIN)
-            return 0
-        names = tuple(name for name, case in CASES.items() if case.device == "cuda")
-        options = dataclasses.replace(options, cases=names, precisions=("bfloat16", "float16"), slots=False)
-    if options.quick:
-        options = dataclasses.replace(options, cases=QUICK_CASES, repeats=min(options.repeats, 2))
+    reason = why_no_gpu(options.device)
+    if reason is not None:
+        out.print(f"nothing measured on {options.device}: {reason}", **PLAIN)
+        return 0
     load = os.getloadavg()[0]
     out.print(f"{machine_name()}, {options.thread_count} threads, load {load:.2f}, random weights", **PLAIN)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for row in all_rows(options):
         rows.append({**row, "machine": machine_name()})
         write(rows, options.output)
@@ -101,137 +90,191 @@ def main() -> int:
     return 0
 
 
-def all_rows(options: Options) -> Iterator[dict[str, Any]]:
+def all_rows(options: Options) -> Iterator[Row]:
     """Rows as they become known, each printed."""
-    out.print(HEADING, **PLAIN)
-    for name in options.cases:
-        for precision in options.precisions:
-            for row in in_process(f"{name} {precision}", options):
-                out.print(line_of(row), **PLAIN)
-                yield row
-    if options.slots:
-        out.print(SLOT_HEADING, **PLAIN)
-        for name in QUICK_SLOTS if options.quick else SLOT_CASES:
-            for row in in_process(f"{name} slots", options):
-                out.print(slot_line_of(row), **PLAIN)
+    kind = "cpu" if options.device == "cpu" else "cuda"
+    chosen = QUICK_CASES if options.quick else CASES
+    names = options.cases or [name for name, case in chosen.items() if case.device == kind]
+    heading = ""
+    for name in names:
+        case = chosen[name]
+        for precision in ("float32",) if case.road_shares or (case.clip_s and kind == "cpu") else options.precisions:
+            for row in in_process(name, precision, options):
+                line, head = LINES[row["kind"]](row)
+                if head != heading:
+                    out.print(f"\n{head}", **PLAIN)
+                    heading = head
+                out.print(line, **PLAIN)
                 yield row
 
 
-def in_process(only: str, options: Options) -> list[dict[str, Any]]:
-    """The rows of a case, run by a new process of this script."""
-    command = [sys.executable, __file__, "--only", only, "--repeats", str(options.repeats)]
+def in_process(name: str, precision: str, options: Options) -> list[Row]:
+    """The rows of a case, measured by a new process of this script."""
+    command = [sys.executable, __file__, "--only", name, precision, "--repeats", str(options.repeats)]
     command += ["--threads", str(options.thread_count), "--device", options.device]
-    with progress(only) as advance:
-        advance("in a process of its own", 0.5)
+    with progress(name) as advance:
+        advance(f"{precision}, in a process of its own", 0.5)
         ran = subprocess.run(command, capture_output=True, text=True, check=False)
     if ran.returncode != 0:
         last = (ran.stderr.strip() or "no output").splitlines()[-1]
-        out.print(f"{only} could not be measured: {last}", **PLAIN)
+        out.print(f"{name} {precision} could not be measured: {last}", **PLAIN)
         return []
     return json.loads(ran.stdout.splitlines()[-1])
 
 
-# ------------------------------------------------------------------------------------- in the process of a case
+def why_no_gpu(device: str) -> str | None:
+    """Why nothing can run on a device, None if it can."""
+    import torch
+
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        return str(error).splitlines()[0]
+    return None
 
 
-def measured(only: str, options: Options) -> list[dict[str, Any]]:
-    """The rows of one case, measured here."""
+# -------------------------------------------------------------------------------------- in the process of one case
+
+
+def measured(name: str, precision: Any, options: Options) -> list[Row]:
+    """The rows of one case."""
     import torch
 
     torch.set_num_threads(options.thread_count)
-    name, what = only.split()
+    case = {**CASES, **QUICK_CASES}[name]
     with torch.inference_mode():
-        if what == "slots":
-            return slot_rows(SLOT_CASES.get(name) or QUICK_SLOTS[name], options)
-        return [pass_row(name, CASES.get(name) or QUICK_CASES[name], what, options)]
-
-
-def pass_row(name: str, case: Case, precision: Any, options: Options) -> dict[str, Any]:
-    """Whole passes of a case: all its chunks after each other."""
-    import torch
-
-    from nurec_sim import network
-
-    model = network.build(case.profile, precision=precision).to(options.device)
-    chunks = [inputs_of(case, seed).to(options.device) for seed in range(case.chunks)]
-    outputs, operations = counted(lambda: model(chunks[0]))
-    gaussians = case.chunks * outputs.gaussians.opacity.numel()
-    del outputs
-    times = [
-        timed(lambda: [model(chunk) for chunk in chunks] and None, options.device) for _ in range(options.repeats + 1)
-    ]
-    row = {
-        "name": f"{name} {precision}",
-        "profile": case.profile,
+        if case.clip_s is not None:
+            rows = [clip_row(name, case, precision, options)]
+        elif case.road_shares:
+            rows = slot_rows(name, case, precision, options)
+        else:
+            rows = [pass_row(name, case, precision, options)]
+    facts = {
         "precision": precision,
-        "images": case.cameras * case.frames,
-        "chunks": case.chunks,
-        "width": chunks[0].rgb.shape[3],
-        "height": chunks[0].rgb.shape[2],
         "device": options.device,
         "threads": options.thread_count,
-        "parameters": sum(parameter.numel() for parameter in model.parameters()),
-        "gaussians": gaussians,
-        "tflop": case.chunks * operations / 1e12,
-        "s_first": times[0][0],
-        "s_median": float(np.median([wall for wall, _ in times[1:]])),
-        "cpu_s_median": float(np.median([cpu for _, cpu in times[1:]])),
-        "passes": options.repeats,
+        "limit_s": case.limit_s,
+        "limit_gb": case.limit_gb,
         # Kilobytes on Linux.
         "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9,
         "load_average": os.getloadavg()[0],
     }
-    row["gflop_per_s"] = 1e3 * row["tflop"] / row["s_median"]
-    row["gflop_per_cpu_s"] = 1e3 * row["tflop"] / row["cpu_s_median"]
     if options.device != "cpu":
-        row["gpu"] = torch.cuda.get_device_name(options.device)
-        row["peak_gpu_gb"] = torch.cuda.max_memory_allocated(options.device) / 1e9
-    return row
+        facts["gpu"] = torch.cuda.get_device_name(options.device)
+        facts["peak_gpu_gb"] = torch.cuda.max_memory_allocated(options.device) / 1e9
+    return [{**row, "profile": case.profile, **facts} for row in rows]
 
 
-def slot_rows(case: Case, options: Options) -> list[dict[str, Any]]:
+def pass_row(name: str, case: Case, precision: Any, options: Options) -> Row:
+    """Passes of a case's images through the whole network."""
+    from nurec_sim import network
+
+    model = network.build(case.profile, precision=precision).to(options.device)
+    inputs = inputs_of(case, 0).to(options.device)
+    outputs, operations = counted(lambda: model(inputs))
+    gaussians = outputs.gaussians.opacity.numel()
+    del outputs
+    wall, cpu = timed([lambda: model(inputs)], options)[0]
+    return {
+        "name": f"{name} {precision}",
+        "kind": "pass",
+        "images": case.cameras * case.frames,
+        "width": inputs.rgb.shape[3],
+        "height": inputs.rgb.shape[2],
+        "parameters": sum(parameter.numel() for parameter in model.parameters()),
+        "gaussians": gaussians,
+        "tflop": operations / 1e12,
+        "s_median": wall,
+        "cpu_s_median": cpu,
+        "gflop_per_s": operations / 1e9 / wall,
+        "gflop_per_cpu_s": operations / 1e9 / cpu,
+        "passes": options.repeats,
+    }
+
+
+def slot_rows(name: str, case: Case, precision: Any, options: Options) -> list[Row]:
     """The selective decoder at several shares of road, with our rule and the release's in turns."""
     from nurec_sim import network
 
-    model = network.build(case.profile).to(options.device)
+    model = network.build(case.profile, precision=precision).to(options.device)
     inputs = inputs_of(case, 0).to(options.device)
-    decoder, size = model.decoder, model.decoder.size
-    whole_s = min(timed(lambda: model(inputs) and None, options.device)[0] for _ in range(2))
+    whole = timed([lambda: model(inputs)], options)[0][0]
     rows = []
     for share in case.road_shares:
         features, context = features_and_context(model, inputs, share)
-        tokens, operations = {}, {}
-        seconds: dict[bool, list[float]] = {False: [], True: []}
-        for number in range(options.repeats + 1):
-            for fill in (False, True):
-                decoder.fill_road_slots = fill
-                decode = lambda features=features, context=context: decoder.gaussians(features, context, inputs)  # noqa: E731
-                if number == 0:
-                    gaussians, operations[fill] = counted(decode)
-                    tokens[fill] = gaussians.opacity.numel() // size.cell**2
-                else:
-                    seconds[fill].append(timed(lambda decode=decode: decode() and None, options.device)[0])
-        ours_s, theirs_s = (float(np.median(seconds[fill])) for fill in (False, True))
+
+        def decode(fill: bool, features=features, context=context) -> Any:
+            model.decoder.fill_road_slots = fill
+            return model.decoder.gaussians(features, context, inputs)
+
+        (ours, operations), (theirs, their_operations) = (
+            counted(lambda fill=fill, decode=decode: decode(fill)) for fill in (False, True)
+        )
+        (wall, cpu), (their_wall, their_cpu) = timed(
+            [lambda fill=fill, decode=decode: decode(fill) for fill in (False, True)], options
+        )
+        cell = model.decoder.size.cell**2
         rows.append(
             {
-                "name": f"{case.profile} slots, {100 * share:.0f} % road",
-                "profile": case.profile,
+                "name": f"{name}, {100 * share:.0f} % road",
+                "kind": "slots",
                 "images": case.cameras * case.frames,
                 "road_share": share,
-                "threads": options.thread_count,
-                "tokens": tokens[False],
-                "tokens_release": tokens[True],
-                "tflop": operations[False] / 1e12,
-                "tflop_release": operations[True] / 1e12,
-                "s_median": ours_s,
-                "s_median_release": theirs_s,
-                "ratio": ours_s / theirs_s,
-                "s_whole_pass": whole_s,
+                "tokens": ours.opacity.numel() // cell,
+                "tokens_release": theirs.opacity.numel() // cell,
+                "tflop": operations / 1e12,
+                "tflop_release": their_operations / 1e12,
+                "s_median": wall,
+                "s_median_release": their_wall,
+                "cpu_s_median": cpu,
+                "cpu_s_median_release": their_cpu,
+                "ratio": cpu / their_cpu if options.device == "cpu" else wall / their_wall,
+                "s_whole_pass": whole,
                 "passes": options.repeats,
-                "load_average": os.getloadavg()[0],
             }
         )
     return rows
+
+
+def clip_row(name: str, case: Case, precision: Any, options: Options) -> Row:
+    """A clip to layers, end to end; the time is without making the network and its weights."""
+    from nurec_sim.reconstruct import FeedForwardSettings, reconstruct
+
+    settings = FeedForwardSettings(
+        case.profile,
+        random_weights=0,
+        device=options.device,
+        precision=precision,
+        chunking="non-overlapping",
+        frames=case.frames,
+    )
+    drive = Drive(case.cameras, case.clip_s or 0.0)
+    runs = []
+    # The first run on a GPU also makes its kernels.
+    for _ in range(1 if options.device == "cpu" else 1 + options.repeats):
+        events: list[tuple[float, str]] = []
+        scene = reconstruct(
+            drive, settings=settings, method="dense",
+            progress=lambda stage, done, events=events: events.append((time.perf_counter(), stage)),
+        )  # fmt: skip
+        events.append((time.perf_counter(), ""))
+        stages: dict[str, float] = defaultdict(float)
+        for (began, stage), (ended, _) in zip(events, events[1:], strict=False):
+            stages[stage.rsplit(": ", 1)[-1]] += ended - began
+        loading = stages.pop("weights")
+        runs.append((sum(stages.values()), loading, dict(stages)))
+    total, loading, stages = sorted(runs[1:] or runs, key=lambda run: run[0])[len(runs[1:]) // 2]
+    return {
+        "name": f"{name} {precision}",
+        "kind": "clip",
+        "clip_s": case.clip_s,
+        "cameras": case.cameras,
+        "chunks": len(scene.provenance["chunks"]),
+        "gaussians": len(scene.static) + len(scene.dynamic),
+        "s_median": total,
+        "s_loading": loading,
+        "stages": stages,
+    }
 
 
 def counted(work: Callable[[], Any]) -> tuple[Any, int]:
@@ -242,80 +285,87 @@ def counted(work: Callable[[], Any]) -> tuple[Any, int]:
     def attention(query, key, value, *args, **kwargs) -> int:
         return 2 * query[0] * query[1] * query[2] * key[2] * (query[3] + value[3])
 
-    # torch counts attention on GPUs only.
+    # torch itself counts attention on GPUs only.
     on_cpu = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
     with FlopCounterMode(display=False, custom_mapping={on_cpu: attention}) as counter:
         result = work()
     return result, counter.get_total_flops()
 
 
-def timed(work: Callable[[], Any], device: str) -> tuple[float, float]:
-    """Wall and CPU seconds of some work, what it leaves to a GPU included."""
+def timed(works: Sequence[Callable[[], Any]], options: Options) -> list[tuple[float, float]]:
+    """Median wall and CPU seconds of works that take turns, what they leave to a GPU included; one turn warms up."""
     import torch
 
     def wait() -> None:
-        if device != "cpu":
-            torch.cuda.synchronize(device)
+        if options.device != "cpu":
+            torch.cuda.synchronize(options.device)
 
-    wait()
-    wall, cpu = time.perf_counter(), time.process_time()
-    work()
-    wait()
-    return time.perf_counter() - wall, time.process_time() - cpu
-
-
-def why_no_gpu(device: str) -> str | None:
-    """Why nothing can run on a CUDA device, None if it can."""
-    import torch
-
-    if not torch.cuda.is_available():
-        return "torch sees no CUDA device"
-    try:
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        return str(error).splitlines()[0]
-    return None
+    turns = []
+    for _ in range(options.repeats + 1):
+        turn = []
+        for work in works:
+            wait()
+            wall, cpu = time.perf_counter(), time.process_time()
+            work()
+            wait()
+            turn.append((time.perf_counter() - wall, time.process_time() - cpu))
+        turns.append(turn)
+    return [(float(wall), float(cpu)) for wall, cpu in np.median(np.array(turns[1:]), axis=0)]
 
 
-# -------------------------------------------------------------------------------------------------- what is printed
+# --------------------------------------------------------------------------------------------------- what is printed
 
 
-def verdicts(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
-    """One line per limit whose rows were measured; times hold for two threads, in the fastest precision."""
-    for name, case in CASES.items():
-        own = [row for row in rows if row["name"].split()[0] == name and "precision" in row]
-        if not own or case.limit_s is None:
-            continue
-        for row in own:
-            yield bars.verdict(row["name"], row["s_median"], case.limit_s, "s")
-            if case.limit_gb is not None:
-                yield bars.verdict(f"peak of {row['name']}", row["peak_gb"], case.limit_gb, "GB")
-    slots = [row for row in rows if "ratio" in row]
-    if slots:
-        best, worst = (pick(slots, key=lambda row: row["ratio"]) for pick in (min, max))
-        yield bars.verdict(f"{best['name']}, over the release's rule", best["ratio"], 1.0, "x")
-        yield f"        {worst['name']}, over the release's rule: {worst['ratio']:.4g} x (no slot is left over there)"
+def verdicts(rows: Sequence[Row]) -> Iterator[str]:
+    """One line per limit whose rows were measured; times hold for two threads of a machine with nothing else to do."""
+    for row in rows:
+        if row["limit_s"] is not None:
+            yield bars.verdict(row["name"], row["s_median"], row["limit_s"], "s")
+        if row["limit_gb"] is not None:
+            yield bars.verdict(f"peak memory of {row['name']}", row["peak_gb"], row["limit_gb"], "GB")
+        if row["kind"] == "slots" and row["tokens"] < row["tokens_release"]:
+            yield bars.verdict(f"{row['name']}, CPU time over the release's rule", row["ratio"], 1.0, "x")
 
 
-def line_of(row: dict[str, Any]) -> str:
-    """A row of whole passes as one line of the table."""
+def pass_line(row: Row) -> tuple[str, str]:
+    """A row of passes and its heading."""
+    head = (
+        f"{'one pass':28s} {'images':>13s} {'M par':>6s} {'TFLOP':>7s} {'s':>7s} {'cpu s':>7s} {'GFLOP/s':>8s}"
+        f" {'/cpu s':>7s} {'GB':>5s} {'Gaussians':>10s} {'load':>5s}"
+    )
     images = f"{row['images']} x {row['width']}x{row['height']}"
     return (
-        f"{row['name']:30s} {images:>14s} {row['parameters'] / 1e6:6.1f} {row['tflop']:7.3f} {row['s_median']:7.2f}"
-        f" {row['cpu_s_median']:7.2f} {row['s_first']:7.2f} {row['gflop_per_s']:8.0f} {row['gflop_per_cpu_s']:7.0f}"
-        f" {row['peak_gb']:5.2f} {row['gaussians']:10,d} {row['load_average']:5.1f}"
+        f"{row['name']:28s} {images:>13s} {row['parameters'] / 1e6:6.1f} {row['tflop']:7.3f} {row['s_median']:7.2f}"
+        f" {row['cpu_s_median']:7.2f} {row['gflop_per_s']:8.0f} {row['gflop_per_cpu_s']:7.0f} {row['peak_gb']:5.2f}"
+        f" {row['gaussians']:10,d} {row['load_average']:5.1f}"
+    ), head
+
+
+def slot_line(row: Row) -> tuple[str, str]:
+    """A comparison of the two rules, ours / the release's, and its heading."""
+    head = (
+        f"{'decoder: ours/release':28s} {'tokens':>13s} {'TFLOP':>13s} {'s':>13s} {'cpu s':>13s} {'ratio':>6s}"
+        f" {'one pass, s':>12s} {'load':>5s}"
     )
-
-
-def slot_line_of(row: dict[str, Any]) -> str:
-    """A comparison of the two rules as one line of the table; ours / the release's."""
+    pairs = [f"{row[key]:.2f}/{row[key + '_release']:.2f}" for key in ("tflop", "s_median", "cpu_s_median")]
     tokens = f"{row['tokens']}/{row['tokens_release']}"
-    operations = f"{row['tflop']:.3f}/{row['tflop_release']:.3f}"
-    seconds = f"{row['s_median']:.2f}/{row['s_median_release']:.2f}"
     return (
-        f"{row['name']:30s} {100 * row['road_share']:12.0f} % {tokens:>11s} {operations:>15s} {seconds:>15s}"
-        f" {row['ratio']:6.2f} {row['s_whole_pass']:10.2f}"
-    )
+        f"{row['name']:28s} {tokens:>13s} {pairs[0]:>13s} {pairs[1]:>13s} {pairs[2]:>13s} {row['ratio']:6.2f}"
+        f" {row['s_whole_pass']:12.2f} {row['load_average']:5.1f}"
+    ), head
+
+
+def clip_line(row: Row) -> tuple[str, str]:
+    """A row of a clip, end to end, and its heading."""
+    head = f"{'clip to layers':28s} {'seconds':>8s} {'chunks':>7s} {'s':>7s} {'GB':>5s} {'Gaussians':>10s}  stages, s"
+    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in row["stages"].items())
+    return (
+        f"{row['name']:28s} {row['clip_s']:8.0f} {row['chunks']:7d} {row['s_median']:7.2f} {row['peak_gb']:5.2f}"
+        f" {row['gaussians']:10,d}  {stages}"
+    ), head
+
+
+LINES = {"pass": pass_line, "slots": slot_line, "clip": clip_line}
 
 
 if __name__ == "__main__":

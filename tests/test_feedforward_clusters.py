@@ -174,3 +174,17 @@ def test_things_that_pass_close_by_are_kept_apart():
         mine = owner[index == number]
         assert np.mean(mine == np.bincount(mine + 1).argmax() - 1) > 0.95
     assert {int(np.bincount(owner[index == k] + 1).argmax()) - 1 for k in range(len(tracks))} == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("hidden_s, expected", [(0.9, 1), (2.4, 2)])
+def test_a_thing_that_is_hidden_for_a_moment_stays_one_track(hidden_s, expected):
+    ego = moving_things.ego()
+    car = moving_things.thing("car", "automobile", (4.5, 1.8, 1.5), (14.0, 3.0), 0.0, 7.0)
+    dynamic, _ = moving_things.lifted([car], ego, outliers=0)
+    seen_s = (dynamic.knot_t_us[:, 1] - ego.start_us) / 1e6
+    kept = (seen_s < 3.2) | (seen_s > 3.2 + hidden_s)
+    hidden = DynamicGaussians(
+        dynamic.gaussians[kept], dynamic.knot_t_us[kept], dynamic.knot_m[kept], dynamic.track[kept]
+    )
+    tracks, index = group_into_tracks(hidden, ego)
+    assert len(tracks) == expected and np.mean(index >= 0) > 0.99

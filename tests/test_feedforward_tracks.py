@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from nurec_sim import geometry
+from nurec_sim import geometry, logs
 from nurec_sim.reconstruct.feedforward import tracks as module
 from nurec_sim.reconstruct.feedforward.tracks import (
     knots_along,
@@ -233,3 +233,22 @@ def test_no_points_and_no_actors():
     assert owners_of_points(actors, none, times, yes(0)).shape == (0,)
     assert owners_of_rays(actors, none, none, times).shape == (0,)
     assert owners_of_points([], np.zeros((4, 3)), np.zeros(4, np.int64), yes(4)).tolist() == [-1] * 4
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name, least", [("kitti_raw_0009", 500), ("ddad_6cam", 500), ("nuscenes_6cam_1frame", 500)])
+def test_real_sweeps_associate_with_real_boxes(realdata, name, least):
+    """Clocks of these logs count microseconds since 1970; sweeps give points, their own times and rays."""
+    clip = logs.open_clip(realdata / name)
+    actors = scene_actors(clip)
+    sweep = clip.sweep("lidar", 0)
+    xyz, t_us = sweep.xyz_world_m, sweep.point_t_us
+    padded = owners_of_points(actors, xyz, t_us, yes(len(xyz)))
+    plain = owners_of_points(actors, xyz, t_us, ~yes(len(xyz)))
+    assert least < (plain >= 0).sum() < (padded >= 0).sum() < 0.5 * len(xyz)
+    assert np.array_equal(plain[plain >= 0] >= 0, padded[plain >= 0] >= 0)
+    rows = np.flatnonzero((plain >= 0) & (np.linalg.norm(sweep.xyz_m, axis=1) > 3))
+    origin = np.broadcast_to(sweep.world_from_lidar[:3, 3], (len(rows), 3))
+    direction = (xyz[rows] - origin) / np.linalg.norm(xyz[rows] - origin, axis=1, keepdims=True)
+    by_ray = owners_of_rays(actors, origin, direction, t_us[rows])
+    assert np.mean(by_ray >= 0) > 0.3 and np.array_equal(by_ray[by_ray >= 0], plain[rows][by_ray >= 0])

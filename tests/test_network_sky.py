@@ -20,7 +20,7 @@ FACES = {"+X": (1, 0, 0), "-X": (-1, 0, 0), "-Y": (0, -1, 0), "+Y": (0, 1, 0), "
 
 @pytest.fixture(scope="session")
 def parity() -> Path:
-    folder = Path(os.environ.get("NUREC_SIM_PARITY", Path(__file__).parents[2] / "shared" / "parity"))
+    folder = Path(__file__).parent / "data" / "reference_network"
     if not folder.is_dir():
         pytest.skip(f"no parity cases of the reference network at {folder}; set NUREC_SIM_PARITY to their folder")
     return folder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 from pathlib import Path
@@ -11,9 +12,14 @@ import tyro
 
 from nurec_sim.cli.console import OnePath, Paths, app, err, out, print_faults, print_table, progress
 from nurec_sim.errors import NurecSimError
+from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 
 if TYPE_CHECKING:
     from nurec_sim.types import GaussianScene
+
+Method = Literal["lift", "dense", "selective"]
+NetworkFlags = Annotated[FeedForwardSettings, tyro.conf.arg(name="")]
+NO_FLAGS = FeedForwardSettings()
 
 
 @app.command
@@ -73,18 +79,24 @@ def reconstruct(
     clip: OnePath,
     *,
     out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
-    method: Literal["lift"] = "lift",
+    method: Method = "lift",
     cameras: tuple[str, ...] = (),
     overwrite: bool = False,
+    network: NetworkFlags = NO_FLAGS,
 ) -> None:
     """Turn a driving log into a Gaussian scene archive (.usdz).
+
+    Methods: `lift` colours LiDAR points, without learning. `dense` and `selective` are the Instant NuRec network, with
+    one Gaussian per pixel or with clusters around chosen points; the options of the second group are theirs.
+    `nurec-sim weights list` shows the profiles, and which weights are here.
 
     Args:
         clip: a clip folder, or a .zip of one.
         out_path: the archive to write; CLIP's name with .usdz in the current folder if not given.
-        method: how to reconstruct; lift colours LiDAR points, no learning.
-        cameras: use only these cameras; all if not given.
+        method: how to reconstruct.
+        cameras: use only these cameras; all if not given, or as many as the network's profile takes.
         overwrite: replace an archive that is there.
+        network: how the clip goes through the network.
     """
     from nurec_sim import logs, scene
     from nurec_sim.reconstruct import reconstruct as run_method
@@ -94,7 +106,9 @@ def reconstruct(
     if target.exists() and not overwrite:
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
     with progress("reconstructing") as advance:
-        world_scene = run_method(log, method, cameras=cameras or None, progress=advance)
+        world_scene = run_method(
+            log, method, cameras=cameras or None, progress=advance, settings=_network_settings(method, network)
+        )
     scene.write_scene(world_scene, target, overwrite=overwrite)
     print_table(f"scene {world_scene.id}", scene.summary(world_scene))
     for text in world_scene.provenance.get("unknown", ()):
@@ -171,13 +185,14 @@ def serve(
 def evaluate(
     clip: OnePath,
     *,
-    method: Literal["lift"] = "lift",
+    method: Method = "lift",
     input_cameras: tuple[str, ...] = (),
     target_cameras: tuple[str, ...] = (),
     hold_out_sweeps: int = 0,
     local: bool = False,
     images: Path | None = None,
     json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
+    network: NetworkFlags = NO_FLAGS,
 ) -> None:
     """Measure a reconstruction against what the log recorded: images of other cameras, LiDAR sweeps left out.
 
@@ -190,6 +205,7 @@ def evaluate(
         local: render in this process instead of through gRPC.
         images: also write rendered and recorded images side by side into this folder.
         json_path: write all figures here.
+        network: how the clip goes through the network (`nurec-sim reconstruct --help` says more).
     """
     from nurec_sim import logs
     from nurec_sim.evaluate import evaluate as run_evaluation
@@ -205,10 +221,29 @@ def evaluate(
             via_grpc=not local,
             images_dir=images,
             progress=advance,
+            settings=_network_settings(method, network),
         )
     if json_path is not None:
         json_path.write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
     print_table(f"{method} on {log.id}", flatten(figures))
+
+
+def _network_settings(method: str, network: FeedForwardSettings) -> FeedForwardSettings | None:
+    """The flags of the network, for the methods that use it.
+
+    Raises:
+        NurecSimError: flags were given to a method that has no use for them.
+    """
+    if method != "lift":
+        return network
+    given = [
+        "--" + each.name.replace("_", "-")
+        for each in dataclasses.fields(network)
+        if getattr(network, each.name) != getattr(NO_FLAGS, each.name)
+    ]
+    if given:
+        raise NurecSimError(f"method 'lift' does not use {', '.join(given)}; choose --method dense or selective")
+    return None
 
 
 def load_scene(source: Path) -> GaussianScene:

@@ -3,8 +3,8 @@
 Frames of different cameras and chunks are exposed at different times. So every Gaussian is placed, by its own motion,
 at the two instants of a common clock that lie around its middle knot. At each instant Gaussians close to each other and
 alike in velocity are one *blob*; a blob and one of the next instant are the same thing if each shares more Gaussians
-with the other than with any other blob. Such chains of blobs become tracks (``boxes``), the largest
-first, and each takes along what moves with it inside its box.
+with the other than with any other blob. Such chains of blobs, which may miss an instant or two, become tracks
+(``boxes``), the largest first, and each takes along what moves with it inside its box.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int32, Int64
+from jaxtyping import Bool, Float64, Int32, Int64, Num
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -40,6 +40,10 @@ ALIKE_MPS = 1.0
 """A Gaussian in a thing's box belongs to it if its velocity differs by less than this."""
 MOMENT_US = 100_000
 """The velocity of a path is taken over this long before and after."""
+MOST_MISSED = 2
+"""A chain goes on after so many instants at which the thing was hidden..."""
+BRIDGE_M = 2.0
+"""...if it is then this close to where it was heading, as alike in velocity as ``METRES_PER_MPS`` counts."""
 LARGEST_M = 20.0
 """Wider blobs are no single object, but a queue or a misread wall."""
 
@@ -84,11 +88,11 @@ def group_into_tracks(
     times, knots = dynamic.knot_t_us[rows], dynamic.knot_m[rows].astype(np.float64)
     clock = _Clock(int(times[:, 1].min()), max(int(np.median((times[:, 2] - times[:, 0]) // 2)), 1))
     placed = _placed(times, knots, clock)
-    blob, instant_of = _blobs(placed)
-    if not len(instant_of):
+    blobs = _blobs(placed)
+    if not len(blobs.instant):
         return (), track
-    chain = _chains(blob, instant_of)
-    of_gaussian = np.where(blob >= 0, chain[blob], -1)
+    chain = _chains(blobs, clock.step_us)
+    of_gaussian = np.where(blobs.of_gaussian >= 0, chain[blobs.of_gaussian], -1)
 
     names = (name for number in range(1, len(taken) + len(chain) + 1) if (name := f"moving-{number}") not in taken)
     tracks: list[Track] = []
@@ -117,7 +121,7 @@ def _living(track: Track, times: Int64[np.ndarray, "n 3"]) -> Track:
 def _goes_along(
     track: Track, xyz_m: Float64[np.ndarray, "n 3"], t_us: Int64[np.ndarray, " n"], velocity: Float64[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
-    """Which points are in a track's padded box and move with it: far sides of a thing, too sparse to be linked to it."""
+    """Which points lie in a track's padded box and move with it: sides of a thing too sparse to be linked to it."""
     inside = owners_of_points([Actor(0, track, False, track.path)], xyz_m, t_us, np.ones(len(xyz_m), bool)) == 0
     rows = np.flatnonzero(inside)
     before = np.maximum(t_us[rows] - MOMENT_US, track.path.start_us)
@@ -151,13 +155,26 @@ def _placed(times: Int64[np.ndarray, "n 3"], knots: Float64[np.ndarray, "n 3 3"]
 # ---------------------------------------------------------------------------------------------------------- blobs
 
 
-def _blobs(placed: _Placed) -> tuple[Int64[np.ndarray, "2 n"], Int64[np.ndarray, " blobs"]]:
-    """The blob of each Gaussian at its two instants, -1 for none, and the instant of each blob."""
-    n = len(placed.first)
+@dataclass(frozen=True)
+class _Blobs:
+    """``of_gaussian`` is the blob of each Gaussian at its two instants, -1 for none; ``like`` as in ``_likeness``."""
+
+    of_gaussian: Int64[np.ndarray, "2 n"]
+    instant: Int64[np.ndarray, " blobs"]
+    like: Float64[np.ndarray, "blobs 4"]
+
+
+def _likeness(
+    position_m: Float64[np.ndarray, "k 3"], velocity: Float64[np.ndarray, "k 3"]
+) -> Float64[np.ndarray, "k 4"]:
+    """Place and velocity over ground, in a space where what belongs together is close together."""
+    return np.column_stack([position_m[:, :2], velocity[:, :2] * METRES_PER_MPS])
+
+
+def _blobs(placed: _Placed) -> _Blobs:
+    """Gaussians of one instant linked with those that are close and alike, by way of their cells."""
     instant = np.concatenate([placed.first, placed.first + 1])
-    like = np.column_stack(
-        [placed.position_m[:, :, :2].reshape(-1, 2), np.tile(placed.velocity_mps[:, :2], (2, 1)) * METRES_PER_MPS]
-    )
+    like = _likeness(placed.position_m.reshape(-1, 3), np.tile(placed.velocity_mps, (2, 1)))
     cell, count, mean = _averaged(instant, like)
     cell_instant = np.zeros(len(count), np.int64)
     cell_instant[cell] = instant
@@ -172,7 +189,8 @@ def _blobs(placed: _Placed) -> tuple[Int64[np.ndarray, "2 n"], Int64[np.ndarray,
     new = np.where(good, np.cumsum(good) - 1, -1)
     instant_of_blob = np.zeros(number, np.int64)
     instant_of_blob[blob_of_cell] = cell_instant
-    return new[blob_of_cell[cell]].reshape(2, n), instant_of_blob[good]
+    middle = np.column_stack([np.bincount(blob_of_cell, count * column, number) for column in mean.T]) / size[:, None]
+    return _Blobs(new[blob_of_cell[cell]].reshape(2, -1), instant_of_blob[good], middle[good])
 
 
 def _averaged(
@@ -198,17 +216,39 @@ def _components(pairs: Int64[np.ndarray, "k 2"], nodes: int) -> tuple[int, Int32
 # --------------------------------------------------------------------------------------------------------- chains
 
 
-def _chains(blob: Int64[np.ndarray, "2 n"], instant_of: Int64[np.ndarray, " blobs"]) -> Int64[np.ndarray, " blobs"]:
+def _chains(blobs: _Blobs, step_us: int) -> Int64[np.ndarray, " blobs"]:
     """The chain of each blob: it and a blob of the next instant are linked if each shares most with the other."""
-    number = len(instant_of)
-    both = (blob >= 0).all(axis=0)
-    pair, shared = np.unique(blob[0, both] * number + blob[1, both], return_counts=True)
+    number = len(blobs.instant)
+    both = blobs.of_gaussian[:, (blobs.of_gaussian >= 0).all(axis=0)]
+    pair, shared = np.unique(both[0] * number + both[1], return_counts=True)
     earlier, later = np.divmod(pair, number)
-    links = _largest(earlier, shared) & _largest(later, shared)
-    return _components(np.column_stack([earlier[links], later[links]]), number)[1].astype(np.int64)
+    mutual = _largest(earlier, shared) & _largest(later, shared)
+    links = np.column_stack([earlier[mutual], later[mutual]])
+    for missed in range(1, MOST_MISSED + 1):
+        links = np.concatenate([links, _bridges(blobs, links, missed, step_us)])
+    return _components(links, number)[1].astype(np.int64)
 
 
-def _largest(group: Int64[np.ndarray, " k"], value: Int64[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+def _bridges(
+    blobs: _Blobs, links: Int64[np.ndarray, "k 2"], missed: int, step_us: int
+) -> Int64[np.ndarray, "bridges 2"]:
+    """Links over instants at which a thing was hidden: from ends of chains to beginnings where they were heading."""
+    everything = np.arange(len(blobs.instant))
+    ends, beginnings = np.setdiff1d(everything, links[:, 0]), np.setdiff1d(everything, links[:, 1])
+    expected = blobs.like[ends].copy()
+    expected[:, :2] += expected[:, 2:] / METRES_PER_MPS * ((missed + 1) * step_us / 1e6)
+    apart = 10 * BRIDGE_M
+    tree = cKDTree(np.column_stack([blobs.like[beginnings], blobs.instant[beginnings] * apart]))
+    distance, nearest = tree.query(
+        np.column_stack([expected, (blobs.instant[ends] + missed + 1) * apart]), distance_upper_bound=BRIDGE_M
+    )
+    met = np.isfinite(distance)
+    ends, distance, nearest = ends[met], distance[met], nearest[met]
+    best = _largest(nearest, -distance)
+    return np.column_stack([ends[best], beginnings[nearest[best]]])
+
+
+def _largest(group: Int64[np.ndarray, " k"], value: Num[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
     """Which entry of each group is the largest; the first of equals."""
     order = np.lexsort((np.arange(len(group)), -value, group))
     first = np.ones(len(group), bool)

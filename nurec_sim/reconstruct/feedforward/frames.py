@@ -146,17 +146,13 @@ def chunk_windows(
     fewer frames than asked for, the chunk has fewer, always as many for every camera.
 
     Raises:
-        ReconstructError: cameras that do not record at the same time, more than ``settings.max_chunks`` chunks, or
-            settings out of range.
+        ReconstructError: cameras that do not record at the same time, more than ``settings.max_chunks`` chunks, or a
+            number of frames that the profile does not take.
     """
     fewest, most = profile.frames
     count = most if settings.frames is None else settings.frames
     if not fewest <= count <= most:
         raise ReconstructError(f"profile {profile.name!r} takes {fewest} to {most} frames per camera, got {count}")
-    if settings.max_chunks < 1 or not 0 <= settings.overlap <= 0.5:
-        raise ReconstructError(
-            f"max_chunks must be at least 1 and overlap lie in 0..0.5, got {settings.max_chunks}, {settings.overlap}"
-        )
     exposures = {camera: np.asarray(clip.camera_times_us(camera), np.int64) for camera in cameras}
     release = settings.chunking == "non-overlapping"
     start, end = _usable_interval(clip, exposures, RELEASE_MARGIN_US if release else 0)

@@ -41,15 +41,15 @@ LABEL_OF_CLASS = np.array([_LABELS[each] for each in SemanticClass], np.uint8)
 
 @dataclass(frozen=True)
 class _Points:
-    """Gaussians of a chunk in the world; ``query`` is their place in the ``QueryGaussians``, ``source`` as there."""
+    """Gaussians of one image in the world: their places in the ``QueryGaussians`` and their (flat) pixels."""
 
     gaussians: Gaussians
     position_m: Float64[np.ndarray, "n 3"]
     query: Int64[np.ndarray, " n"]
-    source: Int64[np.ndarray, " n"]
+    pixel: Int64[np.ndarray, " n"]
 
     def __getitem__(self, index: np.ndarray) -> _Points:
-        return _Points(self.gaussians[index], self.position_m[index], self.query[index], self.source[index])
+        return _Points(self.gaussians[index], self.position_m[index], self.query[index], self.pixel[index])
 
 
 def chunk_layers(clip: Clip, chunk: ChunkInputs, outputs: NetworkOutputs, settings: FeedForwardSettings) -> ChunkLayers:
@@ -69,14 +69,19 @@ def chunk_layers(clip: Clip, chunk: ChunkInputs, outputs: NetworkOutputs, settin
     Returns:
         The layers; ``dynamic.track`` indexes ``clip.tracks``, -1 where the motion head moves a point.
     """
-    points = _points_in_world(chunk, outputs.gaussians, settings.min_opacity)
-    dynamic, moving = _dynamic(clip, chunk, points, outputs.gaussians)
+    actors = scene_actors(clip)
+    static, dynamic = [], []
+    for number, rows in enumerate(_rows_of_images(chunk, outputs.gaussians)):
+        points = _points_in_world(chunk, outputs.gaussians, rows, settings.min_opacity)
+        standing, moving = _split(actors, clip.span_us, chunk, number, points, outputs.gaussians.motion_m)
+        static.append(standing)
+        dynamic.append(moving)
     sky, seen = _sky(chunk, outputs, settings)
     isp = _numpy(outputs.isp[0].double())
     return ChunkLayers(
         images=chunk.images,
-        static=points.gaussians[~moving],
-        dynamic=dynamic,
+        static=Gaussians.concatenate(static),
+        dynamic=join(dynamic),
         sky=sky,
         sky_seen=seen,
         isp={name: isp[number] for number, name in enumerate(chunk.camera_ids)},
@@ -86,8 +91,8 @@ def chunk_layers(clip: Clip, chunk: ChunkInputs, outputs: NetworkOutputs, settin
 def _sky(
     chunk: ChunkInputs, outputs: NetworkOutputs, settings: FeedForwardSettings
 ) -> tuple[Float32[np.ndarray, "6 s s 3"], Float32[np.ndarray, "6 s s"]]:
-    """The learned sky, which knows every direction, turned to the world; or what the images show of it."""
-    if settings.learned_sky and bool((outputs.sky_seen == 1).all()):
+    """The learned sky turned to the world, or what the images show of it."""
+    if settings.learned_sky and outputs.sky_learned:
         sky, seen = (_float32(values[0]) for values in (outputs.sky, outputs.sky_seen))
         return world_sky(sky, seen[..., 0], chunk.world_from_scene, settings.sky_px)
     rays = chunk.tensors.rays.to(outputs.context.rgb.device)
@@ -97,37 +102,48 @@ def _sky(
 # ------------------------------------------------------------------------------------------------- scene to world
 
 
-def _points_in_world(chunk: ChunkInputs, query: QueryGaussians, min_opacity: float) -> _Points:
-    """The Gaussians worth keeping; the work is done where the tensors are, so that only these leave a GPU."""
-    ego = torch.from_numpy(np.ascontiguousarray(chunk.ego).reshape(-1)).to(query.source.device)
-    rows = ((query.opacity[0] > min_opacity) & ~ego[query.source[0]]).nonzero()[:, 0]
-    rows = rows[_sound(query, rows)]
+def _rows_of_images(chunk: ChunkInputs, query: QueryGaussians) -> Sequence[Int64[Tensor, " n"]]:
+    """Which Gaussians were lifted from each image; to go image by image bounds the memory."""
+    image_of = query.source[0] // chunk.ego[0].size
+    order = torch.arange(len(image_of), device=image_of.device)
+    if not bool((image_of[1:] >= image_of[:-1]).all()):
+        order = torch.argsort(image_of, stable=True)
+    return torch.split(order, torch.bincount(image_of, minlength=len(chunk.images)).tolist())
+
+
+def _points_in_world(
+    chunk: ChunkInputs, query: QueryGaussians, rows: Int64[Tensor, " n"], min_opacity: float
+) -> _Points:
+    """Those worth keeping; the work is done where the tensors are, so that only these leave a GPU."""
+    ego = torch.from_numpy(chunk.ego).to(rows.device).reshape(-1)
+    rows = rows[(query.opacity[0, rows] > min_opacity) & ~ego[query.source[0, rows]]]
+    names = ("position_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal")
+    kept = {name: getattr(query, name)[0, rows] for name in names}
+    sound = (kept["quat_wxyz"] != 0).any(dim=-1)
+    for values in kept.values():
+        finite = torch.isfinite(values)
+        sound &= finite if finite.ndim == 1 else finite.all(dim=-1)
+    if not bool(sound.all()):
+        rows, kept = rows[sound], {name: values[sound] for name, values in kept.items()}
+
     turn, shift = chunk.world_from_scene[:3, :3], chunk.world_from_scene[:3, 3]
     # Row k of the products is turn * e_k, so its transpose multiplies by the turn from the left.
     turn_quat = geometry.quat_multiply(np.tile(geometry.quat_from_matrix(turn), (4, 1)), np.eye(4)).T
-    quat = _multiplied(turn_quat, query.quat_wxyz[0, rows])
+    quat = _multiplied(turn_quat, kept["quat_wxyz"])
     quat = quat / torch.linalg.vector_norm(quat, dim=-1, keepdim=True)
-    position = _multiplied(turn, query.position_m[0, rows], shift)
+    position = _multiplied(turn, kept["position_m"], shift)
     semantic = _numpy(query.semantic[0, rows])
     gaussians = Gaussians(
         mean_m=_float32(position),
         quat_wxyz=_float32(torch.where(quat[:, :1] < 0, -quat, quat)),
-        scale_m=_float32(query.scale_m[0, rows]),
-        opacity=_float32(query.opacity[0, rows]),
-        rgb=_float32(query.rgb[0, rows]),
-        normal=_float32(_multiplied(turn, query.normal[0, rows])),
+        scale_m=_float32(kept["scale_m"]),
+        opacity=_float32(kept["opacity"]),
+        rgb=_float32(kept["rgb"]),
+        normal=_float32(_multiplied(turn, kept["normal"])),
         label=LABEL_OF_CLASS[semantic],
         intensity=np.full(len(semantic), np.nan, np.float32),
     )
-    return _Points(gaussians, _numpy(position), _numpy(rows), _numpy(query.source[0, rows]))
-
-
-def _sound(query: QueryGaussians, rows: Int64[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    """Which rows are finite and have a rotation."""
-    sound = torch.isfinite(query.opacity[0, rows]) & (query.quat_wxyz[0, rows] != 0).any(dim=-1)
-    for values in (query.position_m, query.quat_wxyz, query.scale_m, query.rgb, query.normal):
-        sound &= torch.isfinite(values[0, rows]).all(dim=-1)
-    return sound
+    return _Points(gaussians, _numpy(position), _numpy(rows), _numpy(query.source[0, rows] % chunk.ego[0].size))
 
 
 def _multiplied(
@@ -155,28 +171,27 @@ def _float32(values: Tensor) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- static and dynamic
 
 
-def _dynamic(
-    clip: Clip, chunk: ChunkInputs, points: _Points, query: QueryGaussians
-) -> tuple[DynamicGaussians, Bool[np.ndarray, " n"]]:
-    """The dynamic layer, and which points went into it."""
-    actors = scene_actors(clip)
-    label = points.gaussians.label
-    candidates = np.flatnonzero(label != Label.ROAD if actors else label == Label.MOVABLE)
-    pixels = chunk.ego[0].size
-    image_of = points.source[candidates] // pixels
-    order = np.argsort(image_of, kind="stable")
-    starts = np.searchsorted(image_of[order], np.arange(len(chunk.images) + 1))
-    moving, parts = np.zeros(len(label), bool), []
-    for number, image in enumerate(chunk.images):
-        rows = candidates[order[starts[number] : starts[number + 1]]]
-        t_us = pixel_times_us(image, points.source[rows] % pixels)
-        owner = _owners(actors, chunk, number, points[rows], t_us)
-        dynamic = (label[rows] == Label.MOVABLE) | (owner >= 0)
-        rows, t_us, owner = rows[dynamic], t_us[dynamic], owner[dynamic]
-        moving[rows] = True
-        motion = _motion(chunk, query, points.query[rows])
-        parts.append(_moving_points(actors, image, points[rows], t_us, owner, motion, clip.span_us))
-    return join(parts), moving
+def _split(
+    actors: Sequence[Actor],
+    span_us: tuple[int, int],
+    chunk: ChunkInputs,
+    number: int,
+    points: _Points,
+    motion_m: Float[Tensor, "1 n 2 3"] | None,
+) -> tuple[Gaussians, DynamicGaussians]:
+    """Points of image ``number`` that stand, and those that move."""
+    image, label = chunk.images[number], points.gaussians.label
+    rows = np.flatnonzero(label != Label.ROAD if actors else label == Label.MOVABLE)
+    t_us = pixel_times_us(image, points.pixel[rows])
+    owner = _owners(actors, chunk, number, points[rows], t_us)
+    moving = (label[rows] == Label.MOVABLE) | (owner >= 0)
+    rows, t_us, owner = rows[moving], t_us[moving], owner[moving]
+    moved = points[rows]
+    displacement = _displacement(chunk, motion_m, moved.query)
+    dynamic = _moving_points(actors, image, moved, t_us, owner, displacement, span_us)
+    stands = np.ones(len(label), bool)
+    stands[rows] = False
+    return points.gaussians[stands], dynamic
 
 
 def pixel_times_us(image: ContextImage, pixel: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
@@ -193,18 +208,20 @@ def _owners(actors: Sequence[Actor], chunk: ChunkInputs, number: int, points: _P
     owner = owners_of_points(actors, points.position_m, t_us, movable)
     lost = np.flatnonzero(movable & (owner < 0))
     if actors and len(lost):
-        rays = _rays(chunk, number, points.source[lost] % chunk.ego[0].size)
+        rays = _rays(chunk, number, points.pixel[lost])
         origin = geometry.transform_points(chunk.world_from_scene, rays[:, :3])
         direction = rays[:, 3:] @ chunk.world_from_scene[:3, :3].T
         owner[lost] = owners_of_rays(actors, origin, direction, t_us[lost])
     return owner
 
 
-def _motion(chunk: ChunkInputs, query: QueryGaussians, rows: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 2 3"]:
-    """Displacements to the outer knots in world axes; none without a motion head."""
-    if query.motion_m is None:
+def _displacement(
+    chunk: ChunkInputs, motion_m: Float[Tensor, "1 n 2 3"] | None, rows: Int64[np.ndarray, " k"]
+) -> Float64[np.ndarray, "k 2 3"]:
+    """What the motion head says of some Gaussians, in world axes; zeros without it."""
+    if motion_m is None:
         return np.zeros((len(rows), 2, 3))
-    motion = _numpy(query.motion_m[0, torch.from_numpy(rows).to(query.motion_m.device)])
+    motion = _numpy(motion_m[0, torch.from_numpy(rows).to(motion_m.device)])
     return np.einsum("ij,nkj->nki", chunk.world_from_scene[:3, :3], motion)
 
 
@@ -220,14 +237,14 @@ def _moving_points(
     points: _Points,
     t_us: np.ndarray,
     owner: np.ndarray,
-    motion_m: Float64[np.ndarray, "n 2 3"],
+    displacement_m: Float64[np.ndarray, "n 2 3"],
     span_us: tuple[int, int],
 ) -> DynamicGaussians:
     """Dynamic points of one image with their knots."""
     before, after = image.target_t_us
     times = np.stack([np.minimum(before, t_us - 1), t_us, np.maximum(after, t_us + 1)], axis=1)
     knots = np.repeat(points.position_m[:, None], 3, axis=1)
-    knots[:, [0, 2]] += motion_m
+    knots[:, [0, 2]] += displacement_m
     track = np.full(len(owner), -1, np.int32)
     for number in np.unique(owner[owner >= 0]):
         mine = np.flatnonzero(owner == number)

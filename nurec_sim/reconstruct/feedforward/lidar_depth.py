@@ -93,7 +93,7 @@ class DepthFit:
 
     def apply(self, gaussians: QueryGaussians, chunk: ChunkInputs) -> QueryGaussians:
         """Gaussians moved along the rays of their pixels to the fitted depth; sizes and motion grow with distance."""
-        inputs, source = chunk.tensors, gaussians.source
+        inputs, source = chunk.tensors.to(gaussians.source.device), gaussians.source
         _, _, height, width, _ = inputs.rgb.shape
         origin = inputs.rays.reshape(-1, 6)[source, :3]
         ray_m = gaussians.position_m - origin

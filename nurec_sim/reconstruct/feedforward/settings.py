@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from nurec_sim.errors import ReconstructError
+
 
 @dataclass(frozen=True)
 class FeedForwardSettings:
@@ -50,3 +52,25 @@ class FeedForwardSettings:
     ego_masks: Path | None = None
     sky_px: int = 256
     learned_sky: bool = True
+
+    def __post_init__(self) -> None:
+        """Check ranges.
+
+        Raises:
+            ReconstructError: a value out of range.
+        """
+        ranges = {
+            "overlap": (0.0, 0.5),
+            "max_chunks": (1, 10_000),
+            "min_opacity": (0.0, 1.0),
+            "ownership_tolerance_m": (0.0, float("inf")),
+            "sky_px": (8, 4096),
+        }
+        if self.frames is not None:
+            ranges["frames"] = (1, 1000)
+        if self.max_gaussians is not None:
+            ranges["max_gaussians"] = (1, float("inf"))
+        for name, (least, most) in ranges.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise ReconstructError(f"{name} must lie in {least:g}..{most:g}, got {value!r}")
