@@ -8,6 +8,7 @@ import pytest
 import render_scenes
 
 from nurec_sim import geometry
+from nurec_sim.reconstruct.feedforward.boxes import LEAST_M, Sighting, lengthened, track_of
 from nurec_sim.reconstruct.feedforward.clusters import group_into_tracks
 from nurec_sim.render.renderer import Renderer
 from nurec_sim.types import MOVABLE_LABELS, DynamicGaussians
@@ -188,3 +189,34 @@ def test_a_thing_that_is_hidden_for_a_moment_stays_one_track(hidden_s, expected)
     )
     tracks, index = group_into_tracks(hidden, ego)
     assert len(tracks) == expected and np.mean(index >= 0) > 0.99
+
+
+@pytest.mark.parametrize(
+    "label, size, speed",
+    [
+        ("person", (0.6, 0.6, 1.75), 1.5),
+        ("rider", (1.8, 0.6, 1.75), 5.0),
+        ("automobile", (4.4, 1.8, 1.5), 6.0),
+        ("heavy_truck", (9.0, 2.5, 3.4), 6.0),
+    ],
+)
+def test_labels_go_by_size_and_speed(label, size, speed):
+    ego = moving_things.ego(speed=4.0)
+    thing = moving_things.thing("it", label, size, (18.0, 4.0), 0.2, speed)
+    (track,), _ = group_into_tracks(moving_things.lifted([thing], ego, outliers=0)[0], ego)
+    assert track.label == label and np.abs(np.subtract(track.size_m, size)).max() < 0.7
+
+
+def test_a_car_of_which_only_the_rear_is_seen_stands_ahead_of_it():
+    rng = np.random.default_rng(0)
+    ego = moving_things.ego(speed=0.0)
+    sightings = []
+    for second in range(4):
+        rear = np.column_stack([np.full(200, 10.0 + 5 * second), rng.uniform(-0.9, 0.9, 200), rng.uniform(0, 1.5, 200)])
+        sightings.append(Sighting(ego.start_us + second * 1_000_000, rear, np.tile([5.0, 0, 0], (200, 1))))
+    track = track_of("car", sightings, ego)
+    assert track.label == "automobile" and track.size_m[0] == LEAST_M["automobile"][0]
+    assert np.allclose(track.path.position_m[:, 0], [10, 15, 20, 25] + np.array(track.size_m[0] / 2), atol=0.01)
+    assert np.abs(track.path.position_m[:, 1]).max() < 0.1
+    longer = lengthened(track.path, (track.path.start_us - 500_000, track.path.end_us - 1))
+    assert len(longer.t_us) == 5 and longer.position_m[0, 0] == pytest.approx(track.path.position_m[0, 0] - 2.5)

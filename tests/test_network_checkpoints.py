@@ -27,7 +27,7 @@ from nurec_sim.network.checkpoints import (
     save_weights,
 )
 from nurec_sim.network.depth_anything import depth_anything_3_state
-from nurec_sim.network.torch_pickle import OTHER, StoredTensor, read_tensor_pickle
+from nurec_sim.scene.torch_pickle import OTHER, StoredTensor, read_tensor_pickle
 
 
 class Contract:

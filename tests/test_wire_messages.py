@@ -77,7 +77,7 @@ def test_times_are_fixed64():
 
 def test_the_committed_descriptors_match_the_protos(tmp_path):
     built = tmp_path / "descriptors.binpb"
-    names = [path.name for path in (PROTOS / n for n in ("common.proto", "sensorsim.proto", "egodriver.proto"))]
+    names = ["common.proto", "sensorsim.proto", "egodriver.proto", "nurec_sim_v1.proto"]
     protoc(f"-I{PROTOS}", f"--descriptor_set_out={built}", *names)
     assert built.read_bytes() == messages.descriptor_bytes(), "run `python protos/build.py` and commit the result"
 

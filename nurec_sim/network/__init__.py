@@ -17,7 +17,7 @@ def build(profile: str | Profile, *, seed: int | None = 0, precision: Precision 
 
     Args:
         profile: a name of ``PROFILES``, or sizes of one's own.
-        seed: of its random parameters. None leaves parameters and buffers unset, which is quicker where
+        seed: of its random parameters. None leaves parameters unset, which is quicker where
             ``checkpoints.load_weights`` fills them anyway.
         precision: of matrix products and convolutions.
 
@@ -36,6 +36,8 @@ def build(profile: str | Profile, *, seed: int | None = 0, precision: Precision 
         with torch.device("meta"):
             model = InstantNuRec(profile)
         model = model.to_empty(device="cpu")
+        if model.sky is not None:
+            model.sky.set_constants()
     else:
         model = InstantNuRec(profile)
         initialize(model, seed)

@@ -54,7 +54,7 @@ class SkyDecoder(nn.Module):
         super().__init__()
         self.size = size
         self.token = nn.Parameter(torch.zeros(size.width))
-        self.register_buffer("query_rays", cubemap.directions(size.cubemap_px))
+        self.register_buffer("query_rays", cubemap.directions(size.cubemap_px), persistent=profile.training_buffers)
         self.feature_transform = nn.Sequential(
             nn.Linear(2 * profile.encoder.width, size.width), nn.LayerNorm(size.width)
         )
@@ -63,6 +63,10 @@ class SkyDecoder(nn.Module):
         self.blocks = nn.ModuleList(QueryBlock(size.width, size.heads, scale=1.0) for _ in range(size.depth))
         self.kv_projector = KeyValueProjector(size.width, size.heads, normed=True)
         self.upsample = SkyUpsampling(size, profile.head)
+
+    def set_constants(self) -> None:
+        """Compute the directions again, where the module was made without values."""
+        self.query_rays.copy_(cubemap.directions(self.size.cubemap_px))
 
     def forward(
         self,

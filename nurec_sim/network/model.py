@@ -33,7 +33,7 @@ class InstantNuRec(nn.Module):
         super().__init__()
         self.profile = profile
         self.precision: Precision = "float32"
-        if profile.legacy_buffer:
+        if profile.training_buffers:
             self.register_buffer("cuboids_dims_padding", torch.ones(3))
         self.encoder = Encoder(profile.encoder)
         self.decoder = DenseDecoder(profile) if profile.decoder == "dense" else SelectiveDecoder(profile)

@@ -90,7 +90,7 @@ class Profile:
         sky: size of the learned sky decoder; None uses the sky that the images show.
         observed_sky_px: edge of the cubemap of the observed sky.
         isp_heads: attention heads of the decoder of camera responses.
-        legacy_buffer: whether the state dict holds ``cuboids_dims_padding`` at its top too, as training files do.
+        training_buffers: whether the state dict holds the constants that files of the training code hold.
         checkpoint: id of the released file, None if there is none.
     """
 
@@ -108,7 +108,7 @@ class Profile:
     sky: SkySize | None = None
     observed_sky_px: int = 448
     isp_heads: int = 16
-    legacy_buffer: bool = False
+    training_buffers: bool = False
     checkpoint: str | None = None
 
 
@@ -134,7 +134,7 @@ PROFILES: Mapping[str, Profile] = {
         Profile("pa-front", checkpoint="instant_nurec_pa_front_1.1.0"),
         Profile("pa-multiview", 504, 280, (1, 3, 5), checkpoint="instant_nurec_pa_multiview_1.1.0"),
         Profile("pq-front", decoder="selective", checkpoint="instant_nurec_pq_road_1.0.0"),
-        Profile("pa-full", sky=SkySize(), legacy_buffer=True),
+        Profile("pa-full", sky=SkySize(), training_buffers=True),
         _TINY,
         dataclasses.replace(_TINY, name="tiny-selective", decoder="selective"),
     )

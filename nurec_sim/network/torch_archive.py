@@ -1,8 +1,8 @@
 """Files of ``torch.save``: plain state dicts, and training files that hold a state dict among other things.
 
-Only what the network needs is read: a training file's other objects are never unpickled (``torch_pickle``). The zip
-archive is taken at its word about nothing: entries must be stored as they are, lie inside the file, and be as long as
-the tensors say.
+Only what the network needs is read: a training file's other objects are never unpickled (``scene.torch_pickle``). The
+zip archive is taken at its word about nothing: entries must be stored as they are, lie inside the file, and be as long
+as the tensors say.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from nurec_sim.errors import WeightsError
-from nurec_sim.network.torch_pickle import StoredTensor, read_tensor_pickle
+from nurec_sim.scene.torch_pickle import StoredTensor, read_tensor_pickle
 
 _MAX_PICKLE_BYTES = 32 << 20
 _LOCAL_HEADER = struct.Struct("<26xHH")  # the lengths of name and extra field, after which an entry's bytes begin

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
 from nurec_sim import geometry, sensors
@@ -72,7 +72,7 @@ def chunk_layers(clip: Clip, chunk: ChunkInputs, outputs: NetworkOutputs, settin
     actors = scene_actors(clip)
     static, dynamic = [], []
     for number, rows in enumerate(_rows_of_images(chunk, outputs.gaussians)):
-        points = _points_in_world(chunk, outputs.gaussians, rows, settings.min_opacity)
+        points = _points_in_world(chunk, number, outputs.gaussians, rows, settings.min_opacity)
         standing, moving = _split(actors, clip.span_us, chunk, number, points, outputs.gaussians.motion_m)
         static.append(standing)
         dynamic.append(moving)
@@ -112,11 +112,11 @@ def _rows_of_images(chunk: ChunkInputs, query: QueryGaussians) -> Sequence[Int64
 
 
 def _points_in_world(
-    chunk: ChunkInputs, query: QueryGaussians, rows: Int64[Tensor, " n"], min_opacity: float
+    chunk: ChunkInputs, number: int, query: QueryGaussians, rows: Int64[Tensor, " n"], min_opacity: float
 ) -> _Points:
-    """Those worth keeping; the work is done where the tensors are, so that only these leave a GPU."""
-    ego = torch.from_numpy(chunk.ego).to(rows.device).reshape(-1)
-    rows = rows[(query.opacity[0, rows] > min_opacity) & ~ego[query.source[0, rows]]]
+    """Those of an image worth keeping; the work is done where the tensors are, so that only these leave a GPU."""
+    ego = torch.tensor(chunk.ego[number].reshape(-1), device=rows.device)
+    rows = rows[(query.opacity[0, rows] > min_opacity) & ~ego[query.source[0, rows] % len(ego)]]
     names = ("position_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal")
     kept = {name: getattr(query, name)[0, rows] for name in names}
     sound = (kept["quat_wxyz"] != 0).any(dim=-1)
@@ -143,7 +143,7 @@ def _points_in_world(
         label=LABEL_OF_CLASS[semantic],
         intensity=np.full(len(semantic), np.nan, np.float32),
     )
-    return _Points(gaussians, _numpy(position), _numpy(rows), _numpy(query.source[0, rows] % chunk.ego[0].size))
+    return _Points(gaussians, _numpy(position), _numpy(rows), _numpy(query.source[0, rows] % len(ego)))
 
 
 def _multiplied(
@@ -183,8 +183,11 @@ def _split(
     image, label = chunk.images[number], points.gaussians.label
     rows = np.flatnonzero(label != Label.ROAD if actors else label == Label.MOVABLE)
     t_us = pixel_times_us(image, points.pixel[rows])
-    owner = _owners(actors, chunk, number, points[rows], t_us)
-    moving = (label[rows] == Label.MOVABLE) | (owner >= 0)
+    movable = label[rows] == Label.MOVABLE
+    owner = owners_of_points(actors, points.position_m[rows], t_us, movable)
+    lost = np.flatnonzero(movable & (owner < 0))
+    owner[lost] = owners_of_rays(actors, *_rays(chunk, number, points.pixel[rows[lost]]), t_us[lost])
+    moving = movable | (owner >= 0)
     rows, t_us, owner = rows[moving], t_us[moving], owner[moving]
     moved = points[rows]
     displacement = _displacement(chunk, motion_m, moved.query)
@@ -202,19 +205,6 @@ def pixel_times_us(image: ContextImage, pixel: Int64[np.ndarray, " n"]) -> Int64
     return start_us + np.rint(fraction * (end_us - start_us)).astype(np.int64)
 
 
-def _owners(actors: Sequence[Actor], chunk: ChunkInputs, number: int, points: _Points, t_us: np.ndarray) -> np.ndarray:
-    """Place in ``actors`` of the one that each point of image ``number`` belongs to: by its box, else by its ray."""
-    movable = points.gaussians.label == Label.MOVABLE
-    owner = owners_of_points(actors, points.position_m, t_us, movable)
-    lost = np.flatnonzero(movable & (owner < 0))
-    if actors and len(lost):
-        rays = _rays(chunk, number, points.pixel[lost])
-        origin = geometry.transform_points(chunk.world_from_scene, rays[:, :3])
-        direction = rays[:, 3:] @ chunk.world_from_scene[:3, :3].T
-        owner[lost] = owners_of_rays(actors, origin, direction, t_us[lost])
-    return owner
-
-
 def _displacement(
     chunk: ChunkInputs, motion_m: Float[Tensor, "1 n 2 3"] | None, rows: Int64[np.ndarray, " k"]
 ) -> Float64[np.ndarray, "k 2 3"]:
@@ -225,10 +215,14 @@ def _displacement(
     return np.einsum("ij,nkj->nki", chunk.world_from_scene[:3, :3], motion)
 
 
-def _rays(chunk: ChunkInputs, number: int, pixel: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
-    """Origins and directions of some pixels of an image, in the scene frame."""
-    rays = chunk.tensors.rays[0, number].reshape(-1, 6)
-    return _numpy(rays[torch.from_numpy(pixel).to(rays.device)].double())
+def _rays(
+    chunk: ChunkInputs, number: int, pixel: Int64[np.ndarray, " n"]
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Origins and directions, in the world, of some pixels of image ``number``."""
+    of_image = chunk.tensors.rays[0, number].reshape(-1, 6)
+    rays = _numpy(of_image[torch.from_numpy(pixel).to(of_image.device)].double())
+    world_from_scene = chunk.world_from_scene
+    return geometry.transform_points(world_from_scene, rays[:, :3]), rays[:, 3:] @ world_from_scene[:3, :3].T
 
 
 def _moving_points(

@@ -2,8 +2,8 @@
 
 ``torch.save`` writes a pickle that names its tensors, and their values beside it. Training files hold objects of other
 programs as well, so that ``torch.load(weights_only=True)`` refuses them, and unpickling would run whatever they say.
-This reader follows the pickle's instructions over plain values only. Dictionaries with text keys and the places of
-tensors survive; every object, class and call turns into ``OTHER``.
+This reader follows the pickle's instructions over plain values only. Lists, dictionaries with text keys and the places
+of tensors survive; every object, class and call turns into ``OTHER``.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ class _Name:
 _IGNORED = {"PROTO", "FRAME", "READONLY_BUFFER"}
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-_OTHER_FROM_MARK = {"LIST", "FROZENSET", "OBJ", "INST"}
-_DROP_TO_MARK = {"APPENDS", "ADDITEMS", "POP_MARK"}
+_OTHER_FROM_MARK = {"FROZENSET", "OBJ", "INST"}
+_DROP_TO_MARK = {"ADDITEMS", "POP_MARK"}
 _PUT = {"PUT", "BINPUT", "LONG_BINPUT"}
 _GET = {"GET", "BINGET", "LONG_BINGET"}
-_OTHER_VALUES = {"EMPTY_LIST", "EMPTY_SET", "EXT1", "EXT2", "EXT4", "PERSID", "NEXT_BUFFER"}
+_OTHER_VALUES = {"EMPTY_SET", "EXT1", "EXT2", "EXT4", "PERSID", "NEXT_BUFFER"}
 
 
 def read_tensor_pickle(data: bytes) -> object:
@@ -97,6 +97,14 @@ def read_tensor_pickle(data: bytes) -> object:
                 stack.append(())
             elif name == "TUPLE":
                 stack.append(tuple(from_mark()))
+            elif name == "EMPTY_LIST":
+                stack.append([])
+            elif name == "LIST":
+                stack.append(from_mark())
+            elif name in ("APPEND", "APPENDS"):
+                items = from_mark() if name == "APPENDS" else [stack.pop()]
+                if isinstance(stack[-1], list):
+                    stack[-1].extend(items)
             elif name == "EMPTY_DICT":
                 stack.append({})
             elif name == "DICT":
@@ -112,7 +120,7 @@ def read_tensor_pickle(data: bytes) -> object:
                 stack.append(OTHER)
             elif name in _DROP_TO_MARK:
                 from_mark()
-            elif name in ("APPEND", "BUILD", "POP"):
+            elif name in ("BUILD", "POP"):
                 stack.pop()
             elif name == "DUP":
                 stack.append(stack[-1])
