@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs
 
-.PHONY: demo test check format bench gpu-parity gpu-bench clean
+.PHONY: demo test check format bench bench-serving gpu-parity gpu-bench clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(f"nurec_sim needs Python 3.11 or newer; $(PYTHON) is {sys.version.split()[0]}. Try: make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
@@ -28,8 +28,12 @@ format: $(VENV)/.installed ## rewrite the code in house style
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: $(VENV)/.installed ## renderer timings, written to build/bench.json
+bench: $(VENV)/.installed ## timings of the renderer and the network, written to build/bench.json and build/bench_network.json
 	$(BIN)/python benchmarks/render.py
+	$(BIN)/python benchmarks/network.py
+
+bench-serving: $(VENV)/.installed ## 32 clients for 60 s against one, written to build/bench_serving.json
+	$(BIN)/python benchmarks/serving.py
 
 gpu-parity: $(VENV)/.installed ## the CUDA kernels against the reference, on this machine's GPU
 	$(BIN)/python -m nurec_sim.render.gpu

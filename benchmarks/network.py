@@ -1,7 +1,6 @@
 """Times the feed-forward network with random weights: floating-point operations against time, and memory.
 
-Every case runs in a process of its own, so that its peak memory is its own; what is compared with each other takes turns
-in one process.
+Every case has a process of its own, so that its peak memory is its own; what is compared takes turns in one process.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ class Options:
         cases: what to run; all of the device if not given.
         precisions: of matrix products and convolutions, each for every pass.
         quick: only the small network, and few images.
-        repeats: timed passes of each row, after one that warms up.
+        repeats: timed passes of each row, after the one that is counted.
         threads: threads of torch; all that the process may use if not given.
         device: ``cpu``, or a CUDA device.
         output: the results, as JSON.
@@ -112,9 +111,11 @@ def in_process(name: str, precision: str, options: Options) -> list[Row]:
     """The rows of a case, measured by a new process of this script."""
     command = [sys.executable, __file__, "--only", name, precision, "--repeats", str(options.repeats)]
     command += ["--threads", str(options.thread_count), "--device", options.device]
+    # Threads that wait for each other sleep, so that CPU time is work.
+    environment = {"OMP_WAIT_POLICY": "passive", **os.environ}
     with progress(name) as advance:
         advance(f"{precision}, in a process of its own", 0.5)
-        ran = subprocess.run(command, capture_output=True, text=True, check=False)
+        ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if ran.returncode != 0:
         last = (ran.stderr.strip() or "no output").splitlines()[-1]
         out.print(f"{name} {precision} could not be measured: {last}", **PLAIN)
@@ -198,7 +199,8 @@ def slot_rows(name: str, case: Case, precision: Any, options: Options) -> list[R
 
     model = network.build(case.profile, precision=precision).to(options.device)
     inputs = inputs_of(case, 0).to(options.device)
-    whole = timed([lambda: model(inputs)], options)[0][0]
+    model(inputs)
+    whole = timed([lambda: model(inputs)], dataclasses.replace(options, repeats=1))[0][0]
     rows = []
     for share in case.road_shares:
         features, context = features_and_context(model, inputs, share)
@@ -293,7 +295,7 @@ def counted(work: Callable[[], Any]) -> tuple[Any, int]:
 
 
 def timed(works: Sequence[Callable[[], Any]], options: Options) -> list[tuple[float, float]]:
-    """Median wall and CPU seconds of works that take turns, what they leave to a GPU included; one turn warms up."""
+    """Median wall and CPU seconds of works that take turns, what they leave to a GPU included; they have run before."""
     import torch
 
     def wait() -> None:
@@ -301,7 +303,7 @@ def timed(works: Sequence[Callable[[], Any]], options: Options) -> list[tuple[fl
             torch.cuda.synchronize(options.device)
 
     turns = []
-    for _ in range(options.repeats + 1):
+    for _ in range(options.repeats):
         turn = []
         for work in works:
             wait()
@@ -310,7 +312,7 @@ def timed(works: Sequence[Callable[[], Any]], options: Options) -> list[tuple[fl
             wait()
             turn.append((time.perf_counter() - wall, time.process_time() - cpu))
         turns.append(turn)
-    return [(float(wall), float(cpu)) for wall, cpu in np.median(np.array(turns[1:]), axis=0)]
+    return [(float(wall), float(cpu)) for wall, cpu in np.median(np.array(turns), axis=0)]
 
 
 # --------------------------------------------------------------------------------------------------- what is printed
@@ -347,7 +349,7 @@ def slot_line(row: Row) -> tuple[str, str]:
         f"{'decoder: ours/release':28s} {'tokens':>13s} {'TFLOP':>13s} {'s':>13s} {'cpu s':>13s} {'ratio':>6s}"
         f" {'one pass, s':>12s} {'load':>5s}"
     )
-    pairs = [f"{row[key]:.2f}/{row[key + '_release']:.2f}" for key in ("tflop", "s_median", "cpu_s_median")]
+    pairs = [f"{row[key]:.3f}/{row[key + '_release']:.3f}" for key in ("tflop", "s_median", "cpu_s_median")]
     tokens = f"{row['tokens']}/{row['tokens_release']}"
     return (
         f"{row['name']:28s} {tokens:>13s} {pairs[0]:>13s} {pairs[1]:>13s} {pairs[2]:>13s} {row['ratio']:6.2f}"

@@ -57,7 +57,7 @@ CASES: Mapping[str, Case] = {
     "pa-front": Case("pa-front", 1, 2, limit_s=25.0, limit_gb=4.0),
     "pa-multiview": Case("pa-multiview", 3, 1),
     "pq-front": Case("pq-front", 1, 2),
-    "pq-front-slots": Case("pq-front", 1, 2, road_shares=(0.0, 0.02, 0.05, 0.25)),
+    "pq-front-slots": Case("pq-front", 1, 1, road_shares=(0.0, 0.02, 0.05, 0.25)),
     "tiny-clip": Case("tiny", 3, 18, clip_s=20.0),
     "pa-multiview-chunk": Case("pa-multiview", 3, 18, "cuda"),
     "pa-multiview-clip": Case("pa-multiview", 3, 18, "cuda", limit_s=0.5, clip_s=20.0),

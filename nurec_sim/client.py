@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import grpc
 
@@ -31,22 +33,31 @@ class RemoteSensors:
         scene_id: id or alias of the scene; the ids inside requests are not looked at.
         timeout_s: for one call; a server may first have to reconstruct the scene.
         apply_isp: whether images get the camera's colour correction.
+        token: what the server wants to be shown; None if it wants nothing.
+        root_ca: PEM file of the certificates that vouch for the server's; plain text if None.
+        client_cert: PEM file of the certificate to show, for mutual TLS.
+        client_key: PEM file of its private key.
+
+    Raises:
+        ServerError: a PEM file cannot be read, or a certificate comes without its key or without ``root_ca``.
     """
 
-    def __init__(self, address: str, scene_id: str = "", *, timeout_s: float = 300.0, apply_isp: bool = True) -> None:
+    def __init__(
+        self,
+        address: str,
+        scene_id: str = "",
+        *,
+        timeout_s: float = 300.0,
+        apply_isp: bool = True,
+        token: str | None = None,
+        root_ca: Path | None = None,
+        client_cert: Path | None = None,
+        client_key: Path | None = None,
+    ) -> None:
         self.address, self.scene_id = address, scene_id
         self._timeout_s, self._apply_isp = timeout_s, apply_isp
-        config = {"methodConfig": [{"name": [{}], "retryPolicy": _RETRY | {"retryableStatusCodes": ["UNAVAILABLE"]}}]}
-        self._channel = grpc.insecure_channel(
-            address,
-            options=[
-                ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-                ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
-                ("grpc.max_reconnect_backoff_ms", 1000),
-                ("grpc.enable_http_proxy", 0),  # sensor servers are near; a proxy for the web is not for them
-                ("grpc.service_config", json.dumps(config)),
-            ],
-        )
+        self._metadata = [("authorization", f"Bearer {token}")] if token else []
+        self._channel = open_channel(address, root_ca, client_cert, client_key)
         self._procedures = {
             name: self._channel.unary_unary(
                 f"/{wire.SERVICE}/{name}",
@@ -152,17 +163,62 @@ class RemoteSensors:
     # ----------------------------------------------------------------------------------------------------------- calls
 
     def _begin(self, name: str, request) -> grpc.Future:
-        return self._procedures[name].future(request, timeout=self._timeout_s, wait_for_ready=True)
+        procedure = self._procedures[name]
+        return procedure.future(request, timeout=self._timeout_s, wait_for_ready=True, metadata=self._metadata)
 
     def _call(self, name: str, request):
         return self._outcome(self._begin(name, request))
 
     def _outcome(self, call: grpc.Future):
-        try:
+        with our_errors(self.address):
             return call.result()
-        except grpc.RpcError as error:
-            ours = wire.error_of(error.code(), error.details() or "no reason given")
-            raise (ServerError(f"{self.address}: {ours}") if isinstance(ours, ServerError) else ours) from error
+
+
+def open_channel(
+    address: str, root_ca: Path | None = None, client_cert: Path | None = None, client_key: Path | None = None
+) -> grpc.Channel:
+    """A channel whose calls are repeated when the server goes away in between; the arguments are RemoteSensors' own.
+
+    Raises:
+        ServerError: a PEM file cannot be read, or a certificate comes without its key or without ``root_ca``.
+    """
+    credentials = _credentials(root_ca, client_cert, client_key)
+    config = {"methodConfig": [{"name": [{}], "retryPolicy": _RETRY | {"retryableStatusCodes": ["UNAVAILABLE"]}}]}
+    options = [
+        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+        ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+        ("grpc.max_reconnect_backoff_ms", 1000),
+        ("grpc.enable_http_proxy", 0),  # sensor servers are near; a proxy for the web is not for them
+        ("grpc.service_config", json.dumps(config)),
+    ]
+    if credentials is None:
+        return grpc.insecure_channel(address, options)
+    return grpc.secure_channel(address, credentials, options)
+
+
+@contextlib.contextmanager
+def our_errors(address: str) -> Iterator[None]:
+    """Statuses of gRPC become the errors of ours that the server raised; ``ServerError`` where they stand for none."""
+    try:
+        yield
+    except grpc.RpcError as error:
+        ours = wire.error_of(error.code(), error.details() or "no reason given")
+        raise (ServerError(f"{address}: {ours}") if isinstance(ours, ServerError) else ours) from error
+
+
+def _credentials(
+    root_ca: Path | None, client_cert: Path | None, client_key: Path | None
+) -> grpc.ChannelCredentials | None:
+    """TLS of a channel; None for plain text."""
+    if (client_cert is None) != (client_key is None) or (client_cert and root_ca is None):
+        raise ServerError("mutual TLS needs root_ca, client_cert and client_key together")
+    if root_ca is None:
+        return None
+    try:
+        roots, key, cert = (None if path is None else path.read_bytes() for path in (root_ca, client_key, client_cert))
+    except OSError as error:
+        raise ServerError(f"TLS cannot be set up: {error}") from None
+    return grpc.ssl_channel_credentials(roots, key, cert)
 
 
 def _batches(requests: Sequence[SensorRequest]) -> Iterator[list[int]]:

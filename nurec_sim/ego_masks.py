@@ -34,19 +34,22 @@ class EgoMasks:
         """(rig, camera) of every mask."""
         return tuple(self._paths)
 
-    def check(self, key: tuple[str, str]) -> None:
-        """Whether there is such a mask.
+    def find(self, key: tuple[str, str]) -> tuple[str, str]:
+        """The (rig, camera) of the mask that is meant: ``key``, or with an empty rig the only one that has the camera.
 
         Raises:
-            RequestError: there is none; the text lists what there is.
+            RequestError: there is none, or several; the text lists what there is.
         """
+        rigs = [rig for rig, camera in self._paths if camera == key[1]]
+        if not key[0] and len(rigs) == 1:
+            return rigs[0], key[1]
         if key not in self._paths:
             raise RequestError(f"there is no ego mask for (rig, camera) {key}; have {list(self._paths)}")
+        return key
 
     def lay_over(self, rgb: UInt8[np.ndarray, "h w 3"], key: tuple[str, str]) -> UInt8[np.ndarray, "h w 3"]:
         """A copy of an image with the mask, scaled to its size, on top."""
-        self.check(key)
-        picture, cover = _scaled_mask(self._paths[key], rgb.shape[1], rgb.shape[0])
+        picture, cover = _scaled_mask(self._paths[self.find(key)], rgb.shape[1], rgb.shape[0])
         return np.rint(rgb + cover * (picture - rgb)).astype(np.uint8)
 
 

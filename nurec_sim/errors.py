@@ -10,8 +10,14 @@
     ├── RequestError     a render request is malformed                (gRPC INVALID_ARGUMENT)
     │   ├── UnknownSceneError  no such scene                          (gRPC NOT_FOUND)
     │   ├── OutOfRangeError    a time outside the scene               (gRPC OUT_OF_RANGE)
-    │   └── TooLargeError      more pixels or items than allowed      (gRPC RESOURCE_EXHAUSTED)
-    ├── PlanError        a policy answered something that cannot be driven
+    │   ├── TooLargeError      more pixels or items than allowed      (gRPC RESOURCE_EXHAUSTED)
+    │   └── NotAllowedError    what this server was told not to do     (gRPC PERMISSION_DENIED)
+    ├── SceneInUseError  a scene cannot be taken away now             (gRPC FAILED_PRECONDITION)
+    ├── GivenUpError     work ended because nobody waits for it       (gRPC CANCELLED)
+    ├── PlanError        a policy failed, or answered what cannot be driven  (gRPC ABORTED)
+    ├── SessionError     a driving session lacks what it is asked for (gRPC FAILED_PRECONDITION)
+    │   ├── UnknownSessionError  no such session                      (gRPC NOT_FOUND)
+    │   └── SessionExistsError   a session of that id is open         (gRPC ALREADY_EXISTS)
     ├── ScenarioError    a scenario file is wrong
     ├── GpuError         the CUDA back end cannot be used here
     ├── ServerError      a sensor server cannot be reached, or failed
@@ -57,8 +63,32 @@ class TooLargeError(RequestError):
     """A request for more pixels, beams or items than allowed."""
 
 
+class SceneInUseError(NurecSimError):
+    """A scene cannot be taken away while somebody uses it."""
+
+
+class GivenUpError(NurecSimError):
+    """Work ended because nobody waits for its result any more."""
+
+
+class NotAllowedError(RequestError):
+    """Something that this server could do and was started without permission for."""
+
+
 class PlanError(NurecSimError):
-    """A policy answered something that cannot be driven."""
+    """A policy failed, or answered something that cannot be driven."""
+
+
+class SessionError(NurecSimError):
+    """A driving session lacks what it is asked for."""
+
+
+class UnknownSessionError(SessionError):
+    """No driving session of that id is open."""
+
+
+class SessionExistsError(SessionError):
+    """A driving session of that id is open already."""
 
 
 class ScenarioError(NurecSimError):

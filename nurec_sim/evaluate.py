@@ -45,7 +45,7 @@ def evaluate(
     Args:
         clip: the log.
         method: reconstruction method.
-        input_cameras: cameras that the reconstruction may see; all if None.
+        input_cameras: cameras that the reconstruction may see; all if None, or as many as the method takes.
         target_cameras: cameras to compare with, at all their frames; the input cameras if None.
         hold_out_every: hold out sweeps K, 2K, 3K, ...; 0 holds out none.
         hold_out_sweeps: further sweeps to hold out, by index.
@@ -68,17 +68,17 @@ def evaluate(
     from nurec_sim.reconstruct import reconstruct
 
     report = progress or (lambda stage, fraction: None)
-    inputs = list(clip.rig.cameras) if input_cameras is None else list(input_cameras)
-    targets = inputs if target_cameras is None else list(target_cameras)
-    unknown = [camera for camera in targets if camera not in clip.rig.cameras]
+    unknown = [camera for camera in target_cameras or () if camera not in clip.rig.cameras]
     if unknown:
         raise ReconstructError(f"clip {clip.id!r} has no camera {unknown}; have {list(clip.rig.cameras)}")
     if hold_out_every < 0:
         raise ReconstructError(f"hold_out_every must be 0 or more, got {hold_out_every}")
     held = held_out(clip, hold_out_every, hold_out_sweeps)
     stages = _StageClock(report)
-    scene = reconstruct(clip, method, cameras=inputs, hold_out_sweeps=held, progress=stages, **options)
+    scene = reconstruct(clip, method, cameras=input_cameras, hold_out_sweeps=held, progress=stages, **options)
     stages.stop()
+    inputs = list(scene.provenance["cameras"])
+    targets = inputs if target_cameras is None else list(target_cameras)
     seconds = {f"reconstruct: {stage}": round(spent, 3) for stage, spent in stages.seconds.items()}
     seconds["reconstruct"] = round(sum(stages.seconds.values()), 3)
     with sensing(scene, via_grpc) as sense:

@@ -1,4 +1,4 @@
-"""Finds policies: shipped ones by name, files by path, installed ones by entry point."""
+"""Finds policies: shipped ones by name, files by path, installed ones by entry point, remote ones by address."""
 
 from __future__ import annotations
 
@@ -26,10 +26,15 @@ def load_policy(reference: str) -> Policy:
     """Make a policy from a name (``log_replay``), a file (``my_policy.py:Class``) or an entry point's name.
 
     A file with exactly one policy class needs no ``:Class``. The class is called without arguments.
+    ``grpc://host:port`` is a driver that is running there (``driving.RemotePolicy.from_url``).
 
     Raises:
         ScenarioError: nothing of that name, or what was found is no policy; the text says what is available.
     """
+    if reference.startswith("grpc://"):
+        from nurec_sim.driving import RemotePolicy
+
+        return _make(lambda: RemotePolicy.from_url(reference), reference)
     path, _, class_name = reference.partition(":")
     if path.endswith(".py"):
         return _make(_policy_class(_load_file(Path(path)), class_name, reference), reference)
@@ -46,7 +51,7 @@ def load_policy(reference: str) -> Policy:
             raise ScenarioError(f"policy '{reference}' is installed but cannot be imported: {error}") from error
     raise ScenarioError(
         f"unknown policy '{reference}'; have {available_policies()}, a file such as my_policy.py:Class, "
-        f"or an installed package with an entry point in the group '{ENTRY_POINT_GROUP}'"
+        f"grpc://host:port, or an installed package with an entry point in the group '{ENTRY_POINT_GROUP}'"
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 HERE = Path(__file__).parent
-SOURCES = ("common.proto", "sensorsim.proto", "egodriver.proto")
+SOURCES = ("common.proto", "sensorsim.proto", "egodriver.proto", "nurec_sim_v1.proto")
 
 
 def compile_descriptors(target: Path) -> None:

@@ -22,7 +22,7 @@ def _header(name: str, value: str) -> bytes:
 
 
 class SlowReader:
-    """A connection whose replies may not exceed ``window`` bytes, and are never read."""
+    """A connection whose replies may not exceed ``window`` bytes, and are read only on request."""
 
     def __init__(self, address: str, window: int = 1) -> None:
         host, port = address.rsplit(":", 1)
@@ -44,6 +44,23 @@ class SlowReader:
         head = b"".join(_header(name, value) for name, value in fields.items())
         body = b"\0" + struct.pack(">I", len(message)) + message
         self._socket.sendall(_frame(HEADERS, END_HEADERS, stream, head) + _frame(DATA, END_STREAM, stream, body))
+
+    def answered(self) -> bool:
+        """Reads until a call's trailers end its stream; False if the connection ends before."""
+        while True:
+            head = self._read(9)
+            if len(head) < 9:
+                return False
+            kind, flags = head[3], head[4]
+            self._read(int.from_bytes(head[:3], "big"))
+            if kind == HEADERS and flags & END_STREAM:
+                return True
+
+    def _read(self, count: int) -> bytes:
+        data = b""
+        while len(data) < count and (part := self._socket.recv(count - len(data))):
+            data += part
+        return data
 
     def __enter__(self) -> SlowReader:
         return self

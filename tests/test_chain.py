@@ -9,6 +9,7 @@ import pytest
 
 from nurec_sim import metrics, plugins, runs, sim
 from nurec_sim.client import RemoteSensors
+from nurec_sim.driving import DriverServer, RemotePolicy
 from nurec_sim.metrics.offroad import offroad_agreement
 from nurec_sim.metrics.offroad_grid import scene_offroad_grid
 from nurec_sim.scene_store import LoadedScene, SceneStore
@@ -98,6 +99,20 @@ def test_a_rollout_through_the_server_equals_the_local_one_bit_for_bit(
     assert np.array_equal(rollouts["local"].world_from_rig, rollouts["remote"].world_from_rig)
     for (_, mine), (_, theirs) in zip(rollouts["local"].plans, rollouts["remote"].plans, strict=True):
         assert np.array_equal(mine.pose, theirs.pose)
+
+
+@pytest.mark.parametrize("name", ["camera_road_follower", "lidar_aeb"])
+def test_a_driver_on_the_far_side_of_a_wire_drives_the_same_bit_for_bit(
+    name: str, loaded: LoadedScene, remote: RemoteSensors, scenario: Scenario
+) -> None:
+    local = sim.run_rollout(scenario, plugins.load_policy(name), remote.sense, loaded.scene)
+    with DriverServer(lambda: plugins.load_policy(name), port=0) as address, RemotePolicy(address) as policy:
+        far = sim.run_rollout(scenario, policy, remote.sense, loaded.scene)
+    assert local.status == far.status == "ok", far.error
+    assert len(local.plans) == len(far.plans) == 19
+    for (_, mine), (_, theirs) in zip(local.plans, far.plans, strict=True):
+        assert np.array_equal(mine.t_us, theirs.t_us) and np.array_equal(mine.pose, theirs.pose)
+    assert np.array_equal(local.world_from_rig, far.world_from_rig)
 
 
 def test_a_run_folder_with_report(

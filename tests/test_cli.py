@@ -16,6 +16,8 @@ VERBS = (
     "reconstruct",
     "render",
     "serve",
+    "serve-grpc",
+    "health",
     "run",
     "demo",
     "evaluate",

@@ -20,6 +20,7 @@ from nurec_sim.errors import (
 from nurec_sim.render import Renderer
 from nurec_sim.scene_store import SceneStore
 from nurec_sim.server import SensorServer
+from nurec_sim.service import ServiceOptions
 from nurec_sim.types import LidarModel, Pinhole
 
 
@@ -106,7 +107,7 @@ def test_what_the_server_tells_of_a_scene_is_what_it_has(remote, world):
     assert np.array_equal(remote.lidars()["roof"].rig_from_lidar, world.rig.lidars["roof"].rig_from_lidar)
     assert np.array_equal(remote.trajectory().world_from_body, world.ego.world_from_body)
     assert [t.id for t in remote.tracks()] == ["car-1", "parked-1"]
-    assert remote.server_config()["render_workers"] == "1" and remote.version()
+    assert remote.server_config()["render_workers"] == str(ServiceOptions().render_workers) and remote.version()
 
 
 def far_away():

@@ -8,6 +8,7 @@ import tiny_clip
 
 from nurec_sim import scene
 from nurec_sim.errors import ReconstructError, WeightsError
+from nurec_sim.evaluate import evaluate
 from nurec_sim.logs import open_clip
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, reconstruct
 from nurec_sim.render.renderer import Renderer
@@ -52,7 +53,7 @@ def test_every_layer_is_there(world):
 def test_several_chunks_become_one_scene():
     demo = open_clip(Path(__file__).parents[1] / "scenarios" / "demo_clip.zip")
     result = reconstruct(
-        demo, "dense", cameras=["camera_front"], settings=quick(frames=12, overlap=0.0, max_gaussians=None)
+        demo, "dense", cameras=["camera_front"], settings=quick(frames=13, overlap=0.0, max_gaussians=None)
     )
     counts = result.provenance["counts"]
     assert counts["chunks"] == len(result.provenance["chunks"]) == 2
@@ -111,3 +112,11 @@ def test_what_does_not_fit_is_refused(clip):
 def test_weights_that_are_not_there(clip, tmp_path):
     with pytest.raises(WeightsError, match=r"missing\.pth"):
         reconstruct(clip, "dense", settings=quick(random_weights=None, checkpoint=tmp_path / "missing.pth"))
+
+
+def test_evaluation_takes_the_cameras_that_the_method_chose(clip):
+    figures = evaluate(clip, "dense", via_grpc=False, settings=quick())
+    assert figures["method"] == "dense"
+    assert len(figures["input_cameras"]) in (1, 3)
+    assert figures["image"]["psnr_db"] is not None
+    assert set(figures["image"]["cameras"]) == set(figures["input_cameras"])

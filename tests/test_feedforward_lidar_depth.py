@@ -185,7 +185,11 @@ def test_slopes_are_found_where_points_lie_and_do_not_reach_beyond():
         depth = np.geomspace(0.1, 1e5, 400)
         fitted = depth * image.factor(depth)
         assert (fitted > 0).all() and (np.diff(fitted) > 0).all()
-    moved = fit.apply(pixel_gaussians(chunk, bent_m.astype(np.float32)), chunk)
+    before = pixel_gaussians(chunk, bent_m.astype(np.float32))
+    moved = fit.apply(before, chunk)
+    grown = (moved.scale_m / before.scale_m)[0, :, 0].reshape(bent_m.shape).numpy()
+    factors = np.stack([image.factor(depth) for image, depth in zip(fit.images, bent_m, strict=True)])
+    assert np.allclose(grown, factors, rtol=1e-3)
     wanted = pixel_gaussians(chunk, true_m).position_m
     close = torch.tensor((true_m < 60).reshape(1, -1)) & torch.tensor((true_m > 6).reshape(1, -1))
     error = (moved.position_m - wanted).norm(dim=-1) / torch.tensor(true_m).reshape(1, -1)
@@ -214,6 +218,15 @@ def test_points_behind_what_the_camera_sees_are_left_out():
     clip.added = np.stack([np.full(y.size, 35.0), y.ravel(), z.ravel()], axis=1)
     image = fit_depth(clip, chunk, true_m, set(), "scale").images[0]
     assert image.error_before < 0.005 and image.scale == pytest.approx(1, rel=0.005)
+
+
+def test_returns_from_the_recording_car_are_left_out():
+    clip = WallStreet(frames=1)
+    chunk, true_m = street_chunk(clip, ("front",))
+    x, y = np.meshgrid(np.linspace(2.6, 3.5, 200), np.linspace(-0.8, 0.8, 200))
+    bonnet = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.9)], axis=1)
+    clip.added = geometry.transform_points(clip.ego.at(EPOCH_US), bonnet)
+    assert fit_depth(clip, chunk, true_m, set(), "scale").error_before < 0.005
 
 
 def test_held_out_sweeps_are_not_read_and_their_images_take_neighbours():

@@ -1,6 +1,5 @@
 """Cubemaps of the network, and the sky that the released model ships with, against its outputs and in closed form."""
 
-import os
 from pathlib import Path
 
 import numpy as np

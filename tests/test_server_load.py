@@ -31,6 +31,7 @@ from serving_world import LAST_US, START_US, camera_request, lidar_request, scen
 from nurec_sim.render import Renderer
 from nurec_sim.scene_store import SceneStore
 from nurec_sim.server import SensorServer
+from nurec_sim.service import ServiceOptions
 from nurec_sim.wire import common, sensorsim
 
 
@@ -151,8 +152,8 @@ def slowest_health_check(channel, until):
 
 def test_what_a_client_gave_up_is_not_rendered():
     gated = Gated(scene())
-    store = SceneStore([scene()], make_renderer=lambda _: gated)
-    with SensorServer(store, port=0) as address, Stub(address) as stub:
+    store, one = SceneStore([scene()], make_renderer=lambda _: gated), ServiceOptions(render_workers=1)
+    with SensorServer(store, port=0, options=one) as address, Stub(address) as stub:
         first = stub.render_rgb.future(camera_message(camera_request(t_us=5_100_000)))
         wait_until(lambda: gated.begun)
         given_up = stub.render_rgb.future(camera_message(camera_request(t_us=5_200_000)))

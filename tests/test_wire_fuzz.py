@@ -94,7 +94,7 @@ def test_strange_camera_requests(data, start, count):
     with contextlib.suppress(RequestError):
         request, options = wire.read_camera_request(message, rig().cameras)
         is_sound(request)
-        assert 1 <= options.jpeg_quality <= 100
+        assert 1 <= options.quality <= 100
 
 
 @FUZZ

@@ -3,24 +3,39 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Sequence
 
-from nurec_sim.cli import driving, exchange, scenes, weights
+from nurec_sim.cli import conformance, drive, driving, exchange, remote, scenes, serving, validation, weights
 from nurec_sim.cli.console import app, err
 from nurec_sim.errors import NurecSimError
 
-__all__ = ["driving", "exchange", "main", "scenes", "weights"]
+__all__ = [
+    "conformance",
+    "drive",
+    "driving",
+    "exchange",
+    "main",
+    "remote",
+    "scenes",
+    "serving",
+    "validation",
+    "weights",
+]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb; errors of ours become one line and exit status 1, Ctrl-C becomes 130."""
     logging.basicConfig(format="%(message)s", level=logging.ERROR)
+    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
+        if words[:1] == ["serve-grpc"]:
+            words[1:] = serving.sort_serve_grpc(words[1:])
         app.cli(
             prog="nurec-sim",
             description="An open closed-loop sensor simulator for driving. A log becomes a Gaussian world, a gRPC "
             "server renders it, policies drive through it, a report says which is better. Start with: nurec-sim demo",
-            args=None if arguments is None else list(arguments),
+            args=words,
         )
     except NurecSimError as error:
         err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False, soft_wrap=True)

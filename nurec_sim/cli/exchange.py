@@ -52,7 +52,7 @@ def export(
 
 @app.command(name="import")
 def import_(
-    ply: OnePath,
+    file: OnePath,
     *,
     out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     sky: Path | None = None,
@@ -60,32 +60,38 @@ def import_(
     up: Literal["z", "-z", "y", "-y", "x", "-x"] = "z",
     overwrite: bool = False,
 ) -> None:
-    """Make a scene archive (.usdz) from a 3DGS PLY: ours, the Instant NuRec release's, or any trained one.
+    """Make a scene archive (.usdz) from a file of another program.
 
-    A PLY knows colours and shapes, but no sensors, path, times, boxes or map. Those come from --like; without it the
-    car stands at the origin for one second with one camera that looks along x. What is not known is listed below the
-    table. Lengths are taken for metres.
+    A 3DGS PLY: ours, the Instant NuRec release's, or any trained one. A NuRec archive (.usdz), or its volume.nurec or
+    checkpoint.ckpt alone. OpenUSD particle fields (.usdz, .usda, .usdc, .usd).
+
+    What a file does not know, sensors, path, times, boxes or map, comes from --like; without it the car stands at the
+    origin for one second with one camera that looks along x. What is not known or not read is listed below the table.
+    A PLY's lengths are taken for metres.
 
     Ours again: nurec-sim import demo.ply --like scenarios/demo_clip.zip
 
     Trained on COLMAP poses: nurec-sim import garden.ply --up=-y
 
     Args:
-        ply: the PLY file (docs/exchange.md lists the properties that it must have).
-        out_path: the archive to write; the PLY's name with .usdz in the current folder if not given.
+        file: the file (docs/exchange.md says what a PLY must have, docs/foreign_scenes.md what is read of others).
+        out_path: the archive to write; the file's name with .usdz in the current folder if not given.
         sky: a .sky.npz file; X.sky.npz beside X.ply if not given and it is there.
         like: a scene archive or a clip of the same place.
-        up: which axis of the file points up; -y for most trained files, y for those made for OpenGL.
+        up: which axis of a PLY points up; -y for most trained files, y for those made for OpenGL.
         overwrite: replace an archive that is there.
     """
     from nurec_sim import logs, scene
 
-    target = out_path or Path(f"{ply.stem}.usdz")
+    target = out_path or Path(f"{file.stem}.usdz")
     if target.exists() and not overwrite:
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
-    with err.status(f"reading {ply.name}"):
-        known = None if like is None else scene.read_scene(like) if like.suffix == ".usdz" else logs.open_clip(like)
-        world = scene.import_scene(ply, sky=sky, like=known, up=up)
+    if file.resolve() == target.resolve():
+        raise NurecSimError(f"{target} is the file to import; give another --out")
+    with err.status(f"reading {file.name}"):
+        opened = scene.read_scene if like and like.suffix.lower() in scene.SCENE_SUFFIXES else logs.open_clip
+        known = None if like is None else opened(like)
+        world = scene.import_scene(file, sky=sky, like=known, up=up)
     with err.status(f"writing {target.name}"):
         scene.write_scene(world, target, overwrite=overwrite)
     dropped = world.provenance["dropped"]

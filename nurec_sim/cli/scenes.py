@@ -1,16 +1,16 @@
-"""Verbs about one log or scene: inspect, world, reconstruct, render, serve, evaluate."""
+"""Verbs about one log or scene: inspect, world, reconstruct, render, evaluate."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from nurec_sim.cli.console import OnePath, Paths, app, err, out, print_faults, print_table, progress
+from nurec_sim.cli.console import OnePath, app, err, out, print_faults, print_table, progress
+from nurec_sim.cli.validation import inspect_scene
 from nurec_sim.errors import NurecSimError
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 
@@ -23,18 +23,21 @@ NO_FLAGS = FeedForwardSettings()
 
 
 @app.command
-def inspect(clip: OnePath) -> None:
-    """Show what a driving log holds, and check it.
+def inspect(source: OnePath) -> None:
+    """Show what a driving log or a scene archive holds, and check it.
 
     Prints a table of sensors, rates, spans and boxes, then every fault as one line. Exit status 1 if there are faults.
 
     Args:
-        clip: a clip folder, or a .zip of one (docs/clip_format.md).
+        source: a clip folder, or a .zip of one (docs/clip_format.md), or a scene archive (.usdz).
     """
     from nurec_sim import logs
     from nurec_sim.logs.describe import SENSOR_COLUMNS
+    from nurec_sim.scene_store.sources import is_archive
 
-    log = logs.open_clip(clip)
+    if is_archive(source):
+        return inspect_scene(source)
+    log = logs.open_clip(source)
     summary = logs.describe_clip(log)
     print_table(f"clip {log.id}", summary.facts)
     print_table("sensors", summary.sensors, SENSOR_COLUMNS)
@@ -145,40 +148,6 @@ def render(
     scene_ = load_scene(source)
     render_still(scene_, out_path, camera, frame, left_m=left_m, yaw_deg=yaw_deg, layer=layer, width_px=width)
     out.print(f"wrote {out_path}", soft_wrap=True)
-
-
-@app.command
-def serve(
-    sources: Paths,
-    *,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    threads: int | None = None,
-    cache: Path | None = None,
-) -> None:
-    """Serve scenes over gRPC, for AlpaSim, CARLA and NuRec clients. Ctrl-C stops.
-
-    Prints `Serving on <host>:<port>` when ready. Clips are reconstructed on first use and kept in the cache.
-
-    Args:
-        sources: scene archives, clips, or folders of them.
-        host: address to listen on; only this machine unless said otherwise.
-        port: 0 takes a free one.
-        threads: render threads; the number of cores if not given.
-        cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
-    """
-    from nurec_sim.scene_store import SceneStore
-    from nurec_sim.server import serve as run_server
-    from nurec_sim.service import ServiceOptions
-
-    logging.getLogger("nurec_sim").setLevel(logging.WARNING)
-    store = SceneStore(sources, cache_dir=cache, threads=threads, on_progress=err.print)
-    if not store.ids:
-        raise NurecSimError("nothing to serve: " + ("; ".join(store.faults.values()) or "give archives or clips"))
-    try:
-        run_server(store, host=host, port=port, options=ServiceOptions(warm_up=True))
-    except OSError as error:
-        raise NurecSimError(str(error)) from None
 
 
 @app.command

@@ -17,6 +17,7 @@ from nurec_sim.network.profiles import PATCH_PX, Profile
 from nurec_sim.network.tensors import NetworkInputs, NetworkOutputs
 
 Precision = Literal["float32", "bfloat16", "float16"]
+TOKENS_AND_POSITIONS = ("cls_tokens", "cls_pos_embed", "img_pos_embed", "affine_token", "sky.token")
 
 
 class InstantNuRec(nn.Module):
@@ -88,23 +89,21 @@ class InstantNuRec(nn.Module):
             )
 
 
-def initialize(model: nn.Module, seed: int) -> None:
-    """Random parameters as training starts from them: small normal weights, zero biases, tokens and positions small."""
+def initialize(model: InstantNuRec, seed: int) -> None:
+    """Random parameters as training starts from them.
+
+    Weights are normal, so narrow that a layer hardly changes the size of what goes through (transformer blocks: 0.02);
+    biases are zero, tokens and positions small, and camera responses begin as the identity.
+    """
     generator = torch.Generator().manual_seed(seed)
     for name, module in model.named_modules():
         if isinstance(module, (nn.Linear, nn.Conv2d, nn.ConvTranspose2d)):
-            fan_in = module.weight[0].numel()
-            if isinstance(module, nn.ConvTranspose2d):
-                fan_in = module.weight.shape[0]
-            nn.init.trunc_normal_(module.weight, std=min(0.02, fan_in**-0.5) if "blocks" in name else fan_in**-0.5,
-                                  generator=generator)  # fmt: skip
+            inputs = len(module.weight) if isinstance(module, nn.ConvTranspose2d) else module.weight[0].numel()
+            widest = 0.02 if "blocks" in name else 1.0
+            nn.init.trunc_normal_(module.weight, std=min(widest, inputs**-0.5), generator=generator)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
     for name, parameter in model.named_parameters():
-        if name.rsplit(".", 1)[-1] in ("cls_tokens", "cls_pos_embed", "img_pos_embed", "affine_token", "token"):
+        if name.endswith(TOKENS_AND_POSITIONS):
             nn.init.trunc_normal_(parameter, std=0.02, generator=generator)
-    with torch.no_grad():
-        # Camera responses begin as the identity.
-        for module in model.modules():
-            if isinstance(module, IspDecoder):
-                module.affine_linear.weight.zero_()
+    nn.init.zeros_(model.post_processing.affine_linear.weight)

@@ -119,7 +119,7 @@ _TINY = Profile(
     cameras=(1, 3, 5),
     frames=(1, 18),
     keeps_aspect=True,
-    encoder=EncoderSize(144, 10, 6, 2, (3, 5, 7, 9), 16, 1, 4),
+    encoder=EncoderSize(144, 10, 3, 2, (3, 5, 7, 9), 16, 1, 4),
     head=HeadSize((24, 48, 72, 72), 48, 16),
     selective=SelectiveSize(depth=1, heads=6),
     motion=MotionSize(64),

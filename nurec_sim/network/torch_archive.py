@@ -19,8 +19,8 @@ from torch import Tensor
 
 from nurec_sim.errors import WeightsError
 from nurec_sim.scene.torch_pickle import StoredTensor, read_tensor_pickle
+from nurec_sim.scene.torch_zip import TorchZipError, is_little_endian, root_of, stored_entries
 
-_MAX_PICKLE_BYTES = 32 << 20
 _LOCAL_HEADER = struct.Struct("<26xHH")  # the lengths of name and extra field, after which an entry's bytes begin
 _TYPES = {
     "FloatStorage": torch.float32,
@@ -48,11 +48,17 @@ def read_torch_archive(path: Path) -> dict[str, Tensor]:
     """
     try:
         with zipfile.ZipFile(path) as package:
-            entries = _stored_entries(path, package)
-            root = _root(path, entries)
+            entries = stored_entries(package, path.stat().st_size)
+            if any(name.endswith("/constants.pkl") for name in entries):
+                raise WeightsError(
+                    f"{path} is a TorchScript program, not weights; give the state dict (.pth, .safetensors)"
+                )
+            root = root_of(entries)
             contents = read_tensor_pickle(package.read(f"{root}/data.pkl"))
-            if f"{root}/byteorder" in entries and package.read(f"{root}/byteorder") != b"little":
+            if not is_little_endian(package, entries, root):
                 raise WeightsError(f"{path} was written on a big-endian machine; save it again on another")
+    except TorchZipError as error:
+        raise WeightsError(f"{path} {error}") from None
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, OSError) as error:
         raise WeightsError(f"{path} is damaged or cut off: {error}") from None
     except ValueError as error:
@@ -70,31 +76,6 @@ def read_torch_archive(path: Path) -> dict[str, Tensor]:
     with path.open("rb") as file:
         mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     return {name: _tensor(path, mapped, tensor, places[name]) for name, tensor in tensors.items()}
-
-
-def _stored_entries(path: Path, package: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Entries by name; compressed ones are refused, for they could grow without bound, and so are overlapping ones."""
-    infos = package.infolist()
-    for info in infos:
-        if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1 or info.file_size != info.compress_size:
-            raise WeightsError(f"{path} has compressed or encrypted entries; torch.save writes none")
-    entries = {info.filename: info for info in infos}
-    size = path.stat().st_size
-    if len(entries) != len(infos) or sum(info.file_size for info in infos) > size:
-        raise WeightsError(f"{path} is no file of torch.save: its entries overlap")
-    return entries
-
-
-def _root(path: Path, entries: dict[str, zipfile.ZipInfo]) -> str:
-    """The folder in the archive that holds everything."""
-    if any(name.endswith("/constants.pkl") for name in entries):
-        raise WeightsError(f"{path} is a TorchScript program, not weights; give the state dict (.pth, .safetensors)")
-    roots = [name.removesuffix("/data.pkl") for name in entries if name.endswith("/data.pkl") and name.count("/") == 1]
-    if len(roots) != 1:
-        raise WeightsError(f"{path} is a zip file, but not one that torch.save writes: no data.pkl in it")
-    if entries[f"{roots[0]}/data.pkl"].file_size > _MAX_PICKLE_BYTES:
-        raise WeightsError(f"{path}: its list of tensors takes more than {_MAX_PICKLE_BYTES >> 20} MiB")
-    return roots[0]
 
 
 def _network_part(path: Path, contents: object) -> tuple[dict[str, StoredTensor], bool]:

@@ -84,26 +84,28 @@ def moving_gaussians(
     opacity = dynamic.gaussians.opacity[alive] * fade
     seen = (opacity >= MIN_ALPHA) & drawable(dynamic.gaussians[alive])
     seen &= np.isfinite(dynamic.knot_m[alive]).all(axis=(1, 2))
+    boxed = np.zeros(len(dynamic), bool) if dynamic.in_box is None else dynamic.in_box
+    requested = {k: actors[track.id] for k, track in enumerate(tracks) if track.id in actors}
+    gone = [k for k, track in enumerate(tracks) if k not in requested and not track.path.covers(t_us)]
+    seen &= ~(boxed[alive] & np.isin(dynamic.track[alive], gone))
     alive, mean, opacity = alive[seen], mean[seen], opacity[seen]
     gaussians = dynamic.gaussians[alive]
     quat, normal = gaussians.quat_wxyz.astype(np.float64), gaussians.normal.astype(np.float64)
     eye = np.broadcast_to(np.asarray(eye_m, np.float64), mean.shape).copy()
     recorded_mean = mean.copy()
-    owner = dynamic.track[alive]
-    index_of = {track.id: k for k, track in enumerate(tracks)}
-    for name, world_from_box in actors.items():
-        if name not in index_of:
-            continue
-        index = index_of[name]
-        mine = np.flatnonzero(owner == index)
-        if len(mine) == 0:
-            continue
-        new_from_recorded = world_from_box @ geometry.inverse(tracks[index].path.at(t_us))
-        turn = geometry.quat_from_matrix(new_from_recorded[:3, :3])
-        mean[mine] = geometry.transform_points(new_from_recorded, mean[mine])
-        quat[mine] = geometry.quat_multiply(np.broadcast_to(turn, (len(mine), 4)), quat[mine])
-        normal[mine] = normal[mine] @ new_from_recorded[:3, :3].T
-        eye[mine] = geometry.transform_points(geometry.inverse(new_from_recorded), eye[mine])
+    owner, in_box = dynamic.track[alive], boxed[alive]
+    for index in sorted(requested.keys() | set(owner[in_box].tolist())):
+        recorded = tracks[index].path.at(t_us)
+        world_from_box = requested.get(index, recorded)
+        for rigid, new_from_given in ((False, world_from_box @ geometry.inverse(recorded)), (True, world_from_box)):
+            mine = np.flatnonzero((owner == index) & (in_box == rigid))
+            if len(mine) == 0 or not (rigid or index in requested):
+                continue
+            turn = geometry.quat_from_matrix(new_from_given[:3, :3])
+            mean[mine] = geometry.transform_points(new_from_given, mean[mine])
+            quat[mine] = geometry.quat_multiply(np.broadcast_to(turn, (len(mine), 4)), quat[mine])
+            normal[mine] = normal[mine] @ new_from_given[:3, :3].T
+            eye[mine] = geometry.transform_points(geometry.inverse(new_from_given), eye[mine])
     rgb = gaussians.rgb
     if gaussians.sh_rest is not None:
         rgb = view_colour(rgb, gaussians.sh_rest, recorded_mean - eye).astype(np.float32)

@@ -1,6 +1,6 @@
 """Scene archives: a GaussianScene as a USDZ that other simulators open, written and read without loss. And PLY."""
 
-from nurec_sim.scene.archive import FORMAT_VERSION, archive_faults, read_scene, write_scene
+from nurec_sim.scene.archive import FORMAT_VERSION, SCENE_SUFFIXES, archive_faults, read_scene, write_scene
 from nurec_sim.scene.checks import check_scene
 from nurec_sim.scene.describe import scene_hash, summary
 from nurec_sim.scene.exchange import export_scene, import_scene
@@ -9,6 +9,7 @@ from nurec_sim.scene.sidecars import alpasim_id
 
 __all__ = [
     "FORMAT_VERSION",
+    "SCENE_SUFFIXES",
     "alpasim_id",
     "archive_faults",
     "check_scene",

@@ -41,11 +41,16 @@ from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label
 FORMAT_VERSION = 1
 MANIFEST = "nurec_sim/manifest.json"
 FACTS, ISP, SKY = "nurec_sim/scene.json", "nurec_sim/isp.json", "nurec_sim/sky_cubemap.npy"
-KNOT_TIMES, KNOTS, OWNERS = (f"nurec_sim/dynamic_{name}.npy" for name in ("knot_t_us", "knot_m", "track"))
+KNOT_TIMES, KNOTS, OWNERS, IN_BOX = (
+    f"nurec_sim/dynamic_{name}.npy" for name in ("knot_t_us", "knot_m", "track", "in_box")
+)
 TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY, KNOT_TIMES, KNOTS, OWNERS)
-"""The members that a scene is read from; all others are for other programs."""
+"""The members that a scene is read from, with ``IN_BOX`` where it has such; all others are for other programs."""
 
 MAX_JSON_BYTES = 256 * 2**20
+FOREIGN_SUFFIXES = (".ply", ".usd", ".usda", ".usdc", ".nurec", ".ckpt")
+SCENE_SUFFIXES = (".usdz", *FOREIGN_SUFFIXES)
+"""Names of files that ``read_scene`` opens end in one of these, in capitals or not."""
 
 
 def write_scene(scene: GaussianScene, path: Path | str, *, overwrite: bool = False) -> Path:
@@ -84,20 +89,28 @@ def write_scene(scene: GaussianScene, path: Path | str, *, overwrite: bool = Fal
         KNOTS: npy_bytes(scene.dynamic.knot_m),
         OWNERS: npy_bytes(scene.dynamic.track),
     }
+    if scene.dynamic.in_box is not None:
+        members[IN_BOX] = npy_bytes(scene.dynamic.in_box)
     members[MANIFEST] = codec.dump(_manifest(scene, digest, members), MANIFEST, indent=2)
     write_package(path, members)
     return path
 
 
 def read_scene(path: Path | str) -> GaussianScene:
-    """Reads a scene archive written by ``write_scene``; every value comes back exactly.
+    """Reads a scene archive written by ``write_scene``, every value exactly; or what another program wrote.
 
-    Nothing is extracted, unpickled or run, and no file outside of the archive is opened.
+    Of an archive of ours nothing is extracted, unpickled or run, and no file outside of it is opened. For other
+    archives and for ``.ply``, ``.usd``, ``.usda``, ``.usdc``, ``.nurec`` and ``.ckpt`` files see
+    ``foreign.read_foreign``.
 
     Raises:
         ArchiveError: not such an archive, damaged, changed since it was written, unsafe, or not a sound scene.
     """
     path = Path(path)
+    if is_foreign(path):
+        from nurec_sim.scene.foreign import read_foreign
+
+        return read_foreign(path)
     with Package(path) as package:
         manifest = _read_manifest(package)
         _check_hashes(package, manifest, TRUTH)
@@ -112,7 +125,12 @@ def read_scene(path: Path | str) -> GaussianScene:
             harmonics = np.zeros((0, counts["dynamic_sh_rest"], 3), np.float32) if counts["dynamic_sh_rest"] else None
             drop = np.zeros(0, np.float32) if counts.get("dynamic_ray_drop") else None
             moving = dataclasses.replace(moving, sh_rest=harmonics, ray_drop=drop)
-        dynamic = DynamicGaussians(moving, *(_array(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS)))
+        in_box = None
+        if counts.get("dynamic_in_box"):
+            _check_hashes(package, manifest, (IN_BOX,))
+            in_box = array_from_npy(package.read(IN_BOX), f"{path}: {IN_BOX}", kinds="b")
+        knot_t_us, knot_m, owners = (_array(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS))
+        dynamic = DynamicGaussians(moving, knot_t_us, knot_m, owners, in_box)
         isp_json = codec.load(package.read(ISP, MAX_JSON_BYTES), f"{path}: {ISP}")
         isp = codec.from_json(codec.mapping(codec.array(np.float64, 3, 4)), isp_json, f"{path}: {ISP}")
         scene = GaussianScene(static=static, dynamic=dynamic, sky=_array(package, SKY), isp=isp, **facts)
@@ -121,6 +139,18 @@ def read_scene(path: Path | str) -> GaussianScene:
     except ArchiveError as error:
         raise ArchiveError(f"{path}: {error}") from error
     return scene
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether another program wrote a file of a scene: it has no manifest of ours.
+
+    Raises:
+        ArchiveError: the file is no readable archive.
+    """
+    if path.suffix.lower() in FOREIGN_SUFFIXES:
+        return True
+    with Package(path) as package:
+        return MANIFEST not in package.names
 
 
 def archive_faults(path: Path | str) -> list[str]:
@@ -159,6 +189,7 @@ def _manifest(scene: GaussianScene, digest: str, members: dict[str, bytes]) -> d
             "dynamic": len(scene.dynamic),
             "dynamic_sh_rest": 0 if harmonics is None else harmonics.shape[1],
             "dynamic_ray_drop": int(scene.dynamic.gaussians.ray_drop is not None),
+            **({} if scene.dynamic.in_box is None else {"dynamic_in_box": 1}),
         },
         "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},
     }

@@ -119,6 +119,9 @@ def _check_dynamic(dynamic: DynamicGaussians, track_count: int) -> None:
     _check_array(dynamic.track, "dynamic.track", np.int32, (n,))
     _refuse(~np.isfinite(dynamic.knot_m).all(axis=(1, 2)), "dynamic", "knot_m", "not finite")
     _refuse(np.any(np.diff(dynamic.knot_t_us, axis=1) < 0, axis=1), "dynamic", "knot_t_us", "not in order of time")
+    if dynamic.in_box is not None:
+        _check_array(dynamic.in_box, "dynamic.in_box", np.bool_, (n,))
+        _refuse(dynamic.in_box & (dynamic.track < 0), "dynamic", "in_box", "in the box of no track")
     outside = (dynamic.track < -1) | (dynamic.track >= track_count)
     _refuse(outside, "dynamic", "track", f"outside -1..{track_count - 1}")
 

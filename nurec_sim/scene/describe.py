@@ -18,6 +18,8 @@ def scene_arrays(scene: GaussianScene) -> dict[str, np.ndarray]:
     arrays = {f"static.{name}": array for name, array in _columns(scene.static).items()}
     arrays |= {f"dynamic.{name}": array for name, array in _columns(dynamic.gaussians).items()}
     arrays |= {f"dynamic.{name}": getattr(dynamic, name) for name in ("knot_t_us", "knot_m", "track")}
+    if dynamic.in_box is not None:
+        arrays["dynamic.in_box"] = dynamic.in_box
     return arrays | {"sky": scene.sky}
 
 

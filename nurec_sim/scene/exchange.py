@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
-from nurec_sim.scene.harmonics import rotate_harmonics
 from nurec_sim.scene.ply import Progress, read_ply, write_ply
 from nurec_sim.scene.sky_sidecar import SkySidecar, read_sky, sky_paths, write_sky
+from nurec_sim.scene.transform import joined, transformed
 from nurec_sim.types import (
     CameraModel,
     Clip,
@@ -82,7 +81,7 @@ def export_scene(
     start_us, end_us = scene.span_us
     if at_us is not None and not start_us <= at_us < end_us:
         raise ArchiveError(f"instant {at_us} us is outside of the scene, which spans [{start_us}, {end_us}) us")
-    gaussians = scene.static if at_us is None else _with_moving(scene.static, scene.dynamic, at_us)
+    gaussians = scene.static if at_us is None else _with_moving(scene, at_us)
     sidecar = SkySidecar(scene.sky, isp=scene.isp, source=str(scene.provenance.get("method", "unknown")))
     write_sky(sidecar, npz, png, cameras=list(scene.rig.cameras))
     written = write_ply(gaussians, path, overwrite=overwrite, progress=progress)
@@ -93,30 +92,34 @@ def export_scene(
 def import_scene(
     path: Path | str, *, sky: Path | str | None = None, like: GaussianScene | Clip | None = None, up: str = "z"
 ) -> GaussianScene:
-    """A scene from a PLY of any 3DGS program; ``provenance["unknown"]`` says what could not be known.
+    """A scene from a file of another program; ``provenance["unknown"]`` says what could not be known.
 
     Args:
-        path: the PLY; its Gaussians become the static layer, its stem the scene's id.
+        path: a PLY, whose Gaussians become the static layer, its stem the scene's id; or any file that
+            ``foreign.read_foreign`` reads.
         sky: a sky file with colour corrections; ``X.sky.npz`` beside ``X.ply`` is taken if None and it is there.
         like: a scene or a log in the same world: its rig, path, span, tracks and map are taken, and of a scene also
             sky and colour correction where no sky file gives them. Else the car stands at the origin for one second,
             with one camera, 1.5 m up, that looks along x, under a black sky.
-        up: axis of the file that points up, one of ``UP_AXES``; the file is turned so that it is z.
+        up: axis of the PLY that points up, one of ``UP_AXES``; the file is turned so that it is z. Other files say it
+            themselves.
 
     Raises:
         ArchiveError: a file cannot be read, or ``up`` is no axis.
     """
     path = Path(path)
+    if path.suffix.lower() != ".ply":
+        return _import_other(path, sky, like, up)
     if up not in UP_AXES:
         raise ArchiveError(f"up must be one of {list(UP_AXES)}, got {up!r}")
     world_from_file = np.array(UP_AXES[up], np.float64)
     gaussians, dropped = read_ply(path)
     if up != "z":
-        gaussians = _turned(gaussians, world_from_file)
+        gaussians = transformed(gaussians, geometry.pose(world_from_file, np.zeros(3)))
     unknown = ["no moving Gaussians: a PLY holds one instant", "no LiDAR intensity: a PLY holds none"]
     if not (gaussians.label == Label.ROAD).any():
         unknown.append("no road: no vertex has a road_mask")
-    surroundings = _surroundings(like)
+    surroundings = default_surroundings() if like is None else _surroundings(like)
     if like is None:
         unknown.append(
             "no sensors, path, times, tracks and map: the car stands at the origin, one camera looks along x"
@@ -149,52 +152,62 @@ def import_scene(
     )
 
 
-def _with_moving(static: Gaussians, dynamic: DynamicGaussians, at_us: int) -> Gaussians:
+def _import_other(path: Path, sky: Path | str | None, like: GaussianScene | Clip | None, up: str) -> GaussianScene:
+    """A scene from a file that says itself which way is up, and may know sensors, path and sky."""
+    from nurec_sim.scene.foreign import read_foreign
+
+    if up != "z":
+        raise ArchiveError(f"{path}: only for PLY files can another axis than z be given as up; got {up!r}")
+    scene = read_foreign(path)
+    changes: dict[str, Any] = {}
+    if sky is not None:
+        sidecar = read_sky(sky)
+        changes |= {"sky": sidecar.sky, "isp": dict(scene.isp) | dict(sidecar.isp)}
+    if like is not None and scene.tracks:
+        raise ArchiveError(f"{path} has tracks of its own; like is for files without")
+    if like is not None:
+        changes |= _surroundings(like)
+    used = {"sky_file": None if sky is None else Path(sky).name, "like": None if like is None else like.id}
+    return dataclasses.replace(scene, provenance=dict(scene.provenance) | used, **changes)
+
+
+def _with_moving(scene: GaussianScene, at_us: int) -> Gaussians:
     """Both layers at an instant."""
-    rows, mean_m, fade = dynamic.at(at_us)
-    moving = dynamic.gaussians[rows]
+    rows, mean_m, fade = scene.dynamic.at(at_us)
+    moving = scene.dynamic.gaussians[rows]
     opacity = (moving.opacity * fade).astype(np.float32)
     moving = dataclasses.replace(moving, mean_m=mean_m.astype(np.float32), opacity=opacity)
-    parts = [static, moving]
-    k = max(0 if part.sh_rest is None else part.sh_rest.shape[1] for part in parts)
-    return Gaussians.concatenate([_with_harmonics(part, k) if k else part for part in parts])
+    owner, in_box = scene.dynamic.track[rows], np.zeros(len(rows), bool)
+    if scene.dynamic.in_box is not None:
+        in_box = scene.dynamic.in_box[rows]
+    parts = [scene.static, moving[~in_box]]
+    for index in np.unique(owner[in_box]).tolist():
+        path = scene.tracks[index].path
+        if path.covers(at_us):
+            parts.append(transformed(moving[in_box & (owner == index)], path.at(at_us)))
+    return joined(parts)
 
 
-def _with_harmonics(gaussians: Gaussians, k: int) -> Gaussians:
-    """The same colours with k coefficients per channel, no fewer than there are."""
-    rest = np.zeros((len(gaussians), k, 3), np.float32)
-    if gaussians.sh_rest is not None:
-        rest[:, : gaussians.sh_rest.shape[1]] = gaussians.sh_rest
-    return dataclasses.replace(gaussians, sh_rest=rest)
+def default_surroundings() -> dict[str, Any]:
+    """Everything of a scene beside Gaussians, sky and colours, where nothing is known: a car that stands at the origin.
+
+    It stands there for ``DEFAULT_SPAN_US``, with one camera, ``CAMERA_HEIGHT_M`` up, that looks along x.
+    """
+    ahead = geometry.pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.0, 0, CAMERA_HEIGHT_M]))
+    camera = CameraModel("camera", 1280, 720, Pinhole(640.0, 640.0, 640.0, 360.0), ahead)
+    start_us = DEFAULT_SPAN_US[0]
+    return {
+        "rig": Rig({camera.id: camera}, {}),
+        "ego": Trajectory(np.array([start_us]), np.eye(4)[None]),
+        "tracks": [],
+        "road_map": None,
+        "span_us": DEFAULT_SPAN_US,
+        "camera_times_us": {camera.id: np.array([[start_us, start_us]])},
+    }
 
 
-def _turned(gaussians: Gaussians, rotation: Float64[np.ndarray, "3 3"]) -> Gaussians:
-    """Gaussians rotated about the origin, their view-dependent colours with them."""
-    quat = geometry.quat_multiply(geometry.quat_from_matrix(rotation)[None], gaussians.quat_wxyz)
-    rest = gaussians.sh_rest
-    return dataclasses.replace(
-        gaussians,
-        mean_m=(gaussians.mean_m @ rotation.T).astype(np.float32),
-        quat_wxyz=geometry.quat_normalize(quat).astype(np.float32),
-        normal=(gaussians.normal @ rotation.T).astype(np.float32),
-        sh_rest=None if rest is None else rotate_harmonics(rest, rotation),
-    )
-
-
-def _surroundings(like: GaussianScene | Clip | None) -> dict[str, Any]:
-    """Everything of a scene that a PLY and a sky file do not hold."""
-    if like is None:
-        ahead = geometry.pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.0, 0, CAMERA_HEIGHT_M]))
-        camera = CameraModel("camera", 1280, 720, Pinhole(640.0, 640.0, 640.0, 360.0), ahead)
-        start_us = DEFAULT_SPAN_US[0]
-        return {
-            "rig": Rig({camera.id: camera}, {}),
-            "ego": Trajectory(np.array([start_us]), np.eye(4)[None]),
-            "tracks": [],
-            "road_map": None,
-            "span_us": DEFAULT_SPAN_US,
-            "camera_times_us": {camera.id: np.array([[start_us, start_us]])},
-        }
+def _surroundings(like: GaussianScene | Clip) -> dict[str, Any]:
+    """The same, taken from a scene or a log of the same place."""
     known = {name: getattr(like, name) for name in ("rig", "ego", "tracks", "road_map", "span_us")}
     if isinstance(like, GaussianScene):
         return known | {"camera_times_us": like.camera_times_us}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tokenize
 
 import numpy as np
 
@@ -32,7 +33,7 @@ def array_from_npy(data: bytes, where: str, kinds: str = "iuf") -> np.ndarray:
         if np.lib.format.read_magic(buffer) != (1, 0):
             raise ValueError("npy version 1.0 is needed")
         shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(buffer)
-    except ValueError as error:
+    except (ValueError, SyntaxError, tokenize.TokenError, RecursionError) as error:  # NumPy parses it as Python
         raise ArchiveError(f"{where} is no array file: {error}") from error
     if dtype.hasobject or dtype.kind not in kinds or fortran_order:
         raise ArchiveError(

@@ -1,26 +1,33 @@
 """Files at the archive's root that AlpaSim, CARLA and NuRec tools read; nothing of ours reads them back.
 
 Conventions of those tools: ``T_a_b`` maps a to b; track quaternions are ``xyzw``; f-theta principal points count pixel
-centres as whole numbers (ours minus 0.5); exposures end after they start. ``world_to_nre`` is the identity, so poses
-mean the same in every reading.
+centres as whole numbers (ours minus 0.5). ``world_to_nre`` is the identity, so poses mean the same in every reading.
+
+Those tools start a drive at a camera's first frame, which must lie on a path that takes time. So a rig with one pose
+stands there for the whole scene, frames that were exposed outside of the path are left out, and a camera without any
+frame gets one.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import uuid
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int64
 
 from nurec_sim import sensors
+from nurec_sim.errors import ArchiveError
 from nurec_sim.geometry import quat_from_matrix
 from nurec_sim.scene import codec
 from nurec_sim.scene.ground_mesh import encode_ply, ground_mesh
 from nurec_sim.scene.opendrive import opendrive_map, world_to_ecef
-from nurec_sim.types import CameraModel, Fisheye, FTheta, GaussianScene, LidarModel, Pinhole, Shutter, Track
+from nurec_sim.types import CameraModel, Fisheye, FTheta, GaussianScene, LidarModel, Pinhole, Shutter, Track, Trajectory
 
 CHUNK_ID = "dummy_chunk_id"  # CARLA's client looks for this very key
+FIRST_FRAME_US = 100_000
 _FTHETA_TERMS = 6
 _SHUTTER_NAMES = {
     Shutter.GLOBAL: "GLOBAL",
@@ -37,8 +44,26 @@ def alpasim_id(scene_id: str) -> str:
 
 
 def ftheta_fits(scene: GaussianScene) -> dict[str, FTheta]:
-    """Every camera as an f-theta lens with both polynomials: the only model that CARLA's client reads."""
-    return {camera_id: sensors.fit_ftheta(camera) for camera_id, camera in scene.rig.cameras.items()}
+    """Every camera as an f-theta lens with both polynomials: the only model that CARLA's client reads.
+
+    Raises:
+        ArchiveError: no pixel of a camera lies in the field of its lens.
+    """
+    try:
+        return {camera_id: sensors.fit_ftheta(camera) for camera_id, camera in scene.rig.cameras.items()}
+    except ValueError as error:
+        raise ArchiveError(str(error)) from error
+
+
+def fit_error_px(camera: CameraModel, fit: FTheta) -> dict[str, float]:
+    """How far pixels move when the f-theta fit stands for the camera's own lens: root mean square and maximum."""
+    camera = dataclasses.replace(camera, windshield=None)
+    columns, rows = np.linspace(0.0, camera.width_px, 33), np.linspace(0.0, camera.height_px, 25)
+    uv = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    rays, seen = sensors.unproject(camera, uv)
+    fitted, inside = sensors.project(dataclasses.replace(camera, lens=fit), rays)
+    off = np.linalg.norm(fitted - uv, axis=1)[seen & inside]
+    return {"rms": float(np.sqrt(np.mean(off**2))), "max": float(off.max())}
 
 
 def sidecars(scene: GaussianScene, digest: str, fits: Mapping[str, FTheta]) -> dict[str, bytes]:
@@ -78,27 +103,26 @@ def _metadata(scene: GaussianScene, digest: str) -> bytes:
 
 def _data_info(scene: GaussianScene) -> dict[str, Any]:
     start_us, end_us = scene.span_us
+    path = drive_path(scene)
     return {
         "sequence_id": scene.id,
-        "pose-range": {"start-timestamp_us": scene.ego.start_us, "end-timestamp_us": scene.ego.end_us},
+        "pose-range": {"start-timestamp_us": path.start_us, "end-timestamp_us": path.end_us},
         "sequence_timestamp_interval_us": {"start": start_us, "stop": end_us},
     }
 
 
 def _rig_trajectories(scene: GaussianScene, fits: Mapping[str, FTheta]) -> dict[str, Any]:
-    frames = {key: _exposures(times) for key, times in scene.camera_times_us.items()}
-    cameras, lidars = list(scene.rig.cameras), list(scene.rig.lidars)
+    path = drive_path(scene)
+    frames = camera_frames(scene)
     body = scene.rig.body
-    no_frames = np.zeros((0, 2), np.int64)
+    no_sweeps = np.zeros((0, 2), np.int64)
     trajectory = {
         "sequence_id": scene.id,
-        "T_rig_worlds": scene.ego.world_from_body,
-        "T_rig_world_timestamps_us": scene.ego.t_us,
-        "cameras_frame_timestamps_us": {_uid(scene, key): frames.get(key, no_frames) for key in cameras},
-        "cameras_frame_T_rig_worlds": {
-            _uid(scene, key): scene.ego.at(frames[key]) if len(frames.get(key, no_frames)) else [] for key in cameras
-        },
-        "lidars_frame_timestamps_us": {_uid(scene, key): frames.get(key, no_frames) for key in lidars},
+        "T_rig_worlds": path.world_from_body,
+        "T_rig_world_timestamps_us": path.t_us,
+        "cameras_frame_timestamps_us": {_uid(scene, key): times_us for key, times_us in frames.items()},
+        "cameras_frame_T_rig_worlds": {_uid(scene, key): path.at(times_us) for key, times_us in frames.items()},
+        "lidars_frame_timestamps_us": {_uid(scene, key): no_sweeps for key in scene.rig.lidars},
         "rig_bbox": {"centroid": body.center_m, "dim": body.size_m, "rot": [0.0, 0.0, 0.0]},
     }
     return {
@@ -120,9 +144,34 @@ def _uid(scene: GaussianScene, sensor_id: str) -> str:
     return f"{sensor_id}@{scene.id}"
 
 
-def _exposures(times_us: np.ndarray) -> np.ndarray:
-    """Exposures of at least one microsecond: clients refuse empty ones."""
-    return np.column_stack([times_us[:, 0], np.maximum(times_us[:, 1], times_us[:, 0] + 1)])
+def drive_path(scene: GaussianScene) -> Trajectory:
+    """The recorded path; a single pose is held until the scene ends."""
+    if len(scene.ego.t_us) > 1:
+        return scene.ego
+    start_us = scene.ego.start_us
+    times_us = np.array([start_us, max(scene.span_us[1] - 1, start_us + 1)])
+    return Trajectory(times_us, np.repeat(scene.ego.world_from_body, 2, axis=0))
+
+
+def camera_frames(scene: GaussianScene) -> dict[str, Int64[np.ndarray, "f 2"]]:
+    """Exposures of every camera within the path, strictly increasing and at least 1 us long; one at the least.
+
+    A camera without any takes the first exposure of another, or the first tenth of a second.
+    """
+    path = drive_path(scene)
+    none = np.zeros((0, 2), np.int64)
+    frames = {key: _on_path(scene.camera_times_us.get(key, none), path) for key in scene.rig.cameras}
+    starts = [times_us[0].tolist() for times_us in frames.values() if len(times_us)]
+    first = min(starts, default=[path.start_us, min(path.start_us + FIRST_FRAME_US, path.end_us)])
+    return {key: times_us if len(times_us) else np.array([first]) for key, times_us in frames.items()}
+
+
+def _on_path(times_us: Int64[np.ndarray, "n 2"], path: Trajectory) -> Int64[np.ndarray, "f 2"]:
+    times_us = times_us[np.argsort(times_us[:, 0], kind="stable")]
+    frames = np.column_stack([times_us[:, 0], np.maximum(times_us[:, 1], times_us[:, 0] + 1)])
+    frames = frames[(frames[:, 0] >= path.start_us) & (frames[:, 1] <= path.end_us)]
+    latest = np.maximum.accumulate(frames, axis=0)
+    return frames[np.concatenate([np.ones(len(frames[:1]), bool), (frames[1:] > latest[:-1]).all(axis=1)])]
 
 
 def _camera_calibration(scene: GaussianScene, index: int, camera: CameraModel, fit: FTheta) -> dict[str, Any]:
@@ -135,6 +184,7 @@ def _camera_calibration(scene: GaussianScene, index: int, camera: CameraModel, f
     }
     if not isinstance(camera.lens, FTheta):
         calibration["exact_camera_model"] = _exact_model(camera)
+        calibration["ftheta_fit_error_px"] = fit_error_px(camera, fit)
     return calibration
 
 

@@ -3,7 +3,8 @@
 ``/Actors/track_<id>`` holds the label, the size, a guide box that follows the recorded path, and one ParticleField per
 window. A window is a set of Gaussians with the same three knot times: its positions have three time samples and it is
 visible from the first knot to the last. Positions are in the world, as recorded; Gaussians of no track live under
-``/Actors/untracked``. The fade of opacity within a window is not expressed in USD.
+``/Actors/untracked``. The fade of opacity within a window is not expressed in USD. Rigid parts of an actor are one
+window that moves with the box, in its frame.
 """
 
 from __future__ import annotations
@@ -32,7 +33,11 @@ def actors_layer(scene: GaussianScene) -> bytes:
         parent = prims[owner] if owner >= 0 else "untracked"
         if owner < 0:
             stage.DefinePrim("/Actors/untracked", "Xform")
-        _author_window(stage, f"/Actors/{parent}/window_{number:05d}", scene.dynamic, index, start_us)
+        path = f"/Actors/{parent}/window_{number:05d}"
+        if scene.dynamic.in_box is not None and scene.dynamic.in_box[index[0]]:
+            _author_rigid(stage, path, scene.dynamic.gaussians[index], index, scene.tracks[owner], start_us)
+        else:
+            _author_window(stage, path, scene.dynamic, index, start_us)
     return crate_bytes(stage)
 
 
@@ -95,10 +100,12 @@ def _windows(dynamic: DynamicGaussians) -> list[tuple[int, Int64[np.ndarray, " k
     """
     if len(dynamic) == 0:
         return []
-    keys = np.column_stack([dynamic.track, dynamic.knot_t_us])
+    in_box = np.zeros(len(dynamic), bool) if dynamic.in_box is None else dynamic.in_box
+    # The box's path moves rigid parts: one window is enough for them, whatever their knots.
+    keys = np.column_stack([dynamic.track, in_box, np.where(in_box[:, None], 0, dynamic.knot_t_us)])
     unique, window = np.unique(keys, axis=0, return_inverse=True)
     if len(unique) > MAX_WINDOWS:
-        keys[:, 1:] //= _COARSE_WINDOW_US
+        keys[:, 2:] //= _COARSE_WINDOW_US
         unique, window = np.unique(keys, axis=0, return_inverse=True)
     order = np.argsort(window.reshape(-1), kind="stable")
     starts = np.searchsorted(window.reshape(-1)[order], np.arange(len(unique)))
@@ -106,7 +113,7 @@ def _windows(dynamic: DynamicGaussians) -> list[tuple[int, Int64[np.ndarray, " k
 
 
 def _author_window(stage, path: str, dynamic: DynamicGaussians, index: Int64[np.ndarray, " k"], start_us: int) -> None:
-    from pxr import UsdGeom, Vt
+    from pxr import Vt
 
     gaussians: Gaussians = dynamic.gaussians[index]
     knots_m = np.ascontiguousarray(np.moveaxis(dynamic.knot_m[index], 1, 0))
@@ -117,7 +124,22 @@ def _author_window(stage, path: str, dynamic: DynamicGaussians, index: Int64[np.
         positions.Set(Vt.Vec3fArray.FromNumpy(knot_m), time_code(t_us, start_us))
     extent = extent_of([gaussians.mean_m, *knots_m], gaussians.scale_m)
     field.GetExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent))
+    _author_life(field, times_us[0], times_us[2], start_us)
+
+
+def _author_rigid(
+    stage, path: str, gaussians: Gaussians, index: Int64[np.ndarray, " k"], track: Track, start_us: int
+) -> None:
+    field = author_field(stage, path, gaussians, index.astype(np.int32))
+    author_path(field, track.path.t_us, track.path.world_from_body, start_us)
+    _author_life(field, track.path.start_us, track.path.end_us, start_us)
+
+
+def _author_life(field, first_us: int, last_us: int, start_us: int) -> None:
+    """Makes a field visible from one instant to another."""
+    from pxr import UsdGeom
+
     visibility = field.CreateVisibilityAttr()
-    visibility.Set(UsdGeom.Tokens.invisible, time_code(times_us[0] - 1, start_us))
-    visibility.Set(UsdGeom.Tokens.inherited, time_code(times_us[0], start_us))
-    visibility.Set(UsdGeom.Tokens.invisible, time_code(times_us[2] + 1, start_us))
+    visibility.Set(UsdGeom.Tokens.invisible, time_code(first_us - 1, start_us))
+    visibility.Set(UsdGeom.Tokens.inherited, time_code(first_us, start_us))
+    visibility.Set(UsdGeom.Tokens.invisible, time_code(last_us + 1, start_us))

@@ -18,7 +18,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.crate_check import check_crate
 from nurec_sim.scene.harmonics import SH_C0
+from nurec_sim.scene.zip_package import Package
 from nurec_sim.types import Gaussians, GaussianScene, Label
 
 NAMESPACE = "nurec_sim"
@@ -115,6 +117,8 @@ def open_member(package: Path, name: str):
     """
     from pxr import Ar, Sdf, Tf
 
+    with Package(package) as opened, opened.open(name) as file:
+        check_crate(file, f"{package}: {name}")
     try:
         layer = Sdf.Layer.OpenAsAnonymous(Ar.JoinPackageRelativePath(str(package.resolve()), name))
     except Tf.ErrorException as error:

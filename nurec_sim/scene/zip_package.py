@@ -8,6 +8,7 @@ equal content gives equal bytes.
 from __future__ import annotations
 
 import hashlib
+import io
 import mmap
 import os
 import struct
@@ -162,6 +163,14 @@ class Package:
             raise ArchiveError(f"{self.path}: {name} has {stop - start:,} bytes; at most {limit_bytes:,} are read")
         return self._bytes[start:stop]
 
+    def open(self, name: str) -> io.BufferedReader:
+        """A member as a file; good until the package is closed.
+
+        Raises:
+            ArchiveError: no such member.
+        """
+        return io.BufferedReader(_Member(self._bytes, *self._span(name)))
+
     def sha256(self, name: str) -> str:
         """Hash of a member, hexadecimal."""
         start, stop = self._span(name)
@@ -184,3 +193,30 @@ class Package:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
         self.close()
+
+
+class _Member(io.RawIOBase):
+    """Part of a mapped file as a file."""
+
+    def __init__(self, source: mmap.mmap, start: int, stop: int) -> None:
+        self._source, self._start, self._stop, self._at = source, start, stop, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._stop - self._start}[whence]
+        if base + offset < 0:
+            raise OSError(f"cannot seek to {base + offset}")
+        self._at = base + offset
+        return self._at
+
+    def readinto(self, buffer) -> int:
+        first = min(self._start + self._at, self._stop)
+        chunk = self._source[first : min(first + len(buffer), self._stop)]
+        buffer[: len(chunk)] = chunk
+        self._at += len(chunk)
+        return len(chunk)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
 from nurec_sim.types.logs import RoadMap, Track
 from nurec_sim.types.sensors import Rig
@@ -92,6 +92,8 @@ class Gaussians:
 
 GAUSSIAN_FIELDS = ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal", "label", "intensity")
 OPTIONAL_GAUSSIAN_FIELDS = ("sh_rest", "ray_drop")
+RIGID_LIFE_US = 10**12
+"""Knots of rigid Gaussians lie this far apart, so that they do not fade while a log lasts."""
 
 
 @dataclass(frozen=True)
@@ -103,18 +105,32 @@ class DynamicGaussians:
     Gaussian lives from its first to its last knot. ``track`` indexes ``GaussianScene.tracks``, -1 for none. All
     positions and rotations are in the world, as recorded; re-posing an actor applies
     ``world_from_box(requested) @ inverse(track.path.at(t))``.
+
+    ``in_box`` marks rigid parts of their track (None: there are none). Their positions, rotations and normals are in
+    the frame of the track's box; they are there while the track's path covers the instant or a request poses the actor.
     """
 
     gaussians: Gaussians
     knot_t_us: Int64[np.ndarray, "n 3"]
     knot_m: Float32[np.ndarray, "n 3 3"]
     track: Int32[np.ndarray, " n"]
+    in_box: Bool[np.ndarray, " n"] | None = None
 
     def __len__(self) -> int:
         return len(self.gaussians)
 
+    @classmethod
+    def rigid(cls, gaussians: Gaussians, track: Int32[np.ndarray, " n"], t_us: int) -> DynamicGaussians:
+        """Rigid parts of tracks, given in the frames of their boxes; they do not fade within days of ``t_us``."""
+        knot_t_us = np.tile(t_us + np.array([-RIGID_LIFE_US, 0, RIGID_LIFE_US], np.int64), (len(gaussians), 1))
+        knot_m = np.repeat(gaussians.mean_m[:, None], 3, axis=1)
+        return cls(gaussians, knot_t_us, knot_m, track.astype(np.int32), np.ones(len(gaussians), bool))
+
     def at(self, t_us: int) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 3"], Float64[np.ndarray, " k"]]:
-        """Which Gaussians live at ``t_us``, where they are (metres, world, as recorded), and their fade in 0..1."""
+        """Which Gaussians live at ``t_us``, where they are (metres, world, as recorded), and their fade in 0..1.
+
+        Those ``in_box`` stay in the frames of their boxes.
+        """
         rows = np.flatnonzero((self.knot_t_us[:, 0] <= t_us) & (t_us <= self.knot_t_us[:, 2]))
         times, each = self.knot_t_us[rows], np.arange(len(rows))
         after = t_us >= times[:, 1]

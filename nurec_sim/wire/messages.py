@@ -22,6 +22,7 @@ SENSORSIM = "nre.grpc.protos.sensorsim"
 SERVICE = f"{SENSORSIM}.SensorsimService"
 SERVICE_PATHS = (SERVICE, "nurec.grpc.protos.sensorsim.SensorsimService", "sensorsim.SensorsimService")
 """The spellings in use: clients up to 26.09 and AlpaSim; the two that the documentation of 26.10 leaves open."""
+SCENE_SERVICE = "nurec_sim.v1.SceneService"
 
 
 class Method(NamedTuple):
@@ -67,12 +68,16 @@ def _enum(full_name: str) -> Any:
 common = _messages("common.proto")
 sensorsim = _messages("sensorsim.proto")
 egodriver = _messages("egodriver.proto")
+nurec_sim_v1 = _messages("nurec_sim_v1.proto")
 
 ImageFormat = _enum(f"{SENSORSIM}.ImageFormat")
 ShutterType = _enum(f"{SENSORSIM}.ShutterType")
 LidarDeviceType = _enum(f"{SENSORSIM}.LidarDeviceType")
 FthetaPolynomial = _enum(f"{SENSORSIM}.FthetaCameraParam.PolynomialType")
 WindshieldPolynomial = _enum(f"{SENSORSIM}.BivariateWindshieldModelParameters.ReferencePolynomial")
+CameraOutput = _enum("nurec_sim.v1.CameraOutput")
+SweepForm = _enum("nurec_sim.v1.SweepForm")
+SceneKind = _enum("nurec_sim.v1.SceneInfo.Kind")
 CustomSpin = _enum(f"{SENSORSIM}.CustomLidarModel.Spin")
 
 METHODS = {

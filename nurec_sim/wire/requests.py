@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
@@ -11,15 +12,23 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from nurec_sim.errors import RequestError
-from nurec_sim.render.encode import encode_image
+from nurec_sim.render.encode import available_formats, encode_image
 from nurec_sim.render.requests import check_pose_pair
 from nurec_sim.types import CameraFrame, CameraModel, LidarFilter, LidarFrame, LidarModel, SensorRequest
 from nurec_sim.wire.messages import ImageFormat
 from nurec_sim.wire.poses import check_interval, read_poses, write_poses
 from nurec_sim.wire.sensors import read_camera, read_lidar, write_camera, write_lidar
 
-_ENCODER = {ImageFormat.PNG: "png", ImageFormat.JPEG: "jpeg", ImageFormat.RGB_UINT8_PLANAR: "rgb_planar"}
-DEFAULT_JPEG_QUALITY = 95
+_ENCODER = {
+    ImageFormat.PNG: "png",
+    ImageFormat.JPEG: "jpeg",
+    ImageFormat.JPEG2000: "jpeg2000",
+    ImageFormat.RGB_UINT8_PLANAR: "rgb_planar",
+    ImageFormat.AVC: "avc",
+    ImageFormat.AV1: "av1",
+}
+_LOSSLESS = (ImageFormat.PNG, ImageFormat.RGB_UINT8_PLANAR)
+DEFAULT_QUALITY = 95
 DEFAULT_DISTANCE_THRESHOLD_M = 1.0
 """Of a request that enables the distance filter without saying how far is too far."""
 
@@ -28,13 +37,14 @@ Sensor = TypeVar("Sensor", CameraModel, LidarModel)
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """How a camera image is finished: file format, JPEG quality, colour correction, and the ego mask laid over it."""
+    """How a camera image is finished: file format, quality, colour correction, and the ego mask laid over it."""
 
     format: int = ImageFormat.PNG
-    jpeg_quality: int = DEFAULT_JPEG_QUALITY
+    quality: int = DEFAULT_QUALITY
+    """1..100; without effect on PNG and raw planes."""
     apply_isp: bool = True
     ego_mask: tuple[str, str] | None = None
-    """(rig, camera) of the mask, or None."""
+    """(rig, camera) of the mask, or None. The rig may be empty: the one that has a mask of this camera."""
 
 
 # ------------------------------------------------------------------------------------------------------------ requests
@@ -137,20 +147,30 @@ def _read_frame(message, sensor) -> SensorRequest:
 
 
 def _read_image_options(message) -> ImageOptions:
-    if message.image_format not in _ENCODER:
-        allowed = ", ".join(f"{number.name} ({number.value})" for number in _ENCODER)
+    if _ENCODER.get(message.image_format) not in available_formats():
+        allowed = ", ".join(f"{number.name} ({number.value})" for number in offered_formats())
         given = ImageFormat(message.image_format).name if message.image_format in list(ImageFormat) else "unknown"
         raise RequestError(f"image_format must be one of {allowed}; got {given} ({message.image_format})")
-    quality = message.image_quality or DEFAULT_JPEG_QUALITY
-    if message.image_format == ImageFormat.JPEG and not 1 <= quality <= 100:
-        raise RequestError(f"image_quality of a JPEG must lie in 1..100 (0 means 95), got {quality}")
-    mask = (message.ego_mask_id.rig_config_id, message.ego_mask_id.camera_logical_id)
+    lossless = message.image_format in _LOSSLESS
+    quality = DEFAULT_QUALITY if lossless else message.image_quality or DEFAULT_QUALITY
+    if not 1 <= quality <= 100:
+        name = ImageFormat(message.image_format).name
+        raise RequestError(f"image_quality of a {name} must lie in 1..100 (0 means {DEFAULT_QUALITY}), got {quality}")
+    mask = (
+        message.ego_mask_id.rig_config_id,
+        message.ego_mask_id.camera_logical_id or message.camera_intrinsics.logical_id,
+    )
     return ImageOptions(
         message.image_format,
-        int(quality) if message.image_format == ImageFormat.JPEG else DEFAULT_JPEG_QUALITY,
+        round(quality),
         message.apply_isp if message.HasField("apply_isp") else True,
         mask if message.insert_ego_mask else None,
     )
+
+
+def offered_formats() -> tuple[enum.IntEnum, ...]:
+    """Image formats for which this installation has an encoder."""
+    return tuple(number for number, name in _ENCODER.items() if name in available_formats())
 
 
 # -------------------------------------------------------------------------------------------------------------- frames
@@ -158,7 +178,7 @@ def _read_image_options(message) -> ImageOptions:
 
 def write_image(rgb: UInt8[np.ndarray, "h w 3"], options: ImageOptions, message) -> None:
     """Fills an ``RGBRenderReturn``."""
-    message.image_bytes = encode_image(rgb, _ENCODER[options.format], options.jpeg_quality)
+    message.image_bytes = encode_image(rgb, _ENCODER[options.format], options.quality)
 
 
 def read_camera_frame(message, request: SensorRequest) -> CameraFrame:
@@ -198,12 +218,15 @@ def read_lidar_frame(message, request: SensorRequest) -> LidarFrame:
         RequestError: the buffers have different lengths.
     """
     lidar = _sensor_of(request, LidarModel)
-    xyz = np.frombuffer(message.point_xyzs_buffer, "<f4")
-    intensity = np.frombuffer(message.point_intensities_buffer, "<f4")
+    xyz = _read_buffer(message, "point_xyzs_buffer", "<f4")
+    intensity = _read_buffer(message, "point_intensities_buffer", "<f4")
     if not len(xyz):
         xyz, intensity = np.array(message.point_xyzs, "<f4"), np.array(message.point_intensities, "<f4")
     n = message.num_points
-    ranges, beam = np.frombuffer(message.point_ranges_buffer, "<f4"), np.frombuffer(message.point_beams_buffer, "<i4")
+    ranges, beam = (
+        _read_buffer(message, "point_ranges_buffer", "<f4"),
+        _read_buffer(message, "point_beams_buffer", "<i4"),
+    )
     if len(xyz) != 3 * n or len(intensity) != n or len(ranges) not in (0, n) or len(beam) not in (0, n):
         raise RequestError(
             f"lidar {lidar.id!r}: the reply says {n} points but holds {len(xyz)} coordinates, "
@@ -213,3 +236,10 @@ def read_lidar_frame(message, request: SensorRequest) -> LidarFrame:
     ranges = ranges.astype(np.float32) if len(ranges) else np.linalg.norm(xyz, axis=1)
     beam = beam.astype(np.int32) if len(beam) else np.full(n, -1, np.int32)
     return LidarFrame(lidar, request.start_us, request.end_us, xyz, ranges, intensity.astype(np.float32), beam)
+
+
+def _read_buffer(message, name: str, kind: str) -> np.ndarray:
+    data = getattr(message, name)
+    if len(data) % 4:
+        raise RequestError(f"{name} must hold 4 bytes a value, got {len(data)} bytes")
+    return np.frombuffer(data, kind)

@@ -32,6 +32,9 @@ from nurec_sim.types import (
 from nurec_sim.wire.messages import CustomSpin, FthetaPolynomial, LidarDeviceType, ShutterType, WindshieldPolynomial
 from nurec_sim.wire.poses import read_poses, write_poses
 
+MAX_COEFFICIENTS = 64
+"""Of one polynomial; cameras in use have 6, windshields up to 21, and the time to solve one grows with its cube."""
+
 _SHUTTER_TYPE = {
     Shutter.GLOBAL: ShutterType.GLOBAL,
     Shutter.TOP_TO_BOTTOM: ShutterType.ROLLING_TOP_TO_BOTTOM,
@@ -119,7 +122,7 @@ def read_camera(message, width_px: int, height_px: int, known: Mapping[str, Came
             return native
         camera = scaled_camera(native, width_px, height_px)
         check_camera(camera)  # strange numbers may have overflowed
-    except ValueError as error:
+    except (ValueError, ArithmeticError) as error:  # Python's own floats raise where NumPy's become infinite
         raise RequestError(f"camera_intrinsics: {error}") from error
     return camera
 
@@ -137,7 +140,8 @@ def _image_size(native: CameraModel, width_px: int, height_px: int) -> tuple[int
 def _read_lens(message, kind: str) -> Lens:
     param = getattr(message, kind)
     if kind == "ftheta_param":
-        forward, backward = tuple(param.angle_to_pixeldist_poly), tuple(param.pixeldist_to_angle_poly)
+        forward = _bounded(param.angle_to_pixeldist_poly, "angle_to_pixeldist_poly")
+        backward = _bounded(param.pixeldist_to_angle_poly, "pixeldist_to_angle_poly")
         exact = FThetaReference.PIXELDIST_TO_ANGLE if backward else FThetaReference.ANGLE_TO_PIXELDIST
         if param.reference_poly != FthetaPolynomial.UNKNOWN:
             exact = FThetaReference[_member(FthetaPolynomial, param.reference_poly, "reference_poly").name]
@@ -162,6 +166,14 @@ def _read_lens(message, kind: str) -> Lens:
     )
 
 
+def _bounded(values, name: str) -> tuple[float, ...]:
+    if len(values) > MAX_COEFFICIENTS:
+        raise RequestError(
+            f"camera_intrinsics: {name} has {len(values)} values, at most {MAX_COEFFICIENTS} are allowed"
+        )
+    return tuple(values)
+
+
 def _padded(values, count: int, name: str) -> tuple[float, ...]:
     if len(values) > count:
         raise RequestError(f"camera_intrinsics: {name} has {len(values)} values, at most {count} are allowed")
@@ -174,10 +186,10 @@ def _read_windshield(message) -> Windshield | None:
     glass = message.bivariate_windshield_model_param
     return Windshield(
         WindshieldReference[_member(WindshieldPolynomial, glass.reference_poly, "reference_poly").name],
-        tuple(glass.horizontal_poly),
-        tuple(glass.vertical_poly),
-        tuple(glass.horizontal_poly_inverse),
-        tuple(glass.vertical_poly_inverse),
+        _bounded(glass.horizontal_poly, "horizontal_poly"),
+        _bounded(glass.vertical_poly, "vertical_poly"),
+        _bounded(glass.horizontal_poly_inverse, "horizontal_poly_inverse"),
+        _bounded(glass.vertical_poly_inverse, "vertical_poly_inverse"),
     )
 
 

@@ -10,10 +10,18 @@ _CODES: tuple[tuple[type[errors.NurecSimError], grpc.StatusCode], ...] = (
     (errors.UnknownSceneError, grpc.StatusCode.NOT_FOUND),
     (errors.OutOfRangeError, grpc.StatusCode.OUT_OF_RANGE),
     (errors.TooLargeError, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    (errors.NotAllowedError, grpc.StatusCode.PERMISSION_DENIED),
     (errors.RequestError, grpc.StatusCode.INVALID_ARGUMENT),
     (errors.ArchiveError, grpc.StatusCode.FAILED_PRECONDITION),
     (errors.ClipError, grpc.StatusCode.FAILED_PRECONDITION),
     (errors.ReconstructError, grpc.StatusCode.FAILED_PRECONDITION),
+    (errors.WeightsError, grpc.StatusCode.FAILED_PRECONDITION),
+    (errors.SceneInUseError, grpc.StatusCode.FAILED_PRECONDITION),
+    (errors.GivenUpError, grpc.StatusCode.CANCELLED),
+    (errors.UnknownSessionError, grpc.StatusCode.NOT_FOUND),
+    (errors.SessionExistsError, grpc.StatusCode.ALREADY_EXISTS),
+    (errors.SessionError, grpc.StatusCode.FAILED_PRECONDITION),
+    (errors.PlanError, grpc.StatusCode.ABORTED),
 )
 _CODE_OF_NUMBER = {code.value[0]: code for code in grpc.StatusCode}
 

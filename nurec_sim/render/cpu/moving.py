@@ -58,7 +58,8 @@ class PackedMoving:
 
     ``fields`` is as in ``PackedGaussians`` at the middle knot, but LOG_OPACITY is not capped: that is done after
     fading. Times count from ``base_us``. ``reach_m`` is the farthest that a block's Gaussians reach from their centres.
-    Paths are those of all tracks one after the other, track k moved by k * ``stride_us`` in time.
+    Paths are those of all tracks one after the other, track k moved by k * ``stride_us`` in time. Gaussians in the box
+    of track k have ``track`` k plus the number of tracks; ``boxed`` lists those k.
     """
 
     fields: Float32[np.ndarray, "blocks 21 256"]
@@ -67,6 +68,7 @@ class PackedMoving:
     knot_us: Float64[np.ndarray, "blocks 3 256"]
     knot_m: Float32[np.ndarray, "blocks 9 256"]
     track: Int64[np.ndarray, " blocks"]
+    boxed: Int64[np.ndarray, " some_tracks"]
     life_us: Float64[np.ndarray, "blocks 2"]
     reach_m: Float64[np.ndarray, " blocks"]
     base_us: int
@@ -84,7 +86,10 @@ class PackedMoving:
             dynamic: the layer.
             tracks: what ``dynamic.track`` indexes.
         """
-        rows = _grouped_rows(dynamic)
+        owner = dynamic.track.astype(np.int64)
+        if dynamic.in_box is not None:
+            owner[dynamic.in_box] += len(tracks)
+        rows = _grouped_rows(dynamic, owner)
         filled = rows >= 0
         chosen, gaussians = rows[filled], dynamic.gaussians
 
@@ -112,7 +117,8 @@ class PackedMoving:
             index=rows.astype(np.int32),
             knot_us=knot_us,
             knot_m=blocked(dynamic.knot_m[chosen].reshape(-1, 9), np.float32),
-            track=dynamic.track[rows[:, 0]].astype(np.int64),
+            track=owner[rows[:, 0]],
+            boxed=np.unique(owner[chosen][owner[chosen] >= len(tracks)]) - len(tracks),
             life_us=np.stack([np.nanmin(knot_us[:, 0], axis=1), np.nanmax(knot_us[:, 2], axis=1)], axis=-1),
             reach_m=fields[:, SCALE : SCALE + 3].max(axis=(1, 2), where=filled[:, None], initial=0) * REACH,
             base_us=base_us,
@@ -148,11 +154,12 @@ class PackedMoving:
             array: lends the frame's arrays (``pipeline.Buffers``); the result lives as long as the loan.
         """
         instant = float(t_us - self.base_us)
-        blocks = np.flatnonzero((self.life_us[:, 0] <= instant) & (instant <= self.life_us[:, 1]))
+        motions, gone = self._motions(t_us, actors, np.asarray(eye_m, np.float64))
+        lives = (self.life_us[:, 0] <= instant) & (instant <= self.life_us[:, 1])
+        blocks = np.flatnonzero(lives & ~np.isin(self.track, gone))
         count = len(blocks)
         fields = array("moving fields", (count, FIELDS, BLOCK), np.float32)
         centre, radius = np.empty((count, 3)), np.empty(count)
-        motions = self._motions(t_us, actors, np.asarray(eye_m, np.float64))
         workers.run(
             put_in_place,
             [(self.fields, self.sh_rest, self.knot_us, self.knot_m, self.track, self.reach_m, blocks, first, last,
@@ -163,38 +170,45 @@ class PackedMoving:
 
     def _motions(
         self, t_us: int, actors: Mapping[str, Float64[np.ndarray, "4 4"]], eye_m: Float64[np.ndarray, " 3"]
-    ) -> Float64[np.ndarray, "tracks1 20"]:
-        """One motion per track; the last, for Gaussians of no track, is none."""
-        motions = np.zeros((len(self.span_us) + 1, MOTION))
+    ) -> tuple[Float64[np.ndarray, "owners 20"], Int64[np.ndarray, " some_owners"]]:
+        """Motions by ``track``, the last, for Gaussians of no track, being none; and which are not there at all."""
+        count = len(self.span_us)
+        motions = np.zeros((2 * count + 1, MOTION))
         motions[:, [ROTATION, ROTATION + 4, ROTATION + 8, TURN]] = 1
         motions[:, EYE : EYE + 3] = eye_m
-        known = [name for name in actors if name in self.track_of]
-        if not known:
-            return motions
-        tracks = np.array([self.track_of[name] for name in known])
+        asked = np.array([self.track_of[name] for name in actors if name in self.track_of], np.int64)
+        tracks = np.union1d(asked, self.boxed).astype(np.int64)
+        if len(tracks) == 0:
+            return motions, tracks
         start, end = self.span_us[tracks, 0], self.span_us[tracks, 1]
         recorded = geometry.interpolate_poses(
             self.path_us, self.path, np.clip(t_us, start, end) - start + tracks * self.stride_us
         )
-        moved = np.stack([np.asarray(actors[name], np.float64) for name in known]) @ geometry.inverse(recorded)
+        shown = recorded.copy()
+        for name in actors:
+            if name in self.track_of:
+                shown[np.searchsorted(tracks, self.track_of[name])] = actors[name]
+        is_asked = np.isin(tracks, asked)
+        rows = np.concatenate([tracks[is_asked], tracks + count])
+        moved = np.concatenate([shown[is_asked] @ geometry.inverse(recorded[is_asked]), shown])
         back = geometry.inverse(moved)
-        motions[tracks, ROTATION : ROTATION + 9] = moved[:, :3, :3].reshape(-1, 9)
-        motions[tracks, TRANSLATION : TRANSLATION + 3] = moved[:, :3, 3]
-        motions[tracks, TURN : TURN + 4] = geometry.quat_from_matrix(moved[:, :3, :3])
-        motions[tracks, EYE : EYE + 3] = back[:, :3, :3] @ eye_m + back[:, :3, 3]
-        motions[tracks, MOVED] = 1
-        return motions
+        motions[rows, ROTATION : ROTATION + 9] = moved[:, :3, :3].reshape(-1, 9)
+        motions[rows, TRANSLATION : TRANSLATION + 3] = moved[:, :3, 3]
+        motions[rows, TURN : TURN + 4] = geometry.quat_from_matrix(moved[:, :3, :3])
+        motions[rows, EYE : EYE + 3] = back[:, :3, :3] @ eye_m + back[:, :3, 3]
+        motions[rows, MOVED] = 1
+        return motions, tracks[~is_asked & ((t_us < start) | (end < t_us))] + count
 
 
-def _grouped_rows(dynamic: DynamicGaussians) -> Int64[np.ndarray, "blocks 256"]:
+def _grouped_rows(dynamic: DynamicGaussians, owner: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, "blocks 256"]:
     """Rows of the layer's Gaussians that can be drawn, by track, time and place; -1 fills up each track."""
     keep = drawable(dynamic.gaussians) & (np.abs(dynamic.knot_m) <= LARGEST).all(axis=(1, 2))
     rows = np.flatnonzero(keep)
     if len(rows) == 0:
         return np.zeros((0, BLOCK), np.int64)
     rows = rows[morton_order(dynamic.gaussians.mean_m[rows])]
-    rows = rows[np.lexsort((dynamic.knot_t_us[rows, 1] // AGE_US, dynamic.track[rows]))]
-    cuts = np.flatnonzero(np.diff(dynamic.track[rows])) + 1
+    rows = rows[np.lexsort((dynamic.knot_t_us[rows, 1] // AGE_US, owner[rows]))]
+    cuts = np.flatnonzero(np.diff(owner[rows])) + 1
     groups = np.split(rows, cuts)
     return np.concatenate([np.pad(g, (0, -len(g) % BLOCK), constant_values=-1).reshape(-1, BLOCK) for g in groups])
 
@@ -282,7 +296,7 @@ def put_in_place(
         first: first entry of ``blocks`` to take.
         last: one behind the last.
         instant: time since the layer's base.
-        motions: [tracks + 1,20].
+        motions: [2 tracks + 1,20].
         placed: [len(blocks),21,256] output.
         centre: [len(blocks),3] output.
         radius: [len(blocks)] output; 0 where nothing is alive.

@@ -41,6 +41,8 @@ class Workers:
         try:
             work()
         finally:
+            # Helpers that are still busy with another caller's work have nothing left to do here.
+            futures = [future for future in futures if not future.cancel()]
             wait(futures)
         for future in futures:
             future.result()

@@ -26,7 +26,7 @@ MOTION = np.dtype(
         ("translation", np.float64, 3),
         ("quat", np.float32, 4),
         ("moved", np.float32),
-        ("unused", np.float32),
+        ("gone", np.float32),
     ]
 )
 """The struct ``Motion`` of ``kernels/moving.cu``, field by field."""
@@ -37,7 +37,8 @@ class MovingLayer:
     """Dynamic Gaussians on the device, in blocks.
 
     ``fields`` [b,21,256] are those of the middle knots with opacities that are not capped, ``sh_rest`` [b,3k,256] or
-    [0,0,0], ``knot_m`` [b,9,256], ``knot_us`` [b,3,256] and ``track`` [b,256].
+    [0,0,0], ``knot_m`` [b,9,256], ``knot_us`` [b,3,256] and ``track`` [b,256]. Gaussians in the box of track k have
+    ``track`` k plus the number of tracks.
     """
 
     fields: torch.Tensor
@@ -66,7 +67,10 @@ class MovingLayer:
         if rest is not None and blocks:
             sh_rest = to_blocks(np.nan_to_num(rest[chosen].reshape(len(chosen), -1)).astype(np.float32), blocks)
         times, track = np.zeros((blocks * BLOCK, 3), np.int64), np.full(blocks * BLOCK, -1, np.int32)
-        times[: len(chosen)], track[: len(chosen)] = dynamic.knot_t_us[chosen], dynamic.track[chosen]
+        owner = dynamic.track.copy()
+        if dynamic.in_box is not None:
+            owner[dynamic.in_box] += len(tracks)
+        times[: len(chosen)], track[: len(chosen)] = dynamic.knot_t_us[chosen], owner[chosen]
         arrays = (
             to_blocks(columns, blocks, fill=LOG_OPACITY),
             sh_rest,
@@ -74,8 +78,8 @@ class MovingLayer:
             np.ascontiguousarray(times.reshape(blocks, BLOCK, 3).transpose(0, 2, 1)),
             track,
         )
-        fields, sh, knot_m, knot_us, owner = (torch.from_numpy(array).to(device) for array in arrays)
-        return cls(fields, sh, knot_m, knot_us, owner, tracks)
+        fields, sh, knot_m, knot_us, of_track = (torch.from_numpy(array).to(device) for array in arrays)
+        return cls(fields, sh, knot_m, knot_us, of_track, tracks)
 
     def placed(self, launcher: Launcher, batch: Batch, requests: Sequence[SensorRequest]) -> Blocks:
         """The layer as each sensor of a batch sees it, view after view."""
@@ -84,7 +88,7 @@ class MovingLayer:
         if len(self) == 0:
             return Blocks.none(launcher.device)
         views = len(requests)
-        motions = np.zeros((views, max(len(self.tracks), 1)), MOTION)
+        motions = np.zeros((views, max(2 * len(self.tracks), 1)), MOTION)
         instants = np.zeros(views, np.int64)
         for k, (request, sensor) in enumerate(zip(requests, batch.sensors, strict=True)):
             reference = sensor.tensors.grid.reference
@@ -101,13 +105,19 @@ class MovingLayer:
         return Blocks(fields, empty.sh_rest, empty.spheres)
 
     def _fill(self, motions: np.ndarray, request: SensorRequest, reference: float, t_us: int) -> None:
-        """How the request poses each track anew."""
-        for row, track in zip(motions, self.tracks, strict=False):
-            if track.id not in request.actors:
-                continue
-            pair = np.asarray(request.actors[track.id], np.float64)
-            world_from_box = geometry.interpolate_pose_pair(pair, np.array(reference))
-            new_from_recorded = world_from_box @ geometry.inverse(track.path.at(t_us))
-            row["rotation"], row["translation"] = new_from_recorded[:3, :3], new_from_recorded[:3, 3]
-            row["quat"] = geometry.quat_from_matrix(new_from_recorded[:3, :3])
-            row["moved"] = 1
+        """Where each track's Gaussians are shown, those in the world first, then those in its box."""
+        for k, track in enumerate(self.tracks):
+            recorded, pair = track.path.at(t_us), request.actors.get(track.id)
+            shown = recorded
+            if pair is not None:
+                shown = geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(reference))
+                _move(motions[k], shown @ geometry.inverse(recorded))
+            boxed = motions[k + len(self.tracks)]
+            _move(boxed, shown)
+            boxed["gone"] = pair is None and not track.path.covers(t_us)
+
+
+def _move(row: np.void, new_from_given: np.ndarray) -> None:
+    row["rotation"], row["translation"] = new_from_given[:3, :3], new_from_given[:3, 3]
+    row["quat"] = geometry.quat_from_matrix(new_from_given[:3, :3])
+    row["moved"] = 1

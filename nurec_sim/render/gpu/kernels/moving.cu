@@ -3,11 +3,11 @@
 #include "colours.cuh"
 #include "view.cuh"
 
-// How an actor was moved from where it was recorded, row-major.
+// How an actor is moved from where its Gaussians are given, row-major, and whether it is absent.
 struct Motion {
     double rotation[9], translation[3];
     float quat[4];
-    float moved, unused;
+    float moved, gone;
 };
 static_assert(sizeof(Motion) == 120, "gpu/moving.py lays it out alike");
 
@@ -43,6 +43,10 @@ place_moving(const View* views, const float* recorded, const float* sh_rest, int
     int track = tracks[(size_t)block * BLOCK + lane];
     if (track >= 0 && motions[(size_t)blockIdx.y * track_count + track].moved > 0) {
         const Motion& motion = motions[(size_t)blockIdx.y * track_count + track];
+        if (motion.gone > 0) {
+            out[LOG_OPACITY * BLOCK] = -1e9f;
+            return;
+        }
         const double *r = motion.rotation, *t = motion.translation;
         float n[3] = {f[NORMAL * BLOCK], f[(NORMAL + 1) * BLOCK], f[(NORMAL + 2) * BLOCK]};
         double back[3] = {eye[0] - t[0], eye[1] - t[1], eye[2] - t[2]};

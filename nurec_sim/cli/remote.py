@@ -1,0 +1,55 @@
+"""Verbs that talk to a running server: upload."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from nurec_sim.cli.console import OnePath, app, out, progress
+from nurec_sim.errors import NurecSimError
+
+TOKEN_VARIABLE = "NUREC_SIM_TOKEN"
+
+
+@app.command
+def upload(
+    source: OnePath,
+    *,
+    server: str = "127.0.0.1:8080",
+    reconstruct: bool = False,
+    token_file: Path | None = None,
+    root_ca: Path | None = None,
+    client_cert: Path | None = None,
+    client_key: Path | None = None,
+) -> None:
+    """Send a scene archive or a zipped clip to a running server, which offers it from then on.
+
+    The server must have been started with --upload-dir. $NUREC_SIM_TOKEN may hold its token.
+
+    Args:
+        source: a scene archive (.usdz), or a clip (.zip).
+        server: HOST:PORT.
+        reconstruct: also reconstruct the clip now, and not when somebody first asks for it.
+        token_file: file with the token that the server wants.
+        root_ca: certificates (PEM) that vouch for the server's; plain text if not given.
+        client_cert: certificate (PEM) to show, for mutual TLS.
+        client_key: its private key (PEM).
+    """
+    from nurec_sim.client_v1 import SceneClient
+
+    if reconstruct and source.suffix != ".zip":
+        raise NurecSimError(f"--reconstruct is for clips, {source.name} is none")
+    try:
+        token = os.environ.get(TOKEN_VARIABLE) if token_file is None else token_file.read_text().strip()
+        with SceneClient(
+            server, token=token, root_ca=root_ca, client_cert=client_cert, client_key=client_key
+        ) as client:
+            client.stats()  # a server that is not there ends this here, at its time limit
+            with progress("uploading") as advance:
+                scene_id = client.upload(source, advance)
+            if reconstruct:
+                with progress("reconstructing") as advance:
+                    client.reconstruct(scene_id=scene_id, progress=advance)
+    except OSError as error:
+        raise NurecSimError(f"{error.filename or source}: {error.strerror or error}") from None
+    out.print(f"uploaded as {scene_id}", soft_wrap=True)

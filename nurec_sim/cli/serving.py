@@ -1,0 +1,257 @@
+"""Verbs that serve scenes over gRPC: serve for people, serve-grpc with the command line of NVIDIA's renderer."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import glob
+import inspect
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from nurec_sim.cli.console import Paths, app, err, out
+from nurec_sim.cli.nre_flags import sort_flags
+from nurec_sim.cli.operation import NO_FLAGS, Operation, OperationFlags, server_options, service_options, warn
+from nurec_sim.errors import NurecSimError
+
+if TYPE_CHECKING:
+    from nurec_sim.scene_store import SceneStore
+    from nurec_sim.server import ServerOptions
+    from nurec_sim.service import ServiceOptions
+
+
+@app.command
+def serve(
+    sources: Paths,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    threads: int | None = None,
+    cache: Path | None = None,
+    cache_size: int = 10,
+    cache_gb: float | None = None,
+    ego_mask_dir: Path | None = None,
+    operation: Operation = NO_FLAGS,
+) -> None:
+    """Serve scenes over gRPC, for AlpaSim, CARLA and NuRec clients. Ctrl-C stops.
+
+    Prints `Serving on <host>:<port>` when ready. Clips are reconstructed on first use and kept in the cache. Other
+    machines are let in only behind TLS or a token, or with --insecure.
+
+    Args:
+        sources: scene archives, clips, or folders of them.
+        host: address to listen on; only this machine unless said otherwise.
+        port: 0 takes a free one.
+        threads: that work on one frame; half of the cores if not given, so that many clients get the most.
+        cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
+        cache_size: scenes kept in memory.
+        cache_gb: gigabytes of memory for them; half of the machine's if not given.
+        ego_mask_dir: pictures of the ego car, FOLDER/<rig>/<camera>.png.
+        operation: who may call, how much, and what the server tells of itself.
+    """
+    from nurec_sim.server import check_exposure
+
+    options = server_options(operation)
+    protected = options.tls is not None or options.token is not None
+    check_exposure(host, protected=protected, insecure=operation.insecure)
+    store = _store(sources, cache_size, cache_dir=cache, threads=threads, gigabytes=cache_gb, device=operation.device)
+    if not store.ids and operation.upload_dir is None:
+        raise NurecSimError("nothing to serve: " + ("; ".join(store.faults.values()) or "give archives or clips"))
+    _run(store, host, port, service_options(operation, ego_mask_dir=ego_mask_dir), options, operation)
+
+
+@app.command(name="serve-grpc")
+def serve_grpc(
+    *,
+    artifact_glob: str | None = None,
+    host: str = "localhost",
+    port: int = 8080,
+    egocar_hood_dir: Path | None = None,
+    enable_editing_actors: bool = False,
+    cache_size: int = 10,
+    max_workers: int | None = None,
+    download_cache_dir: Path | None = None,
+    download_cache_size: int = 5,
+    test_scenes_are_valid: bool = False,
+    operation: Operation = NO_FLAGS,
+) -> None:
+    """Serve scene archives with the command line of NVIDIA's renderer, as AlpaSim starts it.
+
+    Takes every flag of that renderer, as `--flag value` or `--flag=value`; those that do not apply here (--renderer,
+    --no-enable-nrend, --use-gsplat, --ray-chunk-size, --enable-timing, --metrics-output-dir, --multiproc-workers, and
+    the difix and harmonizer families) are named in one warning and otherwise passed over. Prints
+    `Serving on <host>:<port>` when ready. Listens where it is told without further ado: mind who can reach it.
+
+    Args:
+        artifact_glob: archives to serve, such as 'scenes/**/*.usdz'; must end in .usdz.
+        host: address to listen on; 0.0.0.0 for all.
+        port: 0 takes a free one.
+        egocar_hood_dir: pictures of the ego car, FOLDER/<rig>/<camera>.png.
+        enable_editing_actors: draw only the moving actors that a request lists, if it lists any.
+        cache_size: scenes kept in memory.
+        max_workers: frames rendered at the same time; as many as there are cores if not given.
+        download_cache_dir: where scenes that clients name by URL are kept.
+        download_cache_size: how many of them are kept.
+        test_scenes_are_valid: load every scene first, and end with 1 if one of them is bad.
+        operation: who may call, how much, and what the server tells of itself.
+    """
+    from nurec_sim.server import is_loopback
+
+    options = server_options(operation)
+    if not (is_loopback(host) or operation.insecure or options.tls or options.token):
+        warn(f"anybody who can reach {host}:{port} may call; --tls-cert and --tls-key, or --token-file, protect it")
+    if max_workers is not None and operation.workers is None:
+        operation = dataclasses.replace(operation, workers=max_workers)
+    store = _store(_matches(artifact_glob), cache_size, device=operation.device)
+    if artifact_glob is not None and not store.ids:
+        raise NurecSimError("nothing to serve: " + "; ".join(store.faults.values()))
+    if test_scenes_are_valid:
+        _test_scenes(store)
+    chosen = service_options(
+        operation,
+        ego_mask_dir=egocar_hood_dir,
+        only_listed_actors=enable_editing_actors,
+        download_cache_dir=download_cache_dir,
+        download_cache_size=download_cache_size,
+    )
+    _run(store, host, port, chosen, options, operation)
+
+
+@app.command
+def health(
+    address: Annotated[str, tyro.conf.Positional],
+    *,
+    root_ca: Path | None = None,
+    timeout: float = 4.0,
+) -> None:
+    """Ask a gRPC server whether it serves; exit status 1 if it does not, or not yet.
+
+    Args:
+        address: host:port, of the server or of its --health-port.
+        root_ca: certificates (PEM) that vouch for a server with TLS.
+        timeout: seconds to wait for an answer.
+    """
+    import grpc
+    from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+    from nurec_sim.client import open_channel
+
+    with open_channel(address, root_ca) as channel:
+        try:
+            reply = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=timeout)
+        except grpc.RpcError as error:
+            raise NurecSimError(f"{address}: {error.code().name}: {error.details()}") from None
+    status = health_pb2.HealthCheckResponse.ServingStatus.Name(reply.status)
+    if status != "SERVING":
+        raise NurecSimError(f"{address}: {status}")
+    out.print(f"{address}: {status}", markup=False, highlight=False)
+
+
+def sort_serve_grpc(arguments: Sequence[str]) -> list[str]:
+    """The words after ``serve-grpc`` without what does not apply, which is named in one warning.
+
+    Raises:
+        NurecSimError: a flag is not known.
+    """
+    own = [p for p in inspect.signature(serve_grpc).parameters.values() if p.name != "operation"]
+    kinds = [(p.name, p.default) for p in own] + [(f.name, f.default) for f in dataclasses.fields(OperationFlags)]
+    switches = [name.replace("_", "-") for name, default in kinds if isinstance(default, bool)]
+    values = [name.replace("_", "-") for name, default in kinds if not isinstance(default, bool)]
+    sorted_ = sort_flags(arguments, switches, values)
+    if sorted_.ignored:
+        warn(f"these flags have no effect on this renderer: {', '.join(dict.fromkeys(sorted_.ignored))}")
+    return sorted_.arguments
+
+
+def _store(
+    sources: Sequence[str | Path],
+    capacity: int,
+    *,
+    cache_dir: Path | None = None,
+    threads: int | None = None,
+    gigabytes: float | None = None,
+    device: str = "cpu",
+) -> SceneStore:
+    """The scenes of the sources.
+
+    Raises:
+        NurecSimError: a bound leaves room for nothing, or the device cannot be used.
+    """
+    from nurec_sim.render_queue import usable_cores
+    from nurec_sim.scene_store import SceneStore
+
+    if threads is not None and threads < 1:
+        raise NurecSimError(f"--threads must be at least 1, got {threads}")
+    make_renderer = None
+    if device != "cpu":
+        from nurec_sim.render.gpu.launcher import CudaLauncher
+        from nurec_sim.render.gpu.renderer import GpuRenderer
+
+        make_renderer = functools.partial(GpuRenderer, device=CudaLauncher(device))
+    max_bytes = None if gigabytes is None else int(gigabytes * 1e9)
+    try:
+        return SceneStore(
+            sources,
+            capacity=capacity,
+            max_bytes=max_bytes,
+            cache_dir=cache_dir,
+            threads=threads or max(1, usable_cores() // 2),
+            make_renderer=make_renderer,
+            on_progress=err.print,
+        )
+    except ValueError as error:
+        raise NurecSimError(str(error)) from None
+
+
+def _run(
+    store: SceneStore,
+    host: str,
+    port: int,
+    options: ServiceOptions,
+    listening: ServerOptions,
+    flags: OperationFlags,
+) -> None:
+    from nurec_sim.server import serve as run_server
+    from nurec_sim.service_v1 import SceneOptions
+
+    scene_options = SceneOptions(upload_dir=flags.upload_dir, clip_dirs=flags.clip_dirs)
+    try:
+        run_server(store, host=host, port=port, options=options, scene_options=scene_options, server_options=listening)
+    except OSError as error:
+        raise NurecSimError(str(error)) from None
+
+
+def _matches(pattern: str | None) -> list[str]:
+    """Archives that a pattern matches.
+
+    Raises:
+        NurecSimError: it does not end in .usdz, or matches nothing.
+    """
+    if pattern is None:
+        return []
+    if not pattern.endswith(".usdz"):
+        raise NurecSimError(f"--artifact-glob must end in .usdz, got {pattern!r}; try {pattern.rstrip('/')}/**/*.usdz")
+    found = sorted(glob.glob(pattern, recursive=True))
+    if not found:
+        raise NurecSimError(f"--artifact-glob {pattern!r} matches no file")
+    return found
+
+
+def _test_scenes(store: SceneStore) -> None:
+    """Loads every scene once.
+
+    Raises:
+        NurecSimError: some are bad; the text names them.
+    """
+    bad = dict(store.faults)
+    for scene_id in store.ids:
+        try:
+            store.get(scene_id)
+        except NurecSimError as error:
+            bad[scene_id] = str(error)
+    if bad:
+        texts = "".join(f"\n  {name}: {reason}" for name, reason in bad.items())
+        raise NurecSimError(f"{len(bad)} of {len(store.ids) + len(store.faults)} scenes are bad:{texts}")

@@ -1,0 +1,209 @@
+"""The scene service from the client's side: scenes come and go, and frames have geometry (docs/serving_v1.md)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+from google.protobuf import message_factory
+from jaxtyping import Float32
+
+from nurec_sim import wire
+from nurec_sim.client import open_channel, our_errors
+from nurec_sim.errors import RequestError, ServerError
+from nurec_sim.types import CameraFrame, LidarFrame, LidarModel, SensorRequest
+from nurec_sim.wire import nurec_sim_v1 as v1
+
+CHUNK_BYTES = 1 << 20
+
+Progress = Callable[[str, float], None]
+
+
+class SceneClient:
+    """The scene service of a server.
+
+    Every method raises the errors of ``nurec_sim.errors`` that the server raised, and ``ServerError`` when it cannot be
+    reached in time or failed. Use it as a context manager, or call ``close``. Safe to use from many threads.
+
+    Args:
+        address: ``host:port``.
+        timeout_s: for one call; uploads and reconstructions may take any time, unless their own says otherwise.
+        token: what the server wants to be shown; None if it wants nothing.
+        root_ca: PEM file of the certificates that vouch for the server's; plain text if None.
+        client_cert: PEM file of the certificate to show, for mutual TLS.
+        client_key: PEM file of its private key.
+
+    Raises:
+        ServerError: a PEM file cannot be read, or a certificate comes without its key or without ``root_ca``.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        timeout_s: float = 300.0,
+        token: str | None = None,
+        root_ca: Path | None = None,
+        client_cert: Path | None = None,
+        client_key: Path | None = None,
+    ) -> None:
+        self.address, self._timeout_s = address, timeout_s
+        self._metadata = [("authorization", f"Bearer {token}")] if token else []
+        self._channel = open_channel(address, root_ca, client_cert, client_key)
+        self._procedures = {
+            method.name: _procedure(self._channel, method)
+            for method in wire.pool.FindServiceByName(wire.SCENE_SERVICE).methods
+        }
+
+    def close(self) -> None:
+        """Ends the connection."""
+        self._channel.close()
+
+    def __enter__(self) -> SceneClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # --------------------------------------------------------------------------------------------------------- scenes
+
+    def scenes(self) -> Any:
+        """The ``ListScenesReply``: scenes on offer, and sources that cannot be."""
+        return self._call("ListScenes", v1.ListScenesRequest())
+
+    def stats(self) -> Mapping[str, float]:
+        """Counters of the server by name, as in ``StatsReply``."""
+        reply = self._call("Stats", v1.StatsRequest())
+        return {field.name: getattr(reply, field.name) for field in reply.DESCRIPTOR.fields}
+
+    def upload(self, path: Path, progress: Progress | None = None, *, timeout_s: float | None = None) -> str:
+        """Sends a scene archive (``.usdz``) or a zipped clip (``.zip``); gives the id of its scene.
+
+        Args:
+            path: the file.
+            progress: hears what is being done and the fraction of it that is.
+            timeout_s: for all of it.
+
+        Raises:
+            RequestError: the file has another ending, or the server refuses it.
+            OSError: the file cannot be read.
+        """
+        procedure = {".usdz": "UploadScene", ".zip": "UploadClip"}.get(path.suffix)
+        if procedure is None:
+            raise RequestError(f"{path.name}: a scene archive ends in .usdz, a clip to upload in .zip")
+        said = progress or (lambda stage, fraction: None)
+        said("hashing", 0.0)
+        with path.open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        size = path.stat().st_size
+
+        def parts() -> Iterator:
+            yield v1.UploadPart(header=v1.UploadHeader(name=path.name, size=size, sha256=sha256))
+            sent = 0
+            with path.open("rb") as file:
+                while data := file.read(CHUNK_BYTES):
+                    yield v1.UploadPart(data=data)
+                    sent += len(data)
+                    said("sending", sent / size)
+
+        with our_errors(self.address):
+            return self._begin(procedure, parts(), timeout_s).scene_id
+
+    def reconstruct(
+        self,
+        *,
+        scene_id: str = "",
+        path: str = "",
+        name: str = "",
+        method: str = "",
+        profile: str = "",
+        cameras: Sequence[str] = (),
+        progress: Progress | None = None,
+        timeout_s: float | None = None,
+    ) -> str:
+        """Has a clip reconstructed; gives the id of the scene.
+
+        Args:
+            scene_id: a clip on offer, or
+            path: one on the server, in a folder that it allows.
+            name: id of the new scene, if not the clip's own.
+            method: ``lift``, ``dense`` or ``selective``; empty for the server's choice.
+            profile: size of the network.
+            cameras: ids of the cameras to use.
+            progress: hears what is being done and the fraction of it that is; if it raises, the server gives up too.
+            timeout_s: for all of it.
+        """
+        clip = {"path": path} if path else {"scene_id": scene_id}
+        request = v1.ReconstructClipRequest(**clip, name=name, method=method, profile=profile, cameras=cameras)
+        with our_errors(self.address):
+            events = self._begin("ReconstructClip", request, timeout_s)
+            try:
+                for event in events:
+                    if event.WhichOneof("event") == "done":
+                        return event.done.scene_id
+                    if progress is not None:
+                        progress(event.progress.stage, event.progress.fraction)
+            finally:
+                events.cancel()
+        raise ServerError(f"{self.address}: the reconstruction ended without a scene")
+
+    def unload(self, scene_id: str, *, delete_file: bool = False) -> int:
+        """Takes a scene out of the server's memory; gives the bytes that it took.
+
+        ``delete_file`` also deletes the file of an uploaded one.
+        """
+        request = v1.UnloadSceneRequest(scene_id=scene_id, delete_file=delete_file)
+        return self._call("UnloadScene", request).freed_bytes
+
+    # ------------------------------------------------------------------------------------------------------- rendering
+
+    def render_camera(
+        self, request: SensorRequest, outputs: Sequence[str] = ("depth", "alpha", "label", "normal")
+    ) -> CameraFrame:
+        """A camera frame, bit for bit as ``render.Renderer`` gives it: ``rgb`` always, and the ``outputs``."""
+        message = v1.RenderCameraRequest(outputs=[wire.CameraOutput[name.upper()] for name in {"rgb", *outputs}])
+        wire.write_camera_request(request, message.request, scene_id=request.scene_id)
+        reply = self._call("RenderCamera", message)
+        frame = wire.read_camera_frame(wire.sensorsim.RGBRenderReturn(image_bytes=reply.rgb), request)
+        return CameraFrame(frame.camera, frame.start_us, frame.end_us, frame.rgb, **wire.read_outputs(reply))
+
+    def render_lidar(self, request: SensorRequest) -> LidarFrame:
+        """A sweep as points, bit for bit as ``render.Renderer`` gives it."""
+        message = v1.RenderLidarRequest(form=wire.SweepForm.POINTS)
+        wire.write_lidar_request(request, message.request, scene_id=request.scene_id)
+        return wire.read_lidar_frame(self._call("RenderLidar", message).points, request)
+
+    def range_map(
+        self, request: SensorRequest
+    ) -> tuple[Float32[np.ndarray, "rows columns"], Float32[np.ndarray, "rows columns"]]:
+        """Range in metres and intensity of every beam of a sweep, 0 where none came back."""
+        if not isinstance(request.sensor, LidarModel):
+            raise RequestError(f"the sensor must be a LidarModel, got {type(request.sensor).__name__}")
+        message = v1.RenderLidarRequest(form=wire.SweepForm.RANGE_MAP)
+        wire.write_lidar_request(request, message.request, scene_id=request.scene_id)
+        return wire.read_range_map(self._call("RenderLidar", message).range_map, request)
+
+    # ----------------------------------------------------------------------------------------------------------- calls
+
+    def _begin(self, name: str, request: Any, timeout_s: float | None) -> Any:
+        return self._procedures[name](request, timeout=timeout_s, wait_for_ready=True, metadata=self._metadata)
+
+    def _call(self, name: str, request: Any) -> Any:
+        with our_errors(self.address):
+            return self._begin(name, request, self._timeout_s)
+
+
+def _procedure(channel: grpc.Channel, method: Any) -> Callable:
+    """A callable of the procedure's kind."""
+    kinds = {
+        (False, False): channel.unary_unary,
+        (False, True): channel.unary_stream,
+        (True, False): channel.stream_unary,
+    }
+    request, reply = (message_factory.GetMessageClass(kind) for kind in (method.input_type, method.output_type))
+    make = kinds[method.client_streaming, method.server_streaming]
+    return make(f"/{wire.SCENE_SERVICE}/{method.name}", request.SerializeToString, reply.FromString)

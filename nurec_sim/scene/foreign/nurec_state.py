@@ -1,0 +1,59 @@
+"""The state of a NuRec reconstruction: named arrays and a few facts, from ``volume.nurec`` or ``checkpoint.ckpt``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+GAUSSIANS = "gaussians_nodes."
+_READ = re.compile(
+    r"gaussians_nodes\.[^.]+\.(positions|rotations|scales|densities|features_albedo|features_specular"
+    r"|n_active_features|gaussian_cuboid_ids)"
+    r"|background\.textures"
+    r"|post_processings\.\d+\.ppisp\.(exposure_params|vignetting_params|crf_params)"
+)
+
+
+@dataclass(frozen=True)
+class NurecState:
+    """Arrays of a reconstruction by name, the names spelt alike for both files (``plain_name``).
+
+    Attributes:
+        arrays: those that ``is_read`` names, as stored.
+        track_ids: ``obj_track_ids``: for each layer the tracks that ``gaussian_cuboid_ids`` counts.
+        config: settings of the layers and of the background, empty where the file has none.
+        others: names of the arrays and values that are not read.
+        version: of the program that wrote the file, as it spells it.
+    """
+
+    arrays: Mapping[str, np.ndarray]
+    track_ids: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    config: Mapping[str, Any] = field(default_factory=dict)
+    others: Sequence[str] = ()
+    version: str = ""
+
+
+def plain_name(name: str) -> str:
+    """A name without what the two files put before it: ``.`` in volumes, ``model.`` in checkpoints."""
+    return name.removeprefix("model.").removeprefix(".")
+
+
+def is_read(name: str) -> bool:
+    """Whether an array of that plain name is of use here."""
+    return _READ.fullmatch(name) is not None
+
+
+def track_ids_of(extra_state: object) -> dict[str, tuple[str, ...]]:
+    """``obj_track_ids`` of the extra state by layer; layers whose ids are no list of texts are left out."""
+    ids = extra_state.get("obj_track_ids") if isinstance(extra_state, Mapping) else None
+    if not isinstance(ids, Mapping):
+        return {}
+    return {
+        layer: tuple(names)
+        for layer, names in ids.items()
+        if isinstance(layer, str) and isinstance(names, (list, tuple)) and all(isinstance(n, str) for n in names)
+    }

@@ -1,0 +1,239 @@
+"""Opens the files of other programs as scenes; what they do not say gets a default that ``provenance`` names.
+
+Of an archive with several kinds of Gaussians the first that can be read is taken: particle fields, ``volume.nurec``,
+``checkpoint.ckpt``, PLY files. Nothing is extracted from NuRec files, unpickled or run.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from nurec_sim import geometry
+from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.checks import check_scene
+from nurec_sim.scene.exchange import default_surroundings, import_scene
+from nurec_sim.scene.foreign.found import Found
+from nurec_sim.scene.foreign.nurec_checkpoint import read_checkpoint
+from nurec_sim.scene.foreign.nurec_layers import found_in
+from nurec_sim.scene.foreign.nurec_volume import read_volume
+from nurec_sim.scene.foreign.particle_field import read_particle_fields
+from nurec_sim.scene.foreign.rig_sidecars import DATA_INFO, MAP, RIG, TRACKS, Surroundings, read_surroundings
+from nurec_sim.scene.foreign.usd_inside import LAYER_SUFFIXES, may_hold
+from nurec_sim.scene.ply import read_ply
+from nurec_sim.scene.sky import sample_cubemap
+from nurec_sim.scene.transform import joined, transformed
+from nurec_sim.scene.zip_package import Package
+from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Track
+
+FIELDS = "particle fields"
+_MESHES = ("mesh.ply", "mesh_ground.ply")
+
+
+def read_foreign(path: Path | str) -> GaussianScene:
+    """Reads a scene that another program wrote.
+
+    Args:
+        path: a ``.usdz`` of NuRec or with particle fields, a USD layer, a ``.ply``, ``.nurec`` or ``.ckpt`` file.
+
+    Returns:
+        A sound scene; ``provenance["unknown"]`` lists what the file holds but is not read, and what it lacks.
+
+    Raises:
+        ArchiveError: not such a file, damaged, unsafe, or without Gaussians.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        return import_scene(path)
+    if not path.is_file():
+        raise ArchiveError(f"{path}: cannot be opened ({'Is a directory' if path.is_dir() else 'No such file'})")
+    around = Surroundings(unknown=["no sensors, path, times and tracks: the file holds Gaussians only"])
+    try:
+        if suffix in LAYER_SUFFIXES:
+            found, source = read_particle_fields(path), path.name
+        elif suffix == ".nurec":
+            found, source = found_in(read_volume(path.read_bytes(), str(path)), str(path)), path.name
+        elif suffix == ".ckpt":
+            with path.open("rb") as file:
+                found, source = found_in(read_checkpoint(file, str(path)), str(path)), path.name
+        elif suffix == ".usdz":
+            with Package(path) as package:
+                around = read_surroundings(package)
+                found, source = _find(package, around)
+        else:
+            allowed = (".usdz", *LAYER_SUFFIXES, ".ply", ".nurec", ".ckpt")
+            raise ArchiveError(f"{path}: no scene; names of scenes end in {', '.join(allowed)}")
+        if not found.count:
+            raise ArchiveError(f"{path}: {source} holds no Gaussians. {' '.join(found.unknown)}")
+        scene = _assembled(path, found, around, source)
+        check_scene(scene)
+    except OSError as error:
+        raise ArchiveError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except ArchiveError as error:
+        raise error if str(path) in str(error) else ArchiveError(f"{path}: {error}") from error
+    return scene
+
+
+# ------------------------------------------------------------------------------------------------- where Gaussians are
+
+
+def _find(package: Package, around: Surroundings) -> tuple[Found, str]:
+    """The Gaussians of an archive, and what they come from."""
+    readers = _readers(package)
+    faults: list[str] = []
+    volumes: dict[str, np.ndarray] = {}
+    for number, (source, read) in enumerate(readers, start=1):
+        try:
+            found = read()
+        except ArchiveError as error:
+            faults.append(str(error))
+            continue
+        if found.count:
+            found.unknown += [f"passed over: {fault}" for fault in faults]
+            found.unknown += [f"{name} is not read, because {source} is" for name, _ in readers[number:]]
+            _name_the_rest(package, found, source)
+            if source in volumes and RIG not in package.names:
+                found.static = [transformed(part, volumes[source]) for part in found.static]
+            return found, source
+        around.unknown += found.unknown
+        volumes |= found.volumes
+    raise ArchiveError(
+        f"{package.path}: no Gaussians that can be read: neither nurec_sim/manifest.json (ours), particle fields, "
+        f"volume.nurec, checkpoint.ckpt nor a PLY. {' '.join(faults)}".rstrip()
+    )
+
+
+def _readers(package: Package) -> list[tuple[str, Callable[[], Found]]]:
+    """What may hold the Gaussians, the best first."""
+    names = package.names
+    readers: list[tuple[str, Callable[[], Found]]] = []
+    # Without a rig it is the stage that tells how a volume lies.
+    kinds = (b"ParticleField",) if RIG in names else (b"ParticleField", b"OmniNuRecFieldAsset")
+    if may_hold(package, *kinds):
+        readers.append((FIELDS, partial(read_particle_fields, package.path)))
+    readers += [(name, partial(_volume, package, name)) for name in names if name.endswith(".nurec")]
+    readers += [(name, partial(_checkpoint, package, name)) for name in names if name.endswith(".ckpt")]
+    if plys := [name for name in names if name.lower().endswith(".ply") and name not in _MESHES]:
+        readers.append((", ".join(plys), partial(_plys, package, plys)))
+    return readers
+
+
+def _volume(package: Package, name: str) -> Found:
+    where = f"{package.path}: {name}"
+    return found_in(read_volume(package.read(name), where), where)
+
+
+def _checkpoint(package: Package, name: str) -> Found:
+    where = f"{package.path}: {name}"
+    with package.open(name) as file:
+        return found_in(read_checkpoint(file, where), where)
+
+
+def _plys(package: Package, names: list[str]) -> Found:
+    """The Gaussians of all PLY members that hold such."""
+    found, faults = Found(), []
+    for name in names:
+        with tempfile.NamedTemporaryFile(suffix=".ply", prefix="nurec_sim_") as file:
+            file.write(package.read(name))
+            file.flush()
+            try:
+                gaussians, dropped = read_ply(file.name)
+            except ArchiveError as error:
+                faults.append(str(error).replace(file.name, name))
+                continue
+        found.static.append(gaussians)
+        found.dropped += dropped
+    if not found.static:
+        raise ArchiveError(" ".join(faults))
+    found.unknown += [f"passed over: {fault}" for fault in faults]
+    return found
+
+
+def _name_the_rest(package: Package, found: Found, source: str) -> None:
+    """Names the members that nothing reads, files of one folder by the folder."""
+    read = {RIG, TRACKS, DATA_INFO, MAP, *source.split(", ")}
+    ends = (".nurec", ".ckpt", *(LAYER_SUFFIXES if source == FIELDS else ()))
+    members = [name for name in package.names if name not in read and not name.lower().endswith(ends)]
+    others = sorted({name.split("/")[0] + ("/" if "/" in name else "") for name in members})
+    if others:
+        more = f" and {len(others) - 30} more" if len(others) > 30 else ""
+        found.unknown.append(f"members that are not read: {', '.join(others[:30])}{more}")
+
+
+# ---------------------------------------------------------------------------------------------------------- the scene
+
+
+def _assembled(path: Path, found: Found, around: Surroundings, source: str) -> GaussianScene:
+    unknown = [*around.unknown, *found.unknown]
+    known = default_surroundings()
+    if around.ego is not None and around.rig is not None:
+        known |= {"ego": around.ego, "rig": around.rig, "tracks": around.tracks}
+        known["camera_times_us"] = {name: times for name, times in around.camera_times_us.items() if len(times)}
+        known["span_us"] = around.span_us
+    else:
+        unknown.append("the car stands at the origin for one second, one camera looks along x")
+    if around.road_map is None:
+        unknown.append("no road map is read")
+    world_from_nre = geometry.inverse(around.nre_from_world)
+    static = joined([_moved(part, world_from_nre) for part in found.static])
+    dynamic = _dynamic(found, known["tracks"], known["span_us"][0], unknown)
+    sky = found.sky
+    if sky is None:
+        unknown.append("no sky: it is black")
+    cameras = [name for name in around.camera_order if name in known["rig"].cameras]
+    if found.exposure and len(found.exposure) != len(around.camera_order):
+        unknown.append(f"colour correction: exposure of {len(found.exposure)} cameras, of {len(around.camera_order)}")
+        cameras = []
+    gains = dict(zip(around.camera_order, found.exposure, strict=False))
+    provenance = {"method": "foreign", "file": path.name, "source": source, "dropped": found.dropped,
+                  "unknown": unknown}  # fmt: skip
+    return GaussianScene(
+        id=around.id or path.stem,
+        static=static,
+        dynamic=dynamic,
+        sky=np.zeros((6, 1, 1, 3), np.float32) if sky is None else _turned_sky(sky, world_from_nre[:3, :3]),
+        isp={name: np.eye(3, 4) * gains[name] for name in cameras if name in gains},
+        provenance=provenance,
+        road_map=around.road_map,
+        **{name: value for name, value in known.items() if name != "road_map"},
+    )
+
+
+def _dynamic(found: Found, tracks: list[Track], t_us: int, unknown: list[str]) -> DynamicGaussians:
+    """Rigid parts with the tracks that move them; names may carry the scene's behind an ``@``."""
+    index_of = {track.id.split("@")[0]: k for k, track in enumerate(tracks)}
+    parts: list[Gaussians] = []
+    owners: list[np.ndarray] = []
+    lost: list[str] = []
+    for name, gaussians in found.boxed.items():
+        index = index_of.get(name.split("@")[0])
+        if index is None:
+            lost.append(name)
+            continue
+        parts += gaussians
+        owners += [np.full(len(part), index, np.int32) for part in gaussians]
+    if lost:
+        count = sum(len(part) for name in lost for part in found.boxed[name])
+        shown = ", ".join(ascii(name)[:40] for name in lost[:5])
+        unknown.append(f"{count:,} Gaussians of {len(lost)} tracks without a path are not drawn: {shown}")
+    if not parts:
+        return DynamicGaussians.empty()
+    return DynamicGaussians.rigid(joined(parts), np.concatenate(owners), t_us)
+
+
+def _moved(gaussians: Gaussians, a_from_b: Float64[np.ndarray, "4 4"]) -> Gaussians:
+    return gaussians if np.array_equal(a_from_b, np.eye(4)) else transformed(gaussians, a_from_b)
+
+
+def _turned_sky(sky: np.ndarray, world_from_nre: Float64[np.ndarray, "3 3"]) -> np.ndarray:
+    """The sky in the world's axes; a rotation other than none interpolates it."""
+    if np.array_equal(world_from_nre, np.eye(3)):
+        return sky
+    directions = geometry.cubemap_directions(sky.shape[1]) @ world_from_nre
+    return sample_cubemap(sky, directions).astype(np.float32)

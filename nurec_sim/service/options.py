@@ -1,0 +1,50 @@
+"""What a service allows, and how its errors read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from nurec_sim.errors import NurecSimError, RequestError
+from nurec_sim.render.requests import MAX_RAYS
+from nurec_sim.render_queue import usable_cores
+
+
+@dataclass(frozen=True)
+class ServiceOptions:
+    """What a server allows and how it reads what the interface leaves open."""
+
+    render_workers: int = field(default_factory=usable_cores)
+    """Frames rendered at the same time, in threads of their own beside the renderer's; as many as there are cores."""
+    max_pixels: int = MAX_RAYS
+    """Pixels, or beams, of one frame; the renderer takes no more than the default."""
+    max_batch_items: int = 64
+    max_message_bytes: int = 64 << 20
+    """Of a request or a reply; AlpaSim's clients take no more."""
+    only_listed_actors: bool = False
+    """Whether a request that lists actors hides the controllable ones that it does not list."""
+    ego_mask_dir: Path | None = None
+    allow_shut_down: bool = False
+    warm_up: bool = False
+    """Whether the first scene is loaded, and kernels are compiled, before somebody asks."""
+    max_edited_scenes: int = 8
+    """Scenes of which ``edit_assets`` keeps an edited copy in memory."""
+    allow_remote_scenes: bool = False
+    """Whether clients may name ``http(s)://`` addresses of scenes, and not only ``file://`` ones."""
+    download_cache_dir: Path | None = None
+    """Where downloaded scenes are kept; None for a folder in that of the store."""
+    download_cache_size: int = 5
+    """Scenes kept there; the one used least recently goes first."""
+    max_download_bytes: int = 4 << 30
+    """Of one scene."""
+    download_timeout_s: float = 300.0
+    """For one scene."""
+
+
+class UnsupportedError(RequestError):
+    """A procedure that the interface knows and this server does not offer."""
+
+
+def describe(error: Exception) -> str:
+    """The text of an error that is fit for a client."""
+    return str(error) if isinstance(error, NurecSimError) else f"internal error: {type(error).__name__}: {error}"

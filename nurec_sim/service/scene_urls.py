@@ -1,0 +1,129 @@
+"""Scenes that clients bring along: their address travels as metadata beside any request.
+
+``x-nre-scene-url`` is ``file://`` or ``http(s)://`` and ends in ``.usdz``; ``x-nre-scene-id`` is the name under which
+the scene is served from then on, the archive's own if it is left out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from nurec_sim.errors import NotAllowedError, NurecSimError, RequestError, UnknownSceneError
+from nurec_sim.scene_store import SceneStore, default_cache_dir
+from nurec_sim.service.downloads import DownloadCache, is_web
+from nurec_sim.service.options import ServiceOptions
+
+URL_KEY, ID_KEY = "x-nre-scene-url", "x-nre-scene-id"
+
+_ID = re.compile(r"[A-Za-z0-9_-]{1,200}")
+_MAX_URL = 2048
+
+
+class SceneUrls:
+    """Offers scenes of a store by their addresses; safe to use from many threads.
+
+    Args:
+        store: where they are offered.
+        options: whether web addresses are allowed, and how much may be fetched.
+    """
+
+    def __init__(self, store: SceneStore, options: ServiceOptions) -> None:
+        self._store = store
+        self._allow_web = options.allow_remote_scenes
+        self._cache = DownloadCache(
+            options.download_cache_dir or default_cache_dir() / "downloads",
+            options.download_cache_size,
+            options.max_download_bytes,
+            options.download_timeout_s,
+        )
+        self._offered: dict[tuple[str, str], tuple[str, Path]] = {}  # address and name: id and file
+        self._turns: dict[str, threading.Lock] = {}
+
+    def is_new(self, metadata: Mapping[str, str]) -> bool:
+        """Whether metadata names a scene that ``offer`` still has to do something about; takes no waiting."""
+        return URL_KEY in metadata and self._served(_key(metadata)) is None
+
+    def offer(self, metadata: Mapping[str, str]) -> None:
+        """Makes the store offer the scene that metadata names; fetches it if it lies on the web.
+
+        Raises:
+            RequestError: the address or the name is malformed, or nothing can be fetched from there.
+            NotAllowedError: it lies on the web, and this server does not go there.
+            TooLargeError: it is larger than allowed.
+            ArchiveError: it cannot be opened, or another scene has the name.
+        """
+        url, name = key = _key(metadata)
+        _check(url, name)
+        if is_web(url) and not self._allow_web:
+            raise NotAllowedError(f"this server fetches no scenes from the web, got {url}; use a file:// address")
+        with self._turns.setdefault(url, threading.Lock()):
+            try:
+                if self._served(key) is not None:
+                    return
+                path = self._cache.fetch(url) if is_web(url) else _local_path(url)
+                self._offered[key] = (self._offer(path, name), path)
+                if is_web(url):
+                    self._make_room()
+            finally:
+                self._turns.pop(url, None)
+
+    def _served(self, key: tuple[str, str]) -> str | None:
+        """The id of a scene that is on offer already and whose file is still there."""
+        scene_id, path = self._offered.get(key, ("", Path()))
+        if not scene_id or not path.exists():
+            return None
+        try:
+            return scene_id if self._store.source(scene_id).origin == path else None
+        except NurecSimError:
+            return None
+
+    def _offer(self, path: Path, name: str) -> str:
+        if name:
+            with contextlib.suppress(UnknownSceneError):
+                source = self._store.source(name)
+                if source.origin == path:  # served since the start, or fetched anew after it had to make room
+                    return source.id
+        return self._store.offer(path, name)
+
+    def _make_room(self) -> None:
+        """Scenes whose files had to go are offered no longer, unless they are being rendered."""
+        removed = set(self._cache.make_room())
+        for key, (scene_id, path) in list(self._offered.items()):
+            if path in removed:
+                with contextlib.suppress(NurecSimError):
+                    self._store.remove(scene_id)
+                del self._offered[key]
+
+
+def _key(metadata: Mapping[str, str]) -> tuple[str, str]:
+    return metadata[URL_KEY], metadata.get(ID_KEY, "")
+
+
+def _check(url: str, name: str) -> None:
+    if name and not _ID.fullmatch(name):
+        raise RequestError(f"{ID_KEY} must be 1 to 200 of the letters A-Z a-z 0-9 _ -, got {name[:80]!r}")
+    try:
+        parts = urlsplit(url)
+    except ValueError as error:
+        raise RequestError(f"{URL_KEY} is no address: {error}") from error
+    fits = parts.scheme in ("file", "http", "https") and parts.path.lower().endswith(".usdz")
+    if not fits or len(url) > _MAX_URL or not url.isprintable() or (is_web(url) and not parts.hostname):
+        raise RequestError(
+            f"{URL_KEY} must be a file:// or http(s):// address that ends in .usdz, of up to {_MAX_URL} letters; "
+            f"got {url[:80]!r}"
+        )
+
+
+def _local_path(url: str) -> Path:
+    parts = urlsplit(url)
+    if parts.netloc not in ("", "localhost"):
+        raise RequestError(f"{URL_KEY}: a file:// address names a file of the server, without a host; got {url!r}")
+    path = Path(unquote(parts.path))
+    if not path.is_file():
+        raise RequestError(f"{URL_KEY}: there is no file {path} on the server")
+    return path

@@ -1,0 +1,17 @@
+"""All procedures of the sensor interface together."""
+
+from __future__ import annotations
+
+from nurec_sim.service.discovery import Discovery
+from nurec_sim.service.editing import Editing
+from nurec_sim.service.rendering import Rendering
+
+
+class SensorService(Rendering, Discovery, Editing):
+    """The procedures, one coroutine each, by their names on the wire: message in, message out, errors raised.
+
+    Args:
+        store: the scenes.
+        options: limits and choices.
+        request_stop: called by ``shut_down``.
+    """
