@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 
@@ -40,6 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except NurecSimError as error:
         err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(1) from None
+    except BrokenPipeError:
+        # Whoever read the output has left, as `head` does; nothing more can be said, not even at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
     except KeyboardInterrupt:
-        err.print("interrupted; finished rollouts are kept: go on with --resume runs/latest (or your run folder)")
+        kept = "finished rollouts are kept: go on with --resume runs/latest (or your run folder)"
+        err.print(f"interrupted; {kept if words[:1] in (['run'], ['demo']) else 'nothing half-written was left'}")
         raise SystemExit(130) from None
