@@ -160,7 +160,9 @@ def test_held_out_sweeps_are_not_read(street):
 
 
 def test_errors_say_what_there_is(street):
-    with pytest.raises(ReconstructError, match=r"no reconstruction method 'magic'; have \['lift'\]"):
+    with pytest.raises(
+        ReconstructError, match=r"no reconstruction method 'magic'; have \['lift', 'dense', 'selective'\]"
+    ):
         reconstruct(street, "magic")
     with pytest.raises(ReconstructError, match=r"has no camera \['back'\]; have \['front'\]"):
         reconstruct(street, cameras=["back"])

@@ -66,7 +66,7 @@ class SkyDecoder(nn.Module):
 
     def set_constants(self) -> None:
         """Compute the directions again, where the module was made without values."""
-        self.query_rays.copy_(cubemap.directions(self.size.cubemap_px))
+        self.query_rays.copy_(cubemap.directions(self.size.cubemap_px, self.query_rays.device))
 
     def forward(
         self,
