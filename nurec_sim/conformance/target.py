@@ -12,7 +12,7 @@ from jaxtyping import Float64, UInt8
 from nurec_sim import wire
 from nurec_sim.conformance.kit import Failed, Skipped, expect
 from nurec_sim.types import Matrix4, Trajectory
-from nurec_sim.wire import ImageFormat, common, sensorsim
+from nurec_sim.wire import ImageFormat, sensorsim
 from nurec_sim.wire.poses import write_poses
 
 HEIGHT_PX = 90
@@ -195,6 +195,3 @@ def place(message, start: Matrix4, end: Matrix4 | None = None) -> None:
 def unit_error(quats: Sequence) -> float:
     """How far the squared norms of quaternion messages are from 1, at most."""
     return max((abs(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z - 1) for q in quats), default=0.0)
-
-
-EMPTY = common.Empty()

@@ -226,10 +226,11 @@ def _rows(dynamic: DynamicGaussians, keep: Bool[np.ndarray, " n"]) -> DynamicGau
 
 
 def _joined(one: DynamicGaussians, other: DynamicGaussians) -> DynamicGaussians:
-    return DynamicGaussians(
-        joined([one.gaussians, other.gaussians]),
-        np.concatenate([one.knot_t_us, other.knot_t_us]),
-        np.concatenate([one.knot_m, other.knot_m]),
-        np.concatenate([one.track, other.track]),
-        np.concatenate([_boxed(one), _boxed(other)]),
-    )
+    """Both, with as many coefficients of harmonics as the richer one has."""
+    count = len(one)
+    gaussians = joined([one.gaussians, other.gaussians])
+    parts = [
+        dataclasses.replace(one, gaussians=gaussians[:count]),
+        dataclasses.replace(other, gaussians=gaussians[count:]),
+    ]
+    return DynamicGaussians.concatenate(parts)

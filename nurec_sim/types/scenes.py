@@ -120,6 +120,22 @@ class DynamicGaussians:
         return len(self.gaussians)
 
     @classmethod
+    def concatenate(cls, parts: Sequence[DynamicGaussians]) -> DynamicGaussians:
+        """All parts one after the other; a single part stays as it is."""
+        if len(parts) <= 1:
+            return parts[0] if parts else cls.empty()
+        in_box = None
+        if any(part.in_box is not None for part in parts):
+            in_box = np.concatenate([np.zeros(len(p), bool) if p.in_box is None else p.in_box for p in parts])
+        return cls(
+            Gaussians.concatenate([part.gaussians for part in parts]),
+            np.concatenate([part.knot_t_us for part in parts]),
+            np.concatenate([part.knot_m for part in parts]),
+            np.concatenate([part.track for part in parts]),
+            in_box,
+        )
+
+    @classmethod
     def rigid(cls, gaussians: Gaussians, track: Int32[np.ndarray, " n"], t_us: int) -> DynamicGaussians:
         """Rigid parts of tracks, given in the frames of their boxes; they do not fade within days of ``t_us``."""
         knot_t_us = np.tile(t_us + np.array([-RIGID_LIFE_US, 0, RIGID_LIFE_US], np.int64), (len(gaussians), 1))

@@ -23,7 +23,6 @@ from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ChunkLayers, C
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.reconstruct.feedforward.sky import observed_world_sky, world_sky
 from nurec_sim.reconstruct.feedforward.tracks import knots_along, owners_of_points, owners_of_rays, scene_actors
-from nurec_sim.reconstruct.lift.actors import join
 from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Label
 
@@ -81,7 +80,7 @@ def chunk_layers(clip: Clip, chunk: ChunkInputs, outputs: NetworkOutputs, settin
     return ChunkLayers(
         images=chunk.images,
         static=Gaussians.concatenate(static),
-        dynamic=join(dynamic),
+        dynamic=DynamicGaussians.concatenate(dynamic),
         sky=sky,
         sky_seen=seen,
         isp={name: isp[number] for number, name in enumerate(chunk.camera_ids)},

@@ -74,7 +74,7 @@ def merge_chunks(
     joined = Gaussians.concatenate(static) if len(static) > 1 else static[0]
     progress("merging", 0.8)
     reduced, voxel_m = reduce_to_budget(joined, settings.max_gaussians)
-    dynamic = _joined([chunk.dynamic for chunk in chunks])
+    dynamic = DynamicGaussians.concatenate([chunk.dynamic for chunk in chunks])
     progress("merging", 1.0)
     counts = {
         "chunks": len(chunks),
@@ -94,15 +94,3 @@ def _drawable(chunk: ChunkLayers) -> ChunkLayers:
     """A chunk without static Gaussians that are not finite, have no extent or are not to be seen."""
     mask = drawable(chunk.static)
     return chunk if mask.all() else dataclasses.replace(chunk, static=chunk.static[mask])
-
-
-def _joined(parts: Sequence[DynamicGaussians]) -> DynamicGaussians:
-    """Dynamic layers one after the other, nothing changed."""
-    if len(parts) == 1:
-        return parts[0]
-    return DynamicGaussians(
-        Gaussians.concatenate([part.gaussians for part in parts]),
-        np.concatenate([part.knot_t_us for part in parts]),
-        np.concatenate([part.knot_m for part in parts]),
-        np.concatenate([part.track for part in parts]),
-    )

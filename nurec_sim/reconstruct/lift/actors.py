@@ -130,15 +130,3 @@ def emit(actor: Actor, gaussians_box: Gaussians, windows: list[Window]) -> Dynam
         np.concatenate(knots),
         np.full(total, actor.index, np.int32),
     )
-
-
-def join(parts: list[DynamicGaussians]) -> DynamicGaussians:
-    """All actors in one layer."""
-    if not parts:
-        return DynamicGaussians.empty()
-    return DynamicGaussians(
-        Gaussians.concatenate([part.gaussians for part in parts]),
-        np.concatenate([part.knot_t_us for part in parts]),
-        np.concatenate([part.knot_m for part in parts]),
-        np.concatenate([part.track for part in parts]),
-    )

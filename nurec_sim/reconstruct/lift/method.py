@@ -23,7 +23,7 @@ from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.sky import make_sky
 from nurec_sim.reconstruct.lift.views import View, read_views
-from nurec_sim.types import Clip, Gaussians, GaussianScene
+from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene
 
 Progress = Callable[[str, float], None]
 
@@ -69,7 +69,7 @@ def lift(
     stages.start("sky")
     sky = make_sky(views, canonical, [_sky_weight(p, v, settings) for p, v in zip(pictures, views, strict=True)],
                    settings.sky_px)  # fmt: skip
-    dynamic = actor_layer.join(moving)
+    dynamic = DynamicGaussians.concatenate(moving)
     stages.stop()
     counts = {
         "sweeps": gathered.sweep_count,
