@@ -21,7 +21,8 @@
     ├── ScenarioError    a scenario file is wrong
     ├── GpuError         the CUDA back end cannot be used here
     ├── ServerError      a sensor server cannot be reached, or failed
-    └── RunError         a run folder or a file in it cannot be read or written
+    ├── RunError         a run folder or a file in it cannot be read or written
+    └── TrainingError    a recipe, its data or its checkpoints are wrong
 
 Texts say what was wrong, what was given and what is allowed.
 """
@@ -105,3 +106,7 @@ class ServerError(NurecSimError):
 
 class RunError(NurecSimError):
     """A run folder, or a file in it, cannot be read or written."""
+
+
+class TrainingError(NurecSimError):
+    """A training recipe, its data or its checkpoints are wrong."""

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from nurec_sim import geometry
 from nurec_sim.errors import ClipError
-from nurec_sim.world import Road, RoadLine, RoadPiece, StreetPlan, street_plan
+from nurec_sim.world import RoadLine, RoadPiece, StreetPlan, street_plan
+from nurec_sim.world.plan import StreetRoad as Road
 
 BODY_CENTRE_M, BODY_SIZE_M = 1.4, (4.9, 1.9)
 

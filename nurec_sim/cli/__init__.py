@@ -7,7 +7,19 @@ import os
 import sys
 from collections.abc import Sequence
 
-from nurec_sim.cli import conformance, drive, driving, exchange, remote, scenes, serving, validation, weights
+from nurec_sim.cli import (
+    conformance,
+    drive,
+    driving,
+    evaluation,
+    exchange,
+    remote,
+    scenes,
+    serving,
+    training,
+    validation,
+    weights,
+)
 from nurec_sim.cli.console import app, err
 from nurec_sim.errors import NurecSimError
 
@@ -15,14 +27,23 @@ __all__ = [
     "conformance",
     "drive",
     "driving",
+    "evaluation",
     "exchange",
     "main",
     "remote",
     "scenes",
     "serving",
+    "training",
     "validation",
     "weights",
 ]
+
+KEPT = {
+    "run": "finished rollouts are kept: go on with --resume runs/latest (or your run folder)",
+    "demo": "finished rollouts are kept: go on with --resume runs/latest (or your run folder)",
+    "evaluate": "finished windows of a protocol are kept: go on with --resume evaluations/latest (or your run folder)",
+}
+"""What an interrupted verb leaves behind."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -46,6 +67,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except KeyboardInterrupt:
-        kept = "finished rollouts are kept: go on with --resume runs/latest (or your run folder)"
-        err.print(f"interrupted; {kept if words[:1] in (['run'], ['demo']) else 'nothing half-written was left'}")
+        err.print(f"interrupted; {KEPT.get(words[0] if words else '', 'nothing half-written was left')}")
         raise SystemExit(130) from None

@@ -1,9 +1,8 @@
-"""Verbs about one log or scene: inspect, world, reconstruct, render, evaluate."""
+"""Verbs about one log or scene: inspect, world, reconstruct, render."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -110,7 +109,7 @@ def reconstruct(
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
     with progress("reconstructing") as advance:
         world_scene = run_method(
-            log, method, cameras=cameras or None, progress=advance, settings=_network_settings(method, network)
+            log, method, cameras=cameras or None, progress=advance, settings=network_settings(method, network)
         )
     scene.write_scene(world_scene, target, overwrite=overwrite)
     print_table(f"scene {world_scene.id}", scene.summary(world_scene))
@@ -150,54 +149,7 @@ def render(
     out.print(f"wrote {out_path}", soft_wrap=True)
 
 
-@app.command
-def evaluate(
-    clip: OnePath,
-    *,
-    method: Method = "lift",
-    input_cameras: tuple[str, ...] = (),
-    target_cameras: tuple[str, ...] = (),
-    hold_out_sweeps: int = 0,
-    local: bool = False,
-    images: Path | None = None,
-    json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
-    network: NetworkFlags = NO_FLAGS,
-) -> None:
-    """Measure a reconstruction against what the log recorded: images of other cameras, LiDAR sweeps left out.
-
-    Args:
-        clip: a clip folder, or a .zip of one.
-        method: how to reconstruct.
-        input_cameras: cameras that the reconstruction may see; all if not given.
-        target_cameras: cameras to compare with; the input cameras if not given.
-        hold_out_sweeps: leave out every so-manieth sweep and simulate it; 0 leaves out none.
-        local: render in this process instead of through gRPC.
-        images: also write rendered and recorded images side by side into this folder.
-        json_path: write all figures here.
-        network: how the clip goes through the network (`nurec-sim reconstruct --help` says more).
-    """
-    from nurec_sim import logs
-    from nurec_sim.evaluate import evaluate as run_evaluation
-
-    log = logs.open_clip(clip)
-    with progress("evaluating") as advance:
-        figures = run_evaluation(
-            log,
-            method,
-            input_cameras=input_cameras or None,
-            target_cameras=target_cameras or None,
-            hold_out_every=hold_out_sweeps,
-            via_grpc=not local,
-            images_dir=images,
-            progress=advance,
-            settings=_network_settings(method, network),
-        )
-    if json_path is not None:
-        json_path.write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
-    print_table(f"{method} on {log.id}", flatten(figures))
-
-
-def _network_settings(method: str, network: FeedForwardSettings) -> FeedForwardSettings | None:
+def network_settings(method: str, network: FeedForwardSettings) -> FeedForwardSettings | None:
     """The flags of the network, for the methods that use it.
 
     Raises:
@@ -224,14 +176,3 @@ def load_scene(source: Path) -> GaussianScene:
         raise NurecSimError(fault)
     with progress("loading") as advance:
         return store.get(store.ids[0], progress=advance).scene
-
-
-def flatten(figures: dict, prefix: str = "") -> list[tuple[str, str]]:
-    """Nested figures as dotted rows; lists stay in the JSON file."""
-    rows: list[tuple[str, str]] = []
-    for key, value in figures.items():
-        if isinstance(value, dict):
-            rows += flatten(value, f"{prefix}{key}.")
-        elif not isinstance(value, list):
-            rows.append((prefix + key, f"{value:.4g}" if isinstance(value, float) else str(value)))
-    return rows

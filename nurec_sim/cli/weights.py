@@ -17,7 +17,7 @@ app.command(
 )
 
 Fetchable = Literal["pa-front", "pa-multiview", "pq-front", "da3-base"]
-Checkable = Literal["pa-front", "pa-multiview", "pq-front", "pa-full", "tiny", "tiny-selective"]
+Checkable = Literal["pa-front", "pa-multiview", "pq-front", "pa-full", "tiny", "tiny-selective", "tiny-sky-mlp"]
 
 
 @weights.command(name="list")

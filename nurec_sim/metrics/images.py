@@ -1,4 +1,4 @@
-"""How alike two images are: PSNR and SSIM.
+"""How alike two images are: PSNR and SSIM, over whole images or within a mask.
 
 Images are [h, w] or [h, w, channels] of one type; integers count in 0..255, floats in 0..1 unless ``data_range`` says
 otherwise.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from jaxtyping import Bool
 
 SSIM_WINDOW = 7
 SSIM_K1, SSIM_K2 = 0.01, 0.03
@@ -33,6 +34,17 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float | None = No
     Raises:
         ValueError: the images differ in shape or are smaller than the window.
     """
+    return float(np.mean(ssim_map(image, reference, data_range)))
+
+
+def ssim_map(image: np.ndarray, reference: np.ndarray, data_range: float | None = None) -> np.ndarray:
+    """Structural similarity of every 7x7 window inside the image, ``[h - 6, w - 6]`` or with channels; see ``ssim``.
+
+    The window around pixel (row, column) is at (row - 3, column - 3).
+
+    Raises:
+        ValueError: the images differ in shape or are smaller than the window.
+    """
     a, b, span = _checked(image, reference, data_range)
     if min(a.shape[:2]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs images of at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, got {a.shape}")
@@ -50,7 +62,36 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float | None = No
     var_b = unbiased * (mean(b * b) - mean_b**2)
     covariance = unbiased * (mean(a * b) - mean_a * mean_b)
     alike = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
-    return float(np.mean(alike / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))))
+    return alike / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
+
+
+def masked_psnr(image: np.ndarray, reference: np.ndarray, mask: Bool[np.ndarray, "h w"]) -> float:
+    """PSNR in dB over the pixels of a mask; NaN if it is empty.
+
+    Raises:
+        ValueError: the images or the mask differ in shape.
+    """
+    _check_mask(image, mask)
+    return psnr(image[mask][None], reference[mask][None]) if mask.any() else float("nan")
+
+
+def masked_ssim(image: np.ndarray, reference: np.ndarray, mask: Bool[np.ndarray, "h w"]) -> float:
+    """Mean SSIM of the windows whose middle pixel lies in a mask; NaN if there are none.
+
+    Windows reach over the edge of the mask, as in the STORM protocol.
+
+    Raises:
+        ValueError: the images or the mask differ in shape, or are smaller than the window.
+    """
+    _check_mask(image, mask)
+    border = SSIM_WINDOW // 2
+    inside = mask[border:-border, border:-border]
+    return float(np.mean(ssim_map(image, reference)[inside])) if inside.any() else float("nan")
+
+
+def _check_mask(image: np.ndarray, mask: np.ndarray) -> None:
+    if mask.shape != image.shape[:2]:
+        raise ValueError(f"a mask must have the size of the images, got {mask.shape} for {image.shape}")
 
 
 def _checked(

@@ -13,7 +13,8 @@ from nurec_sim.network.encoder import Encoder
 from nurec_sim.network.isp import IspDecoder
 from nurec_sim.network.learned_sky import SkyDecoder
 from nurec_sim.network.observed_sky import observed_sky
-from nurec_sim.network.profiles import PATCH_PX, Profile
+from nurec_sim.network.profiles import PATCH_PX, Profile, SkySize
+from nurec_sim.network.sky_mlp import SkyMlp
 from nurec_sim.network.tensors import NetworkInputs, NetworkOutputs
 
 Precision = Literal["float32", "bfloat16", "float16"]
@@ -38,7 +39,7 @@ class InstantNuRec(nn.Module):
             self.register_buffer("cuboids_dims_padding", torch.ones(3))
         self.encoder = Encoder(profile.encoder)
         self.decoder = DenseDecoder(profile) if profile.decoder == "dense" else SelectiveDecoder(profile)
-        self.sky = SkyDecoder(profile, profile.sky) if profile.sky else None
+        self.sky = _learned_sky(profile, profile.sky) if profile.sky else None
         self.post_processing = IspDecoder(2 * profile.encoder.width, profile.isp_heads)
 
     def forward(self, inputs: NetworkInputs, motion: bool = True) -> NetworkOutputs:
@@ -87,6 +88,10 @@ class InstantNuRec(nn.Module):
                 f"images must be multiples of {PATCH_PX} px wide and high and at least {least} px, "
                 f"got {width} x {height}"
             )
+
+
+def _learned_sky(profile: Profile, size: SkySize) -> SkyDecoder | SkyMlp:
+    return SkyDecoder(profile, size) if size.kind == "decoder" else SkyMlp(profile, size)
 
 
 def initialize(model: InstantNuRec, seed: int) -> None:

@@ -61,13 +61,17 @@ class MotionSize:
 
 @dataclass(frozen=True)
 class SkySize:
-    """The learned sky decoder: cubemap edge in pixels and its small transformer."""
+    """The learned sky: cubemap edge in pixels and its small transformer.
+
+    ``kind`` is the paper's ``decoder``, or the ``mlp`` of its ablation, which has neither ``depth`` nor ``levels``.
+    """
 
     cubemap_px: int = 448
     width: int = 384
     depth: int = 1
     heads: int = 12
     levels: tuple[int, int, int, int] = (48, 96, 192, 384)
+    kind: Literal["decoder", "mlp"] = "decoder"
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,7 @@ class Profile:
         head: size of each DPT head.
         selective: size of the point-query decoder.
         motion: size of the motion decoder.
-        sky: size of the learned sky decoder; None uses the sky that the images show.
+        sky: size of the learned sky; None uses the sky that the images show.
         observed_sky_px: edge of the cubemap of the observed sky.
         isp_heads: attention heads of the decoder of camera responses.
         training_buffers: whether the state dict holds the constants that files of the training code hold.
@@ -127,6 +131,7 @@ _TINY = Profile(
     observed_sky_px=112,
     isp_heads=6,
 )
+_TINY_SKY_MLP = SkySize(112, 96, heads=3, kind="mlp")
 
 PROFILES: Mapping[str, Profile] = {
     profile.name: profile
@@ -137,6 +142,8 @@ PROFILES: Mapping[str, Profile] = {
         Profile("pa-full", sky=SkySize(), training_buffers=True),
         _TINY,
         dataclasses.replace(_TINY, name="tiny-selective", decoder="selective"),
+        dataclasses.replace(_TINY, name="tiny-sky-mlp", sky=_TINY_SKY_MLP),
     )
 }
-"""By name. ``pa-full`` is the training model with the learned sky; no weights of it are published."""
+"""By name. ``pa-full`` is the training model with the learned sky; no weights of it are published. ``tiny-sky-mlp`` is
+for the ablation of the sky (docs/training.md)."""

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nurec_sim.world.backend import BACKENDS, pick_backend
     from nurec_sim.world.build import Street, build_street
-    from nurec_sim.world.layout import street_plan
-    from nurec_sim.world.plan import Actor, Building, Prop, Road, RoadPiece, StreetPlan
+    from nurec_sim.world.layout import street_plan, town_plan
+    from nurec_sim.world.network import TownNetwork
+    from nurec_sim.world.plan import Actor, Building, Prop, Road, RoadPiece, StreetPlan, TownPlan
+    from nurec_sim.world.random_rigs import random_readout_us, random_rig
     from nurec_sim.world.rig import LIDAR_ID, street_rig
     from nurec_sim.world.road import RoadLine
     from nurec_sim.world.sense import TrueScan, TrueView, TrueWorld
@@ -27,12 +29,17 @@ _MODULE_OF = {
     "Street": "build",
     "build_street": "build",
     "street_plan": "layout",
+    "town_plan": "layout",
+    "TownNetwork": "network",
     "Actor": "plan",
     "Building": "plan",
     "Prop": "plan",
     "Road": "plan",
     "RoadPiece": "plan",
     "StreetPlan": "plan",
+    "TownPlan": "plan",
+    "random_readout_us": "random_rigs",
+    "random_rig": "random_rigs",
     "LIDAR_ID": "rig",
     "street_rig": "rig",
     "RoadLine": "road",
@@ -57,13 +64,18 @@ __all__ = [
     "Street",
     "StreetPlan",
     "SurfaceClass",
+    "TownNetwork",
+    "TownPlan",
     "TrueScan",
     "TrueView",
     "TrueWorld",
     "build_street",
     "pick_backend",
+    "random_readout_us",
+    "random_rig",
     "street_plan",
     "street_rig",
+    "town_plan",
     "write_street_clip",
 ]
 

@@ -15,6 +15,10 @@ import numpy as np
 from nurec_sim.world.meshes import MeshBuilder
 from nurec_sim.world.surface import REFLECTIVITY, SurfaceClass
 
+DECAL_GROUP = 3
+"""Geoms that are drawn in colour images only: no depth, no label, no laser return."""
+DECAL_ALPHA = 0.99
+"""The classic renderer blends only what is not quite opaque."""
 STATIC = 0
 """Instance id of everything that is no actor; actor i of the plan is instance i + 1."""
 
@@ -49,12 +53,13 @@ class SpecBuilder:
         if image is not None:
             self.texture(f"{name}_texture", image, mujoco.mjtTexture.mjTEXTURE_2D)
             material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = f"{name}_texture"
-            mean = mean * image.reshape(-1, 3).mean(axis=0) / 255
+            mean = mean * image[..., :3].reshape(-1, 3).mean(axis=0) / 255
         self._mean_colour[name] = mean
 
     def texture(self, name: str, image: np.ndarray, kind: Any) -> None:
         """A texture; linear, because the classic renderer knows no gamma and would turn sRGB dark."""
-        texture = self.spec.add_texture(name=name, type=kind, width=image.shape[1], height=image.shape[0], nchannel=3)
+        height, width, channels = image.shape
+        texture = self.spec.add_texture(name=name, type=kind, width=width, height=height, nchannel=channels)
         texture.data = np.ascontiguousarray(image).tobytes()
         texture.colorspace = mujoco.mjtColorSpace.mjCOLORSPACE_LINEAR
 
@@ -84,11 +89,14 @@ class SpecBuilder:
         reflectivity: float | None = None,
         shadow: bool = True,
         crease_deg: float = 38.0,
+        decal: bool = False,
     ) -> None:
-        """A mesh on a body."""
+        """A mesh on a body. A ``decal`` is blended over what lies below it and exists in colour images only."""
         name = mesh if isinstance(mesh, str) else self.mesh(mesh, crease_deg)
         geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=xyz, quat=_yaw_quat(yaw))
-        self._dress(geom, surface, material, instance, tint, reflectivity, shadow)
+        self._dress(geom, surface, material, instance, tint, reflectivity, shadow and not decal)
+        if decal:
+            geom.group, geom.rgba = DECAL_GROUP, [*geom.rgba[:3], DECAL_ALPHA]
 
     def shape(
         self,

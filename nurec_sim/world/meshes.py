@@ -5,6 +5,8 @@ Front faces wind counter-clockwise; OpenGL culls back faces, so a wrong winding 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import shapely
 from jaxtyping import Float64, Int64
@@ -20,6 +22,7 @@ class MeshBuilder:
         self._points: list[np.ndarray] = []
         self._uv: list[np.ndarray] = []
         self._faces: list[np.ndarray] = []
+        self._normals: list[np.ndarray] = []
         self._count = 0
 
     @property
@@ -36,13 +39,28 @@ class MeshBuilder:
         """Scales about the origin, then shifts, everything gathered so far."""
         self._points = [points * scale + shift for points in self._points]
 
-    def add(self, points: ArrayLike, faces: ArrayLike, uv: ArrayLike) -> None:
-        """Triangles ``faces [m,3]`` over ``points [n,3]`` with ``uv [n,2]``."""
+    def add(self, points: ArrayLike, faces: ArrayLike, uv: ArrayLike, normals: ArrayLike | None = None) -> None:
+        """Triangles ``faces [m,3]`` over ``points [n,3]`` with ``uv [n,2]``; ``normals [n,3]`` replace smoothed ones."""
         vertices = np.asarray(points, np.float64)
         self._points.append(vertices)
         self._uv.append(np.asarray(uv, np.float64))
         self._faces.append(np.asarray(faces, np.int64) + self._count)
+        self._normals.append(np.full_like(vertices, np.nan) if normals is None else np.asarray(normals, np.float64))
         self._count += len(vertices)
+
+    def extend(self, other: MeshBuilder, pose: Float64[np.ndarray, "4 4"] | None = None) -> None:
+        """Everything of another mesh, moved by a rigid ``pose``."""
+        turn, shift = (np.eye(3), np.zeros(3)) if pose is None else (pose[:3, :3], pose[:3, 3])
+        for points, faces, uv, normals in zip(other._points, other._faces, other._uv, other._normals, strict=True):
+            self._points.append(points @ turn.T + shift)
+            self._uv.append(uv)
+            self._faces.append(faces + self._count)
+            self._normals.append(normals @ turn.T)
+        self._count += other._count
+
+    def warp(self, move: Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]) -> None:
+        """Moves every vertex, as when flat things are laid on hilly ground."""
+        self._points = [move(points) for points in self._points]
 
     def quad(self, a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike, uv: ArrayLike = UNIT_SQUARE) -> None:
         """One quad, counter-clockwise seen from its front."""
@@ -70,6 +88,16 @@ class MeshBuilder:
                 self.quad(middle - along_u - along_w, middle + along_u - along_w,
                           middle + along_u + along_w, middle - along_u + along_w, uv)  # fmt: skip
 
+    def block(self, low: ArrayLike, high: ArrayLike) -> None:
+        """An axis-aligned box between two corners; each of its sides shows the whole texture, upright."""
+        (x0, y0, z0), (x1, y1, z1) = np.asarray(low, np.float64), np.asarray(high, np.float64)
+        self.quad([x0, y0, z0], [x1, y0, z0], [x1, y0, z1], [x0, y0, z1])
+        self.quad([x1, y1, z0], [x0, y1, z0], [x0, y1, z1], [x1, y1, z1])
+        self.quad([x1, y0, z0], [x1, y1, z0], [x1, y1, z1], [x1, y0, z1])
+        self.quad([x0, y1, z0], [x0, y0, z0], [x0, y0, z1], [x0, y1, z1])
+        self.quad([x0, y0, z1], [x1, y0, z1], [x1, y1, z1], [x0, y1, z1])
+        self.quad([x0, y1, z0], [x1, y1, z0], [x1, y0, z0], [x0, y0, z0])
+
     def cylinder(
         self,
         start: ArrayLike,
@@ -78,8 +106,9 @@ class MeshBuilder:
         end_radius: float | None = None,
         sides: int = 12,
         capped: bool = True,
+        side_uv: float = 1.0,
     ) -> None:
-        """A cylinder or cone between two points."""
+        """A cylinder or cone between two points; its side shows the first ``side_uv`` of the texture, its caps all."""
         start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
         radii = (radius, radius if end_radius is None else end_radius)
         axis = (end - start) / np.linalg.norm(end - start)
@@ -87,11 +116,13 @@ class MeshBuilder:
         side /= np.linalg.norm(side)
         angle = np.linspace(0, 2 * np.pi, sides + 1)
         ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(axis, side)
-        self.grid(np.stack([start + radii[0] * ring, end + radii[1] * ring], axis=1))
+        around = np.stack(np.meshgrid(np.linspace(0, 1, sides + 1), [0.0, 1.0], indexing="ij"), axis=-1)
+        self.grid(np.stack([start + radii[0] * ring, end + radii[1] * ring], axis=1), around * side_uv)
         for center, r, sign in ((start, radii[0], -1), (end, radii[1], 1)):
             if capped and r > 1e-4:
                 fan = [[0, i, i + 1][::sign] if sign < 0 else [0, i, i + 1] for i in range(1, sides - 1)]
-                self.add(center + r * ring[:-1], fan, ring[:-1, :2] * 0.5 + 0.5)
+                disc = np.stack([np.cos(angle), np.sin(angle)], axis=1)[:-1] * 0.5 + 0.5
+                self.add(center + r * ring[:-1], fan, disc)
 
     def wall(
         self, outline: ArrayLike, low_m: float, high_m: float, u_per_m: float, v_low: float, v_high: float
@@ -115,9 +146,10 @@ class MeshBuilder:
         points = np.concatenate([xy, np.full((len(xy), 1), z_m)], axis=1)
         self.add(points, np.arange(len(xy)).reshape(-1, 3), xy * uv_per_m)
 
-    def blob(self, rng: np.random.Generator, center: ArrayLike, radius: float, rough: float = 0.2) -> None:
+    def blob(self, rng: np.random.Generator, center: ArrayLike, radius: float, rough: float = 0.2,
+             detail: int = 2) -> None:  # fmt: skip
         """A lumpy ball, as for the crown of a tree."""
-        points, faces = icosphere(2)
+        points, faces = icosphere(detail)
         lumps = sum(np.sin(points @ (rng.normal(size=3) * rng.uniform(2, 6)) + 6 * rng.random()) for _ in range(4)) / 4
         lumps = lumps + rng.normal(0, 0.28, len(points))
         uv = np.stack([np.arctan2(points[:, 1], points[:, 0]) / np.pi, points[:, 2]], axis=1) * radius
@@ -134,17 +166,30 @@ class MeshBuilder:
         normal = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
         area = np.linalg.norm(normal, axis=1)
         faces, normal, area = faces[area > 1e-9], normal[area > 1e-9], area[area > 1e-9]
-        weighted = np.repeat(normal, 3, axis=0)
-        own = np.repeat(normal / area[:, None], 3, axis=0)
         place = points[faces].reshape(-1, 3)
-        key = np.unique(np.round(place, 4), axis=0, return_inverse=True)[1].ravel()
-        order = np.argsort(key, kind="stable")
-        limit, smooth = np.cos(np.deg2rad(crease_deg)), own.copy()
-        for group in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
-            if len(group) > 1:
-                total = ((own[group] @ own[group].T) > limit) @ weighted[group]
-                smooth[group] = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
-        return place, smooth, uv[faces].reshape(-1, 2)
+        smooth = np.repeat(normal / area[:, None], 3, axis=0)
+        if crease_deg > 0:
+            smooth = _smoothed(place, smooth, np.repeat(normal, 3, axis=0), np.cos(np.deg2rad(crease_deg)))
+        given = np.concatenate(self._normals)[faces].reshape(-1, 3)
+        return place, np.where(np.isnan(given), smooth, given), uv[faces].reshape(-1, 2)
+
+
+def _smoothed(place: np.ndarray, own: np.ndarray, weighted: np.ndarray, limit: float) -> np.ndarray:
+    """Each corner's normal averaged over the corners at its place whose normals' cosine to its own exceeds ``limit``."""
+    grid = np.round(place * 1e4).astype(np.int64)
+    key = grid @ np.array([73856093, 19349663, 83492791], np.int64)
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.concatenate([[True], np.diff(key[order]) != 0]))
+    count = np.diff(np.concatenate([first, [len(order)]]))
+    many = np.repeat(count, count)
+    start = np.cumsum(many) - many  # of each corner's run of partners
+    partner = np.arange(many.sum()) - np.repeat(start - np.repeat(first, count), many)
+    own, weighted = own[order], weighted[order]
+    alike = np.einsum("ij,ij->i", np.repeat(own, many, axis=0), own[partner]) > limit
+    total = np.add.reduceat(weighted[partner] * alike[:, None], start, axis=0)
+    smooth = np.empty_like(total)
+    smooth[order] = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    return smooth
 
 
 def icosphere(subdivisions: int) -> tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, "m 3"]]:

@@ -6,12 +6,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32
 
-from nurec_sim import sensors
-from nurec_sim.types import CameraModel, LidarModel
 from nurec_sim.world.build import FAR_M, Street
-from nurec_sim.world.render import View
+from nurec_sim.world.faces import Seen
 
 _VISIBLE = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 
@@ -23,7 +21,10 @@ def cast(
     direction: Float64[np.ndarray, "n 3"],
     reach_m: float = FAR_M,
 ) -> tuple[Int32[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
-    """What rays of unit ``direction`` from one point meet first: geom id (-1 nothing), distance (0), normal (0)."""
+    """What rays of unit ``direction`` from one point meet first: geom id (-1 nothing), distance (0), normal (0).
+
+    Normals point towards the origin of the rays.
+    """
     count = len(direction)
     geom, distance, normal = np.empty(count, np.int32), np.empty(count), np.empty((count, 3))
     rays = np.ascontiguousarray(direction, np.float64).ravel()
@@ -34,46 +35,35 @@ def cast(
     missed = geom < 0
     distance[missed] = 0.0
     normal[missed] = 0.0
+    away = np.einsum("nc,nc->n", normal, direction) > 0
+    normal[away] *= -1
     return geom, distance, normal
 
 
-def view(street: Street, data: Any, camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]) -> View:
-    """An image by one ray per pixel: plain colours of the materials, shaded by the sun, before the same sky.
+def look(
+    street: Street,
+    data: Any,
+    rays: Float64[np.ndarray, "h w 3"],
+    valid: Bool[np.ndarray, "h w"],
+    world_from_sensor: Float64[np.ndarray, "4 4"],
+    seen: Seen,
+) -> None:
+    """Fills in what a grid of rays sees: plain colours of the materials, shaded by the sun, before the same sky.
 
-    Returns what ``render.GlPainter.view`` returns, without textures, shadows or smoothed edges.
+    Unlike drawn images these have no textures, shadows or smoothed edges; geometry is exact.
     """
-    rays, valid = sensors.pixel_rays(camera)
-    height, width = valid.shape
-    direction = rays.reshape(-1, 3) @ world_from_camera[:3, :3].T
-    geom, distance, normal = cast(street, data, world_from_camera[:3, 3], direction)
-    hit = geom >= 0
-    # The renderer lights front faces only, and rays may report the normal of either side.
-    normal = np.where(np.sum(normal * direction, axis=1, keepdims=True) > 0, -normal, normal)
+    direction = rays[valid] @ world_from_sensor[:3, :3].T
+    geom, distance, normal = cast(street, data, world_from_sensor[:3, 3], direction)
     fill = np.array([-street.sun[0], -street.sun[1], 0.8])
     light = np.array([0.48, 0.50, 0.54]) + 0.72 * np.clip(normal @ street.sun, 0, 1)[:, None]
     light = light + 0.16 * np.clip(normal @ (fill / np.linalg.norm(fill)), 0, 1)[:, None]
     lit = np.clip(street.geom_rgb[geom] * light * 255, 0, 255).astype(np.uint8)
-    sky = street.sky.colour(direction.reshape(height, width, 3)).reshape(-1, 3)
-    rgb = np.where(hit[:, None], lit, sky).reshape(height, width, 3)
-    depth = (distance * rays.reshape(-1, 3)[:, 2]).astype(np.float32)
-    return np.ascontiguousarray(rgb), geom.reshape(height, width), depth.reshape(height, width)
+    sky = street.sky.colour(np.where(valid[..., None], rays, (0.0, 0.0, 1.0)) @ world_from_sensor[:3, :3].T)
+    seen.rgb[valid] = np.where((geom >= 0)[:, None], lit, sky[valid])
+    seen.geom[valid], seen.range_m[valid] = geom, distance
+    seen.normal[valid] = normal @ world_from_sensor[:3, :3]
 
 
-def fire_column(
-    street: Street,
-    data: Any,
-    lidar: LidarModel,
-    world_from_lidar: Float64[np.ndarray, "4 4"],
-    beams: Float64[np.ndarray, "rows 3"],
-) -> tuple[Float64[np.ndarray, " rows"], Float32[np.ndarray, " rows"], Int32[np.ndarray, " rows"]]:
-    """One column of a LiDAR fired at one instant: range (0 where nothing returned), intensity and geom id.
-
-    Intensity is the surface's reflectivity, lowered to a quarter as the beam grazes it.
-    """
-    direction = beams @ world_from_lidar[:3, :3].T
-    geom, distance, normal = cast(street, data, world_from_lidar[:3, 3], direction, lidar.range_m[1])
-    # mj_multiRay leaves out whole geoms by their distance, so a large one still answers beyond the reach.
-    returned = (geom >= 0) & (distance >= lidar.range_m[0]) & (distance <= lidar.range_m[1])
-    facing = np.abs(np.sum(normal * direction, axis=1))
-    intensity = np.where(returned, street.geom_reflectivity[geom] * (0.25 + 0.75 * facing), 0.0)
-    return np.where(returned, distance, 0.0), intensity.astype(np.float32), np.where(returned, geom, -1)
+def reflected(reflectivity: Float64[np.ndarray, "*n"], cosine: Float64[np.ndarray, "*n"]) -> Float32[np.ndarray, "*n"]:
+    """Intensity 0..1 of a laser's echo: the surface's reflectivity, lowered to a quarter as the beam grazes it."""
+    return (reflectivity * (0.25 + 0.75 * np.clip(cosine, 0, 1))).astype(np.float32)

@@ -9,24 +9,33 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, UInt8
+from jaxtyping import Bool, Float64, Int32, UInt8
 
-from nurec_sim.types import CameraModel, Pinhole
+from nurec_sim.types import Pinhole
 from nurec_sim.world.backend import gl_context
 from nurec_sim.world.build import FAR_M, NEAR_M, Street
+from nurec_sim.world.faces import Drawn, Face
 
 SHADOW_RADIUS_M = 28.0
 SHADOW_AHEAD_M = 22.0
 HIDDEN_GROUP = 5
-
-View = tuple[UInt8[np.ndarray, "h w 3"], Int32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]
+SAMPLES = (0, 2, 4)
 
 
 class GlPainter:
-    """Draws a street with MuJoCo's classic renderer. Call ``close`` in the same thread when done."""
+    """Draws a street with MuJoCo's classic renderer. Call ``close`` in the same thread when done.
 
-    def __init__(self, street: Street, backend: str):
+    Args:
+        street: what to draw.
+        backend: ``egl`` or ``osmesa``.
+        samples: colour samples per pixel, 0, 2 or 4: smooth edges against time.
+        shadow_px: side of the shadow map, 0 for no shadows.
+    """
+
+    def __init__(self, street: Street, backend: str, samples: int = 4, shadow_px: int = 2048):
         self.street, self.model = street, street.model
+        quality = self.model.vis.quality
+        quality.offsamples, quality.shadowsize = samples, shadow_px
         self._context = gl_context(backend)
         self._context.make_current()
         self._scene = mujoco.MjvScene(self.model, maxgeom=self.model.ngeom + 50)
@@ -36,6 +45,7 @@ class GlPainter:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gl)
         self._gl.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._groups = self.model.geom_group.copy()
+        self._shadows = shadow_px > 0
 
     def close(self) -> None:
         """Frees the context; nothing can be drawn afterwards."""
@@ -43,66 +53,80 @@ class GlPainter:
         self._gl.free()
         self._context.free()
 
-    def view(self, data: Any, camera: CameraModel, world_from_camera: Float64[np.ndarray, "4 4"]) -> View:
-        """Colours, the geom id of every pixel (-1 sky) and the depth along the optical axis in metres (0 sky)."""
-        width, height = camera.width_px, camera.height_px
+    def draw(self, data: Any, face: Face, world_from_sensor: Float64[np.ndarray, "4 4"], colours: bool = True) -> Drawn:
+        """One face of a sensor, upside down in memory nowhere; without ``colours`` half the work or less."""
+        width, height = face.width_px, face.height_px
         if self._gl.offWidth < width or self._gl.offHeight < height:
             # Drawing past the buffer's edge leaves garbage without any error.
             size = max(width, self._gl.offWidth), max(height, self._gl.offHeight)
             mujoco.mjr_resizeOffscreen(*size, self._gl)
-        self._aim(data, camera, world_from_camera)
-        viewport = mujoco.MjrRect(0, 0, width, height)
-        flags = self._scene.flags
-        flags[mujoco.mjtRndFlag.mjRND_SHADOW] = True
-        flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
-        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
-        rgb = np.empty((height, width, 3), np.uint8)
-        mujoco.mjr_render(viewport, self._scene, self._gl)
-        mujoco.mjr_readPixels(rgb, None, viewport, self._gl)
+        eye, axes = world_from_sensor[:3, 3], world_from_sensor[:3, :3] @ face.sensor_from_face
+        viewport, flags = mujoco.MjrRect(0, 0, width, height), self._scene.flags
+        offset = data.geom_xpos - eye
+        seen = self._in_view(offset @ axes, face)
+        rgb = None
+        if colours:
+            self._gather(data, seen | self._throws_shadows(offset, axes) if self._shadows else seen)
+            self._aim(face, eye, axes)
+            flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._shadows
+            flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
+            flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
+            rgb = np.empty((height, width, 3), np.uint8)
+            mujoco.mjr_render(viewport, self._scene, self._gl)
+            mujoco.mjr_readPixels(rgb, None, viewport, self._gl)
+            rgb = np.ascontiguousarray(rgb[::-1])
+        shown = self._gather(data, seen)
+        self._aim(face, eye, axes)
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
         ids, depth = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.float32)
         mujoco.mjr_render(viewport, self._scene, self._gl)
         mujoco.mjr_readPixels(ids, depth, viewport, self._gl)
-        geom = self._geom_ids(ids)
-        metres = NEAR_M * FAR_M / (NEAR_M + depth.astype(np.float64) * (FAR_M - NEAR_M))
-        metres = np.where(geom < 0, 0.0, metres).astype(np.float32)
-        return np.ascontiguousarray(rgb[::-1]), np.ascontiguousarray(geom[::-1]), np.ascontiguousarray(metres[::-1])
+        geom = np.ascontiguousarray(self._geom_ids(ids, shown)[::-1])
+        # Depth is stored reversed, near / z up to a little, so that it is exact where it matters.
+        nearness = depth[::-1] * np.float32((FAR_M - NEAR_M) / (NEAR_M * FAR_M)) + np.float32(1 / FAR_M)
+        return Drawn(rgb, geom, np.where(geom < 0, np.float32(0), nearness))
 
-    def _aim(self, data: Any, camera: CameraModel, pose: Float64[np.ndarray, "4 4"]) -> None:
-        """Gathers the geoms in view and sets both GL cameras to the pinhole's exact frustum."""
-        lens = camera.lens
-        assert isinstance(lens, Pinhole)
-        self.model.geom_group[:] = np.where(self._in_view(data, camera, pose), self._groups, HIDDEN_GROUP)
+    def _gather(self, data: Any, shown: Bool[np.ndarray, " g"]) -> Bool[np.ndarray, " g"]:
+        """Puts some of the geoms into the scene: the renderer itself culls nothing."""
+        self.model.geom_group[:] = np.where(shown, self._groups, HIDDEN_GROUP)
         mujoco.mjv_updateScene(self.model, data, self._options, None, mujoco.MjvCamera(),
                                mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)  # fmt: skip
         self.model.geom_group[:] = self._groups
-        for eye in self._scene.camera:
-            eye.pos, eye.forward, eye.up = pose[:3, 3], pose[:3, 2], -pose[:3, 1]
-            eye.frustum_near, eye.frustum_far = NEAR_M, FAR_M
-            eye.frustum_width = camera.width_px / lens.fx_px / 2 * NEAR_M
-            eye.frustum_center = (camera.width_px / 2 - lens.cx_px) / lens.fx_px * NEAR_M
-            eye.frustum_top = lens.cy_px / lens.fy_px * NEAR_M
-            eye.frustum_bottom = -(camera.height_px - lens.cy_px) / lens.fy_px * NEAR_M
-        sun = self._scene.lights[[i for i in range(self._scene.nlight) if self._scene.lights[i].castshadow][0]]
-        forward = pose[:3, 2] * [1, 1, 0]
-        middle = pose[:3, 3] + SHADOW_AHEAD_M * forward / (np.linalg.norm(forward) + 1e-9)
-        sun.pos = middle + 120.0 * self.street.sun
+        return shown
 
-    def _in_view(self, data: Any, camera: CameraModel, pose: Float64[np.ndarray, "4 4"]) -> np.ndarray:
-        """Geoms whose bounding sphere meets the frustum, or may throw a shadow into it: the renderer culls nothing."""
-        lens, radius = camera.lens, self.model.geom_rbound
-        assert isinstance(lens, Pinhole)
-        offset = data.geom_xpos - pose[:3, 3]
-        x, y, z = (offset @ pose[:3, :3]).T
-        wide = max(lens.cx_px, camera.width_px - lens.cx_px) / lens.fx_px
-        high = max(lens.cy_px, camera.height_px - lens.cy_px) / lens.fy_px
+    def _aim(self, face: Face, eye: Float64[np.ndarray, " 3"], axes: Float64[np.ndarray, "3 3"]) -> None:
+        """Sets both GL cameras to the exact frustum, and the shadow map to what lies before them."""
+        left, right, top, bottom = _tangents(face.lens, face.width_px, face.height_px)
+        for camera in self._scene.camera:
+            camera.pos, camera.forward, camera.up = eye, axes[:, 2], -axes[:, 1]
+            camera.frustum_near, camera.frustum_far = NEAR_M, FAR_M
+            camera.frustum_width = (right - left) / 2 * NEAR_M
+            camera.frustum_center = (left + right) / 2 * NEAR_M
+            camera.frustum_top, camera.frustum_bottom = -top * NEAR_M, -bottom * NEAR_M
+        middle = _shadow_middle(eye, axes)
+        for light in self._scene.lights[: self._scene.nlight]:
+            if light.castshadow:
+                light.pos = middle + 120.0 * self.street.sun
+
+    def _in_view(self, local: Float64[np.ndarray, "g 3"], face: Face) -> Bool[np.ndarray, " g"]:
+        """Geoms whose bounding sphere meets the frustum; those without a size, as planes, always."""
+        x, y, z = local.T
+        radius = self.model.geom_rbound
+        left, right, top, bottom = _tangents(face.lens, face.width_px, face.height_px)
         seen = z > -radius
-        seen &= np.abs(x) - z * wide < radius * np.hypot(1, wide)
-        seen &= np.abs(y) - z * high < radius * np.hypot(1, high)
-        seen |= np.linalg.norm(offset, axis=1) < SHADOW_RADIUS_M + SHADOW_AHEAD_M + radius
+        for place, tangent, side in ((x, left, -1), (x, right, 1), (y, top, -1), (y, bottom, 1)):
+            seen &= side * (place - z * tangent) < radius * np.hypot(1, tangent)
         return seen | (radius <= 0)
 
-    def _geom_ids(self, colours: UInt8[np.ndarray, "h w 3"]) -> Int32[np.ndarray, "h w"]:
+    def _throws_shadows(
+        self, offset: Float64[np.ndarray, "g 3"], axes: Float64[np.ndarray, "3 3"]
+    ) -> Bool[np.ndarray, " g"]:
+        """Geoms that may stand between the sun and what is shown near by."""
+        apart = offset - _shadow_middle(np.zeros(3), axes)
+        across = apart - np.outer(apart @ self.street.sun, self.street.sun)
+        return np.linalg.norm(across, axis=1) < SHADOW_RADIUS_M * np.sqrt(2) + self.model.geom_rbound
+
+    def _geom_ids(self, colours: UInt8[np.ndarray, "h w 3"], shown: Bool[np.ndarray, " g"]) -> Int32[np.ndarray, "h w"]:
         """Geom ids from the colours of the segmentation pass, which count the geoms of this scene, not the model's."""
         table = np.full(self._scene.ngeom + 2, -1, np.int32)
         for i in range(self._scene.ngeom):
@@ -111,3 +135,14 @@ class GlPainter:
                 table[geom.segid + 1] = geom.objid
         index = colours.astype(np.int32) @ np.array([1, 256, 65536], np.int32)
         return table[np.minimum(index, len(table) - 1)]
+
+
+def _tangents(lens: Pinhole, width: int, height: int) -> tuple[float, float, float, float]:
+    """Left, right, top and bottom edge of an image in the plane z = 1."""
+    return -lens.cx_px / lens.fx_px, (width - lens.cx_px) / lens.fx_px, \
+           -lens.cy_px / lens.fy_px, (height - lens.cy_px) / lens.fy_px  # fmt: skip
+
+
+def _shadow_middle(eye: Float64[np.ndarray, " 3"], axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 3"]:
+    forward = axes[:, 2] * [1, 1, 0]
+    return eye + SHADOW_AHEAD_M * forward / (np.linalg.norm(forward) + 1e-9)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nurec_sim import geometry
-from nurec_sim.types import CameraModel, LidarModel, Pinhole, Rig, Spin
+from nurec_sim.types import CameraModel, LidarModel, Matrix4, Pinhole, Rig, Spin
 
 CAMERAS = {  # yaw (deg), horizontal field of view (deg), position in the rig (m)
     "camera_front": (0.0, 82.0, (1.75, 0.0, 1.45)),
@@ -34,18 +34,22 @@ def street_rig(width_px: int = 448, height_px: int = 256, lidar_rows: int = 48, 
         lens = Pinhole(focal, focal, width_px / 2, 0.44 * height_px)
         rotation = geometry.rotation_from_yaw(np.deg2rad(yaw_deg)) @ CAMERA_FROM_RIG_AXES
         cameras[name] = CameraModel(name, width_px, height_px, lens, geometry.pose(rotation, np.array(place)))
-    # Rows lie closest around the horizon, where the street is far, and reach up to the roofs.
-    steep, high = lidar_rows // 3, lidar_rows // 5
-    bands = ((-26.0, -9.0, steep), (-9.0, 6.0, lidar_rows - steep - high), (6.0, 21.0, high))
+    mount = geometry.pose(np.eye(3), np.array([1.1, 0.0, 1.9]))
+    return Rig(cameras, {LIDAR_ID: dense_near_horizon(lidar_rows, lidar_columns, mount)})
+
+
+def dense_near_horizon(rows: int, columns: int, rig_from_lidar: Matrix4) -> LidarModel:
+    """A clockwise LiDAR whose rows lie closest around the horizon, where the street is far, and reach up to roofs."""
+    steep, high = rows // 3, rows // 5
+    bands = ((-26.0, -9.0, steep), (-9.0, 6.0, rows - steep - high), (6.0, 21.0, high))
     elevation_deg = np.concatenate([np.linspace(low, top, count, endpoint=False) for low, top, count in bands])
-    lidar = LidarModel(
+    return LidarModel(
         id=LIDAR_ID,
         elevation_rad=np.deg2rad(elevation_deg[::-1]),
-        azimuth_rad=np.pi - 2 * np.pi * (np.arange(lidar_columns) + 0.5) / lidar_columns,
-        row_azimuth_offset_rad=np.zeros(lidar_rows),
-        rig_from_lidar=geometry.pose(np.eye(3), np.array([1.1, 0.0, 1.9])),
+        azimuth_rad=np.pi - 2 * np.pi * (np.arange(columns) + 0.5) / columns,
+        row_azimuth_offset_rad=np.zeros(rows),
+        rig_from_lidar=rig_from_lidar,
         spin=Spin.CLOCKWISE,
         frequency_hz=10.0,
         range_m=(0.8, 120.0),
     )
-    return Rig(cameras, {LIDAR_ID: lidar})

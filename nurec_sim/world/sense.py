@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
+from zlib import crc32
 
-import mujoco
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, UInt8
+from jaxtyping import Float32, Int32, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError, TooLargeError
-from nurec_sim.types import (
-    CameraFrame,
-    CameraModel,
-    LidarFrame,
-    LidarModel,
-    Pinhole,
-    SensorFrame,
-    SensorRequest,
-    Shutter,
-)
-from nurec_sim.world import rays
+from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, LidarModel, SensorFrame, SensorRequest
+from nurec_sim.world import scan
 from nurec_sim.world.backend import pick_backend
-from nurec_sim.world.build import ActorPlaces, Street, build_street
+from nurec_sim.world.build import Street, build_street
+from nurec_sim.world.isp import CameraResponse, apply_response
 from nurec_sim.world.plan import StreetPlan
-from nurec_sim.world.surface import LABEL_OF_CLASS, SurfaceClass
+from nurec_sim.world.scan import LidarResponse, TrueScan
+from nurec_sim.world.stage import Quality, Stage, named
+from nurec_sim.world.surface import LABEL_OF_CLASS
 
 MAX_SIDE_PX = 4096
 T = TypeVar("T")
@@ -36,47 +30,64 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class TrueView:
-    """An image with its ground truth. ``instance`` is 0 for static surfaces and i + 1 for actor i of the plan."""
+    """An image with its ground truth. Pixels outside of the lens are black sky, and everything else is zero there.
+
+    Args:
+        rgb: colours, as the camera's ``CameraResponse`` makes them.
+        depth_m: distance of the surface along the optical axis, 0 for the sky and for what lies behind the camera
+            (lenses of more than 180 degrees).
+        surface: ``SurfaceClass``.
+        instance: 0 for static surfaces, i + 1 for actor i of the plan.
+        normal: unit normal of the surface in the camera frame, towards the camera; zero where none is known.
+        range_m: distance of the surface from the camera, 0 for the sky.
+    """
 
     rgb: UInt8[np.ndarray, "h w 3"]
     depth_m: Float32[np.ndarray, "h w"]
     surface: UInt8[np.ndarray, "h w"]
     instance: Int32[np.ndarray, "h w"]
-
-
-@dataclass(frozen=True)
-class TrueScan:
-    """A LiDAR turn as measured, ``[rows, columns]``: range (0 no return), intensity 0..1, class and instance."""
-
-    range_m: Float64[np.ndarray, "r c"]
-    intensity: Float32[np.ndarray, "r c"]
-    surface: UInt8[np.ndarray, "r c"]
-    instance: Int32[np.ndarray, "r c"]
+    normal: Float32[np.ndarray, "h w 3"]
+    range_m: Float32[np.ndarray, "h w"]
 
 
 class TrueWorld:
     """A street that answers sensor requests for any pose and any place of its actors.
 
-    All of MuJoCo and OpenGL runs in one thread of its own, because a GL context belongs to its thread; ``sense`` may
-    be called from any thread. Use it as a context manager or call ``close``.
+    Cameras may have any lens, windshield and shutter. All of MuJoCo and OpenGL runs in one thread of its own, because
+    a GL context belongs to its thread; ``sense`` may be called from any thread. Use it as a context manager or call
+    ``close``.
 
     Args:
         plan: the street.
         backend: ``egl``, ``osmesa`` or ``rays``; None picks the first that works (``backend.pick_backend``).
+        responses: how cameras turn light into pixels and which echoes LiDARs lose, by sensor id; others are ideal.
+            Noise depends on the plan's seed, the sensor's id and the time only.
+        quality: how images are drawn.
     """
 
-    def __init__(self, plan: StreetPlan, backend: str | None = None):
+    def __init__(
+        self,
+        plan: StreetPlan,
+        backend: str | None = None,
+        responses: Mapping[str, CameraResponse | LidarResponse] | None = None,
+        quality: Quality = Quality(),  # noqa: B008  (frozen)
+    ):
         self.plan = plan
         self.backend = pick_backend(backend)
+        self._responses, self._quality = dict(responses or {}), quality
         self._recorded = {track.id: track.path for track in plan.tracks()}
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="street")
-        self._painter: Any = None
         self._closed = False
         try:
-            self.street: Street = self._run(self._start)
+            self._stage: Stage = self._run(self._start)
         except BaseException:
             self._thread.shutdown()
             raise
+
+    @property
+    def street(self) -> Street:
+        """The compiled model; only to look things up in it."""
+        return self._stage.street
 
     def __enter__(self) -> TrueWorld:
         return self
@@ -87,7 +98,7 @@ class TrueWorld:
     def close(self) -> None:
         """Frees the GL context and the thread; may be called again."""
         if not self._closed:
-            self._run(self._stop)
+            self._run(self._stage.close)
             self._closed = True
             self._thread.shutdown()
 
@@ -119,72 +130,43 @@ class TrueWorld:
             raise RuntimeError("this street is closed; make a new TrueWorld")
         return self._thread.submit(work).result()
 
-    def _start(self) -> Street:
-        street = build_street(self.plan)
-        self._data = mujoco.MjData(street.model)
-        start_us = self.plan.span_us[0]
-        actors = {name: path.at(start_us)[None] for name, path in self._recorded.items()}
-        street.pose(self._data, start_us, street.actor_places(actors, 1))
-        if self.backend != "rays":
-            from nurec_sim.world.render import GlPainter
-
-            self._painter = GlPainter(street, self.backend)
-        return street
-
-    def _stop(self) -> None:
-        if self._painter is not None:
-            self._painter.close()
-            self._painter = None
-
-    def _places(self, request: SensorRequest, fractions: Float64[np.ndarray, " n"]) -> ActorPlaces:
-        """All actors at fractions of the request's time: as asked for, else as recorded."""
-        times = request.start_us + np.rint(fractions * (request.end_us - request.start_us)).astype(np.int64)
-        actors = {name: path.at(times) for name, path in self._recorded.items() if name not in request.actors}
-        for name, pair in request.actors.items():
-            actors[name] = geometry.interpolate_pose_pair(np.asarray(pair, np.float64), fractions)
-        return self.street.actor_places(actors, len(fractions))
+    def _start(self) -> Stage:
+        return Stage(build_street(self.plan), self._recorded, self.backend, self._quality)
 
     def _view(self, request: SensorRequest) -> TrueView:
         camera = request.sensor
         if not isinstance(camera, CameraModel):
             raise RequestError(f"a view needs a camera, and {camera.id!r} is none")
-        self.street.pose(self._data, request.start_us, self._places(request, np.zeros(1)))
-        pose = np.asarray(request.world_from_sensor, np.float64)[0]
-        if self._painter is not None:
-            rgb, geom, depth = self._painter.view(self._data, camera, pose)
-        else:
-            rgb, geom, depth = rays.view(self.street, self._data, camera, pose)
-        return TrueView(rgb, depth, *self._named(geom))
-
-    def _named(self, geom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Class and instance of geom ids, where -1 is the sky."""
-        sky = geom < 0
-        surface = np.where(sky, np.uint8(SurfaceClass.SKY), self.street.geom_class[geom])
-        return surface, np.where(sky, np.int32(0), self.street.geom_instance[geom])
+        seen = self._stage.see(request, camera)
+        forward = sensors.pixel_rays(camera)[0][..., 2]
+        depth = np.where(seen.range_m > 0, np.maximum(seen.range_m * forward, 0), 0).astype(np.float32)
+        rgb, response = seen.rgb, self._responses.get(camera.id)
+        if isinstance(response, CameraResponse):
+            rgb = apply_response(rgb, response, self._seed(request))
+        return TrueView(rgb, depth, *named(self.street, seen.geom), seen.normal, seen.range_m)
 
     def _scan(self, request: SensorRequest) -> TrueScan:
         lidar = request.sensor
         if not isinstance(lidar, LidarModel):
             raise RequestError(f"a scan needs a LiDAR, and {lidar.id!r} is none")
-        beams, fractions = sensors.beam_directions(lidar), sensors.column_fraction(lidar)
-        poses = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), fractions)
-        shape = beams.shape[:2]
-        range_m, intensity, geom = np.zeros(shape), np.zeros(shape, np.float32), np.zeros(shape, np.int32)
-        places, span_us = self._places(request, fractions), request.end_us - request.start_us
-        for column, fraction in enumerate(fractions):
-            self.street.pose(self._data, request.start_us + fraction * span_us, places, column)
-            range_m[:, column], intensity[:, column], geom[:, column] = rays.fire_column(
-                self.street, self._data, lidar, poses[column], beams[:, column]
-            )
-        return TrueScan(range_m, intensity, *self._named(geom))
+        drawn = self._quality.lidar == "drawn" and self.backend != "rays"
+        turn = (scan.drawn_turn if drawn else scan.cast_turn)(self._stage, request, lidar)
+        response = self._responses.get(lidar.id)
+        if isinstance(response, LidarResponse):
+            return scan.measure(self.street, lidar, turn, response, self._seed(request))
+        return scan.measure(self.street, lidar, turn)
+
+    def _seed(self, request: SensorRequest) -> tuple[int, ...]:
+        return self.plan.seed, crc32(request.sensor.id.encode()), request.start_us
 
     def _frame(self, request: SensorRequest) -> SensorFrame:
         if isinstance(request.sensor, LidarModel):
             return _lidar_frame(request, request.sensor, self._scan(request))
         view = self._view(request)
-        alpha = (view.surface != SurfaceClass.SKY).astype(np.float32)
+        alpha = (view.range_m > 0).astype(np.float32)
+        normal = _in_world(view.normal, request, request.sensor)
         return CameraFrame(request.sensor, request.start_us, request.end_us, view.rgb, view.depth_m, alpha,
-                           LABEL_OF_CLASS[view.surface])  # fmt: skip
+                           LABEL_OF_CLASS[view.surface], normal)  # fmt: skip
 
     # ------------------------------------------------------------------------------------------------- checking
 
@@ -201,21 +183,30 @@ class TrueWorld:
             actor = np.asarray(actor)
             if actor.shape != (2, 4, 4) or not all(geometry.is_rotation(pose[:3, :3]) for pose in actor):
                 raise RequestError(f"actor {name!r}: world_from_box must be two poses [2,4,4] with rotations")
-        if isinstance(sensor, LidarModel):
-            return
-        if not isinstance(sensor.lens, Pinhole) or sensor.lens.distorted or sensor.windshield is not None:
-            raise RequestError(
-                f"camera {sensor.id!r}: the street draws pinhole cameras without distortion or windshield only, "
-                f"got {type(sensor.lens).__name__}"
-            )
-        if sensor.shutter is not Shutter.GLOBAL:
-            raise RequestError(
-                f"camera {sensor.id!r}: the street draws global shutters only, got {sensor.shutter.value}"
-            )
+        try:
+            if isinstance(sensor, LidarModel):
+                sensors.check_lidar(sensor)
+                return
+            sensors.check_camera(sensor)
+        except ValueError as error:
+            raise RequestError(str(error)) from None
         if max(sensor.width_px, sensor.height_px) > MAX_SIDE_PX:
             raise TooLargeError(
                 f"camera {sensor.id!r}: {sensor.width_px} x {sensor.height_px} pixels; at most {MAX_SIDE_PX} a side"
             )
+
+
+def _in_world(
+    normal: Float32[np.ndarray, "h w 3"], request: SensorRequest, camera: CameraModel
+) -> Float32[np.ndarray, "h w 3"]:
+    """Normals of a camera that turns during its exposure, line by line in the world's axes."""
+    pair = np.asarray(request.world_from_sensor, np.float64)
+    height, width = normal.shape[:2]
+    rows, columns = np.mgrid[0:height, 0:width]
+    lines = sensors.shutter_fraction(camera, np.stack([columns.ravel(), rows.ravel()], axis=1))
+    fractions, index = np.unique(lines, return_inverse=True)
+    turns = geometry.interpolate_pose_pair(pair, fractions)[:, :3, :3].astype(np.float32)
+    return np.einsum("hwij,hwj->hwi", turns[index.reshape(height, width)], normal)
 
 
 def measured_points(

@@ -1,4 +1,4 @@
-"""What a surface of the street is: its class, what policies call it, and how well it reflects a laser."""
+"""What a surface of the world is: its class, what policies call it, and how well it reflects a laser."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from nurec_sim.types import Label
 
 
 class SurfaceClass(enum.IntEnum):
-    """Class of a pixel or a LiDAR return in the street's ground truth."""
+    """Class of a pixel or a LiDAR return in the ground truth."""
 
     SKY = 0
     ROAD = 1
@@ -23,6 +23,11 @@ class SurfaceClass(enum.IntEnum):
     POLE = 8
     VEHICLE = 9
     PERSON = 10
+    CYCLIST = 11
+    FENCE = 12
+    FURNITURE = 13
+    SIGN = 14
+    ISLAND = 15
 
 
 REFLECTIVITY = {
@@ -37,10 +42,15 @@ REFLECTIVITY = {
     SurfaceClass.POLE: 0.40,
     SurfaceClass.VEHICLE: 0.45,
     SurfaceClass.PERSON: 0.30,
+    SurfaceClass.CYCLIST: 0.32,
+    SurfaceClass.FENCE: 0.35,
+    SurfaceClass.FURNITURE: 0.35,
+    SurfaceClass.SIGN: 0.90,
+    SurfaceClass.ISLAND: 0.30,
 }
 
 LABEL_OF_CLASS = np.full(len(SurfaceClass), Label.OTHER, np.uint8)
 LABEL_OF_CLASS[SurfaceClass.SKY] = Label.SKY
 LABEL_OF_CLASS[[SurfaceClass.ROAD, SurfaceClass.MARKING]] = Label.ROAD
-LABEL_OF_CLASS[[SurfaceClass.VEHICLE, SurfaceClass.PERSON]] = Label.MOVABLE
+LABEL_OF_CLASS[[SurfaceClass.VEHICLE, SurfaceClass.PERSON, SurfaceClass.CYCLIST]] = Label.MOVABLE
 """``types.Label`` of every ``SurfaceClass``."""

@@ -28,6 +28,19 @@ def _image(values: np.ndarray, colour: tuple[float, ...] | None = None) -> Image
     return np.ascontiguousarray(np.clip(values, 0, 255).astype(np.uint8))
 
 
+def grain(rng: np.random.Generator, size: int, sigma_px: float) -> np.ndarray:
+    """Tileable blurred white noise ``[size, size]`` of unit variance."""
+    margin = int(np.ceil(4 * sigma_px))
+    white = np.pad(rng.standard_normal((size, size), np.float32), margin, mode="wrap")
+    blurred = cv2.GaussianBlur(white, (0, 0), sigma_px)[margin:-margin, margin:-margin]
+    return blurred / float(blurred.std())
+
+
+def as_image(values: np.ndarray, colour: tuple[float, ...] | None = None) -> Image:
+    """A uint8 image of ``values [h,w]`` times a colour, or of ``values [h,w,3]``."""
+    return _image(values, colour)
+
+
 def asphalt(rng: np.random.Generator, size: int = 1024) -> Image:
     """Grey with grain, cracks, repair patches and stains."""
     base = 88.0

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from nurec_sim import geometry
@@ -112,8 +112,12 @@ def _context_images(clip: Clip, view: _View, window: ChunkWindow) -> list[Contex
 
 
 def _fractions(images: Sequence[ContextImage], window: ChunkWindow) -> Float64[np.ndarray, "v 3"]:
-    """Time of each image and its two targets as fractions of the chunk; differences are taken in integers."""
-    times = np.array([(image.centre_t_us, *image.target_t_us) for image in images], np.int64)
+    """Time of each image and its two targets as fractions of the chunk."""
+    return span_fractions(np.array([(image.centre_t_us, *image.target_t_us) for image in images], np.int64), window)
+
+
+def span_fractions(times: Int64[np.ndarray, "*n"], window: ChunkWindow) -> Float64[np.ndarray, "*n"]:
+    """Times as fractions of the chunk, which may lie outside of 0..1; differences are taken in integers."""
     length = window.span_us[1] - window.span_us[0]
     if all(len(frames) == 1 for frames in window.frames.values()):
         # One exposure has no length to speak of: targets half a second away would lie far outside of it.

@@ -1,0 +1,192 @@
+"""The verb that measures reconstructions: evaluate, on one log or by a protocol."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from nurec_sim.cli.console import app, out, print_table, progress
+from nurec_sim.cli.scenes import NO_FLAGS, Method, NetworkFlags, network_settings
+from nurec_sim.errors import NurecSimError
+from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
+
+ProtocolName = Literal["storm", "clip", "shift"]
+Compared = Literal["dense", "selective", "dense-concatenated", "lift", "copy"]
+USUAL_METHODS: dict[str, tuple[Compared, ...]] = {
+    "storm": ("dense", "selective", "lift", "copy"),
+    "clip": ("dense", "dense-concatenated", "lift", "copy"),
+    "shift": ("dense", "selective", "lift", "copy"),
+}
+USUAL_WORLDS = {"storm": 12, "clip": 3, "shift": 6}
+
+
+@dataclass(frozen=True)
+class LogFlags:
+    """One log, cameras and sweeps held out (without --protocol)."""
+
+    method: Method = "lift"
+    """How to reconstruct."""
+    input_cameras: tuple[str, ...] = ()
+    """Cameras that the reconstruction may see; all if not given."""
+    target_cameras: tuple[str, ...] = ()
+    """Cameras to compare with; the input cameras if not given."""
+    hold_out_sweeps: int = 0
+    """Leave out every so-manieth sweep and simulate it; 0 leaves out none."""
+    local: bool = False
+    """Render in this process instead of through gRPC."""
+    images: Path | None = None
+    """Also write rendered and recorded images side by side into this folder."""
+    json: Path | None = None
+    """Write all figures here."""
+
+
+@dataclass(frozen=True)
+class ProtocolFlags:
+    """Methods side by side, on worlds that training never sees or on logs (with --protocol)."""
+
+    methods: tuple[Compared, ...] = ()
+    """What to compare; what the protocol is about if not given."""
+    worlds: int | None = None
+    """How many drawn worlds; 12 for storm, 3 for clip, 6 for shift if not given."""
+    seed: int = 0
+    """Seed of the first drawn world; the others count on from it."""
+    clips: tuple[Path, ...] = ()
+    """Recorded logs instead of drawn worlds."""
+    boxes: bool = False
+    """Give the log's boxes of things that can move to the methods; the paper's network has none."""
+    seconds: float = 10.0
+    """Length of a clip, 2 to 18."""
+    hold_out_every: int = 2
+    """Which frames of a clip are held out: every so-manieth."""
+    clip_cameras: Literal[1, 3] = 3
+    """Cameras of a clip."""
+    selective_checkpoint: Path | None = None
+    """Weights of `selective`; --checkpoint is for `dense`."""
+    out: Path = Path("evaluations")
+    """Folder that collects run folders."""
+    resume: Path | None = None
+    """Go on with this run folder; finished windows are kept."""
+
+
+LogGroup = Annotated[LogFlags, tyro.conf.arg(name="")]
+ProtocolGroup = Annotated[ProtocolFlags, tyro.conf.arg(name="")]
+NO_LOG_FLAGS, NO_PROTOCOL_FLAGS = LogFlags(), ProtocolFlags()
+
+
+@app.command
+def evaluate(
+    clip: Annotated[Path | None, tyro.conf.Positional] = None,
+    *,
+    protocol: ProtocolName | None = None,
+    log: LogGroup = NO_LOG_FLAGS,
+    side_by_side: ProtocolGroup = NO_PROTOCOL_FLAGS,
+    network: NetworkFlags = NO_FLAGS,
+) -> None:
+    """Measure reconstructions: of one log, or methods side by side by a protocol (docs/evaluation.md).
+
+    `evaluate CLIP` compares with what the log recorded: images of other cameras, LiDAR sweeps left out.
+    `evaluate --protocol NAME` prints the paper's tables: `storm` is 2 s with four seen frames (Table 1), `clip` a whole
+    log through the chunked pipeline (Table 2), `shift` views beside the driven path. evaluations/latest holds tables,
+    contact sheets and report.html.
+
+    Args:
+        clip: a clip folder, or a .zip of one.
+        protocol: how to compare methods.
+        log: how to measure one log.
+        side_by_side: what to compare on what.
+        network: how logs go through the network (`nurec-sim reconstruct --help` says more).
+    """
+    if protocol is None:
+        _refuse(given(side_by_side, NO_PROTOCOL_FLAGS), "without --protocol")
+        if clip is None:
+            raise NurecSimError("nothing to evaluate: give a clip, or --protocol storm, clip or shift")
+        evaluate_log(clip, log, network)
+        return
+    _refuse(given(log, NO_LOG_FLAGS), "with --protocol")
+    if clip is not None:
+        raise NurecSimError(f"with --protocol, logs are given by --clips {clip}")
+    evaluate_protocol(protocol, side_by_side, network)
+
+
+def given(flags: Any, usual: Any) -> list[str]:
+    """Names of the flags that were changed."""
+    names = [field.name for field in dataclasses.fields(flags)]
+    return ["--" + name.replace("_", "-") for name in names if getattr(flags, name) != getattr(usual, name)]
+
+
+def _refuse(names: list[str], where: str) -> None:
+    if names:
+        raise NurecSimError(f"{', '.join(names)} cannot be used {where}")
+
+
+def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> None:
+    """Measure one method on one log."""
+    from nurec_sim import logs
+    from nurec_sim.evaluate import evaluate as run_evaluation
+
+    log = logs.open_clip(path)
+    with progress("evaluating") as advance:
+        figures = run_evaluation(
+            log,
+            flags.method,
+            input_cameras=flags.input_cameras or None,
+            target_cameras=flags.target_cameras or None,
+            hold_out_every=flags.hold_out_sweeps,
+            via_grpc=not flags.local,
+            images_dir=flags.images,
+            progress=advance,
+            settings=network_settings(flags.method, network),
+        )
+    if flags.json is not None:
+        flags.json.write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
+    print_table(f"{flags.method} on {log.id}", flatten(figures))
+
+
+def evaluate_protocol(name: ProtocolName, flags: ProtocolFlags, network: FeedForwardSettings) -> None:
+    """Compare methods side by side, print the tables and keep everything in a run folder."""
+    if flags.clips and (flags.worlds is not None or flags.seed):
+        raise NurecSimError("--worlds and --seed are for drawn worlds, --clips for recorded logs; give one of the two")
+    from nurec_sim.evaluate import Protocol, contenders, run_protocol
+    from nurec_sim.evaluate.run import settings_of
+    from nurec_sim.evaluate.tables import tables
+    from nurec_sim.runs.folder import existing_run_folder, new_run_folder
+
+    started = time.monotonic()
+    worlds = USUAL_WORLDS[name] if flags.worlds is None else flags.worlds
+    protocol = Protocol(
+        name,
+        () if flags.clips else tuple(range(flags.seed, flags.seed + worlds)),
+        tuple(path.resolve() for path in flags.clips),
+        boxes=flags.boxes,
+        seconds=flags.seconds,
+        hold_out_every=flags.hold_out_every,
+        cameras=flags.clip_cameras,
+    )
+    methods = contenders(flags.methods or USUAL_METHODS[name], network, flags.selective_checkpoint)
+    settings_of(protocol, methods)  # what is missing is said before a folder is made
+    stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
+    folder = new_run_folder(flags.out, stamp) if flags.resume is None else existing_run_folder(flags.resume)
+    with progress("evaluating") as advance:
+        results = run_protocol(protocol, methods, folder, advance)
+    for table in tables(results):
+        print_table(table.title, table.rows, table.heading)
+        if table.note:
+            out.print(table.note, style="dim", markup=False)
+    out.print(f"{time.monotonic() - started:.0f} s. Report: {folder / 'report.html'}", soft_wrap=True)
+
+
+def flatten(figures: dict, prefix: str = "") -> list[tuple[str, str]]:
+    """Nested figures as dotted rows; lists stay in the JSON file."""
+    rows: list[tuple[str, str]] = []
+    for key, value in figures.items():
+        if isinstance(value, dict):
+            rows += flatten(value, f"{prefix}{key}.")
+        elif not isinstance(value, list):
+            rows.append((prefix + key, f"{value:.4g}" if isinstance(value, float) else str(value)))
+    return rows

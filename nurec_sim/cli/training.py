@@ -1,0 +1,60 @@
+"""The verb that trains the network in the true world."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from nurec_sim.cli.console import OnePath, app, err, out, progress
+from nurec_sim.errors import TrainingError
+
+
+@app.command
+def train(
+    recipe: OnePath,
+    *,
+    out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+    clips: Path = Path("runs/clips"),
+    drawers: int = 1,
+    loaders: int = 1,
+    threads: int | None = None,
+    until: int | None = None,
+) -> None:
+    """Train the network in towns that are drawn meanwhile, as a recipe says (docs/training.md).
+
+    Writes curves, sample renders, checkpoints and weights to the run folder. The same command again goes on where the
+    run was cut off. For several processes or GPUs: `torchrun --nproc-per-node N -m nurec_sim.cli train RECIPE`.
+
+    Args:
+        recipe: a YAML file such as nurec_sim/training/recipes/tiny.yaml.
+        out_path: the run folder; runs/train/NAME-OF-THE-RECIPE if not given.
+        clips: folder for the clips that are drawn, which may hold those of other runs too.
+        drawers: processes that draw clips; 0 uses those that are there.
+        loaders: processes that prepare samples; 0 is a thread of the training process.
+        threads: of torch and of the renderer; all cores if not given.
+        until: stop after so many steps, counted from the beginning of the recipe.
+    """
+    import torch
+
+    from nurec_sim.training.config import read_config
+    from nurec_sim.training.perceptual import perceptual_distance
+    from nurec_sim.training.processes import Processes
+    from nurec_sim.training.samples import TownSamples
+    from nurec_sim.training.trainer import WEIGHTS, Trainer
+
+    if min(drawers, loaders) < 0 or (threads is not None and threads < 1):
+        raise TrainingError(f"drawers and loaders must be 0 or more and threads 1 or more, got {drawers}, {loaders}, {threads}")
+    config = read_config(recipe)
+    folder = out_path or Path("runs/train") / recipe.stem
+    if threads is not None:
+        torch.set_num_threads(threads)
+    processes = Processes.from_torchrun()
+    tell = lambda line: err.print(line, markup=False, highlight=False, soft_wrap=True)  # noqa: E731
+    try:
+        with TownSamples(config, clips, drawers, loaders, processes, tell) as samples, progress("training") as advance:
+            Trainer(config, folder, samples, perceptual_distance, processes, threads).run(advance, until)
+    finally:
+        processes.leave()
+    out.print(f"wrote {folder / WEIGHTS}", soft_wrap=True)

@@ -1,0 +1,161 @@
+"""The methods that are compared: each turns a log into something that shows views."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nurec_sim.errors import ReconstructError
+from nurec_sim.evaluate.windows import Window
+from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings
+from nurec_sim.types import CameraFrame, CameraModel, Clip, SensorRequest
+
+Show = Callable[[SensorRequest], CameraFrame]
+"""Answers a request for a camera image; without ``depth_m`` where a method knows none."""
+
+CHOICES: Mapping[str, str] = {
+    "dense": "the network, one Gaussian per pixel",
+    "selective": "the network, clusters around chosen points",
+    "dense-concatenated": "dense, all Gaussians of all chunks kept instead of merged by ownership",
+    "lift": "coloured LiDAR and stereo, no learning; the only one that sees LiDAR",
+    "copy": "the input image nearest in time, as it is; knows no depth",
+}
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method under the name that tables call it; ``settings`` are those of ``reconstruct``, None for a copy."""
+
+    name: str
+    method: str
+    settings: FeedForwardSettings | LiftSettings | None = None
+
+
+@dataclass(frozen=True)
+class Built:
+    """What a method made of a log: views on demand, how many Gaussians, and the seconds it took to make."""
+
+    show: Show
+    gaussians: int | None
+    seconds: float
+    unknown: tuple[str, ...] = ()
+
+
+def contenders(
+    names: Sequence[str],
+    network: FeedForwardSettings | None = None,
+    selective_checkpoint: Path | None = None,
+    lift: LiftSettings | None = None,
+) -> tuple[Contender, ...]:
+    """The methods of these names (``CHOICES``).
+
+    Args:
+        names: in the order of the tables; none twice.
+        network: how logs go through the network; its profile and checkpoint are those of ``dense`` unless the profile
+            is a selective one. Both network methods share the rest.
+        selective_checkpoint: weights of ``selective``, its own if None.
+        lift: settings of ``lift``.
+
+    Raises:
+        ReconstructError: an unknown name, one given twice, or none.
+    """
+    unknown = [name for name in names if name not in CHOICES]
+    if unknown or not names or len(set(names)) < len(names):
+        raise ReconstructError(f"methods must be some of {list(CHOICES)}, each once; got {list(names)}")
+    settings = network or FeedForwardSettings()
+    return tuple(_contender(name, settings, selective_checkpoint, lift or LiftSettings()) for name in names)
+
+
+def _contender(name: str, network: FeedForwardSettings, selective: Path | None, lift: LiftSettings) -> Contender:
+    if name == "copy":
+        return Contender(name, "copy")
+    if name == "lift":
+        return Contender(name, "lift", lift)
+    method = "selective" if name == "selective" else "dense"
+    if name == "dense-concatenated":
+        network = dataclasses.replace(network, merge="concatenate")
+    fits = network.profile is None or _decoder(network.profile) == method
+    if method == "selective":
+        network = dataclasses.replace(network, checkpoint=selective)
+    return Contender(name, method, network if fits else dataclasses.replace(network, profile=None))
+
+
+def _decoder(profile: str) -> str:
+    from nurec_sim.network import PROFILES
+
+    if profile not in PROFILES:
+        raise ReconstructError(f"no network profile {profile!r}; have {list(PROFILES)}")
+    return PROFILES[profile].decoder
+
+
+def describe(contender: Contender) -> dict[str, Any]:
+    """Everything that a method's results depend on, as plain JSON; files by the digest of their bytes.
+
+    Raises:
+        WeightsError: the network's weights are not there.
+    """
+    said: dict[str, Any] = {"method": contender.method}
+    settings = contender.settings
+    if settings is None:
+        return said
+    values = dataclasses.asdict(settings)
+    if isinstance(settings, FeedForwardSettings):
+        from nurec_sim.network.download import find_weights, sha256
+        from nurec_sim.reconstruct.feedforward.method import profile_name
+
+        profile = values["profile"] = profile_name(contender.method, settings.profile)
+        values["ego_masks"] = None if settings.ego_masks is None else str(settings.ego_masks)
+        values["checkpoint"] = None
+        if settings.random_weights is None:
+            values["checkpoint"] = sha256(find_weights(profile, settings.checkpoint))
+    return said | {"settings": values}
+
+
+def build(contender: Contender, window: Window) -> Built:
+    """Let a method see a window's log.
+
+    Raises:
+        ReconstructError: the log lacks what the method needs.
+        WeightsError: the network's weights are not there or cannot be used.
+    """
+    if contender.method == "copy":
+        return Built(lambda request: _nearest(window.clip, request), None, 0.0)
+    from nurec_sim.reconstruct import reconstruct
+    from nurec_sim.render.renderer import Renderer
+
+    _look(window, sweeps=contender.method == "lift")
+    started = time.perf_counter()
+    scene = reconstruct(window.clip, contender.method, cameras=window.cameras, settings=contender.settings)
+    renderer, spent = Renderer(scene), time.perf_counter() - started
+    return Built(
+        lambda request: renderer.render_camera(request, ("rgb", "depth")),
+        len(scene.static) + len(scene.dynamic),
+        spent,
+        tuple(scene.provenance.get("unknown", ())),
+    )
+
+
+def _look(window: Window, sweeps: bool) -> None:
+    """Ask for all that a method reads, so that drawing it is not counted as the method's time."""
+    clip = window.clip
+    for camera in window.cameras:
+        for index in range(len(clip.camera_times_us(camera))):
+            clip.image(camera, index)
+    for lidar in clip.rig.lidars if sweeps else ():
+        for index in range(len(clip.sweep_times_us(lidar))):
+            clip.sweep(lidar, index)
+
+
+def _nearest(clip: Clip, request: SensorRequest) -> CameraFrame:
+    """The frame of the requested camera that was taken nearest in time."""
+    camera = request.sensor
+    assert isinstance(camera, CameraModel)
+    middle = clip.camera_times_us(camera.id).sum(axis=1) // 2
+    index = int(np.argmin(np.abs(middle - (request.start_us + request.end_us) // 2)))
+    return CameraFrame(camera, request.start_us, request.end_us, clip.image(camera.id, index))

@@ -1,0 +1,123 @@
+"""The report of an evaluation: one HTML file with tables, curves and contact sheets that needs no network."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from nurec_sim.errors import RunError
+from nurec_sim.evaluate.methods import CHOICES
+from nurec_sim.evaluate.tables import Table
+from nurec_sim.report.figure import base_layout, plain
+from nurec_sim.report.template import SCRIPT, STYLE
+
+JPEG_QUALITY = 88
+TITLES = {
+    "storm": "2 s windows, four seen frames",
+    "clip": "Whole clips through the chunked pipeline",
+    "shift": "Views beside the driven path",
+}
+CURVES = {"psnr_db": "PSNR (dB)", "abs_rel": "AbsRel (aligned)", "abs_rel_metric": "AbsRel (metres)"}
+COLOURS = ("#1d4ed8", "#b45309", "#15803d", "#7e22ce", "#64748b")
+MORE_STYLE = "img { max-width:100%; border-radius:6px; display:block; } .plots { display:grid; gap:16px; }"
+
+
+def render_page(results: Mapping[str, Any], tables: Sequence[Table], sheets: Sequence[Path]) -> str:
+    """The report as HTML; the same results give the same text."""
+    protocol = results["protocol"]
+    figures = _curves(results["summary"]["methods"])
+    script = ""
+    if figures:
+        from plotly.offline import get_plotlyjs
+
+        stored = json.dumps({"figures": figures, "images": {}}, separators=(",", ":")).replace("<", "\\u003c")
+        script = (
+            f'<script type="application/json" id="figures">{stored}</script>\n'
+            f"<script>{get_plotlyjs()}</script>\n<script>{SCRIPT}</script>"
+        )
+    body = [
+        f"<h1>Evaluation: protocol {escape(protocol['name'])}</h1>",
+        f'<p class="soft">{escape(TITLES[protocol["name"]])} · {len(results["windows"])} windows · '
+        f"nurec_sim {escape(results['version'])}</p>",
+        '<div class="card"><div class="plots">'
+        + "".join(f'<div class="plot" id="{n}"></div>' for n in figures)
+        + "</div></div>"
+        if figures
+        else "",
+        *(_table(table) for table in tables),
+        _methods(results["methods"]),
+        "<h2>Contact sheets</h2>",
+        *(_sheet(path, results["windows"]) for path in sheets),
+    ]
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(protocol['name'])} · nurec_sim</title><style>{STYLE}{MORE_STYLE}</style></head>\n"
+        "<body><main>\n" + "\n".join(part for part in body if part) + f"\n</main>{script}</body></html>\n"
+    )
+
+
+def _table(table: Table) -> str:
+    heads = "".join(f'<th class="{"n" if n else ""}">{escape(text)}</th>' for n, text in enumerate(table.heading))
+    rows = "".join(
+        "<tr>" + "".join(f'<td class="{"n" if n else ""}">{escape(cell)}</td>' for n, cell in enumerate(row)) + "</tr>"
+        for row in table.rows
+    )
+    note = f'<p class="key">{escape(table.note)}</p>' if table.note else ""
+    return (
+        f'<h2>{escape(table.title)}</h2><div class="card scroll"><table><thead><tr>{heads}</tr></thead>'
+        f"<tbody>{rows}</tbody></table></div>{note}"
+    )
+
+
+def _methods(methods: Mapping[str, Any]) -> str:
+    items = []
+    for name, said in methods.items():
+        weights = (said.get("settings") or {}).get("checkpoint")
+        seed = (said.get("settings") or {}).get("random_weights")
+        text = f"{CHOICES.get(name, '')}"
+        text += f"; weights {weights[:12]}" if weights else ""
+        text += f"; random weights of seed {seed}: its figures mean nothing" if seed is not None else ""
+        items.append(f"<li><b>{escape(name)}</b>: {escape(text)}</li>")
+    return f'<h2>Methods</h2><div class="card"><ul>{"".join(items)}</ul></div>'
+
+
+def _sheet(path: Path, windows: Sequence[Mapping[str, Any]]) -> str:
+    picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise RunError(f"{path} is no picture; delete it and its window's figures, and run again")
+    data = base64.b64encode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
+    about: Mapping[str, Any] = next((window["about"] for window in windows if window["id"] == path.stem), {})
+    facts = " · ".join(f"{key.replace('_', ' ')} {value}" for key, value in about.items())
+    return (
+        f'<div class="card"><h3>{escape(path.stem)}</h3><p class="key">{escape(facts)}</p>'
+        f'<img alt="contact sheet of {escape(path.stem)}" src="data:image/jpeg;base64,{data.decode()}"></div>'
+    )
+
+
+def _curves(methods: Mapping[str, Any]) -> dict[str, Any]:
+    """Figures over the offset from the path; none where there is no such curve."""
+    if not any(row["curve"] for row in methods.values()):
+        return {}
+    figures = {}
+    for column, title in CURVES.items():
+        traces = []
+        for number, (name, row) in enumerate(methods.items()):
+            points = [(float(at), values[column]) for at, values in row["curve"].items() if values[column] is not None]
+            if points:
+                colour = COLOURS[number % len(COLOURS)]
+                traces.append({
+                    "type": "scatter", "mode": "lines+markers", "name": plain(name), "x": [x for x, _ in points],
+                    "y": [round(y, 4) for _, y in points], "line": {"color": colour, "width": 2},
+                })  # fmt: skip
+        layout = base_layout(300)
+        layout["xaxis"]["title"], layout["yaxis"]["title"] = {"text": "metres beside the path"}, {"text": title}
+        figures[f"curve_{column}"] = {"data": traces, "layout": layout}
+    return figures

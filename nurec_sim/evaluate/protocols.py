@@ -1,0 +1,200 @@
+"""The protocols: which windows there are, what the methods see of them and what they are asked for.
+
+``storm``  2 s at 10 Hz; frames 0, 5, 10 and 15 are seen, the other 16 are asked for (paper section 4.1, Table 1).
+``clip``   a whole log through the chunked pipeline; every k-th frame is asked for, the rest is seen (Table 2).
+``shift``  as ``storm``, but asked for are views beside the driven path, where a drawn world has the answer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from nurec_sim.errors import ReconstructError
+from nurec_sim.evaluate.drawn import Drawing, evaluation_rig, held_out_plan
+from nurec_sim.evaluate.windows import ContextClip, Target, Window
+from nurec_sim.world import TrueWorld
+
+PROTOCOLS = ("storm", "clip", "shift")
+ProtocolName = Literal["storm", "clip", "shift"]
+
+STEP_US = 100_000
+STORM_FRAMES, STORM_CONTEXT = 20, (0, 5, 10, 15)
+START_S = 1.0
+"""Windows begin so long after their world does."""
+SHIFTS_M = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
+SHIFT_FRAMES = (3, 8, 13)
+"""Frames of the window at which views beside the path are asked for: each about halfway between two seen ones."""
+NEAR_M, NEAR_SHARE = 1.0, 0.2
+"""A camera with more than this share of its pixels nearer than this is inside of something."""
+
+Progress = Callable[[str, float], None]
+Made = tuple[ContextClip, list[Target]]
+"""What the methods see, and what they are asked for."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """A protocol with its settings; equal protocols give equal windows.
+
+    Attributes:
+        name: one of ``PROTOCOLS``.
+        seeds: of the drawn worlds.
+        clips: recorded logs to use instead; the three settings of drawn images and ``seconds`` do not count for them.
+        boxes: whether the methods get the boxes of what can move.
+        size_px: width and height of the drawn images.
+        seconds: length of a ``clip``.
+        rate_hz: frames per second of a ``clip``.
+        hold_out_every: which frames of a ``clip`` are asked for: k - 1, 2k - 1, ...
+        cameras: of a ``clip``: 1 or 3.
+        backend: what draws, as in ``TrueWorld``.
+    """
+
+    name: ProtocolName
+    seeds: tuple[int, ...] = ()
+    clips: tuple[Path, ...] = ()
+    boxes: bool = False
+    size_px: tuple[int, int] = (480, 320)
+    seconds: float = 10.0
+    rate_hz: float = 4.0
+    hold_out_every: int = 2
+    cameras: int = 3
+    backend: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check ranges.
+
+        Raises:
+            ReconstructError: a value out of range.
+        """
+        if self.name not in PROTOCOLS:
+            raise ReconstructError(f"no protocol {self.name!r}; have {list(PROTOCOLS)}")
+        if bool(self.seeds) == bool(self.clips):
+            raise ReconstructError("a protocol runs on drawn worlds or on recorded logs: give seeds or clips")
+        if min(self.seeds, default=0) < 0 or len(set(self.seeds)) < len(self.seeds):
+            raise ReconstructError(f"seeds must not be negative, and each may be given once, got {self.seeds}")
+        if self.clips and self.name == "shift":
+            raise ReconstructError("protocol 'shift' needs drawn worlds: no log recorded what is beside its path")
+        if not 2 <= self.seconds <= 20 or not 1 <= self.rate_hz <= 10 or self.hold_out_every < 2:
+            raise ReconstructError(
+                "a clip lasts 2..20 seconds at 1..10 Hz and holds out every second frame or fewer, got "
+                f"{self.seconds:g} s, {self.rate_hz:g} Hz, every {self.hold_out_every}"
+            )
+        if self.cameras not in (1, 3):
+            raise ReconstructError(f"a clip has 1 or 3 cameras, got {self.cameras}")
+
+    @cached_property
+    def ids(self) -> tuple[str, ...]:
+        """Names of the windows, in order."""
+        return tuple(f"{self.name}-{seed}" for seed in self.seeds) or tuple(self._recorded)
+
+    @cached_property
+    def _recorded(self) -> dict[str, Callable[[], Window]]:
+        """Windows of the recorded logs by their names."""
+        from nurec_sim.evaluate.recorded import clip_window, storm_windows
+        from nurec_sim.logs import open_clip
+
+        found: dict[str, Callable[[], Window]] = {}
+        for path in self.clips:
+            clip = open_clip(path)
+            if self.name == "storm":
+                found |= storm_windows(clip, STORM_FRAMES, STORM_CONTEXT, STEP_US, self.boxes)
+            else:
+                found |= clip_window(clip, self.cameras, self.hold_out_every, self.boxes)
+        return found
+
+    @contextlib.contextmanager
+    def window(self, index: int, progress: Progress | None = None) -> Iterator[Window]:
+        """Draw or read one window; it can be used until the block ends."""
+        report, name = progress or (lambda stage, fraction: None), self.ids[index]
+        if self.clips:
+            report("reading the log", 0.0)
+            yield self._recorded[name]()
+            return
+        report("building the world", 0.0)
+        long_s = self.seconds if self.name == "clip" else STORM_FRAMES * STEP_US / 1e6
+        plan = held_out_plan(self.seeds[index], long_s + START_S + 0.5)
+        rig = evaluation_rig(self.cameras if self.name == "clip" else 1, *self.size_px)
+        with TrueWorld(plan, self.backend) as world:
+            drawing = Drawing(world, rig)
+            report("drawing", 0.1)
+            clip, targets = _MAKERS[self.name](self, drawing, name, plan.span_us[0] + round(START_S * 1e6), report)
+            yield Window(name, clip, tuple(targets), _about(drawing, clip.span_us))
+
+
+def _storm(protocol: Protocol, drawing: Drawing, id: str, start_us: int, report: Progress) -> Made:
+    times, span_us = _storm_times(start_us)
+    clip = drawing.clip(id, times[list(STORM_CONTEXT)], span_us, protocol.boxes)
+    camera = next(iter(drawing.rig.cameras))
+    targets = []
+    for frame in range(STORM_FRAMES):
+        report("drawing", 0.1 + 0.9 * frame / STORM_FRAMES)
+        if frame not in STORM_CONTEXT:
+            beyond = frame > STORM_CONTEXT[-1]
+            targets.append(drawing.target(f"{frame:02d}", camera, int(times[frame]), beyond=beyond))
+    return clip, targets
+
+
+def _shift(protocol: Protocol, drawing: Drawing, id: str, start_us: int, report: Progress) -> Made:
+    times, span_us = _storm_times(start_us)
+    clip = drawing.clip(id, times[list(STORM_CONTEXT)], span_us, protocol.boxes)
+    camera = next(iter(drawing.rig.cameras))
+    places = [0.0, *(side * shift for shift in SHIFTS_M for side in (1, -1))]
+    targets = []
+    for count, left_m in enumerate(places):
+        report("drawing", 0.1 + 0.9 * count / len(places))
+        for frame in SHIFT_FRAMES:
+            target = drawing.target(f"{frame:02d}{left_m:+.1f}", camera, int(times[frame]), left_m)
+            if not _inside_something(target):
+                targets.append(target)
+    return clip, targets
+
+
+def _clip(protocol: Protocol, drawing: Drawing, id: str, start_us: int, report: Progress) -> Made:
+    count = int(protocol.seconds * protocol.rate_hz)
+    times = start_us + np.rint(np.arange(count) * 1e6 / protocol.rate_hz).astype(np.int64)
+    asked = list(range(protocol.hold_out_every - 1, count, protocol.hold_out_every))
+    seen = sorted(set(range(count)) - set(asked))
+    span_us = (start_us, start_us + round(protocol.seconds * 1e6))
+    clip = drawing.clip(id, times[seen], span_us, protocol.boxes)
+    targets = []
+    for number, frame in enumerate(asked):
+        report("drawing", 0.1 + 0.9 * number / len(asked))
+        for camera in drawing.rig.cameras:
+            beyond = frame > seen[-1]
+            targets.append(drawing.target(f"{camera}-{frame:03d}", camera, int(times[frame]), beyond=beyond))
+    return clip, targets
+
+
+_MAKERS: dict[ProtocolName, Callable[[Protocol, Drawing, str, int, Progress], Made]] = {
+    "storm": _storm,
+    "shift": _shift,
+    "clip": _clip,
+}
+
+
+def _storm_times(start_us: int) -> tuple[np.ndarray, tuple[int, int]]:
+    return start_us + STEP_US * np.arange(STORM_FRAMES), (start_us, start_us + STORM_FRAMES * STEP_US)
+
+
+def _inside_something(target: Target) -> bool:
+    """Whether a view beside the path is from inside or right before a thing: nobody drives there."""
+    depth_m = target.true.depth_m
+    return depth_m is not None and float(((depth_m > 0) & (depth_m < NEAR_M)).mean()) > NEAR_SHARE
+
+
+def _about(drawing: Drawing, span_us: tuple[int, int]) -> dict[str, str | int | float]:
+    """What a window shows, in plain JSON."""
+    plan, ends = drawing.world.plan, drawing.ego.at(np.array(span_us))[:, :3, 3]
+    about: dict[str, str | int | float] = {
+        "seed": plan.seed,
+        "driven_m": round(float(np.linalg.norm(ends[1] - ends[0])), 2),
+        "drawn_by": drawing.world.backend,
+    }
+    return about | {name: str(getattr(plan, name)) for name in ("split", "template") if hasattr(plan, name)}

@@ -1,0 +1,190 @@
+"""Recorded logs as an evaluation sees them: frames and sweeps that are held out are the truth.
+
+Depth is known where the held-out sweep nearest in time sent a beam, things that can move by the log's boxes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from nurec_sim import geometry, sensors
+from nurec_sim.errors import ReconstructError
+from nurec_sim.evaluate.views import View, reduced, scored_size
+from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, Target, Window
+from nurec_sim.reconstruct.feedforward.frames import choose_cameras
+from nurec_sim.types import MOVABLE_LABELS, CameraModel, Clip, Rig, SensorRequest
+
+STEP_TOLERANCE = 0.25
+"""How far the time between frames may be from the protocol's."""
+NEAREST_SWEEP_US = 60_000
+"""A sweep farther in time from a frame says nothing about its depth."""
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
+def front_cameras(clip: Clip, most: int) -> tuple[str, ...]:
+    """Up to so many cameras of a log, the front one first."""
+    from nurec_sim.network import PROFILES
+
+    return choose_cameras(clip, PROFILES["tiny"])[:most]
+
+
+def storm_windows(
+    clip: Clip, frames: int, context: Sequence[int], step_us: int, boxes: bool
+) -> dict[str, Callable[[], Window]]:
+    """Windows of so many frames of the front camera, one after the other, by their names; read when they are called.
+
+    Raises:
+        ReconstructError: the log has no such frames, or not about ``step_us`` apart.
+    """
+    (camera,) = front_cameras(clip, 1)
+    times = clip.camera_times_us(camera).sum(axis=1) // 2
+    rate = np.median(np.diff(times)) if len(times) > 1 else 0
+    if len(times) < frames or abs(rate - step_us) > STEP_TOLERANCE * step_us:
+        apart = f" {rate / 1e6:.3g} s apart" if len(times) > 1 else ""
+        raise ReconstructError(
+            f"clip {clip.id!r}: protocol 'storm' needs {frames} frames {step_us / 1e6:g} s apart, "
+            f"camera {camera!r} has {len(times)}{apart}"
+        )
+    seen = set(context)
+    return {
+        f"{clip.id}-{first:04d}": partial(
+            recorded_window, clip, f"{clip.id}-{first:04d}", (camera,), [first + k for k in context],
+            [first + k for k in range(frames) if k not in seen], boxes,
+        )
+        for first in range(0, len(times) - frames + 1, frames)
+    }  # fmt: skip
+
+
+def clip_window(clip: Clip, cameras: int, every: int, boxes: bool) -> dict[str, Callable[[], Window]]:
+    """The whole log as one window, frames ``every - 1``, ``2 every - 1``, ... held out; read when it is called.
+
+    Raises:
+        ReconstructError: the log has no frame to hold out.
+    """
+    names = front_cameras(clip, cameras)
+    count = min(len(clip.camera_times_us(camera)) for camera in names)
+    asked = list(range(every - 1, count, every))
+    if not asked:
+        raise ReconstructError(f"clip {clip.id!r} has {count} frames: none to hold out when every {every}th is")
+    seen = sorted(set(range(count)) - set(asked))
+    return {clip.id: partial(recorded_window, clip, clip.id, names, seen, asked, boxes)}
+
+
+def recorded_window(
+    clip: Clip,
+    id: str,
+    cameras: Sequence[str],
+    seen: Sequence[int],
+    asked: Sequence[int],
+    boxes: bool,
+) -> Window:
+    """A window of a recorded log.
+
+    Args:
+        clip: the log.
+        id: name of the window.
+        cameras: those that count.
+        seen: indices of the frames that the methods see, of each camera.
+        asked: indices of the frames that they have to show.
+        boxes: whether the methods get the log's boxes.
+    """
+    frames = sorted({*seen, *asked})
+    exposures = np.concatenate([clip.camera_times_us(camera)[frames] for camera in cameras])
+    span_us = (int(exposures.min()), int(exposures.max()) + 1)
+    held = _nearest_sweeps(clip, np.concatenate([clip.camera_times_us(camera)[list(asked)] for camera in cameras]))
+    shots = {camera: tuple(_shot(clip, camera, index) for index in seen) for camera in cameras}
+    turns = {
+        lidar: tuple(
+            Revolution(int(start), int(end), partial(clip.sweep, lidar, index))
+            for index, (start, end) in enumerate(clip.sweep_times_us(lidar))
+            if (lidar, index) not in held.values() and span_us[0] - NEAREST_SWEEP_US <= (start + end) // 2 < span_us[1]
+        )
+        for lidar in clip.rig.lidars
+    }
+    rig = Rig({camera: clip.rig.cameras[camera] for camera in cameras}, clip.rig.lidars, clip.rig.body)
+    context = ContextClip(id, rig, clip.ego, _wider(turns, span_us), shots, turns, tuple(clip.tracks) if boxes else ())
+    targets = tuple(
+        _target(clip, camera, index, held, beyond=index > max(seen)) for index in asked for camera in cameras
+    )
+    ends = clip.ego.at(np.array(span_us))[:, :3, 3]
+    about: dict[str, str | int | float] = {
+        "log": clip.id,
+        "first_frame": frames[0],
+        "driven_m": round(float(np.linalg.norm(ends[1] - ends[0])), 2),
+    }
+    return Window(id, context, targets, about)
+
+
+def _wider(turns: Mapping[str, Sequence[Revolution]], span_us: tuple[int, int]) -> tuple[int, int]:
+    """The span of the window and of its sweeps."""
+    times = [t for records in turns.values() for turn in records for t in (turn.start_us, turn.end_us + 1)]
+    return min([span_us[0], *times]), max([span_us[1], *times])
+
+
+def _shot(clip: Clip, camera: str, index: int) -> Shot:
+    start, end = (int(t) for t in clip.camera_times_us(camera)[index])
+    return Shot(start, end, clip.world_from_camera(camera, index), lambda: clip.image(camera, index))
+
+
+def _nearest_sweeps(clip: Clip, exposures_us: Int64[np.ndarray, "n 2"]) -> dict[int, tuple[str, int]]:
+    """For the middle of each exposure the LiDAR and the index of the sweep nearest to it, where one is near enough."""
+    found: dict[int, tuple[int, tuple[str, int]]] = {}
+    for lidar in clip.rig.lidars:
+        middles = clip.sweep_times_us(lidar).sum(axis=1) // 2
+        for t_us in exposures_us.sum(axis=1) // 2:
+            gaps = np.abs(middles - t_us)
+            if len(gaps) and gaps.min() <= NEAREST_SWEEP_US:
+                entry = (int(gaps.min()), (lidar, int(gaps.argmin())))
+                found[int(t_us)] = min(found.get(int(t_us), entry), entry)
+    return {t_us: sweep for t_us, (_, sweep) in found.items()}
+
+
+def _target(clip: Clip, camera_id: str, index: int, held: dict[int, tuple[str, int]], beyond: bool) -> Target:
+    camera, exposure = clip.rig.cameras[camera_id], clip.camera_times_us(camera_id)[index]
+    start, end = int(exposure[0]), max(int(exposure[1]), int(exposure[0]) + 1)
+    request = SensorRequest("", camera, start, end, clip.world_from_camera(camera_id, index))
+    sweep = held.get(int(exposure.sum()) // 2)
+    true = reduced(clip.image(camera_id, index), None)
+    depth_m = np.zeros(true.rgb.shape[:2], np.float32)
+    if sweep is not None:
+        depth_m = projected_depth(request, camera, clip.sweep(*sweep).xyz_world_m)
+    movable = movable_pixels(clip, request, camera) if clip.tracks else None
+    name = f"{camera_id}-{index:04d}"
+    return Target(name, request, View(true.rgb, depth_m), movable, beyond=beyond)
+
+
+def projected_depth(
+    request: SensorRequest, camera: CameraModel, xyz_world_m: Float64[np.ndarray, "n 3"]
+) -> Float32[np.ndarray, "h w"]:
+    """Z-depth of points at the size at which views are compared: of the nearest one in a pixel, 0 where there is none."""
+    width, height = scored_size(camera.width_px, camera.height_px)
+    uv, valid, fraction = sensors.project_rolling(camera, request.world_from_sensor, xyz_world_m)
+    valid &= sensors.in_image(camera, uv)
+    uv, xyz, fraction = uv[valid], xyz_world_m[valid], fraction[valid]
+    poses = geometry.inverse(geometry.interpolate_pose_pair(request.world_from_sensor, fraction))
+    z = np.einsum("ni,ni->n", poses[:, 2, :3], xyz) + poses[:, 2, 3]
+    column = (uv[:, 0] * width / camera.width_px).astype(int).clip(0, width - 1)
+    row = (uv[:, 1] * height / camera.height_px).astype(int).clip(0, height - 1)
+    depth_m = np.full((height, width), np.inf, np.float32)
+    np.minimum.at(depth_m, (row, column), z.astype(np.float32))
+    return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
+
+
+def movable_pixels(clip: Clip, request: SensorRequest, camera: CameraModel) -> Bool[np.ndarray, "h w"]:
+    """Pixels inside the outlines of the boxes of things that can move, at the size at which views are compared."""
+    width, height = scored_size(camera.width_px, camera.height_px)
+    mask = np.zeros((height, width), np.uint8)
+    for track in clip.tracks:
+        if track.label not in MOVABLE_LABELS or not track.path.covers(request.start_us):
+            continue
+        corners = geometry.transform_points(track.path.at(request.start_us), CORNERS * np.asarray(track.size_m))
+        uv, valid, _ = sensors.project_rolling(camera, request.world_from_sensor, corners)
+        if valid.all():
+            outline = cv2.convexHull((uv * (width / camera.width_px, height / camera.height_px)).astype(np.int32))
+            cv2.fillConvexPoly(mask, outline, 1)
+    return mask.astype(bool)

@@ -1,0 +1,99 @@
+"""Scores of one method on one window: images and depth, over all pixels and over those that can move."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from nurec_sim.evaluate.methods import Built, Contender, build
+from nurec_sim.evaluate.views import View, reduced
+from nurec_sim.evaluate.windows import Target, Window
+from nurec_sim.metrics.depth_scores import depth_score, least_squares_scale
+from nurec_sim.metrics.images import masked_psnr, masked_ssim, psnr, ssim
+
+HIGHEST_PSNR_DB = 100.0
+"""Of images that are equal."""
+
+Figures = dict[str, float | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """A method's record of a window, plain JSON, and its views by the names of the targets."""
+
+    record: dict[str, Any]
+    views: dict[str, View]
+
+
+def score_window(contender: Contender, window: Window, progress: Callable[[str, float], None] | None = None) -> Scored:
+    """Let a method see a window and compare all that it shows with the truth.
+
+    Returns:
+        The record: ``gaussians``, ``seconds`` (``reconstruct``; ``render`` per view), ``unknown``, and per target
+        ``name``, ``left_m``, ``beyond``, ``full`` and ``dynamic`` (see ``score_view``).
+
+    Raises:
+        ReconstructError, WeightsError: see ``methods.build``.
+    """
+    report = progress or (lambda stage, fraction: None)
+    report(f"{contender.name} reconstructs", 0.0)
+    built: Built = build(contender, window)
+    rows, views, rendering = [], {}, 0.0
+    for index, target in enumerate(window.targets):
+        report(f"{contender.name} shows", 0.3 + 0.7 * index / len(window.targets))
+        started = time.perf_counter()
+        frame = built.show(target.request)
+        rendering += time.perf_counter() - started
+        views[target.name] = view = reduced(frame.rgb, frame.depth_m)
+        rows.append({"name": target.name, "left_m": target.left_m, "beyond": target.beyond, **score_view(view, target)})
+    seconds = {"reconstruct": round(built.seconds, 3), "render": round(rendering / max(len(rows), 1), 4)}
+    record = {"gaussians": built.gaussians, "seconds": seconds, "unknown": list(built.unknown), "targets": rows}
+    return Scored(record, views)
+
+
+def score_view(view: View, target: Target) -> dict[str, Figures | None]:
+    """Figures of one view: ``full``, and ``dynamic`` where the truth knows what can move and some of it is in view.
+
+    Each has ``psnr_db``, ``ssim``, and where depth is known ``abs_rel`` and ``delta1`` after the frame's least-squares
+    scale over all pixels, ``abs_rel_metric`` and ``delta1_metric`` as predicted; ``full`` also ``depth_scale`` and
+    ``depth_coverage``. None stands for what cannot be computed.
+    """
+    true, mask = target.true, target.movable
+    full: Figures = {"psnr_db": _capped(psnr(view.rgb, true.rgb)), "ssim": ssim(view.rgb, true.rgb)}
+    scale = 1.0
+    if view.depth_m is not None and true.depth_m is not None:
+        scale = least_squares_scale(view.depth_m, true.depth_m)
+        whole = depth_score(view.depth_m, true.depth_m)
+        full |= {"depth_scale": scale, "depth_coverage": _known(whole.coverage)}
+    full |= _depth_figures(view, true, scale, None)
+    dynamic: Figures | None = None
+    if mask is not None and mask.any():
+        dynamic = {
+            "psnr_db": _capped(masked_psnr(view.rgb, true.rgb, mask)),
+            "ssim": _known(masked_ssim(view.rgb, true.rgb, mask)),
+            **_depth_figures(view, true, scale, mask),
+        }
+    return {"full": full, "dynamic": dynamic}
+
+
+def _depth_figures(view: View, true: View, scale: float, mask: Bool[np.ndarray, "h w"] | None) -> Figures:
+    figures: Figures = dict.fromkeys(("abs_rel", "delta1", "abs_rel_metric", "delta1_metric"))
+    if view.depth_m is not None and true.depth_m is not None:
+        for factor, suffix in ((scale, ""), (1.0, "_metric")):
+            score = depth_score(view.depth_m * factor, true.depth_m, mask)
+            figures |= {f"abs_rel{suffix}": _known(score.abs_rel), f"delta1{suffix}": _known(score.delta1)}
+    return figures
+
+
+def _capped(psnr_db: float) -> float:
+    return min(psnr_db, HIGHEST_PSNR_DB)
+
+
+def _known(value: float) -> float | None:
+    """JSON has no NaN: what cannot be computed is null."""
+    return float(value) if np.isfinite(value) else None

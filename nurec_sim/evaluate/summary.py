@@ -1,0 +1,133 @@
+"""From the records of single views to the figures of a protocol.
+
+Figures are means over views, as in the public protocol; differences between methods are paired by window and have a
+95 % interval of a bootstrap over windows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+Record = Mapping[str, Any]
+FULL = ("psnr_db", "ssim", "abs_rel", "delta1", "abs_rel_metric", "delta1_metric", "depth_scale", "depth_coverage")
+DYNAMIC = FULL[:6]
+PAIRS = (("dense", "lift"), ("dense", "copy"), ("selective", "dense"), ("dense", "dense-concatenated"))
+"""Methods whose difference is told, where both took part."""
+DRAWS = 2000
+CURVE = ("psnr_db", "ssim", "abs_rel", "abs_rel_metric", "depth_coverage")
+
+
+def summarize(windows: Sequence[Record], methods: Iterable[str]) -> dict[str, Any]:
+    """Figures of every method over all windows, and differences between methods.
+
+    Args:
+        windows: records with ``id`` and ``methods``: by name what ``score_window`` gave, or ``error``.
+        methods: names in the order of the tables.
+
+    Returns:
+        ``methods``: by name ``full``, ``dynamic``, ``between``, ``beyond`` (means), ``curve`` (means by the offset from
+        the path in metres), ``abs_rel_doubles_at_m``, ``gaussians``, ``seconds``, ``views``, ``dynamic_views``,
+        ``windows`` and ``failed``; ``differences``: a list of paired differences.
+    """
+    names = list(methods)
+    figures = {name: _method([window["methods"][name] for window in windows]) for name in names}
+    pairs = [pair for pair in PAIRS if pair[0] in names and pair[1] in names]
+    return {"methods": figures, "differences": [_difference(windows, *pair) for pair in pairs]}
+
+
+def _method(records: Sequence[Record]) -> dict[str, Any]:
+    good = [record for record in records if "error" not in record]
+    rows = [row for record in good for row in record["targets"]]
+    on_path = [row for row in rows if row["left_m"] == 0]
+    moving = [row["dynamic"] for row in on_path if row["dynamic"] is not None]
+    curve = _curve(rows)
+    return {
+        "full": _means([row["full"] for row in on_path], FULL),
+        "dynamic": _means(moving, DYNAMIC),
+        "between": _means([row["full"] for row in on_path if not row["beyond"]], FULL),
+        "beyond": _means([row["full"] for row in on_path if row["beyond"]], FULL),
+        "curve": curve,
+        "abs_rel_doubles_at_m": doubling_offset({float(offset): row["abs_rel"] for offset, row in curve.items()}),
+        "gaussians": _mean([record["gaussians"] for record in good]),
+        "seconds": {stage: _mean([record["seconds"][stage] for record in good]) for stage in ("reconstruct", "render")},
+        "views": len(on_path),
+        "dynamic_views": len(moving),
+        "windows": len(good),
+        "failed": len(records) - len(good),
+    }
+
+
+def _means(rows: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> dict[str, float | None]:
+    return {name: _mean([row.get(name) for row in rows]) for name in names}
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """The mean of what is known; None where nothing is."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _curve(rows: Sequence[Record]) -> dict[str, dict[str, float | None]]:
+    """Means by distance from the path, both sides together; empty where all views are on the path."""
+    offsets = sorted({abs(row["left_m"]) for row in rows})
+    if len(offsets) < 2:
+        return {}
+    at = {offset: [row["full"] for row in rows if abs(row["left_m"]) == offset] for offset in offsets}
+    return {f"{offset:g}": {**_means(views, CURVE), "views": len(views)} for offset, views in at.items()}
+
+
+def doubling_offset(abs_rel: Mapping[float, float | None]) -> float | None:
+    """Where a curve over the offset first reaches twice its value at 0, between its points by a straight line.
+
+    None where it does not, or where a value is not known.
+    """
+    offsets = sorted(abs_rel)
+    values = [abs_rel[offset] for offset in offsets]
+    known = [value for value in values if value is not None]
+    if not offsets or offsets[0] != 0 or len(known) < len(values):
+        return None
+    limit = 2 * known[0]
+    for index in range(1, len(known)):
+        before, after = known[index - 1], known[index]
+        if after >= limit:
+            fraction = (limit - before) / (after - before)
+            return float(offsets[index - 1] + fraction * (offsets[index] - offsets[index - 1]))
+    return None
+
+
+def _difference(windows: Sequence[Record], one: str, other: str) -> dict[str, Any]:
+    """How much better ``one`` is: mean over windows of the difference of their means, with intervals."""
+    both = [w for w in windows if all("error" not in w["methods"][name] for name in (one, other))]
+
+    def paired(of: Callable[[Record], Mapping[str, float | None] | None]) -> dict[str, Any]:
+        gains = []
+        for window in both:
+            psnr = []
+            for name in (one, other):
+                rows = [row for row in window["methods"][name]["targets"] if row["left_m"] == 0]
+                psnr.append(_mean([figures["psnr_db"] for row in rows if (figures := of(row)) is not None]))
+            if psnr[0] is not None and psnr[1] is not None:
+                gains.append(psnr[0] - psnr[1])
+        return {
+            "psnr_db": _mean(gains), "interval_db": interval(gains), "better_in": sum(gain > 0 for gain in gains),
+            "windows": len(gains),
+        }  # fmt: skip
+
+    counts = [[w["methods"][name]["gaussians"] for w in both] for name in (one, other)]
+    share = None
+    if both and None not in counts[0] + counts[1]:
+        share = float(np.sum(counts[0]) / max(np.sum(counts[1]), 1))
+    full, dynamic = paired(lambda row: row["full"]), paired(lambda row: row["dynamic"])
+    return {"method": one, "against": other, "full": full, "dynamic": dynamic, "share_of_gaussians": share}
+
+
+def interval(values: Sequence[float]) -> list[float] | None:
+    """95 % interval of the mean by a bootstrap; None of fewer than three values. Same values, same interval."""
+    if len(values) < 3:
+        return None
+    draws = np.random.default_rng([len(values), 0xB007]).integers(0, len(values), (DRAWS, len(values)))
+    low, high = np.quantile(np.asarray(values)[draws].mean(axis=1), (0.025, 0.975))
+    return [float(low), float(high)]

@@ -1,0 +1,189 @@
+"""The tables of a protocol: the same rows for the screen, Markdown, CSV and the report."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+NOT_KNOWN = "-"
+PAPER_HEADING = ("PSNR", "SSIM", "AbsRel", "δ1")
+PAPER_COLUMNS = ("psnr_db", "ssim", "abs_rel", "delta1")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A heading and rows of text; ``note`` says how to read it."""
+
+    name: str
+    title: str
+    heading: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+    def markdown(self) -> str:
+        """As Markdown, with its title and note."""
+        lines = [self.heading, ["---"] + ["---:"] * (len(self.heading) - 1), *self.rows]
+        body = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+        return f"## {self.title}\n\n{body}\n" + (f"\n{self.note}\n" if self.note else "")
+
+    def csv(self) -> str:
+        """As CSV."""
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([self.heading, *self.rows])
+        return text.getvalue()
+
+
+def tables(results: Mapping[str, Any]) -> list[Table]:
+    """All tables of the results of a run (``run.run_protocol``), the paper's first."""
+    protocol, summary = results["protocol"], results["summary"]
+    name, methods = protocol["name"], summary["methods"]
+    made = []
+    if name == "shift":
+        made += [
+            _curve(methods, "psnr_db", "PSNR (dB)", 2),
+            _curve(methods, "abs_rel", "AbsRel", 3),
+            _doubling(methods),
+        ]
+    else:
+        made.append(_paper_table(results))
+        if name == "storm":
+            made.append(_times(methods))
+    made += [_metric_depth(methods), _cost(methods)]
+    if summary["differences"]:
+        made.append(_differences(summary["differences"]))
+    failed = [
+        (window["id"], method, record["error"])
+        for window in results["windows"]
+        for method, record in window["methods"].items()
+        if "error" in record
+    ]
+    if failed:
+        made.append(Table("failures", "Failures", ("window", "method", "error"), tuple(failed)))
+    return made
+
+
+def _paper_table(results: Mapping[str, Any]) -> Table:
+    protocol, methods = results["protocol"], results["summary"]["methods"]
+    storm = protocol["name"] == "storm"
+    heading = ["method", *PAPER_HEADING]
+    if storm:
+        heading += [f"dyn {name}" for name in PAPER_HEADING]
+    rows = []
+    for name, row in methods.items():
+        cells = [name, *_paper_cells(row["full"])]
+        rows.append(tuple(cells + _paper_cells(row["dynamic"]) if storm else cells))
+    views = max((row["views"] for row in methods.values()), default=0)
+    boxes = "with the log's boxes" if protocol["boxes"] else "without boxes, as the paper's network"
+    note = (
+        f"{len(results['windows'])} windows, {views} views a method. Depth after each frame's least-squares scale, as "
+        f"in the paper; true depth up to 80 m; a pixel without depth counts as wrong. Methods ran {boxes}."
+    )
+    if storm:
+        note += " dyn: pixels of vehicles, people and other things that can move, moving or not."
+    title = "Protocol storm (columns of the paper's Table 1)" if storm else "Protocol clip (columns of Table 2)"
+    return Table("paper", title, tuple(heading), tuple(rows), note)
+
+
+def _paper_cells(figures: Mapping[str, float | None]) -> list[str]:
+    return [number(figures[column], 2 if column == "psnr_db" else 3) for column in PAPER_COLUMNS]
+
+
+def _times(methods: Mapping[str, Any]) -> Table:
+    rows = []
+    for name, row in methods.items():
+        cells = [
+            number(row[part][c], 2 if c == "psnr_db" else 3) for part in ("between", "beyond") for c in PAPER_COLUMNS
+        ]
+        rows.append((name, *cells))
+    heading = ("method", *PAPER_HEADING, *(f"after {name}" for name in PAPER_HEADING))
+    note = "First between the four frames that the methods see, then after the last of them, by up to 0.4 s."
+    return Table("times", "Between the seen frames, and after them", heading, tuple(rows), note)
+
+
+def _metric_depth(methods: Mapping[str, Any]) -> Table:
+    rows = tuple(
+        (
+            name,
+            *(number(row["full"][column], 3) for column in ("abs_rel_metric", "delta1_metric")),
+            *(number(row["dynamic"][column], 3) for column in ("abs_rel_metric", "delta1_metric")),
+            number(row["full"]["depth_scale"], 3),
+            percent(row["full"]["depth_coverage"]),
+        )
+        for name, row in methods.items()
+    )
+    heading = ("method", "AbsRel", "δ1", "dyn AbsRel", "dyn δ1", "scale", "covered")
+    note = "scale: what least squares would multiply the depth by, 1 where metres are right."
+    return Table("metric_depth", "Depth in metres, not aligned", heading, rows, note)
+
+
+def _cost(methods: Mapping[str, Any]) -> Table:
+    rows = []
+    for name, row in methods.items():
+        count, seconds = row["gaussians"], row["seconds"]
+        render_ms = None if seconds["render"] is None else 1000 * seconds["render"]
+        cells = (
+            number(None if count is None else count / 1000, 0),
+            number(seconds["reconstruct"], 2),
+            number(render_ms, 1),
+        )
+        rows.append((name, *cells, str(row["windows"]), str(row["failed"])))
+    heading = ("method", "Gaussians (thousand)", "reconstruct (s)", "render (ms a view)", "windows", "failed")
+    return Table("cost", "Cost", heading, tuple(rows), "Means over windows, on this machine.")
+
+
+def _curve(methods: Mapping[str, Any], column: str, title: str, digits: int) -> Table:
+    offsets = sorted({offset for row in methods.values() for offset in row["curve"]}, key=float)
+    rows = tuple(
+        (name, *(number(row["curve"].get(offset, {}).get(column), digits) for offset in offsets))
+        for name, row in methods.items()
+    )
+    views = max(methods.values(), key=lambda row: len(row["curve"]))["curve"]
+    counts = ", ".join(f"{offset} m: {views[offset]['views']}" for offset in offsets if offset in views)
+    note = (
+        f"Views to the left and to the right of the path together ({counts}); those inside of something are left out."
+    )
+    return Table(f"shift_{column}", f"{title} beside the path", ("method", *(f"{o} m" for o in offsets)), rows, note)
+
+
+def _doubling(methods: Mapping[str, Any]) -> Table:
+    rows = []
+    for name, row in methods.items():
+        known = [figures["abs_rel"] for figures in row["curve"].values()]
+        reached, farthest = row["abs_rel_doubles_at_m"], max(map(float, row["curve"]), default=0.0)
+        text = f"{reached:.2f} m" if reached is not None else f"not reached up to {farthest:g} m"
+        rows.append((name, text if known and None not in known else "depth not known"))
+    title = "Offset at which AbsRel is twice that on the path"
+    return Table("shift_doubling", title, ("method", "offset"), tuple(rows))
+
+
+def _differences(differences: Sequence[Mapping[str, Any]]) -> Table:
+    rows = []
+    for pair in differences:
+        cells = [f"{pair['method']} - {pair['against']}"]
+        for part in ("full", "dynamic"):
+            found = pair[part]
+            cells += [number(found["psnr_db"], 2, sign=True), _interval(found["interval_db"])]
+            cells.append(f"{found['better_in']} of {found['windows']}")
+        rows.append((*cells, percent(pair["share_of_gaussians"])))
+    heading = ("PSNR, paired by window", "dB", "95 %", "better in", "dyn dB", "dyn 95 %", "dyn better in", "Gaussians")
+    note = "Intervals by a bootstrap over windows. Gaussians: of the first method, relative to the second."
+    return Table("differences", "Differences between methods", heading, tuple(rows), note)
+
+
+def _interval(ends: Sequence[float] | None) -> str:
+    return NOT_KNOWN if ends is None else f"{ends[0]:+.2f} to {ends[1]:+.2f}"
+
+
+def number(value: float | None, digits: int, sign: bool = False) -> str:
+    """A value with so many decimals; a dash where it is not known."""
+    if value is None:
+        return NOT_KNOWN
+    return f"{value:+,.{digits}f}" if sign else f"{value:,.{digits}f}"
+
+
+def percent(value: float | None) -> str:
+    """A share in percent; a dash where it is not known."""
+    return NOT_KNOWN if value is None else f"{100 * value:.1f} %"

@@ -1,0 +1,119 @@
+"""What a protocol gives to every method, and what it asks of them: a log that they may see, and true views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64, UInt8
+
+from nurec_sim.evaluate.views import View
+from nurec_sim.types import Clip, Rig, RoadMap, SensorRequest, Sweep, Track, Trajectory
+
+Image = UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A frame of a camera: when and from where it was taken, and how to get it."""
+
+    start_us: int
+    end_us: int
+    world_from_camera: Float64[np.ndarray, "2 4 4"]
+    image: Callable[[], Image]
+
+
+@dataclass(frozen=True, eq=False)
+class Revolution:
+    """A turn of a LiDAR: when it was, and how to get it."""
+
+    start_us: int
+    end_us: int
+    sweep: Callable[[], Sweep]
+
+
+@dataclass(frozen=True, eq=False)
+class ContextClip:
+    """A driving log (``types.Clip``) of some frames and sweeps only, which need no files.
+
+    Attributes:
+        id: name of the log.
+        rig: its sensors.
+        ego: poses of the rig, also between and after the frames.
+        span_us: [start, end) of all that may be asked of a reconstruction.
+        shots: the frames of each camera, in time order.
+        revolutions: the turns of each LiDAR, in time order.
+        tracks: labelled objects; none where the methods shall not have them.
+        road_map: what is known of the road.
+    """
+
+    id: str
+    rig: Rig
+    ego: Trajectory
+    span_us: tuple[int, int]
+    shots: Mapping[str, Sequence[Shot]]
+    revolutions: Mapping[str, Sequence[Revolution]] = field(default_factory=dict)
+    tracks: Sequence[Track] = ()
+    road_map: RoadMap | None = None
+
+    def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:
+        """Exposure start and end of every frame."""
+        return _times(self.shots.get(camera_id, ()))
+
+    def world_from_camera(self, camera_id: str, index: int) -> Float64[np.ndarray, "2 4 4"]:
+        """Camera poses at the start and the end of the exposure."""
+        return self.shots[camera_id][index].world_from_camera
+
+    def image(self, camera_id: str, index: int) -> Image:
+        """One RGB frame."""
+        return self.shots[camera_id][index].image()
+
+    def sweep_times_us(self, lidar_id: str) -> Int64[np.ndarray, "sweeps 2"]:
+        """Start and end of every sweep."""
+        return _times(self.revolutions.get(lidar_id, ()))
+
+    def sweep(self, lidar_id: str, index: int) -> Sweep:
+        """One motion-compensated sweep."""
+        return self.revolutions[lidar_id][index].sweep()
+
+
+def _times(records: Sequence[Shot] | Sequence[Revolution]) -> Int64[np.ndarray, "n 2"]:
+    return np.array([(record.start_us, record.end_us) for record in records], np.int64).reshape(-1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A view that the methods have to show, and what is really there.
+
+    Attributes:
+        name: tells it from the other targets of its window.
+        request: camera, exposure and poses.
+        true: what is there, at the size at which it is compared; depth 0 where there is none or it is not known.
+        movable: its pixels of vehicles and other things that can move, whether they do or not; None where not known.
+        left_m: how far beside the driven path it was taken, left positive.
+        beyond: whether it was taken before the first or after the last frame that the methods see.
+    """
+
+    name: str
+    request: SensorRequest
+    true: View
+    movable: Bool[np.ndarray, "h w"] | None
+    left_m: float = 0.0
+    beyond: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """One sample of an evaluation; ``about`` says in plain JSON what it shows."""
+
+    id: str
+    clip: Clip
+    targets: tuple[Target, ...]
+    about: Mapping[str, str | int | float] = field(default_factory=dict)
+
+    @cached_property
+    def cameras(self) -> tuple[str, ...]:
+        """Ids of the cameras that the methods see."""
+        return tuple(name for name in self.clip.rig.cameras if len(self.clip.camera_times_us(name)))

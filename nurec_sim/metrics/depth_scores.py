@@ -1,0 +1,67 @@
+"""How right a depth image is: AbsRel and delta1, as predicted or after a least-squares scale (paper section 4.1).
+
+Depths are z-depths in metres; 0 means that there is none. A pixel with a true depth for which none was predicted
+counts as predicted 0: its relative error is 1 and it misses delta1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+FARTHEST_M = 80.0
+"""True depths beyond are not scored: the LiDARs of the public protocols reach about so far."""
+DELTA1 = 1.25
+
+
+@dataclass(frozen=True)
+class DepthScore:
+    """Scores over some pixels; NaN where there are none.
+
+    Attributes:
+        abs_rel: mean of abs(d - true) / true.
+        delta1: share of pixels with max(d / true, true / d) < 1.25.
+        coverage: share of pixels for which a depth was predicted.
+        pixels: how many had a true depth.
+    """
+
+    abs_rel: float
+    delta1: float
+    coverage: float
+    pixels: int
+
+
+def known_depth(true_m: Float[np.ndarray, "h w"], farthest_m: float = FARTHEST_M) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose true depth is scored."""
+    return (true_m > 0) & (true_m <= farthest_m)
+
+
+def least_squares_scale(depth_m: Float[np.ndarray, "h w"], true_m: Float[np.ndarray, "h w"]) -> float:
+    """The factor s that makes s * depth fit the truth best, over the pixels that have both; 1 where there are none.
+
+    s = sum(true * d) / sum(d^2) (metrics of the paper's Table 1, per frame).
+    """
+    both = known_depth(true_m) & (depth_m > 0)
+    d, true = depth_m[both].astype(np.float64), true_m[both].astype(np.float64)
+    return float(true @ d / (d @ d)) if len(d) else 1.0
+
+
+def depth_score(
+    depth_m: Float[np.ndarray, "h w"], true_m: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"] | None = None
+) -> DepthScore:
+    """Scores of a predicted depth over the pixels whose truth is known, within ``mask`` if it is given.
+
+    Raises:
+        ValueError: the shapes differ.
+    """
+    if depth_m.shape != true_m.shape or (mask is not None and mask.shape != true_m.shape):
+        shapes = depth_m.shape, true_m.shape, None if mask is None else mask.shape
+        raise ValueError(f"depth, truth and mask must have one shape, got {shapes}")
+    valid = known_depth(true_m) if mask is None else known_depth(true_m) & mask
+    d, true = depth_m[valid].astype(np.float64), true_m[valid].astype(np.float64)
+    if not len(d):
+        return DepthScore(np.nan, np.nan, np.nan, 0)
+    near = np.maximum(d, true) < DELTA1 * np.minimum(d, true)
+    return DepthScore(float(np.mean(np.abs(d - true) / true)), float(near.mean()), float((d > 0).mean()), len(d))

@@ -1,0 +1,131 @@
+"""The ablations of the paper's Table 2 as changes of a recipe: each takes one thing away from the full training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from nurec_sim.errors import TrainingError
+from nurec_sim.training.config import LossWeights, Part, Stage, TrainingConfig
+
+SKY_MLP_PROFILES = {"tiny": "tiny-sky-mlp"}
+"""Profiles with an MLP in place of the sky decoder, and nothing else changed."""
+DEPTH_LOSSES = ("depth", "edges", "rendered_depth")
+"""All losses that know the true depth."""
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """Columns of the paper's Table 2; depth figures are taken after scaling, smaller ``abs_rel`` is better."""
+
+    psnr_db: float
+    ssim: float
+    abs_rel: float
+    delta1: float
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """One row of the table.
+
+    Attributes:
+        text: what is different, for tables.
+        paper: the paper's figures, on its own data.
+        change: the full recipe, without what is ablated.
+        merge: how chunks become one scene when the network is used; ``FeedForwardSettings.merge``.
+    """
+
+    text: str
+    paper: TableRow
+    change: Callable[[TrainingConfig], TrainingConfig]
+    merge: Literal["ownership", "concatenate"] = "ownership"
+
+
+def ablated(config: TrainingConfig, name: str) -> TrainingConfig:
+    """The recipe of an ablation.
+
+    Args:
+        config: the full recipe.
+        name: one of ``ABLATIONS``.
+
+    Raises:
+        TrainingError: there is no such ablation, or the recipe has nothing to take away.
+    """
+    if name not in ABLATIONS:
+        raise TrainingError(f"no ablation {name!r}; have {list(ABLATIONS)}")
+    change = ABLATIONS[name].change
+    changed = change(config)
+    if changed == config and change is not _unchanged:
+        raise TrainingError(f"the recipe already trains without what {name!r} takes away")
+    return changed
+
+
+def _in_one_stage(config: TrainingConfig) -> TrainingConfig:
+    """All parts and all losses at once, for as many steps; rate and warm-up are those of the first stage.
+
+    A loss keeps the weight that it has in the first stage to which it applies. Views are rendered in every step, so the
+    same steps take longer; the paper says so too.
+    """
+    if len(config.stages) == 1:
+        return config
+    first = config.stages[0]
+    parts: tuple[Part, ...] = tuple(dict.fromkeys(part for stage in config.stages for part in stage.trains))
+    weights = {name: _first_weight(name, config.stages) for name in LossWeights.model_fields}
+    drawn = max(config.stages, key=lambda stage: stage.targets)
+    changes = {
+        "name": "joint",
+        "steps": config.steps,
+        "trains": parts,
+        "pixels": drawn.pixels,
+        "targets": drawn.targets,
+        "losses": LossWeights(**weights),
+    }
+    return config.model_copy(update={"stages": (first.model_copy(update=changes),)})
+
+
+def _first_weight(name: str, stages: tuple[Stage, ...]) -> float:
+    return next((getattr(stage.losses, name) for stage in stages if _applies(name, stage)), 0.0)
+
+
+def _applies(name: str, stage: Stage) -> bool:
+    """Whether a stage computes a loss at all, its weight aside (``objective.Objective``)."""
+    if name in ("depth", "edges", "normal", "semantic", "rgb"):
+        return bool({"encoder", "context"} & set(stage.trains))
+    if name in ("sky", "motion"):
+        return name in stage.trains
+    if name == "footprint":
+        return "gaussians" in stage.trains
+    return stage.targets > 0
+
+
+def _with_sky_mlp(config: TrainingConfig) -> TrainingConfig:
+    if config.profile not in SKY_MLP_PROFILES:
+        raise TrainingError(f"profile {config.profile!r} has no twin with a sky MLP; have {SKY_MLP_PROFILES}")
+    return config.model_copy(update={"profile": SKY_MLP_PROFILES[config.profile]})
+
+
+def _without(*losses: str) -> Callable[[TrainingConfig], TrainingConfig]:
+    def change(config: TrainingConfig) -> TrainingConfig:
+        none = dict.fromkeys(losses, 0.0)
+        stages = (s.model_copy(update={"losses": s.losses.model_copy(update=none)}) for s in config.stages)
+        return config.model_copy(update={"stages": tuple(stages)})
+
+    return change
+
+
+def _unchanged(config: TrainingConfig) -> TrainingConfig:
+    return config
+
+
+ABLATIONS: Mapping[str, Ablation] = {
+    "full": Ablation("full", TableRow(29.93, 0.793, 0.069, 0.950), _unchanged),
+    "single_stage": Ablation("single-stage training", TableRow(27.65, 0.751, 0.077, 0.955), _in_one_stage),
+    "sky_mlp": Ablation("sky MLP instead of cubemap", TableRow(26.73, 0.692, 0.068, 0.950), _with_sky_mlp),
+    "no_perceptual": Ablation("without perceptual loss", TableRow(26.81, 0.705, 0.073, 0.934), _without("perceptual")),
+    "no_depth_loss": Ablation("without depth loss", TableRow(28.92, 0.782, 0.103, 0.862), _without(*DEPTH_LOSSES)),
+    "concatenation": Ablation(
+        "without frustum-ownership merging", TableRow(26.10, 0.648, 0.098, 0.891), _unchanged, "concatenate"
+    ),
+}
+"""By name, in the order of the paper's table. ``concatenation`` trains nothing of its own."""

@@ -1,0 +1,108 @@
+"""Where a training run stands, in one safetensors file that appears complete or not at all.
+
+It holds the network, its moving average, and the optimiser's two moments; the position in the recipe is the file's
+metadata. Nothing random needs saving: what step k sees depends on the seed and k only.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+from nurec_sim.errors import TrainingError
+
+CHECKPOINT = "checkpoint.safetensors"
+_KEY = "nurec_sim_training"
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+@dataclass(frozen=True)
+class Position:
+    """How far a run is: ``step`` steps done over all stages, ``seconds`` spent, under the recipe of ``digest``."""
+
+    step: int
+    seconds: float
+    digest: str
+    data_hash: str = ""
+
+
+def save_checkpoint(
+    folder: Path,
+    model: nn.Module,
+    average: nn.Module,
+    optimiser: torch.optim.AdamW | None,
+    position: Position,
+) -> Path:
+    """Write the state of a run; ``optimiser`` is None between two stages."""
+    tensors = {f"model/{name}": value for name, value in model.state_dict().items()}
+    tensors |= {f"average/{name}": value for name, value in average.state_dict().items()}
+    if optimiser is not None:
+        for name, parameter in model.named_parameters():
+            state = optimiser.state.get(parameter)
+            if state:
+                tensors |= {f"{moment}/{name}": state[moment] for moment in _MOMENTS}
+                tensors[f"count/{name}"] = state["step"]
+    contiguous = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    data = safetensors.torch.save(contiguous, {_KEY: json.dumps(asdict(position), sort_keys=True)})
+    path = folder / CHECKPOINT
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        part.write_bytes(data)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def read_position(folder: Path) -> Position | None:
+    """Where the run in a folder stands, None if it has no checkpoint.
+
+    Raises:
+        TrainingError: the checkpoint is damaged or of something else.
+    """
+    path = folder / CHECKPOINT
+    if not path.is_file():
+        return None
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            return Position(**json.loads((file.metadata() or {})[_KEY]))
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise TrainingError(f"{path} is damaged or no checkpoint of a training run: {error}") from None
+
+
+def load_networks(folder: Path, model: nn.Module, average: nn.Module) -> dict[str, Tensor]:
+    """Fill the network and its average; what is left are the optimiser's tensors (``restore_optimiser``).
+
+    Raises:
+        TrainingError: the checkpoint is damaged, or of another network.
+    """
+    path = folder / CHECKPOINT
+    try:
+        tensors = safetensors.torch.load_file(path)
+    except (OSError, safetensors.SafetensorError) as error:
+        raise TrainingError(f"{path} cannot be read: {error}") from None
+    for prefix, module in (("model/", model), ("average/", average)):
+        state = {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
+        try:
+            module.load_state_dict(state)
+        except RuntimeError as error:
+            raise TrainingError(f"{path} is of another network: {str(error).splitlines()[0]}") from None
+    return tensors
+
+
+def restore_optimiser(
+    optimiser: torch.optim.AdamW, trained: Mapping[str, nn.Parameter], tensors: Mapping[str, Tensor]
+) -> None:
+    """Give the optimiser the moments that it had."""
+    for name, parameter in trained.items():
+        if f"count/{name}" in tensors:
+            optimiser.state[parameter] = {moment: tensors[f"{moment}/{name}"].clone() for moment in _MOMENTS}
+            optimiser.state[parameter]["step"] = tensors[f"count/{name}"].clone()

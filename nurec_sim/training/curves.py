@@ -1,0 +1,225 @@
+"""The curves of a training run: from ``curves.csv`` to a page that anyone can open, and to a picture."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from nurec_sim.errors import TrainingError
+from nurec_sim.report.cells import escape
+from nurec_sim.report.figure import base_layout
+from nurec_sim.report.template import STYLE
+from nurec_sim.runs.folder import write_text
+
+FIXED = ("step", "stage", "seconds")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+"""Of the stages, in turn; told apart by all eyes (Okabe and Ito)."""
+RATIO = 20.0
+"""Positive curves that span more than this factor get a logarithmic scale."""
+SMOOTHING = 0.8
+"""How much of the mean so far the bold line keeps at each point; the thin one is what was measured."""
+COLUMNS = 4
+PANEL_PX = (340, 210)
+MARGIN = (52, 10, 24, 26)
+"""Left, right, top and bottom of a panel's axes, pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """What a run recorded, n rows in the order of the steps; NaN where a row has no such value."""
+
+    step: Float64[np.ndarray, " n"]
+    stage: tuple[str, ...]
+    seconds: Float64[np.ndarray, " n"]
+    values: dict[str, Float64[np.ndarray, " n"]]
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of the stages in the order in which they came."""
+        return tuple(dict.fromkeys(self.stage))
+
+    def of_stage(self, name: str, stage: str) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
+        """Steps and known values of one curve in one stage."""
+        values = self.values[name]
+        mine = np.array([each == stage for each in self.stage], dtype=bool) & np.isfinite(values)
+        return self.step[mine], values[mine]
+
+
+def read_curves(path: Path) -> Curves:
+    """Read ``curves.csv`` while it is being written or afterwards.
+
+    A last line that is not finished is left out, and so are rows that do not go on from the row before, but for the
+    newest: a run that went on from a checkpoint repeats steps.
+
+    Raises:
+        TrainingError: there is no such file, or it has other columns or other text where numbers belong.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise TrainingError(f"no curves at {path}: {error.strerror}") from None
+    whole = text[: text.rfind("\n") + 1]
+    reader = csv.DictReader(io.StringIO(whole))
+    if reader.fieldnames is None or not set(FIXED) <= set(reader.fieldnames):
+        raise TrainingError(f"{path} must have the columns {', '.join(FIXED)}; it has {reader.fieldnames or 'none'}")
+    rows: list[dict[str, Any]] = []
+    for number, row in enumerate(reader, 2):
+        try:
+            read = {
+                name: _number(text) for name, text in row.items() if name not in (None, "stage") and text is not None
+            }
+            if None in row or None in row.values() or not math.isfinite(read["step"]):
+                raise ValueError("a row needs a value or nothing for every column")
+        except ValueError as error:
+            raise TrainingError(f"{path}, line {number}: {error}") from None
+        while rows and rows[-1]["step"] >= read["step"]:
+            rows.pop()
+        rows.append(read | {"stage": row["stage"]})
+    named = [name for name in reader.fieldnames if name not in FIXED]
+    columns = {name: np.array([row[name] for row in rows], dtype=np.float64) for name in ("step", "seconds", *named)}
+    known = {name: columns[name] for name in named if np.isfinite(columns[name]).any()}
+    return Curves(columns["step"], tuple(row["stage"] for row in rows), columns["seconds"], known)
+
+
+def write_curves(folder: Path) -> tuple[Path, Path]:
+    """Draw a run folder's ``curves.csv`` as ``curves.html`` and ``curves.png`` beside it; their paths.
+
+    Raises:
+        TrainingError: the curves cannot be read, or hold nothing yet.
+    """
+    curves = read_curves(folder / "curves.csv")
+    if not curves.values:
+        raise TrainingError(f"{folder / 'curves.csv'} holds no values yet")
+    page, picture = folder / "curves.html", folder / "curves.png"
+    write_text(page, curves_page(curves, folder.name))
+    part = picture.with_name(f".{picture.name}.{os.getpid()}")
+    part.write_bytes(cv2.imencode(".png", np.ascontiguousarray(curves_image(curves)[..., ::-1]))[1].tobytes())
+    os.replace(part, picture)
+    return page, picture
+
+
+def smoothed(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Exponential mean, without a bias towards 0 at its start."""
+    total, mass, means = 0.0, 0.0, np.empty(len(values))
+    for index, value in enumerate(values):
+        total, mass = SMOOTHING * total + value, SMOOTHING * mass + 1
+        means[index] = total / mass
+    return means
+
+
+def curves_page(curves: Curves, title: str) -> str:
+    """One self-contained HTML text; the same curves give the same text."""
+    from plotly.offline import get_plotlyjs
+
+    panels = [{"id": name, **_figure(curves, name)} for name in curves.values]
+    stored = json.dumps(panels, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    plots = "".join(
+        f'<div class="card"><b>{escape(name)}</b><div id="{escape(name)}"></div></div>' for name in curves.values
+    )
+    hours = curves.seconds[-1] / 3600
+    last = ", ".join(f"{escape(name)} {_shown(values)}" for name, values in curves.values.items())
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f"<title>{escape(title)} · nurec_sim</title><style>{STYLE}"
+        ".grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(360px,1fr));gap:10px}</style></head>\n"
+        f'<body><main><h1>Training curves</h1><p class="soft">{escape(title)} · {int(curves.step[-1]):,} steps · '
+        f'{hours:.2f} h · stages {escape(", ".join(curves.stages))}</p><div class="grid">{plots}</div>'
+        f'<p class="key">Thin: measured. Bold: smoothed. Newest: {last}.</p></main>'
+        f'<script type="application/json" id="panels">{stored}</script>\n<script>{get_plotlyjs()}</script>\n'
+        "<script>JSON.parse(document.getElementById('panels').textContent).forEach(function (panel) {"
+        "Plotly.newPlot(panel.id, panel.data, panel.layout, {responsive: true, displayModeBar: false});});</script>"
+        "</body></html>\n"
+    )
+
+
+def curves_image(curves: Curves) -> UInt8[np.ndarray, "h w 3"]:
+    """A panel for every curve, stages in their colours."""
+    names = list(curves.values)
+    columns = min(COLUMNS, len(names))
+    rows = -(-len(names) // columns)
+    sheet = np.full((rows * PANEL_PX[1], columns * PANEL_PX[0], 3), 255, np.uint8)
+    for index, name in enumerate(names):
+        top, left = (index // columns) * PANEL_PX[1], (index % columns) * PANEL_PX[0]
+        _draw_panel(sheet[top : top + PANEL_PX[1], left : left + PANEL_PX[0]], curves, name)
+    return sheet
+
+
+def _figure(curves: Curves, name: str) -> dict[str, Any]:
+    layout = base_layout(230) | {"showlegend": False}
+    if _logarithmic(curves.values[name]):
+        layout["yaxis"] |= {"type": "log"}
+    data = []
+    for stage, colour in _coloured(curves):
+        step, values = curves.of_stage(name, stage)
+        for line, opacity, width in ((values, 0.35, 1), (smoothed(values), 1.0, 2)):
+            data.append(
+                {"type": "scatter", "mode": "lines", "name": escape(stage), "x": step.tolist(), "opacity": opacity,
+                 "y": [float(f"{value:.5g}") for value in line], "line": {"color": colour, "width": width}}
+            )  # fmt: skip
+    return {"data": data, "layout": layout}
+
+
+def _draw_panel(panel: UInt8[np.ndarray, "h w 3"], curves: Curves, name: str) -> None:
+    left, right, top, bottom = MARGIN
+    height, width = panel.shape[0] - top - bottom, panel.shape[1] - left - right
+    log = _logarithmic(curves.values[name])
+    scale = np.log10 if log else np.asarray
+    known = scale(curves.values[name][np.isfinite(curves.values[name])])
+    low, high = float(known.min()), float(known.max())
+    pad = 0.05 * (high - low) or 0.5 * abs(high) or 1.0
+    low, high = low - pad, high + pad
+    first, last = curves.step[0], max(curves.step[-1], curves.step[0] + 1)
+
+    def text(words: str, x: int, y: int, size: float = 0.38, colour: int = 90) -> None:
+        cv2.putText(panel, words, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, (colour,) * 3, 1, cv2.LINE_AA)
+
+    for share in (0.0, 0.5, 1.0):
+        y = top + round((1 - share) * height)
+        cv2.line(panel, (left, y), (left + width, y), (226, 232, 240), 1)
+        level = low + share * (high - low)
+        text(f"{10**level if log else level:.3g}", 4, y + 4)
+    text(name, left, top - 8, 0.46, 30)
+    newest = _shown(curves.values[name])
+    text(newest, left + width - 8 * len(newest), top - 8, 0.4, 30)
+    text(f"{int(first)}", left, panel.shape[0] - 8)
+    text(f"step {int(last)}", left + width - 75, panel.shape[0] - 8)
+    for stage, colour in _coloured(curves):
+        step, values = curves.of_stage(name, stage)
+        rgb = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)])
+        for line, ink, thick in ((values, 255 - 0.35 * (255 - rgb), 1), (smoothed(values), rgb, 2)):
+            x = left + (step - first) / (last - first) * width
+            y = top + (high - scale(line)) / (high - low) * height
+            points = np.rint(np.stack([x, y], axis=1)).astype(np.int32)
+            cv2.polylines(panel, [points], False, [float(c) for c in ink], thick, cv2.LINE_AA)
+
+
+def _coloured(curves: Curves) -> list[tuple[str, str]]:
+    return [(stage, COLOURS[index % len(COLOURS)]) for index, stage in enumerate(curves.stages)]
+
+
+def _logarithmic(values: Float64[np.ndarray, " n"]) -> bool:
+    known = values[np.isfinite(values)]
+    return bool(known.min() > 0 and known.max() > RATIO * known.min())
+
+
+def _shown(values: Float64[np.ndarray, " n"]) -> str:
+    """The newest known value."""
+    return f"{values[np.isfinite(values)][-1]:.4g}"
+
+
+def _number(text: str) -> float:
+    """A number, NaN for an empty cell; infinities count as not known."""
+    if not text.strip():
+        return math.nan
+    value = float(text)
+    return value if math.isfinite(value) else math.nan

@@ -1,0 +1,50 @@
+"""Gaussians of one pass at another time: what stands stays, what moves goes along its three knots."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nurec_sim.network.tensors import NetworkInputs, QueryGaussians, SemanticClass
+from nurec_sim.render.gradients import GaussianTensors
+
+LEAST_OPACITY = 0.01
+LEAST_MOVING_OPACITY = 0.75
+"""As in the reconstruction (``FeedForwardSettings.min_opacity``, ``layers.MIN_DYNAMIC_OPACITY``)."""
+
+
+def gaussians_at(query: QueryGaussians, inputs: NetworkInputs, time: float) -> GaussianTensors:
+    """The Gaussians as they are drawn at a time (a fraction of the span), in the scene frame; b is 1.
+
+    Positions and fading follow ``types.DynamicGaussians``; which points move is what the network calls movable.
+    """
+    pixels = inputs.rgb[0, 0, ..., 0].numel()
+    image = query.source[0] // pixels
+    moving = query.semantic[0] == SemanticClass.MOVABLE
+    position, opacity = query.position_m[0], query.opacity[0]
+    if query.motion_m is not None and bool(moving.any()):
+        times = torch.stack([inputs.time_before[0], inputs.time[0], inputs.time_after[0]], dim=-1)[image]
+        shift, fade = _along_knots(query.motion_m[0], times, time)
+        position = torch.where(moving[:, None], position + shift, position)
+        opacity = torch.where(moving, opacity.clamp(min=LEAST_MOVING_OPACITY) * fade, opacity)
+    kept = opacity.detach() > LEAST_OPACITY
+    return GaussianTensors(
+        mean_m=position[kept],
+        quat_wxyz=query.quat_wxyz[0][kept],
+        scale_m=query.scale_m[0][kept],
+        opacity=opacity[kept],
+        rgb=query.rgb[0][kept],
+    )
+
+
+def _along_knots(
+    motion_m: Float[Tensor, "n 2 3"], times: Float[Tensor, "n 3"], time: float
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """Displacements at a time, and how far each Gaussian has faded (0 outside of its life)."""
+    before, own, after = times.unbind(-1)
+    later = own <= time
+    gap = torch.where(later, after - own, own - before).clamp(min=1e-6)
+    x = (time - own).abs() / gap
+    shift = torch.where(later[:, None], motion_m[:, 1], motion_m[:, 0]) * x[:, None]
+    return shift, torch.where(x <= 1, torch.exp(-(x**10)), 0)

@@ -1,0 +1,99 @@
+"""The losses on rendered views (paper section 4.1): what the Gaussians of a pass look like from somewhere else.
+
+Static and moving Gaussians are drawn at the view's own time, the sky behind them, and the camera's response applied.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nurec_sim.network import cubemap
+from nurec_sim.network.tensors import NetworkInputs, QueryGaussians, SemanticClass
+from nurec_sim.reconstruct.feedforward.rays import camera_rays, scene_rays
+from nurec_sim.render.gradients import render_camera
+from nurec_sim.training.config import LossWeights
+from nurec_sim.training.moving import gaussians_at
+from nurec_sim.training.sample import TargetView
+
+PerceptualLoss = Callable[[Tensor, Tensor], Tensor]
+"""Takes two images [h, w, 3] in 0..1."""
+PIXEL_SHARE = 0.6
+"""Standard deviation of a Gaussian that covers its pixel, in pixels; neighbours then leave no holes."""
+LARGEST_SCALE_M = 0.3
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One rendered view: ``rgb`` [h, w, 3] as the camera shows it, ``depth_m`` and ``alpha`` [h, w]."""
+
+    rgb: Float[Tensor, "h w 3"]
+    depth_m: Float[Tensor, "h w"]
+    alpha: Float[Tensor, "h w"]
+
+
+def render_view(
+    query: QueryGaussians,
+    sky: Float[Tensor, "6 s s 3"],
+    isp: Float[Tensor, "3 4"],
+    inputs: NetworkInputs,
+    view: TargetView,
+    threads: int | None = None,
+) -> Rendering:
+    """A view of one pass; gradients reach the Gaussians, the sky and the response.
+
+    Args:
+        query: Gaussians in the scene frame, b = 1.
+        sky: the network's cubemap, in the scene frame.
+        isp: response of the view's camera: shown = ``isp[:, :3] @ colour + isp[:, 3]``.
+        inputs: of the pass, for the times of the moving Gaussians.
+        view: where and when to look.
+        threads: of the renderer.
+    """
+    gaussians = gaussians_at(query, inputs, view.time)
+    drawn = render_camera(gaussians, view.camera, torch.from_numpy(view.scene_from_camera), None, threads)
+    rays, _ = camera_rays(view.camera)
+    direction = scene_rays(view.camera, rays, view.scene_from_camera)[..., 3:].astype(np.float32)
+    behind = cubemap.sample(sky, torch.from_numpy(direction))
+    canonical = drawn.rgb + (1 - drawn.alpha)[..., None] * behind
+    shown = canonical @ isp[:, :3].T + isp[:, 3]
+    return Rendering(shown.clamp(0, 1), drawn.depth, drawn.alpha)
+
+
+def render_losses(
+    rendering: Rendering, view: TargetView, weights: LossWeights, perceptual: PerceptualLoss
+) -> dict[str, Tensor]:
+    """Colour (L1), perceptual, opacity where there is sky, and depth (L1 of its logarithm) where both know one."""
+    losses = {}
+    if weights.colour:
+        losses["colour"] = (rendering.rgb - view.rgb).abs().mean()
+    if weights.perceptual:
+        losses["perceptual"] = perceptual(rendering.rgb, view.rgb)
+    if weights.opacity:
+        sky = view.semantic == SemanticClass.SKY
+        losses["opacity"] = torch.where(sky, rendering.alpha, 0).sum() / sky.sum().clamp(min=1)
+    if weights.rendered_depth:
+        both = (view.depth_m > 0) & (rendering.depth_m > 0.1)
+        error = rendering.depth_m.clamp(min=0.1).log() - view.depth_m.clamp(min=0.1).log()
+        losses["rendered_depth"] = torch.where(both, error.abs(), 0).sum() / both.sum().clamp(min=1)
+    return losses
+
+
+def footprint_loss(query: QueryGaussians, depth_m: Float[Tensor, "b v h w"], inputs: NetworkInputs) -> Tensor:
+    """How far the logarithms of the scales are from those of Gaussians that just cover their pixels."""
+    width = inputs.rgb.shape[3]
+    pixel_rad = 2 * (inputs.fov[0, :, 0] / 2).tan() / width
+    image = query.source[0] // depth_m[0, 0].numel()
+    wanted = depth_m[0].flatten()[query.source[0]].detach() * pixel_rad[image] * PIXEL_SHARE
+    wanted = wanted.clamp(1e-3, LARGEST_SCALE_M)
+    return (query.scale_m[0].log() - wanted.log()[:, None]).abs().mean()
+
+
+def psnr_db(rgb: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
+    """Peak signal-to-noise ratio of colours in 0..1."""
+    return float(-10 * torch.log10(((rgb.detach() - truth) ** 2).mean().clamp(min=1e-10)))

@@ -1,0 +1,68 @@
+"""What one step of training sees: inputs of the network, the truth about them, and other views to be rendered.
+
+b clips (1), v context images (camera-major), h x w pixels. The *scene frame* is that of ``network.tensors``: the first
+image's camera at the end of its exposure, metres. Times are fractions of the sample's span, as in ``NetworkInputs``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int64
+from torch import Tensor
+
+from nurec_sim.network.tensors import NetworkInputs
+from nurec_sim.types import CameraModel
+
+
+@dataclass(frozen=True)
+class TrueMaps:
+    """What the context images really show.
+
+    Attributes:
+        depth_m: z-depth in the camera, 0 where there is none (sky) or it is not known.
+        normal: unit surface normals in the scene frame, towards the camera; zeros where not known.
+        semantic: ``network.tensors.SemanticClass``, -1 where not known.
+        motion_m: displacement of the pixel's point to ``time_before`` and ``time_after``; zeros on what stands.
+        motion_known: where ``motion_m`` may be compared.
+    """
+
+    depth_m: Float[Tensor, "b v h w"]
+    normal: Float[Tensor, "b v h w 3"]
+    semantic: Int64[Tensor, "b v h w"]
+    motion_m: Float[Tensor, "b v h w 2 3"]
+    motion_known: Bool[Tensor, "b v h w"]
+
+
+@dataclass(frozen=True, eq=False)
+class TargetView:
+    """A view to be rendered and compared.
+
+    Attributes:
+        camera: exactly what took the image, resized and cropped.
+        camera_idx: whose camera response it has, as in ``NetworkInputs.camera_idxs``.
+        scene_from_camera: poses at the start and the end of the exposure.
+        time: when it was exposed.
+        rgb: colours in 0..1, with the same camera response as the context images of this camera.
+        depth_m: z-depth, 0 where there is none or it is not known.
+        semantic: ``SemanticClass``, -1 where not known.
+    """
+
+    camera: CameraModel
+    camera_idx: int
+    scene_from_camera: Float64[np.ndarray, "2 4 4"]
+    time: float
+    rgb: Float[Tensor, "h w 3"]
+    depth_m: Float[Tensor, "h w"]
+    semantic: Int64[Tensor, "h w"]
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingSample:
+    """One clip of a step; ``id`` names the clip and the window that it came from."""
+
+    id: str
+    inputs: NetworkInputs
+    truth: TrueMaps
+    targets: tuple[TargetView, ...]

@@ -1,0 +1,73 @@
+"""The data part of a recipe: how many clips are drawn, what they are like, and how samples are taken from them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from nurec_sim.network.profiles import Profile
+from nurec_sim.training.augment import AugmentSettings
+from nurec_sim.training.generate import ClipSettings
+from nurec_sim.training.windows import WindowSettings
+
+
+class DataSettings(BaseModel):
+    """Training data, drawn while training goes on.
+
+    Attributes:
+        clips: kept at a time.
+        clips_per_town: drives through each town.
+        clip_frames: of every camera of a clip.
+        clip_period_us: from one frame to the next.
+        clip_pixels: of every image that is drawn, about.
+        first_town: number of the first town; the following ones come next.
+        refresh: whether new clips replace the oldest ones when all are there; runs are then not repeatable.
+        cameras: weight of each number of cameras in a sample.
+        frames: weight of each number of context frames per camera.
+        most_images: of a sample.
+        zoom: most that images are magnified by cutting away their border.
+        mirror: how often left and right change places.
+        colours: whether colours are changed, by a response of each camera, blur, noise and JPEG.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    clips: int = Field(240, ge=1)
+    clips_per_town: int = Field(2, ge=1)
+    clip_frames: int = Field(16, ge=2)
+    clip_period_us: int = Field(125_000, ge=10_000)
+    clip_pixels: int = Field(65_856, ge=12_544)
+    first_town: int = Field(0, ge=0)
+    refresh: bool = False
+    cameras: dict[int, float] = {1: 0.6, 3: 0.4}
+    frames: dict[int, float] = {2: 0.1, 3: 0.1, 4: 0.7, 6: 0.1}
+    most_images: int = Field(6, ge=1)
+    zoom: float = Field(1.4, ge=1)
+    mirror: float = Field(0.5, ge=0, le=1)
+    colours: bool = True
+
+    def clip_settings(self) -> ClipSettings:
+        """Of the clips that are drawn."""
+        return ClipSettings(
+            frames=self.clip_frames,
+            period_us=self.clip_period_us,
+            pixels=self.clip_pixels,
+            clips_per_town=self.clips_per_town,
+        )
+
+    def window_settings(self, profile: Profile, pixels: int, targets: int) -> WindowSettings:
+        """Of samples with images of about so many pixels, and so many views to be rendered."""
+        share = (pixels / (profile.width_px * profile.height_px)) ** 0.5
+        sized = dataclasses.replace(
+            profile, width_px=round(profile.width_px * share), height_px=round(profile.height_px * share)
+        )
+        return WindowSettings(
+            profile=sized,
+            cameras=self.cameras,
+            frames=self.frames,
+            most_images=self.most_images,
+            targets=targets,
+            zoom=self.zoom,
+            mirror=self.mirror,
+            augment=AugmentSettings() if self.colours else None,
+        )

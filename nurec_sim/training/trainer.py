@@ -1,0 +1,226 @@
+"""The training loop: stages one after the other, curves, checkpoints and sample renders in a run folder.
+
+A run folder holds ``recipe.json``, ``curves.csv``, ``checkpoint.safetensors`` (to go on), ``weights.safetensors`` (the
+moving average in half precision, to use) and ``samples/``. Under torchrun every process takes its own samples, and
+gradients are averaged by DDP; only the first process writes.
+"""
+
+from __future__ import annotations
+
+import copy
+import csv
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from nurec_sim import network
+from nurec_sim.errors import TrainingError
+from nurec_sim.network.checkpoints import save_weights
+from nurec_sim.training import checkpoint
+from nurec_sim.training.checkpoint import Position
+from nurec_sim.training.config import Stage, TrainingConfig
+from nurec_sim.training.objective import Objective, StepOutputs
+from nurec_sim.training.processes import Processes
+from nurec_sim.training.rendering import PerceptualLoss
+from nurec_sim.training.sample import TrainingSample
+from nurec_sim.training.samples import Samples
+from nurec_sim.training.start import load_shared, prepare
+
+WEIGHTS, RECIPE, CURVES, SAMPLES = "weights.safetensors", "recipe.json", "curves.csv", "samples"
+COLUMNS = (
+    "step", "stage", "seconds", "rate", "loss", "abs_rel", "psnr", "depth", "edges", "normal", "semantic", "rgb", "sky",
+    "motion", "colour", "perceptual", "opacity", "rendered_depth", "footprint", "gradient", "skipped",
+)  # fmt: skip
+Progress = Callable[[str, float], None]
+
+
+class Trainer:
+    """One run of a recipe.
+
+    Args:
+        config: the recipe.
+        folder: the run folder; an unfinished run of the same recipe there goes on.
+        samples: where samples come from.
+        perceptual: the perceptual term.
+        processes: this process among those of the run.
+        threads: of torch and of the renderer; torch's own number if None.
+
+    Raises:
+        TrainingError: the folder holds a run of another recipe, or a damaged one.
+        WeightsError: ``config.start`` cannot be read.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        folder: Path,
+        samples: Samples,
+        perceptual: PerceptualLoss,
+        processes: Processes | None = None,
+        threads: int | None = None,
+    ) -> None:
+        self.config, self.folder, self.samples, self.perceptual = config, folder, samples, perceptual
+        self.processes = processes or Processes.alone()
+        self.threads = threads
+        self.position = checkpoint.read_position(folder) or Position(0, 0.0, config.digest())
+        if self.position.digest != config.digest():
+            raise TrainingError(f"{folder} holds a run of another recipe; choose another folder, or remove it")
+        self.model = network.build(config.profile, seed=config.seed)
+        prepare(self.model)
+        if config.start is not None and self.position.step == 0:
+            load_shared(self.model, config.start)
+        self.average = copy.deepcopy(self.model).requires_grad_(False)
+        self._moments: dict[str, Tensor] = {}
+        if self.position.step:
+            self._moments = checkpoint.load_networks(folder, self.model, self.average)
+        self._since = time.perf_counter()
+
+    def run(self, progress: Progress | None = None, until: int | None = None) -> None:
+        """Train to the end of the recipe, or for tests up to a step."""
+        report = progress or (lambda stage, fraction: None)
+        if self.processes.first:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / RECIPE).write_text(self.config.model_dump_json(indent=1) + "\n")
+        last = self.config.steps if until is None else min(until, self.config.steps)
+        for stage, first in _stages_with_starts(self.config):
+            if self.position.step < first + stage.steps and self.position.step < last:
+                self._train_stage(stage, first, min(last, first + stage.steps), report)
+
+    def _train_stage(self, stage: Stage, first: int, last: int, report: Progress) -> None:
+        objective = Objective(self.model, stage, self.perceptual, self.config.precision, self.threads)
+        objective.train()
+        trained = objective.trained()
+        optimiser = torch.optim.AdamW(
+            _groups(trained, self.config.weight_decay), lr=stage.learning_rate, betas=(0.9, 0.98), eps=1e-8
+        )
+        checkpoint.restore_optimiser(optimiser, trained, self._moments)
+        self._moments = {}
+        wrapped = self.processes.wrap(objective)
+        curve = _Curve(self.folder / CURVES, self.position.step) if self.processes.first else None
+        with self.samples.stream(stage, self.position.step, self.processes) as stream:
+            for step in range(self.position.step, last):
+                sample = next(stream)
+                rate = learning_rate(stage, step - first)
+                for group in optimiser.param_groups:
+                    group["lr"] = rate
+                loss, said, outputs = wrapped(sample)
+                said |= self._update(optimiser, trained, loss, step) | {"rate": rate, "loss": float(loss.detach())}
+                done = step + 1
+                self.position = dataclasses.replace(self.position, step=done, seconds=self._seconds())
+                if curve is not None:
+                    curve.add(stage.name, said)
+                    if done % self.config.log_every == 0 or done == last:
+                        curve.write(done, self.position.seconds)
+                    if done % self.config.sample_every == 0 or done == last:
+                        self._write_sample(done, sample, outputs)
+                    if done % self.config.checkpoint_every == 0 or done == last:
+                        self._save(None if done == first + stage.steps else optimiser)
+                shown = f"PSNR {said['psnr']:.1f} dB" if "psnr" in said else f"AbsRel {said['abs_rel']:.3f}"
+                report(f"{stage.name} {done - first}/{stage.steps}, {shown}", done / self.config.steps)
+
+    def _save(self, optimiser: torch.optim.AdamW | None) -> None:
+        self.position = dataclasses.replace(self.position, data_hash=self.samples.data_hash())
+        checkpoint.save_checkpoint(self.folder, self.model, self.average, optimiser, self.position)
+        self._write_weights()
+
+    def _update(
+        self, optimiser: torch.optim.AdamW, trained: Mapping[str, nn.Parameter], loss: Tensor, step: int
+    ) -> dict[str, float]:
+        """One optimiser step and the moving average; a step whose gradient is not finite is left out, and counted."""
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = float(nn.utils.clip_grad_norm_(list(trained.values()), self.config.clip_norm))
+        if not math.isfinite(norm):
+            return {"skipped": 1.0}
+        optimiser.step()
+        decay = min(self.config.average, (1 + step) / (10 + step))
+        with torch.no_grad():
+            for mean, (name, now) in zip(self.average.parameters(), self.model.named_parameters(), strict=True):
+                if name in trained:
+                    mean.lerp_(now, 1 - decay)
+        return {"gradient": norm, "skipped": 0.0}
+
+    def _seconds(self) -> float:
+        now = time.perf_counter()
+        spent, self._since = now - self._since, now
+        return self.position.seconds + spent
+
+    def _write_weights(self) -> None:
+        facts = {
+            "recipe": self.config.model_dump_json(),
+            "seed": str(self.config.seed),
+            "steps": str(self.position.step),
+            "seconds": f"{self.position.seconds:.0f}",
+            "data": self.position.data_hash,
+            "trained_on": "worlds drawn by nurec_sim.world",
+        }
+        save_weights(self.average, self.folder / WEIGHTS, facts, half=True)
+
+    def _write_sample(self, step: int, sample: TrainingSample, outputs: StepOutputs) -> None:
+        from nurec_sim.training.view import sample_sheet
+
+        renders = [rendering.rgb.detach().numpy() for rendering in outputs.renderings]
+        sheet = sample_sheet(sample, outputs.context, renders)
+        folder = self.folder / SAMPLES
+        folder.mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / f"{step:06d}.png"), np.ascontiguousarray(sheet[..., ::-1]))
+
+
+def learning_rate(stage: Stage, step: int) -> float:
+    """Linear warm-up, then half a cosine down to ``final_rate`` of the peak."""
+    if step < stage.warm_up:
+        return stage.learning_rate * (step + 1) / stage.warm_up
+    along = (step - stage.warm_up) / max(1, stage.steps - stage.warm_up)
+    return stage.learning_rate * (stage.final_rate + (1 - stage.final_rate) * (1 + math.cos(math.pi * along)) / 2)
+
+
+def _stages_with_starts(config: TrainingConfig) -> Iterator[tuple[Stage, int]]:
+    first = 0
+    for stage in config.stages:
+        yield stage, first
+        first += stage.steps
+
+
+def _groups(trained: Mapping[str, nn.Parameter], decay: float) -> list[dict[str, object]]:
+    """Matrices and kernels decay; biases, norms, scales, tokens and positions don't."""
+    decays = [each for name, each in trained.items() if each.ndim >= 2 and not name.endswith(("embed", "tokens"))]
+    known = {id(each) for each in decays}
+    others = [each for each in trained.values() if id(each) not in known]
+    return [{"params": decays, "weight_decay": decay}, {"params": others, "weight_decay": 0.0}]
+
+
+class _Curve:
+    """Rows of means since the last row; rows after the step that a run goes on from are dropped."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        self.path, self.stage = path, ""
+        self.sums: dict[str, tuple[float, int]] = {}
+        kept = []
+        if path.is_file():
+            with path.open(newline="") as file:
+                kept = [row for row in csv.DictReader(file) if row["step"].isdigit() and int(row["step"]) <= step]
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows({name: row.get(name, "") for name in COLUMNS} for row in kept)
+
+    def add(self, stage: str, values: Mapping[str, float]) -> None:
+        self.stage = stage
+        for name, value in values.items():
+            total, count = self.sums.get(name, (0.0, 0))
+            self.sums[name] = (total + value, count + 1)
+
+    def write(self, step: int, seconds: float) -> None:
+        means = {name: f"{total / count:.6g}" for name, (total, count) in self.sums.items()}
+        with self.path.open("a", newline="") as file:
+            csv.DictWriter(file, COLUMNS).writerow(
+                {"step": step, "stage": self.stage, "seconds": f"{seconds:.1f}"} | means
+            )
+        self.sums = {}

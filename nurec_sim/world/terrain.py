@@ -1,0 +1,89 @@
+"""The rolling ground of a town: a sum of long waves, so smooth that cars can be put on its tangent planes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import ConfigDict
+
+
+@dataclass(frozen=True)
+class Wave:
+    """One sine: its height, its length, the direction in which it runs, and its phase at the origin."""
+
+    amplitude_m: float
+    length_m: float
+    direction_rad: float
+    phase_rad: float
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Height over the plane z = 0 as a sum of waves; without waves the ground is flat."""
+
+    waves: tuple[Wave, ...] = ()
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    def height_m(self, xy: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n"]:
+        """Height of the ground (the road surface; sidewalks and grass lie a kerb higher)."""
+        xy = np.asarray(xy, np.float64)
+        height = np.zeros(xy.shape[:-1])
+        for wave in self.waves:
+            height += wave.amplitude_m * np.sin(self._phase(wave, xy))
+        return height
+
+    def gradient(self, xy: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
+        """Rise per metre towards x and towards y."""
+        xy = np.asarray(xy, np.float64)
+        gradient = np.zeros_like(xy)
+        for wave in self.waves:
+            steep = wave.amplitude_m * 2 * np.pi / wave.length_m * np.cos(self._phase(wave, xy))
+            gradient += steep[..., None] * np.array([np.cos(wave.direction_rad), np.sin(wave.direction_rad)])
+        return gradient
+
+    @property
+    def max_slope(self) -> float:
+        """An upper bound of the rise per metre anywhere."""
+        return float(sum(abs(wave.amplitude_m) * 2 * np.pi / wave.length_m for wave in self.waves))
+
+    def poses(
+        self,
+        xy: Float64[np.ndarray, "n 2"],
+        yaw_rad: Float64[np.ndarray, " n"],
+        above_m: Float64[np.ndarray, " n"],
+        *,
+        upright: bool = False,
+    ) -> Float64[np.ndarray, "n 4 4"]:
+        """Poses of bodies that stand on the ground.
+
+        Args:
+            xy: points on the ground.
+            yaw_rad: heading, seen from above.
+            above_m: how far the body's origin lies above its ground point, along the body's own z axis.
+            upright: z axis straight up instead of square to the ground (people).
+        """
+        xy, yaw_rad = np.asarray(xy, np.float64), np.asarray(yaw_rad, np.float64)
+        slope = np.zeros_like(xy) if upright else self.gradient(xy)
+        heading = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=1)
+        forward = np.concatenate([heading, (slope * heading).sum(axis=1, keepdims=True)], axis=1)
+        up = np.concatenate([-slope, np.ones((len(xy), 1))], axis=1)
+        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        pose = np.tile(np.eye(4), (len(xy), 1, 1))
+        pose[:, :3, 0], pose[:, :3, 1], pose[:, :3, 2] = forward, np.cross(up, forward), up
+        pose[:, :2, 3], pose[:, 2, 3] = xy, self.height_m(xy)
+        pose[:, :3, 3] += up * np.asarray(above_m, np.float64)[:, None]
+        return pose
+
+    @staticmethod
+    def _phase(wave: Wave, xy: np.ndarray) -> np.ndarray:
+        along = xy[..., 0] * np.cos(wave.direction_rad) + xy[..., 1] * np.sin(wave.direction_rad)
+        return 2 * np.pi * along / wave.length_m + wave.phase_rad
+
+
+FLAT = Terrain()
+"""The plane z = 0."""

@@ -1,0 +1,99 @@
+"""The sky of the ablation: the sky decoder's contract, a profile of its own, and smooth skies only."""
+
+import dataclasses
+
+import pytest
+import torch
+from network_inputs import straight_drive
+
+from nurec_sim import network
+from nurec_sim.network import cubemap
+from nurec_sim.network.checkpoints import load_weights, save_weights
+from nurec_sim.network.learned_sky import SkyDecoder
+from nurec_sim.network.profiles import SkySize
+from nurec_sim.network.sky_mlp import SkyMlp
+
+
+def small(kind: str) -> network.Profile:
+    size = SkySize(28, 48, 1, 3, (24, 48, 48, 48), kind)
+    return dataclasses.replace(network.PROFILES["tiny"], name=f"small-{kind}", sky=size)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return network.build(small("mlp"), seed=2)
+
+
+def test_profiles_differ_in_the_sky_only():
+    with torch.device("meta"):
+        names = {
+            name: [key for key in network.build(name).state_dict() if not key.startswith("sky.")]
+            for name in ("tiny", "tiny-sky-mlp")
+        }
+        ours = network.build("tiny-sky-mlp")
+    assert names["tiny"] == names["tiny-sky-mlp"]
+    assert isinstance(ours.sky, SkyMlp) and isinstance(network.build("tiny", seed=None).sky, SkyDecoder)
+    count = {kind: sum(p.numel() for p in part.parameters()) for kind, part in
+             (("mlp", ours.sky), ("decoder", network.build("tiny", seed=None).sky))}  # fmt: skip
+    assert 0.3 < count["mlp"] / count["decoder"] < 3
+
+
+def test_the_network_gives_the_decoders_kind_of_sky(model):
+    inputs = straight_drive(3, clips=2)
+    with torch.inference_mode():
+        outputs = model(inputs)
+        again = model(inputs)
+    assert outputs.sky.shape == (2, 6, 28, 28, 3) and outputs.sky.dtype == torch.float32
+    assert outputs.sky_learned and outputs.sky_seen.shape == (2, 6, 28, 28, 1) and bool((outputs.sky_seen == 1).all())
+    assert outputs.sky.min() >= 0 and outputs.sky.max() <= 1
+    assert torch.equal(outputs.sky, again.sky)
+    assert not torch.allclose(outputs.sky[0], outputs.sky[1])  # it depends on the clip
+
+
+def test_clips_do_not_mix(model):
+    inputs = straight_drive(2, clips=2)
+    alone = {f.name: getattr(inputs, f.name)[1:] for f in dataclasses.fields(inputs)}
+    with torch.inference_mode():
+        both, second = model(inputs).sky, model(type(inputs)(**alone)).sky
+    torch.testing.assert_close(both[1:], second, rtol=1e-4, atol=1e-5)
+
+
+def test_half_precision_and_files(model, tmp_path):
+    inputs = straight_drive(2)
+    save_weights(model, tmp_path / "sky.safetensors", {"of": "test"})
+    twin = network.build(small("mlp"), seed=None, precision="bfloat16")
+    load_weights(twin, tmp_path / "sky.safetensors", "small-mlp")
+    with torch.inference_mode():
+        exact, rough = model(inputs).sky, twin(inputs).sky
+        twin.precision = "float32"
+        assert torch.equal(twin(inputs).sky, exact)
+    assert rough.dtype == torch.float32 and (rough - exact).abs().max() < 0.05
+
+
+def test_it_learns_a_smooth_sky_but_neither_clouds_nor_sun():
+    """What the paper finds: no high frequencies. The same steps bring the sky decoder there."""
+    directions = cubemap.directions(28)
+    down = directions[..., 1:2]
+    smooth = torch.cat([0.5 + 0.2 * down, 0.6 + 0.2 * down, 0.8 + 0.1 * down], dim=-1)
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.rand(6, 3, 7, 7, generator=generator)
+    clouds = torch.nn.functional.interpolate(coarse, size=28).permute(0, 2, 3, 1) - 0.5
+    inputs = straight_drive(2)
+    errors = {}
+    for kind in ("mlp", "decoder"):
+        for name, truth in (("smooth", smooth), ("cloudy", (smooth + 0.4 * clouds).clamp(0, 1))):
+            model = network.build(small(kind), seed=0)
+            with torch.no_grad():
+                patches = model.encoder(inputs.rgb, inputs.c2w, inputs.fov)[-1].patches
+            optimiser = torch.optim.Adam(model.sky.parameters(), 4e-3)
+            for _ in range(40):
+                sky = model.sky(patches, inputs.rgb, inputs.rays[..., 3:])[0]
+                loss = (sky - truth).abs().mean()
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+            errors[kind, name] = float(loss.detach())
+    print(errors)
+    assert errors["mlp", "smooth"] < 0.02
+    assert errors["mlp", "cloudy"] > 2 * errors["mlp", "smooth"]
+    assert errors["mlp", "cloudy"] > 1.3 * errors["decoder", "cloudy"]
