@@ -111,7 +111,7 @@ def features_and_context(model: Any, inputs: NetworkInputs, road_share: float) -
 
     from nurec_sim.network.tensors import SemanticClass
 
-    features = model.encoder(inputs.rgb, inputs.c2w, inputs.fov)
+    features = model.encoder(inputs.rgb, inputs.c2w, inputs.fov, inputs.rays)
     context = model.decoder.context(features, inputs, False)
     height = inputs.rgb.shape[2]
     logits = torch.zeros_like(context.logits)

@@ -26,6 +26,7 @@ VERBS = [
     "run",
     "serve",
     "serve-grpc",
+    "train",
     "upload",
     "validate",
     "weights",

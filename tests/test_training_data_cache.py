@@ -1,13 +1,16 @@
 """The folder of training clips: filled by processes, checked, gone on with; and the stream of samples from it."""
 
 import dataclasses
+import multiprocessing
 import os
 import shutil
+import time
 
 import numpy as np
 import pytest
 import torch
 import training_clips
+import training_workers
 
 from nurec_sim.errors import ClipError
 from nurec_sim.network.profiles import PROFILES
@@ -176,3 +179,21 @@ def test_a_stream_without_clips_says_so(tmp_path):
         next(stream)
     with pytest.raises(ValueError, match="rank below"):
         SampleStream(tmp_path, WINDOWS, 0, rank=1)
+
+
+# ------------------------------------------------------------------------------------------------------------ workers
+
+
+def test_a_worker_ends_when_its_parent_is_killed():
+    context = multiprocessing.get_context("spawn")
+    mine, theirs = context.Pipe(duplex=False)
+    parent = context.Process(target=training_workers.parent_of_a_worker, args=(theirs,))
+    parent.start()
+    assert mine.poll(30)
+    worker = mine.recv()
+    parent.kill()
+    parent.join()
+    deadline = time.monotonic() + 20
+    while cache_module.is_alive(worker) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not cache_module.is_alive(worker)

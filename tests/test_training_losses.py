@@ -68,7 +68,7 @@ def perfect_gaussians(sample):
     model = network.build("tiny", seed=0)
     prepare(model)
     with torch.no_grad():
-        features = model.encoder(sample.inputs.rgb, sample.inputs.c2w, sample.inputs.fov)
+        features = model.encoder(sample.inputs.rgb, sample.inputs.c2w, sample.inputs.fov, sample.inputs.rays)
         query = model.decoder.gaussians(features, perfect_context(sample), sample.inputs)
     pixel = 1 / (0.7 * sample.inputs.rgb.shape[3])
     depth = sample.truth.depth_m.reshape(1, -1)

@@ -80,16 +80,16 @@ def test_many_rays_at_once_agree_with_single_rays(plan, rays):
         *zip(*np.nonzero(actors), strict=True),
         *zip(rng.integers(0, 16, 150), rng.integers(0, 90, 150), strict=True),
     ]
-    street, geom = rays.street, np.zeros(1, np.int32)
+    town, geom = rays.town, np.zeros(1, np.int32)
     for row, column in picked:
         direction = pose[:3, :3] @ beams[row, column]
         groups = np.array([1, 1, 1, 0, 0, 0], np.uint8)
-        distance = mujoco.mj_ray(street.model, rays._stage.data, pose[:3, 3], direction, groups, 1, -1, geom, None)
+        distance = mujoco.mj_ray(town.model, rays._stage.data, pose[:3, 3], direction, groups, 1, -1, geom, None)
         if distance < 0 or not LIDAR.range_m[0] <= distance <= LIDAR.range_m[1]:
             assert scan.range_m[row, column] == 0
         else:
             assert np.isclose(scan.range_m[row, column], distance, atol=1e-9)
-            assert scan.surface[row, column] == street.geom_class[geom[0]]
+            assert scan.surface[row, column] == town.geom_class[geom[0]]
 
 
 @pytest.mark.parametrize("camera_id", list(RIG.cameras))
@@ -157,8 +157,8 @@ def test_drivable_polygon_is_where_the_road_is(empty):
     clear = shapely.distance(shapely.points(xy), polygon.exterior) > 0.01
     inside = shapely.contains_xy(polygon, *xy.T)
     for place, expected in zip(xy[clear], inside[clear], strict=True):
-        geom, distance, _ = cast(empty.street, empty._stage.data, np.array([*place, 1.9]), np.array([[0.0, 0.0, -1.0]]))
-        assert (LABEL_OF_CLASS[empty.street.geom_class[geom[0]]] == Label.ROAD) == expected, place
+        geom, distance, _ = cast(empty.town, empty._stage.data, np.array([*place, 1.9]), np.array([[0.0, 0.0, -1.0]]))
+        assert (LABEL_OF_CLASS[empty.town.geom_class[geom[0]]] == Label.ROAD) == expected, place
         if expected:
             assert 1.9 - 0.011 <= distance[0] <= 1.9 + 1e-9
 
@@ -239,7 +239,7 @@ def test_what_cannot_be_drawn_is_refused(plan, rays):
 
     ask("focal lengths must be positive", lens=Fisheye(-50.0, 50.0, 56.0, 32.0))
     ask("5000 x 64 pixels; at most 4096 a side", TooLargeError, width_px=5000)
-    ask(r"no actor 'ghost' in this street; have \['lead'", actors={"ghost": np.stack([np.eye(4)] * 2)})
+    ask(r"no actor 'ghost' in this town; have \['lead'", actors={"ghost": np.stack([np.eye(4)] * 2)})
     ask("actor 'lead': world_from_box must be two poses", actors={"lead": np.eye(4)})
     ask("world_from_sensor must be two poses", world_from_sensor=np.zeros((2, 4, 4)))
     ask("end_us not before start_us", end_us=5)
@@ -253,5 +253,5 @@ def test_a_closed_world_says_so_and_closes_twice(plan):
     world = TrueWorld(dataclasses.replace(plan, actors=(), buildings=(), props=()), "rays")
     world.close()
     world.close()
-    with pytest.raises(RuntimeError, match="this street is closed"):
+    with pytest.raises(RuntimeError, match="this town is closed"):
         world.sense([request_at(plan, FRONT, 0.0)])

@@ -161,7 +161,7 @@ def _target(clip: Clip, camera_id: str, index: int, held: dict[int, tuple[str, i
 def projected_depth(
     request: SensorRequest, camera: CameraModel, xyz_world_m: Float64[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Z-depth of points at the size at which views are compared: of the nearest one in a pixel, 0 where there is none."""
+    """Z-depth at the size at which views are compared: of the nearest point in each pixel, 0 where there is none."""
     width, height = scored_size(camera.width_px, camera.height_px)
     uv, valid, fraction = sensors.project_rolling(camera, request.world_from_sensor, xyz_world_m)
     valid &= sensors.in_image(camera, uv)

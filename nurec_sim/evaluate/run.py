@@ -1,4 +1,4 @@
-"""Runs a protocol window by window, method by method; what is finished stays on disk, and runs go on where they stopped.
+"""Runs a protocol window by window; what is finished stays on disk, and runs go on where they stopped.
 
 ::
 

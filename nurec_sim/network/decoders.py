@@ -35,6 +35,7 @@ class ContextDecoder(nn.Module):
         # Margin around cuboids, metres; kept in the released state dicts, read by nothing here.
         self.register_buffer("cuboids_dims_padding", torch.ones(3))
         self.depth_head = DptHead(width, profile.head, out=2)
+        self.depth_detail = profile.head.depth_detail
         half = profile.head.fused // 2
         self.rgb_fusion = nn.Sequential(
             nn.Conv2d(3, half // 4, 3, 1, 1), nn.GELU(),
@@ -49,8 +50,9 @@ class ContextDecoder(nn.Module):
         clips, size = inputs.rgb.shape[:2], (inputs.rgb.shape[2], inputs.rgb.shape[3])
         levels = [feature.patches.flatten(0, 1) for feature in features]
         images = inputs.rgb.flatten(0, 1).permute(0, 3, 1, 2)
-        depth = self.depth_head(levels, size)[:, 0].float()
-        context = self.context_head(levels, size, self.rgb_fusion, images).float().permute(0, 2, 3, 1)
+        detail = (self.rgb_fusion, images)
+        depth = self.depth_head(levels, size, *(detail if self.depth_detail else ()))[:, 0].float()
+        context = self.context_head(levels, size, *detail).float().permute(0, 2, 3, 1)
         rgb, normal, logits = context.split([3, 3, len(SemanticClass)], dim=-1)
         moved = None
         if motion:

@@ -6,6 +6,7 @@ more token: first the class token, then one that codes the image's camera.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -15,9 +16,11 @@ from torch.nn import functional
 
 from nurec_sim.network.attention import Mlp, Rope, SelfBlock
 from nurec_sim.network.profiles import PATCH_PX, EncoderSize
+from nurec_sim.network.tensors import SCENE_RESCALE
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
+RAY_OCTAVES = 6
 
 
 def normalized(rgb: Float[Tensor, "*n h w 3"]) -> Float[Tensor, "*n h w 3"]:
@@ -79,6 +82,27 @@ class CameraEmbedding(nn.Module):
             return self.trunk_norm(x)
 
 
+class RayPatches(nn.Module):
+    """What patches see where, added to their tokens: mean ray of each patch, with sinusoids of its direction.
+
+    Not part of the released network, which tells patches their camera by one token. A small network that is trained
+    for hours learns where the ground is much sooner so.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.mlp = Mlp(6 + 3 * 2 * RAY_OCTAVES, width, width)
+
+    def forward(self, rays: Float[Tensor, "n h w 6"]) -> Float[Tensor, "n y x d"]:
+        """Tokens by row and column; always in float32."""
+        with torch.autocast(rays.device.type, enabled=False):
+            mean = functional.avg_pool2d(rays.float().permute(0, 3, 1, 2), PATCH_PX).permute(0, 2, 3, 1)
+            origin, direction = mean[..., :3] * SCENE_RESCALE, mean[..., 3:]
+            angle = direction[..., None] * (math.pi * 2.0 ** torch.arange(RAY_OCTAVES, device=rays.device))
+            waves = torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2)
+            return self.mlp(torch.cat([origin, direction, waves], dim=-1))
+
+
 class AlternatingTransformer(nn.Module):
     """The vision transformer: first single images, then images and clips in turn."""
 
@@ -128,15 +152,22 @@ class Encoder(nn.Module):
     def __init__(self, size: EncoderSize) -> None:
         super().__init__()
         self.patch_embed_img = PatchEmbedding(size.width)
+        self.patch_embed_ray = RayPatches(size.width) if size.rays else None
         self.embed_camera = CameraEmbedding(size)
         self.vit = AlternatingTransformer(size)
 
     def forward(
-        self, rgb: Float[Tensor, "b v h w 3"], c2w: Float[Tensor, "b v 4 4"], fov: Float[Tensor, "b v 2"]
+        self,
+        rgb: Float[Tensor, "b v h w 3"],
+        c2w: Float[Tensor, "b v 4 4"],
+        fov: Float[Tensor, "b v 2"],
+        rays: Float[Tensor, "b v h w 6"],
     ) -> tuple[Features, ...]:
         """Four levels of features, from early to deep."""
-        patches = self.patch_embed_img(normalized(rgb.flatten(0, 1))).unflatten(0, rgb.shape[:2])
-        return self.vit(patches, self.embed_camera(c2w, fov))
+        patches = self.patch_embed_img(normalized(rgb.flatten(0, 1)))
+        if self.patch_embed_ray is not None:
+            patches = patches + self.patch_embed_ray(rays.flatten(0, 1)).to(patches.dtype)
+        return self.vit(patches.unflatten(0, rgb.shape[:2]), self.embed_camera(c2w, fov))
 
 
 def local_positions(rows: int, columns: int, tokens: int, device: torch.device) -> Int64[Tensor, "n 2"]:

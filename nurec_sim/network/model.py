@@ -56,7 +56,7 @@ class InstantNuRec(nn.Module):
         self._check(inputs)
         with self._half_precision(inputs.rgb.device):
             # Images and cameras become features that all decoders share.
-            features = self.encoder(inputs.rgb, inputs.c2w, inputs.fov)
+            features = self.encoder(inputs.rgb, inputs.c2w, inputs.fov, inputs.rays)
             deepest = features[-1].patches
             # What every pixel shows: depth, colour, normal, class, and where its point moves.
             context = self.decoder.context(features, inputs, motion)

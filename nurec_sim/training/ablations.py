@@ -61,6 +61,29 @@ def ablated(config: TrainingConfig, name: str) -> TrainingConfig:
     return changed
 
 
+def scaled(config: TrainingConfig, steps: int, pixels: int) -> TrainingConfig:
+    """A recipe cut down to so many steps in all, with images of at most so many pixels; stages keep their shares.
+
+    Raises:
+        TrainingError: there are fewer steps than stages.
+    """
+    if steps < len(config.stages):
+        raise TrainingError(f"{len(config.stages)} stages need at least as many steps, got {steps}")
+    share = steps / config.steps
+    ends = [round(share * sum(stage.steps for stage in config.stages[: k + 1])) for k in range(len(config.stages))]
+    stages, first = [], 0
+    for number, (stage, end) in enumerate(zip(config.stages, ends, strict=True)):
+        last = min(max(end, first + 1), steps - (len(ends) - 1 - number))
+        changes = {
+            "steps": last - first,
+            "warm_up": min(round(share * stage.warm_up), last - first - 1),
+            "pixels": min(stage.pixels, pixels),
+        }
+        stages.append(stage.model_copy(update=changes))
+        first = last
+    return config.model_copy(update={"stages": tuple(stages)})
+
+
 def _in_one_stage(config: TrainingConfig) -> TrainingConfig:
     """All parts and all losses at once, for as many steps; rate and warm-up are those of the first stage.
 

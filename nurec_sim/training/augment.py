@@ -29,7 +29,8 @@ class AugmentSettings:
     """How much colours change: standard deviations (of logarithms for factors), or shares of samples.
 
     Attributes:
-        light: brightness of the world.
+        brightness: mean of all images, 0..1, towards which exposure goes half of the way.
+        light: brightness of the world beside that.
         tint: of each colour channel of the world.
         saturation: of the world.
         hue_rad: of the world.
@@ -45,6 +46,7 @@ class AugmentSettings:
         jpeg_quality: least and most of their quality.
     """
 
+    brightness: float = 0.38
     light: float = 0.25
     tint: float = 0.05
     saturation: float = 0.25
@@ -82,7 +84,7 @@ class _Response:
 def augmented(rng: np.random.Generator, sample: TrainingSample, settings: AugmentSettings) -> TrainingSample:
     """The sample in other colours; shapes and geometry stay."""
     cameras = sample.inputs.camera_idxs[0].tolist()
-    world = _world_look(rng, settings)
+    world = _world_look(rng, float(sample.inputs.rgb.mean()), settings)
     responses = {camera: _response(rng, world, settings) for camera in sorted(set(cameras))}
     noise = float(rng.uniform(0, settings.noise)) if rng.random() < settings.noisy else 0.0
     low, high = settings.jpeg_quality
@@ -95,12 +97,13 @@ def augmented(rng: np.random.Generator, sample: TrainingSample, settings: Augmen
     return dataclasses.replace(sample, inputs=dataclasses.replace(sample.inputs, rgb=rgb), targets=targets)
 
 
-def _world_look(rng: np.random.Generator, settings: AugmentSettings) -> Float64[np.ndarray, "3 3"]:
+def _world_look(rng: np.random.Generator, mean: float, settings: AugmentSettings) -> Float64[np.ndarray, "3 3"]:
     """Brightness, tint, saturation and hue of everything, as a matrix."""
     saturation, hue = np.exp(rng.normal(0, settings.saturation)), rng.normal(0, settings.hue_rad)
     c, s = saturation * np.cos(hue), saturation * np.sin(hue)
     colours = np.linalg.inv(_YIQ) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ _YIQ
-    gain = np.exp(rng.normal(0, settings.light) + rng.normal(0, settings.tint, 3))
+    exposed = np.sqrt(settings.brightness / max(mean, 0.05))
+    gain = exposed * np.exp(rng.normal(0, settings.light) + rng.normal(0, settings.tint, 3))
     return gain[:, None] * colours
 
 

@@ -11,7 +11,6 @@ import itertools
 import multiprocessing
 import os
 import shutil
-import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.process import BaseProcess
@@ -20,6 +19,7 @@ from pathlib import Path
 from nurec_sim.errors import ClipError
 from nurec_sim.training.clips import UNFINISHED_PREFIX, CachedClip, ready_clips
 from nurec_sim.training.generate import ClipSettings, clip_ids, generate_town, town_of
+from nurec_sim.training.workers import work_in_background
 
 Progress = Callable[[int, int], None]
 """Called with (clips that are ready, clips wanted)."""
@@ -170,7 +170,7 @@ class ClipCache:
     def _run(self, batch: tuple[int, ...], backend: str, niceness: int, refresh: bool) -> int | None:
         """The exit status of a process that draws a few towns."""
         process = multiprocessing.get_context("spawn").Process(
-            target=_draw_towns, args=(batch, self.settings, self.clips, backend, niceness, os.getpid()), daemon=True
+            target=_draw_towns, args=(batch, self.settings, self.clips, backend, niceness), daemon=True
         )
         process.start()
         while process.is_alive() and not self._stop.is_set():
@@ -190,7 +190,7 @@ class ClipCache:
         """Deletes what dead workers left half done."""
         for path in self.clips.glob(f"{UNFINISHED_PREFIX}*"):
             owner = path.name.removeprefix(UNFINISHED_PREFIX).partition("-")[0]
-            if not owner.isdigit() or not _alive(int(owner)):
+            if not owner.isdigit() or not is_alive(int(owner)):
                 shutil.rmtree(path, ignore_errors=True)
 
     def _drop_damaged(self) -> None:
@@ -211,7 +211,7 @@ def _ended(process: BaseProcess) -> int | None:
     return status
 
 
-def _alive(process_id: int) -> bool:
+def is_alive(process_id: int) -> bool:
     try:
         os.kill(process_id, 0)
     except ProcessLookupError:
@@ -221,14 +221,9 @@ def _alive(process_id: int) -> bool:
     return True
 
 
-def _draw_towns(
-    towns: tuple[int, ...], settings: ClipSettings, folder: Path, backend: str, niceness: int, parent: int
-) -> None:
-    """What a worker process does; it ends with the process that started it, which alone answers Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(niceness)
-    os.environ["LP_NUM_THREADS"] = "1"  # Mesa's software renderer would take every core
+def _draw_towns(towns: tuple[int, ...], settings: ClipSettings, folder: Path, backend: str, niceness: int) -> None:
+    """What a worker process does."""
+    work_in_background(niceness)
     for town in towns:
         for _ in generate_town(town, settings, folder, backend):
-            if os.getppid() != parent:
-                return
+            pass

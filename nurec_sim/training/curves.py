@@ -26,10 +26,12 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 """Of the stages, in turn; told apart by all eyes (Okabe and Ito)."""
 RATIO = 20.0
 """Positive curves that span more than this factor get a logarithmic scale."""
-SMOOTHING = 0.8
-"""How much of the mean so far the bold line keeps at each point; the thin one is what was measured."""
+SMOOTHING = 0.6
+"""How much each next neighbour counts in the bold line; the thin one is what was measured."""
 COLUMNS = 4
 PANEL_PX = (340, 210)
+LEGEND_PX = 26
+INK, SOFT_INK = (30, 41, 59), (100, 116, 139)
 MARGIN = (52, 10, 24, 26)
 """Left, right, top and bottom of a panel's axes, pixels."""
 
@@ -109,12 +111,17 @@ def write_curves(folder: Path) -> tuple[Path, Path]:
 
 
 def smoothed(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Exponential mean, without a bias towards 0 at its start."""
-    total, mass, means = 0.0, 0.0, np.empty(len(values))
+    """Means of each value and its neighbours, which count less the farther they are."""
+    forth, back = _fading_sums(values), _fading_sums(values[::-1])[::-1]
+    count = _fading_sums(np.ones(len(values)))
+    return (forth + back - values) / (count + count[::-1] - 1)
+
+
+def _fading_sums(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    sums, total = np.empty(len(values)), 0.0
     for index, value in enumerate(values):
-        total, mass = SMOOTHING * total + value, SMOOTHING * mass + 1
-        means[index] = total / mass
-    return means
+        sums[index] = total = SMOOTHING * total + value
+    return sums
 
 
 def curves_page(curves: Curves, title: str) -> str:
@@ -126,6 +133,7 @@ def curves_page(curves: Curves, title: str) -> str:
     plots = "".join(
         f'<div class="card"><b>{escape(name)}</b><div id="{escape(name)}"></div></div>' for name in curves.values
     )
+    stages = ", ".join(f'<b style="color:{colour}">{escape(stage)}</b>' for stage, colour in _coloured(curves))
     hours = curves.seconds[-1] / 3600
     last = ", ".join(f"{escape(name)} {_shown(values)}" for name, values in curves.values.items())
     return (
@@ -133,7 +141,7 @@ def curves_page(curves: Curves, title: str) -> str:
         f"<title>{escape(title)} · nurec_sim</title><style>{STYLE}"
         ".grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(360px,1fr));gap:10px}</style></head>\n"
         f'<body><main><h1>Training curves</h1><p class="soft">{escape(title)} · {int(curves.step[-1]):,} steps · '
-        f'{hours:.2f} h · stages {escape(", ".join(curves.stages))}</p><div class="grid">{plots}</div>'
+        f"{hours:.2f} h · stages {stages}</p><div class='grid'>{plots}</div>"
         f'<p class="key">Thin: measured. Bold: smoothed. Newest: {last}.</p></main>'
         f'<script type="application/json" id="panels">{stored}</script>\n<script>{get_plotlyjs()}</script>\n'
         "<script>JSON.parse(document.getElementById('panels').textContent).forEach(function (panel) {"
@@ -147,15 +155,20 @@ def curves_image(curves: Curves) -> UInt8[np.ndarray, "h w 3"]:
     names = list(curves.values)
     columns = min(COLUMNS, len(names))
     rows = -(-len(names) // columns)
-    sheet = np.full((rows * PANEL_PX[1], columns * PANEL_PX[0], 3), 255, np.uint8)
+    sheet = np.full((LEGEND_PX + rows * PANEL_PX[1], columns * PANEL_PX[0], 3), 255, np.uint8)
+    place = MARGIN[0]
+    for stage, colour in _coloured(curves):
+        _write(sheet, stage, place, LEGEND_PX - 5, 0.5, _rgb(colour))
+        place += 30 + 10 * len(stage)
     for index, name in enumerate(names):
-        top, left = (index // columns) * PANEL_PX[1], (index % columns) * PANEL_PX[0]
+        top, left = LEGEND_PX + (index // columns) * PANEL_PX[1], (index % columns) * PANEL_PX[0]
         _draw_panel(sheet[top : top + PANEL_PX[1], left : left + PANEL_PX[0]], curves, name)
     return sheet
 
 
 def _figure(curves: Curves, name: str) -> dict[str, Any]:
     layout = base_layout(230) | {"showlegend": False}
+    layout["xaxis"] |= {"range": [float(curves.step[0]), float(curves.step[-1])]}
     if _logarithmic(curves.values[name]):
         layout["yaxis"] |= {"type": "log"}
     data = []
@@ -180,27 +193,34 @@ def _draw_panel(panel: UInt8[np.ndarray, "h w 3"], curves: Curves, name: str) ->
     low, high = low - pad, high + pad
     first, last = curves.step[0], max(curves.step[-1], curves.step[0] + 1)
 
-    def text(words: str, x: int, y: int, size: float = 0.38, colour: int = 90) -> None:
-        cv2.putText(panel, words, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, (colour,) * 3, 1, cv2.LINE_AA)
-
     for share in (0.0, 0.5, 1.0):
         y = top + round((1 - share) * height)
         cv2.line(panel, (left, y), (left + width, y), (226, 232, 240), 1)
         level = low + share * (high - low)
-        text(f"{10**level if log else level:.3g}", 4, y + 4)
-    text(name, left, top - 8, 0.46, 30)
+        _write(panel, f"{10**level if log else level:.3g}", 4, y + 4)
+    _write(panel, name, left, top - 8, 0.46, INK)
     newest = _shown(curves.values[name])
-    text(newest, left + width - 8 * len(newest), top - 8, 0.4, 30)
-    text(f"{int(first)}", left, panel.shape[0] - 8)
-    text(f"step {int(last)}", left + width - 75, panel.shape[0] - 8)
+    _write(panel, newest, left + width - 8 * len(newest), top - 8, 0.4, INK)
+    _write(panel, f"{int(first)}", left, panel.shape[0] - 8)
+    _write(panel, f"step {int(last)}", left + width - 75, panel.shape[0] - 8)
     for stage, colour in _coloured(curves):
         step, values = curves.of_stage(name, stage)
-        rgb = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)])
+        rgb = np.array(_rgb(colour))
         for line, ink, thick in ((values, 255 - 0.35 * (255 - rgb), 1), (smoothed(values), rgb, 2)):
             x = left + (step - first) / (last - first) * width
             y = top + (high - scale(line)) / (high - low) * height
             points = np.rint(np.stack([x, y], axis=1)).astype(np.int32)
             cv2.polylines(panel, [points], False, [float(c) for c in ink], thick, cv2.LINE_AA)
+
+
+def _write(
+    image: UInt8[np.ndarray, "h w 3"], text: str, x: int, y: int, size: float = 0.38, ink: tuple[int, ...] = SOFT_INK
+) -> None:
+    cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, ink, 1, cv2.LINE_AA)
+
+
+def _rgb(colour: str) -> tuple[int, ...]:
+    return tuple(int(colour[k : k + 2], 16) for k in (1, 3, 5))
 
 
 def _coloured(curves: Curves) -> list[tuple[str, str]]:

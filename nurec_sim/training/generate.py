@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from nurec_sim.training.clips import FARTHEST_M, NORMAL_SCALE, CameraRecord, write_training_clip
-from nurec_sim.types import CameraModel, SensorRequest, Shutter, Track, Trajectory
+from nurec_sim.types import CameraModel, Rig, SensorRequest, Shutter, Track, Trajectory
 
 if TYPE_CHECKING:
     from nurec_sim.world import TrueWorld
@@ -25,6 +25,9 @@ GENERATOR = 1
 """To be raised when the same settings would give other clips, so that old ones are not mixed with new ones."""
 CAMERAS = {1: 0.4, 3: 0.5, 5: 0.1}
 """How often a rig has so many cameras."""
+PLAIN_LENS, GLOBAL_SHUTTER = 0.5, 0.7
+"""How often a rig gets pinholes without distortion, and a global shutter, whatever it would have otherwise: other
+lenses cost twice, rolling shutters about four times as much to draw."""
 TOGETHER = 0.5
 """How often all cameras of a rig expose at the same time; otherwise each has its own delay."""
 MOST_DELAY_US, LONGEST_READOUT_US = 90_000, 33_000
@@ -116,20 +119,24 @@ def _draw_clip(world: TrueWorld, drive: int, settings: ClipSettings, folder: Pat
     plan = world.plan
     rng = np.random.default_rng([plan.seed, drive, 0xDA7A])
     count, car = int(rng.choice(list(CAMERAS), p=list(CAMERAS.values()))), int(rng.integers(1 << 31))
-    rig, readout_us = random_rig(car, count, settings.pixels, lidar=None), random_readout_us(car)
+    lens = "pinhole" if rng.random() < PLAIN_LENS else None
+    rig, readout_us = random_rig(car, count, settings.pixels, lens, None), random_readout_us(car)
+    at_once = rng.random() < GLOBAL_SHUTTER
     ego = plan.ego_trajectory()
     # The drives of a town share its time evenly.
     free_us = plan.span_us[1] - plan.span_us[0] - settings.frames * settings.period_us - MOST_DELAY_US
     start_us = plan.span_us[0] + int(free_us * (drive + rng.random()) / settings.clips_per_town)
     together = rng.random() < TOGETHER
     records = []
-    for camera in rig.cameras.values():
+    cameras = [dataclasses.replace(c, shutter=Shutter.GLOBAL) if at_once else c for c in rig.cameras.values()]
+    for camera in cameras:
         delay_us = 0 if together else int(rng.integers(MOST_DELAY_US - LONGEST_READOUT_US))
         first = start_us + delay_us + settings.period_us * np.arange(settings.frames, dtype=np.int64)
         last = first if camera.shutter is Shutter.GLOBAL else first + readout_us
         records.append(_record(world, camera, ego, np.stack([first, last], axis=1)))
     span_us = (min(int(r.t_us.min()) for r in records), max(int(r.t_us.max()) for r in records))
     tracks = [dataclasses.replace(track, path=_cut(track, span_us)) for track in plan.tracks()]
+    rig = Rig({camera.id: camera for camera in cameras}, {}, rig.body)
     return write_training_clip(folder, rig, ego, tracks, records, facts)
 
 

@@ -85,7 +85,7 @@ class Objective(nn.Module):
         with torch.autocast(inputs.rgb.device.type, self.precision, enabled=self.precision is not torch.float32):
             frozen = "encoder" not in stage.trains
             with torch.no_grad() if frozen else contextlib.nullcontext():
-                features = model.encoder(inputs.rgb, inputs.c2w, inputs.fov)
+                features = model.encoder(inputs.rgb, inputs.c2w, inputs.fov, inputs.rays)
             motion = "motion" in stage.trains or stage.targets > 0
             context = model.decoder.context(features, inputs, motion)
             if stage.targets:

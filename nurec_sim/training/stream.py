@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
-import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -22,9 +21,11 @@ from nurec_sim.errors import ClipError
 from nurec_sim.training.clips import CachedClip, ready_clips
 from nurec_sim.training.sample import TrainingSample
 from nurec_sim.training.windows import WindowSettings, sample_window
+from nurec_sim.training.workers import work_in_background
 
 AHEAD = 3
 """Samples prepared ahead by each worker."""
+LOADER_NICENESS = 5
 EMPTY_PAUSE_S = 1.0
 GIVEN_UP_AFTER = 8
 """Clips of one sample that may turn out damaged or gone."""
@@ -90,7 +91,7 @@ class SampleStream:
         self._next, self._depth = start, AHEAD * max(workers, 1)
         self._ahead: deque[Future[TrainingSample]] = deque()
         self._workers: Executor = (
-            ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_calm)
+            ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_prepare_worker)
             if workers
             else ThreadPoolExecutor(1, "samples")
         )
@@ -125,9 +126,8 @@ class SampleStream:
         self._workers.shutdown(wait=True, cancel_futures=True)
 
 
-def _calm() -> None:
-    """One thread per worker: training itself needs the cores."""
+def _prepare_worker() -> None:
     import torch
 
-    torch.set_num_threads(1)
-    os.nice(5)
+    work_in_background(LOADER_NICENESS)
+    torch.set_num_threads(1)  # training itself needs the cores

@@ -66,6 +66,8 @@ class SpecBuilder:
     def mesh(self, builder: MeshBuilder, crease_deg: float = 38.0) -> str:
         """Registers a mesh and gives its name."""
         points, normals, uv = builder.corners(crease_deg)
+        if len(points) == 3:  # MuJoCo wants at least four vertices
+            points, normals, uv = (np.concatenate([values, values]) for values in (points, normals, uv))
         self._meshes += 1
         mesh = self.spec.add_mesh(name=f"mesh{self._meshes}")
         mesh.uservert = points.ravel().tolist()

@@ -28,6 +28,8 @@ LEAVING_M = 60.0
 CYCLISTS = 0.13
 LEAD = 0.8
 FREE_M = 2.5
+FLOWING_RANK = 3
+"""Who is of this rank at a junction rarely has to wait: the ego chooses such ways a little more often."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +55,11 @@ def ego_driver(rng: np.random.Generator, rules: Rules, seconds: float) -> Driver
         free = route.length_m - END_M - distance
         inside = [leg for leg in route.legs if leg.in_junction]
         score = min(free, 10.0) / 10.0 + (1.0 if inside else 0.0)
-        if any(rules.rank[leg.lane] < 0 for leg in inside) and rng.random() < 0.7:
+        first_rank = min((rules.rank[leg.lane] for leg in inside[:1]), default=0)
+        if first_rank < 0 and rng.random() < 0.8:
             score -= 1.5
+        if first_rank >= FLOWING_RANK:
+            score += float(rng.uniform(0.0, 1.0))
         start = float(rng.uniform(8.0, max(free, 10.0)))
         if inside:
             start = max(min(free, inside[0].start_m - float(rng.uniform(0.1, 0.6)) * distance), 10.0)
@@ -85,7 +90,9 @@ def other_vehicles(
             pace = float(rng.uniform(3.0, 6.5)) / rules.lanes[lanes[0]].speed_limit_mps
             route = lay_route(rules.lanes, lanes, _cycling_m(rules, lanes), pace)
         place = route.at(np.array(station))
-        if any(np.linalg.norm(place - other) < (size[0] + length) / 2 + FREE_M for other, length in taken):
+        if station < size[0] / 2 + 1.0 or any(
+            np.linalg.norm(place - other) < (size[0] + length) / 2 + FREE_M for other, length in taken
+        ):
             continue
         taken.append((place, size[0]))
         name = "lead" if leads else f"{'cyclist' if kind == 'cyclist' else 'vehicle'}_{len(found)}"
@@ -100,8 +107,8 @@ Place = tuple[float, Route, float]
 
 def _lead(rng: np.random.Generator, rules: Rules, ego: Driver) -> list[Place]:
     """A place before the ego, most of the time, for somebody who is rather slower."""
-    station = ego.station_m + EGO_SIZE_M[0] + float(rng.uniform(7.0, 22.0)) + 0.5 * ego.speed_mps
-    slower = float(rng.uniform(0.6, 1.05))
+    station = ego.station_m + EGO_SIZE_M[0] + float(rng.uniform(7.0, 28.0)) + 0.5 * ego.speed_mps
+    slower = float(rng.uniform(0.7, 1.1))
     if rng.random() > LEAD or station > ego.route.length_m - LEAVING_M:
         return []
     return [(-1.0, lay_route(rules.lanes, [leg.lane for leg in ego.route.legs], speed_factor=slower), station)]

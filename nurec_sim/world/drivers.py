@@ -112,8 +112,8 @@ def follow(
     lead_speed: float | Float64[np.ndarray, " n"] = 0.0,
 ) -> Float64[np.ndarray, " n"]:
     """Accelerations by the intelligent driver model; an infinite gap is a free road."""
-    wanted = np.maximum(wanted, 0.05)
-    free = np.where(speed < wanted, 1 - np.minimum(speed / wanted, 1.0) ** 4, 1.5 * (wanted - speed))
+    share = np.minimum(speed / np.maximum(wanted, 0.05), 1.0)
+    free = np.where(speed < wanted, 1 - share**4, 1.5 * (wanted - speed))
     closing = speed * (speed - lead_speed) / (2 * np.sqrt(ACCEL_MPS2 * BRAKE_MPS2))
     desired = STAND_GAP_M + np.maximum(0.0, speed * HEADWAY_S + closing)
     wish = ACCEL_MPS2 * (free - (desired / np.maximum(gap_m, 0.1)) ** 2)
@@ -130,7 +130,7 @@ class _Roads:
         self.speed = np.stack([np.pad(r.allowed_mps, (0, longest - len(r.xy_m)), mode="edge") for r in routes])
         self.rows = np.arange(len(routes))
 
-    def at(self, station_m: Float64[np.ndarray, "n *looks"]) -> Float64[np.ndarray, "n *looks 2"]:
+    def at(self, station_m: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n ... 2"]:
         """Points of everybody's own route, straight on beyond both ends."""
         shape = (-1,) + (1,) * (station_m.ndim - 1)
         row, place = self.rows.reshape(shape), station_m / SPACING_M

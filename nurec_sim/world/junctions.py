@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from nurec_sim.geometry import wrap_angle
+from nurec_sim import geometry
 from nurec_sim.world.plan import Arm, Connection, Junction, Road, RoadPiece
 from nurec_sim.world.road import RoadLanes
 
@@ -79,7 +79,7 @@ def join(start: Pose2, end: Pose2) -> tuple[RoadPiece, ...]:
     """A smooth path between two poses: line, arc, line where their tangents meet, else two arcs."""
     (p, from_yaw), (q, to_yaw) = start, end
     u, v = (np.array([np.cos(yaw), np.sin(yaw)]) for yaw in (from_yaw, to_yaw))
-    turn, chord = float(wrap_angle(to_yaw - from_yaw)), q - p
+    turn, chord = _wrapped(to_yaw - from_yaw), q - p
     cross = float(u[0] * v[1] - u[1] * v[0])
     if abs(cross) < 1e-9 and abs(float(u[0] * chord[1] - u[1] * chord[0])) < 1e-6 and float(u @ v) > 0:
         return (RoadPiece(float(np.hypot(*chord))),)
@@ -153,7 +153,7 @@ def connections(junction: str, mouths: Sequence[Mouth], ring: tuple[np.ndarray, 
             outbound = target.lanes(inbound=False)
             if a == b or not inbound or not outbound:
                 continue
-            change = float(wrap_angle(target.pose()[1] - source.pose()[1] - np.pi))
+            change = _wrapped(target.pose()[1] - source.pose()[1] - np.pi)
             if ring is None and abs(change) > SHARPEST_TURN_RAD:
                 continue
             turn: Literal["straight", "left", "right"]
@@ -169,8 +169,13 @@ def connections(junction: str, mouths: Sequence[Mouth], ring: tuple[np.ndarray, 
                 pieces = join(start, end) if ring is None else ring_path(start, end, *ring)
                 found.append(Connection(
                     f"{junction}:{len(found)}", f"{source.arm.road}:{lane_in}", f"{target.arm.road}:{lane_out}", turn,
-                    float(start[0][0]), float(start[0][1]), float(wrap_angle(start[1])), pieces))  # fmt: skip
+                    float(start[0][0]), float(start[0][1]), _wrapped(start[1]), pieces))  # fmt: skip
     return tuple(found)
+
+
+def _wrapped(angle_rad: float) -> float:
+    """The same angle in -pi..pi."""
+    return float(geometry.wrap_angle(np.array(angle_rad)))
 
 
 def _has_ramp(*mouths: Mouth) -> bool:

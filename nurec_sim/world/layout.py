@@ -25,7 +25,7 @@ MOST_SECONDS = 30.0
 
 
 def town_plan(seed: int, split: Split = "train", template: str | None = None, seconds: float = 12.0) -> TownPlan:
-    """The town of a seed, and ``seconds`` of traffic in it.
+    """The town of a seed, and ``seconds`` of traffic in it; less than a second of work.
 
     Args:
         seed: same seed, same split, same plan to the byte.
@@ -38,6 +38,13 @@ def town_plan(seed: int, split: Split = "train", template: str | None = None, se
         ValueError: a negative seed, an unknown split or template, a template that the split holds out, or seconds out
             of range.
     """
+    plan = still_town(seed, split, template, seconds)
+    ego, actors = traffic.drive(TownNetwork(plan), seed, split, plan.span_us)
+    return replace(plan, ego=ego, actors=actors)
+
+
+def still_town(seed: int, split: Split = "train", template: str | None = None, seconds: float = 12.0) -> TownPlan:
+    """The same town without anybody in it; arguments and errors as in ``town_plan``."""
     if seed < 0 or not 1.0 <= seconds <= MOST_SECONDS:
         raise ValueError(
             f"a town needs a seed >= 0 and 1..{MOST_SECONDS:g} seconds, got seed {seed}, {seconds} seconds"
@@ -80,8 +87,7 @@ def town_plan(seed: int, split: Split = "train", template: str | None = None, se
     network = TownNetwork(plan)
     houses = town_houses(stream(6), network, style)
     props = town_props(stream(7), network, houses, style)
-    ego, actors = traffic.drive(network, seed, split, plan.span_us)
-    return replace(plan, buildings=houses, props=props, ego=ego, actors=actors)
+    return replace(plan, buildings=houses, props=props)
 
 
 def _crossings(rng: np.random.Generator, network: TownNetwork) -> tuple[tuple[Crossing, ...], tuple[StopLine, ...]]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import shapely
 
 from nurec_sim.world.junctions import Mouth
-from nurec_sim.world.plan import Crossing, StopLine, TownPlan
+from nurec_sim.world.plan import Crossing, RoadPiece, StopLine, TownPlan
 from nurec_sim.world.road import RoadLanes
 
 LINE_PART_M = 20.0
@@ -37,6 +37,12 @@ def town_markings(
             painted += [Marking("white", area) for area in _lane_lines(line, start, end)]
             painted += [Marking("white", area) for area in _edge_lines(line, start, end)]
     white: list[shapely.Polygon] = []
+    for junction in plan.junctions:
+        if junction.kind == "fork":
+            through = _through(junctions[junction.id])
+            painted += [Marking(centre_colour, area) for area in _centre_line(through, 0.0, through.length_m)]
+            white += _lane_lines(through, 0.0, through.length_m)
+            white += _dashes(through, 0.0, through.length_m, -through.plan.lanes_forward, 1.0, 1.5, 0.2)
     for crossing in plan.crossings:
         white += _crossing(roads[crossing.road], crossing)
     rules = {(mouth.arm.road, not mouth.outward): mouth.arm.rule for group in junctions.values() for mouth in group}
@@ -68,6 +74,14 @@ def _open_spans(line: RoadLanes, plan: TownPlan) -> Iterator[tuple[float, float]
             ends = np.linspace(start, low, count + 1)
             yield from ((float(a), float(b)) for a, b in zip(ends[:-1], ends[1:], strict=True))
         start = max(start, high)
+
+
+def _through(arms: list[Mouth]) -> RoadLanes:
+    """The main road through a fork: straight from its first arm to its second, with the ramp to its right."""
+    (start, _), (end, yaw) = arms[0].pose(), arms[1].pose()
+    straight = (RoadPiece(float(np.hypot(*(end - start)))),)
+    road = replace(arms[1].line.plan, x_m=float(start[0]), y_m=float(start[1]), yaw_rad=yaw, pieces=straight)
+    return RoadLanes(road)
 
 
 def _stripe(line: RoadLanes, start: float, end: float, offset: float | np.ndarray, width: float) -> shapely.Polygon:

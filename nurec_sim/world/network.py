@@ -23,6 +23,7 @@ class Lane:
     """A lane of a road (``<road>:<number>``) or a path through a junction (``<junction>:<k>``), in driving direction.
 
     ``polyline`` lies on the ground, with points at most 1 m apart. Paths end exactly where their successor begins.
+    ``width_m`` is that of the narrowest place.
     ``turn`` and ``junction`` are of paths only; a lane that ends at a junction names it in ``ends_at``.
     """
 
@@ -123,16 +124,30 @@ class TownNetwork:
             for number in line.numbers:
                 xy, _ = line.at(stations, line.lane_offset_m(number, stations))
                 key = f"{name}:{number}"
-                yield Lane(key, name, self._on_ground(xy if number < 0 else xy[::-1]), line.plan.lane_width_m,
-                                  line.plan.speed_limit_mps, tuple(after.get(key, ())), False,
-                                  ends_at=ends_at.get(key, ""))  # fmt: skip
+                yield Lane(
+                    id=key,
+                    road=name,
+                    polyline=self._on_ground(xy if number < 0 else xy[::-1]),
+                    width_m=float(line.lane_width_m(stations).min()),
+                    speed_limit_mps=line.plan.speed_limit_mps,
+                    successors=tuple(after.get(key, ())),
+                    in_junction=False,
+                    ends_at=ends_at.get(key, ""),
+                )
         for junction, path in paths:
             curve = RoadLine(path)
-            xy, _ = curve.at(curve.stations())
             road = self.roads[path.from_lane.rpartition(":")[0]].plan
-            limit = road.speed_limit_mps
-            yield Lane(path.id, junction.id, self._on_ground(xy), road.lane_width_m, limit, (path.to_lane,),
-                                  True, path.turn, junction.id)  # fmt: skip
+            yield Lane(
+                id=path.id,
+                road=junction.id,
+                polyline=self._on_ground(curve.at(curve.stations())[0]),
+                width_m=road.lane_width_m,
+                speed_limit_mps=road.speed_limit_mps,
+                successors=(path.to_lane,),
+                in_junction=True,
+                turn=path.turn,
+                junction=junction.id,
+            )
 
     def _on_ground(self, xy: Float64[np.ndarray, "k 2"]) -> Float64[np.ndarray, "k 3"]:
         return np.concatenate([xy, self.height_m(xy)[:, None]], axis=1)

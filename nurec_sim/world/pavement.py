@@ -38,8 +38,7 @@ def junction_area(junction: Junction, roads: Mapping[str, RoadLanes]) -> shapely
         if junction.kind != "roundabout":
             parts.append(_stub(mouth, centre))
     for path in junction.connections:
-        line = RoadLine(path)
-        parts.append(_lane_ribbon(line, path_half_width_m(path.from_lane, roads)))
+        parts.append(_lane_ribbon(RoadLine(path), path_half_width_m(path.from_lane, roads)))
     whole = shapely.union_all(parts)
     if junction.kind == "roundabout":
         ring, half = junction.ring_radius_m, junction.ring_width_m / 2

@@ -8,18 +8,19 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
-from nurec_sim.world.build import FAR_M, Street
+from nurec_sim.world.build import Town
 from nurec_sim.world.faces import Seen
 
+REACH_M = 1400.0
 _VISIBLE = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 
 
 def cast(
-    street: Street,
+    town: Town,
     data: Any,
     origin: Float64[np.ndarray, " 3"],
     direction: Float64[np.ndarray, "n 3"],
-    reach_m: float = FAR_M,
+    reach_m: float = REACH_M,
 ) -> tuple[Int32[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     """What rays of unit ``direction`` from one point meet first: geom id (-1 nothing), distance (0), normal (0).
 
@@ -30,7 +31,7 @@ def cast(
     rays = np.ascontiguousarray(direction, np.float64).ravel()
     origin = np.ascontiguousarray(origin, np.float64)
     mujoco.mj_multiRay(
-        street.model, data, origin, rays, _VISIBLE, 1, -1, geom, distance, normal.reshape(-1), count, reach_m
+        town.model, data, origin, rays, _VISIBLE, 1, -1, geom, distance, normal.reshape(-1), count, reach_m
     )
     missed = geom < 0
     distance[missed] = 0.0
@@ -41,7 +42,7 @@ def cast(
 
 
 def look(
-    street: Street,
+    town: Town,
     data: Any,
     rays: Float64[np.ndarray, "h w 3"],
     valid: Bool[np.ndarray, "h w"],
@@ -53,15 +54,22 @@ def look(
     Unlike drawn images these have no textures, shadows or smoothed edges; geometry is exact.
     """
     direction = rays[valid] @ world_from_sensor[:3, :3].T
-    geom, distance, normal = cast(street, data, world_from_sensor[:3, 3], direction)
-    fill = np.array([-street.sun[0], -street.sun[1], 0.8])
-    light = np.array([0.48, 0.50, 0.54]) + 0.72 * np.clip(normal @ street.sun, 0, 1)[:, None]
-    light = light + 0.16 * np.clip(normal @ (fill / np.linalg.norm(fill)), 0, 1)[:, None]
-    lit = np.clip(street.geom_rgb[geom] * light * 255, 0, 255).astype(np.uint8)
-    sky = street.sky.colour(np.where(valid[..., None], rays, (0.0, 0.0, 1.0)) @ world_from_sensor[:3, :3].T)
+    geom, distance, normal = cast(town, data, world_from_sensor[:3, 3], direction)
+    light = _light(town, normal)
+    lit = np.clip(town.geom_rgb[geom] * light * 255, 0, 255).astype(np.uint8)
+    sky = town.sky.colour(np.where(valid[..., None], rays, (0.0, 0.0, 1.0)) @ world_from_sensor[:3, :3].T)
     seen.rgb[valid] = np.where((geom >= 0)[:, None], lit, sky[valid])
     seen.geom[valid], seen.range_m[valid] = geom, distance
     seen.normal[valid] = normal @ world_from_sensor[:3, :3]
+
+
+def _light(town: Town, normal: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """Light (0..1) on surfaces by the lamps of the model: ambient, and every directional one by its cosine."""
+    model = town.model
+    light = np.asarray(model.vis.headlight.ambient, np.float64)[None]
+    for direction, diffuse in zip(model.light_dir, model.light_diffuse, strict=True):
+        light = light + np.clip(normal @ -direction, 0, 1)[:, None] * diffuse
+    return light
 
 
 def reflected(reflectivity: Float64[np.ndarray, "*n"], cosine: Float64[np.ndarray, "*n"]) -> Float32[np.ndarray, "*n"]:

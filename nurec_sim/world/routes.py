@@ -18,7 +18,7 @@ from nurec_sim.world.network import Lane
 SPACING_M = 0.5
 SIDEWAYS_MPS2 = 2.2
 BRAKE_MPS2 = 1.6
-END_M = 6.0
+END_M = 8.0
 """Nobody drives into the last metres of a route: the town ends there."""
 CONFLICT_M = 2.5
 """Paths through a junction that come closer than this cannot be driven at the same time."""
@@ -69,7 +69,8 @@ def random_lanes(rng: np.random.Generator, lanes: Mapping[str, Lane], first: str
 
 def lay_route(lanes: Mapping[str, Lane], way: Sequence[str], right_m: float = 0.0, speed_factor: float = 1.0) -> Route:
     """The route along lanes, ``right_m`` to the right of their middle, for someone who takes limits times a factor."""
-    pieces, limits, legs, start = [], [], [], 0.0
+    pieces: list[np.ndarray] = []
+    limits, legs, start = [], [], 0.0
     for name in way:
         lane = lanes[name]
         xy = lane.polyline[:, :2]

@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, Int32, UInt8
 from nurec_sim import geometry, sensors
 from nurec_sim.types import LidarModel, SensorRequest
 from nurec_sim.world import rays
-from nurec_sim.world.build import Street
+from nurec_sim.world.build import Town
 from nurec_sim.world.faces import Seen
 from nurec_sim.world.shutter import lidar_patches
 from nurec_sim.world.stage import Stage, named
@@ -74,7 +74,7 @@ def cast_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
     for column in range(shape[1]):
         pose = moments.enter(column)
         direction = beams[:, column] @ pose[:3, :3].T
-        geom, range_m, normal = rays.cast(stage.street, stage.data, pose[:3, 3], direction, lidar.range_m[1])
+        geom, range_m, normal = rays.cast(stage.town, stage.data, pose[:3, 3], direction, lidar.range_m[1])
         turn.geom[:, column], turn.range_m[:, column] = geom, range_m
         turn.cosine[:, column] = -np.einsum("nc,nc->n", normal, direction)
     return turn
@@ -115,13 +115,13 @@ def drawn_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
 
 
 def measure(
-    street: Street, lidar: LidarModel, turn: Turn, response: LidarResponse | None = None, seed: Sequence[int] = ()
+    town: Town, lidar: LidarModel, turn: Turn, response: LidarResponse | None = None, seed: Sequence[int] = ()
 ) -> TrueScan:
     """What the sensor reports of a turn; without a response all surfaces within its range return."""
     near, far = lidar.range_m
     # mj_multiRay leaves out whole geoms by their distance, so a large one still answers beyond the reach.
     returned = (turn.geom >= 0) & (turn.range_m >= near) & (turn.range_m <= far)
-    reflectivity = street.geom_reflectivity[turn.geom]
+    reflectivity = town.geom_reflectivity[turn.geom]
     range_m = turn.range_m
     if response is not None:
         rng = np.random.default_rng(list(seed))
@@ -129,7 +129,7 @@ def measure(
         returned &= rng.random(lost.shape) >= lost
         range_m = np.maximum(range_m + response.range_noise_m * rng.standard_normal(lost.shape), near)
     intensity = np.where(returned, rays.reflected(reflectivity, turn.cosine), np.float32(0))
-    surface, instance = named(street, np.where(returned, turn.geom, -1))
+    surface, instance = named(town, np.where(returned, turn.geom, -1))
     return TrueScan(np.where(returned, range_m, 0.0), intensity, surface, instance)
 
 

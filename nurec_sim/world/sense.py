@@ -1,4 +1,4 @@
-"""The street itself as a sensor simulator: what a renderer of its reconstruction should have shown."""
+"""The town itself as a sensor simulator: what a renderer of its reconstruction should have shown."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import TypeVar
 from zlib import crc32
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Float32, Float64, Int32, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError, TooLargeError
 from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, LidarModel, SensorFrame, SensorRequest
 from nurec_sim.world import scan
 from nurec_sim.world.backend import pick_backend
-from nurec_sim.world.build import Street, build_street
+from nurec_sim.world.build import Town, build_street
 from nurec_sim.world.isp import CameraResponse, apply_response
-from nurec_sim.world.plan import StreetPlan
+from nurec_sim.world.plan import TownPlan
 from nurec_sim.world.scan import LidarResponse, TrueScan
 from nurec_sim.world.stage import Quality, Stage, named
 from nurec_sim.world.surface import LABEL_OF_CLASS
@@ -51,14 +51,14 @@ class TrueView:
 
 
 class TrueWorld:
-    """A street that answers sensor requests for any pose and any place of its actors.
+    """A town that answers sensor requests for any pose and any place of its actors.
 
     Cameras may have any lens, windshield and shutter. All of MuJoCo and OpenGL runs in one thread of its own, because
     a GL context belongs to its thread; ``sense`` may be called from any thread. Use it as a context manager or call
     ``close``.
 
     Args:
-        plan: the street.
+        plan: the town.
         backend: ``egl``, ``osmesa`` or ``rays``; None picks the first that works (``backend.pick_backend``).
         responses: how cameras turn light into pixels and which echoes LiDARs lose, by sensor id; others are ideal.
             Noise depends on the plan's seed, the sensor's id and the time only.
@@ -67,7 +67,7 @@ class TrueWorld:
 
     def __init__(
         self,
-        plan: StreetPlan,
+        plan: TownPlan,
         backend: str | None = None,
         responses: Mapping[str, CameraResponse | LidarResponse] | None = None,
         quality: Quality = Quality(),  # noqa: B008  (frozen)
@@ -76,7 +76,7 @@ class TrueWorld:
         self.backend = pick_backend(backend)
         self._responses, self._quality = dict(responses or {}), quality
         self._recorded = {track.id: track.path for track in plan.tracks()}
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="street")
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="town")
         self._closed = False
         try:
             self._stage: Stage = self._run(self._start)
@@ -85,9 +85,9 @@ class TrueWorld:
             raise
 
     @property
-    def street(self) -> Street:
+    def town(self) -> Town:
         """The compiled model; only to look things up in it."""
-        return self._stage.street
+        return self._stage.town
 
     def __enter__(self) -> TrueWorld:
         return self
@@ -106,7 +106,7 @@ class TrueWorld:
         """One frame per request, in order (``types.Sense``).
 
         Raises:
-            RequestError: a lens or shutter that the street cannot draw, an unknown actor, or a pose that is none.
+            RequestError: a lens or shutter that the town cannot draw, an unknown actor, or a pose that is none.
             TooLargeError: an image wider or higher than 4096 pixels.
         """
         for request in requests:
@@ -123,11 +123,15 @@ class TrueWorld:
         self._check(request)
         return self._run(functools.partial(self._scan, request))
 
-    # ------------------------------------------------------------------------------------- in the street's thread
+    def boxes(self, t_us: int) -> Float64[np.ndarray, "actors 4 4"]:
+        """``world_from_box`` of all recorded actors, in the order of the plan: row i is instance i + 1 of a view."""
+        return np.array([path.at(t_us) for path in self._recorded.values()], np.float64).reshape(-1, 4, 4)
+
+    # ------------------------------------------------------------------------------------- in the town's thread
 
     def _run(self, work: Callable[[], T]) -> T:
         if self._closed:
-            raise RuntimeError("this street is closed; make a new TrueWorld")
+            raise RuntimeError("this town is closed; make a new TrueWorld")
         return self._thread.submit(work).result()
 
     def _start(self) -> Stage:
@@ -140,10 +144,10 @@ class TrueWorld:
         seen = self._stage.see(request, camera)
         forward = sensors.pixel_rays(camera)[0][..., 2]
         depth = np.where(seen.range_m > 0, np.maximum(seen.range_m * forward, 0), 0).astype(np.float32)
-        rgb, response = seen.rgb, self._responses.get(camera.id)
+        rgb, response = self.town.through_air(seen.rgb, seen.range_m), self._responses.get(camera.id)
         if isinstance(response, CameraResponse):
             rgb = apply_response(rgb, response, self._seed(request))
-        return TrueView(rgb, depth, *named(self.street, seen.geom), seen.normal, seen.range_m)
+        return TrueView(rgb, depth, *named(self.town, seen.geom), seen.normal, seen.range_m)
 
     def _scan(self, request: SensorRequest) -> TrueScan:
         lidar = request.sensor
@@ -153,8 +157,8 @@ class TrueWorld:
         turn = (scan.drawn_turn if drawn else scan.cast_turn)(self._stage, request, lidar)
         response = self._responses.get(lidar.id)
         if isinstance(response, LidarResponse):
-            return scan.measure(self.street, lidar, turn, response, self._seed(request))
-        return scan.measure(self.street, lidar, turn)
+            return scan.measure(self.town, lidar, turn, response, self._seed(request))
+        return scan.measure(self.town, lidar, turn)
 
     def _seed(self, request: SensorRequest) -> tuple[int, ...]:
         return self.plan.seed, crc32(request.sensor.id.encode()), request.start_us
@@ -179,7 +183,7 @@ class TrueWorld:
             raise RequestError(f"sensor {sensor.id!r}: poses must be finite and end_us not before start_us")
         for name, actor in request.actors.items():
             if name not in self._recorded:
-                raise RequestError(f"no actor {name!r} in this street; have {sorted(self._recorded)}")
+                raise RequestError(f"no actor {name!r} in this town; have {sorted(self._recorded)}")
             actor = np.asarray(actor)
             if actor.shape != (2, 4, 4) or not all(geometry.is_rotation(pose[:3, :3]) for pose in actor):
                 raise RequestError(f"actor {name!r}: world_from_box must be two poses [2,4,4] with rotations")

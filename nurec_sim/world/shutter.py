@@ -20,9 +20,11 @@ MOTION_PX = 0.5
 """Bands are made so narrow that things move less than this within one, if ``MOST_BANDS`` are enough for it."""
 MOST_BANDS = 16
 FEWEST_LINES = 4
-CAMERA_FINENESS, LIDAR_FINENESS = 1.5, 2.0
-"""Pixels of the drawn faces for a pixel of a camera and for a beam; finer ones cost time and sharpen edges."""
-SECTOR_RAD = np.deg2rad(30.0)
+FINENESS = 1.5
+"""Pixels of a drawn face per pixel of the camera or beam; finer ones cost time and sharpen edges."""
+SECTORS = 12
+SECTOR_PIXEL_RAD = np.deg2rad(0.1)
+"""Pixels of a LiDAR's faces are no wider than this, however far apart its beams are."""
 KEPT_PIXELS = 1 << 20
 IMAGE_DOWN, LIDAR_DOWN = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])
 
@@ -77,26 +79,27 @@ def _camera_patches(
         flat = None
         if isinstance(lens, Pinhole) and not lens.distorted and glass is None:
             flat = Pinhole(lens.fx_px, lens.fy_px, lens.cx_px - columns.start, lens.cy_px - rows.start)
-        patches.append(RayPatch(rows, columns, fraction, part, seen, IMAGE_DOWN, CAMERA_FINENESS, flat))
+        patches.append(RayPatch(rows, columns, fraction, part, seen, IMAGE_DOWN, FINENESS, flat))
     return tuple(patches)
 
 
 _kept_camera_patches = functools.lru_cache(maxsize=12)(_camera_patches)
 
 
+@functools.lru_cache(maxsize=4)
 def lidar_patches(lidar: LidarModel) -> tuple[RayPatch, ...]:
-    """A turning LiDAR as sectors of ``SECTOR_RAD`` at most."""
+    """A turning LiDAR as up to ``SECTORS`` sectors of its columns."""
     beams, fraction = sensors.beam_directions(lidar), sensors.column_fraction(lidar)
     rows, columns = beams.shape[:2]
-    turned = abs(lidar.azimuth_rad[-1] - lidar.azimuth_rad[0])
-    edges = np.rint(np.linspace(0, columns, max(int(np.ceil(turned / SECTOR_RAD)), 1) + 1)).astype(int)
+    angles = (lidar.elevation_rad, lidar.azimuth_rad)
+    closest = min((float(np.quantile(np.abs(np.diff(k)), 0.2)) for k in angles if len(k) > 1), default=0.0)
+    fineness = max(FINENESS, closest / SECTOR_PIXEL_RAD)
+    edges = np.unique(np.rint(np.linspace(0, columns, SECTORS + 1)).astype(int)).tolist()
     patches = []
     for low, high in zip(edges[:-1], edges[1:], strict=True):
-        if low == high:
-            continue
         part, valid = beams[:, low:high], np.ones((rows, high - low), bool)
         middle = float(fraction[low:high].mean())
-        patches.append(RayPatch(slice(0, rows), slice(int(low), int(high)), middle, part, valid, LIDAR_DOWN, LIDAR_FINENESS))
+        patches.append(RayPatch(slice(0, rows), slice(low, high), middle, part, valid, LIDAR_DOWN, fineness))
     return tuple(patches)
 
 

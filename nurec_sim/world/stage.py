@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int32, UInt8
 from nurec_sim import geometry, sensors
 from nurec_sim.types import CameraModel, SensorRequest, Shutter, Trajectory
 from nurec_sim.world import rays
-from nurec_sim.world.build import ActorPlaces, Street
+from nurec_sim.world.build import ActorPlaces, Town
 from nurec_sim.world.faces import Seen
 from nurec_sim.world.shutter import RayPatch, bands_for, camera_patches, motion_px
 from nurec_sim.world.surface import SurfaceClass
@@ -29,8 +29,8 @@ class Quality:
     Args:
         samples: colour samples per pixel, 0, 2 or 4; edges are smooth with more.
         shadow_px: side of the shadow map, 0 for no shadows.
-        lidar: ``rays`` casts one exact ray per beam from its own instant; ``drawn`` reads sectors of 30 degrees from
-            OpenGL images, several times faster, exact on surfaces and less so at their edges.
+        lidar: ``rays`` casts one exact ray per beam from its own instant; ``drawn`` reads twelve sectors from OpenGL
+            images, several times faster, exact on surfaces and less so at their edges and on what moves.
     """
 
     samples: int = 4
@@ -49,7 +49,7 @@ class Quality:
 class Moments:
     """Instants of one request: times, where all actors are, and where the sensor is."""
 
-    street: Street
+    town: Town
     data: Any
     t_us: Float64[np.ndarray, " n"]
     places: ActorPlaces
@@ -57,38 +57,38 @@ class Moments:
 
     def enter(self, index: int) -> Float64[np.ndarray, "4 4"]:
         """Puts the town into an instant and gives the sensor's pose."""
-        self.street.pose(self.data, float(self.t_us[index]), self.places, index)
+        self.town.pose(self.data, float(self.t_us[index]), self.places, index)
         return self.world_from_sensor[index]
 
 
-def named(street: Street, geom: Int32[np.ndarray, "*n"]) -> tuple[UInt8[np.ndarray, "*n"], Int32[np.ndarray, "*n"]]:
+def named(town: Town, geom: Int32[np.ndarray, "*n"]) -> tuple[UInt8[np.ndarray, "*n"], Int32[np.ndarray, "*n"]]:
     """``SurfaceClass`` and instance of geom ids, where -1 is the sky."""
     sky = geom < 0
-    surface = np.where(sky, np.uint8(SurfaceClass.SKY), street.geom_class[geom])
-    return surface, np.where(sky, np.int32(0), street.geom_instance[geom])
+    surface = np.where(sky, np.uint8(SurfaceClass.SKY), town.geom_class[geom])
+    return surface, np.where(sky, np.int32(0), town.geom_instance[geom])
 
 
 class Stage:
-    """A compiled street with its own state and, for OpenGL back ends, a painter.
+    """A compiled town with its own state and, for OpenGL back ends, a painter.
 
     Args:
-        street: the street.
+        town: the town.
         recorded: where its actors are when a request does not say.
         backend: ``egl``, ``osmesa`` or ``rays``.
         quality: of drawn images.
     """
 
-    def __init__(self, street: Street, recorded: Mapping[str, Trajectory], backend: str, quality: Quality):
-        self.street, self._recorded = street, recorded
-        self.data = mujoco.MjData(street.model)
-        start_us = street.plan.span_us[0]
+    def __init__(self, town: Town, recorded: Mapping[str, Trajectory], backend: str, quality: Quality):
+        self.town, self._recorded = town, recorded
+        self.data = mujoco.MjData(town.model)
+        start_us = town.plan.span_us[0]
         actors = {name: path.at(start_us)[None] for name, path in recorded.items()}
-        street.pose(self.data, start_us, street.actor_places(actors, 1))
+        town.pose(self.data, start_us, town.actor_places(actors, 1))
         self.painter: Any = None
         if backend != "rays":
             from nurec_sim.world.render import GlPainter
 
-            self.painter = GlPainter(street, backend, quality.samples, quality.shadow_px)
+            self.painter = GlPainter(town, backend, quality.samples, quality.shadow_px)
 
     def close(self) -> None:
         """Frees the painter."""
@@ -109,14 +109,14 @@ class Stage:
     def moments(self, request: SensorRequest, fractions: Float64[np.ndarray, " n"]) -> Moments:
         """Instants at fractions of the request's time."""
         times = request.start_us + fractions * (request.end_us - request.start_us)
-        places = self.street.actor_places(self.actor_boxes(request, fractions), len(fractions))
+        places = self.town.actor_places(self.actor_boxes(request, fractions), len(fractions))
         poses = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), fractions)
-        return Moments(self.street, self.data, times, places, poses)
+        return Moments(self.town, self.data, times, places, poses)
 
     def look(self, patch: RayPatch, world_from_sensor: Float64[np.ndarray, "4 4"], seen: Seen, colours: bool = True):
         """Fills ``seen``, as large as the patch, with what its rays meet at the instant that was entered."""
         if self.painter is None:
-            rays.look(self.street, self.data, patch.rays, patch.valid, world_from_sensor, seen)
+            rays.look(self.town, self.data, patch.rays, patch.valid, world_from_sensor, seen)
         else:
             for face in patch.faces:
                 face.read(self.painter.draw(self.data, face, world_from_sensor, colours), seen)
@@ -145,10 +145,10 @@ class Stage:
         directions, valid = sensors.unproject(camera, np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
         pose = moments.enter(0)
         directions = directions[valid] @ pose[:3, :3].T
-        geom, distance, _ = rays.cast(self.street, self.data, pose[:3, 3], directions)
+        geom, distance, _ = rays.cast(self.town, self.data, pose[:3, 3], directions)
         start = pose[:3, 3] + np.where(geom < 0, 1e4, distance)[:, None] * directions
-        end, instance = start.copy(), np.where(geom < 0, 0, self.street.geom_instance[geom])
-        for index, actor in enumerate(self.street.plan.actors):
+        end, instance = start.copy(), np.where(geom < 0, 0, self.town.geom_instance[geom])
+        for index, actor in enumerate(self.town.plan.actors):
             on_it = instance == index + 1
             if on_it.any():
                 moved = boxes[actor.id][1] @ geometry.inverse(boxes[actor.id][0])

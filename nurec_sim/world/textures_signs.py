@@ -9,7 +9,8 @@ from nurec_sim.world.plan import SIGNS
 from nurec_sim.world.textures import Image, noise
 
 _RED, _WHITE, _BLACK, _BLUE, _YELLOW = (196, 28, 32), (240, 240, 238), (22, 22, 24), (20, 82, 170), (246, 196, 40)
-SIGN_SHAPES = {"stop": 8, "yield": -3, "priority": 4, "speed": 0, "narrow": 3, "crossing": -4, "no_parking": 0}
+SIGN_SHAPES = {"stop": 8, "yield": -3, "priority": 4, "speed": 0, "narrow": 3, "crossing": -4, "no_parking": 0,
+               "roundabout": 0}  # fmt: skip
 """Corners of each sign's board: 0 is round, 3 a triangle, -3 one upside down, 4 a square on its corner, -4 upright."""
 
 
@@ -58,6 +59,13 @@ def sign(rng: np.random.Generator, picture: str, size: int = 128) -> Image:
         for step in ((-0.1, 0.76), (0.1, 0.76)):
             end = (int((0.5 + step[0]) * size), int(step[1] * size))
             cv2.line(image, (size // 2, int(0.5 * size)), end, _BLACK, 6, cv2.LINE_AA)
+    elif picture == "roundabout":
+        board(0.97, _WHITE, _BLUE)
+        for turn in (0, 120, 240):
+            cv2.ellipse(image, middle, (int(0.26 * size),) * 2, turn, 10, 90, _WHITE, 11, cv2.LINE_AA)
+            tip = np.deg2rad(turn + 100)
+            place = (int(middle[0] + 0.26 * size * np.cos(tip)), int(middle[1] + 0.26 * size * np.sin(tip)))
+            cv2.circle(image, place, 11, _WHITE, -1, cv2.LINE_AA)
     else:
         board(0.80, _RED, _BLUE)
         cv2.line(image, (int(0.22 * size), int(0.22 * size)), (int(0.78 * size), int(0.78 * size)), _RED, 13, cv2.LINE_AA)

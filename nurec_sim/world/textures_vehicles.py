@@ -118,6 +118,16 @@ def window(rng: np.random.Generator, size: int = 128) -> Image:
     return as_image(grey, (0.90, 0.98, 1.06))
 
 
+def lamp(rng: np.random.Generator, colour: tuple[float, float, float], size: int = 64) -> Image:
+    """A lamp's cover: bulbs behind ribbed glass in a dark frame."""
+    level = 0.62 + 0.12 * np.sin(np.linspace(0, 60, size, dtype=np.float32))[None] + np.zeros((size, 1), np.float32)
+    for x in (0.3, 0.68):
+        cv2.circle(level, (int(x * size), size // 2), size // 5, 1.15, -1, cv2.LINE_AA)
+    level[:5] = level[-5:] = 0.16
+    level[:, :3] = level[:, -3:] = 0.2
+    return as_image(level * (1 + 0.03 * grain(rng, size, 0.8)), colour)
+
+
 def plate(rng: np.random.Generator) -> Image:
     """A number plate."""
     yellow = rng.random() < 0.2

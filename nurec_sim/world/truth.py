@@ -1,4 +1,4 @@
-"""What exact depth says about surfaces: slopes within a pixel and normals.
+"""What exact depth and exact boxes tell: slopes within a pixel, normals, and how every point moves.
 
 ``nearness`` is 1 / z along the optical axis, 0 for the sky: seen by a pinhole, a plane's nearness is linear in the
 pixel coordinates, so that differences of neighbours are exact on planes, at any distance and angle.
@@ -6,10 +6,16 @@ pixel coordinates, so that differences of neighbours are exact on planes, at any
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Bool, Float32, Int32
+from typing import TYPE_CHECKING
 
-from nurec_sim.types import Pinhole
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32
+
+from nurec_sim import geometry, sensors
+from nurec_sim.types import CameraModel, Pinhole
+
+if TYPE_CHECKING:
+    from nurec_sim.world.sense import TrueView
 
 _NO_NEIGHBOUR = np.float32(1e9)
 
@@ -59,3 +65,31 @@ def plane_normals(
     length = np.sqrt(np.einsum("hwc,hwc->hw", normal, normal))
     normal *= np.where(known, -1 / np.maximum(length, np.float32(1e-12)), np.float32(0))[..., None]
     return normal
+
+
+def scene_flow(
+    view: TrueView,
+    camera: CameraModel,
+    world_from_camera: Float64[np.ndarray, "4 4"],
+    boxes_now: Float64[np.ndarray, "actors 4 4"],
+    boxes_then: Float64[np.ndarray, "actors 4 4"],
+) -> Float32[np.ndarray, "h w 3"]:
+    """How far every pixel's point moves from now to then, in metres along the world's axes; zero where it stands.
+
+    Points of an actor move with its box: limbs that swing and wheels that turn are not followed.
+
+    Args:
+        view: what the camera sees now.
+        camera: the camera.
+        world_from_camera: its pose now.
+        boxes_now: ``world_from_box`` of all actors of the plan in its order (``TrueWorld.boxes``).
+        boxes_then: the same at another time.
+    """
+    flow = np.zeros((*view.instance.shape, 3), np.float32)
+    rays, _ = sensors.pixel_rays(camera)
+    for instance in np.unique(view.instance[view.instance > 0]):
+        moved = boxes_then[instance - 1] @ geometry.inverse(boxes_now[instance - 1])
+        on_it = view.instance == instance
+        points = geometry.transform_points(world_from_camera, rays[on_it] * view.range_m[on_it, None])
+        flow[on_it] = geometry.transform_points(moved, points) - points
+    return flow

@@ -1,0 +1,138 @@
+"""Bodies of vehicles, cyclists and pedestrians in the MuJoCo model, and how their limbs move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float64
+
+from nurec_sim.world import people, textures_ground, textures_people, textures_vehicles
+from nurec_sim.world.builder import SpecBuilder
+from nurec_sim.world.meshes import MeshBuilder
+from nurec_sim.world.plan import Actor, TownPlan
+from nurec_sim.world.surface import SurfaceClass
+from nurec_sim.world.vehicle_families import FAMILIES
+from nurec_sim.world.vehicle_meshes import vehicle_parts
+
+LASER_OF_PART = {"taillight": 0.9, "headlight": 0.8, "plate": 0.95, "glass": 0.1, "trim": 0.15, "wheel": 0.2}
+STRIDE_M, BRISK_MPS = 1.45, 1.4
+PEDAL_TURN_M = 5.0
+LEAN_RAD = 0.55
+"""How far riders lean forward."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gait:
+    """Whose limbs move how: joint names, and the distance covered at each time of the recorded path."""
+
+    kind: str
+    joints: dict[str, str]
+    t_us: Float64[np.ndarray, " n"]
+    distance_m: Float64[np.ndarray, " n"]
+    phase_rad: float
+
+    def angles(self, t_us: float) -> dict[str, float]:
+        """Angle of every joint at a time."""
+        here, before = np.interp([t_us, t_us - 200_000], self.t_us, self.distance_m)
+        if self.kind == "cyclist":
+            angles = people.cycling_angles(self.phase_rad + 2 * np.pi * here / PEDAL_TURN_M)
+        else:
+            stride = min((here - before) / 0.2 / BRISK_MPS, 1.15) if len(self.t_us) > 1 else 0.0
+            angles = people.walking_angles(self.phase_rad + 2 * np.pi * here / STRIDE_M, stride)
+        return {joint: angles[limb] for limb, joint in self.joints.items()}
+
+
+class ActorBuilder:
+    """Adds actors to a town; meshes of vehicles of one kind and size are shared."""
+
+    def __init__(self, builder: SpecBuilder, plan: TownPlan):
+        self.builder, self.plan = builder, plan
+        self._vehicles: dict[tuple[str, tuple[float, float, float]], dict[str, str]] = {}
+        self._painted: set[str] = set()
+        self._limbs: dict[tuple[str, bool], str] = {}
+
+    def add(self, actor: Actor, instance: int) -> Gait | None:
+        """One actor as a mocap body; people get a gait."""
+        body = self.builder.spec.worldbody.add_body(name=actor.id, mocap=True)
+        rng = np.random.default_rng([self.plan.style.texture_seed, 7, instance])
+        if actor.kind in ("pedestrian", "cyclist"):
+            return self._person(body, actor, instance, rng)
+        self._vehicle(body, actor, instance, rng)
+        return None
+
+    # ----------------------------------------------------------------------------------------------------- vehicles
+
+    def _vehicle(self, body: Any, actor: Actor, instance: int, rng: np.random.Generator) -> None:
+        self._paint(actor)
+        key = (actor.kind, actor.size_m)
+        if key not in self._vehicles:
+            parts = vehicle_parts(actor.kind, actor.size_m)
+            self._vehicles[key] = {name: self.builder.mesh(mesh, 34.0) for name, mesh in parts.items()}
+        looks = {"paint": f"paint_{actor.kind}", "wheel": f"wheel{rng.integers(3)}", "plate": f"plate{rng.integers(4)}",
+                 "cargo": f"cargo{rng.integers(4)}"}  # fmt: skip
+        for name, mesh in self._vehicles[key].items():
+            tint = actor.colour if name == "paint" else (1.0, 1.0, 1.0)
+            self.builder.place(body, mesh, SurfaceClass.VEHICLE, looks.get(name, name), instance=instance, tint=tint,
+                               reflectivity=LASER_OF_PART.get(name))  # fmt: skip
+        half_l, half_w, ground = actor.size_m[0] / 2 + 0.5, actor.size_m[1] / 2 + 0.5, 0.02 - actor.size_m[2] / 2
+        shadow = MeshBuilder()
+        shadow.quad([-half_l, -half_w, ground], [half_l, -half_w, ground], [half_l, half_w, ground],
+                    [-half_l, half_w, ground], ((0, 0), (0, 1), (1, 1), (1, 0)))  # fmt: skip
+        self.builder.place(body, shadow, SurfaceClass.ROAD, f"shadow_{actor.kind}", decal=True)
+
+    def _paint(self, actor: Actor) -> None:
+        """The family's paint and contact shadow, made for the first of its vehicles."""
+        if actor.kind in self._painted:
+            return
+        self._painted.add(actor.kind)
+        rng = np.random.default_rng([self.plan.style.texture_seed, 8, *actor.kind.encode()])
+        atlas = textures_vehicles.body_atlas(rng, FAMILIES[actor.kind], actor.size_m)
+        self.builder.material(f"paint_{actor.kind}", atlas, shine=0.8)
+        self.builder.material(f"shadow_{actor.kind}", textures_ground.contact_shadow(*actor.size_m[:2]))
+
+    # ------------------------------------------------------------------------------------------------------- people
+
+    def _person(self, body: Any, actor: Actor, instance: int, rng: np.random.Generator) -> Gait:
+        rides = actor.kind == "cyclist"
+        surface = SurfaceClass.CYCLIST if rides else SurfaceClass.PERSON
+        cloth = f"person{instance}"
+        self.builder.material(cloth, textures_people.person(rng, actor.colour))
+        scale = actor.size_m[2] / people.HEIGHT_M
+        foot, bare, lean = -actor.size_m[2] / 2, rng.random() < 0.3, LEAN_RAD if rides else 0.0
+
+        def place(where: Any, mesh: MeshBuilder, material: str, tint: tuple[float, ...] = (1.0, 1.0, 1.0)) -> None:
+            mesh.transform(np.full(3, scale), np.zeros(3))
+            self.builder.place(where, mesh, surface, material, instance=instance, tint=tint, crease_deg=70.0)
+
+        trunk = _rigid(body, [-0.2 * scale if rides else 0.0, 0.0, foot + (0.02 * scale if rides else 0.0)])
+        place(trunk, people.trunk(rng, helmet=rides, skirt=not rides and rng.random() < 0.15, lean_rad=lean), cloth)
+        bodies, joints = {"": trunk}, {}
+        for limb in people.LIMBS:
+            x, y, z = limb.joint
+            if rides and limb.name.endswith("_arm"):
+                up = z - people.HIP_M
+                x, z = up * np.sin(lean), people.HIP_M + up * np.cos(lean)
+            part = _rigid(bodies[limb.parent], [x * scale, y * scale, z * scale])
+            hinge = part.add_joint(name=f"{actor.id}_{limb.name}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
+            place(part, people.limb(limb.name, bare=bare), cloth)
+            bodies[limb.name], joints[limb.name] = part, hinge.name
+        if rides:
+            bicycle = people.bicycle()
+            for mesh, material, tint in ((bicycle["frame"], "cycle", rng.uniform(0.08, 0.85, 3)),
+                                         (bicycle["tyres"], "trim", (1, 1, 1))):  # fmt: skip
+                mesh.transform(np.full(3, scale), np.array([0.0, 0.0, foot]))
+                self.builder.place(body, mesh, surface, material, instance=instance, tint=tuple(tint))
+        path = np.array(actor.path, np.float64)
+        step = np.linalg.norm(np.diff(path[:, 1:3], axis=0), axis=1)
+        return Gait(actor.kind, joints, path[:, 0], np.concatenate([[0.0], np.cumsum(step)]),
+                    float(rng.uniform(0, 2 * np.pi)))  # fmt: skip
+
+
+def _rigid(parent: Any, place: list[float]) -> Any:
+    """A child body with some inertia, which MuJoCo wants of everything that has a joint."""
+    part = parent.add_body(pos=place)
+    part.mass, part.inertia, part.explicitinertial = 3.0, [0.1, 0.1, 0.1], True
+    return part
