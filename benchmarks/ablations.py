@@ -1,7 +1,7 @@
 """Trains every ablation of the paper's Table 2 with the same small budget, evaluates all, and compares the signs.
 
-A variant is trained stage by stage. Each stage's run goes by a digest of all that it depends on, the stages before among
-it: variants share what they have in common, and what is finished is not trained again.
+A variant is trained stage by stage. Each stage's run goes by a digest of all that it depends on, earlier stages
+included: variants share what they have in common, and what is finished is not trained again.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Options:
         variants: which rows; the full training is always there, for the others are compared with it.
         recipe: what is cut down to the budget.
         steps: of each variant in all, shared out to the stages as in the recipe.
-        pixels: of an input image, at most.
+        pixels: of an input image, at most in training and always in evaluation.
         start: weights that every variant begins with.
         seed: of the training.
         training_clips: drawn before training; equal for all.
@@ -180,9 +180,10 @@ def contender(name: str, weights: Path, options: Options) -> Contender:
     """A variant's network as a method of the evaluation."""
     profile = json.loads((weights.parent / "recipe.json").read_text())["profile"]
     merge = ABLATIONS[name].merge
-    return Contender(
-        name, "dense", FeedForwardSettings(profile, weights, frames=options.frames, max_chunks=100, merge=merge)
+    settings = FeedForwardSettings(
+        profile, weights, frames=options.frames, image_pixels=options.pixels, max_chunks=100, merge=merge
     )
+    return Contender(name, "dense", settings)
 
 
 def rows_of(windows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[dict[str, Any]]:

@@ -48,7 +48,7 @@ def test_a_run_folder_holds_everything(finished):
 def test_methods_that_see_the_street_beat_random_weights(finished):
     methods = finished[0]["summary"]["methods"]
     assert methods["lift"]["full"]["psnr_db"] > methods["copy"]["full"]["psnr_db"]
-    assert methods["lift"]["full"]["abs_rel"] < 0.1 and methods["copy"]["full"]["abs_rel"] is None
+    assert methods["lift"]["full"]["abs_rel"] < 0.3 and methods["copy"]["full"]["abs_rel"] is None
     assert methods["dense"]["full"]["psnr_db"] < methods["lift"]["full"]["psnr_db"]
     assert methods["dense"]["gaussians"] > 1000 and methods["dense"]["windows"] == 2
     assert finished[0]["methods"]["dense"]["settings"]["random_weights"] == 3

@@ -68,6 +68,17 @@ def test_sizes_that_keep_the_aspect(width, height):
     assert crop.resized[0] == size[0] or crop.resized[1] == size[1]
 
 
+def test_images_may_be_smaller_or_larger_where_the_profile_keeps_the_aspect():
+    camera = pinhole("a", width=480, height=320)
+    for pixels in (5_000, 16_464, 200_000):
+        size = input_size(TINY, camera, pixels)
+        assert abs(size[0] * size[1] / pixels - 1) < 0.2 and abs(size[0] / size[1] / 1.5 - 1) < 0.2
+    with pytest.raises(ReconstructError, match="'pa-front' always have 784 x 448 px; image_pixels must not be given"):
+        input_size(FRONT, camera, 16_464)
+    with pytest.raises(ReconstructError, match=r"image_pixels must lie in 784\.\.4e\+06, got 10"):
+        FeedForwardSettings(image_pixels=10)
+
+
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("glass", [False, True])
 def test_cropped_camera_maps_pixels_by_scale_and_offset(lens, glass):

@@ -11,7 +11,7 @@ from nurec_sim.world.junctions import join, reaches
 from nurec_sim.world.layout import still_town
 from nurec_sim.world.plan import Narrowing
 from nurec_sim.world.road import RoadLanes
-from nurec_sim.world.templates import network_of
+from nurec_sim.world.templates import road_graph
 
 
 @pytest.fixture(scope="module", params=splits.TEMPLATES.all)
@@ -141,7 +141,7 @@ def test_ground_triangles_cover_an_area_once_and_follow_the_terrain(network):
 @pytest.mark.parametrize("template", splits.TEMPLATES.all)
 @pytest.mark.parametrize("seed", range(6))
 def test_roads_meet_in_junctions_only(template, seed):
-    found = network_of(template, np.random.default_rng([seed, 99]))
+    found = road_graph(template, np.random.default_rng([seed, 99]))
     surfaces = [(lanes := RoadLanes(road)).surface(0.0, lanes.length_m) for road in found.roads]
     for k, first in enumerate(surfaces):
         assert first.is_valid
@@ -153,6 +153,6 @@ def test_roads_meet_in_junctions_only(template, seed):
 def test_curves_come_in_many_radii():
     radii = []
     for seed in range(30):
-        road = network_of("curve", np.random.default_rng(seed)).roads[0]
+        road = road_graph("curve", np.random.default_rng(seed)).roads[0]
         radii.append(1 / max(abs(piece.start_curvature_per_m) for piece in road.pieces))
     assert min(radii) < 40 and max(radii) > 130 and 25 - 1e-9 <= min(radii) and max(radii) <= 200 + 1e-9

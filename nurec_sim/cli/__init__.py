@@ -19,6 +19,7 @@ from nurec_sim.cli import (
     training,
     validation,
     weights,
+    worlds,
 )
 from nurec_sim.cli.console import app, err
 from nurec_sim.errors import NurecSimError
@@ -36,6 +37,7 @@ __all__ = [
     "training",
     "validation",
     "weights",
+    "worlds",
 ]
 
 KEPT = {

@@ -5,14 +5,17 @@ from __future__ import annotations
 import contextlib
 import inspect
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from nurec_sim.cli.console import OnePath, Paths, app, out, print_faults, print_table, progress
 from nurec_sim.errors import NurecSimError
+
+if TYPE_CHECKING:
+    from nurec_sim.types import GaussianScene, Sense
 
 
 @app.command
@@ -25,6 +28,7 @@ def run(
     out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs"),
     resume: Path | None = None,
     address: str | None = None,
+    true_world: Path | None = None,
     cache: Path | None = None,
     video: bool = True,
 ) -> None:
@@ -41,10 +45,12 @@ def run(
         out_path: folder that collects run folders.
         resume: go on with this run folder; finished rollouts are kept.
         address: host:port of a running server that serves the same scenes.
+        true_world: also drive in the town that the clip was drawn in, given by the plan.json of its truth folder; the
+            report shows it as the reconstruction `truth` (docs/world.md).
         cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
         video: also record the front camera of every rollout.
     """
-    drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video)
+    drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video, true_world)
 
 
 @app.command
@@ -107,6 +113,7 @@ def drive(
     address: str | None,
     cache: Path | None,
     video: bool,
+    true_world: Path | None = None,
 ) -> None:
     """Scenes, server, rollouts, report: what `run` and `demo` share."""
     from nurec_sim import runs, sim
@@ -127,19 +134,31 @@ def drive(
     with contextlib.ExitStack() as stack:
         if address is None:
             address = stack.enter_context(SensorServer(store, port=0))
+        server = address
+        worlds: list[tuple[str, Sequence[GaussianScene], Callable[[str], Sense]]] = [
+            ("driving", scenes, lambda scene_id: stack.enter_context(RemoteSensors(server, scene_id)).sense)
+        ]
+        if true_world is not None:
+            if len(scenes) != 1:
+                raise NurecSimError(f"--true-world goes with one clip or scene, got {len(scenes)}")
+            scene, sense = stack.enter_context(runs.true_world(true_world, scenes[0]))
+            worlds.append(("driving in the truth", [scene], lambda scene_id: sense))
         out.print(f"sensors from {address}; {len(scenes)} scene(s), scenario {scenario.name}")
-        with progress("driving") as advance:
-            folder = runs.execute(
-                scenes,
-                scenario,
-                policy_names or scenario.policies,
-                lambda scene_id: stack.enter_context(RemoteSensors(address, scene_id)).sense,
-                out_dir,
-                seeds=seeds or scenario.seeds,
-                resume=resume,
-                video=video,
-                progress=advance,
-            )
+        folder = resume
+        for title, driven, sense_for in worlds:
+            with progress(title) as advance:
+                folder = runs.execute(
+                    driven,
+                    scenario,
+                    policy_names or scenario.policies,
+                    sense_for,
+                    out_dir,
+                    seeds=seeds or scenario.seeds,
+                    resume=folder,
+                    video=video,
+                    progress=advance,
+                )
+    assert folder is not None
     heading, *rows = runs.headline(folder)
     print_table("means over rollouts", rows, heading)
     out.print(f"{time.monotonic() - started:.0f} s. Report: {(folder / 'report.html').resolve()}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Verbs about one log or scene: inspect, world, reconstruct, render."""
+"""Verbs about one log or scene: inspect, reconstruct, render."""
 
 from __future__ import annotations
 
@@ -44,36 +44,6 @@ def inspect(source: OnePath) -> None:
         faults = logs.check_clip(log)
     print_faults(faults)
     out.print("no faults")
-
-
-@app.command
-def world(
-    *,
-    out_path: Annotated[Path, tyro.conf.arg(name="out")],
-    seed: int = 7,
-    seconds: float = 12.0,
-    truth: Path | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Draw a small MuJoCo street and write it as a driving log.
-
-    Args:
-        out_path: the clip to write: a folder, or a .zip.
-        seed: same seed, same street, same log.
-        seconds: length of the log, 1 to 20.
-        truth: also write exact depth and labels into this folder, apart from the log.
-        overwrite: replace a clip that is there.
-    """
-    from nurec_sim.world import street_plan, write_street_clip
-
-    try:
-        plan = street_plan(seed, seconds)
-    except ValueError as error:
-        raise NurecSimError(str(error)) from None
-    command = f"nurec-sim world --seed {seed} --seconds {seconds:g} --out {out_path.name}"
-    with progress("drawing the street") as advance:
-        path = write_street_clip(plan, out_path, truth=truth, command=command, progress=advance, overwrite=overwrite)
-    out.print(f"wrote {path}", soft_wrap=True)
 
 
 @app.command

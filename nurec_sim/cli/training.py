@@ -39,22 +39,29 @@ def train(
     import torch
 
     from nurec_sim.training.config import read_config
+    from nurec_sim.training.lpips import load_lpips
     from nurec_sim.training.perceptual import perceptual_distance
     from nurec_sim.training.processes import Processes
     from nurec_sim.training.samples import TownSamples
     from nurec_sim.training.trainer import WEIGHTS, Trainer
 
     if min(drawers, loaders) < 0 or (threads is not None and threads < 1):
-        raise TrainingError(f"drawers and loaders must be 0 or more and threads 1 or more, got {drawers}, {loaders}, {threads}")
+        raise TrainingError(
+            f"drawers and loaders must be 0 or more and threads 1 or more, got {drawers}, {loaders}, {threads}"
+        )
     config = read_config(recipe)
     folder = out_path or Path("runs/train") / recipe.stem
     if threads is not None:
         torch.set_num_threads(threads)
+    perceptual = perceptual_distance if config.lpips is None else load_lpips(config.lpips)
     processes = Processes.from_torchrun()
-    tell = lambda line: err.print(line, markup=False, highlight=False, soft_wrap=True)  # noqa: E731
     try:
-        with TownSamples(config, clips, drawers, loaders, processes, tell) as samples, progress("training") as advance:
-            Trainer(config, folder, samples, perceptual_distance, processes, threads).run(advance, until)
+        with TownSamples(config, clips, drawers, loaders, processes, _tell) as samples, progress("training") as advance:
+            Trainer(config, folder, samples, perceptual, processes, threads).run(advance, until)
     finally:
         processes.leave()
     out.print(f"wrote {folder / WEIGHTS}", soft_wrap=True)
+
+
+def _tell(line: str) -> None:
+    err.print(line, markup=False, highlight=False, soft_wrap=True)

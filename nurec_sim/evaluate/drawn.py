@@ -11,8 +11,8 @@ from nurec_sim import geometry, sensors
 from nurec_sim.evaluate.views import reduced, reduced_mask
 from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, Target
 from nurec_sim.types import CameraModel, Label, LidarModel, Pinhole, Rig, SensorRequest, Sweep, Trajectory
-from nurec_sim.world import LIDAR_ID, TrueWorld, street_plan, street_rig
-from nurec_sim.world.plan import StreetPlan
+from nurec_sim.world import LIDAR_ID, TrueWorld, street_rig, town_plan
+from nurec_sim.world.plan import TownPlan
 from nurec_sim.world.rig import CAMERA_FROM_RIG_AXES
 from nurec_sim.world.sense import measured_points
 from nurec_sim.world.surface import LABEL_OF_CLASS, SurfaceClass
@@ -100,6 +100,6 @@ def sweep_of(world: TrueWorld, ego: Trajectory, lidar: LidarModel, start_us: int
     )
 
 
-def held_out_plan(seed: int, seconds: float) -> StreetPlan:
-    """The world of a seed of which no training run has seen anything."""
-    return street_plan(seed, seconds)
+def held_out_plan(seed: int, seconds: float) -> TownPlan:
+    """The town of a seed from the split that training never sees (``world.splits``)."""
+    return town_plan(seed, "test", seconds=seconds)

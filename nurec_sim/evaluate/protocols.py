@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -192,9 +193,12 @@ def _inside_something(target: Target) -> bool:
 def _about(drawing: Drawing, span_us: tuple[int, int]) -> dict[str, str | int | float]:
     """What a window shows, in plain JSON."""
     plan, ends = drawing.world.plan, drawing.ego.at(np.array(span_us))[:, :3, 3]
-    about: dict[str, str | int | float] = {
+    return {
         "seed": plan.seed,
+        "split": plan.split,
+        "template": plan.template,
+        "sky": plan.weather.preset,
         "driven_m": round(float(np.linalg.norm(ends[1] - ends[0])), 2),
+        "plan": hashlib.sha256(plan.to_json().encode()).hexdigest()[:12],
         "drawn_by": drawing.world.backend,
     }
-    return about | {name: str(getattr(plan, name)) for name in ("split", "template") if hasattr(plan, name)}

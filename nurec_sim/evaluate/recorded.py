@@ -102,7 +102,8 @@ def recorded_window(
         lidar: tuple(
             Revolution(int(start), int(end), partial(clip.sweep, lidar, index))
             for index, (start, end) in enumerate(clip.sweep_times_us(lidar))
-            if (lidar, index) not in held.values() and span_us[0] - NEAREST_SWEEP_US <= (start + end) // 2 < span_us[1]
+            if (lidar, index) not in held.values()
+            and span_us[0] - NEAREST_SWEEP_US <= (start + end) // 2 < span_us[1] + NEAREST_SWEEP_US
         )
         for lidar in clip.rig.lidars
     }

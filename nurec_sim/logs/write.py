@@ -64,6 +64,7 @@ def write_clip(
     road_map: RoadMap | None = None,
     facts: Mapping[str, Any] | None = None,
     jpeg_quality: int | None = 95,
+    attachments: Mapping[str, bytes] | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write a driving log; it appears at ``path`` complete or not at all.
@@ -79,6 +80,7 @@ def write_clip(
         road_map: drivable areas and lanes, if known.
         facts: anything else to remember, as plain JSON (source, seed, licence, ...).
         jpeg_quality: 1 to 100 for images given as pixels, or None for lossless PNG.
+        attachments: other files to lay beside the log's own, by name (``map.xodr``); readers leave them alone.
         overwrite: replace what is at ``path``.
 
     Returns:
@@ -115,6 +117,10 @@ def write_clip(
             _write_json(folder / "tracks.json", {"tracks": [tables.track_to_json(track) for track in tracks]})
         if road_map is not None:
             _write_json(folder / "map.json", tables.map_to_json(road_map))
+        for name, data in (attachments or {}).items():
+            if not _SAFE_ID.fullmatch(name) or (folder / name).exists():
+                raise ClipError(f"attachment {name!r} needs a plain file name that the clip does not use itself")
+            _write_bytes(folder / name, data)
         _move_into_place(folder, path, work)
     finally:
         shutil.rmtree(work, ignore_errors=True)

@@ -12,6 +12,7 @@ _HOMES = {
     "load_rollout": "rollout_file",
     "record_video": "video",
     "save_rollout": "rollout_file",
+    "true_world": "truth",
     "write_report": "results",
 }
 __all__ = sorted(_HOMES)

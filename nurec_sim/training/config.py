@@ -87,6 +87,11 @@ class TrainingConfig(_Strict):
     def _known(self) -> TrainingConfig:
         if self.profile not in PROFILES:
             raise ValueError(f"no network profile {self.profile!r}; have {list(PROFILES)}")
+        if PROFILES[self.profile].sky is None:
+            able = [name for name, each in PROFILES.items() if each.sky is not None]
+            raise ValueError(
+                f"profile {self.profile!r} has no sky decoder to render views with; these have one: {able}"
+            )
         names = [stage.name for stage in self.stages]
         if len(set(names)) != len(names):
             raise ValueError(f"stages must have different names, got {names}")

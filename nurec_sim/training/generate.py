@@ -21,13 +21,15 @@ from nurec_sim.types import CameraModel, Rig, SensorRequest, Shutter, Track, Tra
 if TYPE_CHECKING:
     from nurec_sim.world import TrueWorld
 
-GENERATOR = 1
+GENERATOR = 2
 """To be raised when the same settings would give other clips, so that old ones are not mixed with new ones."""
 CAMERAS = {1: 0.4, 3: 0.5, 5: 0.1}
 """How often a rig has so many cameras."""
-PLAIN_LENS, GLOBAL_SHUTTER = 0.5, 0.7
+PLAIN_LENS, GLOBAL_SHUTTER = 0.6, 0.85
 """How often a rig gets pinholes without distortion, and a global shutter, whatever it would have otherwise: other
 lenses cost twice, rolling shutters about four times as much to draw."""
+SAMPLES_AND_SHADOW = 2, 1024
+"""Colour samples per pixel and pixels of the shadow map, half of what logs are drawn with."""
 TOGETHER = 0.5
 """How often all cameras of a rig expose at the same time; otherwise each has its own delay."""
 MOST_DELAY_US, LONGEST_READOUT_US = 90_000, 33_000
@@ -99,25 +101,27 @@ def generate_town(town: int, settings: ClipSettings, folder: Path, backend: str 
         ValueError: ``town`` is negative.
         RuntimeError: ``backend`` does not work here (``world.pick_backend``).
     """
-    from nurec_sim.world import TrueWorld, street_plan
+    from nurec_sim.world import TrueWorld, town_plan
+    from nurec_sim.world.stage import Quality
 
     missing = [(drive, name) for drive, name in enumerate(clip_ids(town, settings)) if not (folder / name).is_dir()]
     if not missing:
         return
-    plan = street_plan(town, settings.seconds)
+    plan = town_plan(town, settings.split, seconds=settings.seconds)
     plan_sha256 = hashlib.sha256(plan.to_json().encode()).hexdigest()
     facts = {"town": town, "split": settings.split, "plan_sha256": plan_sha256, "generator": GENERATOR,
              "settings": dataclasses.asdict(settings)}  # fmt: skip
-    with TrueWorld(plan, backend) as world:
+    with TrueWorld(plan, backend, quality=Quality(*SAMPLES_AND_SHADOW)) as world:
         for drive, name in missing:
             yield _draw_clip(world, drive, settings, folder / name, {**facts, "drive": drive})
 
 
 def _draw_clip(world: TrueWorld, drive: int, settings: ClipSettings, folder: Path, facts: dict) -> Path:
     from nurec_sim.world import random_readout_us, random_rig
+    from nurec_sim.world.splits import STREAM_OF_SPLIT
 
     plan = world.plan
-    rng = np.random.default_rng([plan.seed, drive, 0xDA7A])
+    rng = np.random.default_rng([plan.seed, drive, STREAM_OF_SPLIT[plan.split]])
     count, car = int(rng.choice(list(CAMERAS), p=list(CAMERAS.values()))), int(rng.integers(1 << 31))
     lens = "pinhole" if rng.random() < PLAIN_LENS else None
     rig, readout_us = random_rig(car, count, settings.pixels, lens, None), random_readout_us(car)

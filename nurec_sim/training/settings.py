@@ -33,7 +33,7 @@ class DataSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     clips: int = Field(240, ge=1)
-    clips_per_town: int = Field(2, ge=1)
+    clips_per_town: int = Field(3, ge=1)
     clip_frames: int = Field(16, ge=2)
     clip_period_us: int = Field(125_000, ge=10_000)
     clip_pixels: int = Field(65_856, ge=12_544)

@@ -1,6 +1,6 @@
 """The training loop: stages one after the other, curves, checkpoints and sample renders in a run folder.
 
-A run folder holds ``recipe.json``, ``curves.csv``, ``checkpoint.safetensors`` (to go on), ``weights.safetensors`` (the
+A run folder holds ``recipe.json``, ``curves.csv`` (and as pictures), ``checkpoint.safetensors`` (to go on), ``weights.safetensors`` (the
 moving average in half precision, to use) and ``samples/``. Under torchrun every process takes its own samples, and
 gradients are averaged by DDP; only the first process writes.
 """
@@ -26,6 +26,7 @@ from nurec_sim.network.checkpoints import save_weights
 from nurec_sim.training import checkpoint
 from nurec_sim.training.checkpoint import Position
 from nurec_sim.training.config import Stage, TrainingConfig
+from nurec_sim.training.curves import write_curves
 from nurec_sim.training.objective import Objective, StepOutputs
 from nurec_sim.training.processes import Processes
 from nurec_sim.training.rendering import PerceptualLoss
@@ -92,6 +93,8 @@ class Trainer:
         for stage, first in _stages_with_starts(self.config):
             if self.position.step < first + stage.steps and self.position.step < last:
                 self._train_stage(stage, first, min(last, first + stage.steps), report)
+        if self.processes.first and self.position.step:
+            write_curves(self.folder)
 
     def _train_stage(self, stage: Stage, first: int, last: int, report: Progress) -> None:
         objective = Objective(self.model, stage, self.perceptual, self.config.precision, self.threads)

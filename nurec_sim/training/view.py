@@ -44,11 +44,12 @@ def sample_sheet(
     truth = sample.truth
     rows = []
     for image in _spread(sample.inputs.rgb.shape[1]):
+        depth_m, true_m = _array(context.depth_m[0, image]), _array(truth.depth_m[0, image])
         rows.append(
             [
                 ("input", _colours(_array(sample.inputs.rgb[0, image]))),
-                ("depth", _depth(_array(context.depth_m[0, image]))),
-                ("true depth", _depth(_array(truth.depth_m[0, image]))),
+                (_depth_caption(depth_m, true_m), _depth(depth_m)),
+                ("true depth", _depth(true_m)),
                 ("classes", _classes(_array(context.logits[0, image]).argmax(-1))),
                 ("true classes", _classes(_array(truth.semantic[0, image]))),
                 ("normals", _normals(_array(context.normal[0, image]))),
@@ -60,6 +61,13 @@ def sample_sheet(
     for first in range(0, len(pairs), 2):
         rows.append([tile for pair in pairs[first : first + 2] for tile in pair])
     return _pasted(rows)
+
+
+def _depth_caption(depth_m: np.ndarray, true_m: np.ndarray) -> str:
+    known = true_m > 0
+    if not known.any():
+        return "depth"
+    return f"depth, AbsRel {float(np.mean(np.abs(depth_m - true_m)[known] / true_m[known])):.3f}"
 
 
 def _view_tiles(render: np.ndarray, true: np.ndarray) -> list[tuple[str, Image]]:

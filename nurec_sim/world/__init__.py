@@ -1,6 +1,6 @@
-"""A small MuJoCo street: a seeded plan, true sensors for any pose, and driving logs.
+"""Procedural MuJoCo towns: a seeded plan, true sensors for any pose, and driving logs.
 
-``street_plan(seed)`` decides everything as plain data, ``TrueWorld(plan)`` draws it, ``write_street_clip`` writes
+``town_plan(seed)`` decides everything as plain data, ``TrueWorld(plan)`` draws it, ``write_town_clip`` writes
 a log of it with exact boxes and map.
 Names are loaded on first use, so that importing this package does not load MuJoCo.
 """
@@ -12,23 +12,22 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from nurec_sim.world.backend import BACKENDS, pick_backend
-    from nurec_sim.world.build import Street, build_street
-    from nurec_sim.world.layout import street_plan, town_plan
+    from nurec_sim.world.build import Town, build_town
+    from nurec_sim.world.layout import town_plan
     from nurec_sim.world.network import TownNetwork
-    from nurec_sim.world.plan import Actor, Building, Prop, Road, RoadPiece, StreetPlan, TownPlan
+    from nurec_sim.world.plan import Actor, Building, Prop, Road, RoadPiece, TownPlan
     from nurec_sim.world.random_rigs import random_readout_us, random_rig
     from nurec_sim.world.rig import LIDAR_ID, street_rig
     from nurec_sim.world.road import RoadLine
     from nurec_sim.world.sense import TrueScan, TrueView, TrueWorld
     from nurec_sim.world.surface import LABEL_OF_CLASS, SurfaceClass
-    from nurec_sim.world.write import write_street_clip
+    from nurec_sim.world.write import random_responses, true_sweep, write_town_clip
 
 _MODULE_OF = {
     "BACKENDS": "backend",
     "pick_backend": "backend",
-    "Street": "build",
-    "build_street": "build",
-    "street_plan": "layout",
+    "Town": "build",
+    "build_town": "build",
     "town_plan": "layout",
     "TownNetwork": "network",
     "Actor": "plan",
@@ -36,7 +35,6 @@ _MODULE_OF = {
     "Prop": "plan",
     "Road": "plan",
     "RoadPiece": "plan",
-    "StreetPlan": "plan",
     "TownPlan": "plan",
     "random_readout_us": "random_rigs",
     "random_rig": "random_rigs",
@@ -48,7 +46,9 @@ _MODULE_OF = {
     "TrueWorld": "sense",
     "LABEL_OF_CLASS": "surface",
     "SurfaceClass": "surface",
-    "write_street_clip": "write",
+    "random_responses": "write",
+    "true_sweep": "write",
+    "write_town_clip": "write",
 }
 
 __all__ = [
@@ -61,22 +61,22 @@ __all__ = [
     "Road",
     "RoadLine",
     "RoadPiece",
-    "Street",
-    "StreetPlan",
     "SurfaceClass",
+    "Town",
     "TownNetwork",
     "TownPlan",
     "TrueScan",
     "TrueView",
     "TrueWorld",
-    "build_street",
+    "build_town",
     "pick_backend",
     "random_readout_us",
+    "random_responses",
     "random_rig",
-    "street_plan",
     "street_rig",
     "town_plan",
-    "write_street_clip",
+    "true_sweep",
+    "write_town_clip",
 ]
 
 

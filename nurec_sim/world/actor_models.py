@@ -11,15 +11,16 @@ from jaxtyping import Float64
 
 from nurec_sim.world import people, textures_ground, textures_people, textures_vehicles
 from nurec_sim.world.builder import SpecBuilder
-from nurec_sim.world.meshes import MeshBuilder
+from nurec_sim.world.meshes import Corners, MeshBuilder
 from nurec_sim.world.plan import Actor, TownPlan
 from nurec_sim.world.surface import SurfaceClass
 from nurec_sim.world.vehicle_families import FAMILIES
 from nurec_sim.world.vehicle_meshes import vehicle_parts
 
-LASER_OF_PART = {"taillight": 0.9, "headlight": 0.8, "plate": 0.95, "glass": 0.1, "trim": 0.15, "wheel": 0.2}
+LASER_OF_PART = {"taillight": 0.9, "headlight": 0.8, "plate": 0.95, "glass": 0.1, "wheel": 0.2}
 STRIDE_M, BRISK_MPS = 1.45, 1.4
 PEDAL_TURN_M = 5.0
+SMOOTH_DEG = 70.0
 LEAN_RAD = 0.55
 """How far riders lean forward."""
 
@@ -46,13 +47,12 @@ class Gait:
 
 
 class ActorBuilder:
-    """Adds actors to a town; meshes of vehicles of one kind and size are shared."""
+    """Adds actors to a town. The first of a family is modelled, the others are stretched copies of it."""
 
     def __init__(self, builder: SpecBuilder, plan: TownPlan):
         self.builder, self.plan = builder, plan
-        self._vehicles: dict[tuple[str, tuple[float, float, float]], dict[str, str]] = {}
-        self._painted: set[str] = set()
-        self._limbs: dict[tuple[str, bool], str] = {}
+        self._vehicles: dict[str, tuple[tuple[float, float, float], dict[str, Corners]]] = {}
+        self._limbs: dict[tuple[str, bool], Corners] = {}
 
     def add(self, actor: Actor, instance: int) -> Gait | None:
         """One actor as a mocap body; people get a gait."""
@@ -66,15 +66,17 @@ class ActorBuilder:
     # ----------------------------------------------------------------------------------------------------- vehicles
 
     def _vehicle(self, body: Any, actor: Actor, instance: int, rng: np.random.Generator) -> None:
-        self._paint(actor)
-        key = (actor.kind, actor.size_m)
-        if key not in self._vehicles:
+        if actor.kind not in self._vehicles:
             parts = vehicle_parts(actor.kind, actor.size_m)
-            self._vehicles[key] = {name: self.builder.mesh(mesh, 34.0) for name, mesh in parts.items()}
+            self._vehicles[actor.kind] = actor.size_m, {name: mesh.corners(34.0) for name, mesh in parts.items()}
+            self._paint(actor)
+        made_for, shapes = self._vehicles[actor.kind]
+        stretch = np.array(actor.size_m) / made_for
         looks = {"paint": f"paint_{actor.kind}", "wheel": f"wheel{rng.integers(3)}", "plate": f"plate{rng.integers(4)}",
                  "cargo": f"cargo{rng.integers(4)}"}  # fmt: skip
-        for name, mesh in self._vehicles[key].items():
+        for name, corners in shapes.items():
             tint = actor.colour if name == "paint" else (1.0, 1.0, 1.0)
+            mesh = self.builder.shared_mesh(corners, stretch)
             self.builder.place(body, mesh, SurfaceClass.VEHICLE, looks.get(name, name), instance=instance, tint=tint,
                                reflectivity=LASER_OF_PART.get(name))  # fmt: skip
         half_l, half_w, ground = actor.size_m[0] / 2 + 0.5, actor.size_m[1] / 2 + 0.5, 0.02 - actor.size_m[2] / 2
@@ -85,9 +87,6 @@ class ActorBuilder:
 
     def _paint(self, actor: Actor) -> None:
         """The family's paint and contact shadow, made for the first of its vehicles."""
-        if actor.kind in self._painted:
-            return
-        self._painted.add(actor.kind)
         rng = np.random.default_rng([self.plan.style.texture_seed, 8, *actor.kind.encode()])
         atlas = textures_vehicles.body_atlas(rng, FAMILIES[actor.kind], actor.size_m)
         self.builder.material(f"paint_{actor.kind}", atlas, shine=0.8)
@@ -103,12 +102,13 @@ class ActorBuilder:
         scale = actor.size_m[2] / people.HEIGHT_M
         foot, bare, lean = -actor.size_m[2] / 2, rng.random() < 0.3, LEAN_RAD if rides else 0.0
 
-        def place(where: Any, mesh: MeshBuilder, material: str, tint: tuple[float, ...] = (1.0, 1.0, 1.0)) -> None:
-            mesh.transform(np.full(3, scale), np.zeros(3))
-            self.builder.place(where, mesh, surface, material, instance=instance, tint=tint, crease_deg=70.0)
+        def place(where: Any, corners: Corners, material: str, tint: tuple[float, ...] = (1.0, 1.0, 1.0)) -> None:
+            mesh = self.builder.shared_mesh(corners, [scale] * 3)
+            self.builder.place(where, mesh, surface, material, instance=instance, tint=tint)
 
         trunk = _rigid(body, [-0.2 * scale if rides else 0.0, 0.0, foot + (0.02 * scale if rides else 0.0)])
-        place(trunk, people.trunk(rng, helmet=rides, skirt=not rides and rng.random() < 0.15, lean_rad=lean), cloth)
+        upper = people.trunk(rng, helmet=rides, skirt=not rides and rng.random() < 0.15, lean_rad=lean)
+        place(trunk, upper.corners(SMOOTH_DEG), cloth)
         bodies, joints = {"": trunk}, {}
         for limb in people.LIMBS:
             x, y, z = limb.joint
@@ -117,14 +117,16 @@ class ActorBuilder:
                 x, z = up * np.sin(lean), people.HIP_M + up * np.cos(lean)
             part = _rigid(bodies[limb.parent], [x * scale, y * scale, z * scale])
             hinge = part.add_joint(name=f"{actor.id}_{limb.name}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
-            place(part, people.limb(limb.name, bare=bare), cloth)
+            if (limb.name, bare) not in self._limbs:
+                self._limbs[limb.name, bare] = people.limb(limb.name, bare=bare).corners(SMOOTH_DEG)
+            place(part, self._limbs[limb.name, bare], cloth)
             bodies[limb.name], joints[limb.name] = part, hinge.name
         if rides:
+            wheels = _rigid(body, [0.0, 0.0, foot])
             bicycle = people.bicycle()
-            for mesh, material, tint in ((bicycle["frame"], "cycle", rng.uniform(0.08, 0.85, 3)),
-                                         (bicycle["tyres"], "trim", (1, 1, 1))):  # fmt: skip
-                mesh.transform(np.full(3, scale), np.array([0.0, 0.0, foot]))
-                self.builder.place(body, mesh, surface, material, instance=instance, tint=tuple(tint))
+            colour = tuple(float(c) for c in rng.uniform(0.08, 0.85, 3))
+            place(wheels, bicycle["frame"].corners(SMOOTH_DEG), "cycle", colour)
+            place(wheels, bicycle["tyres"].corners(SMOOTH_DEG), "trim")
         path = np.array(actor.path, np.float64)
         step = np.linalg.norm(np.diff(path[:, 1:3], axis=0), axis=1)
         return Gait(actor.kind, joints, path[:, 0], np.concatenate([[0.0], np.cumsum(step)]),

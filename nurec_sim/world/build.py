@@ -14,7 +14,7 @@ from nurec_sim.world.actor_models import ActorBuilder, Gait
 from nurec_sim.world.builder import SpecBuilder
 from nurec_sim.world.materials import add_materials
 from nurec_sim.world.network import TownNetwork
-from nurec_sim.world.plan import StreetPlan, TownPlan
+from nurec_sim.world.plan import TownPlan
 from nurec_sim.world.scenery import add_scenery
 from nurec_sim.world.sky import Sky
 from nurec_sim.world.weather import add_fog, add_lights
@@ -101,17 +101,3 @@ def build_town(plan: TownPlan, network: TownNetwork | None = None) -> Town:
         sun=sky.sun,
         sky=sky,
     )
-
-
-# ------------------------------------------------------------ the one-curve street, until everything reads town plans
-
-Street = Town
-
-
-def build_street(plan: StreetPlan | TownPlan) -> Town:
-    """A town, or a street that answers like one."""
-    if isinstance(plan, TownPlan):
-        return build_town(plan)
-    from nurec_sim.world.street_build import build_street as build_old_street
-
-    return build_old_street(plan)  # type: ignore[return-value]

@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nurec_sim.world.meshes import MeshBuilder
+from nurec_sim.world.meshes import Corners, MeshBuilder
 from nurec_sim.world.surface import REFLECTIVITY, SurfaceClass
 
 DECAL_GROUP = 3
@@ -65,12 +65,16 @@ class SpecBuilder:
 
     def mesh(self, builder: MeshBuilder, crease_deg: float = 38.0) -> str:
         """Registers a mesh and gives its name."""
-        points, normals, uv = builder.corners(crease_deg)
+        return self.shared_mesh(builder.corners(crease_deg))
+
+    def shared_mesh(self, corners: Corners, scale: Sequence[float] = (1.0, 1.0, 1.0)) -> str:
+        """Registers what ``MeshBuilder.corners`` gave, stretched along the axes, and gives its name."""
+        points, normals, uv = corners
         if len(points) == 3:  # MuJoCo wants at least four vertices
             points, normals, uv = (np.concatenate([values, values]) for values in (points, normals, uv))
         self._meshes += 1
         mesh = self.spec.add_mesh(name=f"mesh{self._meshes}")
-        mesh.uservert = points.ravel().tolist()
+        mesh.uservert = (points * np.asarray(scale)).ravel().tolist()
         mesh.usernormal = normals.ravel().tolist()
         mesh.usertexcoord = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).ravel().tolist()
         mesh.userface = list(range(len(points)))

@@ -58,8 +58,8 @@ class Chunks:
 
     def join(self, other: Chunks) -> None:
         """Takes over the meshes of another collection as they are, with its own squares."""
-        for number, (key, mesh) in enumerate(other._meshes.items()):
-            self._meshes[(-(10**6) - number, *key[1:])] = mesh
+        for key, mesh in other._meshes.items():
+            self._meshes[(-(10**6) - len(self._meshes), *key[1:])] = mesh
 
     def place(self, builder: SpecBuilder) -> None:
         """Makes one geom of each square, class and material."""

@@ -70,7 +70,9 @@ def _kerb_walls(chunks: Chunks, network: TownNetwork) -> None:
             low, top = np.column_stack([points, foot]), np.column_stack([points, foot + high])
             corners = np.stack([np.stack([low[a], low[b], top[b]], axis=1), np.stack([low[a], top[b], top[a]], axis=1)])
             v = np.array([[0.02, 0.02, 0.09], [0.02, 0.09, 0.09]])
-            u = np.stack([np.stack([along[a], along[b], along[b]], axis=1), np.stack([along[a], along[b], along[a]], axis=1)])
+            u = np.stack(
+                [np.stack([along[a], along[b], along[b]], axis=1), np.stack([along[a], along[b], along[a]], axis=1)]
+            )
             uv = np.stack([u, np.broadcast_to(v[:, None], u.shape)], axis=-1)
             side = points[b] - points[a]
             normal = np.stack([side[:, 1], -side[:, 0], np.zeros(len(side))], axis=1)
@@ -100,9 +102,10 @@ def _green(chunks: Chunks, network: TownNetwork) -> None:
     """Grass around the town, coarser far away, and wooded hills that close the view."""
     high, bounds = network.plan.kerb.height_m, np.array(network.surface.bounds)
     low, top = bounds[:2] - NEAR_MARGIN_M, bounds[2:] + NEAR_MARGIN_M
-    near = shapely.box(*low, *top)
-    _lay(chunks, network, near.difference(shapely.buffer(network.paved, -0.2)), high - GRASS_BELOW_M,
+    near, lawns = shapely.box(*low, *top), Chunks(2 * chunks.size_m)
+    _lay(lawns, network, near.difference(shapely.buffer(network.paved, -0.2)), high - GRASS_BELOW_M,
          SurfaceClass.GRASS, "grass", GRASS_TILE_M, GRASS_STEP_M)  # fmt: skip
+    chunks.join(lawns)
     middle = (low + top) / 2
     far = shapely.Point(middle).buffer(FAR_REACH_M, quad_segs=8).difference(near.buffer(-25.0))
     wide = Chunks(400.0)

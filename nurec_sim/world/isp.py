@@ -78,4 +78,4 @@ def _vignette(height: int, width: int, corner: float) -> Float32[np.ndarray, "h 
     """Share of the light that reaches each pixel."""
     v, u = (np.arange(n, dtype=np.float32) * 2 + (1 - n) for n in (height, width))
     radius2 = (v * v)[:, None] + u * u
-    return 1 - np.float32(corner) * radius2 / np.float32(max(height**2 + width**2 - 2, 1))
+    return 1 - np.float32(corner) * radius2 / np.float32(max((height - 1) ** 2 + (width - 1) ** 2, 1))

@@ -15,8 +15,7 @@ from nurec_sim.world.network import TownNetwork
 from nurec_sim.world.plan import Crossing, Kerb, StopLine, TownPlan
 from nurec_sim.world.road import RoadLanes
 from nurec_sim.world.splits import SPLITS, STREAM_OF_SPLIT, TEMPLATES, Split
-from nurec_sim.world.street_layout import FACADES, TREES, street_plan  # noqa: F401
-from nurec_sim.world.templates import network_of
+from nurec_sim.world.templates import road_graph
 
 START_US = 1_000_000
 STEP_US = 50_000
@@ -63,7 +62,7 @@ def still_town(seed: int, split: Split = "train", template: str | None = None, s
         held_out = split == "test" and choose.random() < 0.5
         names = TEMPLATES.held_out if held_out else TEMPLATES.shared
         template = str(names[int(choose.integers(len(names)))])
-    roads = network_of(template, stream(1))
+    roads = road_graph(template, stream(1))
     style = town_style(stream(2), split)
     walk = float(choose.uniform(1.8, 2.6) if style.district == "suburb" else choose.uniform(2.4, 4.0))
     plan = TownPlan(

@@ -12,7 +12,25 @@ import shapely
 from jaxtyping import Float64, Int64
 from numpy.typing import ArrayLike
 
+Corners = tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"]]
+"""Positions, unit normals and texture places of triangle corners, three per triangle."""
 UNIT_SQUARE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
+
+
+def _unit_box() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners of the six sides of a cube, four each; texture places of the corners; the axes along u and v."""
+    corners, axes = [], []
+    for axis in range(3):
+        for sign in (-1, 1):
+            u, w = (axis + 1) % 3, (axis + 2) % 3
+            middle, along_u, along_w = sign * np.eye(3)[axis], sign * np.eye(3)[u], np.eye(3)[w]
+            corners += [middle + a * along_u + b * along_w for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+            axes += [(u, w)] * 4
+    return np.array(corners), np.tile(np.array(UNIT_SQUARE), (6, 1)), np.array(axes)
+
+
+_BOX_CORNERS, _BOX_UV, _BOX_AXES = _unit_box()
+_BOX_FACES = (4 * np.arange(6)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
 
 
 class MeshBuilder:
@@ -40,7 +58,7 @@ class MeshBuilder:
         self._points = [points * scale + shift for points in self._points]
 
     def add(self, points: ArrayLike, faces: ArrayLike, uv: ArrayLike, normals: ArrayLike | None = None) -> None:
-        """Triangles ``faces [m,3]`` over ``points [n,3]`` with ``uv [n,2]``; ``normals [n,3]`` replace smoothed ones."""
+        """Triangles ``faces [m,3]`` over ``points [n,3]`` with ``uv [n,2]``; ``normals [n,3]`` replace computed ones."""
         vertices = np.asarray(points, np.float64)
         self._points.append(vertices)
         self._uv.append(np.asarray(uv, np.float64))
@@ -57,6 +75,10 @@ class MeshBuilder:
             self._faces.append(faces + self._count)
             self._normals.append(normals @ turn.T)
         self._count += other._count
+
+    def shrink_texture(self, part: float) -> None:
+        """Puts all texture places into the first ``part`` of the texture, where it is plain."""
+        self._uv = [np.mod(uv, 1.0) * part for uv in self._uv]
 
     def warp(self, move: Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]) -> None:
         """Moves every vertex, as when flat things are laid on hilly ground."""
@@ -78,15 +100,10 @@ class MeshBuilder:
 
     def box(self, center: ArrayLike, half: ArrayLike, uv_per_m: float = 1.0) -> None:
         """An axis-aligned box."""
-        center, half = np.asarray(center, np.float64), np.asarray(half, np.float64)
-        for axis in range(3):
-            for sign in (-1, 1):
-                u, w = (axis + 1) % 3, (axis + 2) % 3
-                middle = center + sign * half[axis] * np.eye(3)[axis]
-                along_u, along_w = sign * half[u] * np.eye(3)[u], half[w] * np.eye(3)[w]
-                uv = np.array(UNIT_SQUARE) * 2 * np.array([half[u], half[w]]) * uv_per_m
-                self.quad(middle - along_u - along_w, middle + along_u - along_w,
-                          middle + along_u + along_w, middle - along_u + along_w, uv)  # fmt: skip
+        half = np.asarray(half, np.float64)
+        points = _BOX_CORNERS * half + np.asarray(center, np.float64)
+        uv = _BOX_UV * 2 * uv_per_m * np.stack([half[_BOX_AXES[:, 0]], half[_BOX_AXES[:, 1]]], axis=1)
+        self.add(points, _BOX_FACES, uv)
 
     def block(self, low: ArrayLike, high: ArrayLike) -> None:
         """An axis-aligned box between two corners; each of its sides shows the whole texture, upright."""
@@ -155,9 +172,7 @@ class MeshBuilder:
         uv = np.stack([np.arctan2(points[:, 1], points[:, 0]) / np.pi, points[:, 2]], axis=1) * radius
         self.add(points * radius * (1 + rough * lumps)[:, None] + np.asarray(center), faces, uv)
 
-    def corners(
-        self, crease_deg: float
-    ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"]]:
+    def corners(self, crease_deg: float) -> Corners:
         """Positions, unit normals and texture coordinates of every triangle corner, three per triangle.
 
         A corner's normal averages the faces at its position that bend less than ``crease_deg`` from its own.
@@ -175,7 +190,7 @@ class MeshBuilder:
 
 
 def _smoothed(place: np.ndarray, own: np.ndarray, weighted: np.ndarray, limit: float) -> np.ndarray:
-    """Each corner's normal averaged over the corners at its place whose normals' cosine to its own exceeds ``limit``."""
+    """Each corner's normal averaged over those at its place whose cosine to its own exceeds ``limit``."""
     grid = np.round(place * 1e4).astype(np.int64)
     key = grid @ np.array([73856093, 19349663, 83492791], np.int64)
     order = np.argsort(key, kind="stable")

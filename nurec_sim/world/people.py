@@ -96,7 +96,9 @@ def limb(name: str, *, bare: bool = False) -> MeshBuilder:
     if kind == "thigh":
         _tube(mesh, [(-KNEE_M, 0.058, 0.056), (-0.25, 0.078, 0.072), (0.02, 0.092, 0.086)], "trousers")
     elif kind == "shin":
-        _tube(mesh, [(-0.40, 0.040, 0.040), (-0.20, 0.058, 0.054), (0.02, 0.058, 0.055)], "skin" if bare else "trousers")
+        _tube(
+            mesh, [(-0.40, 0.040, 0.040), (-0.20, 0.058, 0.054), (0.02, 0.058, 0.055)], "skin" if bare else "trousers"
+        )
         _ball(mesh, (0.055, 0.0, -0.415), (0.135, 0.046, 0.045), "shoes")
     elif kind == "arm":
         _tube(mesh, [(-ELBOW_M - 0.02, 0.041, 0.041), (-0.1, 0.052, 0.050), (0.02, 0.056, 0.052)], "shirt")
@@ -110,7 +112,13 @@ def limb(name: str, *, bare: bool = False) -> MeshBuilder:
 def bicycle() -> dict[str, MeshBuilder]:
     """Frame and tyres, in the rider's body frame with the saddle below the hip; the wheels touch z = 0."""
     frame, tyres = MeshBuilder(), MeshBuilder()
-    rear, front, pedal, seat, head = (-0.44, 0, 0.34), (0.60, 0, 0.34), (0.0, 0, 0.30), (-0.16, 0, 0.88), (0.46, 0, 0.86)
+    rear, front, pedal, seat, head = (
+        (-0.44, 0, 0.34),
+        (0.60, 0, 0.34),
+        (0.0, 0, 0.30),
+        (-0.16, 0, 0.88),
+        (0.46, 0, 0.86),
+    )
     for a, b, radius in ((rear, pedal, 0.016), (rear, seat, 0.014), (pedal, seat, 0.019), (pedal, head, 0.022),
                          (seat, head, 0.019), (head, front, 0.018)):  # fmt: skip
         frame.cylinder(a, b, radius, sides=6, capped=False)

@@ -29,6 +29,7 @@ PropKind = Literal[
 PROP_KINDS: tuple[str, ...] = get_args(PropKind)
 SIGNS = ("speed", "stop", "yield", "priority", "crossing", "narrow", "no_parking", "roundabout")
 """Pictures of signs, in the order of ``Prop.variant``."""
+Rule = Literal["priority", "yield", "stop", "red", "green"]
 ActorKind = Literal[
     "hatch", "sedan", "wagon", "suv", "van", "pickup", "truck", "bus", "sports", "minivan", "cyclist", "pedestrian"
 ]
@@ -93,7 +94,7 @@ class Arm:
 
     road: str
     end: Literal["start", "end"]
-    rule: Literal["priority", "yield", "stop", "red", "green"] = "priority"
+    rule: Rule = "priority"
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
@@ -319,68 +320,3 @@ class TownPlan:
             where = ".".join(str(part) for part in first["loc"]) or "the text itself"
             known = ", ".join(field.name for field in fields(TownPlan))
             raise ClipError(f"not a town plan: {where}: {first['msg']}; a plan has the fields {known}") from error
-
-
-# ------------------------------------------------------------ the one-curve street, until everything reads town plans
-
-
-@dataclass(frozen=True)
-class StreetRoad:
-    """One lane each way, parking strips, raised kerbs and sidewalks along a centre line."""
-
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    pieces: tuple[RoadPiece, ...]
-    lane_width_m: float = 3.5
-    strip_width_m: float = 2.2
-    kerb_width_m: float = 0.16
-    kerb_height_m: float = 0.13
-    sidewalk_width_m: float = 2.6
-    zebra_station_m: float | None = None
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
-
-    @property
-    def half_width_m(self) -> float:
-        """From the centre line to the foot of the kerb."""
-        return self.lane_width_m + self.strip_width_m
-
-
-@dataclass(frozen=True)
-class StreetPlan:
-    """One street and what happens on it."""
-
-    seed: int
-    span_us: tuple[int, int]
-    road: StreetRoad
-    buildings: tuple[Building, ...]
-    props: tuple[Prop, ...]
-    actors: tuple[Actor, ...]
-    ego: tuple[tuple[int, float, float, float], ...]
-    sun_azimuth_rad: float
-    sun_elevation_rad: float
-    cloud_cover: float
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
-
-    ego_trajectory = TownPlan.ego_trajectory
-    tracks = TownPlan.tracks
-
-    @property
-    def terrain(self) -> Terrain:
-        """Flat."""
-        return FLAT
-
-    def to_json(self) -> str:
-        """The plan as text."""
-        return TypeAdapter(StreetPlan).dump_json(self, indent=1).decode() + "\n"
-
-    @staticmethod
-    def from_json(text: str) -> StreetPlan:
-        """A plan from its text."""
-        try:
-            return TypeAdapter(StreetPlan).validate_json(text)
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"]) or "the text itself"
-            known = ", ".join(field.name for field in fields(StreetPlan))
-            raise ClipError(f"not a street plan: {where}: {first['msg']}; a plan has the fields {known}") from error

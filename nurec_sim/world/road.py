@@ -11,8 +11,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float64
 
-from nurec_sim.types import RoadMap
-from nurec_sim.world.plan import Road, RoadPiece, StreetRoad
+from nurec_sim.world.plan import Road, RoadPiece
 
 FINE_STEP_M = 0.25
 MESH_STEP_M = 1.0
@@ -92,32 +91,6 @@ class RoadLine:
         right, _ = self.at(stations, right_m)
         left, _ = self.at(stations, left_m)
         return shapely.Polygon(np.concatenate([right, left[::-1]]))
-
-    # ------------------------------------------------------- of the one-curve street, until everything reads networks
-
-    @property
-    def road(self) -> StreetRoad:
-        """The street's road."""
-        assert isinstance(self.curve, StreetRoad)
-        return self.curve
-
-    def line(self, offset_m: float) -> Float64[np.ndarray, "k 2"]:
-        """A line parallel to the centre line."""
-        return self.at(self.stations(), offset_m)[0]
-
-    def ring(self, right_m: float, left_m: float) -> Float64[np.ndarray, "k 2"]:
-        """The closed counter-clockwise outline of everything between two offsets (last point = first)."""
-        outline = np.concatenate([self.line(right_m), self.line(left_m)[::-1]])
-        return np.concatenate([outline, outline[:1]])
-
-    def road_map(self) -> RoadMap:
-        """The exact drivable polygon and both lane centre lines in driving direction."""
-        half, lane = self.road.half_width_m, self.road.lane_width_m / 2
-        lanes = (self.line(-lane), self.line(lane)[::-1])
-        return RoadMap(
-            drivable=((self.ring(-half, half),),),
-            lanes=tuple(np.concatenate([line, np.zeros((len(line), 1))], axis=1) for line in lanes),
-        )
 
 
 class RoadLanes(RoadLine):

@@ -143,3 +143,12 @@ def drop_probability(
     echo = reflectivity * np.clip(cosine, 0, 1) * (ECHO_AT_M / range_m) ** 2
     through = np.exp(-((reflectivity / CLEAR) ** 2))
     return 1 - (1 - np.exp(-echo / FAINTEST_ECHO)) * (1 - through)
+
+
+def measured_points(
+    lidar: LidarModel, scan: TrueScan
+) -> tuple[Float64[np.ndarray, "n 3"], Float32[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
+    """Returns of a turn: points in the frame of the LiDAR at their own instant, intensity, beam (row-major)."""
+    beam = np.flatnonzero(scan.range_m.ravel() > 0).astype(np.int32)
+    directions = sensors.beam_directions(lidar).reshape(-1, 3)[beam]
+    return directions * scan.range_m.ravel()[beam, None], scan.intensity.ravel()[beam], beam

@@ -16,13 +16,15 @@ from nurec_sim.world.plan import Prop
 from nurec_sim.world.surface import SurfaceClass
 
 HEDGE_HEIGHT_M = (0.9, 1.5)
+DETAIL_CHUNK_M = 60.0
 TREE_SIZES = (0.8, 1.0, 1.25)
 
 
 def add_scenery(builder: SpecBuilder, network: TownNetwork) -> None:
     """Ground, houses, plants and furniture of a network's plan; ``materials`` has made their materials."""
-    plan, chunks = network.plan, Chunks()
-    add_ground(chunks, network, np.random.default_rng([plan.style.texture_seed, 20]), plan.weather.wetness)
+    plan, chunks = network.plan, Chunks(DETAIL_CHUNK_M)
+    ground = Chunks()
+    add_ground(ground, network, np.random.default_rng([plan.style.texture_seed, 20]), plan.weather.wetness)
     for index, house in enumerate(plan.buildings):
         rng = np.random.default_rng([plan.style.texture_seed, 21, index])
         add_house(chunks, house, plan.terrain, plan.kerb.height_m, rng)
@@ -38,6 +40,7 @@ def add_scenery(builder: SpecBuilder, network: TownNetwork) -> None:
         else:
             for mesh, surface, material in fixture_parts(prop):
                 chunks.at(pose[:2, 3], surface, material, crease_deg=30.0).extend(mesh, pose)
+    ground.place(builder)
     chunks.place(builder)
 
 

@@ -14,13 +14,13 @@ from jaxtyping import Float32, Float64, Int32, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError, TooLargeError
-from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, LidarModel, SensorFrame, SensorRequest
+from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, LidarModel, SensorFrame, SensorRequest, Shutter
 from nurec_sim.world import scan
 from nurec_sim.world.backend import pick_backend
-from nurec_sim.world.build import Town, build_street
+from nurec_sim.world.build import Town, build_town
 from nurec_sim.world.isp import CameraResponse, apply_response
 from nurec_sim.world.plan import TownPlan
-from nurec_sim.world.scan import LidarResponse, TrueScan
+from nurec_sim.world.scan import LidarResponse, TrueScan, measured_points
 from nurec_sim.world.stage import Quality, Stage, named
 from nurec_sim.world.surface import LABEL_OF_CLASS
 
@@ -135,7 +135,7 @@ class TrueWorld:
         return self._thread.submit(work).result()
 
     def _start(self) -> Stage:
-        return Stage(build_street(self.plan), self._recorded, self.backend, self._quality)
+        return Stage(build_town(self.plan), self._recorded, self.backend, self._quality)
 
     def _view(self, request: SensorRequest) -> TrueView:
         camera = request.sensor
@@ -204,30 +204,23 @@ def _in_world(
     normal: Float32[np.ndarray, "h w 3"], request: SensorRequest, camera: CameraModel
 ) -> Float32[np.ndarray, "h w 3"]:
     """Normals of a camera that turns during its exposure, line by line in the world's axes."""
-    pair = np.asarray(request.world_from_sensor, np.float64)
     height, width = normal.shape[:2]
-    rows, columns = np.mgrid[0:height, 0:width]
-    lines = sensors.shutter_fraction(camera, np.stack([columns.ravel(), rows.ravel()], axis=1))
-    fractions, index = np.unique(lines, return_inverse=True)
-    turns = geometry.interpolate_pose_pair(pair, fractions)[:, :3, :3].astype(np.float32)
-    return np.einsum("hwij,hwj->hwi", turns[index.reshape(height, width)], normal)
+    by_column = camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
+    lines = np.arange(width if by_column else height) + 0.5
+    fractions = sensors.shutter_fraction(camera, np.stack([lines, lines], axis=1))
+    poses = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), fractions)
+    turns = np.ascontiguousarray(poses[:, :3, :3].transpose(0, 2, 1), np.float32)
+    if by_column:
+        return np.ascontiguousarray((normal.transpose(1, 0, 2) @ turns).transpose(1, 0, 2))
+    return normal @ turns
 
 
-def measured_points(
-    lidar: LidarModel, scan: TrueScan
-) -> tuple[Float64[np.ndarray, "n 3"], Float32[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
-    """Returns of a turn: points in the frame of the LiDAR at their own instant, intensity, beam (row-major)."""
-    beam = np.flatnonzero(scan.range_m.ravel() > 0).astype(np.int32)
-    directions = sensors.beam_directions(lidar).reshape(-1, 3)[beam]
-    return directions * scan.range_m.ravel()[beam, None], scan.intensity.ravel()[beam], beam
-
-
-def _lidar_frame(request: SensorRequest, lidar: LidarModel, scan: TrueScan) -> LidarFrame:
+def _lidar_frame(request: SensorRequest, lidar: LidarModel, turn: TrueScan) -> LidarFrame:
     """A turn as a frame: points in the sensor frame at the end of the spin."""
-    xyz, intensity, beam = measured_points(lidar, scan)
+    xyz, intensity, beam = measured_points(lidar, turn)
     pair = np.asarray(request.world_from_sensor, np.float64)
-    fired = geometry.interpolate_pose_pair(pair, sensors.column_fraction(lidar))[beam % scan.range_m.shape[1]]
+    fired = geometry.interpolate_pose_pair(pair, sensors.column_fraction(lidar))[beam % turn.range_m.shape[1]]
     xyz = sensors.compensate_sweep(xyz, fired, pair[1])
-    range_m = scan.range_m.ravel()[beam]
+    range_m = turn.range_m.ravel()[beam]
     return LidarFrame(lidar, request.start_us, request.end_us, xyz.astype(np.float32), range_m.astype(np.float32),
                       intensity, beam)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Road layouts by name: which roads and junctions a town has. Everything happens within about 150 m of the origin."""
+"""Road layouts by name: which roads and junctions a town has. They end some 100 to 180 m from the origin."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from nurec_sim.world.junctions import crossing, reaches, roundabout
-from nurec_sim.world.plan import Arm, Junction, Narrowing, Road, RoadPiece
+from nurec_sim.world.plan import Arm, Junction, Narrowing, Road, RoadPiece, Rule
+from nurec_sim.world.road import RoadLine
 
 HALF_TOWN_M = 130.0
 EASE_M = 12.0
@@ -17,7 +18,7 @@ EASE_M = 12.0
 
 
 @dataclass(frozen=True)
-class Network:
+class RoadGraph:
     """Roads and the junctions between them."""
 
     roads: tuple[Road, ...]
@@ -27,7 +28,7 @@ class Network:
 Pieces = tuple[RoadPiece, ...]
 
 
-def network_of(template: str, rng: np.random.Generator) -> Network:
+def road_graph(template: str, rng: np.random.Generator) -> RoadGraph:
     """The roads of a template.
 
     Raises:
@@ -68,29 +69,27 @@ def _usual(rng: np.random.Generator, lanes: Sequence[int] = (1, 1, 1, 2)) -> dic
     }
 
 
-def _single(rng: np.random.Generator, pieces: Pieces, **changes: Any) -> Network:
+def _single(rng: np.random.Generator, pieces: Pieces, **changes: Any) -> RoadGraph:
     """One road whose middle lies near the origin, in any direction."""
     road = Road("main", 0.0, 0.0, 0.0, pieces, **{**_usual(rng), **changes})
-    from nurec_sim.world.road import RoadLine
-
     middle, _ = RoadLine(road).at(road.length_m / 2)
     yaw = float(rng.uniform(-np.pi, np.pi))
     turned = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ -middle
-    return Network((replace(road, x_m=float(turned[0]), y_m=float(turned[1]), yaw_rad=yaw),), ())
+    return RoadGraph((replace(road, x_m=float(turned[0]), y_m=float(turned[1]), yaw_rad=yaw),), ())
 
 
-def _straight(rng: np.random.Generator) -> Network:
+def _straight(rng: np.random.Generator) -> RoadGraph:
     return _single(rng, (RoadPiece(2 * HALF_TOWN_M),))
 
 
-def _curve(rng: np.random.Generator) -> Network:
+def _curve(rng: np.random.Generator) -> RoadGraph:
     radius = float(np.exp(rng.uniform(np.log(25.0), np.log(200.0))))
     turn = float(rng.choice([-1, 1]) * min(rng.uniform(0.7, 1.6), 150.0 / radius))
     entry = float(rng.uniform(85.0, 105.0))
     return _single(rng, (RoadPiece(entry), *bend(turn, radius), RoadPiece(120.0)))
 
 
-def _s_curve(rng: np.random.Generator) -> Network:
+def _s_curve(rng: np.random.Generator) -> RoadGraph:
     sign = float(rng.choice([-1, 1]))
     first, second = (float(v) for v in rng.uniform(32.0, 110.0, 2))
     turns = [min(float(rng.uniform(0.6, 1.1)), 85.0 / radius) for radius in (first, second)]
@@ -106,7 +105,7 @@ def _s_curve(rng: np.random.Generator) -> Network:
     )
 
 
-def _narrowing(rng: np.random.Generator) -> Network:
+def _narrowing(rng: np.random.Generator) -> RoadGraph:
     lane, narrow = round(float(rng.uniform(3.3, 3.6)), 2), round(float(rng.uniform(2.75, 3.0)), 2)
     start = float(rng.uniform(110.0, 130.0))
     gone = [(0.0, 0.0), (2.2, 0.0), (0.0, 2.2)][int(rng.integers(3))]
@@ -127,7 +126,7 @@ class _Spoke:
     name: str
     angle_rad: float
     section: dict[str, Any]
-    rule: str
+    rule: Rule
     tail: Pieces
 
     @property
@@ -152,12 +151,11 @@ def _tail(rng: np.random.Generator, length_m: float = 112.0) -> Pieces:
     return (RoadPiece(26.0), *bend(turn, radius), RoadPiece(max(length_m - 26.0 - abs(turn) * radius, 20.0)))
 
 
-def _rules(rng: np.random.Generator, main: int, side: int) -> list[str]:
+def _rules(rng: np.random.Generator, main: int, side: int) -> list[Rule]:
     """Lights, stop signs or yield signs; the main road comes first."""
-    kind = int(rng.integers(3))
-    if kind == 0:
-        return ["green"] * main + ["red"] * side
-    return ["priority"] * main + [("stop", "yield")[kind - 1]] * side
+    kinds: tuple[tuple[Rule, Rule], ...] = (("green", "red"), ("priority", "stop"), ("priority", "yield"))
+    first, second = kinds[int(rng.integers(3))]
+    return [first] * main + [second] * side
 
 
 def _spokes(rng: np.random.Generator, angles: Sequence[float], main: dict[str, Any], side: dict[str, Any],
@@ -185,12 +183,12 @@ def _reaches(spokes: Sequence[_Spoke], corner_m: float, at_least: Sequence[float
     return found
 
 
-def _meet(junction: str, centre: np.ndarray, spokes: Sequence[_Spoke], corner_m: float) -> Network:
+def _meet(junction: str, centre: np.ndarray, spokes: Sequence[_Spoke], corner_m: float) -> RoadGraph:
     found = _reaches(spokes, corner_m)
     roads = tuple(spoke.road(centre, reach) for spoke, reach in zip(spokes, found, strict=True))
-    arms = [Arm(spoke.name, "start", spoke.rule) for spoke in spokes]  # type: ignore[arg-type]
+    arms = [Arm(spoke.name, "start", spoke.rule) for spoke in spokes]
     by_id = {road.id: road for road in roads}
-    return Network(roads, (crossing(junction, "crossing", centre, arms, by_id, corner_m),))
+    return RoadGraph(roads, (crossing(junction, "crossing", centre, arms, by_id, corner_m),))
 
 
 def _main_and_side(rng: np.random.Generator) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -199,7 +197,7 @@ def _main_and_side(rng: np.random.Generator) -> tuple[dict[str, Any], dict[str, 
     return main, side
 
 
-def _t_junction(rng: np.random.Generator) -> Network:
+def _t_junction(rng: np.random.Generator) -> RoadGraph:
     turn = float(rng.uniform(-np.pi, np.pi))
     stem = turn + float(rng.choice([-1, 1]) * (np.pi / 2 + rng.normal(0, 0.12)))
     main, side = _main_and_side(rng)
@@ -207,7 +205,7 @@ def _t_junction(rng: np.random.Generator) -> Network:
     return _meet("junction", np.zeros(2), spokes, float(rng.uniform(5, 9)))
 
 
-def _x_junction(rng: np.random.Generator) -> Network:
+def _x_junction(rng: np.random.Generator) -> RoadGraph:
     turn = float(rng.uniform(-np.pi, np.pi))
     skew = float(rng.normal(0, 0.12))
     main, side = _main_and_side(rng)
@@ -216,7 +214,7 @@ def _x_junction(rng: np.random.Generator) -> Network:
     return _meet("junction", np.zeros(2), spokes, float(rng.uniform(5, 9)))
 
 
-def _double_junction(rng: np.random.Generator) -> Network:
+def _double_junction(rng: np.random.Generator) -> RoadGraph:
     turn, apart = float(rng.uniform(-np.pi, np.pi)), float(rng.uniform(75.0, 100.0))
     ahead = np.array([np.cos(turn), np.sin(turn)])
     centres = [-ahead * apart / 2, ahead * apart / 2]
@@ -225,7 +223,7 @@ def _double_junction(rng: np.random.Generator) -> Network:
     first_side = float(rng.choice([-1, 1]))
     roads: list[Road] = []
     spokes_at: list[list[_Spoke]] = []
-    for i, centre in enumerate(centres):
+    for i in (0, 1):
         outer = turn + (np.pi if i == 0 else 0.0)
         sides = [first_side if i == 0 else -first_side] if rng.random() < 0.6 else [-1.0, 1.0]
         angles = [outer, outer + np.pi, *(turn + s * (np.pi / 2 + float(rng.normal(0, 0.06))) for s in sides)]
@@ -241,16 +239,13 @@ def _double_junction(rng: np.random.Generator) -> Network:
     for i, centre in enumerate(centres):
         spokes = spokes_at[i]
         roads += [spoke.road(centre, reach[i][k]) for k, spoke in enumerate(spokes) if k != 1]
-        arms = [
-            Arm(spoke.name, "end" if k == 1 and i == 1 else "start", spoke.rule)  # type: ignore[arg-type]
-            for k, spoke in enumerate(spokes)
-        ]
+        arms = [Arm(spoke.name, "end" if k == 1 and i == 1 else "start", spoke.rule) for k, spoke in enumerate(spokes)]
         by_id = {road.id: road for road in roads}
         junctions.append(crossing(f"junction_{i}", "crossing", centre, arms, by_id, corner))
-    return Network(tuple(roads), tuple(junctions))
+    return RoadGraph(tuple(roads), tuple(junctions))
 
 
-def _slip_road(rng: np.random.Generator) -> Network:
+def _slip_road(rng: np.random.Generator) -> RoadGraph:
     """A ramp that leaves the main road to the right, or joins it from the right."""
     turn, joins = float(rng.uniform(-np.pi, np.pi)), bool(rng.random() < 0.4)
     main = {**_usual(rng, (1, 2)), "left_strip_m": 0.0, "right_strip_m": 0.0, "speed_limit_mps": 16.667}
@@ -271,12 +266,12 @@ def _slip_road(rng: np.random.Generator) -> Network:
     found = _reaches(spokes, corner)
     centre = -np.array([np.cos(turn), np.sin(turn)]) * 15.0
     roads = tuple(spoke.road(centre, reach) for spoke, reach in zip(spokes, found, strict=True))
-    arms = [Arm(spoke.name, "start", spoke.rule) for spoke in spokes]  # type: ignore[arg-type]
+    arms = [Arm(spoke.name, "start", spoke.rule) for spoke in spokes]
     fork = crossing("fork", "fork", centre, arms, {road.id: road for road in roads}, corner)
-    return Network(roads, (fork,))
+    return RoadGraph(roads, (fork,))
 
 
-def _roundabout(rng: np.random.Generator) -> Network:
+def _roundabout(rng: np.random.Generator) -> RoadGraph:
     turn, count = float(rng.uniform(-np.pi, np.pi)), int(rng.choice([3, 4, 4]))
     section = _usual(rng, (1,))
     ring, width, flare = float(rng.uniform(12.5, 18.0)), float(rng.uniform(5.5, 6.5)), float(rng.uniform(10.0, 14.0))
@@ -286,15 +281,15 @@ def _roundabout(rng: np.random.Generator) -> Network:
         for name, angle in zip(("east", "north", "west", "south"), spread, strict=False)
     ]
     corner = float(rng.uniform(7.0, 10.0))
-    reach = float(np.hypot(ring + flare, 0.0)) + 2.0
+    reach = ring + flare + 2.0
     centre = np.zeros(2)
     roads = tuple(spoke.road(centre, reach) for spoke in spokes)
     arms = [Arm(spoke.name, "start", "yield") for spoke in spokes]
     by_id = {road.id: road for road in roads}
-    return Network(roads, (roundabout("roundabout", centre, arms, by_id, corner, ring, width, flare),))
+    return RoadGraph(roads, (roundabout("roundabout", centre, arms, by_id, corner, ring, width, flare),))
 
 
-_TEMPLATES: dict[str, Callable[[np.random.Generator], Network]] = {
+_TEMPLATES: dict[str, Callable[[np.random.Generator], RoadGraph]] = {
     "straight": _straight,
     "curve": _curve,
     "s_curve": _s_curve,

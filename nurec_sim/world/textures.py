@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -14,13 +16,24 @@ def noise(rng: np.random.Generator, size: int, octaves: int = 5, cells: int = 4,
     total, weight = np.zeros((size, size), np.float32), 0.0
     for octave in range(octaves):
         n = min(cells * 2**octave, size)
-        grid = np.pad(rng.random((n, n), dtype=np.float32), 2, mode="wrap")
-        zoom = size / n
-        big = cv2.resize(grid, (round((n + 4) * zoom),) * 2, interpolation=cv2.INTER_CUBIC)
-        start = round(2 * zoom)
-        total += persistence**octave * big[start : start + size, start : start + size]
+        rows = _periodic_weights(size, n)
+        total += persistence**octave * (rows @ rng.random((n, n), dtype=np.float32) @ rows.T)
         weight += persistence**octave
     return np.clip(total / weight, 0, 1)
+
+
+@functools.lru_cache(maxsize=32)
+def _periodic_weights(size: int, n: int) -> np.ndarray:
+    """Cubic interpolation ``[size, n]`` from n values on a ring to ``size`` places between them."""
+    place = (np.arange(size) + 0.5) * n / size - 0.5
+    whole = np.floor(place).astype(int)
+    t = place - whole
+    weights = np.zeros((size, n), np.float32)
+    cubic = (-0.5 * t + t**2 - 0.5 * t**3, 1 - 2.5 * t**2 + 1.5 * t**3, 0.5 * t + 2 * t**2 - 1.5 * t**3,
+             -0.5 * t**2 + 0.5 * t**3)  # fmt: skip
+    for shift, weight in zip((-1, 0, 1, 2), cubic, strict=True):
+        np.add.at(weights, (np.arange(size), (whole + shift) % n), weight.astype(np.float32))
+    return weights
 
 
 def _image(values: np.ndarray, colour: tuple[float, ...] | None = None) -> Image:

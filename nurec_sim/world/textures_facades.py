@@ -52,9 +52,10 @@ def _brick(rng: np.random.Generator, size: int) -> np.ndarray:
 def _plaster(rng: np.random.Generator, size: int) -> np.ndarray:
     palette = ((214, 204, 184), (196, 172, 146), (198, 198, 196), (216, 190, 146), (186, 150, 128), (226, 220, 210),
                (166, 176, 160), (204, 170, 160), (176, 186, 196), (222, 204, 158))  # fmt: skip
-    image = np.asarray(palette[rng.integers(len(palette))], np.float32) * (
-        0.86 + 0.2 * noise(rng, size, 5, 4) + 0.03 * grain(rng, size, 0.8)
-    )[..., None]
+    image = (
+        np.asarray(palette[rng.integers(len(palette))], np.float32)
+        * (0.86 + 0.2 * noise(rng, size, 5, 4) + 0.03 * grain(rng, size, 0.8))[..., None]
+    )
     damp = np.clip((noise(rng, size, 4, 3) - 0.62) * 4, 0, 0.3)[..., None]
     return image * (1 - damp)
 
@@ -222,7 +223,9 @@ def shopfront(rng: np.random.Generator, night: float) -> Image:
             colour = (rng.uniform(30, 220, 3) * (0.8 if glow == 1.0 else dark)).tolist()
             cv2.rectangle(image, (x, y), (x + int(rng.integers(3, 14)), bottom), colour, -1)
         door = x0 + int(rng.integers(4, max(5, x1 - x0 - 34)))
-        cv2.rectangle(image, (door, top + 4), (door + 26, int(0.99 * high)), (rng.uniform(30, 110, 3) * dark).tolist(), -1)
+        cv2.rectangle(
+            image, (door, top + 4), (door + 26, int(0.99 * high)), (rng.uniform(30, 110, 3) * dark).tolist(), -1
+        )
         cv2.rectangle(image, (door + 4, top + 10), (door + 22, int(0.7 * high)), (90 * dark, 98 * dark, 104 * dark), -1)
         cv2.rectangle(image, (x0, top), (x1, bottom), (48 * dark, 48 * dark, 50 * dark), 2)
     return image

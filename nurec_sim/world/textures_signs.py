@@ -68,7 +68,9 @@ def sign(rng: np.random.Generator, picture: str, size: int = 128) -> Image:
             cv2.circle(image, place, 11, _WHITE, -1, cv2.LINE_AA)
     else:
         board(0.80, _RED, _BLUE)
-        cv2.line(image, (int(0.22 * size), int(0.22 * size)), (int(0.78 * size), int(0.78 * size)), _RED, 13, cv2.LINE_AA)
+        cv2.line(
+            image, (int(0.22 * size), int(0.22 * size)), (int(0.78 * size), int(0.78 * size)), _RED, 13, cv2.LINE_AA
+        )
     return image
 
 

@@ -43,7 +43,8 @@ def _side(side: np.ndarray, family: Family, size_m: tuple[float, float, float]) 
 
     heights = (1 - (np.arange(SIDE_PX) + 0.5) / SIDE_PX) / family.belt
     # Upper halves of doors mirror the sky, lower halves the ground; a crease runs along the shoulder.
-    steps = ((0.0, 0.42), (0.3, 0.60), (0.5, 0.74), (0.72, 0.80), (0.86, 1.0), (0.90, 0.88), (1.0, 0.97), (1.05, 0.93), (1.7, 1.0))  # fmt: skip
+    steps = ((0.0, 0.42), (0.3, 0.60), (0.5, 0.74), (0.72, 0.80), (0.86, 1.0), (0.90, 0.88), (1.0, 0.97), (1.05, 0.93),
+             (1.7, 1.0))  # fmt: skip
     side *= np.interp(heights, *np.array(steps).T)[:, None].astype(np.float32)
     sill = at(0, family.floor_m / high + 0.035)[1]
     side[sill:] *= 0.45

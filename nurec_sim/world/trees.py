@@ -58,7 +58,7 @@ def hedge(rng: np.random.Generator, length_m: float, height_m: float) -> MeshBui
     for end, order in ((0, -1), (-1, 1)):
         ring = lattice[end]
         uv_end = _in_leaves(ring[:, [0, 2]] / LEAF_TILE_M)
-        mesh.add(ring, [[0, i, i + 1][:: -order] for i in range(1, len(ring) - 1)], uv_end)
+        mesh.add(ring, [[0, i, i + 1][::-order] for i in range(1, len(ring) - 1)], uv_end)
     return mesh
 
 
@@ -80,7 +80,13 @@ def _conifer(rng: np.random.Generator, scale: float) -> MeshBuilder:
         ring = np.stack([out * np.cos(angle), out * np.sin(angle), z - 0.35 * drop * (out / radius)], axis=1)
         top = np.stack([0.08 * np.cos(angle), 0.08 * np.sin(angle), np.full(len(angle), z + drop * 0.8)], axis=1)
         lattice = np.stack([ring, top], axis=1)
-        uv = np.stack([np.stack([angle * radius, np.zeros_like(angle)], 1), np.stack([angle * radius, np.full_like(angle, radius)], 1)], axis=1)
+        uv = np.stack(
+            [
+                np.stack([angle * radius, np.zeros_like(angle)], 1),
+                np.stack([angle * radius, np.full_like(angle, radius)], 1),
+            ],
+            axis=1,
+        )
         mesh.grid(lattice, _in_leaves(uv / LEAF_TILE_M))
         below = np.concatenate([ring[:-1], [[0.0, 0.0, z + 0.1 * drop]]])
         fan = [[(i + 1) % (2 * sides), i, 2 * sides] for i in range(2 * sides)]

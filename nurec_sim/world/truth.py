@@ -93,3 +93,25 @@ def scene_flow(
         points = geometry.transform_points(world_from_camera, rays[on_it] * view.range_m[on_it, None])
         flow[on_it] = geometry.transform_points(moved, points) - points
     return flow
+
+
+def follow(
+    view: TrueView,
+    camera: CameraModel,
+    world_from_camera: Float64[np.ndarray, "4 4"],
+    flow_m: Float32[np.ndarray, "h w 3"],
+    world_from_camera_then: Float64[np.ndarray, "4 4"],
+) -> tuple[Float64[np.ndarray, "h w 2"], Float64[np.ndarray, "h w"]]:
+    """Where a camera sees each pixel's point at another time, if nothing hides it.
+
+    Returns:
+        Pixel coordinates then, NaN for the sky and for what the lens does not see; and the distance then.
+    """
+    rays, _ = sensors.pixel_rays(camera)
+    met = view.range_m > 0
+    points = geometry.transform_points(world_from_camera, rays[met] * view.range_m[met, None]) + flow_m[met]
+    points = geometry.transform_points(geometry.inverse(world_from_camera_then), points)
+    uv, range_m = np.full((*met.shape, 2), np.nan), np.zeros(met.shape)
+    uv[met], _ = sensors.project(camera, points)
+    range_m[met] = np.linalg.norm(points, axis=1)
+    return uv, range_m

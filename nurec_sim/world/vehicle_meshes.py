@@ -10,7 +10,10 @@ from nurec_sim.world.meshes import MeshBuilder
 from nurec_sim.world.textures_vehicles import atlas_uv
 from nurec_sim.world.vehicle_families import FAMILIES, Family
 
-PARTS = ("paint", "glass", "trim", "wheel", "headlight", "taillight", "plate", "cargo")
+PARTS = ("paint", "glass", "wheel", "headlight", "taillight", "plate", "cargo")
+"""``wheel`` holds trim and bumpers too, which are of the same dark plastic as tyres are of rubber."""
+RUBBER = 0.02
+"""The first corner of the wheel's texture is plain."""
 MIRROR_M = 0.075
 """How far mirrors stand out on each side of the body; the box holds them too."""
 
@@ -25,7 +28,7 @@ def vehicle_parts(kind: str, size_m: tuple[float, float, float]) -> dict[str, Me
     """
     if kind not in FAMILIES:
         raise ValueError(f"no vehicle family {kind!r}; have {sorted(FAMILIES)}")
-    family, parts = FAMILIES[kind], {name: MeshBuilder() for name in PARTS}
+    family, parts = FAMILIES[kind], {name: MeshBuilder() for name in (*PARTS, "trim")}
     half_l, half_w, high = size_m[0] / 2, size_m[1] / 2 - MIRROR_M, size_m[2]
     body = _lower_body(parts["paint"], family, half_l, half_w, high)
     surface = _cabin(parts["paint"], family, half_l, half_w, high)
@@ -38,6 +41,9 @@ def vehicle_parts(kind: str, size_m: tuple[float, float, float]) -> dict[str, Me
         floor, wide = family.wheel_m * 2 + 0.12, size_m[1] / 2
         parts["cargo"].block([rear, -wide, floor], [front, wide, high])
         parts["trim"].box([(rear + front) / 2, 0, floor - 0.14], [(front - rear) / 2 * 0.98, 0.45, 0.14])
+    trim = parts.pop("trim")
+    trim.shrink_texture(RUBBER)
+    parts["wheel"].extend(trim)
     used = {name: part for name, part in parts.items() if not part.empty}
     _fit(used, size_m)
     used["paint"] = _with_atlas(used["paint"], size_m)
@@ -85,8 +91,9 @@ def _cabin(paint: MeshBuilder, family: Family, half_l: float, half_w: float, hig
     end = 0.99 if boxy else 0.93
     bottom = np.array([[rear_low, low_w * end, low], [rear_low, -low_w * end, low],
                        [front_low, -low_w * end, low], [front_low, low_w * end, low]])  # fmt: skip
-    top = np.array([[rear_high, top_w * 0.97, roof], [rear_high, -top_w * 0.97, roof], [front_high, -top_w * 0.97, roof],
-                    [front_high, top_w * 0.97, roof]])  # fmt: skip
+    top_w *= 0.97
+    top = np.array([[rear_high, top_w, roof], [rear_high, -top_w, roof], [front_high, -top_w, roof],
+                    [front_high, top_w, roof]])  # fmt: skip
     outward = np.array([[-1, 0, 0], [0, -1, 0], [1, 0, 0], [0, 1, 0]], np.float64)
     bulge = (0.05, 0.028, 0.05 if boxy else 0.12, 0.028)
 
@@ -130,7 +137,7 @@ def _wheels(parts: dict[str, MeshBuilder], family: Family, half_l: float, half_w
             inner, outer = side * (half_w - 0.24), side * (half_w + 0.012)
             # The caps show the whole wheel texture, the tread its corner, which is rubber.
             parts["wheel"].cylinder([x * half_l, inner, radius], [x * half_l, outer, radius], radius, sides=20,
-                                    side_uv=0.02)  # fmt: skip
+                                    side_uv=RUBBER)  # fmt: skip
 
 
 def _lamps(parts: dict[str, MeshBuilder], family: Family, half_l: float, half_w: float, high: float) -> None:
@@ -167,11 +174,16 @@ def _trim(
         trim.box([end - sign * 0.02, 0, floor + 0.17], [0.035, half_w * 0.72, 0.055])
     rear = (family.cargo or (family.top[0][0],))[0] * half_l
     parts["plate"].box([nose + 0.012, 0, floor + 0.25], [0.010, 0.26, 0.056])
-    parts["plate"].box([rear - 0.004, 0, floor + (0.34 if boxy else 0.30) * high * (0.6 if boxy else 0.9)], [0.010, 0.26, 0.056])
+    parts["plate"].box(
+        [rear - 0.004, 0, floor + (0.34 if boxy else 0.30) * high * (0.6 if boxy else 0.9)], [0.010, 0.26, 0.056]
+    )
     mirror_x = (family.cabin[3] * 0.80 + family.cabin[2] * 0.20) * half_l
     mirror_z = family.belt * high + (0.35 if boxy else 0.06)
     for side in (-1, 1):
-        trim.box([mirror_x, side * (half_w + 0.01), mirror_z], [0.05, MIRROR_M - 0.01, 0.16 if boxy and high > 2.4 else 0.065])
+        trim.box(
+            [mirror_x, side * (half_w + 0.01), mirror_z],
+            [0.05, MIRROR_M - 0.01, 0.16 if boxy and high > 2.4 else 0.065],
+        )
     if family.rails:
         for side in (-1, 1):
             middle, length = (family.cabin[1] + family.cabin[2]) / 2, (family.cabin[2] - family.cabin[1]) / 2

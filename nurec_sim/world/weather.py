@@ -61,8 +61,9 @@ def add_lights(spec: Any, weather: Weather) -> None:
     spec.worldbody.add_light(name="sun", type=directional, pos=(sun * 120).tolist(), dir=(-sun).tolist(),
                              ambient=[0, 0, 0], diffuse=list(light.sun), specular=[light.highlight] * 3,
                              castshadow=True)  # fmt: skip
-    spec.worldbody.add_light(name="fill", type=directional, dir=(-fill / np.linalg.norm(fill)).tolist(),
-                             ambient=[0, 0, 0], diffuse=list(light.fill), specular=[0, 0, 0], castshadow=False)  # fmt: skip
+    away = -fill / np.linalg.norm(fill)
+    spec.worldbody.add_light(name="fill", type=directional, dir=away.tolist(), ambient=[0, 0, 0],
+                             diffuse=list(light.fill), specular=[0, 0, 0], castshadow=False)  # fmt: skip
     headlight = spec.visual.headlight
     headlight.ambient, headlight.diffuse, headlight.specular = list(light.ambient), [0.05] * 3, [0, 0, 0]
 

@@ -1,37 +1,45 @@
-"""Writing a street as a driving log: what its cameras and LiDAR saw, and nothing of the truth behind it.
-
-The truth (depth, classes, instances, plan) goes to a folder of its own where asked for, so that no reader of the log
-can peek.
-"""
+"""Writing a drive through a town as a driving log: what its sensors saw, and nothing of the truth behind it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int64, UInt8
 
 from nurec_sim import geometry, logs, sensors
 from nurec_sim.errors import ClipError
-from nurec_sim.types import LidarModel, Rig, SensorRequest, Sweep, Trajectory
-from nurec_sim.world.plan import StreetPlan
+from nurec_sim.types import CameraModel, LidarModel, Rig, SensorRequest, Shutter, Sweep, Trajectory
+from nurec_sim.world.isp import CameraResponse, random_response
+from nurec_sim.world.network import TownNetwork
+from nurec_sim.world.plan import TownPlan
 from nurec_sim.world.rig import street_rig
-from nurec_sim.world.road import RoadLine
-from nurec_sim.world.sense import TrueView, TrueWorld, measured_points
+from nurec_sim.world.scan import LidarResponse
+from nurec_sim.world.sense import TrueWorld, measured_points
+from nurec_sim.world.truth import scene_flow
+from nurec_sim.world.truth_folder import TruthFolder
+from nurec_sim.world.xodr import opendrive_town
 
 Progress = Callable[[str, float], None]
 """Called with (what was drawn, fraction done)."""
+Responses = Mapping[str, CameraResponse | LidarResponse]
 SPIN_US = 100_000
+READOUT_US = 20_000
 
 
-def write_street_clip(
-    plan: StreetPlan,
+def write_town_clip(
+    plan: TownPlan,
     path: str | Path,
     *,
     rig: Rig | None = None,
-    period_us: int = 200_000,
+    period_us: int = 100_000,
+    readout_us: int = READOUT_US,
+    responses: Responses | None = None,
     jpeg_quality: int = 80,
     point_step_m: float = 0.01,
     backend: str | None = None,
@@ -40,21 +48,24 @@ def write_street_clip(
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Drive through a street and write the log, as a folder or a ``.zip``.
+    """Drive through a town and write the log, as a folder or a ``.zip``; log and truth appear complete or not at all.
 
-    Every ``period_us`` the LiDAR turns once (0.1 s, clockwise, from straight behind) and all cameras expose at
-    once in the middle of the turn, when the LiDAR looks straight ahead. Sweeps are motion-compensated to that middle.
+    Every ``period_us`` the LiDAR turns once (0.1 s, from straight behind) and all cameras expose around the middle of
+    the turn, when the LiDAR looks straight ahead: at once with a global shutter, else from ``readout_us / 2`` before
+    to as much after. Sweeps are motion-compensated to that middle. Poses, calibration, boxes and map are exact.
 
     Args:
-        plan: the street and its traffic.
+        plan: the town and its traffic.
         path: what to write.
         rig: sensors; ``street_rig()`` by default.
-        period_us: time from one set of frames to the next, at least one turn.
+        period_us: time from one set of frames to the next; at least one turn with a LiDAR.
+        readout_us: how long rolling shutters take from their first to their last line, at most 0.1 s.
+        responses: what sensors do to light and echoes, by id (``random_responses``); ideal ones by default. They are
+            written to the truth, not to the log.
         jpeg_quality: 1..100; colours are stored at half resolution, as by real cameras.
         point_step_m: LiDAR coordinates are rounded to multiples of it (a centimetre halves the size of the file).
         backend: see ``TrueWorld``.
-        truth: a folder that does not exist yet, for ``plan.json`` and ``<camera>/<frame>.npz`` with depth_m [h,w],
-            surface [h,w] (``SurfaceClass``) and instance [h,w].
+        truth: a folder that does not exist yet, for everything that the log must not tell (docs/world.md).
         command: the command line to remember in the log's meta data.
         progress: called after every camera or LiDAR frame.
         overwrite: replace what is at ``path``.
@@ -63,81 +74,113 @@ def write_street_clip(
         ``path``.
 
     Raises:
-        ClipError: the path or the truth folder exists, or ``period_us`` is shorter than a turn.
+        ClipError: the path or the truth folder exists, the plan has nobody who drives, or a time is out of range.
     """
-    if period_us < SPIN_US:
-        raise ClipError(f"a LiDAR turn takes {SPIN_US} us; period_us must not be less, got {period_us}")
-    path, truth = Path(path), None if truth is None else Path(truth)
+    path, rig = Path(path), street_rig() if rig is None else rig
+    least_us = SPIN_US if rig.lidars else 2 * max(readout_us, 1)
+    if period_us < least_us:
+        raise ClipError(f"period_us must be {least_us} or more (a LiDAR turn, or two readouts), got {period_us}")
+    if not 0 <= readout_us <= SPIN_US:
+        raise ClipError(f"readout_us must be within 0..{SPIN_US}, got {readout_us}")
     if path.exists() and not overwrite:
         raise ClipError(f"{str(path)!r} exists; choose another path or allow overwriting")
-    if truth is not None:
-        if truth.exists():
-            raise ClipError(f"{str(truth)!r} exists; choose another folder for the truth")
-        truth.mkdir(parents=True)
-        (truth / "plan.json").write_text(plan.to_json())
-    rig = street_rig() if rig is None else rig
-    with TrueWorld(plan, backend) as world:
-        facts = {
-            "dataset": "nurec_sim procedural street",
-            "source": "synthetic: MuJoCo, drawn by nurec_sim.world",
-            "licence": "Apache-2.0",
-            "seed": plan.seed,
-            "seconds": (plan.span_us[1] - plan.span_us[0]) / 1e6,
-            "command": command,
-            "backend": world.backend,
-            "poses": "exact",
-            "boxes": "exact",
-            "map": "exact",
-        }
+    if not plan.ego:
+        raise ClipError("the plan has no ego: nobody drives through its town; make plans with town_plan(seed)")
+    responses = dict(responses or {})
+    with contextlib.ExitStack() as stack:
+        folder = None if truth is None else stack.enter_context(TruthFolder(truth))
+        world = stack.enter_context(TrueWorld(plan, backend, responses))
+        if folder is not None:
+            folder.add_plan(plan, responses)
+        drive = _Drive(world, rig, period_us, readout_us, jpeg_quality, point_step_m, folder, progress)
         return logs.write_clip(
             path,
-            id=f"street-{plan.seed}",
+            id=f"town-{plan.split}-{plan.template}-{plan.seed}",
             rig=rig,
-            ego=plan.ego_trajectory(),
-            frames=_frames(world, rig, period_us, jpeg_quality, point_step_m, truth, progress),
+            ego=drive.ego,
+            frames=drive.frames(),
             tracks=plan.tracks(),
-            road_map=RoadLine(plan.road).road_map(),
-            facts=facts,
+            road_map=TownNetwork(plan).road_map(),
+            facts=_facts(plan, command, world.backend),
+            attachments={"map.xodr": opendrive_town(plan)},
             overwrite=overwrite,
         )
 
 
-def _frames(
-    world: TrueWorld,
-    rig: Rig,
-    period_us: int,
-    jpeg_quality: int,
-    point_step_m: float,
-    truth: Path | None,
-    progress: Progress | None,
-) -> Iterator[logs.CameraEntry | logs.LidarEntry]:
-    start_us, end_us = world.plan.span_us
-    ego = world.plan.ego_trajectory()
-    turns = range(start_us, end_us - SPIN_US + 1, period_us)
-    total, done = len(turns) * (len(rig.lidars) + len(rig.cameras)), 0
-    for index, turn_us in enumerate(turns):
-        for lidar in rig.lidars.values():
-            yield logs.LidarEntry(lidar.id, _sweep(world, ego, lidar, turn_us, point_step_m))
-            done += 1
-            _tell(progress, lidar.id, done / total)
-        now_us = turn_us + SPIN_US // 2
-        for camera in rig.cameras.values():
-            pose = ego.at(now_us) @ camera.rig_from_camera
-            view = world.view(SensorRequest("", camera, now_us, now_us, np.stack([pose, pose])))
-            if truth is not None:
-                _write_truth(truth / camera.id / f"{index:04d}.npz", view)
-            yield logs.CameraEntry(camera.id, now_us, now_us, _jpeg(view.rgb, jpeg_quality), np.stack([pose, pose]))
-            done += 1
-            _tell(progress, camera.id, done / total)
+def random_responses(rig: Rig, seed: int) -> dict[str, CameraResponse | LidarResponse]:
+    """Imperfect sensors: every camera with colours, vignette and noise of its own; LiDARs lose faint echoes."""
+    rng = np.random.default_rng([seed, 0x15B])
+    cameras = {name: random_response(rng) for name in rig.cameras}
+    return {**cameras, **{name: LidarResponse(1.0, 0.015) for name in rig.lidars}}
 
 
-def _tell(progress: Progress | None, stage: str, fraction: float) -> None:
-    if progress is not None:
-        progress(stage, fraction)
+def _facts(plan: TownPlan, command: str, backend: str) -> dict[str, Any]:
+    return {
+        "dataset": "nurec_sim procedural town",
+        "source": "synthetic: MuJoCo, drawn by nurec_sim.world",
+        "licence": "Apache-2.0",
+        "seed": plan.seed,
+        "split": plan.split,
+        "template": plan.template,
+        "seconds": (plan.span_us[1] - plan.span_us[0]) / 1e6,
+        "command": command,
+        "backend": backend,
+        "poses": "exact",
+        "boxes": "exact",
+        "map": "exact",
+    }
 
 
-def _sweep(world: TrueWorld, ego: Trajectory, lidar: LidarModel, start_us: int, point_step_m: float) -> Sweep:
-    """One turn, compensated with the car's own motion to the middle of the turn."""
+@dataclass
+class _Drive:
+    """The frames of a log, drawn one at a time."""
+
+    world: TrueWorld
+    rig: Rig
+    period_us: int
+    readout_us: int
+    jpeg_quality: int
+    point_step_m: float
+    truth: TruthFolder | None
+    progress: Progress | None
+
+    def __post_init__(self) -> None:
+        self.ego = self.world.plan.ego_trajectory()
+
+    def frames(self) -> Iterator[logs.CameraEntry | logs.LidarEntry]:
+        start_us, end_us = self.world.plan.span_us
+        turns = range(start_us, end_us - SPIN_US + 1, self.period_us)
+        total, done = len(turns) * (len(self.rig.lidars) + len(self.rig.cameras)), 0
+        for index, turn_us in enumerate(turns):
+            for sensor in (*self.rig.lidars.values(), *self.rig.cameras.values()):
+                if isinstance(sensor, LidarModel):
+                    sweep = true_sweep(self.world, self.ego, sensor, turn_us, self.point_step_m)
+                    yield logs.LidarEntry(sensor.id, sweep)
+                else:
+                    yield self._image(sensor, index, turn_us + SPIN_US // 2)
+                done += 1
+                if self.progress is not None:
+                    self.progress(sensor.id, done / total)
+
+    def _image(self, camera: CameraModel, index: int, middle_us: int) -> logs.CameraEntry:
+        half_us = 0 if camera.shutter is Shutter.GLOBAL else self.readout_us // 2
+        start_us, end_us = middle_us - half_us, middle_us + half_us
+        poses = self.ego.at(np.array([start_us, end_us])) @ camera.rig_from_camera
+        view = self.world.view(SensorRequest("", camera, start_us, end_us, poses))
+        if self.truth is not None:
+            now, then = self.world.boxes(middle_us), self.world.boxes(middle_us + self.period_us)
+            pose = self.ego.at(middle_us) @ camera.rig_from_camera
+            self.truth.add_view(camera.id, index, view, scene_flow(view, camera, pose, now, then))
+        return logs.CameraEntry(camera.id, start_us, end_us, _jpeg(view.rgb, self.jpeg_quality), poses)
+
+
+def true_sweep(
+    world: TrueWorld, ego: Trajectory, lidar: LidarModel, start_us: int, point_step_m: float | None = None
+) -> Sweep:
+    """One turn of a LiDAR, compensated with the car's own motion to the middle of the turn.
+
+    Coordinates are rounded to multiples of ``point_step_m`` if given.
+    """
     end_us, middle_us = start_us + SPIN_US, start_us + SPIN_US // 2
     pair = ego.at(np.array([start_us, end_us])) @ lidar.rig_from_lidar
     scan = world.scan(SensorRequest("", lidar, start_us, end_us, pair))
@@ -145,17 +188,13 @@ def _sweep(world: TrueWorld, ego: Trajectory, lidar: LidarModel, start_us: int, 
     fraction = sensors.column_fraction(lidar)[beam % scan.range_m.shape[1]]
     fired = geometry.interpolate_pose_pair(pair, fraction)
     middle = ego.at(middle_us) @ lidar.rig_from_lidar
-    point_t_us = start_us + np.rint(fraction * SPIN_US).astype(np.int64)
-    xyz = np.rint(sensors.compensate_sweep(xyz, fired, middle) / point_step_m) * point_step_m
+    point_t_us: Int64[np.ndarray, " n"] = start_us + np.rint(fraction * SPIN_US).astype(np.int64)
+    xyz = sensors.compensate_sweep(xyz, fired, middle)
+    if point_step_m is not None:
+        xyz = np.rint(xyz / point_step_m) * point_step_m
     return Sweep(middle_us, start_us, end_us, middle, xyz, intensity, point_t_us)
 
 
 def _jpeg(rgb: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
     return cv2.imencode(".jpg", np.ascontiguousarray(rgb[:, :, ::-1]), options)[1].tobytes()
-
-
-def _write_truth(file: Path, view: TrueView) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    instance = view.instance.astype(np.uint16)
-    np.savez_compressed(file, allow_pickle=False, depth_m=view.depth_m, surface=view.surface, instance=instance)

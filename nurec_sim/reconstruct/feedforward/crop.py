@@ -18,6 +18,7 @@ from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
 from nurec_sim import geometry, sensors
+from nurec_sim.errors import ReconstructError
 from nurec_sim.network.profiles import PATCH_PX, Profile
 from nurec_sim.types import CameraModel, Shutter
 
@@ -41,11 +42,20 @@ class Crop:
     align_corners: bool
 
 
-def input_size(profile: Profile, camera: CameraModel) -> tuple[int, int]:
-    """Width and height of a chunk's images; ``camera`` is its first one, whose aspect some profiles keep."""
+def input_size(profile: Profile, camera: CameraModel, pixels: int | None = None) -> tuple[int, int]:
+    """Width and height of a chunk's images; ``camera`` is its first one, whose aspect some profiles keep.
+
+    Raises:
+        ReconstructError: ``pixels`` asks for another size of images than the profile's only one.
+    """
     if not profile.keeps_aspect:
+        if pixels is not None:
+            raise ReconstructError(
+                f"images of profile {profile.name!r} always have {profile.width_px} x {profile.height_px} px; "
+                f"image_pixels must not be given, got {pixels}"
+            )
         return profile.width_px, profile.height_px
-    patches = profile.width_px * profile.height_px / PATCH_PX**2
+    patches = (pixels or profile.width_px * profile.height_px) / PATCH_PX**2
     across = np.sqrt(patches * camera.width_px / camera.height_px)
     width, height = (max(SMALLEST_PX, PATCH_PX * round(float(n))) for n in (across, patches / across))
     return width, height

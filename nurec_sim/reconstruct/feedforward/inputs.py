@@ -48,11 +48,11 @@ def chunk_inputs(clip: Clip, profile: Profile, window: ChunkWindow, settings: Fe
     result also holds the pixels that the lens does not reach: they show no world either.
 
     Raises:
-        ReconstructError: an ego mask or a lens cannot be used.
+        ReconstructError: an ego mask or a lens cannot be used, or the profile has no images of the wanted size.
         ClipError: an image is missing or broken.
     """
     cameras = [clip.rig.cameras[name] for name in window.frames]
-    size = input_size(profile, cameras[0])
+    size = input_size(profile, cameras[0], settings.image_pixels)
     crops = {camera.id: plan_crop(profile, camera, size) for camera in cameras}
     masks = ego_masks(settings.ego_masks, clip, crops)
     views = [_view(camera, crops[camera.id], masks[camera.id]) for camera in cameras]

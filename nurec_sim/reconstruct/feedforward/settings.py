@@ -22,6 +22,8 @@ class FeedForwardSettings:
         chunking: ``overlapping`` chunks as in the paper, or the release's ``non-overlapping`` sampling.
         overlap: share of a chunk that the next one repeats, 0 up to 0.5 (only ``overlapping``).
         frames: most frames per camera and chunk; None takes the profile's.
+        image_pixels: about how many pixels each image has on its way in; None takes the profile's size. Only profiles
+            that keep the cameras' aspect can have others.
         max_chunks: refuse longer clips instead of running for hours.
         min_opacity: Gaussians below are dropped (paper section 3.4).
         merge: ``ownership`` keeps each static Gaussian only where its chunk saw it from nearest; ``concatenate`` keeps
@@ -43,6 +45,7 @@ class FeedForwardSettings:
     chunking: Literal["overlapping", "non-overlapping"] = "overlapping"
     overlap: float = 0.25
     frames: int | None = None
+    image_pixels: int | None = None
     max_chunks: int = 16
     min_opacity: float = 0.01
     merge: Literal["ownership", "concatenate"] = "ownership"
@@ -68,6 +71,8 @@ class FeedForwardSettings:
         }
         if self.frames is not None:
             ranges["frames"] = (1, 1000)
+        if self.image_pixels is not None:
+            ranges["image_pixels"] = (784, 4_000_000)
         if self.max_gaussians is not None:
             ranges["max_gaussians"] = (1, float("inf"))
         for name, (least, most) in ranges.items():

@@ -1,0 +1,151 @@
+"""The verb that draws true worlds: world."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from nurec_sim.cli.console import app, out, print_table, progress
+from nurec_sim.errors import ClipError, NurecSimError
+
+if TYPE_CHECKING:
+    from nurec_sim.types import Rig
+    from nurec_sim.world import TownPlan
+
+Template = Literal[
+    "straight", "curve", "s_curve", "t_junction", "x_junction", "narrowing", "slip_road", "roundabout",
+    "double_junction",
+]  # fmt: skip
+DEFAULT_SEED, DEFAULT_SECONDS = 7, 12.0
+
+
+@app.command
+def world(
+    *,
+    out_path: Annotated[Path, tyro.conf.arg(name="out")],
+    seed: int | None = None,
+    split: Literal["train", "test"] | None = None,
+    template: Template | None = None,
+    seconds: float | None = None,
+    plan_path: Annotated[Path | None, tyro.conf.arg(name="plan")] = None,
+    truth: Path | None = None,
+    hz: float = 10.0,
+    cameras: Literal[1, 3, 5] | None = None,
+    lens: Literal["pinhole", "distorted", "fisheye", "ftheta"] | None = None,
+    pixels: int | None = None,
+    lidar: str | None = None,
+    rig_seed: int | None = None,
+    imperfect: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Draw a drive through a procedural town and write it as a driving log.
+
+    Everything about a town is known exactly: with --truth its depth, labels, normals, motion and plan are written
+    beside the log, where no reader of the log can see them. Without any of the last group of options the car is that
+    of the demonstration: three pinhole cameras of 448 x 256 pixels and one LiDAR.
+
+    Examples: `nurec-sim world --seed 7 --out town.zip`;
+    `nurec-sim world --split test --template roundabout --cameras 5 --lens fisheye --truth truth --out town.zip`.
+
+    Args:
+        out_path: the clip to write: a folder, or a .zip.
+        seed: same seed, same town, same log; 7 if not given.
+        split: train if not given; towns of split test show templates, materials and vehicles that training never sees.
+        template: how the roads lie; by the seed if not given. roundabout and double_junction are of split test only.
+        seconds: length of the drive, 1 to 30; 12 if not given.
+        plan_path: draw this plan.json (of a truth folder) instead of a new town.
+        truth: also write the ground truth into this folder, which must not exist (docs/world.md).
+        hz: sets of frames per second: up to 10 with a LiDAR, up to 25 without.
+        cameras: a random car with so many cameras: front, + front left and right, + rear left and right.
+        lens: a random car with lenses of this kind.
+        pixels: a random car with so many pixels per image (width times height, about).
+        lidar: a random car with this LiDAR: 64x900, PANDAR128, AT128, HDL-64, HDL-32, VLP-16, or none.
+        rig_seed: another random car; the town's seed if not given.
+        imperfect: give every camera colours, vignette and noise of its own, and let the LiDAR lose faint echoes.
+        overwrite: replace a clip that is there.
+    """
+    from nurec_sim.world import random_readout_us, random_responses, write_town_clip
+
+    plan = _plan(seed, split, template, seconds, plan_path)
+    car_seed = plan.seed if rig_seed is None else rig_seed
+    rig = _rig(car_seed, cameras, lens, pixels, lidar, chosen=rig_seed is not None)
+    if not 0.1 <= hz <= 25.0:
+        raise NurecSimError(f"--hz must be within 0.1..25, got {hz:g}")
+    with progress("drawing the town") as advance:
+        path = write_town_clip(
+            plan,
+            out_path,
+            rig=rig,
+            period_us=round(1e6 / hz),
+            readout_us=random_readout_us(car_seed),
+            responses=random_responses(rig, car_seed) if imperfect else None,
+            truth=truth,
+            command=_command(plan, out_path, plan_path),
+            progress=advance,
+            overwrite=overwrite,
+        )
+    moving = sum(actor.moves for actor in plan.actors)
+    print_table(f"town {plan.split} {plan.seed}", [
+        ("template", plan.template), ("sky", plan.weather.preset), ("seconds", f"{_seconds(plan):g}"),
+        ("actors", f"{moving} moving, {len(plan.actors) - moving} standing"),
+    ])  # fmt: skip
+    out.print(f"wrote {path}" + ("" if truth is None else f" and its truth {truth}"), soft_wrap=True)
+
+
+def _plan(
+    seed: int | None, split: str | None, template: str | None, seconds: float | None, file: Path | None
+) -> TownPlan:
+    from nurec_sim.world import TownPlan, town_plan
+
+    if file is None:
+        try:
+            return town_plan(
+                DEFAULT_SEED if seed is None else seed,
+                "test" if split == "test" else "train",
+                template,
+                DEFAULT_SECONDS if seconds is None else seconds,
+            )
+        except ValueError as error:
+            raise NurecSimError(str(error)) from None
+    given = {"--seed": seed, "--split": split, "--template": template, "--seconds": seconds}
+    both = [name for name, value in given.items() if value is not None]
+    if both:
+        raise NurecSimError(f"--plan says everything about the town; leave out {', '.join(both)}")
+    try:
+        return TownPlan.from_json(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise NurecSimError(f"cannot read the plan {file}: {error}") from None
+    except ClipError as error:
+        raise NurecSimError(f"{file}: {error}") from None
+
+
+def _rig(
+    seed: int, cameras: int | None, lens: str | None, pixels: int | None, lidar: str | None, *, chosen: bool
+) -> Rig:
+    """The demonstration's car, or a random one where anything about it is asked for."""
+    from nurec_sim.world import random_rig, street_rig
+
+    if not chosen and (cameras, lens, pixels, lidar) == (None, None, None, None):
+        return street_rig()
+    given = {"pixels": pixels, "lidar": lidar}
+    options: dict = {name: value for name, value in given.items() if value is not None}
+    if lidar == "none":
+        options["lidar"] = None
+    try:
+        return random_rig(seed, cameras, lens=lens, **options)
+    except ValueError as error:
+        raise NurecSimError(str(error)) from None
+
+
+def _seconds(plan: TownPlan) -> float:
+    return (plan.span_us[1] - plan.span_us[0]) / 1e6
+
+
+def _command(plan: TownPlan, out_path: Path, plan_path: Path | None) -> str:
+    """What makes the same town again."""
+    if plan_path is not None:
+        return f"nurec-sim world --plan {plan_path.name} --out {out_path.name}"
+    town = f"--seed {plan.seed} --split {plan.split} --template {plan.template} --seconds {_seconds(plan):g}"
+    return f"nurec-sim world {town} --out {out_path.name}"

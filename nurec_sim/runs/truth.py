@@ -1,0 +1,63 @@
+"""Driving in the truth: the same scene, but sensed by the town that its log was drawn in.
+
+What a policy does there is what its rollouts in reconstructions of that log are to be compared with.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from nurec_sim.errors import ClipError, RunError
+from nurec_sim.types import GaussianScene, Sense
+from nurec_sim.world import TownPlan, TrueWorld
+
+TRUTH = "truth"
+"""The true world's name among the reconstructions of a run."""
+SAME_PLACE_M = 0.01
+
+
+@contextmanager
+def true_world(
+    plan_file: str | Path, scene: GaussianScene, backend: str | None = None
+) -> Iterator[tuple[GaussianScene, Sense]]:
+    """The town of a plan, as a scene to be driven through.
+
+    Args:
+        plan_file: ``plan.json`` of a truth folder (docs/world.md).
+        scene: any reconstruction of the log of that town: its sensors, tracks, map and road stay what metrics measure
+            against, so that only what policies see differs.
+        backend: see ``world.TrueWorld``.
+
+    Yields:
+        The scene under the name ``truth``, and what senses in the town.
+
+    Raises:
+        RunError: the file cannot be read or is no plan, or the scene is not from the log of that town.
+    """
+    try:
+        plan = TownPlan.from_json(Path(plan_file).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ClipError) as error:
+        raise RunError(f"{plan_file} is no plan of a town: {error}") from None
+    _check_same_town(plan, scene)
+    with TrueWorld(plan, backend) as world:
+        provenance = {**scene.provenance, "method": TRUTH}
+        yield dataclasses.replace(scene, provenance=provenance), world.sense
+
+
+def _check_same_town(plan: TownPlan, scene: GaussianScene) -> None:
+    strangers = sorted({track.id for track in scene.tracks} - {actor.id for actor in plan.actors})
+    if strangers:
+        raise RunError(f"scene {scene.id!r} is not from this town: the plan has no actor {strangers[0]!r}")
+    driven = plan.ego_trajectory()
+    times = scene.ego.t_us
+    if not (driven.covers(int(times[0])) and driven.covers(int(times[-1]))):
+        raise RunError(f"scene {scene.id!r} is not from this town: it lasts from {times[0]} to {times[-1]} us, "
+                       f"the plan from {driven.start_us} to {driven.end_us} us")  # fmt: skip
+    off = float(np.linalg.norm(driven.at(times)[:, :3, 3] - scene.ego.position_m, axis=1).max())
+    if off > SAME_PLACE_M:
+        raise RunError(f"scene {scene.id!r} is not from this town: its ego is up to {off:.2f} m beside the plan's")

@@ -1,0 +1,78 @@
+"""Ground truth on disk, in a folder of its own: what no reader of the log may see. docs/world.md describes it.
+
+A folder appears complete or not at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float32
+
+from nurec_sim.errors import ClipError
+from nurec_sim.world.isp import CameraResponse
+from nurec_sim.world.plan import TownPlan
+from nurec_sim.world.scan import LidarResponse
+
+if TYPE_CHECKING:
+    from nurec_sim.world.sense import TrueView
+
+PLAN_FILE, RESPONSES_FILE = "plan.json", "responses.json"
+
+
+class TruthFolder:
+    """Collects truth beside ``path`` and moves it there when the ``with`` block ends well.
+
+    Raises:
+        ClipError: ``path`` exists.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        if self.path.exists():
+            raise ClipError(f"{str(self.path)!r} exists; choose another folder for the truth")
+
+    def __enter__(self) -> TruthFolder:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._work = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", dir=self.path.parent))
+        self._folder = self._work / "truth"
+        self._folder.mkdir()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                os.replace(self._folder, self.path)
+        finally:
+            shutil.rmtree(self._work, ignore_errors=True)
+
+    def add_plan(self, plan: TownPlan, responses: Mapping[str, CameraResponse | LidarResponse]) -> None:
+        """The plan, and what each sensor does to light or echoes."""
+        (self._folder / PLAN_FILE).write_text(plan.to_json(), encoding="utf-8")
+        known = {name: dataclasses.asdict(response) for name, response in responses.items()}
+        (self._folder / RESPONSES_FILE).write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+
+    def add_view(self, camera_id: str, index: int, view: TrueView, flow_m: Float32[np.ndarray, "h w 3"]) -> None:
+        """The truth of one image; ``flow_m`` is how far each pixel's point moves until the next one."""
+        file = self._folder / camera_id / f"{index:04d}.npz"
+        file.parent.mkdir(exist_ok=True)
+        np.savez_compressed(
+            file,
+            allow_pickle=False,
+            depth_m=view.depth_m,
+            surface=view.surface,
+            instance=view.instance.astype(np.uint16),
+            normal=view.normal.astype(np.float16),
+            flow_m=flow_m.astype(np.float16),
+        )
