@@ -102,6 +102,7 @@ def inputs_of(case: Case, seed: int) -> NetworkInputs:
         time=time[None],
         time_before=(time - gap)[None],
         time_after=(time + gap)[None],
+        rig_from_scene=torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])[None],
     )
 
 
@@ -111,7 +112,7 @@ def features_and_context(model: Any, inputs: NetworkInputs, road_share: float) -
 
     from nurec_sim.network.tensors import SemanticClass
 
-    features = model.encoder(inputs.rgb, inputs.c2w, inputs.fov, inputs.rays)
+    features = model.features(inputs)
     context = model.decoder.context(features, inputs, False)
     height = inputs.rgb.shape[2]
     logits = torch.zeros_like(context.logits)

@@ -8,11 +8,7 @@ from collections.abc import Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
-from nurec_sim.errors import NurecSimError
-
-
-class DeadlinePassedError(NurecSimError):
-    """The client's deadline passed before the work began."""
+from nurec_sim.errors import DeadlinePassedError
 
 
 @dataclass

@@ -2,80 +2,41 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from typing import Unpack
 
 import grpc
 
 from nurec_sim import wire
+from nurec_sim.connection import Connection, ConnectionOptions, our_errors
 from nurec_sim.errors import ServerError
 from nurec_sim.types import CameraModel, LidarModel, SensorFrame, SensorRequest, Track, Trajectory
 from nurec_sim.wire import common, sensorsim
 
-MAX_MESSAGE_BYTES = 64 << 20
 MAX_BATCH_ITEMS = 64
 _BATCH_REPLY_BYTES = 60 << 20
-_RETRY = {"maxAttempts": 5, "initialBackoff": "0.2s", "maxBackoff": "2s", "backoffMultiplier": 2.0}
 
 
-class RemoteSensors:
+class RemoteSensors(Connection):
     """One scene of a sensor server.
-
-    Calls wait for a server that is starting, and are repeated when it goes away in between; both end at ``timeout_s``.
-    Every method raises the errors of ``nurec_sim.errors`` that the server raised, and ``ServerError`` when it cannot be
-    reached in time or failed. Use it as a context manager, or call ``close``. Safe to use from many threads.
 
     Args:
         address: ``host:port``.
         scene_id: id or alias of the scene; the ids inside requests are not looked at.
-        timeout_s: for one call; a server may first have to reconstruct the scene.
         apply_isp: whether images get the camera's colour correction.
-        token: what the server wants to be shown; None if it wants nothing.
-        root_ca: PEM file of the certificates that vouch for the server's; plain text if None.
-        client_cert: PEM file of the certificate to show, for mutual TLS.
-        client_key: PEM file of its private key.
+        **options: time limit, token and TLS, see ``ConnectionOptions``; a server may first have to reconstruct the
+            scene, which counts.
 
     Raises:
-        ServerError: a PEM file cannot be read, or a certificate comes without its key or without ``root_ca``.
+        ServerError: see ``Connection``.
     """
 
     def __init__(
-        self,
-        address: str,
-        scene_id: str = "",
-        *,
-        timeout_s: float = 300.0,
-        apply_isp: bool = True,
-        token: str | None = None,
-        root_ca: Path | None = None,
-        client_cert: Path | None = None,
-        client_key: Path | None = None,
+        self, address: str, scene_id: str = "", *, apply_isp: bool = True, **options: Unpack[ConnectionOptions]
     ) -> None:
-        self.address, self.scene_id = address, scene_id
-        self._timeout_s, self._apply_isp = timeout_s, apply_isp
-        self._metadata = [("authorization", f"Bearer {token}")] if token else []
-        self._channel = open_channel(address, root_ca, client_cert, client_key)
-        self._procedures = {
-            name: self._channel.unary_unary(
-                f"/{wire.SERVICE}/{name}",
-                request_serializer=method.request.SerializeToString,
-                response_deserializer=method.reply.FromString,
-            )
-            for name, method in wire.METHODS.items()
-        }
-
-    def close(self) -> None:
-        """Ends the connection."""
-        self._channel.close()
-
-    def __enter__(self) -> RemoteSensors:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        super().__init__(address, wire.SERVICE, **options)
+        self.scene_id, self._apply_isp = scene_id, apply_isp
 
     # ------------------------------------------------------------------------------------------------------- rendering
 
@@ -163,62 +124,11 @@ class RemoteSensors:
     # ----------------------------------------------------------------------------------------------------------- calls
 
     def _begin(self, name: str, request) -> grpc.Future:
-        procedure = self._procedures[name]
-        return procedure.future(request, timeout=self._timeout_s, wait_for_ready=True, metadata=self._metadata)
-
-    def _call(self, name: str, request):
-        return self._outcome(self._begin(name, request))
+        return self._procedures[name].future(request, **self._options(self._timeout_s))
 
     def _outcome(self, call: grpc.Future):
         with our_errors(self.address):
             return call.result()
-
-
-def open_channel(
-    address: str, root_ca: Path | None = None, client_cert: Path | None = None, client_key: Path | None = None
-) -> grpc.Channel:
-    """A channel whose calls are repeated when the server goes away in between; the arguments are RemoteSensors' own.
-
-    Raises:
-        ServerError: a PEM file cannot be read, or a certificate comes without its key or without ``root_ca``.
-    """
-    credentials = _credentials(root_ca, client_cert, client_key)
-    config = {"methodConfig": [{"name": [{}], "retryPolicy": _RETRY | {"retryableStatusCodes": ["UNAVAILABLE"]}}]}
-    options = [
-        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-        ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
-        ("grpc.max_reconnect_backoff_ms", 1000),
-        ("grpc.enable_http_proxy", 0),  # sensor servers are near; a proxy for the web is not for them
-        ("grpc.service_config", json.dumps(config)),
-    ]
-    if credentials is None:
-        return grpc.insecure_channel(address, options)
-    return grpc.secure_channel(address, credentials, options)
-
-
-@contextlib.contextmanager
-def our_errors(address: str) -> Iterator[None]:
-    """Statuses of gRPC become the errors of ours that the server raised; ``ServerError`` where they stand for none."""
-    try:
-        yield
-    except grpc.RpcError as error:
-        ours = wire.error_of(error.code(), error.details() or "no reason given")
-        raise (ServerError(f"{address}: {ours}") if isinstance(ours, ServerError) else ours) from error
-
-
-def _credentials(
-    root_ca: Path | None, client_cert: Path | None, client_key: Path | None
-) -> grpc.ChannelCredentials | None:
-    """TLS of a channel; None for plain text."""
-    if (client_cert is None) != (client_key is None) or (client_cert and root_ca is None):
-        raise ServerError("mutual TLS needs root_ca, client_cert and client_key together")
-    if root_ca is None:
-        return None
-    try:
-        roots, key, cert = (None if path is None else path.read_bytes() for path in (root_ca, client_key, client_cert))
-    except OSError as error:
-        raise ServerError(f"TLS cannot be set up: {error}") from None
-    return grpc.ssl_channel_credentials(roots, key, cert)
 
 
 def _batches(requests: Sequence[SensorRequest]) -> Iterator[list[int]]:

@@ -5,15 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
-import grpc
 import numpy as np
-from google.protobuf import message_factory
 from jaxtyping import Float32
 
 from nurec_sim import wire
-from nurec_sim.client import open_channel, our_errors
+from nurec_sim.connection import Connection, ConnectionOptions, our_errors
 from nurec_sim.errors import RequestError, ServerError
 from nurec_sim.types import CameraFrame, LidarFrame, LidarModel, SensorRequest
 from nurec_sim.wire import nurec_sim_v1 as v1
@@ -23,51 +21,20 @@ CHUNK_BYTES = 1 << 20
 Progress = Callable[[str, float], None]
 
 
-class SceneClient:
+class SceneClient(Connection):
     """The scene service of a server.
-
-    Every method raises the errors of ``nurec_sim.errors`` that the server raised, and ``ServerError`` when it cannot be
-    reached in time or failed. Use it as a context manager, or call ``close``. Safe to use from many threads.
 
     Args:
         address: ``host:port``.
-        timeout_s: for one call; uploads and reconstructions may take any time, unless their own says otherwise.
-        token: what the server wants to be shown; None if it wants nothing.
-        root_ca: PEM file of the certificates that vouch for the server's; plain text if None.
-        client_cert: PEM file of the certificate to show, for mutual TLS.
-        client_key: PEM file of its private key.
+        **options: time limit, token and TLS, see ``ConnectionOptions``. Uploads and reconstructions may take any time,
+            unless their own ``timeout_s`` says otherwise.
 
     Raises:
-        ServerError: a PEM file cannot be read, or a certificate comes without its key or without ``root_ca``.
+        ServerError: see ``Connection``.
     """
 
-    def __init__(
-        self,
-        address: str,
-        *,
-        timeout_s: float = 300.0,
-        token: str | None = None,
-        root_ca: Path | None = None,
-        client_cert: Path | None = None,
-        client_key: Path | None = None,
-    ) -> None:
-        self.address, self._timeout_s = address, timeout_s
-        self._metadata = [("authorization", f"Bearer {token}")] if token else []
-        self._channel = open_channel(address, root_ca, client_cert, client_key)
-        self._procedures = {
-            method.name: _procedure(self._channel, method)
-            for method in wire.pool.FindServiceByName(wire.SCENE_SERVICE).methods
-        }
-
-    def close(self) -> None:
-        """Ends the connection."""
-        self._channel.close()
-
-    def __enter__(self) -> SceneClient:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __init__(self, address: str, **options: Unpack[ConnectionOptions]) -> None:
+        super().__init__(address, wire.SCENE_SERVICE, **options)
 
     # --------------------------------------------------------------------------------------------------------- scenes
 
@@ -111,7 +78,7 @@ class SceneClient:
                     said("sending", sent / size)
 
         with our_errors(self.address):
-            return self._begin(procedure, parts(), timeout_s).scene_id
+            return self._procedures[procedure](parts(), **self._options(timeout_s)).scene_id
 
     def reconstruct(
         self,
@@ -140,7 +107,7 @@ class SceneClient:
         clip = {"path": path} if path else {"scene_id": scene_id}
         request = v1.ReconstructClipRequest(**clip, name=name, method=method, profile=profile, cameras=cameras)
         with our_errors(self.address):
-            events = self._begin("ReconstructClip", request, timeout_s)
+            events = self._procedures["ReconstructClip"](request, **self._options(timeout_s))
             try:
                 for event in events:
                     if event.WhichOneof("event") == "done":
@@ -186,24 +153,3 @@ class SceneClient:
         message = v1.RenderLidarRequest(form=wire.SweepForm.RANGE_MAP)
         wire.write_lidar_request(request, message.request, scene_id=request.scene_id)
         return wire.read_range_map(self._call("RenderLidar", message).range_map, request)
-
-    # ----------------------------------------------------------------------------------------------------------- calls
-
-    def _begin(self, name: str, request: Any, timeout_s: float | None) -> Any:
-        return self._procedures[name](request, timeout=timeout_s, wait_for_ready=True, metadata=self._metadata)
-
-    def _call(self, name: str, request: Any) -> Any:
-        with our_errors(self.address):
-            return self._begin(name, request, self._timeout_s)
-
-
-def _procedure(channel: grpc.Channel, method: Any) -> Callable:
-    """A callable of the procedure's kind."""
-    kinds = {
-        (False, False): channel.unary_unary,
-        (False, True): channel.unary_stream,
-        (True, False): channel.stream_unary,
-    }
-    request, reply = (message_factory.GetMessageClass(kind) for kind in (method.input_type, method.output_type))
-    make = kinds[method.client_streaming, method.server_streaming]
-    return make(f"/{wire.SCENE_SERVICE}/{method.name}", request.SerializeToString, reply.FromString)

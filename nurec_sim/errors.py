@@ -11,9 +11,11 @@
     │   ├── UnknownSceneError  no such scene                          (gRPC NOT_FOUND)
     │   ├── OutOfRangeError    a time outside the scene               (gRPC OUT_OF_RANGE)
     │   ├── TooLargeError      more pixels or items than allowed      (gRPC RESOURCE_EXHAUSTED)
+    │   ├── UnsupportedError   a procedure that this server lacks      (gRPC UNIMPLEMENTED)
     │   └── NotAllowedError    what this server was told not to do     (gRPC PERMISSION_DENIED)
     ├── SceneInUseError  a scene cannot be taken away now             (gRPC FAILED_PRECONDITION)
     ├── GivenUpError     work ended because nobody waits for it       (gRPC CANCELLED)
+    ├── DeadlinePassedError  the client's deadline passed before the answer  (gRPC DEADLINE_EXCEEDED)
     ├── PlanError        a policy failed, or answered what cannot be driven  (gRPC ABORTED)
     ├── SessionError     a driving session lacks what it is asked for (gRPC FAILED_PRECONDITION)
     │   ├── UnknownSessionError  no such session                      (gRPC NOT_FOUND)
@@ -64,12 +66,20 @@ class TooLargeError(RequestError):
     """A request for more pixels, beams or items than allowed."""
 
 
+class UnsupportedError(RequestError):
+    """A procedure that the interface knows and this server does not offer."""
+
+
 class SceneInUseError(NurecSimError):
     """A scene cannot be taken away while somebody uses it."""
 
 
 class GivenUpError(NurecSimError):
     """Work ended because nobody waits for its result any more."""
+
+
+class DeadlinePassedError(NurecSimError):
+    """The time that a client, or a server, allows passed before there was an answer."""
 
 
 class NotAllowedError(RequestError):

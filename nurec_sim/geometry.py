@@ -235,13 +235,17 @@ def project_to_polyline(
 # --------------------------------------------------------------------------------------------------------- cubemaps
 
 
-def cubemap_directions(size: int) -> Float64[np.ndarray, "6 size size 3"]:
+def cubemap_directions(size: int, rim: int = 0) -> Float64[np.ndarray, "6 n n 3"]:
     """World directions (z up) of the texel centres of a cubemap.
 
     Faces in OpenGL order +X -X +Y -Y +Z -Z, looked up with GL axes x = -y_world, y = z_world, z = -x_world
     (docs/scene_format.md), so face 5 (-Z) looks along the world's x axis and face 2 (+Y) up.
+
+    Args:
+        size: texels along the edge of a face.
+        rim: that many more on each side, in the plane of their face; ``n = size + 2 rim``.
     """
-    gl = _opengl_texels(size)
+    gl = _opengl_texels(size, rim)
     world = np.stack([-gl[..., 2], -gl[..., 0], gl[..., 1]], axis=-1)
     return world / np.linalg.norm(world, axis=-1, keepdims=True)
 
@@ -256,9 +260,9 @@ def released_cubemap_directions(size: int) -> Float64[np.ndarray, "6 size size 3
     return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
 
-def _opengl_texels(size: int) -> Float64[np.ndarray, "6 size size 3"]:
+def _opengl_texels(size: int, rim: int = 0) -> Float64[np.ndarray, "6 n n 3"]:
     """Points on the cube [-1, 1]^3 in OpenGL's axes, at the texel centres of its faces +X -X +Y -Y +Z -Z."""
-    c = (np.arange(size) + 0.5) / size * 2 - 1
+    c = (np.arange(-rim, size + rim) + 0.5) / size * 2 - 1
     t, s = np.meshgrid(c, c, indexing="ij")
     one = np.ones_like(s)
     faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]

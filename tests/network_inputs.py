@@ -5,6 +5,9 @@ from torch.nn import functional
 
 from nurec_sim.network.tensors import SCENE_RESCALE, NetworkInputs
 
+RIG_FROM_CAMERA = torch.tensor([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+"""Of a camera that looks ahead, 1.5 m above the ground."""
+
 
 def straight_drive(images: int, cameras: int = 1, height: int = 56, width: int = 84, clips: int = 1) -> NetworkInputs:
     """``images`` pictures of ``cameras`` cameras that look the same way, one metre from frame to frame."""
@@ -29,4 +32,5 @@ def straight_drive(images: int, cameras: int = 1, height: int = 56, width: int =
         time=time,
         time_before=time - 0.2,
         time_after=time + 0.2,
+        rig_from_scene=RIG_FROM_CAMERA.expand(clips, 4, 4),
     )

@@ -28,14 +28,16 @@ def small_plan():
     return dataclasses.replace(plan, buildings=near(plan.buildings, 14), props=near(plan.props, 40))
 
 
-_TOWNS = {}
+_towns = {}
 
 
 def true_world(plan, backend, **options):
     """A TrueWorld whose town is compiled once per plan; worlds of one town must not be used at the same time."""
 
     def built(wanted):
-        return _TOWNS.setdefault(id(wanted), (wanted, build_town(wanted)))[1]
+        if id(wanted) not in _towns:
+            _towns[id(wanted)] = wanted, build_town(wanted)
+        return _towns[id(wanted)][1]
 
     with mock.patch.object(sense, "build_town", built):
         return TrueWorld(plan, backend, **options)

@@ -90,7 +90,7 @@ def test_readme_uses_only_verbs_that_exist() -> None:
         (["render", "nowhere.usdz"], "nowhere.usdz does not exist"),
         (["evaluate", "nowhere"], "no clip at 'nowhere'"),
         (["policies", "nobody"], "unknown policy 'nobody'; have ['camera_road_follower'"),
-        (["world", "--out", "a.zip", "--seconds", "100"], "1..20 seconds"),
+        (["world", "--out", "a.zip", "--seconds", "100"], "1..30 seconds"),
     ],
 )
 def test_mistakes_are_one_clear_line(

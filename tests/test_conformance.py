@@ -11,8 +11,8 @@ from serving_world import LAST_US
 
 from nurec_sim import cli, geometry, wire
 from nurec_sim.conformance import CHECKS, Target, Verdict, run_checks
-from nurec_sim.errors import OutOfRangeError, RequestError
-from nurec_sim.service import SensorService, UnsupportedError
+from nurec_sim.errors import OutOfRangeError, RequestError, UnsupportedError
+from nurec_sim.service import SensorService
 from nurec_sim.wire import ImageFormat
 
 

@@ -1,6 +1,5 @@
 """A driver on the far side of a wire in our loop: the same rollout as at home, failed rows when something breaks."""
 
-import json
 import re
 import subprocess
 import sys
@@ -218,7 +217,7 @@ def test_sessions_end_with_the_next_rollout_and_with_the_policy():
 
 
 def test_only_what_may_be_said_twice_is_repeated():
-    config = json.loads(dict(remote_module._channel_options())["grpc.service_config"])
+    config = remote_module._service_config()
     names = {entry["method"] for entry in config["methodConfig"][0]["name"]}
     assert {"drive", "start_session", "close_session", "shut_down"} & names == set()
     assert "submit_image_observation" in names and DriverOptions().max_sessions == 8

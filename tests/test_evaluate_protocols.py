@@ -9,6 +9,7 @@ from nurec_sim import sensors
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate import Protocol
 from nurec_sim.evaluate.recorded import clip_window, recorded_window, storm_windows
+from nurec_sim.logs import open_clip
 
 SMALL = {"size_px": (48, 32), "backend": "rays"}
 
@@ -134,3 +135,20 @@ def test_boxes_of_a_log_say_what_can_move():
     log.tracks = [tree]
     assert not recorded_window(log, "street", ("front",), (0,), (2,), False).targets[0].movable.any()
     assert list(BOX) == ["car"]
+
+
+@pytest.mark.realdata
+def test_a_real_drive_is_cut_into_windows_with_depth_and_boxes(realdata):
+    log = open_clip(realdata / "kitti_raw_0009")
+    windows = storm_windows(log, 20, (0, 5, 10, 15), 100_000, False)
+    assert list(windows) == ["kitti_raw_0009-0000", "kitti_raw_0009-0020"]
+    window = windows["kitti_raw_0009-0020"]()
+    assert window.cameras == ("cam_left",) and len(window.clip.sweep_times_us("lidar")) <= 6
+    depth_m = window.targets[5].true.depth_m
+    assert depth_m.shape == (108, 357) and (depth_m > 0).mean() > 0.2
+    assert 3 < np.median(depth_m[depth_m > 0]) < 30
+    assert 0.01 < window.targets[5].movable.mean() < 0.5
+    with pytest.raises(ReconstructError, match="give each once"):
+        Protocol("storm", clips=(realdata / "kitti_raw_0009",) * 2).ids  # noqa: B018
+    with pytest.raises(ReconstructError, match="needs 20 frames 0.1 s apart"):
+        Protocol("storm", clips=(realdata / "ddad_6cam",)).ids  # noqa: B018

@@ -6,9 +6,10 @@ import torch
 
 from nurec_sim import geometry
 from nurec_sim.network import cubemap
-from nurec_sim.network.observed_sky import NOTHING_SEEN, observed_sky
+from nurec_sim.network.observed_sky import observed_sky
 from nurec_sim.network.tensors import ContextMaps, SemanticClass
-from nurec_sim.reconstruct.feedforward.sky import CUBE_FROM_WORLD, fill_unseen, observed_world_sky, world_sky
+from nurec_sim.reconstruct.feedforward.sky import CUBE_FROM_WORLD, observed_world_sky, world_sky
+from nurec_sim.reconstruct.sky_fill import NOTHING_SEEN, fill_unseen
 
 SIZE = 64
 HORIZON, ZENITH, SUN = np.array([0.85, 0.88, 0.9]), np.array([0.35, 0.55, 0.85]), np.array([0.2, 0.15, 0.05])

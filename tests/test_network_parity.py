@@ -55,7 +55,7 @@ def test_encoder(case):
         close(encoder.embed_camera(inputs.c2w, inputs.fov), arrays["mid/camera_tokens"], RAW)
         patches = encoder.patch_embed_img(normalized(inputs.rgb.flatten(0, 1)))
         close(patches[..., ::4], arrays["mid/patch_tokens_ch4"], RAW)
-        for feature, block in zip(encoder(inputs.rgb, inputs.c2w, inputs.fov, inputs.rays), (5, 7, 9, 11), strict=True):
+        for feature, block in zip(encoder(inputs.rgb, inputs.c2w, inputs.fov), (5, 7, 9, 11), strict=True):
             close(feature.patches[..., ::4], arrays[f"mid/feat_block{block}_ch4"], RAW)
             close(feature.token, arrays[f"mid/cls_block{block}"], RAW)
 
@@ -65,7 +65,7 @@ def test_heads(case):
     decoder, size = model.decoder, inputs.rgb.shape[2:4]
     images = inputs.rgb.flatten(0, 1).permute(0, 3, 1, 2)
     with torch.inference_mode():
-        features = model.encoder(inputs.rgb, inputs.c2w, inputs.fov, inputs.rays)
+        features = model.features(inputs)
         levels = [feature.patches.flatten(0, 1) for feature in features]
         close(decoder.depth_head(levels, size), arrays["mid/depth_head_raw"], RAW)
         context = decoder.context_head(levels, size, decoder.rgb_fusion, images)

@@ -84,7 +84,7 @@ def test_it_learns_a_smooth_sky_but_neither_clouds_nor_sun():
         for name, truth in (("smooth", smooth), ("cloudy", (smooth + 0.4 * clouds).clamp(0, 1))):
             model = network.build(small(kind), seed=0)
             with torch.no_grad():
-                patches = model.encoder(inputs.rgb, inputs.c2w, inputs.fov, inputs.rays)[-1].patches
+                patches = model.features(inputs)[-1].patches
             optimiser = torch.optim.Adam(model.sky.parameters(), 4e-3)
             for _ in range(40):
                 sky = model.sky(patches, inputs.rgb, inputs.rays[..., 3:])[0]

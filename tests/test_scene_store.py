@@ -29,7 +29,8 @@ def test_a_scene_in_use_is_never_evicted():
     with store.lease("a") as first, store.lease("b"):
         assert store.get("c").scene.id == "c"
         assert store.loaded_ids == ("clipgt-a", "clipgt-b", "clipgt-c") and store.stats.in_use == 2
-        assert store.in_memory("a") is first
+        with store.lease_in_memory("a") as again:
+            assert again is first
     assert store.loaded_ids == ("clipgt-a",), "room is made when the leases end; the one used last stays"
 
 

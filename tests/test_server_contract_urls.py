@@ -1,5 +1,6 @@
 """Scenes that clients bring along: ``x-nre-scene-url`` and ``x-nre-scene-id`` beside any request."""
 
+import contextlib
 import http.server
 import os
 import threading
@@ -13,6 +14,7 @@ from grpc import StatusCode as Code
 from serving_calls import Stub, camera_message, pixels
 from serving_world import camera_request, scene
 
+from nurec_sim.errors import RequestError
 from nurec_sim.render import Renderer
 from nurec_sim.scene import read_scene, write_scene
 from nurec_sim.scene_store import SceneStore
@@ -36,10 +38,14 @@ class Web(http.server.BaseHTTPRequestHandler):
         self.server.asked.append(self.path)
         status, headers, body = self.server.pages.get(self.path, (404, {}, b""))
         self.send_response(status)
-        for name, value in ({"Content-Length": str(len(body))} | headers).items():
+        chunks = [body] if isinstance(body, bytes) else body
+        length = {"Content-Length": str(len(body))} if isinstance(body, bytes) else {}
+        for name, value in (length | headers).items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(body)
+        with contextlib.suppress(OSError):  # who asked has left
+            for chunk in chunks:
+                self.wfile.write(chunk)
 
     def log_message(self, *_):
         pass
@@ -88,6 +94,15 @@ def test_a_file_is_served_under_the_name_that_is_asked_for(archive, tmp_path):
         again = pixels(stub.render_rgb(camera_message(scene_id="brought")))
     expected = Renderer(read_scene(archive), threads=2).render_camera(camera_request()).rgb
     assert np.array_equal(image, expected) and np.array_equal(again, expected)
+
+
+def test_a_file_that_is_served_already_is_found_again_however_its_path_is_spelt(archive, tmp_path, monkeypatch):
+    monkeypatch.chdir(archive.parent)
+    options = ServiceOptions(download_cache_dir=tmp_path / "downloads")
+    store = SceneStore([archive.name], threads=2, cache_dir=tmp_path)
+    with SensorServer(store, port=0, options=options) as address, Stub(address) as stub:
+        for name in (None, "brought"):
+            assert scenes(stub, archive.as_uri(), name) == ["clipgt-brought"]
 
 
 WRONG = {
@@ -163,6 +178,30 @@ def test_a_body_longer_than_allowed_is_cut_off_whatever_its_header_says(tmp_path
     cache = DownloadCache(tmp_path, 2, 1 << 20, 10.0)
     with pytest.raises(Exception, match="a scene may have 1,048,576 bytes"):
         cache.fetch(f"{web.url}/a.usdz")
+
+
+def test_a_web_that_sends_a_byte_now_and_then_is_given_up_in_time(tmp_path, web):
+    def trickle():
+        for byte in b"PK\x03\x04" + bytes(400):
+            yield bytes([byte])
+            time.sleep(0.05)
+
+    web.pages = {"/a.usdz": (200, {"Content-Length": "1000000"}, trickle())}
+    begin = time.monotonic()
+    with pytest.raises(RequestError, match=r"did not arrive within 0\.5 s"):
+        DownloadCache(tmp_path, 2, 1 << 20, 0.5).fetch(f"{web.url}/a.usdz")
+    assert time.monotonic() - begin < 10 and list(tmp_path.iterdir()) == []
+
+
+def test_files_that_were_not_downloaded_never_make_room(tmp_path):
+    own = tmp_path / "my town.usdz"
+    cache = DownloadCache(tmp_path, 1, 1 << 20, 10.0)
+    files = [own, *(cache.path_of(f"http://h/{k}.usdz") for k in range(3))]
+    for age, file in enumerate(files):
+        file.write_bytes(b"PK")
+        os.utime(file, (age, age))
+    assert sorted(cache.make_room()) == sorted(files[1:3])
+    assert sorted(tmp_path.iterdir()) == sorted([own, files[3]])
 
 
 def test_the_least_recently_used_download_makes_room_and_is_fetched_again(archive, tmp_path, web):

@@ -98,7 +98,18 @@ def test_shared_libraries_are_loaded_before_there_are_threads_that_could_load_th
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
-def test_a_reconstruction_does_not_hold_up_the_end(tmp_path, monkeypatch):
+def drawing(stub):
+    return stub.render_rgb.future(camera_message(scene_id="drive"), timeout=60)
+
+
+def editing(stub):
+    request = sensorsim.EditAssetsRequest(scene_id="street")
+    request.replace.add(original_id="car-1", replacement_id="drive/car-1")
+    return stub.edit_assets.future(request, timeout=60)
+
+
+@pytest.mark.parametrize("ask", [drawing, editing])
+def test_a_reconstruction_does_not_hold_up_the_end(ask, tmp_path, monkeypatch):
     import nurec_sim.logs
     import nurec_sim.reconstruct
 
@@ -114,10 +125,10 @@ def test_a_reconstruction_does_not_hold_up_the_end(tmp_path, monkeypatch):
     (tmp_path / "drive").mkdir()
     monkeypatch.setattr(nurec_sim.logs, "open_clip", lambda path: SimpleNamespace(id="drive"))
     monkeypatch.setattr(nurec_sim.reconstruct, "reconstruct", reconstruct)
-    store = SceneStore([tmp_path / "drive"], cache_dir=tmp_path / "cache")
+    store = SceneStore([tmp_path / "drive", scene()], cache_dir=tmp_path / "cache")
     server = SensorServer(store, port=0, server_options=ServerOptions(stop_grace_s=0.1))
     with Stub(server.start()) as stub:
-        call = stub.render_rgb.future(camera_message(scene_id="drive"), timeout=60)
+        call = ask(stub)
         assert begun.wait(30)
         begin = time.monotonic()
         server.stop()

@@ -8,8 +8,8 @@ from serving_calls import Gated, wait_until
 from serving_world import camera_request, lidar_request, scene
 
 from nurec_sim import wire
-from nurec_sim.client import open_channel
 from nurec_sim.client_v1 import SceneClient
+from nurec_sim.connection import open_channel
 from nurec_sim.errors import (
     ArchiveError,
     OutOfRangeError,

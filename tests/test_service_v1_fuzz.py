@@ -9,8 +9,8 @@ from grpc import StatusCode as Code
 from serving_world import camera_request, lidar_request, scene
 
 from nurec_sim import wire
-from nurec_sim.client import open_channel
 from nurec_sim.client_v1 import SceneClient
+from nurec_sim.connection import open_channel
 from nurec_sim.scene_store import SceneStore
 from nurec_sim.server import SensorServer
 from nurec_sim.service import ServiceOptions

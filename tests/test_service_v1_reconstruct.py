@@ -1,6 +1,7 @@
 """Clips that become scenes on the server: progress, names, folders that are allowed, clients that leave."""
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -104,6 +105,20 @@ def test_a_clip_that_is_on_offer_already_is_known_again_by_its_path(client, clip
     assert len(method.begun) == 1 and len(store.ids) == 3
 
 
+def test_two_clients_that_want_the_same_at_once_get_the_same(client, address, clip, method, store, monkeypatch):
+    offer = store.offer
+
+    def slowly(*arguments):
+        time.sleep(0.2)
+        return offer(*arguments)
+
+    monkeypatch.setattr(store, "offer", slowly)
+    method.gate.set()
+    with SceneClient(address) as other, ThreadPoolExecutor(2) as pool:
+        ids = list(pool.map(lambda each: each.reconstruct(path=str(clip)), (client, other)))
+    assert ids == ["clipgt-tiny"] * 2 and len(method.begun) == 1
+
+
 def test_only_allowed_folders_are_looked_at(client, clip, tmp_path):
     outside = tmp_path / "secret.zip"
     outside.write_bytes(clip.read_bytes())
@@ -124,7 +139,7 @@ def test_bad_requests_are_explained_and_leave_no_scene(client, clip, store, tmp_
         (RequestError, "scene 'clipgt-street' comes from no clip", {"scene_id": "street"}),
         (RequestError, "scene 'clipgt-stored' comes from no clip", {"scene_id": "stored"}),
         (RequestError, "names a scene, not a clip", {"path": str(clip.parent / "scene.usdz")}),
-        (RequestError, "name must have letters", {"path": str(clip), "name": "a b"}),
+        (RequestError, "name must have up to 150 letters", {"path": str(clip), "name": "a b"}),
         (RequestError, "profile and cameras need a method", {"path": str(clip), "profile": "tiny-dense"}),
         (RequestError, "method 'lift' uses no network", {"path": str(clip), "method": "lift", "profile": "x"}),
         (ArchiveError, "no reconstruction method 'magic'", {"path": str(clip), "method": "magic"}),

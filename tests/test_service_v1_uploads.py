@@ -18,12 +18,13 @@ from serving_calls import wait_until
 from serving_world import camera_request, scene
 
 from nurec_sim import wire
-from nurec_sim.client import RemoteSensors, open_channel, our_errors
+from nurec_sim.client import RemoteSensors
 from nurec_sim.client_v1 import SceneClient
+from nurec_sim.connection import open_channel, our_errors
 from nurec_sim.errors import ArchiveError, NurecSimError, RequestError, ServerError, TooLargeError, UnknownSceneError
 from nurec_sim.render import Renderer
 from nurec_sim.scene import write_scene
-from nurec_sim.scene_store import SceneStore
+from nurec_sim.scene_store import SceneStore, UploadFolder
 from nurec_sim.server import SensorServer
 from nurec_sim.service_v1 import SceneOptions
 from nurec_sim.wire import nurec_sim_v1 as v1
@@ -243,7 +244,7 @@ def test_a_full_disk_refuses_and_the_server_lives_on(address, client, archive, f
 SERVER = """
 import sys
 from pathlib import Path
-from nurec_sim.scene_store import SceneStore
+from nurec_sim.scene_store import SceneStore, UploadFolder
 from nurec_sim.server import serve
 from nurec_sim.service_v1 import SceneOptions
 serve(SceneStore([sys.argv[1]], threads=1), port=0, scene_options=SceneOptions(upload_dir=Path(sys.argv[2])))
@@ -291,3 +292,13 @@ def test_the_command_line_uploads(address, archive, folder, tmp_path, capsys):
         with pytest.raises(SystemExit):
             main(["upload", *arguments, "--server", address])
         assert text in " ".join(capsys.readouterr().err.split())
+
+
+def test_uploads_at_the_same_time_share_the_room_that_they_were_promised(folder):
+    uploads = UploadFolder(folder, SceneStore(), max_bytes=100, max_total_bytes=150)
+    with uploads.receive("a.usdz", 100, "0" * 64, ".usdz") as upload:
+        upload.write(b"PK")
+        assert uploads.total_bytes == 100
+        with pytest.raises(TooLargeError, match="uploads may take 150 bytes in all, with this one 160"):
+            uploads.receive("b.usdz", 60, "0" * 64, ".usdz").__enter__()
+    assert uploads.total_bytes == 0 and list(folder.iterdir()) == []

@@ -22,7 +22,9 @@ from nurec_sim.training.generate import ClipSettings, clip_ids, generate_town
 from nurec_sim.training.stream import SampleStream, clip_order, draw_sample
 from nurec_sim.training.windows import WindowSettings, sample_window
 
-SETTINGS = ClipSettings(frames=2, pixels=12_544, clips_per_town=1)
+SETTINGS = ClipSettings(frames=2, pixels=12_544, clips_per_town=1, seconds=2.0)
+TOWN = 7
+"""Its first rig has one plain camera, which is quickly drawn."""
 PROFILE = dataclasses.replace(PROFILES["tiny"], width_px=56, height_px=42)
 WINDOWS = WindowSettings(PROFILE, frames={2: 1.0}, targets=1)
 
@@ -39,7 +41,7 @@ def cache_with(folder, count):
 
 
 def test_clips_of_other_settings_lie_elsewhere():
-    assert SETTINGS.hash == ClipSettings(frames=2, pixels=12_544, clips_per_town=1).hash
+    assert SETTINGS.hash == dataclasses.replace(SETTINGS).hash
     others = [dataclasses.replace(SETTINGS, frames=3), dataclasses.replace(SETTINGS, split="test")]
     assert len({settings.hash for settings in [SETTINGS, *others]}) == 3
 
@@ -97,20 +99,22 @@ def test_a_failing_worker_is_reported_and_ends(tmp_path, monkeypatch):
 
 def test_a_process_fills_the_cache_a_second_run_goes_on_and_another_draws_the_same_bytes(tmp_path):
     seen = []
-    ClipCache(tmp_path, SETTINGS, 1).fill(progress=lambda done, wanted: seen.append((done, wanted)), backend="rays")
-    cache = ClipCache(tmp_path, SETTINGS, 1)
-    assert seen[-1] == (1, 1) and cache.clip_ids() == ["train-000000-0"]
-    written = (cache.clips / "train-000000-0" / "meta.json").stat().st_mtime_ns
+    ClipCache(tmp_path, SETTINGS, 1, TOWN).fill(
+        progress=lambda done, wanted: seen.append((done, wanted)), backend="rays"
+    )
+    cache = ClipCache(tmp_path, SETTINGS, 1, TOWN)
+    assert seen[-1] == (1, 1) and cache.clip_ids() == ["train-000007-0"]
+    written = (cache.clips / "train-000007-0" / "meta.json").stat().st_mtime_ns
     cache.fill(backend="rays")
-    assert (cache.clips / "train-000000-0" / "meta.json").stat().st_mtime_ns == written
-    clip = cache.clip("train-000000-0")
+    assert (cache.clips / "train-000007-0" / "meta.json").stat().st_mtime_ns == written
+    clip = cache.clip("train-000007-0")
     assert len(clip.plan_hash) == 64 and len(cache.data_hash()) == 64
     check_drawn_clip(clip)
-    (again,) = generate_town(0, SETTINGS, tmp_path / "again", "rays")
+    (again,) = generate_town(TOWN, SETTINGS, tmp_path / "again", "rays")
     files = sorted(path.name for path in again.iterdir())
     assert len(files) >= 12
     for name in files:
-        assert (again / name).read_bytes() == (cache.clips / "train-000000-0" / name).read_bytes(), name
+        assert (again / name).read_bytes() == (cache.clips / "train-000007-0" / name).read_bytes(), name
 
 
 def check_drawn_clip(clip):

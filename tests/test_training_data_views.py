@@ -127,7 +127,7 @@ def sample(tmp_path_factory):
 
 
 def test_augmented_samples_keep_shapes_and_geometry(sample):
-    settings = AugmentSettings(blurred=1.0, noisy=1.0, jpeg=1.0)
+    settings = AugmentSettings(clean=0.0, blurred=1.0, noisy=1.0, jpeg=1.0)
     changed = augmented(np.random.default_rng(1), sample, settings)
     again = augmented(np.random.default_rng(1), sample, settings)
     assert changed.truth is sample.truth and changed.inputs.rays is sample.inputs.rays
@@ -141,8 +141,12 @@ def test_augmented_samples_keep_shapes_and_geometry(sample):
         assert target.camera is before.camera and target.time == before.time
 
 
+def test_clean_samples_stay_as_they_are(sample):
+    assert augmented(np.random.default_rng(0), sample, AugmentSettings(clean=1.0)) is sample
+
+
 def test_targets_share_the_response_of_their_camera(sample):
-    quiet = AugmentSettings(noisy=0.0, jpeg=0.0, blurred=0.0, vignette=0.0, gamma=0.0)
+    quiet = AugmentSettings(clean=0.0, noisy=0.0, jpeg=0.0, blurred=0.0, vignette=0.0, gamma=0.0)
     changed = augmented(np.random.default_rng(2), sample, quiet)
     maps = []
     for camera in range(3):

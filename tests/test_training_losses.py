@@ -68,7 +68,7 @@ def perfect_gaussians(sample):
     model = network.build("tiny", seed=0)
     prepare(model)
     with torch.no_grad():
-        features = model.encoder(sample.inputs.rgb, sample.inputs.c2w, sample.inputs.fov, sample.inputs.rays)
+        features = model.features(sample.inputs)
         query = model.decoder.gaussians(features, perfect_context(sample), sample.inputs)
     pixel = 1 / (0.7 * sample.inputs.rgb.shape[3])
     depth = sample.truth.depth_m.reshape(1, -1)
@@ -158,3 +158,20 @@ def test_training_starts_with_the_colours_of_the_image():
     assert float((outputs.context.rgb - sample.inputs.rgb).abs().mean()) < 0.06
     assert 0.03 < float(outputs.gaussians.scale_m.median()) < 0.07
     assert SCENE_RESCALE == 0.15
+
+
+def test_training_starts_with_the_depth_of_flat_ground():
+    sample = ground_sample()
+    model = network.build("tiny", seed=3)
+    prepare(model)
+    with torch.no_grad():
+        depth = model(sample.inputs).context.depth_m
+    ground = (sample.truth.depth_m > 0) & (sample.truth.depth_m < 30)
+    assert float((depth / sample.truth.depth_m - 1)[ground].abs().median()) < 0.1
+    assert float(depth[sample.truth.depth_m == 0].median()) == pytest.approx(40, rel=0.2)
+
+
+def test_a_network_that_needs_the_cars_view_says_so():
+    sample = ground_sample()
+    with pytest.raises(ValueError, match="rig_from_scene"):
+        network.build("tiny")(dataclasses.replace(sample.inputs, rig_from_scene=None))

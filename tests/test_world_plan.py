@@ -132,6 +132,22 @@ def test_broken_plans_are_refused_with_the_field():
         TownPlan.from_json(text[:-30])
 
 
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ('"road": "stem"', '"road": "trunk"', "no road 'trunk'; have east, stem, west"),
+        ('"from_lane": "stem:1"', '"from_lane": "stem:7"', "no lane 'stem:7'; have east:-1"),
+        ('"id": "west"', '"id": "east"', "two roads are called 'east'"),
+        ('"pieces": [', '"pieces": [], "other": [', r"roads\.0\.pieces: Tuple should have at least 1 item"),
+    ],
+)
+def test_plans_whose_parts_do_not_fit_are_refused(old, new, message):
+    text = still_town(2, template="t_junction").to_json()
+    assert old in text
+    with pytest.raises(ClipError, match=f"not a town plan: {message}"):
+        TownPlan.from_json(text.replace(old, new))
+
+
 def test_plans_are_frozen():
     with pytest.raises(dataclasses.FrozenInstanceError):
         town_plan(1, template="straight", seconds=1.0).seed = 3

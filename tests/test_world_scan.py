@@ -41,7 +41,7 @@ def test_drawn_turns_agree_with_rays(plan, rays, name):
     cast = rays.scan(request)
     with painted_world(plan, quality=Quality(lidar="drawn")) as world:
         drawn = world.scan(request)
-    assert np.mean((drawn.range_m > 0) == (cast.range_m > 0)) > 0.995
+    assert np.mean((drawn.range_m > 0) == (cast.range_m > 0)) > 0.99
     same = (drawn.surface == cast.surface) & (drawn.instance == cast.instance)
     assert same.mean() > 0.97
     both = same & (drawn.range_m > 0) & (cast.range_m > 0)
@@ -57,7 +57,7 @@ def test_rays_backends_never_draw(plan):
 
 def test_faint_echoes_are_lost_more_often():
     far = drop_probability(np.full(5, 0.3), np.full(5, 0.7), np.array([5.0, 30.0, 60.0, 120.0, 240.0]))
-    assert (np.diff(far) > 0).all() and far[0] < 0.01 < 0.5 < far[-1]
+    assert (np.diff(far) >= 0).all() and far[0] < 0.001 < 0.3 < far[-1]
     grazing = drop_probability(np.full(4, 0.12), np.array([1.0, 0.3, 0.1, 0.01]), np.full(4, 30.0))
     assert (np.diff(grazing) > 0).all()
     road = drop_probability(np.full(2, 0.12), np.array([1.9 / 20, 1.9 / 50]), np.array([20.0, 50.0]))

@@ -16,6 +16,7 @@ from nurec_sim.types import CameraModel, Pinhole
 
 CAMERA_HEIGHT_M = 1.5
 STEP_M = 1.0
+RIG_FROM_CAMERA = torch.tensor([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, CAMERA_HEIGHT_M], [0, 0, 0, 1]])
 
 
 def ground_sample(seed=0, width=56, height=42, images=2, targets=1):
@@ -45,6 +46,7 @@ def ground_sample(seed=0, width=56, height=42, images=2, targets=1):
         time=time,
         time_before=time - 0.5,
         time_after=time + 0.5,
+        rig_from_scene=RIG_FROM_CAMERA[None],
     )
     normal = torch.zeros(1, images, height, width, 3)
     normal[..., 1] = -1

@@ -61,7 +61,7 @@ class ProtocolFlags:
     boxes: bool = False
     """Give the log's boxes of things that can move to the methods; the paper's network has none."""
     seconds: float = 10.0
-    """Length of a clip, 2 to 18."""
+    """Length of a clip, 2 to 20."""
     hold_out_every: int = 2
     """Which frames of a clip are held out: every so-manieth."""
     clip_cameras: Literal[1, 3] = 3

@@ -137,7 +137,7 @@ def health(
     import grpc
     from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-    from nurec_sim.client import open_channel
+    from nurec_sim.connection import open_channel
 
     with open_channel(address, root_ca) as channel:
         try:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from nurec_sim.cli.console import OnePath, app, err, out, progress
 from nurec_sim.errors import TrainingError
+
+AblationName = Literal["full", "single_stage", "sky_mlp", "no_perceptual", "no_depth_loss", "concatenation"]
 
 
 @app.command
@@ -21,6 +23,7 @@ def train(
     loaders: int = 1,
     threads: int | None = None,
     until: int | None = None,
+    ablation: AblationName = "full",
 ) -> None:
     """Train the network in towns that are drawn meanwhile, as a recipe says (docs/training.md).
 
@@ -35,22 +38,25 @@ def train(
         loaders: processes that prepare samples; 0 is a thread of the training process.
         threads: of torch and of the renderer; all cores if not given.
         until: stop after so many steps, counted from the beginning of the recipe.
+        ablation: what to leave out, a row of the paper's Table 2; concatenation trains as full does.
     """
     import torch
 
+    from nurec_sim.training.ablations import ablated
     from nurec_sim.training.config import read_config
+    from nurec_sim.training.curves import write_curves
     from nurec_sim.training.lpips import load_lpips
     from nurec_sim.training.perceptual import perceptual_distance
     from nurec_sim.training.processes import Processes
     from nurec_sim.training.samples import TownSamples
-    from nurec_sim.training.trainer import WEIGHTS, Trainer
+    from nurec_sim.training.trainer import CURVES, WEIGHTS, Trainer
 
     if min(drawers, loaders) < 0 or (threads is not None and threads < 1):
         raise TrainingError(
             f"drawers and loaders must be 0 or more and threads 1 or more, got {drawers}, {loaders}, {threads}"
         )
-    config = read_config(recipe)
-    folder = out_path or Path("runs/train") / recipe.stem
+    config = ablated(read_config(recipe), ablation)
+    folder = out_path or Path("runs/train") / (recipe.stem if ablation == "full" else f"{recipe.stem}-{ablation}")
     if threads is not None:
         torch.set_num_threads(threads)
     perceptual = perceptual_distance if config.lpips is None else load_lpips(config.lpips)
@@ -60,6 +66,8 @@ def train(
             Trainer(config, folder, samples, perceptual, processes, threads).run(advance, until)
     finally:
         processes.leave()
+    if processes.first and (folder / CURVES).is_file():
+        write_curves(folder)
     out.print(f"wrote {folder / WEIGHTS}", soft_wrap=True)
 
 

@@ -16,7 +16,6 @@ from nurec_sim.wire import ImageFormat, sensorsim
 from nurec_sim.wire.poses import write_poses
 
 HEIGHT_PX = 90
-MAX_MESSAGE_BYTES = 64 << 20
 
 
 class Target:
@@ -39,8 +38,8 @@ class Target:
         self.channel = grpc.insecure_channel(
             address,
             options=[
-                ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-                ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+                ("grpc.max_receive_message_length", wire.MAX_MESSAGE_BYTES),
+                ("grpc.max_send_message_length", wire.MAX_MESSAGE_BYTES),
                 ("grpc.enable_http_proxy", 0),
             ],
         )

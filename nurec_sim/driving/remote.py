@@ -5,16 +5,17 @@ The session opens with the first plan of a rollout, for only then it is known wh
 
 from __future__ import annotations
 
-import json
 import uuid
 import weakref
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 import grpc
 
+from nurec_sim.connection import channel_options
 from nurec_sim.errors import PlanError, RequestError, ScenarioError, ServerError
 from nurec_sim.render.encode import encode_image
 from nurec_sim.types import CameraFrame, Needs, Observation, Plan, Rig
@@ -23,7 +24,6 @@ from nurec_sim.wire import common, driving, driving_paths, egodriver
 SCHEME = "grpc"
 OTHER_NEEDS = Needs(cameras=("front",), image_width_px=512)
 """Of drivers that do not tell what they read: AlpaSim's are sent the front camera unless told otherwise."""
-MAX_MESSAGE_BYTES = 64 << 20
 MAX_TIMEOUT_S = 3600.0
 _REPEATABLE = ("get_policy", "get_version", "submit_image_observation", "submit_egomotion_observation",
                "submit_route", "submit_recording_ground_truth", "submit_lidar_observation",
@@ -66,7 +66,7 @@ class RemotePolicy:
         connect_timeout_s: float = 10.0,
     ) -> None:
         self.address, self._timeout_s = address, timeout_s
-        self._channel = grpc.insecure_channel(address, _channel_options())
+        self._channel = grpc.insecure_channel(address, channel_options(_service_config()))
         self._calls = {
             name: self._channel.unary_unary(
                 f"/{driving.DRIVER_SERVICE}/{name}", method.request.SerializeToString, method.reply.FromString
@@ -260,12 +260,6 @@ def _hang_up(channel: grpc.Channel, calls: dict, session_ids: set[str]) -> None:
     channel.close()
 
 
-def _channel_options() -> list[tuple[str, object]]:
+def _service_config() -> dict[str, Any]:
     names = [{"service": driving.DRIVER_SERVICE, "method": name} for name in _REPEATABLE]
-    return [
-        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-        ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
-        ("grpc.max_reconnect_backoff_ms", 1000),
-        ("grpc.enable_http_proxy", 0),  # drivers are near; a proxy for the web is not for them
-        ("grpc.service_config", json.dumps({"methodConfig": [{"name": names, "retryPolicy": _RETRY}]})),
-    ]
+    return {"methodConfig": [{"name": names, "retryPolicy": _RETRY}]}

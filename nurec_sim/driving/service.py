@@ -17,22 +17,22 @@ from typing import TypeVar
 import numpy as np
 
 import nurec_sim
-from nurec_sim.calls import DeadlinePassedError
 from nurec_sim.driving.session import Question, Session
 from nurec_sim.driving.worker import PolicyThread
 from nurec_sim.errors import (
+    DeadlinePassedError,
     NurecSimError,
     PlanError,
     RequestError,
     SessionExistsError,
     TooLargeError,
     UnknownSessionError,
+    UnsupportedError,
 )  # fmt: skip
-from nurec_sim.service import UnsupportedError
 from nurec_sim.service.discovery import API_VERSION
 from nurec_sim.sim.plans import check_plan
 from nurec_sim.types import EgoState, Plan, Policy
-from nurec_sim.wire import common, driving, driving_paths, egodriver
+from nurec_sim.wire import MAX_MESSAGE_BYTES, common, driving, driving_paths, egodriver
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class DriverOptions:
     """A policy that thinks for longer has failed, whatever its client would wait for."""
     route_speed_mps: float = 8.0
     """Speed along routes of clients that do not tell any, as AlpaSim's."""
-    max_message_bytes: int = 64 << 20
+    max_message_bytes: int = MAX_MESSAGE_BYTES
     allow_shut_down: bool = False
 
     def __post_init__(self) -> None:

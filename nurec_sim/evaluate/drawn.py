@@ -12,6 +12,7 @@ from nurec_sim.evaluate.views import reduced, reduced_mask
 from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, Target
 from nurec_sim.types import CameraModel, Label, LidarModel, Pinhole, Rig, SensorRequest, Sweep, Trajectory
 from nurec_sim.world import LIDAR_ID, TrueWorld, street_rig, town_plan
+from nurec_sim.world.isp import CameraResponse, random_response
 from nurec_sim.world.plan import TownPlan
 from nurec_sim.world.rig import CAMERA_FROM_RIG_AXES
 from nurec_sim.world.sense import measured_points
@@ -34,6 +35,11 @@ def evaluation_rig(cameras: int = 1, width_px: int = 480, height_px: int = 320) 
         place = np.array([AHEAD_M, 0.0, HEIGHT_M]) + turn @ np.array([0.1, 0.0, 0.0])
         models[name] = CameraModel(name, width_px, height_px, lens, geometry.pose(turn @ CAMERA_FROM_RIG_AXES, place))
     return Rig(models, {LIDAR_ID: street_rig().lidars[LIDAR_ID]})
+
+
+def camera_responses(rig: Rig, seed: int) -> dict[str, CameraResponse]:
+    """A colour response of its own for every camera, as the cameras of one car differ."""
+    return {name: random_response(np.random.default_rng([seed, n, 0xCA3])) for n, name in enumerate(rig.cameras)}
 
 
 class Drawing:

@@ -14,7 +14,7 @@ import numpy as np
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.windows import Window
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings
-from nurec_sim.types import CameraFrame, CameraModel, Clip, SensorRequest
+from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, SensorRequest
 
 Show = Callable[[SensorRequest], CameraFrame]
 """Answers a request for a camera image; without ``depth_m`` where a method knows none."""
@@ -26,6 +26,9 @@ CHOICES: Mapping[str, str] = {
     "lift": "coloured LiDAR and stereo, no learning; the only one that sees LiDAR",
     "copy": "the input image nearest in time, as it is; knows no depth",
 }
+
+LIFT = LiftSettings(sky_px=256)
+"""A finer sky would not be seen at the size at which views are compared."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +42,16 @@ class Contender:
 
 @dataclass(frozen=True)
 class Built:
-    """What a method made of a log: views on demand, how many Gaussians, and the seconds it took to make."""
+    """What a method made of a log: views on demand, the scene behind them if there is one, the seconds it took."""
 
     show: Show
-    gaussians: int | None
+    scene: GaussianScene | None
     seconds: float
-    unknown: tuple[str, ...] = ()
+
+    @property
+    def gaussians(self) -> int | None:
+        """How many there are."""
+        return None if self.scene is None else len(self.scene.static) + len(self.scene.dynamic)
 
 
 def contenders(
@@ -60,7 +67,7 @@ def contenders(
         network: how logs go through the network; its profile and checkpoint are those of ``dense`` unless the profile
             is a selective one. Both network methods share the rest.
         selective_checkpoint: weights of ``selective``, its own if None.
-        lift: settings of ``lift``.
+        lift: settings of ``lift``; ``LIFT`` if None.
 
     Raises:
         ReconstructError: an unknown name, one given twice, or none.
@@ -69,7 +76,7 @@ def contenders(
     if unknown or not names or len(set(names)) < len(names):
         raise ReconstructError(f"methods must be some of {list(CHOICES)}, each once; got {list(names)}")
     settings = network or FeedForwardSettings()
-    return tuple(_contender(name, settings, selective_checkpoint, lift or LiftSettings()) for name in names)
+    return tuple(_contender(name, settings, selective_checkpoint, lift or LIFT) for name in names)
 
 
 def _contender(name: str, network: FeedForwardSettings, selective: Path | None, lift: LiftSettings) -> Contender:
@@ -133,12 +140,7 @@ def build(contender: Contender, window: Window) -> Built:
     started = time.perf_counter()
     scene = reconstruct(window.clip, contender.method, cameras=window.cameras, settings=contender.settings)
     renderer, spent = Renderer(scene), time.perf_counter() - started
-    return Built(
-        lambda request: renderer.render_camera(request, ("rgb", "depth")),
-        len(scene.static) + len(scene.dynamic),
-        spent,
-        tuple(scene.provenance.get("unknown", ())),
-    )
+    return Built(lambda request: renderer.render_camera(request, ("rgb", "depth")), scene, spent)
 
 
 def _look(window: Window, sweeps: bool) -> None:
@@ -157,5 +159,7 @@ def _nearest(clip: Clip, request: SensorRequest) -> CameraFrame:
     camera = request.sensor
     assert isinstance(camera, CameraModel)
     middle = clip.camera_times_us(camera.id).sum(axis=1) // 2
+    if not len(middle):
+        raise ReconstructError(f"clip {clip.id!r}: camera {camera.id!r} has no seen frame that could be copied")
     index = int(np.argmin(np.abs(middle - (request.start_us + request.end_us) // 2)))
     return CameraFrame(camera, request.start_us, request.end_us, clip.image(camera.id, index))

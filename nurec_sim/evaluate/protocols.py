@@ -18,9 +18,9 @@ from typing import Literal
 import numpy as np
 
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate.drawn import Drawing, evaluation_rig, held_out_plan
+from nurec_sim.evaluate.drawn import Drawing, camera_responses, evaluation_rig, held_out_plan
 from nurec_sim.evaluate.windows import ContextClip, Target, Window
-from nurec_sim.world import TrueWorld
+from nurec_sim.world import Quality, TrueWorld
 
 PROTOCOLS = ("storm", "clip", "shift")
 ProtocolName = Literal["storm", "clip", "shift"]
@@ -34,6 +34,7 @@ SHIFT_FRAMES = (3, 8, 13)
 """Frames of the window at which views beside the path are asked for: each about halfway between two seen ones."""
 NEAR_M, NEAR_SHARE = 1.0, 0.2
 """A camera with more than this share of its pixels nearer than this is inside of something."""
+QUALITY = Quality(lidar="drawn")
 
 Progress = Callable[[str, float], None]
 Made = tuple[ContextClip, list[Target]]
@@ -105,9 +106,12 @@ class Protocol:
         for path in self.clips:
             clip = open_clip(path)
             if self.name == "storm":
-                found |= storm_windows(clip, STORM_FRAMES, STORM_CONTEXT, STEP_US, self.boxes)
+                new = storm_windows(clip, STORM_FRAMES, STORM_CONTEXT, STEP_US, self.boxes)
             else:
-                found |= clip_window(clip, self.cameras, self.hold_out_every, self.boxes)
+                new = clip_window(clip, self.cameras, self.hold_out_every, self.boxes)
+            if found.keys() & new.keys():
+                raise ReconstructError(f"two of the logs are called {clip.id!r}; give each once")
+            found |= new
         return found
 
     @contextlib.contextmanager
@@ -122,7 +126,8 @@ class Protocol:
         long_s = self.seconds if self.name == "clip" else STORM_FRAMES * STEP_US / 1e6
         plan = held_out_plan(self.seeds[index], long_s + START_S + 0.5)
         rig = evaluation_rig(self.cameras if self.name == "clip" else 1, *self.size_px)
-        with TrueWorld(plan, self.backend) as world:
+        responses = camera_responses(rig, plan.seed) if self.name == "clip" else {}
+        with TrueWorld(plan, self.backend, responses, QUALITY) as world:
             drawing = Drawing(world, rig)
             report("drawing", 0.1)
             clip, targets = _MAKERS[self.name](self, drawing, name, plan.span_us[0] + round(START_S * 1e6), report)

@@ -82,36 +82,43 @@ def recorded_window(
     seen: Sequence[int],
     asked: Sequence[int],
     boxes: bool,
+    asked_of: Sequence[str] | None = None,
 ) -> Window:
     """A window of a recorded log.
+
+    Sweeps nearest in time to views that are asked for are held out, unless the views themselves are seen.
 
     Args:
         clip: the log.
         id: name of the window.
-        cameras: those that count.
-        seen: indices of the frames that the methods see, of each camera.
+        cameras: those that the methods see.
+        seen: indices of the frames that they see, of each of these cameras.
         asked: indices of the frames that they have to show.
         boxes: whether the methods get the log's boxes.
+        asked_of: cameras whose frames they have to show; the seen ones if None.
     """
+    shown_by = list(cameras if asked_of is None else asked_of)
     frames = sorted({*seen, *asked})
-    exposures = np.concatenate([clip.camera_times_us(camera)[frames] for camera in cameras])
+    views = [(camera, index) for index in asked for camera in shown_by]
+    given = {(camera, index) for camera in cameras for index in seen}
+    exposures = np.concatenate([clip.camera_times_us(camera)[frames] for camera in {*cameras, *shown_by}])
     span_us = (int(exposures.min()), int(exposures.max()) + 1)
-    held = _nearest_sweeps(clip, np.concatenate([clip.camera_times_us(camera)[list(asked)] for camera in cameras]))
+    nearest = {view: _nearest_sweep(clip, clip.camera_times_us(view[0])[view[1]]) for view in views}
+    held = {sweep for view, sweep in nearest.items() if view not in given}
     shots = {camera: tuple(_shot(clip, camera, index) for index in seen) for camera in cameras}
     turns = {
         lidar: tuple(
             Revolution(int(start), int(end), partial(clip.sweep, lidar, index))
             for index, (start, end) in enumerate(clip.sweep_times_us(lidar))
-            if (lidar, index) not in held.values()
+            if (lidar, index) not in held
             and span_us[0] - NEAREST_SWEEP_US <= (start + end) // 2 < span_us[1] + NEAREST_SWEEP_US
         )
         for lidar in clip.rig.lidars
     }
-    rig = Rig({camera: clip.rig.cameras[camera] for camera in cameras}, clip.rig.lidars, clip.rig.body)
+    names = [name for name in clip.rig.cameras if name in {*cameras, *shown_by}]
+    rig = Rig({name: clip.rig.cameras[name] for name in names}, clip.rig.lidars, clip.rig.body)
     context = ContextClip(id, rig, clip.ego, _wider(turns, span_us), shots, turns, tuple(clip.tracks) if boxes else ())
-    targets = tuple(
-        _target(clip, camera, index, held, beyond=index > max(seen)) for index in asked for camera in cameras
-    )
+    targets = tuple(_target(clip, *view, nearest[view], beyond=view[1] > max(seen)) for view in views)
     ends = clip.ego.at(np.array(span_us))[:, :3, 3]
     about: dict[str, str | int | float] = {
         "log": clip.id,
@@ -132,24 +139,21 @@ def _shot(clip: Clip, camera: str, index: int) -> Shot:
     return Shot(start, end, clip.world_from_camera(camera, index), lambda: clip.image(camera, index))
 
 
-def _nearest_sweeps(clip: Clip, exposures_us: Int64[np.ndarray, "n 2"]) -> dict[int, tuple[str, int]]:
-    """For the middle of each exposure the LiDAR and the index of the sweep nearest to it, where one is near enough."""
-    found: dict[int, tuple[int, tuple[str, int]]] = {}
+def _nearest_sweep(clip: Clip, exposure_us: Int64[np.ndarray, " 2"]) -> tuple[str, int] | None:
+    """The LiDAR and the index of the sweep nearest to the middle of an exposure, None if none is near enough."""
+    best: tuple[int, str, int] | None = None
     for lidar in clip.rig.lidars:
-        middles = clip.sweep_times_us(lidar).sum(axis=1) // 2
-        for t_us in exposures_us.sum(axis=1) // 2:
-            gaps = np.abs(middles - t_us)
-            if len(gaps) and gaps.min() <= NEAREST_SWEEP_US:
-                entry = (int(gaps.min()), (lidar, int(gaps.argmin())))
-                found[int(t_us)] = min(found.get(int(t_us), entry), entry)
-    return {t_us: sweep for t_us, (_, sweep) in found.items()}
+        gaps = np.abs(clip.sweep_times_us(lidar).sum(axis=1) // 2 - int(exposure_us.sum()) // 2)
+        if len(gaps) and gaps.min() <= NEAREST_SWEEP_US:
+            entry = (int(gaps.min()), lidar, int(gaps.argmin()))
+            best = entry if best is None else min(best, entry)
+    return None if best is None else best[1:]
 
 
-def _target(clip: Clip, camera_id: str, index: int, held: dict[int, tuple[str, int]], beyond: bool) -> Target:
+def _target(clip: Clip, camera_id: str, index: int, sweep: tuple[str, int] | None, beyond: bool) -> Target:
     camera, exposure = clip.rig.cameras[camera_id], clip.camera_times_us(camera_id)[index]
     start, end = int(exposure[0]), max(int(exposure[1]), int(exposure[0]) + 1)
     request = SensorRequest("", camera, start, end, clip.world_from_camera(camera_id, index))
-    sweep = held.get(int(exposure.sum()) // 2)
     true = reduced(clip.image(camera_id, index), None)
     depth_m = np.zeros(true.rgb.shape[:2], np.float32)
     if sweep is not None:

@@ -52,7 +52,8 @@ def score_window(contender: Contender, window: Window, progress: Callable[[str, 
         views[target.name] = view = reduced(frame.rgb, frame.depth_m)
         rows.append({"name": target.name, "left_m": target.left_m, "beyond": target.beyond, **score_view(view, target)})
     seconds = {"reconstruct": round(built.seconds, 3), "render": round(rendering / max(len(rows), 1), 4)}
-    record = {"gaussians": built.gaussians, "seconds": seconds, "unknown": list(built.unknown), "targets": rows}
+    unknown = [] if built.scene is None else list(built.scene.provenance.get("unknown", ()))
+    record = {"gaussians": built.gaussians, "seconds": seconds, "unknown": unknown, "targets": rows}
     return Scored(record, views)
 
 

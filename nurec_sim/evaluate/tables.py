@@ -51,7 +51,7 @@ def tables(results: Mapping[str, Any]) -> list[Table]:
         made.append(_paper_table(results))
         if name == "storm":
             made.append(_times(methods))
-    made += [_metric_depth(methods), _cost(methods)]
+    made += [_metric_depth(methods, ", on the path" if name == "shift" else ""), _cost(methods)]
     if summary["differences"]:
         made.append(_differences(summary["differences"]))
     failed = [
@@ -103,7 +103,7 @@ def _times(methods: Mapping[str, Any]) -> Table:
     return Table("times", "Between the seen frames, and after them", heading, tuple(rows), note)
 
 
-def _metric_depth(methods: Mapping[str, Any]) -> Table:
+def _metric_depth(methods: Mapping[str, Any], where: str) -> Table:
     rows = tuple(
         (
             name,
@@ -116,7 +116,7 @@ def _metric_depth(methods: Mapping[str, Any]) -> Table:
     )
     heading = ("method", "AbsRel", "δ1", "dyn AbsRel", "dyn δ1", "scale", "covered")
     note = "scale: what least squares would multiply the depth by, 1 where metres are right."
-    return Table("metric_depth", "Depth in metres, not aligned", heading, rows, note)
+    return Table("metric_depth", f"Depth in metres, not aligned{where}", heading, rows, note)
 
 
 def _cost(methods: Mapping[str, Any]) -> Table:
@@ -154,9 +154,11 @@ def _doubling(methods: Mapping[str, Any]) -> Table:
         known = [figures["abs_rel"] for figures in row["curve"].values()]
         reached, farthest = row["abs_rel_doubles_at_m"], max(map(float, row["curve"]), default=0.0)
         text = f"{reached:.2f} m" if reached is not None else f"not reached up to {farthest:g} m"
-        rows.append((name, text if known and None not in known else "depth not known"))
-    title = "Offset at which AbsRel is twice that on the path"
-    return Table("shift_doubling", title, ("method", "offset"), tuple(rows))
+        psnr_db = [row["curve"].get(offset, {}).get("psnr_db") for offset in ("0", "2")]
+        lost = None if None in psnr_db else psnr_db[0] - psnr_db[1]
+        rows.append((name, text if known and None not in known else "depth not known", number(lost, 2)))
+    heading = ("method", "AbsRel is twice that on the path at", "PSNR lost 2 m beside it (dB)")
+    return Table("shift_doubling", "How fast views beside the path get worse", heading, tuple(rows))
 
 
 def _differences(differences: Sequence[Mapping[str, Any]]) -> Table:

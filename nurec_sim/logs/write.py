@@ -261,5 +261,6 @@ def _zip_folder(folder: Path, target: Path) -> None:
         for file in sorted(item for item in folder.rglob("*") if item.is_file()):
             info = zipfile.ZipInfo(file.relative_to(folder).as_posix(), date_time=_ZIP_DATE)
             # Images and npz files are compressed already.
-            info.compress_type = zipfile.ZIP_DEFLATED if file.suffix == ".json" else zipfile.ZIP_STORED
+            compressed = file.suffix in (".jpg", ".png", ".npz")
+            info.compress_type = zipfile.ZIP_STORED if compressed else zipfile.ZIP_DEFLATED
             archive.writestr(info, file.read_bytes())

@@ -10,10 +10,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nurec_sim.network.attention import KeyValueProjector, QueryBlock
+from nurec_sim.network.car_view import CHANNELS, car_view
 from nurec_sim.network.dpt import DptHead
 from nurec_sim.network.encoder import Features
 from nurec_sim.network.motion import MotionDecoder
-from nurec_sim.network.profiles import Profile
+from nurec_sim.network.profiles import HeadSize, Profile
 from nurec_sim.network.tensors import SCENE_RESCALE, ContextMaps, NetworkInputs, QueryGaussians, SemanticClass
 
 LARGEST_SCALE = 0.045
@@ -35,13 +36,8 @@ class ContextDecoder(nn.Module):
         # Margin around cuboids, metres; kept in the released state dicts, read by nothing here.
         self.register_buffer("cuboids_dims_padding", torch.ones(3))
         self.depth_head = DptHead(width, profile.head, out=2)
-        self.depth_detail = profile.head.depth_detail
-        half = profile.head.fused // 2
-        self.rgb_fusion = nn.Sequential(
-            nn.Conv2d(3, half // 4, 3, 1, 1), nn.GELU(),
-            nn.Conv2d(half // 4, half // 2, 3, 1, 1), nn.GELU(),
-            nn.Conv2d(half // 2, half, 3, 1, 1), nn.GELU(),
-        )  # fmt: skip
+        self.depth_fusion = _fusion(3 + CHANNELS, profile.head) if profile.head.depth_detail else None
+        self.rgb_fusion = _fusion(3, profile.head)
         self.context_head = DptHead(width, profile.head, out=3 + 3 + len(SemanticClass))
         self.context_motion_head = MotionDecoder(profile)
 
@@ -50,9 +46,9 @@ class ContextDecoder(nn.Module):
         clips, size = inputs.rgb.shape[:2], (inputs.rgb.shape[2], inputs.rgb.shape[3])
         levels = [feature.patches.flatten(0, 1) for feature in features]
         images = inputs.rgb.flatten(0, 1).permute(0, 3, 1, 2)
-        detail = (self.rgb_fusion, images)
-        depth = self.depth_head(levels, size, *(detail if self.depth_detail else ()))[:, 0].float()
-        context = self.context_head(levels, size, *detail).float().permute(0, 2, 3, 1)
+        seen = () if self.depth_fusion is None else (self.depth_fusion, self._pixels_with_view(images, inputs))
+        depth = self.depth_head(levels, size, *seen)[:, 0].float()
+        context = self.context_head(levels, size, self.rgb_fusion, images).float().permute(0, 2, 3, 1)
         rgb, normal, logits = context.split([3, 3, len(SemanticClass)], dim=-1)
         moved = None
         if motion:
@@ -64,6 +60,19 @@ class ContextDecoder(nn.Module):
             logits=logits.unflatten(0, clips),
             motion_m=moved,
         )
+
+    def _pixels_with_view(self, images: Float[Tensor, "n 3 h w"], inputs: NetworkInputs) -> Float[Tensor, "n 11 h w"]:
+        return torch.cat([images, car_view(inputs).flatten(0, 1).permute(0, 3, 1, 2).to(images.dtype)], dim=1)
+
+
+def _fusion(channels: int, size: HeadSize) -> nn.Sequential:
+    """Three convolutions that bring pixels to the width of a head's last layers."""
+    half = size.fused // 2
+    return nn.Sequential(
+        nn.Conv2d(channels, half // 4, 3, 1, 1), nn.GELU(),
+        nn.Conv2d(half // 4, half // 2, 3, 1, 1), nn.GELU(),
+        nn.Conv2d(half // 2, half, 3, 1, 1), nn.GELU(),
+    )  # fmt: skip
 
 
 class DenseDecoder(ContextDecoder):

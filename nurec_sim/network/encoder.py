@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nurec_sim.network.attention import Mlp, Rope, SelfBlock
+from nurec_sim.network.car_view import CHANNELS
 from nurec_sim.network.profiles import PATCH_PX, EncoderSize
-from nurec_sim.network.tensors import SCENE_RESCALE
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
@@ -82,25 +82,23 @@ class CameraEmbedding(nn.Module):
             return self.trunk_norm(x)
 
 
-class RayPatches(nn.Module):
-    """What patches see where, added to their tokens: mean ray of each patch, with sinusoids of its direction.
+class ViewPatches(nn.Module):
+    """What patches see where (``car_view``), added to their tokens: patch means, with sinusoids of the direction.
 
-    Not part of the released network, which tells patches their camera by one token. A small network that is trained
-    for hours learns where the ground is much sooner so.
+    Not part of the released network.
     """
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.mlp = Mlp(6 + 3 * 2 * RAY_OCTAVES, width, width)
+        self.mlp = Mlp(CHANNELS + 3 * 2 * RAY_OCTAVES, width, width)
 
-    def forward(self, rays: Float[Tensor, "n h w 6"]) -> Float[Tensor, "n y x d"]:
+    def forward(self, view: Float[Tensor, "n h w 8"]) -> Float[Tensor, "n y x d"]:
         """Tokens by row and column; always in float32."""
-        with torch.autocast(rays.device.type, enabled=False):
-            mean = functional.avg_pool2d(rays.float().permute(0, 3, 1, 2), PATCH_PX).permute(0, 2, 3, 1)
-            origin, direction = mean[..., :3] * SCENE_RESCALE, mean[..., 3:]
-            angle = direction[..., None] * (math.pi * 2.0 ** torch.arange(RAY_OCTAVES, device=rays.device))
+        with torch.autocast(view.device.type, enabled=False):
+            mean = functional.avg_pool2d(view.float().permute(0, 3, 1, 2), PATCH_PX).permute(0, 2, 3, 1)
+            angle = mean[..., 3:6, None] * (math.pi * 2.0 ** torch.arange(RAY_OCTAVES, device=view.device))
             waves = torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2)
-            return self.mlp(torch.cat([origin, direction, waves], dim=-1))
+            return self.mlp(torch.cat([mean, waves], dim=-1))
 
 
 class AlternatingTransformer(nn.Module):
@@ -152,7 +150,7 @@ class Encoder(nn.Module):
     def __init__(self, size: EncoderSize) -> None:
         super().__init__()
         self.patch_embed_img = PatchEmbedding(size.width)
-        self.patch_embed_ray = RayPatches(size.width) if size.rays else None
+        self.patch_embed_view = ViewPatches(size.width) if size.car_view else None
         self.embed_camera = CameraEmbedding(size)
         self.vit = AlternatingTransformer(size)
 
@@ -161,12 +159,12 @@ class Encoder(nn.Module):
         rgb: Float[Tensor, "b v h w 3"],
         c2w: Float[Tensor, "b v 4 4"],
         fov: Float[Tensor, "b v 2"],
-        rays: Float[Tensor, "b v h w 6"],
+        view: Float[Tensor, "b v h w 8"] | None = None,
     ) -> tuple[Features, ...]:
-        """Four levels of features, from early to deep."""
+        """Four levels of features, from early to deep; ``view`` is the ``car_view`` of profiles that have one."""
         patches = self.patch_embed_img(normalized(rgb.flatten(0, 1)))
-        if self.patch_embed_ray is not None:
-            patches = patches + self.patch_embed_ray(rays.flatten(0, 1)).to(patches.dtype)
+        if self.patch_embed_view is not None and view is not None:
+            patches = patches + self.patch_embed_view(view.flatten(0, 1)).to(patches.dtype)
         return self.vit(patches.unflatten(0, rgb.shape[:2]), self.embed_camera(c2w, fov))
 
 

@@ -8,8 +8,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from nurec_sim.network.car_view import car_view
 from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
-from nurec_sim.network.encoder import Encoder
+from nurec_sim.network.encoder import Encoder, Features
 from nurec_sim.network.isp import IspDecoder
 from nurec_sim.network.learned_sky import SkyDecoder
 from nurec_sim.network.observed_sky import observed_sky
@@ -56,7 +57,7 @@ class InstantNuRec(nn.Module):
         self._check(inputs)
         with self._half_precision(inputs.rgb.device):
             # Images and cameras become features that all decoders share.
-            features = self.encoder(inputs.rgb, inputs.c2w, inputs.fov, inputs.rays)
+            features = self.features(inputs)
             deepest = features[-1].patches
             # What every pixel shows: depth, colour, normal, class, and where its point moves.
             context = self.decoder.context(features, inputs, motion)
@@ -72,6 +73,11 @@ class InstantNuRec(nn.Module):
             # How each camera shows these colours.
             isp = self.post_processing(deepest, inputs.camera_idxs)
         return NetworkOutputs(context, gaussians, sky, seen, self.sky is not None, isp)
+
+    def features(self, inputs: NetworkInputs) -> tuple[Features, ...]:
+        """Four levels of the encoder's features, from early to deep."""
+        view = car_view(inputs) if self.profile.encoder.car_view else None
+        return self.encoder(inputs.rgb, inputs.c2w, inputs.fov, view)
 
     def _half_precision(self, device: torch.device) -> contextlib.AbstractContextManager:
         if self.precision == "float32":

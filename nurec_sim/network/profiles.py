@@ -20,7 +20,7 @@ class EncoderSize:
 
     Blocks before ``alternate_from`` look at one image each; from there on even blocks look at one image, odd ones at
     all. The features after ``taps`` (all odd) go to the heads, twice as wide as ``width``: last local and global state.
-    ``rays`` adds to every patch where it looks, which the released network does not.
+    ``car_view`` tells every patch where it looks as seen from the car, which the released network does not.
     """
 
     width: int = 768
@@ -31,15 +31,15 @@ class EncoderSize:
     position_grid: int = 37
     camera_depth: int = 4
     camera_heads: int = 16
-    rays: bool = False
+    car_view: bool = False
 
 
 @dataclass(frozen=True)
 class HeadSize:
     """A DPT head: channels of the four levels from fine to coarse, of their fusion, and of the last two layers.
 
-    ``depth_detail`` shows the image to the depth head's last layers too, as the released network does for colours only:
-    where patches are coarse, the edges of things are in the image alone.
+    ``depth_detail`` shows the image and the ``car_view`` to the depth head's last layers too, as the released network
+    shows the image to those of the colours only: where patches are coarse, the edges of things are in the image alone.
     """
 
     levels: tuple[int, int, int, int] = (96, 192, 384, 768)
@@ -130,7 +130,7 @@ _TINY = Profile(
     cameras=(1, 3, 5),
     frames=(1, 18),
     keeps_aspect=True,
-    encoder=EncoderSize(144, 10, 3, 2, (3, 5, 7, 9), 16, 1, 4, rays=True),
+    encoder=EncoderSize(144, 10, 3, 2, (3, 5, 7, 9), 16, 1, 4, car_view=True),
     head=HeadSize((24, 48, 72, 72), 48, 16, depth_detail=True),
     selective=SelectiveSize(depth=1, heads=6),
     motion=MotionSize(64),

@@ -42,6 +42,8 @@ class NetworkInputs:
         time: when each image's centre was exposed, as a fraction of the clip's span (0..1).
         time_before: the time to which the first motion goes: the camera's frame before, as such a fraction.
         time_after: the same for the camera's next frame.
+        rig_from_scene: the scene frame as seen from the car, metres; what our own profiles read (``car_view``) and the
+            released ones don't.
     """
 
     rgb: Float[Tensor, "b v h w 3"]
@@ -53,10 +55,12 @@ class NetworkInputs:
     time: Float[Tensor, "b v"]
     time_before: Float[Tensor, "b v"]
     time_after: Float[Tensor, "b v"]
+    rig_from_scene: Float[Tensor, "b 4 4"] | None = None
 
     def to(self, device: torch.device | str) -> NetworkInputs:
         """The same on another device."""
-        return NetworkInputs(**{f.name: getattr(self, f.name).to(device) for f in dataclasses.fields(self)})
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return NetworkInputs(**{name: None if value is None else value.to(device) for name, value in values.items()})
 
 
 @dataclass(frozen=True)

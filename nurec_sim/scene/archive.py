@@ -47,7 +47,6 @@ KNOT_TIMES, KNOTS, OWNERS, IN_BOX = (
 TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY, KNOT_TIMES, KNOTS, OWNERS)
 """The members that a scene is read from, with ``IN_BOX`` where it has such; all others are for other programs."""
 
-MAX_JSON_BYTES = 256 * 2**20
 FOREIGN_SUFFIXES = (".ply", ".usd", ".usda", ".usdc", ".nurec", ".ckpt")
 SCENE_SUFFIXES = (".usdz", *FOREIGN_SUFFIXES)
 """Names of files that ``read_scene`` opens end in one of these, in capitals or not."""
@@ -115,7 +114,7 @@ def read_scene(path: Path | str) -> GaussianScene:
         manifest = _read_manifest(package)
         _check_hashes(package, manifest, TRUTH)
         counts = manifest["counts"]
-        facts_json = codec.load(package.read(FACTS, MAX_JSON_BYTES), f"{path}: {FACTS}")
+        facts_json = codec.load(package.read(FACTS, codec.MAX_JSON_BYTES), f"{path}: {FACTS}")
         facts = facts_from_json(facts_json, f"{path}: {FACTS}")
         static_usd = open_member(path, STATIC_LAYER)
         static = _read_fields(static_usd, ["/Static/background", "/Static/road"], counts["static"], f"{path}: static")
@@ -131,7 +130,7 @@ def read_scene(path: Path | str) -> GaussianScene:
             in_box = array_from_npy(package.read(IN_BOX), f"{path}: {IN_BOX}", kinds="b")
         knot_t_us, knot_m, owners = (_array(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS))
         dynamic = DynamicGaussians(moving, knot_t_us, knot_m, owners, in_box)
-        isp_json = codec.load(package.read(ISP, MAX_JSON_BYTES), f"{path}: {ISP}")
+        isp_json = codec.load(package.read(ISP, codec.MAX_JSON_BYTES), f"{path}: {ISP}")
         isp = codec.from_json(codec.mapping(codec.array(np.float64, 3, 4)), isp_json, f"{path}: {ISP}")
         scene = GaussianScene(static=static, dynamic=dynamic, sky=_array(package, SKY), isp=isp, **facts)
     try:
@@ -199,10 +198,10 @@ def _read_manifest(package: Package) -> dict[str, Any]:
     if MANIFEST not in package.names:
         raise ArchiveError(
             f"{package.path}: {MANIFEST} is missing, so this is no scene archive of nurec_sim; "
-            "archives of other programs cannot be read"
+            "what was changed in archives of other programs cannot be told"
         )
     where = f"{package.path}: {MANIFEST}"
-    manifest = codec.load(package.read(MANIFEST, MAX_JSON_BYTES), where)
+    manifest = codec.load(package.read(MANIFEST, codec.MAX_JSON_BYTES), where)
     if not isinstance(manifest, dict) or manifest.get("format") != "nurec_sim scene archive":
         raise ArchiveError(f"{where}: not the manifest of a nurec_sim scene archive")
     if manifest.get("version") != FORMAT_VERSION:

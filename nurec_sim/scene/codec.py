@@ -36,6 +36,10 @@ from nurec_sim.types import (
 Decoder = Callable[[Any], Any]
 
 
+MAX_JSON_BYTES = 256 * 2**20
+"""Of one JSON file of an archive."""
+
+
 def to_json(value: Any) -> Any:
     """Plain JSON of a value made of the types of this module, numbers, strings, arrays, sequences and mappings."""
     if dataclasses.is_dataclass(value):

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.columns import Columns, sigmoid
 from nurec_sim.scene.harmonics import SH_C0
 from nurec_sim.scene.new_file import new_file
 from nurec_sim.scene.ply_table import VertexTable
@@ -96,25 +96,15 @@ def read_ply(path: Path | str) -> tuple[Gaussians, int]:
     logit, rest = table.columns(["opacity"]), table.columns(_rest_names(k))
     with np.errstate(over="ignore"):
         scale = np.exp(table.columns(SCALE).astype(np.float64)).astype(np.float32)
-    sound = ~np.isnan(logit[:, 0]) & (scale > 0).all(axis=1) & (np.linalg.norm(quat.astype(np.float64), axis=1) > 1e-12)
-    for values in (mean, quat, colour, scale, rest):
-        sound &= np.isfinite(values).all(axis=1)
-    n = int(sound.sum())
-    rest = rest[sound].reshape(n, 3, k).transpose(0, 2, 1)
-    view_dependent = bool(rest.any())
-    rgb = 0.5 + SH_C0 * colour[sound].astype(np.float64)
-    gaussians = Gaussians(
-        mean_m=mean[sound],
-        quat_wxyz=geometry.quat_normalize(quat[sound]).astype(np.float32),
-        scale_m=scale[sound],
-        opacity=_sigmoid(logit[sound, 0]),
-        rgb=(rgb if view_dependent else np.maximum(rgb, 0)).astype(np.float32),
-        normal=_normals(table)[sound],
-        label=_labels(table)[sound],
-        intensity=np.full(n, np.nan, np.float32),
-        sh_rest=np.ascontiguousarray(rest) if view_dependent else None,
+    columns = Columns(
+        mean_m=mean,
+        quat_wxyz=quat,
+        scale_m=scale,
+        opacity=sigmoid(logit[:, 0]),
+        dc=colour,
+        rest=rest.reshape(len(table), 3, k).transpose(0, 2, 1) if k else None,
     )
-    return gaussians, len(table) - n
+    return columns.gaussians(_labels(table), _normals(table))
 
 
 # -------------------------------------------------------------------------------------------------------- writing
@@ -178,12 +168,6 @@ def _harmonics_of(table: VertexTable) -> int:
     raise ArchiveError(
         f"{table.path}: {len(given)} properties f_rest_*; degrees 0 to 3 have 0, 9, 24 and 45, numbered from 0"
     )
-
-
-def _sigmoid(logit: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
-    # Of either sign and infinite logits alike: exp never overflows.
-    small = np.exp(-np.abs(logit.astype(np.float64)))
-    return (np.where(logit < 0, small, 1.0) / (1 + small)).astype(np.float32)
 
 
 def _normals(table: VertexTable) -> Float32[np.ndarray, "n 3"]:

@@ -29,7 +29,7 @@ from nurec_sim.types import CameraModel, Fisheye, FTheta, GaussianScene, LidarMo
 CHUNK_ID = "dummy_chunk_id"  # CARLA's client looks for this very key
 FIRST_FRAME_US = 100_000
 _FTHETA_TERMS = 6
-_SHUTTER_NAMES = {
+SHUTTER_NAMES = {
     Shutter.GLOBAL: "GLOBAL",
     Shutter.TOP_TO_BOTTOM: "ROLLING_TOP_TO_BOTTOM",
     Shutter.LEFT_TO_RIGHT: "ROLLING_LEFT_TO_RIGHT",
@@ -200,7 +200,7 @@ def _common_parameters(camera: CameraModel) -> dict[str, Any]:
     }
     return {
         "resolution": [camera.width_px, camera.height_px],
-        "shutter_type": _SHUTTER_NAMES[camera.shutter],
+        "shutter_type": SHUTTER_NAMES[camera.shutter],
         "external_distortion_parameters": distortion,
     }
 

@@ -24,6 +24,7 @@ from nurec_sim.scene.zip_package import Package
 from nurec_sim.types import Gaussians, GaussianScene, Label
 
 NAMESPACE = "nurec_sim"
+LAYER_SUFFIXES = (".usda", ".usdc", ".usd")
 STATIC_LAYER, ACTORS_LAYER, CAMERAS_LAYER = "splats_static.usdc", "splats_actors.usdc", "cameras.usdc"
 SKY_TEXTURE = "sky/envmap_latlong.exr"
 

@@ -35,6 +35,10 @@ class Source:
         """Everything that it answers to."""
         return (self.id, *self.aliases)
 
+    def is_from(self, path: Path) -> bool:
+        """Whether it comes from the file or folder ``path``, however that is spelt."""
+        return isinstance(self.origin, Path) and self.origin.resolve() == path.resolve()
+
     @property
     def kind(self) -> str:
         """``memory``, ``archive`` or ``clip``."""

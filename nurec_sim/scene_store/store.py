@@ -196,6 +196,11 @@ class SceneStore:
     # ------------------------------------------------------------------------------------------------ what is in memory
 
     @property
+    def cache_dir(self) -> Path:
+        """Where reconstructed clips are kept, and what else takes time to get again."""
+        return self._kept.folder
+
+    @property
     def capacity(self) -> int:
         """How many scenes are kept in memory."""
         return self._memory.capacity
@@ -244,14 +249,6 @@ class SceneStore:
     def get(self, name: str, progress: Progress | None = None) -> LoadedScene:
         """As ``lease``, for those who hold the scene but not its place in memory."""
         with self.lease(name, progress) as loaded:
-            return loaded
-
-    def in_memory(self, name: str) -> LoadedScene | None:
-        """As ``lease_in_memory``, for those who hold the scene but not its place in memory."""
-        lease = self.lease_in_memory(name)
-        if lease is None:
-            return None
-        with lease as loaded:
             return loaded
 
     def unload(self, name: str) -> int:

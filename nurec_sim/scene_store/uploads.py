@@ -25,7 +25,7 @@ from nurec_sim.scene_store.store import SceneStore
 
 log = logging.getLogger(__name__)
 
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,150}")
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,149}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _INCOMING = ".incoming-"
 _PLACING = ".placing.lock"
@@ -61,8 +61,12 @@ class UploadFolder:
 
     @property
     def total_bytes(self) -> int:
-        """Size of all files, those that are arriving too."""
-        return sum(path.stat().st_size for path in self.folder.iterdir() if path.is_file())
+        """Size of all files; of those that are arriving the size that was promised."""
+        total = 0
+        for path in self.folder.iterdir():
+            with contextlib.suppress(FileNotFoundError):  # it arrived, or was given up, at this moment
+                total += path.stat().st_size
+        return total
 
     @contextlib.contextmanager
     def receive(self, name: str, size: int, sha256: str, ending: str) -> Iterator[Upload]:
@@ -78,10 +82,7 @@ class UploadFolder:
             RequestError: a name, a size or a hash that cannot be; the text says which.
             TooLargeError: there is no room for so many bytes.
         """
-        if not _NAME.fullmatch(name) or not name.endswith(ending):
-            raise RequestError(
-                f"name must have up to 150 letters, digits, '_', '-' and '.' and end in {ending}, got {name[:200]!r}"
-            )
+        check_name(name, ending)
         if not _SHA256.fullmatch(sha256):
             raise RequestError(f"sha256 must have 64 hexadecimal digits in lower case, got {sha256[:100]!r}")
         if size < 1:
@@ -96,6 +97,8 @@ class UploadFolder:
         self._refuse_taken(name)
         hidden = self.folder / f"{_INCOMING}{secrets.token_hex(8)}{ending}"
         with owned_file(hidden, lambda: None) as handle, os.fdopen(handle, "wb", closefd=False) as file:
+            with out_of_room():
+                os.truncate(handle, size)  # so that it counts for whoever comes next
             yield Upload(self, file, hidden, self.folder / name, size, sha256)
 
     def place(self, hidden: Path, target: Path) -> str:
@@ -185,6 +188,20 @@ class Upload:
                 return self._folder.place(self._hidden, self._target)
         except ArchiveError as error:  # clients know the file by its own name
             raise ArchiveError(str(error).replace(str(self._hidden), self._target.name)) from error
+
+
+def check_name(name: str, ending: str = "") -> None:
+    """Refuses names that clients may not give to files and scenes.
+
+    Raises:
+        RequestError: the text says what is allowed.
+    """
+    if not _NAME.fullmatch(name) or not name.endswith(ending):
+        end = f" and end in {ending}" if ending else ""
+        raise RequestError(
+            f"name must have up to 150 letters, digits, '_', '-' and '.', begin with none of the last two{end}, "
+            f"got {name[:200]!r}"
+        )
 
 
 @contextlib.contextmanager

@@ -95,8 +95,9 @@ class Gate(grpc.aio.ServerInterceptor):
         async def behaviour(request, context: grpc.aio.ServicerContext) -> AsyncIterator:
             with self._passing(name, context):
                 await self._admit(name, context)
-                async for reply in inner(request, context):
-                    yield reply
+                async with contextlib.aclosing(inner(request, context)) as replies:
+                    async for reply in replies:
+                        yield reply
 
         return behaviour
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from nurec_sim import wire
 from nurec_sim.server.security import Tls
-
-MAX_MESSAGE_BYTES = 64 << 20
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class ServerOptions:
     """Calls that it may make at once after a pause."""
     max_calls: int = 4096
     """Calls in progress; more are refused."""
-    max_message_bytes: int = MAX_MESSAGE_BYTES
+    max_message_bytes: int = wire.MAX_MESSAGE_BYTES
     """Of a request or a reply."""
     max_unread_bytes: int = 1 << 30
     """Of replies that their clients have not taken yet; one connection may leave a quarter of it, but one reply

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -13,9 +14,9 @@ from google.protobuf import message_factory
 from google.protobuf.descriptor import MethodDescriptor
 
 from nurec_sim import wire
-from nurec_sim.calls import DeadlinePassedError, current_call
+from nurec_sim.calls import current_call
 from nurec_sim.errors import NurecSimError
-from nurec_sim.service import UnsupportedError, describe
+from nurec_sim.service import describe
 
 log = logging.getLogger(__name__)
 
@@ -92,8 +93,9 @@ def _handler(
         try:
             if prepare is not None:
                 await prepare()
-            async for reply in procedure(take(data)):
-                yield reply.SerializeToString()
+            async with contextlib.aclosing(procedure(take(data))) as replies:
+                async for reply in replies:
+                    yield reply.SerializeToString()
         except Exception as error:
             await _refuse(procedure, error, context)
 
@@ -110,16 +112,9 @@ async def _refuse(procedure: Callable, error: Exception, context: grpc.aio.Servi
     """Ends a call with the status of an error."""
     if isinstance(error, grpc.aio.AbortError):
         raise error
-    if isinstance(error, UnsupportedError):
-        code, text = grpc.StatusCode.UNIMPLEMENTED, str(error)
-    elif isinstance(error, DeadlinePassedError):
-        code, text = grpc.StatusCode.DEADLINE_EXCEEDED, str(error)
-    elif isinstance(error, NurecSimError):
-        code, text = wire.code_of(error), str(error)
-    else:
+    if not isinstance(error, NurecSimError):
         log.error("%s failed", getattr(procedure, "__name__", "a procedure"), exc_info=error)
-        code, text = grpc.StatusCode.INTERNAL, describe(error)
-    await context.abort(code, text[:_MAX_TEXT])
+    await context.abort(wire.code_of(error), describe(error)[:_MAX_TEXT])
 
 
 def _scene_of(request) -> str:

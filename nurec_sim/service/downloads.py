@@ -19,6 +19,8 @@ _CHUNK = 1 << 20
 _STALL_S = 30.0
 _ABANDONED_S = 86_400.0
 _ZIP_START = b"PK\x03\x04"
+_OURS = "[0-9a-f]" * 32 + ".usdz"
+"""What files that were fetched are called; the folder may hold others, which stay."""
 
 
 class DownloadCache:
@@ -76,7 +78,7 @@ class DownloadCache:
 
     def make_room(self) -> list[Path]:
         """Removes files beyond the capacity and says which; open ones can still be read to their end."""
-        kept = sorted(self.folder.glob("*.usdz"), key=_last_use, reverse=True)
+        kept = sorted(self.folder.glob(_OURS), key=_last_use, reverse=True)
         removed = kept[self._capacity :]
         for path in removed:
             path.unlink(missing_ok=True)
@@ -89,10 +91,11 @@ class DownloadCache:
             said = reply.headers.get("Content-Length", "")
             if said.isdigit() and int(said) > self._max_bytes:
                 raise self._too_large(url, int(said))
-            done = 0
-            while chunk := reply.read(_CHUNK):
-                if not done and not chunk.startswith(_ZIP_START):
-                    raise RequestError(f"what is at {url} is no .usdz archive: it begins with {chunk[:8]!r}")
+            done, start = 0, b""
+            while chunk := reply.read1(_CHUNK):  # what is there: to wait for more could take any time
+                start = (start + chunk)[:8]
+                if not start.startswith(_ZIP_START[: len(start)]):
+                    raise RequestError(f"what is at {url} is no .usdz archive: it begins with {start!r}")
                 done += len(chunk)
                 if done > self._max_bytes:
                     raise self._too_large(url, done)

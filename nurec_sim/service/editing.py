@@ -115,7 +115,7 @@ class Editing(ServiceCore):
             return edits.asset_of(scene, asset_id)
         scene_name, _, track_id = asset_id.partition("/")
         try:
-            with self._store.lease(scene_name) as other:
+            with self._store.lease(scene_name, self._go_on) as other:
                 return edits.asset_of(other.scene, track_id)
         except UnknownSceneError as error:
             raise UnknownSceneError(

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from nurec_sim.errors import NurecSimError, RequestError
+from nurec_sim import wire
+from nurec_sim.errors import NurecSimError
 from nurec_sim.render.requests import MAX_RAYS
 from nurec_sim.render_queue import usable_cores
 
@@ -19,8 +20,8 @@ class ServiceOptions:
     max_pixels: int = MAX_RAYS
     """Pixels, or beams, of one frame; the renderer takes no more than the default."""
     max_batch_items: int = 64
-    max_message_bytes: int = 64 << 20
-    """Of a request or a reply; AlpaSim's clients take no more."""
+    max_message_bytes: int = wire.MAX_MESSAGE_BYTES
+    """Of a request or a reply."""
     only_listed_actors: bool = False
     """Whether a request that lists actors hides the controllable ones that it does not list."""
     ego_mask_dir: Path | None = None
@@ -39,10 +40,6 @@ class ServiceOptions:
     """Of one scene."""
     download_timeout_s: float = 300.0
     """For one scene."""
-
-
-class UnsupportedError(RequestError):
-    """A procedure that the interface knows and this server does not offer."""
 
 
 def describe(error: Exception) -> str:

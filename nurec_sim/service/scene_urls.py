@@ -9,12 +9,13 @@ from __future__ import annotations
 import contextlib
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from nurec_sim.errors import NotAllowedError, NurecSimError, RequestError, UnknownSceneError
-from nurec_sim.scene_store import SceneStore, default_cache_dir
+from nurec_sim.scene_store import SceneStore
+from nurec_sim.scene_store.sources import Source, identify
 from nurec_sim.service.downloads import DownloadCache, is_web
 from nurec_sim.service.options import ServiceOptions
 
@@ -36,7 +37,7 @@ class SceneUrls:
         self._store = store
         self._allow_web = options.allow_remote_scenes
         self._cache = DownloadCache(
-            options.download_cache_dir or default_cache_dir() / "downloads",
+            options.download_cache_dir or store.cache_dir / "downloads",
             options.download_cache_size,
             options.max_download_bytes,
             options.download_timeout_s,
@@ -61,16 +62,29 @@ class SceneUrls:
         _check(url, name)
         if is_web(url) and not self._allow_web:
             raise NotAllowedError(f"this server fetches no scenes from the web, got {url}; use a file:// address")
-        with self._turns.setdefault(url, threading.Lock()):
-            try:
-                if self._served(key) is not None:
-                    return
-                path = self._cache.fetch(url) if is_web(url) else _local_path(url)
-                self._offered[key] = (self._offer(path, name), path)
-                if is_web(url):
-                    self._make_room()
-            finally:
-                self._turns.pop(url, None)
+        with self._turn(url):
+            if self._served(key) is not None:
+                return
+            path = self._cache.fetch(url) if is_web(url) else _local_path(url)
+            source = self._offer(path, name)
+            assert isinstance(source.origin, Path)
+            self._offered[key] = (source.id, source.origin)
+            if is_web(url):
+                self._make_room()
+
+    @contextlib.contextmanager
+    def _turn(self, url: str) -> Iterator[None]:
+        """One thread at a time for each address; nothing is kept of those that nobody waits for."""
+        while True:
+            lock = self._turns.setdefault(url, threading.Lock())
+            with lock:
+                if self._turns.get(url) is not lock:  # its last holder has ended meanwhile
+                    continue
+                try:
+                    yield
+                finally:
+                    del self._turns[url]
+                return
 
     def _served(self, key: tuple[str, str]) -> str | None:
         """The id of a scene that is on offer already and whose file is still there."""
@@ -82,13 +96,12 @@ class SceneUrls:
         except NurecSimError:
             return None
 
-    def _offer(self, path: Path, name: str) -> str:
-        if name:
-            with contextlib.suppress(UnknownSceneError):
-                source = self._store.source(name)
-                if source.origin == path:  # served since the start, or fetched anew after it had to make room
-                    return source.id
-        return self._store.offer(path, name)
+    def _offer(self, path: Path, name: str) -> Source:
+        with contextlib.suppress(UnknownSceneError):
+            source = self._store.source(name or identify(path).id)
+            if source.is_from(path):  # served since the start, or fetched anew after it had to make room
+                return source
+        return self._store.source(self._store.offer(path, name))
 
     def _make_room(self) -> None:
         """Scenes whose files had to go are offered no longer, unless they are being rendered."""

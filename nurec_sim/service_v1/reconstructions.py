@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 import threading
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncGenerator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -14,9 +13,9 @@ from nurec_sim.errors import GivenUpError, NurecSimError, RequestError
 from nurec_sim.reconstruct import FeedForwardSettings
 from nurec_sim.scene_store import LoadedScene, Recipe, SceneStore
 from nurec_sim.scene_store.sources import is_archive
+from nurec_sim.scene_store.uploads import check_name
 from nurec_sim.wire import nurec_sim_v1 as v1
 
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,150}")
 _LEAST_STEP = 0.005
 """Progress that is worth a message."""
 
@@ -34,6 +33,7 @@ class Reconstructions:
         self._clip_dirs = [folder.resolve() for folder in clip_dirs]
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="reconstruct")
         self._closing = threading.Event()
+        self._offering = threading.Lock()
         self._awaited: dict[str, int] = {}
         """Clients that wait, by id of scenes that would not be offered without them."""
 
@@ -42,7 +42,7 @@ class Reconstructions:
         self._closing.set()
         self._thread.shutdown(wait=True, cancel_futures=True)
 
-    async def run(self, request) -> AsyncIterator:
+    async def run(self, request) -> AsyncGenerator:
         """The events of a ``ReconstructClipRequest``: progress, then the scene.
 
         When the client leaves, the work ends at its next step, and the store offers no more than before.
@@ -90,15 +90,15 @@ class Reconstructions:
 
     def _offer(self, request) -> tuple[str, bool]:
         """The id of the scene that the request is for, and whether it was not offered before."""
-        if request.name and not _NAME.fullmatch(request.name):
-            raise RequestError(f"name must have letters, digits, '_', '-' and '.', got {request.name[:200]!r}")
+        if request.name:
+            check_name(request.name)
         path, own_recipe = self._clip(request)
         recipe = _recipe(request) or own_recipe
-        for source in self._store.sources:
-            same_clip = isinstance(source.origin, Path) and source.origin.resolve() == path.resolve()
-            if same_clip and source.recipe == recipe and request.name in ("", *source.names):
-                return source.id, False
-        return self._store.offer(path, request.name, recipe), True
+        with self._offering:  # of two clients that want the same, one offers it and both wait for it
+            for source in self._store.sources:
+                if source.is_from(path) and source.recipe == recipe and request.name in ("", *source.names):
+                    return source.id, False
+            return self._store.offer(path, request.name, recipe), True
 
     def _clip(self, request) -> tuple[Path, Recipe | None]:
         kind = request.WhichOneof("clip")

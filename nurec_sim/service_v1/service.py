@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, aclosing
 
 from nurec_sim import wire
-from nurec_sim.errors import RequestError, TooLargeError
+from nurec_sim.errors import RequestError, TooLargeError, UnsupportedError
 from nurec_sim.scene_store import SceneStore, Upload, UploadFolder
-from nurec_sim.service import SensorService, UnsupportedError
+from nurec_sim.service import SensorService
 from nurec_sim.service_v1.frames import Frames
 from nurec_sim.service_v1.options import SceneOptions
 from nurec_sim.service_v1.reconstructions import Reconstructions
@@ -148,14 +148,11 @@ class SceneService:
 
     # ------------------------------------------------------------------------------------- reconstruction and rendering
 
-    async def reconstruct_clip(self, request) -> AsyncIterator:
+    async def reconstruct_clip(self, request) -> AsyncGenerator:
         """Progress, then the scene."""
-        events = self._reconstructions.run(request)
-        try:
+        async with aclosing(self._reconstructions.run(request)) as events:
             async for event in events:
                 yield event
-        finally:
-            await events.aclose()  # type: ignore[attr-defined]
 
     async def render_camera(self, request):
         """One camera frame."""

@@ -129,12 +129,13 @@ def _with_sky_mlp(config: TrainingConfig) -> TrainingConfig:
 
 
 def _without(*losses: str) -> Callable[[TrainingConfig], TrainingConfig]:
-    def change(config: TrainingConfig) -> TrainingConfig:
-        none = dict.fromkeys(losses, 0.0)
-        stages = (s.model_copy(update={"losses": s.losses.model_copy(update=none)}) for s in config.stages)
-        return config.model_copy(update={"stages": tuple(stages)})
+    """Stages that do not compute a loss are left as they are: variants then share them."""
 
-    return change
+    def without(stage: Stage) -> Stage:
+        none = {name: 0.0 for name in losses if _applies(name, stage)}
+        return stage.model_copy(update={"losses": stage.losses.model_copy(update=none)}) if none else stage
+
+    return lambda config: config.model_copy(update={"stages": tuple(without(stage) for stage in config.stages)})
 
 
 def _unchanged(config: TrainingConfig) -> TrainingConfig:

@@ -29,6 +29,7 @@ class AugmentSettings:
     """How much colours change: standard deviations (of logarithms for factors), or shares of samples.
 
     Attributes:
+        clean: share of samples that stay as they are.
         brightness: mean of all images, 0..1, towards which exposure goes half of the way.
         light: brightness of the world beside that.
         tint: of each colour channel of the world.
@@ -46,6 +47,7 @@ class AugmentSettings:
         jpeg_quality: least and most of their quality.
     """
 
+    clean: float = 0.1
     brightness: float = 0.38
     light: float = 0.25
     tint: float = 0.05
@@ -83,6 +85,8 @@ class _Response:
 
 def augmented(rng: np.random.Generator, sample: TrainingSample, settings: AugmentSettings) -> TrainingSample:
     """The sample in other colours; shapes and geometry stay."""
+    if rng.random() < settings.clean:
+        return sample
     cameras = sample.inputs.camera_idxs[0].tolist()
     world = _world_look(rng, float(sample.inputs.rgb.mean()), settings)
     responses = {camera: _response(rng, world, settings) for camera in sorted(set(cameras))}
@@ -123,10 +127,10 @@ def _spoilt(rng: np.random.Generator, image: Image, noise: float, quality: int |
         image = np.clip(image + spread * rng.standard_normal(image.shape, np.float32), 0, 1).astype(np.float32)
     if quality is None:
         return image
-    pressed = cv2.imencode(
-        ".jpg", np.rint(image[..., ::-1] * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality]
-    )
-    return cv2.imdecode(pressed[1], cv2.IMREAD_COLOR)[..., ::-1].astype(np.float32) / 255
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    pressed = cv2.imencode(".jpg", np.rint(image[..., ::-1] * 255).astype(np.uint8), options)[1]
+    unpacked = np.asarray(cv2.imdecode(pressed, cv2.IMREAD_COLOR), np.float32)
+    return np.ascontiguousarray(unpacked[..., ::-1]) / 255
 
 
 def _seen(target: TargetView, response: _Response) -> TargetView:

@@ -212,6 +212,7 @@ def _ended(process: BaseProcess) -> int | None:
 
 
 def is_alive(process_id: int) -> bool:
+    """Whether a process of this machine runs."""
     try:
         os.kill(process_id, 0)
     except ProcessLookupError:

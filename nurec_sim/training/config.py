@@ -48,8 +48,8 @@ class LossWeights(_Strict):
 class Stage(_Strict):
     """One stage of the curriculum: which parts of the network learn, for how long, from what.
 
-    The learning rate rises over ``warm_up`` steps and falls by a cosine to ``final_rate`` of its peak. ``targets`` views
-    are rendered per step, none if 0. ``pixels`` is about how many an input image has.
+    The learning rate rises over ``warm_up`` steps and falls by a cosine to ``final_rate`` of its peak. ``targets``
+    views are rendered per step, none if 0. ``pixels`` is about how many an input image has.
     """
 
     name: str = Field(min_length=1, pattern=r"^[a-z0-9_]+$")

@@ -52,7 +52,7 @@ def context_losses(
 
 
 def motion_loss(motion_m: Float[Tensor, "b v h w 2 3"], truth: TrueMaps) -> Tensor:
-    """L1 of the displacements, metres; points that move and points that stand are averaged apart (paper section 4.1)."""
+    """L1 of the displacements, metres; points that move and that stand are averaged apart (paper section 4.1)."""
     error = (motion_m - truth.motion_m).abs().sum(-1)
     moves = truth.motion_m.norm(dim=-1) > MOVED_M
     known = truth.motion_known[..., None].expand_as(moves)

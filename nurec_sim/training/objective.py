@@ -18,7 +18,7 @@ from nurec_sim.training.sample import TrainingSample
 
 PREFIXES: Mapping[Part, tuple[str, ...]] = {
     "encoder": ("encoder.",),
-    "context": ("decoder.depth_head.", "decoder.rgb_fusion.", "decoder.context_head."),
+    "context": ("decoder.depth_head.", "decoder.depth_fusion.", "decoder.rgb_fusion.", "decoder.context_head."),
     "motion": ("decoder.context_motion_head.",),
     "sky": ("sky.",),
     "gaussians": ("decoder.gaussians_head.", "decoder.xyz_embed.", "decoder.ca_", "decoder.gs_linear."),
@@ -85,7 +85,7 @@ class Objective(nn.Module):
         with torch.autocast(inputs.rgb.device.type, self.precision, enabled=self.precision is not torch.float32):
             frozen = "encoder" not in stage.trains
             with torch.no_grad() if frozen else contextlib.nullcontext():
-                features = model.encoder(inputs.rgb, inputs.c2w, inputs.fov, inputs.rays)
+                features = model.features(inputs)
             motion = "motion" in stage.trains or stage.targets > 0
             context = model.decoder.context(features, inputs, motion)
             if stage.targets:

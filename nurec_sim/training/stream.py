@@ -11,7 +11,7 @@ import hashlib
 import multiprocessing
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
@@ -86,9 +86,9 @@ class SampleStream:
         if min(seed, start, workers, rank) < 0 or rank >= world_size:
             raise ValueError("seed, start, workers and rank must not be negative, and rank below world_size; got "
                              f"{seed}, {start}, {workers}, {rank} of {world_size}")  # fmt: skip
-        self._draw: Callable[[int], tuple] = lambda index: (folder, settings, seed, index)
-        self._folder, self._rank, self._world_size, self._wait_s = folder, rank, world_size, wait_s
-        self._next, self._depth = start, AHEAD * max(workers, 1)
+        self._folder, self._settings, self._seed, self._wait_s = folder, settings, seed, wait_s
+        self._next, self._stride = start * world_size + rank, world_size
+        self._depth = AHEAD * max(workers, 1)
         self._ahead: deque[Future[TrainingSample]] = deque()
         self._workers: Executor = (
             ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_prepare_worker)
@@ -109,9 +109,9 @@ class SampleStream:
         while not self._ahead and not ready_clips(self._folder) and time.monotonic() < deadline:
             time.sleep(EMPTY_PAUSE_S)
         while len(self._ahead) < self._depth:
-            index = self._next * self._world_size + self._rank
-            self._ahead.append(self._workers.submit(draw_sample, *self._draw(index)))
-            self._next += 1
+            coming = self._workers.submit(draw_sample, self._folder, self._settings, self._seed, self._next)
+            self._ahead.append(coming)
+            self._next += self._stride
         return self._ahead.popleft().result()
 
     def __enter__(self) -> SampleStream:

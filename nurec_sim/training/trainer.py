@@ -1,8 +1,8 @@
 """The training loop: stages one after the other, curves, checkpoints and sample renders in a run folder.
 
-A run folder holds ``recipe.json``, ``curves.csv`` (and as pictures), ``checkpoint.safetensors`` (to go on), ``weights.safetensors`` (the
-moving average in half precision, to use) and ``samples/``. Under torchrun every process takes its own samples, and
-gradients are averaged by DDP; only the first process writes.
+A run folder holds ``recipe.json``, ``curves.csv`` (and as pictures), ``checkpoint.safetensors`` (to go on),
+``weights.safetensors`` (the moving average in half precision, to use) and ``samples/``. Under torchrun every process
+takes its own samples, and gradients are averaged by DDP; only the first process writes.
 """
 
 from __future__ import annotations

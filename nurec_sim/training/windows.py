@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -28,9 +27,9 @@ class WindowSettings:
             takes about ``width_px * height_px`` pixels).
         cameras: weight of each number of cameras; those that a rig does not have are left out.
         frames: weight of each number of context frames per camera.
-        spacing_s: from which context frames are taken so far apart, evenly, unless ``usual_share`` says otherwise.
-        usual_spacing_s: spacing of the protocol ``storm``: four frames in two seconds.
-        usual_share: how often it is used.
+        usual_share: how often context frames lie ``usual_spacing_s`` apart.
+        usual_spacing_s: as in the protocol ``storm``, with four frames in two seconds.
+        spacing_s: otherwise, least and most time from one context frame to the next.
         most_images: of all cameras together; samples of more get fewer frames per camera.
         targets: held-out frames to be rendered.
         zoom: most that images are magnified by cutting away their border; 1 keeps them whole.
@@ -41,9 +40,9 @@ class WindowSettings:
     profile: Profile = PROFILES["tiny"]
     cameras: Mapping[int, float] = field(default_factory=lambda: {1: 0.5, 3: 0.4, 5: 0.1})
     frames: Mapping[int, float] = field(default_factory=lambda: {2: 0.1, 3: 0.1, 4: 0.6, 5: 0.1, 6: 0.05, 8: 0.05})
-    spacing_s: tuple[float, float] = (0.1, 0.6)
-    usual_spacing_s: float = 0.5
     usual_share: float = 0.6
+    usual_spacing_s: float = 0.5
+    spacing_s: tuple[float, float] = (0.1, 0.6)
     most_images: int = 12
     targets: int = 4
     zoom: float = 1.4
@@ -142,8 +141,3 @@ def _reframed(
 def _drawn(rng: np.random.Generator, weights: Mapping[int, float]) -> int:
     values = np.array(list(weights.values()), np.float64)
     return int(rng.choice(list(weights), p=values / values.sum()))
-
-
-def with_pixels(profile: Profile, width_px: int, height_px: int) -> Profile:
-    """The profile for images of another size, at the same network."""
-    return dataclasses.replace(profile, width_px=width_px, height_px=height_px)

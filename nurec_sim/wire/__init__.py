@@ -4,6 +4,7 @@ Nothing outside this folder knows what a message looks like, except that ``servi
 """
 
 from nurec_sim.wire.messages import (
+    MAX_MESSAGE_BYTES,
     METHODS,
     SCENE_SERVICE,
     SERVICE,
@@ -52,6 +53,7 @@ from nurec_sim.wire.sensors import (
 from nurec_sim.wire.status import code_of, error_of, number_of
 
 __all__ = [
+    "MAX_MESSAGE_BYTES",
     "METHODS",
     "SCENE_SERVICE",
     "SERVICE",

@@ -24,6 +24,9 @@ SERVICE_PATHS = (SERVICE, "nurec.grpc.protos.sensorsim.SensorsimService", "senso
 """The spellings in use: clients up to 26.09 and AlpaSim; the two that the documentation of 26.10 leaves open."""
 SCENE_SERVICE = "nurec_sim.v1.SceneService"
 
+MAX_MESSAGE_BYTES = 64 << 20
+"""Of a request or a reply, unless a server is told otherwise; AlpaSim's clients take no more."""
+
 
 class Method(NamedTuple):
     """Request and reply class of one remote procedure."""

@@ -11,6 +11,7 @@ _CODES: tuple[tuple[type[errors.NurecSimError], grpc.StatusCode], ...] = (
     (errors.OutOfRangeError, grpc.StatusCode.OUT_OF_RANGE),
     (errors.TooLargeError, grpc.StatusCode.RESOURCE_EXHAUSTED),
     (errors.NotAllowedError, grpc.StatusCode.PERMISSION_DENIED),
+    (errors.UnsupportedError, grpc.StatusCode.UNIMPLEMENTED),
     (errors.RequestError, grpc.StatusCode.INVALID_ARGUMENT),
     (errors.ArchiveError, grpc.StatusCode.FAILED_PRECONDITION),
     (errors.ClipError, grpc.StatusCode.FAILED_PRECONDITION),
@@ -18,11 +19,14 @@ _CODES: tuple[tuple[type[errors.NurecSimError], grpc.StatusCode], ...] = (
     (errors.WeightsError, grpc.StatusCode.FAILED_PRECONDITION),
     (errors.SceneInUseError, grpc.StatusCode.FAILED_PRECONDITION),
     (errors.GivenUpError, grpc.StatusCode.CANCELLED),
+    (errors.DeadlinePassedError, grpc.StatusCode.DEADLINE_EXCEEDED),
     (errors.UnknownSessionError, grpc.StatusCode.NOT_FOUND),
     (errors.SessionExistsError, grpc.StatusCode.ALREADY_EXISTS),
     (errors.SessionError, grpc.StatusCode.FAILED_PRECONDITION),
     (errors.PlanError, grpc.StatusCode.ABORTED),
 )
+_GRPC_SAYS_TOO = (grpc.StatusCode.UNIMPLEMENTED, grpc.StatusCode.DEADLINE_EXCEEDED)
+"""What clients also get from servers that were never reached, or are not ours; to them it is a ``ServerError``."""
 _CODE_OF_NUMBER = {code.value[0]: code for code in grpc.StatusCode}
 
 
@@ -40,5 +44,5 @@ def error_of(code: grpc.StatusCode | int, text: str) -> errors.NurecSimError:
     """The error that a status stands for; ``ServerError`` where it stands for none of ours."""
     if isinstance(code, int):
         code = _CODE_OF_NUMBER.get(code, grpc.StatusCode.UNKNOWN)
-    kind = next((kind for kind, known in _CODES if known is code), None)
+    kind = next((kind for kind, known in _CODES if known is code and code not in _GRPC_SAYS_TOO), None)
     return kind(text) if kind else errors.ServerError(f"{code.name}: {text}")

@@ -52,6 +52,7 @@ class ActorBuilder:
     def __init__(self, builder: SpecBuilder, plan: TownPlan):
         self.builder, self.plan = builder, plan
         self._vehicles: dict[str, tuple[tuple[float, float, float], dict[str, Corners]]] = {}
+        self._shadows: set[str] = set()
         self._limbs: dict[tuple[str, bool], Corners] = {}
 
     def add(self, actor: Actor, instance: int) -> Gait | None:
@@ -79,18 +80,25 @@ class ActorBuilder:
             mesh = self.builder.shared_mesh(corners, stretch)
             self.builder.place(body, mesh, SurfaceClass.VEHICLE, looks.get(name, name), instance=instance, tint=tint,
                                reflectivity=LASER_OF_PART.get(name))  # fmt: skip
-        half_l, half_w, ground = actor.size_m[0] / 2 + 0.5, actor.size_m[1] / 2 + 0.5, 0.02 - actor.size_m[2] / 2
-        shadow = MeshBuilder()
-        shadow.quad([-half_l, -half_w, ground], [half_l, -half_w, ground], [half_l, half_w, ground],
-                    [-half_l, half_w, ground], ((0, 0), (0, 1), (1, 1), (1, 0)))  # fmt: skip
-        self.builder.place(body, shadow, SurfaceClass.ROAD, f"shadow_{actor.kind}", decal=True)
+        self._shadow(body, actor, *actor.size_m[:2])
+
+    def _shadow(self, body: Any, actor: Actor, length_m: float, width_m: float) -> None:
+        """The dark ground below something of this size."""
+        material = f"shadow_{actor.kind}"
+        if material not in self._shadows:
+            self._shadows.add(material)
+            self.builder.material(material, textures_ground.contact_shadow(length_m, width_m))
+        half_l, half_w, ground = length_m / 2 + 0.5, width_m / 2 + 0.5, 0.02 - actor.size_m[2] / 2
+        mesh = MeshBuilder()
+        mesh.quad([-half_l, -half_w, ground], [half_l, -half_w, ground], [half_l, half_w, ground],
+                  [-half_l, half_w, ground], ((0, 0), (0, 1), (1, 1), (1, 0)))  # fmt: skip
+        self.builder.place(body, mesh, SurfaceClass.ROAD, material, decal=True)
 
     def _paint(self, actor: Actor) -> None:
-        """The family's paint and contact shadow, made for the first of its vehicles."""
+        """The family's paint, made for the first of its vehicles."""
         rng = np.random.default_rng([self.plan.style.texture_seed, 8, *actor.kind.encode()])
         atlas = textures_vehicles.body_atlas(rng, FAMILIES[actor.kind], actor.size_m)
         self.builder.material(f"paint_{actor.kind}", atlas, shine=0.8)
-        self.builder.material(f"shadow_{actor.kind}", textures_ground.contact_shadow(*actor.size_m[:2]))
 
     # ------------------------------------------------------------------------------------------------------- people
 
@@ -127,6 +135,7 @@ class ActorBuilder:
             colour = tuple(float(c) for c in rng.uniform(0.08, 0.85, 3))
             place(wheels, bicycle["frame"].corners(SMOOTH_DEG), "cycle", colour)
             place(wheels, bicycle["tyres"].corners(SMOOTH_DEG), "trim")
+        self._shadow(body, actor, 1.5 if rides else 0.45, 0.4)
         path = np.array(actor.path, np.float64)
         step = np.linalg.norm(np.diff(path[:, 1:3], axis=0), axis=1)
         return Gait(actor.kind, joints, path[:, 0], np.concatenate([[0.0], np.cumsum(step)]),

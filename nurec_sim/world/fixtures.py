@@ -141,7 +141,8 @@ def _billboard(prop: Prop) -> Iterator[Part]:
     for y in (-1.2, 1.2):
         frame.cylinder([0.05, y, -0.6], [0.05, y, 2.2], 0.06, sides=8)
     frame.box([0.06, 0, 3.2], [0.05, 1.95, 1.05])
-    board.quad([-0.005, 1.85, 2.25], [-0.005, -1.85, 2.25], [-0.005, -1.85, 4.15], [-0.005, 1.85, 4.15])
+    for x, side in ((-0.005, 1.85), (0.115, -1.85)):  # one picture for each direction
+        board.quad([x, side, 2.25], [x, -side, 2.25], [x, -side, 4.15], [x, side, 4.15])
     yield frame, _FURNITURE, "metal"
     yield board, _FURNITURE, f"billboard{prop.variant % 2}"
 

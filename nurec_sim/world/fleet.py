@@ -69,7 +69,10 @@ def parked_cars(
                 kind = pick_kind(rng, split, parked=True)
                 size = pick_size(rng, kind)
                 room = float(rng.uniform(0.9, 2.6))
-                ends, station = (station, station + size[0]), station + size[0] + room
+                # On the inside of a bend a metre of the strip is more than a metre of stations.
+                strip = road.at(np.array([station, station + 1.0]), road.edge_m(side, station))[0]
+                per_m = max(1.0, 1.0 / float(np.linalg.norm(strip[1] - strip[0])))
+                ends, station = (station, station + size[0] * per_m), station + (size[0] + room) * per_m
                 out, turn, taken = abs(float(rng.normal(0, 0.04))), float(rng.normal(0, 0.012)), rng.random() < full
                 narrow = float(road.strip_width_m(side, np.array(ends)).min()) < size[1] + 0.1
                 if not taken or narrow or any(ends[0] < high and low < ends[1] for low, high in kept_free):

@@ -1,7 +1,7 @@
 """Cutting areas of a plan into triangles so small that they follow the rolling ground.
 
 All areas are cut along one lattice, so that neighbouring surfaces meet without gaps and paint stays above asphalt: the
-plane through a triangle's corners lies within 2 mm of the smooth terrain (waves of 140 m and more, slopes up to 6 %).
+plane through a triangle's corners lies within 4 mm of the smooth terrain (waves of 140 m and more, slopes up to 6 %).
 """
 
 from __future__ import annotations

@@ -146,7 +146,7 @@ def _wear(chunks: Chunks, network: TownNetwork, rng: np.random.Generator, wetnes
         across = np.array([-0.5, -0.25, 0.0, 0.25, 0.5]) * min(lane.width_m, 3.4)
         xy = line[:, None] + across[:, None] * side[:, None]
         uv = np.stack(np.broadcast_arrays(np.linspace(0, 1, 5)[None], station[:, None] / 12.0), axis=-1)
-        _decal_grid(chunks, network, xy[:, ::-1], uv[:, ::-1], "tracks")
+        _decal_grid(chunks, network, xy, uv, "tracks")
     kinds = [("stains", 3.2, 90.0), ("seams", 4.5, 160.0), ("manhole", 0.68, 420.0)]
     if wetness > 0:
         kinds.append(("puddles", 5.5, 70.0 / wetness))
@@ -164,6 +164,18 @@ def _wear(chunks: Chunks, network: TownNetwork, rng: np.random.Generator, wetnes
                 lattice = place + t[:, None, None] * x + t[None, :, None] * y
                 uv = np.stack(np.meshgrid(t / size + 0.5, t / size + 0.5, indexing="ij"), axis=-1)
                 _decal_grid(chunks, network, lattice, uv, material)
+
+
+def add_light_pools(chunks: Chunks, network: TownNetwork) -> None:
+    """The light of street lamps on the road and the sidewalk below them."""
+    for prop in network.plan.props:
+        if prop.kind != "lamp":
+            continue
+        towards = np.array([-np.sin(prop.yaw_rad), np.cos(prop.yaw_rad)])
+        t = np.linspace(-6.5, 6.5, 8)
+        lattice = np.array([prop.x_m, prop.y_m]) + 1.8 * towards + np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1)
+        uv = np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1) / 13.0 + 0.5
+        _decal_grid(chunks, network, lattice, uv, "light_pool")
 
 
 def _decal_grid(chunks: Chunks, network: TownNetwork, xy: Float64[np.ndarray, "n m 2"], uv: np.ndarray,

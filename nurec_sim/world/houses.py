@@ -47,7 +47,7 @@ def add_house(chunks: Chunks, house: Building, terrain: Terrain, kerb_m: float, 
     here, pose = (house.x_m, house.y_m), pose_from_xyyaw(house.x_m, house.y_m, house.yaw_rad, floor)
     variant = house.facade % 4
     material = f"facade_{house.family}{variant}"
-    tint = tuple(round(float(c), 2) for c in house.tint)
+    tint = tuple(round(0.5 + 0.5 * float(c), 2) for c in house.tint)  # walls of one colour, not of many
     parts = ((mesh.facade, material, tint), (mesh.shop, f"shop{house.facade % 2}", (1.0, 1.0, 1.0)),
              (mesh.roof, f"roof{house.facade % 2}", (1.0, 1.0, 1.0)), (mesh.trim, "concrete", (1.0, 1.0, 1.0)),
              (mesh.dark, "metal", (1.0, 1.0, 1.0)))  # fmt: skip

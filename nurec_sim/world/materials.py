@@ -12,6 +12,8 @@ from nurec_sim.world.weather import illumination
 
 WET_DARKER = 0.45
 """How much of its light a soaked road swallows."""
+LAMPS_ON = 0.7
+"""From this dusk on lamps and rooms are lit."""
 
 
 def add_materials(builder: SpecBuilder, plan: TownPlan, sky: Sky) -> None:
@@ -42,6 +44,8 @@ def _ground(builder: SpecBuilder, plan: TownPlan, sky: Sky) -> None:
     builder.material("stains", textures_ground.stains(rng))
     builder.material("seams", textures_ground.seams(rng), shine=0.2)
     builder.material("manhole", textures_ground.manhole(rng), shine=0.3)
+    if plan.weather.dusk > LAMPS_ON:
+        builder.material("light_pool", textures_ground.light_pool(), glow=1.0)
     if wet > 0:
         mirrored = 0.5 * (sky.horizon + np.asarray(sky.colours.zenith))
         builder.material("puddles", textures_ground.puddles(rng, tuple(mirrored)), glow=0.35)
@@ -51,7 +55,7 @@ def _facades(builder: SpecBuilder, plan: TownPlan) -> None:
     dusk = plan.weather.dusk
     lit = 0.03 + 0.37 * dusk
     level = sum(illumination(plan.weather).ambient) / 3 + 0.06
-    glow = 0.72 if dusk > 0.7 else 0.0
+    glow = 0.72 if dusk > LAMPS_ON else 0.0
     night = glow / level
     wanted = sorted({(house.family, house.facade % 4) for house in plan.buildings})
     for family, variant in wanted:
@@ -71,7 +75,7 @@ def _plants(builder: SpecBuilder, plan: TownPlan) -> None:
     for i, family in enumerate(plan.style.foliages):
         builder.material(f"plant{i}", textures_plants.plant(rng, family))
     builder.material("hedge", textures_plants.plant(rng, "broadleaf"))
-    builder.material("forest", textures_plants.plant(rng, "broadleaf", 128), (0.72, 0.78, 0.82))
+    builder.material("forest", textures_plants.plant(rng, "broadleaf", 128), (0.56, 0.62, 0.68))
 
 
 def _furniture(builder: SpecBuilder, plan: TownPlan) -> None:
@@ -86,10 +90,10 @@ def _furniture(builder: SpecBuilder, plan: TownPlan) -> None:
     for i, colour in enumerate(((0.62, 0.10, 0.08), (0.12, 0.26, 0.16), (0.30, 0.31, 0.33))):
         builder.material(f"plastic{i}", colour=colour, shine=0.25)
     for picture in SIGNS:
-        builder.material(f"sign_{picture}", textures_signs.sign(rng, picture), glow=0.08 + 0.2 * dusk)
+        builder.material(f"sign_{picture}", textures_signs.sign(rng, picture), glow=0.22 + 0.15 * dusk)
     for i in range(2):
         builder.material(f"billboard{i}", textures_signs.billboard(rng), glow=0.05 + 0.5 * dusk)
-    builder.material("lamp", colour=(0.98, 0.90, 0.72), glow=1.0 if dusk > 0.7 else 0.1)
+    builder.material("lamp", colour=(0.98, 0.90, 0.72), glow=1.0 if dusk > LAMPS_ON else 0.1)
     for name, colour in (("red", (0.98, 0.10, 0.06)), ("amber", (1.0, 0.62, 0.06)), ("green", (0.10, 0.92, 0.42))):
         builder.material(f"light_{name}", colour=colour, glow=0.9)
     builder.material("light_off", colour=(0.09, 0.09, 0.10), shine=0.4)
@@ -98,7 +102,7 @@ def _furniture(builder: SpecBuilder, plan: TownPlan) -> None:
 def _vehicles(builder: SpecBuilder, plan: TownPlan) -> None:
     rng, weather = _stream(plan, 6), plan.weather
     # Lamps are on in fog, rain and dusk.
-    on = 1.0 if weather.dusk > 0.7 or weather.preset in ("foggy", "wet") else 0.0
+    on = 1.0 if weather.dusk > LAMPS_ON or weather.preset in ("foggy", "wet") else 0.0
     builder.material("glass", textures_vehicles.window(rng), shine=0.9)
     builder.material("cycle", shine=0.6)
     builder.material("trim", colour=(0.075, 0.075, 0.08), shine=0.25)

@@ -5,6 +5,7 @@ Front faces wind counter-clockwise; OpenGL culls back faces, so a wrong winding 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -58,7 +59,7 @@ class MeshBuilder:
         self._points = [points * scale + shift for points in self._points]
 
     def add(self, points: ArrayLike, faces: ArrayLike, uv: ArrayLike, normals: ArrayLike | None = None) -> None:
-        """Triangles ``faces [m,3]`` over ``points [n,3]`` with ``uv [n,2]``; ``normals [n,3]`` replace computed ones."""
+        """Triangles ``faces [m,3]`` over ``points [n,3]`` with ``uv [n,2]``; ``normals [n,3]`` replace smooth ones."""
         vertices = np.asarray(points, np.float64)
         self._points.append(vertices)
         self._uv.append(np.asarray(uv, np.float64))
@@ -184,9 +185,17 @@ class MeshBuilder:
         place = points[faces].reshape(-1, 3)
         smooth = np.repeat(normal / area[:, None], 3, axis=0)
         if crease_deg > 0:
-            smooth = _smoothed(place, smooth, np.repeat(normal, 3, axis=0), np.cos(np.deg2rad(crease_deg)))
+            smooth = _smoothed(place, smooth, smooth * _corner_angles(place)[:, None], np.cos(np.deg2rad(crease_deg)))
         given = np.concatenate(self._normals)[faces].reshape(-1, 3)
         return place, np.where(np.isnan(given), smooth, given), uv[faces].reshape(-1, 2)
+
+
+def _corner_angles(place: np.ndarray) -> np.ndarray:
+    """Angle of each triangle at each of its corners: weights that do not depend on how quads are cut in two."""
+    corner = place.reshape(-1, 3, 3)
+    ahead, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
+    lengths = np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2)
+    return np.arccos(np.clip(np.einsum("nci,nci->nc", ahead, back) / np.maximum(lengths, 1e-12), -1, 1)).ravel()
 
 
 def _smoothed(place: np.ndarray, own: np.ndarray, weighted: np.ndarray, limit: float) -> np.ndarray:
@@ -207,6 +216,7 @@ def _smoothed(place: np.ndarray, own: np.ndarray, weighted: np.ndarray, limit: f
     return smooth
 
 
+@functools.cache
 def icosphere(subdivisions: int) -> tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, "m 3"]]:
     """A unit sphere of near-equal triangles."""
     t = (1 + 5**0.5) / 2

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from nurec_sim.types import RoadMap
 from nurec_sim.world.junctions import Mouth
 from nurec_sim.world.markings import Marking, town_markings
-from nurec_sim.world.pavement import QUARTER_SEGMENTS, drivable_area, junction_core, mouths
+from nurec_sim.world.pavement import GRID_M, QUARTER_SEGMENTS, SMOOTH_M, drivable_area, mouths
 from nurec_sim.world.plan import TownPlan
 from nurec_sim.world.road import RoadLanes, RoadLine
 
@@ -22,9 +22,9 @@ from nurec_sim.world.road import RoadLanes, RoadLine
 class Lane:
     """A lane of a road (``<road>:<number>``) or a path through a junction (``<junction>:<k>``), in driving direction.
 
-    ``polyline`` lies on the ground, with points at most 1 m apart. Paths end exactly where their successor begins.
-    ``width_m`` is that of the narrowest place.
-    ``turn`` and ``junction`` are of paths only; a lane that ends at a junction names it in ``ends_at``.
+    ``polyline`` lies on the ground, with points at most 1 m apart; it ends exactly where its successors begin.
+    ``width_m`` is that of the narrowest place. ``road`` is the lane's road or the path's junction, ``turn`` is
+    ``straight``, ``left`` or ``right`` on paths, and ``ends_at`` is the junction that a lane of a road leads to.
     """
 
     id: str
@@ -35,7 +35,6 @@ class Lane:
     successors: tuple[str, ...]
     in_junction: bool
     turn: str = ""
-    junction: str = ""
     ends_at: str = ""
 
     @property
@@ -45,7 +44,7 @@ class Lane:
 
 
 class TownNetwork:
-    """Areas are shapely geometry in metres, seen from above; ``height_m`` and ``ground`` lift them to the terrain.
+    """Areas are shapely geometry in metres, seen from above; ``ground.ground_triangles`` cuts them to fit the terrain.
 
     Attributes:
         roads: by id, the centre line and cross-section of every road.
@@ -93,18 +92,13 @@ class TownNetwork:
         return self._grown(kerb.width_m + kerb.sidewalk_width_m)
 
     @cached_property
-    def junction_areas(self) -> dict[str, shapely.Geometry]:
-        """What lies between the mouths of each junction."""
-        return {j.id: junction_core(j, self.roads).intersection(self.surface) for j in self.plan.junctions}
-
-    @cached_property
     def markings(self) -> tuple[Marking, ...]:
         """All paint, in pieces no longer than about 20 m."""
         return town_markings(self.plan, self.roads, self.junction_mouths, self.surface)
 
     def _grown(self, by_m: float) -> shapely.Geometry:
         grown = shapely.buffer(self.surface, by_m, quad_segs=QUARTER_SEGMENTS)
-        return shapely.set_precision(grown.simplify(0.004), 1e-4)
+        return shapely.set_precision(grown.simplify(SMOOTH_M), GRID_M)
 
     # --------------------------------------------------------------------------------------------------------- lanes
 
@@ -146,7 +140,6 @@ class TownNetwork:
                 successors=(path.to_lane,),
                 in_junction=True,
                 turn=path.turn,
-                junction=junction.id,
             )
 
     def _on_ground(self, xy: Float64[np.ndarray, "k 2"]) -> Float64[np.ndarray, "k 3"]:

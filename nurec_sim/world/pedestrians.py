@@ -8,19 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from jaxtyping import Float64
+from scipy.spatial.distance import cdist
 
 from nurec_sim import geometry
 from nurec_sim.world.boxes import Boxes, standing
 from nurec_sim.world.fleet import pick_colour
 from nurec_sim.world.network import TownNetwork
-from nurec_sim.world.plan import Crossing
+from nurec_sim.world.plan import Crossing, Kerb
 
 SIZE_M = (0.9, 0.62, 1.74)
 PACE_MPS = (0.9, 1.7)
 NEAR_M = 45.0
 """People walk within this distance of where the ego drives; further away nobody sees them."""
-BESIDE_KERB = {1: 0.36, -1: 0.74}
-"""Where on the sidewalk one walks, by direction along its edge, so that people pass each other."""
+BEHIND_TREES_M, BEFORE_BENCHES_M = 1.3, 1.1
+"""Lamps and trees stand within this distance of the kerb, benches and bus stops within this one of the other edge."""
+ROOM_M = {"bus_stop": 1.3, "bench": 0.9, "billboard": 1.5}
+USUAL_ROOM_M = 0.45
+"""How far people keep from the middle of what stands about, by its kind."""
 WALKERS = (3, 8)
 CROSSERS = (0.5, 0.35, 0.15)
 """How often nobody, one or two people use a crossing nearby."""
@@ -79,10 +83,8 @@ def _on_sidewalks(
     rng: np.random.Generator, network: TownNetwork, way: shapely.LineString, t_s: np.ndarray, count: int
 ) -> list[Walker]:
     kerb = network.plan.kerb
-    rings = {
-        direction: _rings(network.surface.buffer(kerb.width_m + share * kerb.sidewalk_width_m))
-        for direction, share in BESIDE_KERB.items()
-    }
+    near, far = _walking_m(kerb)
+    rings = {direction: _rings(network.surface.buffer(kerb.width_m + m)) for direction, m in ((1, near), (-1, far))}
     walkable = network.sidewalk.buffer(0.05)
     shapely.prepare(walkable)
     found: list[Walker] = []
@@ -91,15 +93,17 @@ def _on_sidewalks(
             break
         direction = int(rng.choice([-1, 1]))
         ring = rings[direction][int(rng.integers(len(rings[direction])))]
-        start = float(rng.uniform(0, ring.length))
+        length = geometry.arc_length(ring)
+        start = float(rng.uniform(0, length[-1]))
         pace = 0.0 if rng.random() < 0.15 else float(rng.uniform(*PACE_MPS))
-        if shapely.distance(way, ring.interpolate(start)) > NEAR_M:
-            continue
         station = start + direction * pace * t_s
-        xy = _along(ring, station)
+        at = _lookup(length, ring)
+        xy = at(station % length[-1])
+        if shapely.distance(way, shapely.Point(xy[0])) > NEAR_M or _runs_into_something(xy, network):
+            continue
         if not shapely.contains_xy(walkable, *xy[:: max(1, len(xy) // 12)].T).all():
             continue
-        step = _along(ring, station + 0.6) - _along(ring, station - 0.6)
+        step = at((station + 0.6) % length[-1]) - at((station - 0.6) % length[-1])
         yaw = np.unwrap(np.arctan2(step[:, 1], step[:, 0])) + (np.pi if direction < 0 else 0.0)
         if pace == 0.0:
             yaw = yaw + float(rng.uniform(-np.pi, np.pi))
@@ -107,14 +111,23 @@ def _on_sidewalks(
     return found
 
 
-def _rings(area: shapely.Geometry) -> list[shapely.LineString]:
-    """Outer outlines of an area, counter-clockwise (nobody walks on islands)."""
-    return [shapely.LineString(shapely.orient_polygons(polygon).exterior.coords) for polygon in shapely.get_parts(area)]
+def _walking_m(kerb: Kerb) -> tuple[float, float]:
+    """How far behind the kerb one walks with it to the left and to the right; the same on narrow sidewalks."""
+    near = min(BEHIND_TREES_M, kerb.sidewalk_width_m - 0.45)
+    return near, max(near, kerb.sidewalk_width_m - BEFORE_BENCHES_M)
 
 
-def _along(ring: shapely.LineString, station_m: np.ndarray) -> Float64[np.ndarray, "t 2"]:
-    points = shapely.line_interpolate_point(ring, station_m % ring.length)
-    return shapely.get_coordinates(points)
+def _rings(area: shapely.Geometry) -> list[Float64[np.ndarray, "k 2"]]:
+    """Outer outlines of an area, closed and counter-clockwise (nobody walks on islands)."""
+    return [np.array(shapely.orient_polygons(polygon).exterior.coords) for polygon in shapely.get_parts(area)]
+
+
+def _runs_into_something(xy: Float64[np.ndarray, "t 2"], network: TownNetwork) -> bool:
+    """Whether a way leads through a tree, a lamp or the like."""
+    props = network.plan.props
+    places = np.array([(prop.x_m, prop.y_m) for prop in props]).reshape(-1, 2)
+    room = np.array([ROOM_M.get(prop.kind, USUAL_ROOM_M) for prop in props])
+    return bool((cdist(places, xy[::4]).min(axis=1) < room).any())
 
 
 # ----------------------------------------------------------------------------------------------------- over the road
@@ -131,7 +144,9 @@ def _on_crossings(
             continue
         for share in (0.3, 0.7)[: int(rng.choice(3, p=CROSSERS))]:
             station = crossing.station_m + share * crossing.depth_m
-            found.append(_crosser(rng, network, crossing, station, t_s))
+            walker = _crosser(rng, network, crossing, station, t_s)
+            if not _runs_into_something(walker.xy_m, network):
+                found.append(walker)
     return found
 
 
@@ -141,7 +156,7 @@ def _crosser(
     """Along the sidewalk to the crossing, over it, and on along the other sidewalk."""
     road, kerb = network.roads[crossing.road], network.plan.kerb
     side = int(rng.choice([-1, 1]))
-    beyond = kerb.width_m + 0.5 * kerb.sidewalk_width_m
+    beyond = kerb.width_m + _walking_m(kerb)[0]
     near, far = (float(road.edge_m(s, station_m)) + s * beyond for s in (side, -side))
     inward = 1.0 if station_m < road.length_m / 2 else -1.0  # away from the junction that the crossing belongs to
     before, after = (station_m + inward * float(rng.uniform(2.0, 12.0)) for _ in range(2))

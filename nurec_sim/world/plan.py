@@ -8,10 +8,10 @@ from the centre line to the right, driving with growing stations; 1, 2 to the le
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import ClassVar, Literal, get_args
+from typing import Annotated, ClassVar, Literal, get_args
 
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from nurec_sim.errors import ClipError
 from nurec_sim.types import Track, Trajectory
@@ -19,6 +19,7 @@ from nurec_sim.world.splits import Split
 from nurec_sim.world.terrain import FLAT, Terrain
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+Positive = Annotated[float, Field(gt=0)]
 EGO_MIDDLE_M = 1.4
 """From the ego's rear axle to the middle between its axles, where the slope under it is taken."""
 
@@ -40,7 +41,7 @@ LABEL_OF_KIND = {"pedestrian": "person", "cyclist": "rider", "truck": "heavy_tru
 class RoadPiece:
     """A stretch of centre line whose curvature (left positive) changes linearly: line, arc or clothoid."""
 
-    length_m: float
+    length_m: Positive
     start_curvature_per_m: float = 0.0
     end_curvature_per_m: float = 0.0
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
@@ -52,7 +53,7 @@ class Narrowing:
 
     start_m: float
     end_m: float
-    taper_m: float
+    taper_m: Positive
     lane_width_m: float
     left_strip_m: float
     right_strip_m: float
@@ -70,7 +71,7 @@ class Road:
     x_m: float
     y_m: float
     yaw_rad: float
-    pieces: tuple[RoadPiece, ...]
+    pieces: Annotated[tuple[RoadPiece, ...], Field(min_length=1)]
     lanes_forward: int = 1
     lanes_backward: int = 1
     lane_width_m: float = 3.5
@@ -109,7 +110,7 @@ class Connection:
     x_m: float
     y_m: float
     yaw_rad: float
-    pieces: tuple[RoadPiece, ...]
+    pieces: Annotated[tuple[RoadPiece, ...], Field(min_length=1)]
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
@@ -207,7 +208,7 @@ class Actor:
     size_m: tuple[float, float, float]
     colour: tuple[float, float, float]
     moves: bool
-    path: tuple[tuple[int, float, float, float, float], ...]
+    path: Annotated[tuple[tuple[int, float, float, float, float], ...], Field(min_length=1)]
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
     @property
@@ -311,12 +312,37 @@ class TownPlan:
         """A plan from its text.
 
         Raises:
-            ClipError: a field is missing, misspelt or of the wrong kind.
+            ClipError: a field is missing, misspelt or of the wrong kind, or something is named that is not there.
         """
         try:
-            return TypeAdapter(TownPlan).validate_json(text)
+            plan = TypeAdapter(TownPlan).validate_json(text)
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"]) or "the text itself"
             known = ", ".join(field.name for field in fields(TownPlan))
             raise ClipError(f"not a town plan: {where}: {first['msg']}; a plan has the fields {known}") from error
+        _check_names(plan)
+        return plan
+
+
+def _check_names(plan: TownPlan) -> None:
+    """Refuses roads and actors that share a name, and names of roads and lanes that are not there."""
+    roads = {road.id: road for road in plan.roads}
+    for what, items in (("road", plan.roads), ("actor", plan.actors)):
+        names = [item.id for item in items]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ClipError(f"not a town plan: two {what}s are called {twice[0]!r}")
+    lanes = {
+        f"{road.id}:{number}"
+        for road in plan.roads
+        for number in (*range(-road.lanes_forward, 0), *range(1, road.lanes_backward + 1))
+    }
+    arms = [arm for junction in plan.junctions for arm in junction.arms]
+    paths = [path for junction in plan.junctions for path in junction.connections]
+    for name in [item.road for group in (arms, plan.crossings, plan.stop_lines) for item in group]:
+        if name not in roads:
+            raise ClipError(f"not a town plan: no road {name!r}; have {', '.join(sorted(roads))}")
+    for name in [lane for path in paths for lane in (path.from_lane, path.to_lane)]:
+        if name not in lanes:
+            raise ClipError(f"not a town plan: no lane {name!r}; have {', '.join(sorted(lanes))}")

@@ -59,7 +59,7 @@ class GlPainter:
         self._context.free()
 
     def draw(self, data: Any, face: Face, world_from_sensor: Float64[np.ndarray, "4 4"], colours: bool = True) -> Drawn:
-        """One face of a sensor, upside down in memory nowhere; without ``colours`` half the work or less."""
+        """One face of a sensor; without ``colours`` only what is where, at a fraction of the cost."""
         width, height = face.width_px, face.height_px
         if self._gl.offWidth < width or self._gl.offHeight < height:
             # Drawing past the buffer's edge leaves garbage without any error.
@@ -67,6 +67,8 @@ class GlPainter:
             mujoco.mjr_resizeOffscreen(*size, self._gl)
         eye, axes = world_from_sensor[:3, 3], world_from_sensor[:3, :3] @ face.sensor_from_face
         viewport, flags = mujoco.MjrRect(0, 0, width, height), self._scene.flags
+        # Leaves and other open surfaces are seen from both sides, as rays meet them.
+        flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = False
         offset = data.geom_xpos - eye
         seen = self._in_view(offset @ axes, face)
         rgb = None
@@ -82,24 +84,23 @@ class GlPainter:
             mujoco.mjr_render(viewport, self._scene, self._gl)
             mujoco.mjr_readPixels(rgb, None, viewport, self._gl)
             rgb = np.ascontiguousarray(rgb[::-1])
-        shown = self._gather(data, seen)
+        self._gather(data, seen)
         self._aim(face, eye, axes)
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
         ids, depth = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.float32)
         mujoco.mjr_render(viewport, self._scene, self._gl)
         mujoco.mjr_readPixels(ids, depth, viewport, self._gl)
-        geom = np.ascontiguousarray(self._geom_ids(ids, shown)[::-1])
-        # Depth is stored reversed, near / z up to a little, so that it is exact where it matters.
+        geom = np.ascontiguousarray(self._geom_ids(ids)[::-1])
+        # Depth is stored reversed, as a linear function of 1 / z, so that it is exact where it matters.
         nearness = depth[::-1] * np.float32(1 / self._near_m - 1 / self._far_m) + np.float32(1 / self._far_m)
         return Drawn(rgb, geom, np.where(geom < 0, np.float32(0), nearness))
 
-    def _gather(self, data: Any, shown: Bool[np.ndarray, " g"]) -> Bool[np.ndarray, " g"]:
+    def _gather(self, data: Any, shown: Bool[np.ndarray, " g"]) -> None:
         """Puts some of the geoms into the scene: the renderer itself culls nothing."""
         self.model.geom_group[:] = np.where(shown, self._groups, HIDDEN_GROUP)
         mujoco.mjv_updateScene(self.model, data, self._options, None, mujoco.MjvCamera(),
                                mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)  # fmt: skip
         self.model.geom_group[:] = self._groups
-        return shown
 
     def _aim(self, face: Face, eye: Float64[np.ndarray, " 3"], axes: Float64[np.ndarray, "3 3"]) -> None:
         """Sets both GL cameras to the exact frustum, and the shadow map to what lies before them."""
@@ -133,7 +134,7 @@ class GlPainter:
         across = apart - np.outer(apart @ self.town.sun, self.town.sun)
         return np.linalg.norm(across, axis=1) < SHADOW_RADIUS_M * np.sqrt(2) + self.model.geom_rbound
 
-    def _geom_ids(self, colours: UInt8[np.ndarray, "h w 3"], shown: Bool[np.ndarray, " g"]) -> Int32[np.ndarray, "h w"]:
+    def _geom_ids(self, colours: UInt8[np.ndarray, "h w 3"]) -> Int32[np.ndarray, "h w"]:
         """Geom ids from the colours of the segmentation pass, which count the geoms of this scene, not the model's."""
         table = np.full(self._scene.ngeom + 2, -1, np.int32)
         for i in range(self._scene.ngeom):

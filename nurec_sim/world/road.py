@@ -13,8 +13,7 @@ from jaxtyping import Float64
 
 from nurec_sim.world.plan import Road, RoadPiece
 
-FINE_STEP_M = 0.25
-MESH_STEP_M = 1.0
+STEP_M = 1.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
@@ -42,8 +41,6 @@ class RoadLine:
         for piece in curve.pieces:
             xy, yaw = _along(piece, *self._starts[-1], np.array([piece.length_m]))
             self._starts.append((xy[0], float(yaw[0])))
-        self.station_m = np.linspace(0.0, self.length_m, int(np.ceil(self.length_m / FINE_STEP_M)) + 1)
-        self.xy_m, self.yaw_rad = self.at(self.station_m)
 
     @property
     def end(self) -> tuple[Float64[np.ndarray, " 2"], float]:
@@ -70,18 +67,10 @@ class RoadLine:
         offset = np.asarray(offset_m, np.float64)[..., None]
         return xy + offset * np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1), yaw
 
-    def curvature_at(self, station_m: float) -> float:
-        """Curvature of the centre line, left positive."""
-        index = int(np.clip(np.searchsorted(self.piece_station_m, station_m, side="right") - 1, 0,
-                            len(self.curve.pieces) - 1))  # fmt: skip
-        piece = self.curve.pieces[index]
-        share = float(np.clip((station_m - self.piece_station_m[index]) / piece.length_m, 0.0, 1.0))
-        return piece.start_curvature_per_m + share * (piece.end_curvature_per_m - piece.start_curvature_per_m)
-
     def stations(self, start_m: float = 0.0, end_m: float | None = None) -> Float64[np.ndarray, " k"]:
         """Stations at most 1 m apart, at which polygons and polylines have vertices."""
         end_m = self.length_m if end_m is None else end_m
-        return np.linspace(start_m, end_m, max(2, int(np.ceil((end_m - start_m) / MESH_STEP_M)) + 1))
+        return np.linspace(start_m, end_m, max(2, int(np.ceil((end_m - start_m) / STEP_M)) + 1))
 
     def band(
         self, start_m: float, end_m: float, right_m: float | np.ndarray, left_m: float | np.ndarray

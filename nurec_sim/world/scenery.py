@@ -8,9 +8,10 @@ from nurec_sim.geometry import pose_from_xyyaw
 from nurec_sim.world import trees
 from nurec_sim.world.builder import SpecBuilder
 from nurec_sim.world.chunks import Chunks
-from nurec_sim.world.fixtures import fixture_parts
-from nurec_sim.world.ground_meshes import add_ground
+from nurec_sim.world.fixtures import Part, fixture_parts
+from nurec_sim.world.ground_meshes import add_ground, add_light_pools
 from nurec_sim.world.houses import add_house
+from nurec_sim.world.materials import LAMPS_ON
 from nurec_sim.world.network import TownNetwork
 from nurec_sim.world.plan import Prop
 from nurec_sim.world.surface import SurfaceClass
@@ -25,10 +26,12 @@ def add_scenery(builder: SpecBuilder, network: TownNetwork) -> None:
     plan, chunks = network.plan, Chunks(DETAIL_CHUNK_M)
     ground = Chunks()
     add_ground(ground, network, np.random.default_rng([plan.style.texture_seed, 20]), plan.weather.wetness)
+    if plan.weather.dusk > LAMPS_ON:
+        add_light_pools(ground, network)
     for index, house in enumerate(plan.buildings):
         rng = np.random.default_rng([plan.style.texture_seed, 21, index])
         add_house(chunks, house, plan.terrain, plan.kerb.height_m, rng)
-    plants = _Plants(builder, network)
+    plants, fixtures = _Plants(builder, network), dict[tuple[str, int, float], tuple[Part, ...]]()
     for index, prop in enumerate(plan.props):
         pose = _pose(network, prop)
         if prop.kind in ("tree", "bush"):
@@ -38,7 +41,10 @@ def add_scenery(builder: SpecBuilder, network: TownNetwork) -> None:
             mesh = trees.hedge(rng, prop.length_m, float(rng.uniform(*HEDGE_HEIGHT_M)))
             chunks.at(pose[:2, 3], SurfaceClass.VEGETATION, "hedge").extend(mesh, pose)
         else:
-            for mesh, surface, material in fixture_parts(prop):
+            kind = prop.kind, prop.variant, prop.length_m
+            if kind not in fixtures:
+                fixtures[kind] = tuple(fixture_parts(prop))
+            for mesh, surface, material in fixtures[kind]:
                 chunks.at(pose[:2, 3], surface, material, crease_deg=30.0).extend(mesh, pose)
     ground.place(builder)
     chunks.place(builder)

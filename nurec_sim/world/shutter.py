@@ -25,7 +25,8 @@ FINENESS = 1.5
 SECTORS = 12
 SECTOR_PIXEL_RAD = np.deg2rad(0.1)
 """Pixels of a LiDAR's faces are no wider than this, however far apart its beams are."""
-KEPT_PIXELS = 1 << 20
+KEPT_PIXELS = 1 << 21
+"""Patches of images up to this size are kept for the next frame; about 50 bytes a pixel."""
 IMAGE_DOWN, LIDAR_DOWN = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])
 
 
@@ -83,7 +84,7 @@ def _camera_patches(
     return tuple(patches)
 
 
-_kept_camera_patches = functools.lru_cache(maxsize=12)(_camera_patches)
+_kept_camera_patches = functools.lru_cache(maxsize=8)(_camera_patches)
 
 
 @functools.lru_cache(maxsize=4)

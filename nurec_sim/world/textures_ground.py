@@ -108,7 +108,7 @@ def paving(rng: np.random.Generator, family: str, size: int = 512) -> Image:
     if family not in layouts:
         raise ValueError(f"no paving family {family!r}; have {sorted(layouts)}")
     rows, columns = layouts[family]
-    colour = {"slabs": (168, 163, 154), "concrete": (160, 159, 155), "bricks": (146, 112, 98)}[family]
+    colour = {"slabs": (152, 148, 140), "concrete": (148, 147, 143), "bricks": (140, 108, 95)}[family]
     y, x = np.meshgrid(np.arange(size), np.arange(size), indexing="ij")
     row = y * rows // size
     shifted = (x + (row % 2) * size // columns // 2 * (family == "bricks")) % size
@@ -200,6 +200,15 @@ def contact_shadow(length_m: float, width_m: float, size: int = 64) -> Decal:
     outside = np.hypot(*np.meshgrid(np.maximum(x - length_m / 2 + 0.35, 0), np.maximum(y - width_m / 2 + 0.3, 0),
                                     indexing="ij"))  # fmt: skip
     return _decal(np.full((size, size), 8.0), 0.78 * np.clip(1 - outside / 0.75, 0, 1) ** 1.6)
+
+
+def light_pool(size: int = 64) -> Decal:
+    """Warm light on the ground below a street lamp."""
+    across = np.linspace(-1, 1, size, dtype=np.float32)
+    cover = np.clip(1 - np.hypot(across[:, None], across[None]), 0, 1) ** 1.5 * 0.34
+    image = _decal(np.full((size, size), 255.0), cover)
+    image[..., :3] = (255, 206, 138)
+    return image
 
 
 def puddles(rng: np.random.Generator, colour: tuple[float, float, float], size: int = 512) -> Decal:

@@ -19,8 +19,8 @@ from nurec_sim.world.isp import CameraResponse, random_response
 from nurec_sim.world.network import TownNetwork
 from nurec_sim.world.plan import TownPlan
 from nurec_sim.world.rig import street_rig
-from nurec_sim.world.scan import LidarResponse
-from nurec_sim.world.sense import TrueWorld, measured_points
+from nurec_sim.world.scan import LidarResponse, measured_points
+from nurec_sim.world.sense import TrueWorld
 from nurec_sim.world.truth import scene_flow
 from nurec_sim.world.truth_folder import TruthFolder
 from nurec_sim.world.xodr import opendrive_town
@@ -150,9 +150,10 @@ class _Drive:
     def frames(self) -> Iterator[logs.CameraEntry | logs.LidarEntry]:
         start_us, end_us = self.world.plan.span_us
         turns = range(start_us, end_us - SPIN_US + 1, self.period_us)
-        total, done = len(turns) * (len(self.rig.lidars) + len(self.rig.cameras)), 0
+        carried: list[LidarModel | CameraModel] = [*self.rig.lidars.values(), *self.rig.cameras.values()]
+        total, done = len(turns) * len(carried), 0
         for index, turn_us in enumerate(turns):
-            for sensor in (*self.rig.lidars.values(), *self.rig.cameras.values()):
+            for sensor in carried:
                 if isinstance(sensor, LidarModel):
                     sweep = true_sweep(self.world, self.ego, sensor, turn_us, self.point_step_m)
                     yield logs.LidarEntry(sensor.id, sweep)

@@ -82,6 +82,7 @@ def chunk_inputs(clip: Clip, profile: Profile, window: ChunkWindow, settings: Fe
         time=_tensor(times[:, 0]),
         time_before=_tensor(times[:, 1]),
         time_after=_tensor(times[:, 2]),
+        rig_from_scene=_tensor(clip.rig.cameras[images[0].camera.id].rig_from_camera),
     )
     ego = np.stack([view.hidden for view in shown])
     return ChunkInputs(window.index, window.span_us, tuple(images), world_from_scene, tensors, ego)

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from nurec_sim.errors import ArchiveError
-from nurec_sim.scene.foreign.found import Columns, Found, sigmoid
+from nurec_sim.scene.columns import Columns, sigmoid
+from nurec_sim.scene.foreign.found import Found
 from nurec_sim.scene.foreign.nurec_state import GAUSSIANS, NurecState
 from nurec_sim.types import Label
 

@@ -24,10 +24,11 @@ from nurec_sim.scene.foreign.nurec_layers import found_in
 from nurec_sim.scene.foreign.nurec_volume import read_volume
 from nurec_sim.scene.foreign.particle_field import read_particle_fields
 from nurec_sim.scene.foreign.rig_sidecars import DATA_INFO, MAP, RIG, TRACKS, Surroundings, read_surroundings
-from nurec_sim.scene.foreign.usd_inside import LAYER_SUFFIXES, may_hold
+from nurec_sim.scene.foreign.usd_inside import may_hold
 from nurec_sim.scene.ply import read_ply
 from nurec_sim.scene.sky import sample_cubemap
 from nurec_sim.scene.transform import joined, transformed
+from nurec_sim.scene.usd_layers import LAYER_SUFFIXES
 from nurec_sim.scene.zip_package import Package
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Track
 

@@ -25,7 +25,6 @@ from nurec_sim.scene.zip_package import Package
 from nurec_sim.types import Box, CameraModel, LidarModel, Rig, RoadMap, Track, Trajectory
 
 RIG, TRACKS, DATA_INFO, MAP = "rig_trajectories.json", "sequence_tracks.json", "data_info.json", "map.xodr"
-MAX_JSON_BYTES = 256 * 2**20
 
 
 @dataclass
@@ -75,7 +74,7 @@ def read_surroundings(package: Package) -> Surroundings:
 
 def _load(package: Package, name: str) -> dict[str, Any]:
     where = f"{package.path}: {name}"
-    value = codec.load(package.read(name, MAX_JSON_BYTES), where)
+    value = codec.load(package.read(name, codec.MAX_JSON_BYTES), where)
     if not isinstance(value, dict):
         raise ArchiveError(f"{where}: must hold an object, got {type(value).__name__}")
     return value
@@ -130,7 +129,7 @@ def _add_map(around: Surroundings, package: Package, world_base: object) -> None
         place = codec.from_json(codec.array(np.float64, 4, 4), world_base, f"{package.path}: {RIG}: T_world_base")
         if not geometry.is_rotation(place[:3, :3]):
             place = None
-    around.road_map, note = road_map_from(package.read(MAP, MAX_JSON_BYTES), place, around.ego, where)
+    around.road_map, note = road_map_from(package.read(MAP, codec.MAX_JSON_BYTES), place, around.ego, where)
     around.unknown.append(note)
 
 

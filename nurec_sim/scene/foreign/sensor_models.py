@@ -13,6 +13,7 @@ import numpy as np
 
 from nurec_sim import sensors
 from nurec_sim.scene import codec
+from nurec_sim.scene.sidecars import SHUTTER_NAMES
 from nurec_sim.types import (
     CameraModel,
     Fisheye,
@@ -21,19 +22,12 @@ from nurec_sim.types import (
     Lens,
     LidarModel,
     Pinhole,
-    Shutter,
     Spin,
     Windshield,
     WindshieldReference,
 )
 
-_SHUTTERS = {
-    "GLOBAL": Shutter.GLOBAL,
-    "ROLLING_TOP_TO_BOTTOM": Shutter.TOP_TO_BOTTOM,
-    "ROLLING_LEFT_TO_RIGHT": Shutter.LEFT_TO_RIGHT,
-    "ROLLING_BOTTOM_TO_TOP": Shutter.BOTTOM_TO_TOP,
-    "ROLLING_RIGHT_TO_LEFT": Shutter.RIGHT_TO_LEFT,
-}
+_SHUTTERS = {name: shutter for shutter, name in SHUTTER_NAMES.items()}
 _MATRIX = codec.array(np.float64, 4, 4)
 
 

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from nurec_sim.errors import ArchiveError
-from nurec_sim.scene.usd_layers import open_member
+from nurec_sim.scene.usd_layers import LAYER_SUFFIXES, open_member
 from nurec_sim.scene.zip_package import Package, name_fault
 
-LAYER_SUFFIXES = (".usda", ".usdc", ".usd")
 MAX_LAYERS = 2000
 
 

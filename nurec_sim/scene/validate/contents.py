@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.codec import MAX_JSON_BYTES
 from nurec_sim.scene.zip_package import MAX_MEMBERS
 
-MAX_JSON_BYTES = 256 * 2**20
 MAX_YAML_BYTES = 2**20
 MAX_MEMBER_BYTES = 2 * 2**30
 

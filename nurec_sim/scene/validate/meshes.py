@@ -6,18 +6,13 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.ply_table import BYTE_ORDERS, TYPES
 from nurec_sim.scene.validate.contents import Contents
 from nurec_sim.scene.validate.finding import Report
 
 PROBES = 40
 GROUND_WITHIN_M = 2.0
 _MAX_HEADER_BYTES = 65536
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
 
 
 def check_ground(report: Report, contents: Contents, world_from_rig: Float64[np.ndarray, "t 4 4"] | None) -> None:
@@ -73,7 +68,7 @@ def read_triangles(data: bytes, name: str) -> tuple[Float64[np.ndarray, "v 3"], 
         kind, elements = _header(data[:end].decode("ascii", "replace"))
         body = data[line_end + 1 :]
         read = _ascii if kind == "ascii" else _binary
-        vertices, faces = read(body, elements, _ORDERS.get(kind, ""))
+        vertices, faces = read(body, elements, BYTE_ORDERS[kind])
     except (ValueError, KeyError, IndexError, TypeError, OverflowError, MemoryError) as error:
         raise ArchiveError(f"{name} is damaged or of an unknown layout ({error})") from None
     if len(faces) == 0 or len(vertices) < 3:
@@ -103,7 +98,7 @@ def _header(text: str) -> tuple[str, Elements]:
                 raise ValueError(f"{words[2]} of {current}")
         elif words[:1] == ["property"]:
             elements[current][1].append(words[1:])
-    if kind != "ascii" and kind not in _ORDERS:
+    if kind not in BYTE_ORDERS:
         raise ValueError(f"format {kind!r}")
     if list(elements)[:2] != ["vertex", "face"]:
         raise ValueError(f"elements {list(elements)}; vertex, then face is read")
@@ -115,10 +110,10 @@ def _columns(properties: list[list[str]], order: str) -> np.dtype:
     fields: list[tuple] = []
     for words in properties:
         if words[0] == "list":
-            fields.append((f"count of {words[3]}", order + _TYPES[words[1]]))
-            fields.append((words[3], order + _TYPES[words[2]], 3))
+            fields.append((f"count of {words[3]}", order + TYPES[words[1]]))
+            fields.append((words[3], order + TYPES[words[2]], 3))
         else:
-            fields.append((words[1], order + _TYPES[words[0]]))
+            fields.append((words[1], order + TYPES[words[0]]))
     return np.dtype(fields)
 
 

@@ -12,9 +12,10 @@ import sys
 import zipfile
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.usd_layers import LAYER_SUFFIXES
 from nurec_sim.scene.validate.contents import Contents, shown
 from nurec_sim.scene.validate.finding import Report, Rule
-from nurec_sim.scene.validate.usd_stage import LAYER_SUFFIXES, SPLATS, Fault, stage_faults
+from nurec_sim.scene.validate.usd_stage import SPLATS, Fault, stage_faults
 from nurec_sim.scene.zip_package import ALIGNMENT, MAX_PACKAGE_BYTES, name_fault
 
 _PROGRAM = ("-c", "from nurec_sim.scene.validate.usd_stage import main; main()")

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.usd_layers import LAYER_SUFFIXES, open_member
 from nurec_sim.scene.validate.contents import Contents, shown
 
-LAYER_SUFFIXES = (".usda", ".usdc", ".usd")
 SPLATS = "ParticleField3DGaussianSplat"
 MEMORY_BYTES = 8 * 2**30
 _ALREADY_TOLD = {
@@ -49,8 +49,6 @@ def stage_faults(path: Path) -> list[Fault]:
 
 def _layer_faults(contents: Contents) -> Iterator[Fault]:
     """Layers that cannot be read, or that refer to anything but layers of the package."""
-    from nurec_sim.scene.usd_layers import open_member
-
     for name in contents.names:
         if not name.endswith(LAYER_SUFFIXES):
             continue

@@ -1,0 +1,158 @@
+"""A connection to one service of a server: TLS, token, time limits, and the server's errors raised as ours."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Self, TypedDict
+
+import grpc
+from google.protobuf import message_factory
+
+from nurec_sim import wire
+from nurec_sim.errors import ServerError
+
+_RETRY = {
+    "maxAttempts": 5,
+    "initialBackoff": "0.2s",
+    "maxBackoff": "2s",
+    "backoffMultiplier": 2.0,
+    "retryableStatusCodes": ["UNAVAILABLE"],
+}
+
+
+class ConnectionOptions(TypedDict, total=False):
+    """Keywords of ``Connection``; all may be left out.
+
+    ``timeout_s`` (300): for one call. ``token``: what the server wants to be shown. ``root_ca``: PEM file of the
+    certificates that vouch for the server's; plain text without. ``client_cert`` and ``client_key``: PEM files of the
+    certificate to show, for mutual TLS, and of its private key.
+    """
+
+    timeout_s: float
+    token: str | None
+    root_ca: Path | None
+    client_cert: Path | None
+    client_key: Path | None
+
+
+class Connection:
+    """One service of a server; what its clients share.
+
+    Calls wait for a server that is starting, and are repeated when it goes away in between; both end at ``timeout_s``.
+    They raise the errors of ``nurec_sim.errors`` that the server raised, and ``ServerError`` when it cannot be reached
+    in time or failed. Use it as a context manager, or call ``close``. Safe to use from many threads.
+
+    Args:
+        address: ``host:port``.
+        service: full name in ``protos/``.
+        timeout_s: for one call.
+        token: what the server wants to be shown; None if it wants nothing.
+        root_ca: PEM file of the certificates that vouch for the server's; plain text if None.
+        client_cert: PEM file of the certificate to show, for mutual TLS.
+        client_key: PEM file of its private key.
+
+    Raises:
+        ServerError: a PEM file cannot be read, or a certificate comes without its key or without ``root_ca``.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        service: str,
+        *,
+        timeout_s: float = 300.0,
+        token: str | None = None,
+        root_ca: Path | None = None,
+        client_cert: Path | None = None,
+        client_key: Path | None = None,
+    ) -> None:
+        self.address, self._timeout_s = address, timeout_s
+        self._metadata = [("authorization", f"Bearer {token}")] if token else []
+        self._channel = open_channel(address, root_ca, client_cert, client_key)
+        methods = wire.pool.FindServiceByName(service).methods
+        self._procedures = {method.name: _procedure(self._channel, service, method) for method in methods}
+
+    def close(self) -> None:
+        """Ends the connection."""
+        self._channel.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _options(self, timeout_s: float | None) -> Mapping[str, Any]:
+        """Keywords of every call; None waits for ever."""
+        return {"timeout": timeout_s, "wait_for_ready": True, "metadata": self._metadata}
+
+    def _call(self, name: str, request: Any) -> Any:
+        """The reply of a procedure that streams nothing."""
+        with our_errors(self.address):
+            return self._procedures[name](request, **self._options(self._timeout_s))
+
+
+def open_channel(
+    address: str, root_ca: Path | None = None, client_cert: Path | None = None, client_key: Path | None = None
+) -> grpc.Channel:
+    """A channel whose calls are repeated when the server goes away in between; the arguments are ``Connection``'s.
+
+    Raises:
+        ServerError: a PEM file cannot be read, or a certificate comes without its key or without ``root_ca``.
+    """
+    credentials = _credentials(root_ca, client_cert, client_key)
+    options = channel_options({"methodConfig": [{"name": [{}], "retryPolicy": _RETRY}]})
+    if credentials is None:
+        return grpc.insecure_channel(address, options)
+    return grpc.secure_channel(address, credentials, options)
+
+
+def channel_options(service_config: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Options of every channel of ours: long messages, quick new attempts; and which calls are repeated."""
+    return [
+        ("grpc.max_receive_message_length", wire.MAX_MESSAGE_BYTES),
+        ("grpc.max_send_message_length", wire.MAX_MESSAGE_BYTES),
+        ("grpc.max_reconnect_backoff_ms", 1000),
+        ("grpc.enable_http_proxy", 0),  # servers of ours are near; a proxy for the web is not for them
+        ("grpc.service_config", json.dumps(service_config)),
+    ]
+
+
+@contextlib.contextmanager
+def our_errors(address: str) -> Iterator[None]:
+    """Statuses of gRPC become the errors of ours that the server raised; ``ServerError`` where they stand for none."""
+    try:
+        yield
+    except grpc.RpcError as error:
+        ours = wire.error_of(error.code(), error.details() or "no reason given")
+        raise (ServerError(f"{address}: {ours}") if isinstance(ours, ServerError) else ours) from error
+
+
+def _credentials(
+    root_ca: Path | None, client_cert: Path | None, client_key: Path | None
+) -> grpc.ChannelCredentials | None:
+    """TLS of a channel; None for plain text."""
+    if (client_cert is None) != (client_key is None) or (client_cert and root_ca is None):
+        raise ServerError("mutual TLS needs root_ca, client_cert and client_key together")
+    if root_ca is None:
+        return None
+    try:
+        roots, key, cert = (None if path is None else path.read_bytes() for path in (root_ca, client_key, client_cert))
+    except OSError as error:
+        raise ServerError(f"TLS cannot be set up: {error}") from None
+    return grpc.ssl_channel_credentials(roots, key, cert)
+
+
+def _procedure(channel: grpc.Channel, service: str, method: Any) -> Any:
+    """A callable of the procedure's kind."""
+    kinds = {
+        (False, False): channel.unary_unary,
+        (False, True): channel.unary_stream,
+        (True, False): channel.stream_unary,
+    }
+    request, reply = (message_factory.GetMessageClass(kind) for kind in (method.input_type, method.output_type))
+    make = kinds[method.client_streaming, method.server_streaming]
+    return make(f"/{service}/{method.name}", request.SerializeToString, reply.FromString)
