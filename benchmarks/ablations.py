@@ -36,7 +36,7 @@ from nurec_sim.training.trainer import WEIGHTS, Trainer
 VariantName = Literal[tuple(ABLATIONS)]  # type: ignore[valid-type]
 Progress = Callable[[str, float], None]
 COLUMNS = {"psnr_db": ("PSNR", 2), "ssim": ("SSIM", 3), "abs_rel": ("AbsRel", 3), "delta1": ("δ1", 3)}
-RECIPE = ROOT / "nurec_sim" / "training" / "recipes" / "tiny.yaml"
+RECIPE = Path(__file__).with_name("ablations.yaml")
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class Options:
 
     Args:
         variants: which rows; the full training is always there, for the others are compared with it.
-        recipe: what is cut down to the budget.
-        steps: of each variant in all, shared out to the stages as in the recipe.
+        recipe: of the full training; another one than that of benchmarks/ablations.yaml, say.
+        steps: of each variant in all, shared out to the stages as in the recipe; the recipe's own if not given.
         pixels: of an input image, at most in training and always in evaluation.
         start: weights that every variant begins with.
         seed: of the training.
-        training_clips: drawn before training; equal for all.
+        training_clips: drawn before training, equal for all; the recipe's number if not given.
         clips: folder for them, OUT/clips if not given; nobody else should draw into it meanwhile.
         drawers: processes that draw them.
         worlds: held-out worlds to evaluate in; three or more give intervals.
@@ -67,11 +67,11 @@ class Options:
 
     variants: tuple[VariantName, ...] = tuple(ABLATIONS)
     recipe: Path = RECIPE
-    steps: int = 600
+    steps: int | None = None
     pixels: int = 16_464
     start: Path | None = None
     seed: int = 0
-    training_clips: int = 48
+    training_clips: int | None = None
     clips: Path | None = None
     drawers: int = 1
     worlds: int = 4
@@ -116,8 +116,9 @@ def main() -> None:
 
 def budget(options: Options) -> TrainingConfig:
     """The full recipe at the budget of the options."""
-    config = scaled(read_config(options.recipe), options.steps, options.pixels)
-    data = config.data.model_copy(update={"clips": options.training_clips, "refresh": False})
+    recipe = read_config(options.recipe)
+    config = scaled(recipe, options.steps or recipe.steps, options.pixels)
+    data = config.data.model_copy(update={"clips": options.training_clips or recipe.data.clips, "refresh": False})
     start = options.start or config.start
     return config.model_copy(update={"seed": options.seed, "data": data, "start": start})
 

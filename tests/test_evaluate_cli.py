@@ -46,6 +46,18 @@ def test_random_weights_are_named_as_such(streets, capsys):
     assert "selective" in capsys.readouterr().out
 
 
+def test_usual_methods_without_weights_are_left_out_and_named(streets, monkeypatch, capsys):
+    monkeypatch.setattr("nurec_sim.network.download._SHIPPED", streets)
+    monkeypatch.delenv("INSTANT_NUREC_FULL_PT", raising=False)
+    monkeypatch.setitem(evaluation.USUAL_METHODS, "storm", ("dense", "copy"))
+    run_cli("--protocol", "storm", "--worlds", 1)
+    said = capsys.readouterr()
+    assert "dense is left out: weights of 'tiny' are not part of this version" in " ".join(said.err.split())
+    assert "copy" in said.out and "dense" not in said.out
+    with pytest.raises(SystemExit):
+        run_cli("--protocol", "storm", "--worlds", 1, "--methods", "dense")
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [

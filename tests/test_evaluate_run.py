@@ -1,5 +1,6 @@
 import json
 import re
+from pathlib import Path
 
 import cv2
 import pytest
@@ -7,7 +8,7 @@ from evaluation_worlds import StreetProtocol
 
 from nurec_sim.errors import ReconstructError, RunError, WeightsError
 from nurec_sim.evaluate import contenders, run_protocol
-from nurec_sim.evaluate.methods import CHOICES, describe
+from nurec_sim.evaluate.methods import CHOICES, describe, without_weights
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, PointSettings, ViewSettings
 
 LIFT = LiftSettings(sky_px=32, views=ViewSettings(levels=16), points=PointSettings(min_voxel_m=0.24))
@@ -116,6 +117,12 @@ def test_choosing_methods():
     assert both[0].settings.merge == "concatenate" and both[0].settings.profile == "tiny"
     assert both[1].settings.profile is None and both[1].settings.random_weights == 1
     assert describe(both[1])["settings"]["profile"] == "tiny-selective"
+    given = FeedForwardSettings(profile="pq-front", checkpoint=Path("a.pt"))
+    dense, selective = contenders(("dense", "selective"), given)
+    assert (dense.settings.profile, dense.settings.checkpoint) == (None, None)
+    assert (selective.settings.profile, selective.settings.checkpoint) == ("pq-front", Path("a.pt"))
+    (own,) = contenders(("selective",), FeedForwardSettings(checkpoint=Path("a.pt")), Path("b.pt"))
+    assert own.settings.checkpoint == Path("b.pt") and without_weights(own) is None
     with pytest.raises(ReconstructError, match=r"methods must be some of \['dense'"):
         contenders(("dense", "dense"))
     with pytest.raises(ReconstructError, match="no network profile 'big'"):

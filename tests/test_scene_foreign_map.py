@@ -70,6 +70,7 @@ def test_a_map_is_used_if_it_lies_where_the_car_drove(tmp_path, y, text):
         (b"<a/>", "no OpenDRIVE map"),
         (b"<OpenDRIVE>", "no XML, or damaged"),
         (b"<!DOCTYPE a [<!ENTITY b 'c'>]><OpenDRIVE/>", "entities are not read"),
+        ("<!DOCTYPE a [<!ENTITY b 'c'>]><OpenDRIVE/>".encode("utf-16"), "XML must be UTF-8"),
         (xodr("<line/>", 1e12), "roads of more than"),
         (xodr("<line/>", "nan"), "finite number"),
         (xodr("<circle/>", 5), "<circle> is not known"),

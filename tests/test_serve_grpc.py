@@ -173,6 +173,7 @@ def test_an_unknown_flag_is_an_error_that_names_the_nearest(capsys, word, neares
         (["--artifact-glob=/no/such/*.usdz"], "--artifact-glob '/no/such/*.usdz' matches no file"),
         (["--cache-size=0"], "capacity 0"),
         (["--max-workers=0"], "render_workers must be at least 1, got 0"),
+        (["--download-cache-size=0"], "download_cache_size must be at least 1, got 0"),
         (["--rate=-1"], "rate_per_s must be above 0, got -1"),
         (["--tls-cert=a.pem"], "TLS needs both --tls-cert and --tls-key"),
         (["--token-file=/no/such/token"], "the token cannot be read from /no/such/token"),

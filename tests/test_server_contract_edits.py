@@ -1,5 +1,7 @@
 """``edit_assets`` and ``restore_model_parameters``: what clients see and what is drawn."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from grpc import StatusCode as Code
@@ -135,6 +137,18 @@ def test_edits_add_up_and_other_scenes_are_not_touched(stub):
     insertion(request)
     code, text = refusal(stub.edit_assets, request)
     assert code == Code.RESOURCE_EXHAUSTED and "1 scenes are edited" in text
+
+
+def test_of_edits_at_the_same_time_no_more_are_kept_than_allowed(stub):
+    def insert_into(name):
+        request = edit(name)
+        insertion(request)
+        call = stub.edit_assets.future(request, timeout=30)
+        return call.exception() and call.exception().code()
+
+    with ThreadPoolExecutor(2) as pool:
+        codes = list(pool.map(insert_into, ("street", "other")))
+    assert set(codes) == {None, Code.RESOURCE_EXHAUSTED}
 
 
 def test_frames_in_progress_are_rendered_from_what_they_began_with():

@@ -17,6 +17,7 @@ from serving_world import camera_request, scene
 
 from nurec_sim import wire
 from nurec_sim.calls import Call, current_call
+from nurec_sim.errors import DeadlinePassedError
 from nurec_sim.scene_store import SceneStore
 from nurec_sim.server import SensorServer, ServerOptions, set_up_logging
 from nurec_sim.service import ServiceOptions

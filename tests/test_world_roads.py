@@ -118,6 +118,25 @@ def test_areas_fit_together(network):
     assert islands == (network.plan.template == "roundabout")
 
 
+def test_paint_lies_where_the_plan_says(network):
+    white = shapely.union_all([marking.area for marking in network.markings if marking.colour == "white"])
+    rules = {(arm.road, arm.end): arm.rule for junction in network.plan.junctions for arm in junction.arms}
+    for stop in network.plan.stop_lines:
+        line, side = network.roads[stop.road], -1 if stop.forward else 1
+        middle = stop.station_m + 0.2 * side  # the line lies before the bumpers' station
+        across = line.at(np.full(2, middle), np.array([side * 0.3, line.lane_edge_m(side, middle) - side * 0.5]))[0]
+        painted = shapely.LineString(across).intersection(white).length / np.linalg.norm(across[1] - across[0])
+        broken = rules[stop.road, "end" if stop.forward else "start"] == "yield"
+        assert (0.4 < painted < 0.9) if broken else painted > 0.99
+        other_side = line.at(middle, -side * 0.5 * line.plan.lane_width_m)[0]
+        assert shapely.distance(white, shapely.Point(other_side)) > 0.1
+    for crossing in network.plan.crossings:
+        line = network.roads[crossing.road]
+        band = line.surface(crossing.station_m + 0.2, crossing.station_m + crossing.depth_m - 0.2)
+        painted = band.intersection(white).area / band.area
+        assert (0.35 < painted < 0.6) if crossing.zebra else painted < 0.01
+
+
 def test_road_map_is_the_surface(network):
     road_map = network.road_map()
     outer, *holes = road_map.drivable[0]

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from nurec_sim.cli.console import app, out, print_table, progress
+from nurec_sim.cli.console import app, err, out, print_table, progress
 from nurec_sim.cli.scenes import NO_FLAGS, Method, NetworkFlags, network_settings
 from nurec_sim.errors import NurecSimError
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
@@ -31,19 +31,19 @@ class LogFlags:
     """One log, cameras and sweeps held out (without --protocol)."""
 
     method: Method = "lift"
-    """How to reconstruct."""
+    """CLIP: how to reconstruct."""
     input_cameras: tuple[str, ...] = ()
-    """Cameras that the reconstruction may see; all if not given."""
+    """CLIP: cameras that the reconstruction may see; all if not given."""
     target_cameras: tuple[str, ...] = ()
-    """Cameras to compare with; the input cameras if not given."""
+    """CLIP: cameras to compare with; the input cameras if not given."""
     hold_out_sweeps: int = 0
-    """Leave out every so-manieth sweep and simulate it; 0 leaves out none."""
+    """CLIP: leave out every so-manieth sweep and simulate it; 0 leaves out none."""
     local: bool = False
-    """Render in this process instead of through gRPC."""
+    """CLIP: render in this process instead of through gRPC."""
     images: Path | None = None
-    """Also write rendered and recorded images side by side into this folder."""
+    """CLIP: also write rendered and recorded images side by side into this folder."""
     json: Path | None = None
-    """Write all figures here."""
+    """CLIP: write all figures here."""
 
 
 @dataclass(frozen=True)
@@ -51,27 +51,27 @@ class ProtocolFlags:
     """Methods side by side, on worlds that training never sees or on logs (with --protocol)."""
 
     methods: tuple[Compared, ...] = ()
-    """What to compare; what the protocol is about if not given."""
+    """Protocol: what to compare; what the protocol is about if not given."""
     worlds: int | None = None
-    """How many drawn worlds; 12 for storm, 3 for clip, 6 for shift if not given."""
+    """Protocol: how many drawn worlds; 12 for storm, 3 for clip, 6 for shift if not given."""
     seed: int = 0
-    """Seed of the first drawn world; the others count on from it."""
+    """Protocol: seed of the first drawn world; the others count on from it."""
     clips: tuple[Path, ...] = ()
-    """Recorded logs instead of drawn worlds."""
+    """Protocol: recorded logs instead of drawn worlds."""
     boxes: bool = False
-    """Give the log's boxes of things that can move to the methods; the paper's network has none."""
+    """Protocol: give the log's boxes of things that can move to the methods; the paper's network has none."""
     seconds: float = 10.0
-    """Length of a clip, 2 to 20."""
+    """Protocol: length of a clip, 2 to 20."""
     hold_out_every: int = 2
-    """Which frames of a clip are held out: every so-manieth."""
+    """Protocol: which frames of a clip are held out: every so-manieth."""
     clip_cameras: Literal[1, 3] = 3
-    """Cameras of a clip."""
+    """Protocol: cameras of a clip."""
     selective_checkpoint: Path | None = None
-    """Weights of `selective`; --checkpoint is for `dense`."""
+    """Protocol: weights of `selective`; --checkpoint is for `dense`."""
     out: Path = Path("evaluations")
-    """Folder that collects run folders."""
+    """Protocol: folder that collects run folders."""
     resume: Path | None = None
-    """Go on with this run folder; finished windows are kept."""
+    """Protocol: go on with this run folder; finished windows are kept."""
 
 
 LogGroup = Annotated[LogFlags, tyro.conf.arg(name="")]
@@ -81,7 +81,7 @@ NO_LOG_FLAGS, NO_PROTOCOL_FLAGS = LogFlags(), ProtocolFlags()
 
 @app.command
 def evaluate(
-    clip: Annotated[Path | None, tyro.conf.Positional] = None,
+    clip: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CLIP]")] = None,
     *,
     protocol: ProtocolName | None = None,
     log: LogGroup = NO_LOG_FLAGS,
@@ -153,6 +153,7 @@ def evaluate_protocol(name: ProtocolName, flags: ProtocolFlags, network: FeedFor
     if flags.clips and (flags.worlds is not None or flags.seed):
         raise NurecSimError("--worlds and --seed are for drawn worlds, --clips for recorded logs; give one of the two")
     from nurec_sim.evaluate import Protocol, contenders, run_protocol
+    from nurec_sim.evaluate.methods import without_weights
     from nurec_sim.evaluate.run import settings_of
     from nurec_sim.evaluate.tables import tables
     from nurec_sim.runs.folder import existing_run_folder, new_run_folder
@@ -169,6 +170,11 @@ def evaluate_protocol(name: ProtocolName, flags: ProtocolFlags, network: FeedFor
         cameras=flags.clip_cameras,
     )
     methods = contenders(flags.methods or USUAL_METHODS[name], network, flags.selective_checkpoint)
+    if not flags.methods:
+        missing = {method: why for method in methods if (why := without_weights(method)) is not None}
+        methods = tuple(method for method in methods if method not in missing)
+        for method, why in missing.items():
+            err.print(f"note: {method.name} is left out: {why}", style="yellow", markup=False, soft_wrap=True)
     settings_of(protocol, methods)  # what is missing is said before a folder is made
     stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
     folder = new_run_folder(flags.out, stamp) if flags.resume is None else existing_run_folder(flags.resume)

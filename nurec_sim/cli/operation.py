@@ -114,17 +114,17 @@ def service_options(flags: OperationFlags, **more: Any) -> ServiceOptions:
         "max_batch_items": flags.max_batch_items,
         "max_message_bytes": None if flags.max_message_mb is None else flags.max_message_mb << 20,
     }
-    for name, value in given.items():
-        if value is not None and value < 1:
-            raise NurecSimError(f"{name} must be at least 1, got {value}")
     chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    return ServiceOptions(
-        warm_up=True,
-        allow_shut_down=flags.allow_shut_down,
-        allow_remote_scenes=flags.allow_remote_scenes,
-        **chosen,
-        **more,
-    )
+    try:
+        return ServiceOptions(
+            warm_up=True,
+            allow_shut_down=flags.allow_shut_down,
+            allow_remote_scenes=flags.allow_remote_scenes,
+            **chosen,
+            **more,
+        )
+    except ValueError as error:
+        raise NurecSimError(str(error)) from None
 
 
 def warn(text: str) -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from nurec_sim.cli.console import OnePath, app, out, progress
 from nurec_sim.errors import NurecSimError
-
-TOKEN_VARIABLE = "NUREC_SIM_TOKEN"
 
 
 @app.command
@@ -36,13 +33,13 @@ def upload(
         client_key: its private key (PEM).
     """
     from nurec_sim.client_v1 import SceneClient
+    from nurec_sim.server import read_token
 
     if reconstruct and source.suffix != ".zip":
         raise NurecSimError(f"--reconstruct is for clips, {source.name} is none")
     try:
-        token = os.environ.get(TOKEN_VARIABLE) if token_file is None else token_file.read_text().strip()
         with SceneClient(
-            server, token=token, root_ca=root_ca, client_cert=client_cert, client_key=client_key
+            server, token=read_token(token_file), root_ca=root_ca, client_cert=client_cert, client_key=client_key
         ) as client:
             client.stats()  # a server that is not there ends this here, at its time limit
             with progress("uploading") as advance:

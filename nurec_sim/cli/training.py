@@ -44,12 +44,11 @@ def train(
 
     from nurec_sim.training.ablations import ablated
     from nurec_sim.training.config import read_config
-    from nurec_sim.training.curves import write_curves
     from nurec_sim.training.lpips import load_lpips
     from nurec_sim.training.perceptual import perceptual_distance
     from nurec_sim.training.processes import Processes
     from nurec_sim.training.samples import TownSamples
-    from nurec_sim.training.trainer import CURVES, WEIGHTS, Trainer
+    from nurec_sim.training.trainer import WEIGHTS, Trainer
 
     if min(drawers, loaders) < 0 or (threads is not None and threads < 1):
         raise TrainingError(
@@ -66,8 +65,6 @@ def train(
             Trainer(config, folder, samples, perceptual, processes, threads).run(advance, until)
     finally:
         processes.leave()
-    if processes.first and (folder / CURVES).is_file():
-        write_curves(folder)
     out.print(f"wrote {folder / WEIGHTS}", soft_wrap=True)
 
 

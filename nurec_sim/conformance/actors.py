@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import grpc
 import numpy as np
 
 from nurec_sim import geometry, wire
@@ -54,8 +55,6 @@ def unknown_id(target: Target) -> str:
 @check("actors-not-finite")
 def not_finite(target: Target) -> str:
     """An actor at a pose that is not finite is refused."""
-    import grpc
-
     request = target.request()
     add(request, "anyone", target.path.at(target.middle_us))
     request.dynamic_objects[0].pose_pair.start_pose.vec.y = float("inf")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from nurec_sim.errors import ReconstructError
+from nurec_sim.errors import ReconstructError, WeightsError
 from nurec_sim.evaluate.windows import Window
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings
 from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, SensorRequest
@@ -64,9 +64,9 @@ def contenders(
 
     Args:
         names: in the order of the tables; none twice.
-        network: how logs go through the network; its profile and checkpoint are those of ``dense`` unless the profile
-            is a selective one. Both network methods share the rest.
-        selective_checkpoint: weights of ``selective``, its own if None.
+        network: how logs go through the network; profile and checkpoint are for ``dense``, or for ``selective`` if the
+            profile is one of its. Both share the rest.
+        selective_checkpoint: weights of ``selective``.
         lift: settings of ``lift``; ``LIFT`` if None.
 
     Raises:
@@ -87,10 +87,11 @@ def _contender(name: str, network: FeedForwardSettings, selective: Path | None, 
     method = "selective" if name == "selective" else "dense"
     if name == "dense-concatenated":
         network = dataclasses.replace(network, merge="concatenate")
-    fits = network.profile is None or _decoder(network.profile) == method
-    if method == "selective":
-        network = dataclasses.replace(network, checkpoint=selective)
-    return Contender(name, method, network if fits else dataclasses.replace(network, profile=None))
+    owner = "dense" if network.profile is None else _decoder(network.profile)
+    given = network.checkpoint if owner == method else None
+    checkpoint = selective if method == "selective" and selective is not None else given
+    profile = network.profile if owner == method else None
+    return Contender(name, method, dataclasses.replace(network, profile=profile, checkpoint=checkpoint))
 
 
 def _decoder(profile: str) -> str:
@@ -99,6 +100,18 @@ def _decoder(profile: str) -> str:
     if profile not in PROFILES:
         raise ReconstructError(f"no network profile {profile!r}; have {list(PROFILES)}")
     return PROFILES[profile].decoder
+
+
+def without_weights(contender: Contender) -> str | None:
+    """Why a method cannot run here: nobody named weights for it, and there are none. None if it can."""
+    settings = contender.settings
+    if not isinstance(settings, FeedForwardSettings) or settings.checkpoint is not None:
+        return None
+    try:
+        describe(contender)
+    except WeightsError as error:
+        return str(error)
+    return None
 
 
 def describe(contender: Contender) -> dict[str, Any]:

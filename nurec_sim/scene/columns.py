@@ -63,7 +63,7 @@ class Columns:
             normal: unit vectors or zero; zero for all if None.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            single = {name: np.asarray(value).astype(np.float32) for name, value in self._parts().items()}
+            single = {name: np.asarray(value).astype(np.float32, copy=False) for name, value in self._parts().items()}
             length = np.linalg.norm(single["quat_wxyz"].astype(np.float64), axis=1)
             sound = np.isfinite(single["opacity"]) & (length > 1e-12) & (single["scale_m"] > 0).all(axis=1)
         for values in single.values():

@@ -122,8 +122,8 @@ class SceneStore:
             self._sources[entry.id] = entry
         return entry.id
 
-    def remove(self, name: str) -> None:
-        """Offers a scene no longer; its file stays.
+    def remove(self, name: str) -> int:
+        """Offers a scene no longer; its file stays. Gives the bytes of memory that it took.
 
         Raises:
             UnknownSceneError, ArchiveError: see ``resolve``.
@@ -133,7 +133,7 @@ class SceneStore:
         with self._lock:
             self._sources.pop(source.id, None)
         try:
-            self._unload(source.id)
+            return self._unload(source.id)
         except SceneInUseError:
             with self._lock:
                 self._sources.setdefault(source.id, source)

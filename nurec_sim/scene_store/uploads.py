@@ -120,8 +120,8 @@ class UploadFolder:
         """Whether a source is a file of this folder."""
         return isinstance(path, Path) and path.parent == self.folder
 
-    def delete(self, name: str) -> None:
-        """Offers an uploaded scene no longer and deletes its file.
+    def delete(self, name: str) -> int:
+        """Offers an uploaded scene no longer and deletes its file; gives the bytes of memory that it took.
 
         Raises:
             UnknownSceneError, ArchiveError: see ``SceneStore.resolve``.
@@ -131,9 +131,10 @@ class UploadFolder:
         source = self._store.source(name)
         if not self.holds(source.origin):
             raise RequestError(f"scene {source.id!r} was not uploaded, so it cannot be deleted")
-        self._store.remove(source.id)
+        freed = self._store.remove(source.id)
         assert isinstance(source.origin, Path)
         source.origin.unlink(missing_ok=True)
+        return freed
 
     def _refuse_taken(self, name: str) -> None:
         if (self.folder / name).exists():

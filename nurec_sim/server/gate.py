@@ -14,6 +14,7 @@ import grpc
 from nurec_sim.calls import Call, enter_call
 from nurec_sim.server.limits import RateLimit, UnreadReplies, address_of
 from nurec_sim.server.options import ServerOptions
+from nurec_sim.server.registration import HANDLER_KINDS
 from nurec_sim.server.request_log import log_call
 from nurec_sim.server.security import shows_token
 from nurec_sim.server.telemetry import Telemetry
@@ -22,13 +23,6 @@ Code = grpc.StatusCode
 _HEALTH = "Health/"
 _DRAIN_STEP_S = 0.02
 _SECRETS = ("authorization", "cookie")
-_OTHER_KINDS = {
-    (False, False): grpc.unary_unary_rpc_method_handler,
-    (False, True): grpc.unary_stream_rpc_method_handler,
-    (True, False): grpc.stream_unary_rpc_method_handler,
-    (True, True): grpc.stream_stream_rpc_method_handler,
-}
-"""What makes a handler, by whether requests and replies are streams."""
 
 
 class Gate(grpc.aio.ServerInterceptor):
@@ -78,7 +72,7 @@ class Gate(grpc.aio.ServerInterceptor):
             if behaviour is not None
         )
         through = self._streaming if inspect.isasyncgenfunction(inner) else self._answering
-        return _OTHER_KINDS[streams](through(inner, name), handler.request_deserializer, handler.response_serializer)
+        return HANDLER_KINDS[streams](through(inner, name), handler.request_deserializer, handler.response_serializer)
 
     def _answering(self, inner: Callable, name: str) -> Callable:
         async def behaviour(request, context: grpc.aio.ServicerContext):

@@ -20,6 +20,13 @@ from nurec_sim.service import describe
 
 log = logging.getLogger(__name__)
 
+HANDLER_KINDS = {
+    (False, False): grpc.unary_unary_rpc_method_handler,
+    (False, True): grpc.unary_stream_rpc_method_handler,
+    (True, False): grpc.stream_unary_rpc_method_handler,
+    (True, True): grpc.stream_stream_rpc_method_handler,
+}
+"""What makes a handler, by whether requests and replies are streams."""
 _MAX_TEXT = 2000  # a status text travels in the HTTP/2 trailers, which end at 8 KiB
 
 
@@ -99,13 +106,9 @@ def _handler(
         except Exception as error:
             await _refuse(procedure, error, context)
 
-    if method.server_streaming:
-        make = (
-            grpc.stream_stream_rpc_method_handler if method.client_streaming else grpc.unary_stream_rpc_method_handler
-        )
-        return make(stream)
-    make = grpc.stream_unary_rpc_method_handler if method.client_streaming else grpc.unary_unary_rpc_method_handler
-    return make(answer)
+    return HANDLER_KINDS[method.client_streaming, method.server_streaming](
+        stream if method.server_streaming else answer
+    )
 
 
 async def _refuse(procedure: Callable, error: Exception, context: grpc.aio.ServicerContext) -> None:

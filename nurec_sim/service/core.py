@@ -117,3 +117,13 @@ class ServiceCore:
                 f"the raw {what} of this reply may take {size:,} bytes of {self._options.max_message_bytes:,}; "
                 f"ask for fewer {fewer}"
             )
+
+
+async def run_to_end(executor: ThreadPoolExecutor, function: Callable, *arguments):
+    """What a function gives that must not be left half-way: a client that leaves waits for its end all the same."""
+    work = asyncio.get_running_loop().run_in_executor(executor, function, *arguments)
+    try:
+        return await asyncio.shield(work)
+    except asyncio.CancelledError:
+        await asyncio.wait([work])
+        raise

@@ -36,8 +36,6 @@ class DownloadCache:
     """
 
     def __init__(self, folder: Path, capacity: int, max_bytes: int, timeout_s: float) -> None:
-        if capacity < 1:
-            raise ValueError(f"a download cache needs room for at least 1 scene, got capacity {capacity}")
         self.folder = folder
         self._capacity, self._max_bytes, self._timeout_s = capacity, max_bytes, timeout_s
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 from nurec_sim import wire
 from nurec_sim.errors import NurecSimError, RequestError, TooLargeError, UnknownSceneError
 from nurec_sim.scene import edits
-from nurec_sim.service.core import ServiceCore
+from nurec_sim.service.core import ServiceCore, run_to_end
 from nurec_sim.types import GaussianScene
 from nurec_sim.wire import common, sensorsim
 
@@ -29,6 +29,8 @@ class Editing(ServiceCore):
     def __init__(self, *arguments) -> None:
         super().__init__(*arguments)
         self._turns: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._in_work: set[str] = set()
+        """Scenes that an edit is about to be kept of."""
 
     async def edit_assets(self, request):
         """Replaces and inserts actors that look like others of this scene or of another one on offer."""
@@ -37,16 +39,21 @@ class Editing(ServiceCore):
         if count > MAX_EDITS:
             raise TooLargeError(f"a request may make {MAX_EDITS} edits, got {count}")
         async with self._turns[scene_id]:
-            known = scene_id in self._store.edited_ids
-            if not known and len(self._store.edited_ids) >= self._options.max_edited_scenes:
+            taken = {*self._store.edited_ids, *self._in_work}
+            if scene_id not in taken and len(taken) >= self._options.max_edited_scenes:
                 raise TooLargeError(
                     f"{self._options.max_edited_scenes} scenes are edited, which is all that this server keeps; "
                     "restore one of them first"
                 )
-            with await self.lease(scene_id) as loaded:
-                edited = await self._run(self._loading, self._edited, loaded.scene, request)
-                if count:
-                    await self._run(self._loading, self._store.replace, scene_id, edited)
+            self._in_work.add(scene_id)
+            try:
+                with await self.lease(scene_id) as loaded:
+                    edited = await self._run(self._loading, self._edited, loaded.scene, request)
+                    if count:
+                        # To its end, or an edit of the next client could be overtaken by this one.
+                        await run_to_end(self._loading, self._store.replace, scene_id, edited)
+            finally:
+                self._in_work.discard(scene_id)
         return sensorsim.EditAssetsReturn(
             success=True, message=f"{len(request.replace)} replaced or removed, {len(request.insert)} inserted"
         )

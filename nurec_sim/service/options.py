@@ -41,6 +41,16 @@ class ServiceOptions:
     download_timeout_s: float = 300.0
     """For one scene."""
 
+    def __post_init__(self) -> None:
+        counts = ("render_workers", "max_pixels", "max_batch_items", "max_message_bytes", "download_cache_size",
+                  "max_download_bytes")  # fmt: skip
+        for name in counts:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("max_edited_scenes", "download_timeout_s"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+
 
 def describe(error: Exception) -> str:
     """The text of an error that is fit for a client."""

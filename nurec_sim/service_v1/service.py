@@ -11,6 +11,7 @@ from nurec_sim import wire
 from nurec_sim.errors import RequestError, TooLargeError, UnsupportedError
 from nurec_sim.scene_store import SceneStore, Upload, UploadFolder
 from nurec_sim.service import SensorService
+from nurec_sim.service.core import run_to_end
 from nurec_sim.service_v1.frames import Frames
 from nurec_sim.service_v1.options import SceneOptions
 from nurec_sim.service_v1.reconstructions import Reconstructions
@@ -66,10 +67,11 @@ class SceneService:
         return reply
 
     async def unload_scene(self, request):
-        """Takes a scene out of memory, and deletes it if that is asked for."""
-        freed = self._store.unload(request.scene_id)
+        """Takes a scene out of memory, and deletes it if that is asked for; what cannot be deleted stays as it is."""
         if request.delete_file:
-            await self._in_disk_thread(self._upload_folder().delete, request.scene_id)
+            freed = await self._in_disk_thread(self._upload_folder().delete, request.scene_id)
+        else:
+            freed = self._store.unload(request.scene_id)
         return v1.UnloadSceneReply(freed_bytes=freed)
 
     async def stats(self, request):
@@ -138,13 +140,8 @@ class SceneService:
         return self._uploads
 
     async def _in_disk_thread(self, function, *arguments):
-        # Shielded: a file must not be closed under the thread that writes it when the client leaves.
-        work = asyncio.get_running_loop().run_in_executor(self._disk, function, *arguments)
-        try:
-            return await asyncio.shield(work)
-        except asyncio.CancelledError:
-            await asyncio.wait([work])
-            raise
+        # To its end: a file must not be closed under the thread that writes it when the client leaves.
+        return await run_to_end(self._disk, function, *arguments)
 
     # ------------------------------------------------------------------------------------- reconstruction and rendering
 

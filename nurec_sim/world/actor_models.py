@@ -77,7 +77,7 @@ class ActorBuilder:
                  "cargo": f"cargo{rng.integers(4)}"}  # fmt: skip
         for name, corners in shapes.items():
             tint = actor.colour if name == "paint" else (1.0, 1.0, 1.0)
-            mesh = self.builder.shared_mesh(corners, stretch)
+            mesh = self.builder.shared_mesh(corners, stretch.tolist())
             self.builder.place(body, mesh, SurfaceClass.VEHICLE, looks.get(name, name), instance=instance, tint=tint,
                                reflectivity=LASER_OF_PART.get(name))  # fmt: skip
         self._shadow(body, actor, *actor.size_m[:2])

@@ -66,8 +66,8 @@ class Face:
 
     ``rows`` and ``columns`` bound the part of the grid that has such rays, ``owned`` marks them in it. ``nearest`` is
     the flat index of each ray's pixel, ``offset_px`` how far right of and below its centre the ray passes, ``cosine``
-    the z of the ray in the face. ``colour_maps`` are places to read colours at, to be averaged. All of them are None
-    for a face whose pixels are the grid itself.
+    the z of the ray in the face. ``colour_maps`` are places to read colours at, to be averaged. A face whose pixels are
+    the grid itself has no ``nearest`` and what follows it.
     """
 
     lens: Pinhole
@@ -98,13 +98,13 @@ class Face:
             rgb = None if rgb is None else self._colours(rgb)
         range_m = np.zeros_like(nearness)
         np.divide(1, nearness * self.cosine, out=range_m, where=geom >= 0)
-        owned = True if self.owned is None else self.owned
-        for target, source in ((seen.geom, geom), (seen.range_m, range_m)):
-            np.copyto(target[self.rows, self.columns], source, where=owned)
-        for target, image in ((seen.rgb, rgb), (seen.normal, normal)):
-            if image is not None:
-                where = owned if owned is True else self.owned[..., None]  # type: ignore[index]
-                np.copyto(target[self.rows, self.columns], image, where=where)
+        owned = np.ones((1, 1), bool) if self.owned is None else self.owned
+        part = seen.part(self.rows, self.columns)
+        np.copyto(part.geom, geom, where=owned)
+        np.copyto(part.range_m, range_m, where=owned)
+        np.copyto(part.normal, normal, where=owned[..., None])
+        if rgb is not None:
+            np.copyto(part.rgb, rgb, where=owned[..., None])
 
     def _colours(self, rgb: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """Colours along the rays, between pixel centres bilinear."""

@@ -25,7 +25,7 @@ def add_house(chunks: Chunks, house: Building, terrain: Terrain, kerb_m: float, 
     heights = terrain.height_m(corners)
     floor = float(heights.max()) + kerb_m
     low = float(heights.min()) - 0.6
-    mesh = _House(house, floor)
+    mesh = _House(house)
     tall = house.floors * house.floor_height_m
     mesh.plinth(low - floor)
     facade_low = 0.0
@@ -45,10 +45,8 @@ def add_house(chunks: Chunks, house: Building, terrain: Terrain, kerb_m: float, 
     else:
         mesh.flat_roof(tall, rng)
     here, pose = (house.x_m, house.y_m), pose_from_xyyaw(house.x_m, house.y_m, house.yaw_rad, floor)
-    variant = house.facade % 4
-    material = f"facade_{house.family}{variant}"
     tint = tuple(round(0.5 + 0.5 * float(c), 2) for c in house.tint)  # walls of one colour, not of many
-    parts = ((mesh.facade, material, tint), (mesh.shop, f"shop{house.facade % 2}", (1.0, 1.0, 1.0)),
+    parts = ((mesh.facade, f"facade_{house.family}{house.facade}", tint), (mesh.shop, f"shop{house.facade % 2}", (1.0, 1.0, 1.0)),
              (mesh.roof, f"roof{house.facade % 2}", (1.0, 1.0, 1.0)), (mesh.trim, "concrete", (1.0, 1.0, 1.0)),
              (mesh.dark, "metal", (1.0, 1.0, 1.0)))  # fmt: skip
     for part, name, colour in parts:
@@ -59,7 +57,7 @@ def add_house(chunks: Chunks, house: Building, terrain: Terrain, kerb_m: float, 
 class _House:
     """The parts of a house in its own frame, z = 0 at its floor."""
 
-    def __init__(self, house: Building, floor_m: float):
+    def __init__(self, house: Building):
         self.house = house
         self.half = np.array([house.width_m, house.depth_m]) / 2
         self.facade, self.shop, self.roof, self.trim, self.dark = (MeshBuilder() for _ in range(5))
@@ -70,7 +68,7 @@ class _House:
         """A base down into the slope, and a step around the walls."""
         out = self.outline * (1 + 0.03 / self.half)
         self.trim.wall(out, low, 0.35, 0.5, 0.0, 0.5)
-        self._ring(self.trim, out, 0.35)
+        self.trim.quad(*([*corner, 0.35] for corner in out[:4]))
 
     def walls(self, mesh: MeshBuilder, low: float, high: float, v_span: float) -> None:
         """Walls with a whole number of bays each; the texture begins somewhere else on every wall."""
@@ -162,8 +160,3 @@ class _House:
             at = rng.uniform(-0.55, 0.55, 2) * self.half
             part = self.dark if rng.random() < 0.5 else self.trim
             part.box([*at, eaves + size[2]], size)
-
-    @staticmethod
-    def _ring(mesh: MeshBuilder, outer: np.ndarray, z: float) -> None:
-        """A horizontal surface inside a closed outline."""
-        mesh.quad(*([*corner, z] for corner in outer[:4]))

@@ -57,7 +57,7 @@ def _facades(builder: SpecBuilder, plan: TownPlan) -> None:
     level = sum(illumination(plan.weather).ambient) / 3 + 0.06
     glow = 0.72 if dusk > LAMPS_ON else 0.0
     night = glow / level
-    wanted = sorted({(house.family, house.facade % 4) for house in plan.buildings})
+    wanted = sorted({(house.family, house.facade) for house in plan.buildings})
     for family, variant in wanted:
         rng = np.random.default_rng([plan.style.texture_seed, 2, variant, *family.encode()])
         image = textures_facades.facade(rng, family, lit, night)

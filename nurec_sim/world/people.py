@@ -128,9 +128,9 @@ def bicycle() -> dict[str, MeshBuilder]:
     for hub in (rear, front):
         angle = np.linspace(0, 2 * np.pi, 25)
         tube = np.linspace(0, 2 * np.pi, 7)
-        radius = 0.315 + 0.024 * np.cos(tube)
-        ring = np.stack([hub[0] + np.outer(np.cos(angle), radius), np.tile(0.022 * np.sin(tube), (25, 1)),
-                         hub[2] + np.outer(np.sin(angle), radius)], axis=2)  # fmt: skip
+        reach_m = 0.315 + 0.024 * np.cos(tube)
+        ring = np.stack([hub[0] + np.outer(np.cos(angle), reach_m), np.tile(0.022 * np.sin(tube), (25, 1)),
+                         hub[2] + np.outer(np.sin(angle), reach_m)], axis=2)  # fmt: skip
         tyres.grid(ring)
         for spoke in np.arange(4) * np.pi / 4:
             reach = 0.30 * np.array([np.cos(spoke), 0, np.sin(spoke)])

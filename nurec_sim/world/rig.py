@@ -1,4 +1,4 @@
-"""The car that drives through the street: three cameras and one spinning LiDAR."""
+"""The car that drives through the town: three cameras and one spinning LiDAR."""
 
 from __future__ import annotations
 

@@ -76,4 +76,4 @@ class _Plants:
             mesh = trees.tree(rng, name, TREE_SIZES[size]) if prop.kind == "tree" else trees.bush(rng, TREE_SIZES[size])
             self._shapes[key] = self.builder.mesh(mesh, 40.0)
         self.builder.place(self.builder.world, self._shapes[key], SurfaceClass.VEGETATION, f"plant{family}",
-                           xyz=pose[:3, 3], yaw=prop.yaw_rad)  # fmt: skip
+                           xyz=pose[:3, 3].tolist(), yaw=prop.yaw_rad)  # fmt: skip

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
+from numpy.typing import ArrayLike
 
 from nurec_sim.world.plan import Weather
 from nurec_sim.world.textures import noise
@@ -68,18 +69,18 @@ class Sky:
         up = direction[..., 2:]
         flat = np.clip(up, 0, 1)
         blend = 1 - np.exp(-3.2 * flat)
-        colour = np.float32(self.colours.horizon) * (1 - blend) + np.float32(self.colours.zenith) * blend
-        towards = direction @ np.float32(self.sun)
-        glow = np.exp((towards - 1) * 40)[..., None] * np.float32([70, 62, 46])
-        glow = glow + np.exp((towards - 1) * 5)[..., None] * np.float32([34, 27, 14])
+        colour = _single(self.colours.horizon) * (1 - blend) + _single(self.colours.zenith) * blend
+        towards = direction @ _single(self.sun)
+        glow = np.exp((towards - 1) * 40)[..., None] * _single([70, 62, 46])
+        glow = glow + np.exp((towards - 1) * 5)[..., None] * _single([34, 27, 14])
         colour = colour + self.colours.glow * glow
         cover, light = self._cloud(direction)
-        lit = np.float32(self.colours.cloud_lit) + 0.35 * self.colours.glow * glow
-        colour = colour + cover * (lit * light + np.float32(self.colours.cloud_dark) * (1 - light) - colour)
+        lit = _single(self.colours.cloud_lit) + 0.35 * self.colours.glow * glow
+        colour = colour + cover * (lit * light + _single(self.colours.cloud_dark) * (1 - light) - colour)
         if self.sun_seen:
             disc = np.clip((towards - np.cos(np.deg2rad(0.75))) / 4e-5, 0, 1)[..., None] * (1 - 0.85 * cover)
-            colour = colour + disc * (np.float32(self.colours.sun) - colour)
-        colour = np.where(up < 0, np.float32(self.colours.horizon) * (1 + 0.35 * np.clip(up, -0.6, 0)), colour)
+            colour = colour + disc * (_single(self.colours.sun) - colour)
+        colour = np.where(up < 0, _single(self.colours.horizon) * (1 + 0.35 * np.clip(up, -0.6, 0)), colour)
         return np.clip(colour * self._tone, 0, 255).astype(np.uint8)
 
     def _cloud(self, direction: np.ndarray) -> tuple[Float32[np.ndarray, "h w 1"], Float32[np.ndarray, "h w 1"]]:
@@ -88,14 +89,14 @@ class Sky:
         plane = direction[..., :2] / up[..., None]
         # Towards the sun a cloud is lit, so the second look-up is a step nearer to the sun.
         here = self._thickness(plane)
-        nearer = self._thickness(plane + np.float32(0.09) * np.float32(self.sun[:2]))
+        nearer = self._thickness(plane + np.float32(0.09) * _single(self.sun[:2]))
         limit = 0.5 + 0.75 * (0.5 - self.cover)
         cover = np.clip((here - limit) / 0.22, 0, 1) * np.clip((direction[..., 2] - 0.005) * 9, 0, 1)
         light = np.clip(0.72 + 2.6 * (here - nearer) - 0.75 * (here - limit), 0.0, 1.0)
         return (cover * cover * (3 - 2 * cover))[..., None], light[..., None]
 
     def _thickness(self, plane: np.ndarray) -> np.ndarray:
-        place = np.mod(plane * np.float32(CLOUD_CELLS_PX) + np.float32([310, 530]), 1024).astype(np.float32)
+        place = np.mod(plane * np.float32(CLOUD_CELLS_PX) + _single([310, 530]), 1024).astype(np.float32)
         return cv2.remap(self._clouds, np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1]),
                          cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)  # fmt: skip
 
@@ -110,15 +111,19 @@ class Sky:
     def _face(self, direction: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
         """One face; ``direction`` need not be of unit length. What lies below the horizon costs nothing."""
         rows = int((direction[:, :, 2] > 0).any(axis=1).sum())
-        image = np.empty(direction.shape, np.uint8)
+        width, image = direction.shape[1], np.empty(direction.shape, np.uint8)
         if rows < len(image):
             step = direction[rows:, :: max(1, len(image) // 8)]
             below = self.colour(step / np.linalg.norm(step, axis=-1, keepdims=True))
-            image[rows:] = cv2.resize(below, (image.shape[1], len(below)), interpolation=cv2.INTER_LINEAR)
+            image[rows:] = cv2.resize(below, (width, len(below)), interpolation=cv2.INTER_LINEAR)
         if rows:
             seen = direction[:rows]
             image[:rows] = self.colour(seen / np.linalg.norm(seen, axis=-1, keepdims=True))
         return image
+
+
+def _single(values: ArrayLike) -> np.ndarray:
+    return np.asarray(values, np.float32)
 
 
 def sun_direction(weather: Weather) -> Float64[np.ndarray, " 3"]:

@@ -15,6 +15,7 @@ from nurec_sim.world.textures import Image, as_image, grain, noise
 
 FLOORS = BAYS = 4
 FACADE_PX = 512
+_PARAPETS = ((168, 120, 92), (132, 148, 160), (176, 158, 112), (122, 142, 118), (150, 150, 148), (164, 104, 88))
 _LAMP = np.array([255.0, 214.0, 150.0])
 _NAMES = ("CAFE", "BAKERY", "BOOKS", "MARKET", "PIZZA", "BANK", "HOTEL", "FLOWERS", "SUSHI", "BAR", "PHARMA", "OPTIK",
           "SHOES", "DELI", "KIOSK", "RADIO", "TAILOR", "GYM", "TOYS", "WINE")  # fmt: skip
@@ -65,7 +66,7 @@ def _panel(rng: np.random.Generator, size: int) -> np.ndarray:
     grey *= np.kron(rng.uniform(0.93, 1.05, (FLOORS, BAYS)), np.ones((size // FLOORS, size // BAYS)))
     image = grey[..., None] * np.array([rng.uniform(150, 190)] * 3) * [1, rng.uniform(0.96, 1), rng.uniform(0.9, 1)]
     if rng.random() < 0.5:  # coloured parapets
-        strip = np.array([rng.uniform(90, 200), rng.uniform(90, 170), rng.uniform(80, 170)])
+        strip = np.array(_PARAPETS[rng.integers(len(_PARAPETS))]) * rng.uniform(0.85, 1.1)
         for floor in range(FLOORS):
             y = int((floor + 0.78) * size / FLOORS)
             image[y : y + size // FLOORS // 5] = strip * grey[y : y + size // FLOORS // 5, :, None]

@@ -35,7 +35,7 @@ def person(rng: np.random.Generator, shirt: tuple[float, float, float]) -> Image
     colours = (_SKINS[rng.integers(len(_SKINS))], _HAIRS[rng.integers(len(_HAIRS))], 255 * np.asarray(shirt), trousers,
                _SHOES[rng.integers(len(_SHOES))])  # fmt: skip
     for row, colour in enumerate(colours):
-        image[row * step : (row + 1) * step] = colour
+        image[row * step : (row + 1) * step] = np.asarray(colour, np.float32)
     wear = image[2 * step : 3 * step]
     pattern = int(rng.integers(5))
     if pattern == 1:

@@ -21,6 +21,7 @@ from nurec_sim.scene.checks import MIN_START_US
 from nurec_sim.scene.foreign.sensor_models import camera_from, lidar_from
 from nurec_sim.scene.foreign.track_sidecar import tracks_from
 from nurec_sim.scene.foreign.xodr_lanes import road_map_from
+from nurec_sim.scene.opendrive_xml import MAX_XML_BYTES
 from nurec_sim.scene.zip_package import Package
 from nurec_sim.types import Box, CameraModel, LidarModel, Rig, RoadMap, Track, Trajectory
 
@@ -129,7 +130,7 @@ def _add_map(around: Surroundings, package: Package, world_base: object) -> None
         place = codec.from_json(codec.array(np.float64, 4, 4), world_base, f"{package.path}: {RIG}: T_world_base")
         if not geometry.is_rotation(place[:3, :3]):
             place = None
-    around.road_map, note = road_map_from(package.read(MAP, codec.MAX_JSON_BYTES), place, around.ego, where)
+    around.road_map, note = road_map_from(package.read(MAP, MAX_XML_BYTES), place, around.ego, where)
     around.unknown.append(note)
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 
 from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.opendrive_xml import opendrive_root
 from nurec_sim.types import RoadMap, Trajectory
 
 STEP_M = 2.0
@@ -59,7 +60,7 @@ def lanes_from(data: bytes, where: str) -> list[Float64[np.ndarray, "k 3"]]:
     Raises:
         ArchiveError: no OpenDRIVE, damaged, too long, or a geometry that is not known.
     """
-    root = _root(data, where)
+    root = opendrive_root(data, where)
     lines: list[np.ndarray] = []
     total = 0.0
     try:
@@ -75,7 +76,7 @@ def lanes_from(data: bytes, where: str) -> list[Float64[np.ndarray, "k 3"]]:
 
 def ecef_from_map(data: bytes, where: str) -> Float64[np.ndarray, "4 4"] | None:
     """The map's place on the earth, from ``lat_0``, ``lon_0`` and ``alt_0`` of its geoReference; None without them."""
-    text = " ".join(each.text or "" for each in _root(data, where).iter("geoReference"))
+    text = " ".join(each.text or "" for each in opendrive_root(data, where).iter("geoReference"))
     given = dict(re.findall(r"\+=?(lat_0|lon_0|alt_0)=([-+.\deE]+)", text.replace("+=alt", "+alt")))
     try:
         latitude, longitude = np.radians(float(given["lat_0"])), np.radians(float(given["lon_0"]))
@@ -88,18 +89,6 @@ def ecef_from_map(data: bytes, where: str) -> Float64[np.ndarray, "4 4"] | None:
     up = np.array([cos * np.cos(longitude), cos * np.sin(longitude), sin])
     origin = np.array([*(normal_m + height) * up[:2], (normal_m * (1 - _E2) + height) * sin])
     return geometry.pose(np.stack([east, np.cross(up, east), up], axis=1), origin)
-
-
-def _root(data: bytes, where: str) -> ElementTree.Element:
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise ArchiveError(f"{where}: document types and entities are not read")
-    try:
-        root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise ArchiveError(f"{where}: no XML, or damaged ({error})") from error
-    if root.tag != "OpenDRIVE":
-        raise ArchiveError(f"{where}: no OpenDRIVE map, but <{root.tag:.40}>")
-    return root
 
 
 def _value(element: ElementTree.Element, name: str, default: float | None = None) -> float:

@@ -100,7 +100,7 @@ def check(report: Report, contents: Contents) -> None:
     _check_data_info(report, contents, path_us)
     shared.tracks(report, contents, CHUNK_KEY)
     with report.rule("map"):
-        root = maps.opendrive_root(contents)
+        root = maps.road_root(contents)
         text = maps.georeference(root)
         if maps.geodetic_origin(text) is None:
             report.add("map-origin", f"map.xodr: the geoReference is {shown(text)}")

@@ -8,13 +8,13 @@ from typing import Any
 from xml.etree import ElementTree
 
 from nurec_sim.errors import ArchiveError
-from nurec_sim.scene.validate.contents import Contents, entry_of, numbers_of, shown
+from nurec_sim.scene.opendrive_xml import MAX_XML_BYTES, opendrive_root
+from nurec_sim.scene.validate.contents import Contents, entry_of, numbers_of
 from nurec_sim.scene.validate.finding import Report
 
 XODR = "map.xodr"
 MAP_FOLDERS = ("map_data", "clipgt", "fastmap")
 CLIPGT_TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign", "wait_line")
-MAX_XML_BYTES = 256 * 2**20
 MAX_TABLE_BYTES = 256 * 2**20
 
 
@@ -28,7 +28,7 @@ def check_alpasim_map(report: Report, contents: Contents, rig: dict[str, Any] | 
         report.add("map", f"the archive has neither {', '.join(f'{name}/' for name in MAP_FOLDERS)} nor {XODR}")
     elif folder is None:
         with report.rule("xodr"):
-            if georeference(opendrive_root(contents)) is None:
+            if georeference(road_root(contents)) is None:
                 raise ArchiveError(f"{XODR} has no geoReference")
         if rig is not None:
             with report.rule("base-frame"):
@@ -45,21 +45,13 @@ def check_base_frame(rig: dict[str, Any]) -> None:
     numbers_of(entry_of(rig, "T_world_base", name), f"{name}: T_world_base", 4, 4)
 
 
-def opendrive_root(contents: Contents) -> ElementTree.Element:
+def road_root(contents: Contents) -> ElementTree.Element:
     """The root of ``map.xodr``, which has a road at least.
 
     Raises:
         ArchiveError: missing, damaged, no OpenDRIVE, or without roads.
     """
-    text = contents.read(XODR, MAX_XML_BYTES)
-    if b"<!ENTITY" in text:
-        raise ArchiveError(f"{XODR} defines XML entities, which are not expanded")
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError, LookupError, RecursionError) as error:
-        raise ArchiveError(f"{XODR} is not XML ({error})") from error
-    if root.tag != "OpenDRIVE":
-        raise ArchiveError(f"{XODR} is no OpenDRIVE but <{shown(root.tag)}>")
+    root = opendrive_root(contents.read(XODR, MAX_XML_BYTES), XODR)
     if root.find("road") is None:
         raise ArchiveError(f"{XODR} has no road")
     return root
