@@ -59,8 +59,8 @@ class NetworkInputs:
 
     def to(self, device: torch.device | str) -> NetworkInputs:
         """The same on another device."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return NetworkInputs(**{name: None if value is None else value.to(device) for name, value in values.items()})
+        present = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if getattr(self, f.name) is not None}
+        return NetworkInputs(**{name: value.to(device) for name, value in present.items()})
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from nurec_sim.errors import TrainingError
 from nurec_sim.network.checkpoints import load_state_dict
 from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
-from nurec_sim.network.dpt import Fusion
+from nurec_sim.network.dpt import DptHead
 from nurec_sim.network.model import InstantNuRec
 
 FIRST_LOG_SCALE = 1.0
@@ -30,64 +30,61 @@ GROUND_CHANNEL = 3 + 6
 
 def prepare(model: InstantNuRec) -> None:
     """Change a randomly initialised network as above."""
+    decoder = model.decoder
     with torch.no_grad():
-        _pass_colours_through(model)
-        if model.decoder.depth_fusion is not None:
-            _pass_ground_through(model)
-        _first_gaussians(model.decoder)
+        # Raw colours r are shown as sigmoid(2 r).
+        grey = torch.linspace(0.05, 0.95, 10)
+        _pass_through(decoder.rgb_fusion, decoder.context_head, (0, 1, 2), grey, torch.logit(grey) / 2)
+        if decoder.depth_fusion is not None:
+            # The depth head puts out the logarithm, which is what its view holds of the ground.
+            log_depth = torch.linspace(-1.0, 1.8, 10)
+            _pass_through(decoder.depth_fusion, decoder.depth_head, (GROUND_CHANNEL,), log_depth, log_depth)
+        _first_gaussians(decoder)
 
 
-def _pass_colours_through(model: InstantNuRec) -> None:
-    """Three channels of the context head carry the image's colours from its input to its output."""
-    fusion, head = model.decoder.rgb_fusion, model.decoder.context_head.fusion_head
-    _open_way(fusion, head, (0, 1, 2))
-    # Raw colours r are shown as sigmoid(2 r): the line that fits best, found from what goes through.
-    grey = torch.linspace(0.05, 0.95, 10)
-    _fit_last_layer(fusion, head, grey[:, None].expand(-1, 3), torch.logit(grey) / 2, 3)
-
-
-def _pass_ground_through(model: InstantNuRec) -> None:
-    """One channel of the depth head carries the depth of flat ground, whose logarithm is what the head puts out."""
-    fusion, head = model.decoder.depth_fusion, model.decoder.depth_head.fusion_head
-    _open_way(fusion, head, (GROUND_CHANNEL,))
-    log_depth = torch.linspace(-1.0, 1.8, 10)
-    seen = torch.zeros(10, fusion[0].in_channels)
-    seen[:, GROUND_CHANNEL] = log_depth
-    _fit_last_layer(fusion, head, seen, log_depth, 1)
-
-
-def _open_way(fusion: nn.Sequential, head: Fusion, inputs: tuple[int, ...]) -> None:
-    """The first channels of every layer hand on these inputs, and nothing else."""
-    rows = range(len(inputs))
-    layers = [layer for layer in fusion if isinstance(layer, nn.Conv2d)]
-    for layer, sources in zip((*layers, head.after_conv[0]), (inputs, rows, rows, rows), strict=True):
-        layer.weight[: len(inputs)] = 0
-        layer.weight[list(rows), list(sources), 1, 1] = 1
-    layers[0].bias[: len(inputs)] = LINEAR_PART
-    head.before_conv.weight[: len(inputs)] = 0
-
-
-def _fit_last_layer(
-    fusion: nn.Sequential, head: Fusion, seen: Float[Tensor, "n inputs"], wanted: Float[Tensor, " n"], count: int
+def _pass_through(
+    fusion: nn.Sequential,
+    head: DptHead,
+    channels: tuple[int, ...],
+    seen: Float[Tensor, " n"],
+    wanted: Float[Tensor, " n"],
 ) -> None:
-    """The first ``count`` outputs of the head become a line over what the open way hands on, with the least squared error."""
-    passed = torch.relu(fusion(seen[:, :, None, None].expand(-1, -1, 5, 5))[:, 0, 2, 2])
+    """The head's first outputs become these channels of what its fusion sees, by the line that takes seen to wanted."""
+    kept = range(len(channels))
+    into, last = (layer for layer in head.fusion_head.after_conv if isinstance(layer, nn.Conv2d))
+    layers = [layer for layer in fusion if isinstance(layer, nn.Conv2d)]
+    # The first channels of every layer hand on these inputs, and nothing else.
+    for layer, sources in zip((*layers, into), (channels, kept, kept, kept), strict=True):
+        layer.weight[: len(channels)] = 0
+        layer.weight[list(kept), list(sources), 1, 1] = 1
+    _biases(layers[0])[: len(channels)] = LINEAR_PART
+    head.fusion_head.before_conv.weight[: len(channels)] = 0
+    # The last layer undoes what the others did on the way: the line with the least squared error.
+    images = torch.zeros(len(seen), layers[0].in_channels, 5, 5)
+    images[:, list(channels)] = seen[:, None, None, None]
+    passed = torch.relu(fusion(images)[:, 0, 2, 2])
     away = passed - passed.mean()
     slope = (away * wanted).sum() / (away**2).sum()
-    last = head.after_conv[2]
-    last.weight[:count] = 0
-    last.weight[range(count), range(count), 0, 0] = slope
-    last.bias[:count] = wanted.mean() - slope * passed.mean()
+    last.weight[: len(channels)] = 0
+    last.weight[list(kept), list(kept), 0, 0] = slope
+    _biases(last)[: len(channels)] = wanted.mean() - slope * passed.mean()
+
+
+def _biases(layer: nn.Conv2d | nn.Linear) -> Tensor:
+    assert layer.bias is not None
+    return layer.bias
 
 
 def _first_gaussians(decoder: DenseDecoder | SelectiveDecoder) -> None:
     """Biases of the last layer: scale 3, quaternion 4, opacity 1, for each Gaussian of a cluster."""
     first = torch.tensor([FIRST_LOG_SCALE] * 3 + [1.0, 0, 0, 0] + [FIRST_RAW_OPACITY])
+    last: nn.Module
     if isinstance(decoder, DenseDecoder):
-        last: nn.Module = decoder.gaussians_head.fusion_head.after_conv[2]
+        last = decoder.gaussians_head.fusion_head.after_conv[2]
     else:
         last = decoder.gs_linear
-    last.bias.copy_(first.repeat(last.bias.numel() // len(first)))
+    assert isinstance(last, (nn.Conv2d, nn.Linear))
+    _biases(last).copy_(first.repeat(len(_biases(last)) // len(first)))
     last.weight.mul_(0.1)
 
 

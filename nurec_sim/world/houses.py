@@ -46,9 +46,10 @@ def add_house(chunks: Chunks, house: Building, terrain: Terrain, kerb_m: float, 
         mesh.flat_roof(tall, rng)
     here, pose = (house.x_m, house.y_m), pose_from_xyyaw(house.x_m, house.y_m, house.yaw_rad, floor)
     tint = tuple(round(0.5 + 0.5 * float(c), 2) for c in house.tint)  # walls of one colour, not of many
-    parts = ((mesh.facade, f"facade_{house.family}{house.facade}", tint), (mesh.shop, f"shop{house.facade % 2}", (1.0, 1.0, 1.0)),
-             (mesh.roof, f"roof{house.facade % 2}", (1.0, 1.0, 1.0)), (mesh.trim, "concrete", (1.0, 1.0, 1.0)),
-             (mesh.dark, "metal", (1.0, 1.0, 1.0)))  # fmt: skip
+    plain, kind = (1.0, 1.0, 1.0), house.facade % 2
+    parts = ((mesh.facade, f"facade_{house.family}{house.facade}", tint), (mesh.shop, f"shop{kind}", plain),
+             (mesh.roof, f"roof{kind}", plain), (mesh.trim, "concrete", plain),
+             (mesh.dark, "metal", plain))  # fmt: skip
     for part, name, colour in parts:
         if not part.empty:
             chunks.at(here, SurfaceClass.BUILDING, name, tint=colour, crease_deg=20.0).extend(part, pose)
