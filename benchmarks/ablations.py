@@ -19,7 +19,8 @@ import tyro
 from render import PLAIN, machine_name, progress
 from scenes import ROOT
 
-from nurec_sim.cli.console import out
+from nurec_sim.cli.console import err, out
+from nurec_sim.errors import TrainingError
 from nurec_sim.evaluate import Contender, Protocol, run_protocol
 from nurec_sim.evaluate.run import settings_of
 from nurec_sim.evaluate.summary import interval
@@ -28,6 +29,7 @@ from nurec_sim.reconstruct import FeedForwardSettings
 from nurec_sim.runs.folder import write_text
 from nurec_sim.training.ablations import ABLATIONS, ablated, scaled
 from nurec_sim.training.checkpoint import read_position
+from nurec_sim.training.clips import ready_clips
 from nurec_sim.training.config import TrainingConfig, read_config
 from nurec_sim.training.perceptual import perceptual_distance
 from nurec_sim.training.samples import Samples, TownSamples
@@ -48,14 +50,14 @@ class Options:
 
     Args:
         variants: which rows; the full training is always there, for the others are compared with it.
-        recipe: of the full training; another one than that of benchmarks/ablations.yaml, say.
+        recipe: of the full training.
         steps: of each variant in all, shared out to the stages as in the recipe; the recipe's own if not given.
         pixels: of an input image, at most in training and always in evaluation.
         start: weights that every variant begins with.
         seed: of the training.
         training_clips: drawn before training, equal for all; the recipe's number if not given.
         clips: folder for them, OUT/clips if not given; nobody else should draw into it meanwhile.
-        drawers: processes that draw them.
+        drawers: processes that draw them; with 0 they must be there already.
         worlds: held-out worlds to evaluate in; three or more give intervals.
         seconds: of each.
         cameras: of each, 1 or 3.
@@ -98,7 +100,7 @@ def main() -> None:
     began = time.perf_counter()
     config = budget(options)
     clips = options.clips or options.out / "clips"
-    with TownSamples(config, clips, options.drawers, 0) as samples, progress("ablations") as advance:
+    with TownSamples(config, clips, options.drawers, 0, report=err.print) as samples, progress("ablations") as advance:
         weights = {name: train(ablated(config, name), options, samples, advance) for name in options.names}
     with progress("evaluation") as advance:
         results = evaluate(weights, options, advance)
@@ -150,10 +152,16 @@ def train(config: TrainingConfig, options: Options, samples: TownSamples | Sampl
 
 
 def wait_for_clips(samples: TownSamples, count: int, advance: Progress) -> None:
-    """All variants must see the same clips, so that training begins when all are drawn."""
-    from nurec_sim.training.clips import ready_clips
+    """All variants must see the same clips, so that training begins when all are drawn.
 
+    Raises:
+        TrainingError: some are missing and nobody draws them.
+    """
     while (ready := len(ready_clips(samples.cache.clips))) < count:
+        if not samples.drawers:
+            raise TrainingError(
+                f"{samples.cache.clips} holds {ready} clips, and {count} are needed; drawers must draw them"
+            )
         advance(f"drawing clips, {ready} of {count}", 0.0)
         time.sleep(1.0)
 

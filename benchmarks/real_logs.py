@@ -122,7 +122,7 @@ def cells(values: Mapping[str, Any]) -> tuple[str, ...]:
     digits = {"psnr_whole_db": 2, "psnr_db": 2, "ssim": 3, "abs_rel": 3, "delta1": 3, "abs_rel_metric": 3}
     thousand = None if values["gaussians"] is None else values["gaussians"] / 1000
     return (
-        values["log"], values["shown"], values["method"], *(number(values.get(n), d) for n, d in digits.items()),
+        values["method"], *(number(values.get(n), d) for n, d in digits.items()),
         number(thousand, 0), number(values["seconds"], 1), values["archive"],
     )  # fmt: skip
 
@@ -151,7 +151,8 @@ def main() -> None:
         out.print(f"{name}: {time.monotonic() - started:.0f} s", markup=False)
         options.output.parent.mkdir(parents=True, exist_ok=True)
         options.output.write_text(json.dumps(rows, indent=1) + "\n")
-    print_table("real logs", [cells(values) for values in rows], HEADING)
+    for name, shown in dict.fromkeys((values["log"], values["shown"]) for values in rows):
+        print_table(f"{name}: {shown}", [cells(values) for values in rows if values["log"] == name], HEADING)
 
 
 if __name__ == "__main__":

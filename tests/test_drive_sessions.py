@@ -29,10 +29,12 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from nurec_sim import geometry
-from nurec_sim.driving import RemotePolicy
+from nurec_sim.driving import RemotePolicy, session
+from nurec_sim.driving.session import Session
+from nurec_sim.errors import TooLargeError
 from nurec_sim.plugins import load_policy
 from nurec_sim.sim.flat_world import demo_rig
-from nurec_sim.types import Needs
+from nurec_sim.types import LidarFrame, Needs
 from nurec_sim.wire import common, driving, driving_paths, egodriver
 
 Code = grpc.StatusCode
@@ -332,3 +334,20 @@ def test_a_route_of_an_earlier_time_is_moved_with_the_car():
             stub.drive(drive_message(), timeout=10)
             moved = geometry.inverse(now) @ then @ [10.0, 0.0, 0.0, 1.0]
             np.testing.assert_allclose(stub.made[-1].seen[-1].route_m, [moved[:2]], atol=1e-5)
+
+
+def test_sweeps_and_images_share_what_a_session_may_hold(monkeypatch):
+    rig = demo_rig()
+    told = Session(driving.SessionStart("s", 0, rig, {}), Needs(lidars=("any",)), 8.0)
+    monkeypatch.setattr(session, "MAX_SESSION_BYTES", 30_000)
+
+    def sweep(end_us):
+        points, ones = np.ones((1000, 3), np.float32), np.ones(1000, np.float32)
+        return LidarFrame(rig.lidars["top"], end_us - 100_000, end_us, points, ones, ones, np.zeros(1000, np.int32))
+
+    told.add_sweep(sweep(NOW_US))
+    told.add_sweep(sweep(NOW_US))  # in the place of the first
+    with pytest.raises(TooLargeError, match="a session may hold 30000 bytes of images and sweeps, got 48000"):
+        told.add_sweep(sweep(NOW_US + 1))
+    told.add_states([ego_state(NOW_US)])
+    assert told.question(NOW_US).sweeps["any"].end_us == NOW_US

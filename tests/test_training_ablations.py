@@ -15,6 +15,7 @@ from nurec_sim.network.profiles import PROFILES
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.training.ablations import ABLATIONS, DEPTH_LOSSES, SKY_MLP_PROFILES, ablated, scaled
 from nurec_sim.training.config import LossWeights
+from nurec_sim.training.samples import TownSamples
 
 CONFIG = small_config()
 
@@ -146,6 +147,29 @@ def test_finished_runs_are_not_trained_again(script, tmp_path):
     assert contender.settings == FeedForwardSettings(
         "tiny", full, frames=4, image_pixels=options.pixels, max_chunks=100, merge="concatenate"
     )
+
+
+def test_clips_that_nobody_draws_are_not_waited_for(script, tmp_path):
+    options = script.Options(out=tmp_path, training_clips=2)
+    with (
+        TownSamples(script.budget(options), tmp_path / "clips", drawers=0) as samples,
+        pytest.raises(TrainingError, match="holds 0 clips, and 2 are needed; drawers must draw them"),
+    ):
+        script.train(CONFIG.model_copy(update={"data": script.budget(options).data}), options, samples, lambda *a: None)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_the_benchmarks_own_recipe_can_be_trained_without_each_thing(script):
+    config = script.budget(script.Options())
+    assert config.data.refresh is False and [stage.name for stage in config.stages] == [
+        "context",
+        "motion",
+        "gaussians",
+    ]
+    changed = [ablated(config, name) for name in ABLATIONS if name not in ("full", "concatenation")]
+    assert len({each.digest() for each in (config, *changed)}) == 5
+    assert {each.steps for each in changed} == {config.steps}
+    assert script.budget(script.Options(steps=30)).steps == 30
 
 
 # --- table

@@ -160,8 +160,8 @@ def test_training_starts_with_the_colours_of_the_image():
     assert SCENE_RESCALE == 0.15
 
 
-def test_training_starts_with_the_depth_of_flat_ground():
-    sample = ground_sample()
+def test_training_starts_with_the_depth_of_flat_ground_where_nothing_matches():
+    sample = ground_sample(images=1)
     model = network.build("tiny", seed=3)
     prepare(model)
     with torch.no_grad():

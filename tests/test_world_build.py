@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import shapely
 
-from nurec_sim import geometry
-from nurec_sim.types import Label
+from nurec_sim import geometry, sensors
+from nurec_sim.types import Label, SensorRequest
+from nurec_sim.world import TrueWorld, pick_backend, street_rig
 from nurec_sim.world.build import FAR_M, build_town
 from nurec_sim.world.builder import DECAL_ALPHA, DECAL_GROUP
 from nurec_sim.world.layout import town_plan
@@ -105,7 +106,7 @@ def test_ground_faces_up_everywhere(town, data):
     for geom in np.flatnonzero(np.isin(town.geom_class, GROUND) & (town.model.geom_bodyid == 0)):
         corners = world_triangles(town, data, geom)
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        upright = town.geom_class[geom] == SurfaceClass.KERB  # the faces of the kerb stones
+        upright = town.geom_class[geom] in (SurfaceClass.KERB, SurfaceClass.SIDEWALK)  # edges of stones and paving
         limit = -0.01 * np.linalg.norm(normal, axis=1) if upright else 0.0
         assert (normal[:, 2] >= limit).all(), SurfaceClass(town.geom_class[geom])
 
@@ -136,6 +137,28 @@ def test_rays_straight_down_meet_the_surface_of_the_network(town, data):
     np.testing.assert_allclose(ground_m[walk], heights[walk] + kerb.height_m, atol=0.006)
     lawn = surface == SurfaceClass.GRASS
     np.testing.assert_allclose(ground_m[lawn], heights[lawn] + kerb.height_m, atol=0.08)
+
+
+@pytest.mark.needs_gl
+def test_drawn_from_anywhere_there_is_no_sky_below_the_horizon(town):
+    """OpenGL leaves out back faces, so what is wound wrongly or lacks a side is a hole; seen from lawns as well."""
+    backend = pick_backend()
+    if backend == "rays":
+        pytest.skip("neither EGL nor OSMesa works here (or NUREC_SIM_GL=rays)")
+    camera = street_rig(160, 96).cameras["camera_front"]
+    rng, start_us = np.random.default_rng(8), town.plan.span_us[0]
+    places = town.plan.ego_trajectory().position_m[::8, :2]
+    low, high = np.array(town.network.surface.bounds).reshape(2, 2)
+    around = rng.uniform(low - 10, high + 10, (40, 2))
+    houses = [shapely.Point(h.x_m, h.y_m).buffer(np.hypot(h.width_m, h.depth_m) / 2) for h in town.plan.buildings]
+    places = np.concatenate([places, around[~shapely.contains_xy(shapely.union_all(houses), *around.T)][:12]])
+    with TrueWorld(town.plan, backend) as world:
+        for place, yaw in zip(places, rng.uniform(-np.pi, np.pi, len(places)), strict=True):
+            rig = geometry.pose_from_xyyaw(*place, yaw, float(town.plan.terrain.height_m(place)) + 0.2)
+            pose = np.stack([rig @ camera.rig_from_camera] * 2)
+            view = world.view(SensorRequest("town", camera, start_us, start_us, pose, {}))
+            up = (sensors.pixel_rays(camera)[0] @ pose[0][:3, :3].T)[..., 2]
+            assert (view.surface[up < -0.004] != SurfaceClass.SKY).all(), place
 
 
 def test_nothing_open_below_the_horizon(town, data):

@@ -79,6 +79,19 @@ def test_every_valid_ray_belongs_to_one_face_of_moderate_size(name):
     assert len(plan_faces(rays, np.zeros_like(valid), np.array([0.0, 1.0, 0.0]), 1.0)) == 0
 
 
+def test_lone_holes_in_the_ground_are_closed_and_those_in_leaves_are_not():
+    from nurec_sim.world.render import _close_cracks
+
+    geom, nearness = np.full((9, 9), 3, np.int32), np.full((9, 9), 0.1, np.float32)
+    for row, column in ((1, 4), (6, 3), (6, 6), (6, 7)):  # above the horizon; alone below it; two side by side
+        geom[row, column], nearness[row, column] = -1, 0
+    rgb = np.where(geom[..., None] < 0, 255, 90).astype(np.uint8) * np.ones((1, 1, 3), np.uint8)
+    drawn = Drawn(rgb, geom, nearness)
+    _close_cracks(drawn, Pinhole(9.0, 9.0, 4.5, 4.5), np.array([0.0, -1.0, 0.0]))
+    assert np.argwhere(geom < 0).tolist() == [[1, 4], [6, 6], [6, 7]]
+    assert nearness[6, 3] == np.float32(0.1) and rgb[6, 3].tolist() == [90, 90, 90]
+
+
 def test_columns_of_a_lidar_are_shared_out_in_order():
     lidar = sensors.lidar_model("HDL-64", np.eye(4), columns=100)
     patches = lidar_patches(lidar)
@@ -167,11 +180,14 @@ def test_rays_of_a_rolling_shutter_start_where_their_line_is(plan, rays, shutter
 
 @pytest.mark.needs_gl
 @pytest.mark.parametrize("name", ["pinhole", "f-theta"])
-def test_drawn_rolling_shutters_agree_with_rays_of_every_line(plan, painted, rays, name):
-    camera = dataclasses.replace(CAMERAS[name], shutter=Shutter.TOP_TO_BOTTOM)
+@pytest.mark.parametrize("shutter, turn_rad", [
+    (Shutter.TOP_TO_BOTTOM, 0.05), (Shutter.BOTTOM_TO_TOP, 0.4), (Shutter.LEFT_TO_RIGHT, -0.4)
+])  # fmt: skip
+def test_drawn_rolling_shutters_agree_with_rays_of_every_line(plan, painted, rays, name, shutter, turn_rad):
+    camera = dataclasses.replace(CAMERAS[name], shutter=shutter)
     request = request_at(plan, camera, 4.0, 30_000)
     turned = request.world_from_sensor[1].copy()
-    turned[:3, :3] = geometry.rotation_from_yaw(0.05) @ turned[:3, :3]
+    turned[:3, :3] = geometry.rotation_from_yaw(turn_rad) @ turned[:3, :3]
     request = dataclasses.replace(request, world_from_sensor=np.stack([request.world_from_sensor[0], turned]))
     drawn, cast = painted.view(request), rays.view(request)
     assert_agree(drawn, cast, labels=0.97)

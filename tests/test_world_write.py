@@ -165,6 +165,15 @@ def test_writing_over_things_is_refused(plan, written):
     assert sorted(file.name for file in path.parent.iterdir()) == before
 
 
+@pytest.mark.parametrize("name", ["meta.json", "../map.xodr", "a/b", ""])
+def test_attachments_need_names_of_their_own(plan, tmp_path, name):
+    with pytest.raises(ClipError, match="needs a plain file name that the clip does not use itself"):
+        logs.write_clip(
+            tmp_path / "clip", id="x", rig=Rig({}, {}), ego=plan.ego_trajectory(), frames=(), attachments={name: b""}
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
 # ----------------------------------------------------------------------------------------------------- command line
 
 

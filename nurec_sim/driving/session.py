@@ -81,16 +81,19 @@ class Session:
         if not image.data:
             return
         image_size(image.data, f"the image of camera {image.camera_id!r}")
-        frames = _with(self._images.get(image.camera_id, []), image)
-        others = [kept for name, kept in self._images.items() if name != image.camera_id]
-        held = sum(len(frame.data) for kept in (*others, frames) for frame in kept)
-        if held > MAX_SESSION_BYTES:
-            raise TooLargeError(f"a session may hold {MAX_SESSION_BYTES} bytes of images, got {held}")
-        self._images[image.camera_id] = frames
+        images = self._images | {image.camera_id: _with(self._images.get(image.camera_id, []), image)}
+        _check_room(images, self._sweeps)
+        self._images = images
 
     def add_sweep(self, frame: LidarFrame) -> None:
-        """A LiDAR sweep."""
-        self._sweeps[frame.lidar.id] = _with(self._sweeps.get(frame.lidar.id, []), frame)
+        """A LiDAR sweep.
+
+        Raises:
+            TooLargeError: too many bytes in this session.
+        """
+        sweeps = self._sweeps | {frame.lidar.id: _with(self._sweeps.get(frame.lidar.id, []), frame)}
+        _check_room(self._images, sweeps)
+        self._sweeps = sweeps
 
     def set_route(self, route: Route) -> None:
         """The way ahead; replaces the last one."""
@@ -195,6 +198,15 @@ def _with(frames: list, frame) -> list:
     kept = [other for other in frames if other.end_us != frame.end_us]
     insort(kept, frame, key=lambda other: other.end_us)
     return kept[-KEPT_FRAMES:]
+
+
+def _check_room(images: Mapping[str, list[EncodedImage]], sweeps: Mapping[str, list[LidarFrame]]) -> None:
+    """Refuses what would take more memory than a session may have."""
+    held = sum(len(image.data) for kept in images.values() for image in kept)
+    for sweep in (sweep for kept in sweeps.values() for sweep in kept):
+        held += sum(values.nbytes for values in (sweep.xyz_m, sweep.range_m, sweep.intensity, sweep.beam))
+    if held > MAX_SESSION_BYTES:
+        raise TooLargeError(f"a session may hold {MAX_SESSION_BYTES} bytes of images and sweeps, got {held}")
 
 
 def _newest(name: str, frames: list, now_us: int):

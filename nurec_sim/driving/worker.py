@@ -20,8 +20,7 @@ class PolicyThread:
 
     def __init__(self, name: str) -> None:
         self._jobs: queue.SimpleQueue[tuple[Future, Callable[[], object]] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._work, name=name, daemon=True).start()
 
     async def run(self, function: Callable[[], T], timeout_s: float) -> T:
         """What ``function`` gives; it is not begun if the await is cancelled or times out before its turn.
@@ -37,11 +36,6 @@ class PolicyThread:
     def stop(self) -> None:
         """Ends the thread after what it is doing; does not wait."""
         self._jobs.put(None)
-
-    def join(self, timeout_s: float) -> bool:
-        """Waits for the end of a stopped thread; whether it came."""
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:

@@ -15,6 +15,7 @@ import numpy as np
 from nurec_sim.errors import RunError
 from nurec_sim.evaluate.methods import CHOICES
 from nurec_sim.evaluate.tables import Table
+from nurec_sim.report.cells import count_of
 from nurec_sim.report.figure import base_layout, plain
 from nurec_sim.report.template import SCRIPT, STYLE
 
@@ -44,7 +45,7 @@ def render_page(results: Mapping[str, Any], tables: Sequence[Table], sheets: Seq
         )
     body = [
         f"<h1>Evaluation: protocol {escape(protocol['name'])}</h1>",
-        f'<p class="soft">{escape(TITLES[protocol["name"]])} · {len(results["windows"])} windows · '
+        f'<p class="soft">{escape(TITLES[protocol["name"]])} · {count_of(len(results["windows"]), "window")} · '
         f"nurec_sim {escape(results['version'])}</p>",
         '<div class="card"><div class="plots">'
         + "".join(f'<div class="plot" id="{n}"></div>' for n in figures)

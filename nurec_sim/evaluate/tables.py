@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from nurec_sim.report.cells import count_of
+
 NOT_KNOWN = "-"
 PAPER_HEADING = ("PSNR", "SSIM", "AbsRel", "δ1")
 PAPER_COLUMNS = ("psnr_db", "ssim", "abs_rel", "delta1")
@@ -77,9 +79,10 @@ def _paper_table(results: Mapping[str, Any]) -> Table:
         rows.append(tuple(cells + _paper_cells(row["dynamic"]) if storm else cells))
     views = max((row["views"] for row in methods.values()), default=0)
     boxes = "with the log's boxes" if protocol["boxes"] else "without boxes, as the paper's network"
+    windows = count_of(len(results["windows"]), "window")
     note = (
-        f"{len(results['windows'])} windows, {views} views a method. Depth after each frame's least-squares scale, as "
-        f"in the paper; true depth up to 80 m; a pixel without depth counts as wrong. Methods ran {boxes}."
+        f"{windows}, {views} views a method. Depth after each frame's least-squares scale, as in the paper; true depth "
+        f"up to 80 m; a pixel without depth counts as wrong. Methods ran {boxes}."
     )
     if storm:
         note += " dyn: pixels of vehicles, people and other things that can move, moving or not."

@@ -61,7 +61,7 @@ class ContextDecoder(nn.Module):
             motion_m=moved,
         )
 
-    def _pixels_with_view(self, images: Float[Tensor, "n 3 h w"], inputs: NetworkInputs) -> Float[Tensor, "n 11 h w"]:
+    def _pixels_with_view(self, images: Float[Tensor, "n 3 h w"], inputs: NetworkInputs) -> Float[Tensor, "n 14 h w"]:
         return torch.cat([images, car_view(inputs).flatten(0, 1).permute(0, 3, 1, 2).to(images.dtype)], dim=1)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from typing import Literal
 
 import torch
@@ -14,6 +15,7 @@ from nurec_sim.network.encoder import Encoder, Features
 from nurec_sim.network.isp import IspDecoder
 from nurec_sim.network.learned_sky import SkyDecoder
 from nurec_sim.network.observed_sky import observed_sky
+from nurec_sim.network.plane_sweep import plane_sweep
 from nurec_sim.network.profiles import PATCH_PX, Profile, SkySize
 from nurec_sim.network.sky_mlp import SkyMlp
 from nurec_sim.network.tensors import NetworkInputs, NetworkOutputs
@@ -57,6 +59,8 @@ class InstantNuRec(nn.Module):
         self._check(inputs)
         with self._half_precision(inputs.rgb.device):
             # Images and cameras become features that all decoders share.
+            if self.profile.encoder.car_view and inputs.matches is None:
+                inputs = dataclasses.replace(inputs, matches=plane_sweep(inputs))
             features = self.features(inputs)
             deepest = features[-1].patches
             # What every pixel shows: depth, colour, normal, class, and where its point moves.

@@ -44,6 +44,7 @@ class NetworkInputs:
         time_after: the same for the camera's next frame.
         rig_from_scene: the scene frame as seen from the car, metres; what our own profiles read (``car_view``) and the
             released ones don't.
+        matches: what ``plane_sweep`` says of these inputs, if it was asked already.
     """
 
     rgb: Float[Tensor, "b v h w 3"]
@@ -56,6 +57,7 @@ class NetworkInputs:
     time_before: Float[Tensor, "b v"]
     time_after: Float[Tensor, "b v"]
     rig_from_scene: Float[Tensor, "b 4 4"] | None = None
+    matches: Float[Tensor, "b v h w 2"] | None = None
 
     def to(self, device: torch.device | str) -> NetworkInputs:
         """The same on another device."""

@@ -1,6 +1,6 @@
-"""How training begins: colours as those of the image, depth as that of flat ground, Gaussians small and nearly opaque.
+"""How training begins: colours as in the image, depth as ground and matches say, Gaussians small and nearly opaque.
 
-A network that starts so has only to learn how the world differs from a flat one before its renderings look right.
+A network that starts so has only to learn how the world differs from that before its renderings look right.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nurec_sim.errors import TrainingError
+from nurec_sim.network.car_view import BEST_GUESS
 from nurec_sim.network.checkpoints import load_state_dict
 from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
 from nurec_sim.network.dpt import DptHead
@@ -24,8 +25,8 @@ FIRST_RAW_OPACITY = 3.5
 """An opacity of 0.82."""
 LINEAR_PART = 3.0
 """GELU is nearly the identity from here on; what passes is shifted by it on its way."""
-GROUND_CHANNEL = 3 + 6
-"""Of the depth head's view: after the colours, the ray's origin and its direction."""
+GUESS_CHANNEL = 3 + BEST_GUESS
+"""Of what the depth head's fusion sees: the colours come first."""
 
 
 def prepare(model: InstantNuRec) -> None:
@@ -36,9 +37,9 @@ def prepare(model: InstantNuRec) -> None:
         grey = torch.linspace(0.05, 0.95, 10)
         _pass_through(decoder.rgb_fusion, decoder.context_head, (0, 1, 2), grey, torch.logit(grey) / 2)
         if decoder.depth_fusion is not None:
-            # The depth head puts out the logarithm, which is what its view holds of the ground.
-            log_depth = torch.linspace(-1.0, 1.8, 10)
-            _pass_through(decoder.depth_fusion, decoder.depth_head, (GROUND_CHANNEL,), log_depth, log_depth)
+            # The depth head puts out the logarithm, which is what the car's view holds.
+            log_depth = torch.linspace(-1.2, 2.9, 10)
+            _pass_through(decoder.depth_fusion, decoder.depth_head, (GUESS_CHANNEL,), log_depth, log_depth)
         _first_gaussians(decoder)
 
 

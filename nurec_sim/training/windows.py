@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from nurec_sim.network.plane_sweep import plane_sweep
 from nurec_sim.network.profiles import PROFILES, Profile
 from nurec_sim.reconstruct.feedforward.frames import ChunkWindow
 from nurec_sim.reconstruct.feedforward.inputs import chunk_inputs
@@ -89,7 +90,12 @@ def sample_window(rng: np.random.Generator, clip: TrueClip, settings: WindowSett
             for name, frame in _targets(rng, names, context, step, taken, settings.targets)
         ),
     )
-    return sample if settings.augment is None else augmented(rng, sample, settings.augment)
+    if settings.augment is not None:
+        sample = augmented(rng, sample, settings.augment)
+    if not settings.profile.encoder.car_view:
+        return sample
+    # Here, in a worker, matching does not hold up the training.
+    return dataclasses.replace(sample, inputs=dataclasses.replace(sample.inputs, matches=plane_sweep(sample.inputs)))
 
 
 def _cameras(rng: np.random.Generator, clip: TrueClip, weights: Mapping[int, float]) -> tuple[str, ...]:

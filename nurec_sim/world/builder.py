@@ -24,7 +24,7 @@ STATIC = 0
 
 
 class SpecBuilder:
-    """Collects a street in ``spec``; remembers each material's mean colour for images without OpenGL."""
+    """Collects a world in ``spec``; remembers each material's mean colour for images without OpenGL."""
 
     def __init__(self) -> None:
         self.spec = mujoco.MjSpec()
@@ -103,20 +103,6 @@ class SpecBuilder:
         self._dress(geom, surface, material, instance, tint, reflectivity, shadow and not decal)
         if decal:
             geom.group, geom.rgba = DECAL_GROUP, [*geom.rgba[:3], DECAL_ALPHA]
-
-    def shape(
-        self,
-        body: Any,
-        kind: Any,
-        surface: SurfaceClass,
-        material: str,
-        instance: int,
-        tint: Sequence[float],
-        **where: Any,
-    ) -> None:
-        """A primitive on a body; ``where`` holds MuJoCo's own ``size``, ``pos`` and ``fromto``."""
-        where["size"] = [*where["size"], *[0.0] * (3 - len(where["size"]))]
-        self._dress(body.add_geom(type=kind, **where), surface, material, instance, tint, None, True)
 
     def _dress(self, geom: Any, surface: SurfaceClass, material: str, instance: int, tint: Sequence[float],
                reflectivity: float | None, shadow: bool) -> None:  # fmt: skip

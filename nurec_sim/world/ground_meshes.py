@@ -19,6 +19,7 @@ DECAL_LIFT_M = 0.004
 GRASS_STEP_M, FAR_STEP_M = 5.0, 40.0
 GRASS_BELOW_M, FAR_BELOW_M = 0.04, 1.4
 """Coarser ground lies this much lower, so that it never comes through the finer ground that it reaches under."""
+EDGE_M = 0.3
 NEAR_MARGIN_M = 60.0
 FAR_REACH_M, HILLS_M, HILLS_END_M = 640.0, 540.0, 900.0
 
@@ -28,7 +29,9 @@ def add_ground(chunks: Chunks, network: TownNetwork, rng: np.random.Generator, w
     high = network.plan.kerb.height_m
     _lay(chunks, network, network.surface, 0.0, SurfaceClass.ROAD, "asphalt", ASPHALT_TILE_M)
     _lay(chunks, network, network.kerb, high, SurfaceClass.KERB, "kerb", 2.0)
-    _kerb_walls(chunks, network)
+    _walls(chunks, network, network.surface, 0.0, high, SurfaceClass.KERB, "kerb", inwards=True)
+    # Grass lies a little lower than paving, and without an edge one would see below the paving from the grass.
+    _walls(chunks, network, network.paved, high - EDGE_M, high, SurfaceClass.SIDEWALK, "paving", inwards=False)
     outside = shapely.union_all([shapely.Polygon(part.exterior) for part in network.surface.geoms])
     for area, surface in ((network.sidewalk.difference(outside), SurfaceClass.SIDEWALK),
                           (network.sidewalk.intersection(outside), SurfaceClass.ISLAND)):  # fmt: skip
@@ -57,29 +60,29 @@ def _normals(network: TownNetwork, xy: Float64[np.ndarray, "*n 2"]) -> Float64[n
     return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
 
-def _kerb_walls(chunks: Chunks, network: TownNetwork) -> None:
-    """The faces of the kerb stones, towards the road."""
-    high, terrain = network.plan.kerb.height_m, network.plan.terrain
-    for polygon in network.surface.geoms:
-        for ring in (polygon.exterior, *polygon.interiors):
-            # The road lies to the left of its rings, and walls face to the right of their line.
-            points = _split_at_lattice(np.asarray(ring.coords)[::-1, :2])
+def _walls(chunks: Chunks, network: TownNetwork, area: shapely.Geometry, low_m: float, high_m: float,
+           surface: SurfaceClass, material: str, inwards: bool) -> None:  # fmt: skip
+    """Upright faces along the edge of an area, between two heights over the terrain."""
+    for polygon in shapely.get_parts(area):
+        oriented = shapely.orient_polygons(polygon)
+        for ring in (oriented.exterior, *oriented.interiors):
+            # The area lies to the left of its rings, and walls face to the right of their line.
+            points = _split_at_lattice(np.asarray(ring.coords)[:: -1 if inwards else 1, :2])
             along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]) * 0.5
-            foot = terrain.height_m(points)
+            ground = network.height_m(points)
             a, b = slice(None, -1), slice(1, None)
-            low, top = np.column_stack([points, foot]), np.column_stack([points, foot + high])
+            low, top = np.column_stack([points, ground + low_m]), np.column_stack([points, ground + high_m])
             corners = np.stack([np.stack([low[a], low[b], top[b]], axis=1), np.stack([low[a], top[b], top[a]], axis=1)])
             v = np.array([[0.02, 0.02, 0.09], [0.02, 0.09, 0.09]])
-            u = np.stack(
-                [np.stack([along[a], along[b], along[b]], axis=1), np.stack([along[a], along[b], along[a]], axis=1)]
-            )
+            left, right = along[a], along[b]
+            u = np.stack([np.stack([left, right, right], axis=1), np.stack([left, right, left], axis=1)])
             uv = np.stack([u, np.broadcast_to(v[:, None], u.shape)], axis=-1)
             side = points[b] - points[a]
             normal = np.stack([side[:, 1], -side[:, 0], np.zeros(len(side))], axis=1)
             normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
             normals = np.broadcast_to(normal[None, :, None], corners.shape)
-            chunks.triangles(corners.reshape(-1, 3, 3), normals.reshape(-1, 3, 3), uv.reshape(-1, 3, 2),
-                             SurfaceClass.KERB, "kerb")  # fmt: skip
+            chunks.triangles(corners.reshape(-1, 3, 3), normals.reshape(-1, 3, 3), uv.reshape(-1, 3, 2), surface,
+                             material)  # fmt: skip
 
 
 def _split_at_lattice(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "m 2"]:

@@ -1,4 +1,4 @@
-"""A small triangle-mesh builder: quads, lattices, boxes, cylinders, walls and blobs with texture coordinates.
+"""A small triangle-mesh builder: quads, lattices, boxes, cylinders and walls with texture coordinates.
 
 Front faces wind counter-clockwise; OpenGL culls back faces, so a wrong winding shows as a hole.
 """
@@ -9,7 +9,6 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
-import shapely
 from jaxtyping import Float64, Int64
 from numpy.typing import ArrayLike
 
@@ -152,26 +151,6 @@ class MeshBuilder:
                                     strict=True):  # fmt: skip
             self.quad([*a, low_m], [*b, low_m], [*b, high_m], [*a, high_m],
                       [[ua, v_low], [ub, v_low], [ub, v_high], [ua, v_high]])  # fmt: skip
-
-    def flat(self, polygon: shapely.Geometry, z_m: float, uv_per_m: float) -> None:
-        """A polygon, holes included, as a horizontal surface that faces up; its texture lies in world axes."""
-        triangles = [t for t in shapely.constrained_delaunay_triangles(polygon).geoms if t.area > 1e-6]
-        corners = np.array([np.asarray(t.exterior.coords)[:3] for t in triangles])
-        side = corners[:, 1:] - corners[:, :1]
-        clockwise = side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0] < 0
-        corners[clockwise] = corners[clockwise][:, ::-1]
-        xy = corners.reshape(-1, 2)
-        points = np.concatenate([xy, np.full((len(xy), 1), z_m)], axis=1)
-        self.add(points, np.arange(len(xy)).reshape(-1, 3), xy * uv_per_m)
-
-    def blob(self, rng: np.random.Generator, center: ArrayLike, radius: float, rough: float = 0.2,
-             detail: int = 2) -> None:  # fmt: skip
-        """A lumpy ball, as for the crown of a tree."""
-        points, faces = icosphere(detail)
-        lumps = sum(np.sin(points @ (rng.normal(size=3) * rng.uniform(2, 6)) + 6 * rng.random()) for _ in range(4)) / 4
-        lumps = lumps + rng.normal(0, 0.28, len(points))
-        uv = np.stack([np.arctan2(points[:, 1], points[:, 0]) / np.pi, points[:, 2]], axis=1) * radius
-        self.add(points * radius * (1 + rough * lumps)[:, None] + np.asarray(center), faces, uv)
 
     def corners(self, crease_deg: float) -> Corners:
         """Positions, unit normals and texture coordinates of every triangle corner, three per triangle.

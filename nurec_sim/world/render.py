@@ -21,6 +21,7 @@ SHADOW_RADIUS_M = 28.0
 SHADOW_AHEAD_M = 22.0
 HIDDEN_GROUP = 5
 TEXTURE_LOD_BIAS = -0.7
+HORIZON = -0.03
 FAINT_SUN = 0.3
 """A sun weaker than this throws no shadows worth drawing, which saves a third of the time."""
 
@@ -95,7 +96,9 @@ class GlPainter:
         geom = np.ascontiguousarray(self._geom_ids(ids)[::-1])
         # Depth is stored reversed, as a linear function of 1 / z, so that it is exact where it matters.
         nearness = depth[::-1] * np.float32(1 / self._near_m - 1 / self._far_m) + np.float32(1 / self._far_m)
-        return Drawn(rgb, geom, np.where(geom < 0, np.float32(0), nearness))
+        drawn = Drawn(rgb, geom, np.where(geom < 0, np.float32(0), nearness))
+        _close_cracks(drawn, face.lens, axes[2])
+        return drawn
 
     def _gather(self, data: Any, shown: Bool[np.ndarray, " g"]) -> None:
         """Puts some of the geoms into the scene: the renderer itself culls nothing."""
@@ -163,3 +166,23 @@ def _tangents(lens: Pinhole, width: int, height: int) -> tuple[float, float, flo
 def _shadow_middle(eye: Float64[np.ndarray, " 3"], axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 3"]:
     forward = axes[:, 2] * [1, 1, 0]
     return eye + SHADOW_AHEAD_M * forward / (np.linalg.norm(forward) + 1e-9)
+
+
+def _close_cracks(drawn: Drawn, lens: Pinhole, up: Float64[np.ndarray, " 3"]) -> None:
+    """Fills lone pixels of sky below the horizon from their left neighbours.
+
+    Where the edge of one mesh lies along an edge of another, rounding leaves about two in a million pixels open.
+    ``up`` is the world's z in the face.
+    """
+    empty = drawn.geom < 0
+    height, width = empty.shape
+    x = (np.arange(1, width - 1) + 0.5 - lens.cx_px) / lens.fx_px
+    y = (np.arange(1, height - 1) + 0.5 - lens.cy_px) / lens.fy_px
+    beside = empty[1:-1, :-2] | empty[1:-1, 2:] | empty[:-2, 1:-1] | empty[2:, 1:-1]
+    lone = empty[1:-1, 1:-1] & ~beside
+    rows, columns = np.nonzero(lone)
+    below = up[0] * x[columns] + up[1] * y[rows] + up[2] < HORIZON
+    rows, columns = rows[below] + 1, columns[below] + 1
+    for image in (drawn.rgb, drawn.geom, drawn.nearness):
+        if image is not None:
+            image[rows, columns] = image[rows, columns - 1]

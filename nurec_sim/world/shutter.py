@@ -114,6 +114,25 @@ def bands_for(camera: CameraModel, motion_px: float) -> int:
     return bands
 
 
+def turned_patch(patch: RayPatch, turns: Float64[np.ndarray, "*lines 3 3"]) -> RayPatch:
+    """The patch with the rays of every line turned (``turns`` broadcasts over its rays): a camera that turns fast."""
+    rays = (turns @ np.where(patch.valid[..., None], patch.rays, 0.0)[..., None])[..., 0]
+    return RayPatch(patch.rows, patch.columns, patch.fraction, rays, patch.valid, patch.down, patch.fineness)
+
+
+def line_turns(
+    camera: CameraModel, patch: RayPatch, world_from_camera: Float64[np.ndarray, "2 4 4"]
+) -> Float64[np.ndarray, "*lines 3 3"]:
+    """Rotations band_from_line of a rolling shutter: [h,1,3,3] for bands of rows, [1,w,3,3] for bands of columns."""
+    by_column = camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
+    band = patch.columns if by_column else patch.rows
+    lines = np.arange(band.start, band.stop) + 0.5
+    fractions = sensors.shutter_fraction(camera, np.stack([lines, lines], axis=1))
+    poses = geometry.interpolate_pose_pair(world_from_camera, np.append(fractions, patch.fraction))[:, :3, :3]
+    turns = poses[-1].T @ poses[:-1]
+    return turns[None] if by_column else turns[:, None]
+
+
 def motion_px(
     camera: CameraModel,
     world_from_camera: Float64[np.ndarray, "2 4 4"],

@@ -15,7 +15,15 @@ from nurec_sim.types import CameraModel, SensorRequest, Shutter, Trajectory
 from nurec_sim.world import rays
 from nurec_sim.world.build import ActorPlaces, Town
 from nurec_sim.world.faces import Seen
-from nurec_sim.world.shutter import RayPatch, bands_for, camera_patches, motion_px
+from nurec_sim.world.shutter import (
+    MOTION_PX,
+    RayPatch,
+    bands_for,
+    camera_patches,
+    line_turns,
+    motion_px,
+    turned_patch,
+)
 from nurec_sim.world.surface import SurfaceClass
 
 PROBES = (24, 16)
@@ -122,21 +130,35 @@ class Stage:
                 face.read(self.painter.draw(self.data, face, world_from_sensor, colours), seen)
 
     def see(self, request: SensorRequest, camera: CameraModel) -> Seen:
-        """A camera image, every band of a rolling shutter at its own time."""
-        patches = camera_patches(camera, self._bands(request, camera))
+        """A camera image, every band of a rolling shutter at its own time.
+
+        What moves is off by half of its motion within a band at most. If bands are not narrow enough for a camera
+        that turns fast, every line gets its own direction, and only the motion of its place is left to the bands.
+        """
+        bands, turning = self._bands(request, camera)
+        patches = camera_patches(camera, bands)
         moments = self.moments(request, np.array([patch.fraction for patch in patches]))
         seen = Seen.nothing(camera.height_px, camera.width_px)
         for index, patch in enumerate(patches):
-            self.look(patch, moments.enter(index), seen.part(patch.rows, patch.columns))
+            pose, part = moments.enter(index), seen.part(patch.rows, patch.columns)
+            if turning:
+                turns = line_turns(camera, patch, np.asarray(request.world_from_sensor, np.float64))
+                self.look(turned_patch(patch, turns), pose, part)
+                part.normal[:] = (part.normal[..., None, :] @ turns.astype(np.float32))[..., 0, :]
+            else:
+                self.look(patch, pose, part)
         return seen
 
-    def _bands(self, request: SensorRequest, camera: CameraModel) -> int:
-        """Bands of a rolling shutter: as many as the motion in the image asks for; every line with exact rays."""
+    def _bands(self, request: SensorRequest, camera: CameraModel) -> tuple[int, bool]:
+        """Bands of a rolling shutter, and whether its lines need directions of their own.
+
+        As many as the motion in the image asks for; every line with exact rays.
+        """
         if camera.shutter is Shutter.GLOBAL:
-            return 1
+            return 1, False
         if self.painter is None:
             by_column = camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
-            return camera.width_px if by_column else camera.height_px
+            return (camera.width_px if by_column else camera.height_px), False
         ends = np.array([0.0, 1.0])
         moments, boxes = self.moments(request, ends), self.actor_boxes(request, ends)
         u, v = (
@@ -153,4 +175,11 @@ class Stage:
             if on_it.any():
                 moved = boxes[actor.id][1] @ geometry.inverse(boxes[actor.id][0])
                 end[on_it] = geometry.transform_points(moved, start[on_it])
-        return bands_for(camera, motion_px(camera, moments.world_from_sensor, start, end))
+        pair = moments.world_from_sensor
+        motion = motion_px(camera, pair, start, end)
+        bands = bands_for(camera, motion)
+        if motion <= bands * MOTION_PX:
+            return bands, False
+        straight = pair.copy()
+        straight[1, :3, :3] = pair[0, :3, :3]
+        return bands_for(camera, motion_px(camera, straight, start, end)), True

@@ -12,7 +12,9 @@ from scipy import sparse
 Image = UInt8[np.ndarray, "h w 3"]
 
 
-def noise(rng: np.random.Generator, size: int, octaves: int = 5, cells: int = 4, persistence: float = 0.55):
+def noise(
+    rng: np.random.Generator, size: int, octaves: int = 5, cells: int = 4, persistence: float = 0.55
+) -> np.ndarray:
     """Tileable fractal value noise ``[size, size]`` in 0..1."""
     total, weight = np.zeros((size, size), np.float32), 0.0
     for octave in range(octaves):

@@ -80,8 +80,8 @@ def _cobbled(rng: np.random.Generator, size: int) -> Image:
     """Rows of rounded stones, half a stone shifted from row to row."""
     rows, columns = 80, 60
     y, x = np.meshgrid(np.arange(size, dtype=np.float32), np.arange(size, dtype=np.float32), indexing="ij")
-    x = x + 2.5 * (noise(rng, size, 2, 20) - 0.5) * size / columns * 0.5
-    y = y + 2.5 * (noise(rng, size, 2, 20) - 0.5) * size / rows * 0.5
+    x += 2.5 * (noise(rng, size, 2, 20) - 0.5) * size / columns * 0.5
+    y += 2.5 * (noise(rng, size, 2, 20) - 0.5) * size / rows * 0.5
     row = np.floor(y * rows / size).astype(np.int32) % rows
     along = x * columns / size + 0.5 * (row % 2)
     stone = np.floor(along).astype(np.int32) % columns
@@ -163,7 +163,7 @@ def wheel_track(rng: np.random.Generator, size: int = 256) -> Decal:
 
 def stains(rng: np.random.Generator, size: int = 512) -> Decal:
     """Oil drops, drips and tyre marks on nothing."""
-    cover = np.zeros((size, size), np.float32)
+    cover: np.ndarray = np.zeros((size, size), np.float32)
     for _ in range(34):
         (x, y), (a, b) = rng.integers(30, size - 30, 2), rng.integers(3, 26, 2)
         cv2.ellipse(cover, (int(x), int(y)), (int(a), int(b)), float(rng.uniform(0, 180)), 0, 360,

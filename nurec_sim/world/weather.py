@@ -25,11 +25,6 @@ class Illumination:
     fill: Colour
     highlight: float
 
-    @property
-    def casts_shadow(self) -> bool:
-        """Whether the sun is strong enough for shadows with an edge."""
-        return max(self.sun) > 0.3
-
 
 _PRESETS: dict[str, Illumination] = {
     "clear": Illumination((0.80, 0.76, 0.68), (0.36, 0.39, 0.44), (0.13, 0.14, 0.17), 0.40),
