@@ -16,7 +16,8 @@ from nurec_sim.network.tensors import SCENE_RESCALE, NetworkInputs
 
 CHANNELS = 11
 """Origin (3, in the network's unit) and direction (3) of the ray; logarithm of flat ground's depth in that unit and
-whether there is ground; the same of the matched depth (``plane_sweep``) and its confidence; and what both say together."""
+whether there is ground; the same of the matched depth (``plane_sweep``) and its confidence; and what both say
+together."""
 BEST_GUESS = 10
 """The last of these channels."""
 UNSURE, SURE = 0.2, 0.5

@@ -20,9 +20,15 @@ NEAREST_M, FARTHEST_M, DEPTHS = 2.0, 120.0, 48
 NEIGHBOURS = (-1, 1, -2)
 """Frames of the same camera to compare with, by their places in the order of time."""
 SHRINK = 2
-WINDOW_PX = 5
+WINDOW_PX = 9
 SHARPNESS = 25.0
 """How strongly the best match is preferred to the others."""
+OUTSIDE = 0.3
+"""Badness of a depth whose point the other image does not show: neither a good match nor a bad one."""
+AGREEING = 0.15
+"""Two images agree on a point if the logarithms of its depth differ by less; the confidence of others is cut down."""
+ALONE = 0.15
+"""Share of the confidence that is left where no other image agrees."""
 LENS_STEPS = 2
 LEAST_CONTRAST = 0.02
 """Below this deviation within a window, brightness in 0..1 is noise."""
@@ -55,6 +61,8 @@ def _clip_sweep(inputs: NetworkInputs, clip: int) -> Float[Tensor, "v h w 2"]:
         costs = [_cost(points, local[k], local[n], views[n]) for n in _neighbours(camera, time, k)]
         maps.append(_chosen(torch.stack(costs), log_m) if costs else _nothing(size, log_m))
     found = torch.stack(maps)
+    agreed = [_agreement(found, small[k], along[k], views, k, _neighbours(camera, time, k)) for k in range(v)]
+    found[..., 1] *= torch.stack(agreed)
     found[..., 0] += math.log(SCENE_RESCALE)
     return functional.interpolate(found.permute(0, 3, 1, 2), (height, width), mode="nearest").permute(0, 2, 3, 1)
 
@@ -128,10 +136,30 @@ def _neighbours(camera: Tensor, time: Tensor, image: int) -> list[int]:
 def _cost(
     points: Float[Tensor, "d h w 3"], own: Float[Tensor, "1 h w"], other: Float[Tensor, "1 h w"], view: _View
 ) -> Float[Tensor, "d h w"]:
-    """How badly each depth fits, 0..1; 1 where the point is out of the other image."""
+    """How badly each depth fits, 0..1."""
     place, inside = view.places(points)
     difference = (_sampled(other[None], place)[0] - own).abs().clamp(max=2) / 2
-    return torch.where(inside, _window_mean(difference[:, None])[:, 0], 1.0)
+    return torch.where(inside, _window_mean(difference[:, None])[:, 0], OUTSIDE)
+
+
+def _agreement(
+    found: Float[Tensor, "v h w 2"],
+    rays: Float[Tensor, "h w 6"],
+    along: Float[Tensor, "h w"],
+    views: list[_View],
+    image: int,
+    neighbours: list[int],
+) -> Float[Tensor, "h w"]:
+    """1 where a neighbour has found the same point, ``ALONE`` elsewhere."""
+    distance = found[image, ..., 0].exp() / along.clamp(min=1e-3)
+    points = rays[..., :3] + distance[..., None] * functional.normalize(rays[..., 3:], dim=-1)
+    same = torch.zeros_like(distance, dtype=torch.bool)
+    for n in neighbours:
+        place, inside = views[n].places(points[None])
+        depth = ((points - views[n].eye) @ views[n].turn)[..., 2].clamp(min=1e-3).log()
+        theirs = functional.grid_sample(found[n, None, None, ..., 0], place, mode="nearest", align_corners=False)
+        same |= inside[0] & ((theirs[0, 0] - depth).abs() < AGREEING)
+    return torch.where(same, 1.0, ALONE)
 
 
 def _chosen(costs: Float[Tensor, "n d h w"], log_m: Float[Tensor, " d"]) -> Float[Tensor, "h w 2"]:
@@ -142,8 +170,7 @@ def _chosen(costs: Float[Tensor, "n d h w"], log_m: Float[Tensor, " d"]) -> Floa
     near = (torch.arange(len(log_m), device=peak.device)[:, None, None] - peak).abs() <= 2
     around = weight * near
     share = around.sum(0)
-    seen = (best.amin(0) < 0.999).to(share.dtype)
-    return torch.stack([(around * log_m[:, None, None]).sum(0) / share, share * seen], dim=-1)
+    return torch.stack([(around * log_m[:, None, None]).sum(0) / share, share], dim=-1)
 
 
 def _nothing(size: tuple[int, int], log_m: Tensor) -> Float[Tensor, "h w 2"]:
