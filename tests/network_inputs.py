@@ -34,3 +34,8 @@ def straight_drive(images: int, cameras: int = 1, height: int = 56, width: int =
         time_after=time + 0.2,
         rig_from_scene=RIG_FROM_CAMERA.expand(clips, 4, 4),
     )
+
+
+def given(inputs: NetworkInputs) -> dict[str, torch.Tensor]:
+    """The tensors that are there, by name: matches are found later, by the network."""
+    return {name: value for name, value in vars(inputs).items() if value is not None}

@@ -68,6 +68,11 @@ def test_sizes_that_keep_the_aspect(width, height):
     assert crop.resized[0] == size[0] or crop.resized[1] == size[1]
 
 
+def given_fields(tensors):
+    """Fields that are there: matches are found later, by the network."""
+    return [field for field in dataclasses.fields(tensors) if getattr(tensors, field.name) is not None]
+
+
 def test_images_may_be_smaller_or_larger_where_the_profile_keeps_the_aspect():
     camera = pinhole("a", width=480, height=320)
     for pixels in (5_000, 16_464, 200_000):
@@ -188,7 +193,7 @@ def test_pixels_that_the_lens_does_not_reach_are_finite_and_marked():
         CameraModel("glass", 200, 120, LENSES["ftheta"], looking(-70), windshield=GLASS),
     ]
     chunk = made_chunk(clip_of(*cameras, times=frame_times(2, 400_000)))
-    for field in dataclasses.fields(chunk.tensors):
+    for field in given_fields(chunk.tensors):
         assert torch.isfinite(getattr(chunk.tensors, field.name)).all(), field.name
     directions = chunk.tensors.rays[0, ..., 3:]
     torch.testing.assert_close(directions.norm(dim=-1), torch.ones(6, 42, 84))
@@ -265,7 +270,7 @@ def test_epoch_times_give_the_same_bits():
         made_chunk(surround(frame_times(6, 333_333, first_us=first, exposure_us=31_111)))
         for first in (1_000_000, START_US + 7)
     )
-    for field in dataclasses.fields(early.tensors):
+    for field in given_fields(early.tensors):
         assert torch.equal(getattr(early.tensors, field.name), getattr(late.tensors, field.name)), field.name
     shift = START_US + 7 - 1_000_000
     for a, b in zip(early.images, late.images, strict=True):
@@ -345,6 +350,6 @@ def test_real_logs_become_inputs(realdata, pack, views, frames, count, profile):
     windows = chunk_windows(clip, cameras, profile, settings)
     chunk = chunk_inputs(clip, profile, windows[-1], settings)
     assert len(chunk.images) == len(cameras) * count
-    for field in dataclasses.fields(chunk.tensors):
+    for field in given_fields(chunk.tensors):
         assert torch.isfinite(getattr(chunk.tensors, field.name)).all(), field.name
     assert 0.1 < chunk.tensors.rgb.mean() < 0.9 and chunk.tensors.rgb.std() > 0.1

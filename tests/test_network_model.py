@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from network_inputs import straight_drive
+from network_inputs import given, straight_drive
 
 from nurec_sim import network
 from nurec_sim.network.checkpoints import save_weights
@@ -46,7 +46,7 @@ def test_two_clips_at_once_are_the_clips_one_by_one(tiny):
     inputs = straight_drive(3, clips=2)
     both = run(tiny, inputs)
     for clip in range(2):
-        parts = {f.name: getattr(inputs, f.name)[clip : clip + 1] for f in dataclasses.fields(inputs)}
+        parts = {name: value[clip : clip + 1] for name, value in given(inputs).items()}
         alone = run(tiny, type(inputs)(**parts))
         torch.testing.assert_close(both.context.depth_m[clip : clip + 1], alone.context.depth_m, rtol=1e-4, atol=1e-4)
         torch.testing.assert_close(both.isp[clip : clip + 1], alone.isp, rtol=1e-4, atol=1e-4)
@@ -55,7 +55,9 @@ def test_two_clips_at_once_are_the_clips_one_by_one(tiny):
 
 def test_cameras_may_come_in_any_order(skyless):
     inputs = straight_drive(4, cameras=2)
-    swapped = {f.name: getattr(inputs, f.name)[:, [2, 3, 0, 1]] for f in dataclasses.fields(inputs)}
+    per_image = {name: value for name, value in given(inputs).items() if name != "rig_from_scene"}
+    swapped = {name: value[:, [2, 3, 0, 1]] for name, value in per_image.items()}
+    swapped["rig_from_scene"] = inputs.rig_from_scene
     swapped["camera_idxs"] = inputs.camera_idxs
     ours, theirs = run(skyless, inputs), run(skyless, type(inputs)(**swapped))
     torch.testing.assert_close(ours.context.depth_m[:, [2, 3, 0, 1]], theirs.context.depth_m, rtol=1e-3, atol=1e-3)

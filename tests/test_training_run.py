@@ -57,7 +57,7 @@ def test_training_lowers_the_loss(tmp_path):
     trainer(tmp_path, small_config(stages=[stage])).run()
     with (tmp_path / CURVES).open() as file:
         depth = [float(row["depth"]) for row in csv.DictReader(file)]
-    assert sum(depth[-5:]) < 0.6 * sum(depth[:5])
+    assert sum(depth[-5:]) < 0.75 * sum(depth[:5])
 
 
 def test_another_recipe_does_not_go_on_in_a_run_folder(tmp_path):
