@@ -7,22 +7,21 @@ from functools import cache
 import numpy as np
 from jaxtyping import Int64
 
-from nurec_sim import geometry, sensors
+from nurec_sim import geometry
 from nurec_sim.evaluate.views import reduced, reduced_mask
 from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, Target
-from nurec_sim.types import CameraModel, Label, LidarModel, Pinhole, Rig, SensorRequest, Sweep, Trajectory
-from nurec_sim.world import LIDAR_ID, TrueWorld, street_rig, town_plan
+from nurec_sim.types import CameraModel, Label, Pinhole, Rig, SensorRequest
+from nurec_sim.world import LIDAR_ID, TrueWorld, street_rig, town_plan, true_sweep
 from nurec_sim.world.isp import CameraResponse, random_response
 from nurec_sim.world.plan import TownPlan
 from nurec_sim.world.rig import CAMERA_FROM_RIG_AXES
-from nurec_sim.world.sense import measured_points
 from nurec_sim.world.surface import LABEL_OF_CLASS, SurfaceClass
+from nurec_sim.world.write import SPIN_US
 
 CAMERAS_DEG = {"camera_front": 0.0, "camera_front_left": 45.0, "camera_front_right": -45.0}
 """Where the cameras of the evaluated rig look, left positive."""
 FIELD_DEG, HEIGHT_M, AHEAD_M = 50.0, 1.8, 1.5
 """As wide as the front cameras of the public protocol's recordings, on the roof."""
-SPIN_US = 100_000
 
 
 def evaluation_rig(cameras: int = 1, width_px: int = 480, height_px: int = 320) -> Rig:
@@ -82,7 +81,7 @@ class Drawing:
 
     def _revolution(self, lidar_id: str, start_us: int) -> Revolution:
         lidar = self.rig.lidars[lidar_id]
-        measured = cache(lambda: sweep_of(self.world, self.ego, lidar, start_us))
+        measured = cache(lambda: true_sweep(self.world, self.ego, lidar, start_us))
         return Revolution(start_us, start_us + SPIN_US, measured)
 
     def clip(self, id: str, times_us: Int64[np.ndarray, " n"], span_us: tuple[int, int], boxes: bool) -> ContextClip:
@@ -90,20 +89,6 @@ class Drawing:
         tracks = self.world.plan.tracks() if boxes else ()
         shots, turns = self.shots(times_us), self.revolutions(span_us)
         return ContextClip(id, self.rig, self.ego, span_us, shots, turns, tracks)
-
-
-def sweep_of(world: TrueWorld, ego: Trajectory, lidar: LidarModel, start_us: int) -> Sweep:
-    """One turn of a LiDAR, compensated with the car's own motion to the middle of the turn."""
-    end_us, middle_us = start_us + SPIN_US, start_us + SPIN_US // 2
-    pair = ego.at(np.array([start_us, end_us])) @ lidar.rig_from_lidar
-    scan = world.scan(SensorRequest("", lidar, start_us, end_us, pair))
-    xyz, intensity, beam = measured_points(lidar, scan)
-    fraction = sensors.column_fraction(lidar)[beam % scan.range_m.shape[1]]
-    middle = ego.at(middle_us) @ lidar.rig_from_lidar
-    xyz = sensors.compensate_sweep(xyz, geometry.interpolate_pose_pair(pair, fraction), middle)
-    return Sweep(
-        middle_us, start_us, end_us, middle, xyz, intensity, start_us + np.rint(fraction * SPIN_US).astype(int)
-    )
 
 
 def held_out_plan(seed: int, seconds: float) -> TownPlan:

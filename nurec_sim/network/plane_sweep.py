@@ -129,8 +129,7 @@ def _neighbours(camera: Tensor, time: Tensor, image: int) -> list[int]:
     same = torch.nonzero(camera == camera[image]).flatten().tolist()
     order = sorted(same, key=lambda k: (float(time[k]), k))
     place = order.index(image)
-    found = [order[place + step] for step in NEIGHBOURS if 0 <= place + step < len(order)]
-    return found or []
+    return [order[place + step] for step in NEIGHBOURS if 0 <= place + step < len(order)]
 
 
 def _cost(

@@ -52,7 +52,7 @@ class ReframedClip:
     """
 
     def __init__(self, clip: TrueClip, cuts: Mapping[str, Cut], mirrored: bool = False) -> None:
-        self._clip, self._cuts, self._mirrored = clip, cuts, mirrored
+        self._clip, self._mirrored = clip, mirrored
         self._crops: dict[str, Crop] = {}
         for name, camera in clip.rig.cameras.items():
             cut = cuts.get(name, Cut(0, 0, camera.width_px, camera.height_px))
