@@ -11,6 +11,7 @@ from nurec_sim.network.tensors import ContextMaps, NetworkInputs, NetworkOutputs
 from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ContextImage
 from nurec_sim.reconstruct.feedforward.layers import MIN_DYNAMIC_OPACITY, chunk_layers
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
+from nurec_sim.reconstruct.sky_fill import SURE
 from nurec_sim.types import CameraModel, Label, Pinhole, Shutter, Track, Trajectory
 
 EPOCH_US = 1_550_000_000_000_000
@@ -196,10 +197,23 @@ def test_camera_responses_and_sky():
     assert list(layers.isp) == ["front", "left"]
     assert all(np.array_equal(layers.isp[name], result.isp[0, k].numpy()) for k, name in enumerate(layers.isp))
     assert layers.isp["left"].dtype == np.float64
-    assert layers.sky.shape == (6, 8, 8, 3) and np.allclose(layers.sky, 0.4) and np.allclose(layers.sky_seen, 1)
+    assert layers.sky.shape == (6, 8, 8, 3) and np.allclose(layers.sky, 0.4) and np.allclose(layers.sky_seen, SURE)
     observed = chunk_layers(drive, drive.chunk(), result, dataclasses.replace(SETTINGS, learned_sky=False))
     assert observed.sky.shape == (6, 8, 8, 3) and not observed.sky_seen.any()  # no pixel is sky
     assert layers.images == drive.images
+
+
+def test_the_sky_that_images_show_replaces_the_learned_one_where_they_show_it():
+    drive = Drive()
+    result = outputs(drive)
+    logits = torch.zeros_like(result.context.logits)
+    logits[..., SemanticClass.SKY] = 10
+    context = dataclasses.replace(result.context, logits=logits, rgb=torch.full_like(result.context.rgb, 0.7))
+    layers = chunk_layers(drive, drive.chunk(), dataclasses.replace(result, context=context), SETTINGS)
+    shown = layers.sky_seen == 1
+    assert shown.any() and np.allclose(layers.sky[shown], 0.7)
+    elsewhere = layers.sky_seen == SURE
+    assert elsewhere.any() and np.allclose(layers.sky[elsewhere], 0.4)
 
 
 # -------------------------------------------------------------------------------------------------------- pruning

@@ -24,6 +24,7 @@ from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.reconstruct.feedforward.sky import observed_world_sky, world_sky
 from nurec_sim.reconstruct.feedforward.tracks import knots_along, owners_of_points, owners_of_rays, scene_actors
 from nurec_sim.reconstruct.lift.points import Actor
+from nurec_sim.reconstruct.sky_fill import SURE
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Label
 
 MIN_DYNAMIC_OPACITY = 0.75
@@ -90,12 +91,15 @@ def chunk_layers(clip: Clip, chunk: ChunkInputs, outputs: NetworkOutputs, settin
 def _sky(
     chunk: ChunkInputs, outputs: NetworkOutputs, settings: FeedForwardSettings
 ) -> tuple[Float32[np.ndarray, "6 s s 3"], Float32[np.ndarray, "6 s s"]]:
-    """The learned sky turned to the world, or what the images show of it."""
-    if settings.learned_sky and outputs.sky_learned:
-        sky, seen = (_float32(values[0]) for values in (outputs.sky, outputs.sky_seen))
-        return world_sky(sky, seen[..., 0], chunk.world_from_scene, settings.sky_px)
+    """What the images show of the sky; elsewhere the learned one, or what goes on from what was seen."""
     rays = chunk.tensors.rays.to(outputs.context.rgb.device)
-    return observed_world_sky(outputs.context, rays, chunk.world_from_scene, settings.sky_px, chunk.ego)
+    observed, shown = observed_world_sky(outputs.context, rays, chunk.world_from_scene, settings.sky_px, chunk.ego)
+    if not (settings.learned_sky and outputs.sky_learned):
+        return observed, shown
+    sky, seen = (_float32(values[0]) for values in (outputs.sky, outputs.sky_seen))
+    learned, _ = world_sky(sky, seen[..., 0], chunk.world_from_scene, settings.sky_px)
+    # All of it is known surely enough to stay, what an image showed still more so.
+    return learned + shown[..., None] * (observed - learned), SURE + (1 - SURE) * shown
 
 
 # ------------------------------------------------------------------------------------------------- scene to world

@@ -34,7 +34,7 @@ class FeedForwardSettings:
             (``scale``), or by a factor and a slope over inverse depth (``affine``).
         ego_masks: folder with ``<camera>.png``: pixels of the car's own body, not black where it covers the view.
         sky_px: edge of the scene's sky cubemap.
-        learned_sky: whether to use the learned sky decoder where the profile has one.
+        learned_sky: whether the sky that no image shows comes from the profile's sky decoder, if it has one.
     """
 
     profile: str | None = None
