@@ -7,22 +7,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from nurec_sim.errors import TrainingError
 from nurec_sim.network.profiles import PROFILES
-from nurec_sim.training.settings import DataSettings
+from nurec_sim.training.settings import DataSettings, Strict
 
 Part = Literal["encoder", "context", "motion", "sky", "gaussians", "isp"]
 
 
-class _Strict(BaseModel):
-    """A part of a recipe: frozen, and unknown keys are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class LossWeights(_Strict):
+class LossWeights(Strict):
     """Weights of the loss terms; 0 leaves a term out.
 
     The paper's context losses are ``depth``, ``normal`` and ``semantic``, its motion loss is ``motion``, its render
@@ -45,7 +39,7 @@ class LossWeights(_Strict):
     footprint: float = Field(0.05, ge=0)
 
 
-class Stage(_Strict):
+class Stage(Strict):
     """One stage of the curriculum: which parts of the network learn, for how long, from what.
 
     The learning rate rises over ``warm_up`` steps and falls by a cosine to ``final_rate`` of its peak. ``targets``
@@ -63,7 +57,7 @@ class Stage(_Strict):
     losses: LossWeights = LossWeights()
 
 
-class TrainingConfig(_Strict):
+class TrainingConfig(Strict):
     """A recipe. ``start`` names weights to begin with; parts that they lack begin at random.
 
     ``lpips`` names a file with the weights of LPIPS to use in place of our own perceptual term.

@@ -12,7 +12,13 @@ from nurec_sim.training.generate import ClipSettings
 from nurec_sim.training.windows import WindowSettings
 
 
-class DataSettings(BaseModel):
+class Strict(BaseModel):
+    """A part of a recipe: frozen, and unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class DataSettings(Strict):
     """Training data, drawn while training goes on.
 
     Attributes:
@@ -31,7 +37,6 @@ class DataSettings(BaseModel):
         colours: whether colours are changed, by a response of each camera, blur, noise and JPEG.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     clips: int = Field(240, ge=1)
     clips_per_town: int = Field(3, ge=1)
     clip_frames: int = Field(16, ge=2)
