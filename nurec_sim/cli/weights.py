@@ -1,4 +1,4 @@
-"""Verbs about the weights of the network: weights list, fetch, check."""
+"""Verbs about the weights of the network: weights list, fetch, check, share."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ weights = tyro.extras.SubcommandApp()
 app.command(
     weights,
     name="weights",
-    help="Weights of the network: list what there is, fetch released ones, check a file.",
+    help="Weights of the network: list what there is, fetch released ones, check a file, leave out what two share.",
 )
 
 Fetchable = Literal["pa-front", "pa-multiview", "pq-front", "da3-base"]
@@ -101,3 +101,21 @@ def check(path: OnePath, *, profile: Checkable | None = None) -> None:
     print_table(path.name, report.facts)
     print_faults(report.faults)
     out.print("no faults")
+
+
+@weights.command
+def share(path: OnePath, *, other: Path, to: Path) -> None:
+    """Write a weights file without the tensors that another one beside it has too, value by value.
+
+    For profiles that differ in a part only: the small file is read together with the other one, which must stay beside
+    it, unchanged.
+
+    Args:
+        path: the whole file, .safetensors.
+        other: the file with which it shares tensors, .safetensors.
+        to: the file to write, in the folder of the other one; one that is there is replaced.
+    """
+    from nurec_sim.network.shared_weights import save_difference
+
+    count = save_difference(path, other, to)
+    out.print(f"{to}: {count} tensors are those of {other.name}; {to.stat().st_size:,} bytes", soft_wrap=True)

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from nurec_sim.errors import WeightsError
+from nurec_sim.network.shared_weights import with_shared
 from nurec_sim.network.torch_archive import read_torch_archive
 
 _LEGACY_PROJECTOR = re.compile(r"^(post_processing\.affine_attention)\.(to_k|to_v)\.")
@@ -173,7 +174,8 @@ def read_metadata(path: Path) -> dict[str, str]:
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
     """The tensors in the order of their names, for the library's own order changes from run to run."""
     try:
-        return dict(sorted(safetensors.torch.load_file(path).items()))
+        own = dict(sorted(safetensors.torch.load_file(path).items()))
+        return with_shared(path, own)
     except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type that torch lacks
         raise WeightsError(f"{path} is damaged: {error}") from None
 

@@ -10,11 +10,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nurec_sim.network.attention import KeyValueProjector, QueryBlock
-from nurec_sim.network.car_view import CHANNELS, car_view
+from nurec_sim.network.car_view import CHANNELS, MATCHED_DEPTH, car_view
+from nurec_sim.network.depth_detail import DepthDetail, chosen_depth, pixel_layers
 from nurec_sim.network.dpt import DptHead
 from nurec_sim.network.encoder import Features
+from nurec_sim.network.footprints import Footprints, footprints
 from nurec_sim.network.motion import MotionDecoder
-from nurec_sim.network.profiles import HeadSize, Profile
+from nurec_sim.network.profiles import Profile
 from nurec_sim.network.tensors import SCENE_RESCALE, ContextMaps, NetworkInputs, QueryGaussians, SemanticClass
 
 LARGEST_SCALE = 0.045
@@ -36,18 +38,18 @@ class ContextDecoder(nn.Module):
         # Margin around cuboids, metres; kept in the released state dicts, read by nothing here.
         self.register_buffer("cuboids_dims_padding", torch.ones(3))
         self.depth_head = DptHead(width, profile.head, out=2)
-        self.depth_fusion = _fusion(3 + CHANNELS, profile.head) if profile.head.depth_detail else None
-        self.rgb_fusion = _fusion(3, profile.head)
+        self.depth_fusion = DepthDetail(3 + CHANNELS, profile.head.fused // 2) if profile.head.depth_detail else None
+        self.rgb_fusion = pixel_layers(3, profile.head.fused // 2)
         self.context_head = DptHead(width, profile.head, out=3 + 3 + len(SemanticClass))
         self.context_motion_head = MotionDecoder(profile)
+        self.begins_as_footprints = profile.footprints
 
     def context(self, features: Sequence[Features], inputs: NetworkInputs, motion: bool) -> ContextMaps:
         """Maps of all images."""
         clips, size = inputs.rgb.shape[:2], (inputs.rgb.shape[2], inputs.rgb.shape[3])
         levels = [feature.patches.flatten(0, 1) for feature in features]
         images = inputs.rgb.flatten(0, 1).permute(0, 3, 1, 2)
-        seen = () if self.depth_fusion is None else (self.depth_fusion, self._pixels_with_view(images, inputs))
-        depth = self.depth_head(levels, size, *seen)[:, 0].float()
+        depth = self._log_depth(levels, size, images, inputs)
         context = self.context_head(levels, size, self.rgb_fusion, images).float().permute(0, 2, 3, 1)
         rgb, normal, logits = context.split([3, 3, len(SemanticClass)], dim=-1)
         moved = None
@@ -61,18 +63,16 @@ class ContextDecoder(nn.Module):
             motion_m=moved,
         )
 
-    def _pixels_with_view(self, images: Float[Tensor, "n 3 h w"], inputs: NetworkInputs) -> Float[Tensor, "n 14 h w"]:
-        return torch.cat([images, car_view(inputs).flatten(0, 1).permute(0, 3, 1, 2).to(images.dtype)], dim=1)
-
-
-def _fusion(channels: int, size: HeadSize) -> nn.Sequential:
-    """Three convolutions that bring pixels to the width of a head's last layers."""
-    half = size.fused // 2
-    return nn.Sequential(
-        nn.Conv2d(channels, half // 4, 3, 1, 1), nn.GELU(),
-        nn.Conv2d(half // 4, half // 2, 3, 1, 1), nn.GELU(),
-        nn.Conv2d(half // 2, half, 3, 1, 1), nn.GELU(),
-    )  # fmt: skip
+    def _log_depth(
+        self, levels: list[Tensor], size: tuple[int, int], images: Float[Tensor, "n 3 h w"], inputs: NetworkInputs
+    ) -> Float[Tensor, "n h w"]:
+        """Logarithm of the depth in the network's unit."""
+        if self.depth_fusion is None:
+            return self.depth_head(levels, size)[:, 0].float()
+        view = car_view(inputs).flatten(0, 1).permute(0, 3, 1, 2)
+        seen = torch.cat([images, view.to(images.dtype)], dim=1)
+        predicted, trust = self.depth_head(levels, size, self.depth_fusion, seen).float().unbind(1)
+        return chosen_depth(predicted, trust, view[:, MATCHED_DEPTH])
 
 
 class DenseDecoder(ContextDecoder):
@@ -89,7 +89,8 @@ class DenseDecoder(ContextDecoder):
         raw = raw.float().permute(0, 2, 3, 1).reshape(b, v * h * w, GAUSSIAN_CHANNELS)
         source = torch.arange(v * h * w, device=raw.device).expand(b, -1)
         visible = (outside_probability(context.logits) > 0.5).reshape(b, -1).to(raw.dtype)
-        return gaussians_at(source, raw, visible, lifted_points(context, inputs), context)
+        shapes = footprints(inputs, context, source, raw.new_ones(v * h * w)) if self.begins_as_footprints else None
+        return gaussians_at(source, raw, visible, lifted_points(context, inputs), context, shapes)
 
 
 class SelectiveDecoder(ContextDecoder):
@@ -121,12 +122,18 @@ class SelectiveDecoder(ContextDecoder):
         if len(context.depth_m) != 1:
             raise ValueError(f"the selective decoder takes one clip at a time, got {len(context.depth_m)}")
         road, filled = self.road_cells(context.logits[0])
-        source = torch.cat([self.regular_cells(context.depth_m[0]), road]).flatten()[None]
+        regular = self.regular_cells(context.depth_m[0])
+        source = torch.cat([regular, road]).flatten()[None]
         points = lifted_points(context, inputs)
         raw = self.decode(points.gather(1, source[..., None].expand(-1, -1, 3)), features)
         visible = outside_probability(context.logits).reshape(1, -1).gather(1, source)
         visible[:, source.shape[1] - road.numel() :] *= filled.repeat_interleave(self.size.cell**2)
-        return gaussians_at(source, raw, visible, points, context)
+        shapes = None
+        if self.begins_as_footprints:
+            spacing = raw.new_ones(source.shape[1])
+            spacing[: regular.numel()] = self.size.stride
+            shapes = footprints(inputs, context, source, spacing)
+        return gaussians_at(source, raw, visible, points, context, shapes)
 
     def decode(self, points: Float[Tensor, "b n 3"], features: Sequence[Features]) -> Float[Tensor, "b n 8"]:
         """Raw attributes of the Gaussians at points, whole clusters of ``cell``**2 after each other."""
@@ -191,10 +198,19 @@ def gaussians_at(
     visible: Float[Tensor, "b n"],
     points: Float[Tensor, "b pixels 3"],
     context: ContextMaps,
+    shapes: Footprints | None,
 ) -> QueryGaussians:
-    """Activated Gaussians at source pixels, with the pixels' colour, normal, class and motion."""
-    scale, quaternion, opacity = raw.split([3, 4, 1], dim=-1)
-    scale = (scale + (torch.tensor(LARGEST_SCALE).log() - SCALE_SHIFT)).exp().clamp(max=LARGEST_SCALE)
+    """Activated Gaussians at source pixels, with the pixels' colour, normal, class and motion.
+
+    Scales and orientations are absolute, as in the release, or changes of ``shapes``.
+    """
+    log_scale, quaternion, opacity = raw.split([3, 4, 1], dim=-1)
+    if shapes is None:
+        log_scale = log_scale + (torch.tensor(LARGEST_SCALE).log() - SCALE_SHIFT)
+        scale_m = log_scale.exp().clamp(max=LARGEST_SCALE) / SCENE_RESCALE
+        quat_wxyz = functional.normalize(quaternion, dim=-1)
+    else:
+        scale_m, quat_wxyz = shapes.changed(log_scale, quaternion)
 
     def at_source(values: Tensor) -> Tensor:
         flat = values.reshape(source.shape[0], -1, *values.shape[4:])
@@ -203,8 +219,8 @@ def gaussians_at(
 
     return QueryGaussians(
         position_m=points.gather(1, source[..., None].expand(-1, -1, 3)),
-        quat_wxyz=functional.normalize(quaternion, dim=-1),
-        scale_m=scale / SCENE_RESCALE,
+        quat_wxyz=quat_wxyz,
+        scale_m=scale_m,
         opacity=torch.sigmoid(opacity[..., 0] - OPACITY_SHIFT) * visible,
         rgb=at_source(context.rgb),
         normal=at_source(context.normal),

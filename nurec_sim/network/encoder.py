@@ -92,7 +92,7 @@ class ViewPatches(nn.Module):
         super().__init__()
         self.mlp = Mlp(CHANNELS + 3 * 2 * RAY_OCTAVES, width, width)
 
-    def forward(self, view: Float[Tensor, "n h w 11"]) -> Float[Tensor, "n y x d"]:
+    def forward(self, view: Float[Tensor, "n h w 12"]) -> Float[Tensor, "n y x d"]:
         """Tokens by row and column; always in float32."""
         with torch.autocast(view.device.type, enabled=False):
             mean = functional.avg_pool2d(view.float().permute(0, 3, 1, 2), PATCH_PX).permute(0, 2, 3, 1)
@@ -159,7 +159,7 @@ class Encoder(nn.Module):
         rgb: Float[Tensor, "b v h w 3"],
         c2w: Float[Tensor, "b v 4 4"],
         fov: Float[Tensor, "b v 2"],
-        view: Float[Tensor, "b v h w 11"] | None = None,
+        view: Float[Tensor, "b v h w 12"] | None = None,
     ) -> tuple[Features, ...]:
         """Four levels of features, from early to deep; ``view`` is the ``car_view`` of profiles that have one."""
         patches = self.patch_embed_img(normalized(rgb.flatten(0, 1)))

@@ -14,11 +14,12 @@ from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
 from nurec_sim.network.encoder import Encoder, Features
 from nurec_sim.network.isp import IspDecoder
 from nurec_sim.network.learned_sky import SkyDecoder
+from nurec_sim.network.motion_search import searched_motion
 from nurec_sim.network.observed_sky import observed_sky
 from nurec_sim.network.plane_sweep import plane_sweep
 from nurec_sim.network.profiles import PATCH_PX, Profile, SkySize
 from nurec_sim.network.sky_mlp import SkyMlp
-from nurec_sim.network.tensors import NetworkInputs, NetworkOutputs
+from nurec_sim.network.tensors import NetworkInputs, NetworkOutputs, SemanticClass
 
 Precision = Literal["float32", "bfloat16", "float16"]
 TOKENS_AND_POSITIONS = ("cls_tokens", "cls_pos_embed", "img_pos_embed", "affine_token", "sky.token")
@@ -65,6 +66,10 @@ class InstantNuRec(nn.Module):
             deepest = features[-1].patches
             # What every pixel shows: depth, colour, normal, class, and where its point moves.
             context = self.decoder.context(features, inputs, motion)
+            if context.motion_m is not None and self.profile.motion_search:
+                movable = context.logits.argmax(-1) == SemanticClass.MOVABLE
+                found = searched_motion(inputs, context.depth_m, movable, context.motion_m)
+                context = dataclasses.replace(context, motion_m=found)
             # Pixels lifted to points, points grown to Gaussians.
             gaussians = self.decoder.gaussians(features, context, inputs)
             # What lies behind everything.

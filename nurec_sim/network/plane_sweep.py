@@ -1,7 +1,8 @@
 """Depth by matching: how well every pixel fits its camera's other frames, for depths from near to far (a plane sweep).
 
-Nothing is learned. Images are compared where their own brightness has been divided out, in small windows; what moves,
-has no texture or lies where the car drives to does not match, and says so by a low confidence.
+Nothing is learned. Images are compared where their own brightness has been divided out, in small windows; nothing lies
+below flat ground; and neighbours agree unless there is an edge (``semi_global``). What moves, has no texture or lies
+where the car drives to is found wrongly: three more numbers say how far to trust a depth.
 """
 
 from __future__ import annotations
@@ -9,169 +10,124 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from nurec_sim.network.flat_ground import flat_ground
+from nurec_sim.network.matching import Places, SmallImages, neighbours, sampled, small_images, window_mean
+from nurec_sim.network.semi_global import semi_global
 from nurec_sim.network.tensors import SCENE_RESCALE, NetworkInputs
 
+CHANNELS = 4
+"""Logarithm of the depth in the network's unit; how much of the weight of all depths lies around it; how much better
+than others it fits by the pixel alone; and how well another image agrees."""
 NEAREST_M, FARTHEST_M, DEPTHS = 2.0, 120.0, 48
 """Depths are tried in equal steps of their logarithm, each 9 % farther than the last."""
+USUAL_M, UNUSUAL = 40.0, 0.003
+"""Where nothing else is known, depths of this logarithm are preferred, by this much times the squared difference."""
 NEIGHBOURS = (-1, 1, -2)
 """Frames of the same camera to compare with, by their places in the order of time."""
-SHRINK = 2
-WINDOW_PX = 9
+WINDOW_PX = 5
+"""Windows in which brightness is compared."""
 SHARPNESS = 25.0
 """How strongly the best match is preferred to the others."""
 OUTSIDE = 0.3
 """Badness of a depth whose point the other image does not show: neither a good match nor a bad one."""
+BELOW_GROUND, BELOW, WELL_BELOW = 0.5, 0.05, 0.25
+"""Cost of points below flat ground: none if their logarithm is up to ``BELOW`` farther, all from ``WELL_BELOW`` on."""
+ON_GROUND, GROUND_WIDTH = 0.05, 0.1
+"""What points on the ground are preferred by, and how far from it in the logarithm."""
 AGREEING = 0.15
-"""Two images agree on a point if the logarithms of its depth differ by less; the confidence of others is cut down."""
-ALONE = 0.15
-"""Share of the confidence that is left where no other image agrees."""
-LENS_STEPS = 2
-LEAST_CONTRAST = 0.02
-"""Below this deviation within a window, brightness in 0..1 is noise."""
+"""Two images agree on a point if the logarithms of its depth differ by less than about this."""
 
 
 @torch.no_grad()
-def plane_sweep(inputs: NetworkInputs) -> Float[Tensor, "b v h w 2"]:
-    """Logarithm of the matched depth in the network's unit, and its confidence in 0..1 (0: nothing to compare with)."""
-    return torch.stack([_clip_sweep(inputs, clip) for clip in range(len(inputs.rgb))])
+def plane_sweep(inputs: NetworkInputs) -> Float[Tensor, "b v h w 4"]:
+    """The channels above, of every pixel.
+
+    Raises:
+        ValueError: the inputs do not say where the car is.
+    """
+    ground_m, there = flat_ground(inputs)
+    with torch.autocast(inputs.rgb.device.type, enabled=False):
+        return torch.stack([_clip_sweep(inputs, k, ground_m[k], there[k]) for k in range(len(inputs.rgb))])
 
 
-def _clip_sweep(inputs: NetworkInputs, clip: int) -> Float[Tensor, "v h w 2"]:
-    rgb, rays = inputs.rgb[clip].float(), inputs.rays[clip].float()
-    v, height, width = rgb.shape[:3]
-    size = (max(1, height // SHRINK), max(1, width // SHRINK))
-    grey = functional.interpolate(rgb.mean(-1)[:, None], size, mode="area")
-    local = _locally_normalized(grey)
-    small = functional.interpolate(rays.permute(0, 3, 1, 2), size, mode="bilinear", antialias=True).permute(0, 2, 3, 1)
-    along = functional.interpolate(
-        inputs.distance_to_depth_scale[clip].float().permute(0, 3, 1, 2), size, mode="bilinear", antialias=True
-    )[:, 0]
-    views = [_View(small[k], inputs.c2w[clip, k].float()) for k in range(v)]
-    log_m = torch.linspace(math.log(NEAREST_M), math.log(FARTHEST_M), DEPTHS, device=rgb.device)
-    camera, time = inputs.camera_idxs[clip], inputs.time[clip]
-    maps = []
-    for k in range(v):
-        distance = log_m.exp()[:, None, None] / along[k].clamp(min=1e-3)
-        direction = functional.normalize(small[k, ..., 3:], dim=-1)
-        points = small[k, ..., :3] + distance[..., None] * direction
-        costs = [_cost(points, local[k], local[n], views[n]) for n in _neighbours(camera, time, k)]
-        maps.append(_chosen(torch.stack(costs), log_m) if costs else _nothing(size, log_m))
+def _clip_sweep(
+    inputs: NetworkInputs, clip: int, ground_m: Float[Tensor, "v h w"], there: Bool[Tensor, "v h w"]
+) -> Float[Tensor, "v h w 4"]:
+    images = small_images(inputs, clip)
+    log_m = torch.linspace(math.log(NEAREST_M), math.log(FARTHEST_M), DEPTHS, device=ground_m.device)
+    maps, compared = [], []
+    for k, view_rays in enumerate(images.rays):
+        others = neighbours(inputs.camera_idxs[clip], inputs.time[clip], k, NEIGHBOURS)
+        ground, meets = _shrunk(ground_m[k], images.size), _shrunk(there[k].float(), images.size)
+        distance = log_m.exp()[:, None, None] / images.along[k].clamp(min=1e-3)
+        costs = [_cost(images.views[n].places(view_rays, distance), images.local[k], images.local[n]) for n in others]
+        fits = _of_the_better_half(costs) if costs else torch.full_like(distance, OUTSIDE)
+        cost = semi_global(fits + _expectation(ground, meets, log_m), images.grey[k, 0])
+        maps.append(_chosen(fits, cost, log_m))
+        compared.append(others)
     found = torch.stack(maps)
-    agreed = [_agreement(found, small[k], along[k], views, k, _neighbours(camera, time, k)) for k in range(v)]
-    found[..., 1] *= torch.stack(agreed)
+    agreed = [_agreement(found, images, k, others) for k, others in enumerate(compared)]
+    found = torch.cat([found, torch.stack(agreed)[..., None]], dim=-1)
     found[..., 0] += math.log(SCENE_RESCALE)
-    return functional.interpolate(found.permute(0, 3, 1, 2), (height, width), mode="nearest").permute(0, 2, 3, 1)
+    size = (ground_m.shape[1], ground_m.shape[2])
+    return functional.interpolate(found.permute(0, 3, 1, 2), size, mode="nearest").permute(0, 2, 3, 1)
 
 
-class _View:
-    """Projection into an image by its rays alone, whatever its lens: a pinhole first, then corrected by the rays."""
-
-    def __init__(self, rays: Float[Tensor, "h w 6"], c2w: Float[Tensor, "4 4"]) -> None:
-        height, width = rays.shape[:2]
-        self.eye, self.turn = rays[height // 2, width // 2, :3], c2w[:3, :3]
-        ahead = rays[..., 3:] @ self.turn
-        plane = ahead[..., :2] / ahead[..., 2:].clamp(min=0.05)
-        self.plane = plane.permute(2, 0, 1)[None]
-        # Places in an image are -1..1 from edge to edge, as grid_sample wants them.
-        y, x = torch.meshgrid(
-            (torch.arange(height, device=rays.device) * 2 + 1) / height - 1,
-            (torch.arange(width, device=rays.device) * 2 + 1) / width - 1,
-            indexing="ij",
-        )
-        self.lines = [_line(plane[..., k], place) for k, place in enumerate((x, y))]
-
-    def places(self, points: Float[Tensor, "d h w 3"]) -> tuple[Float[Tensor, "d h w 2"], Tensor]:
-        """Where points are seen, and whether they are."""
-        local = (points - self.eye) @ self.turn
-        z = local[..., 2]
-        wanted = local[..., :2] / z.clamp(min=0.1)[..., None]
-        slope = wanted.new_tensor([line[0] for line in self.lines])
-        start = wanted.new_tensor([line[1] for line in self.lines])
-        place = wanted * slope + start
-        for _ in range(LENS_STEPS):
-            reached = _sampled(self.plane, place)
-            place = place + (wanted - reached.permute(1, 2, 3, 0)) * slope
-        inside = (z > 0.3) & (place.abs() < 1).all(-1)
-        return place, inside
+def _shrunk(values: Float[Tensor, "h w"], size: tuple[int, int]) -> Float[Tensor, "hh ww"]:
+    return functional.interpolate(values[None, None], size, mode="nearest")[0, 0]
 
 
-def _line(plane: Tensor, place: Tensor) -> tuple[float, float]:
-    """Slope and start of the places over coordinates in the image plane at z = 1, by least squares."""
-    away = plane - plane.mean()
-    slope = float((away * place).sum() / (away**2).sum().clamp(min=1e-9))
-    return slope, float(place.mean() - slope * plane.mean())
-
-
-def _sampled(values: Float[Tensor, "1 c h w"], place: Float[Tensor, "d h w 2"]) -> Float[Tensor, "c d h w"]:
-    d, h, w = place.shape[:3]
-    flat = place.reshape(1, d * h, w, 2)
-    sampled = functional.grid_sample(values, flat, mode="bilinear", padding_mode="border", align_corners=False)
-    return sampled[0].reshape(-1, d, h, w)
-
-
-def _locally_normalized(grey: Float[Tensor, "v 1 h w"]) -> Float[Tensor, "v 1 h w"]:
-    """Brightness without the mean and the deviation of its window; nearly 0 where there is no texture."""
-    mean = _window_mean(grey)
-    deviation = (_window_mean(grey**2) - mean**2).clamp(min=0).sqrt()
-    return (grey - mean) / (deviation + LEAST_CONTRAST)
-
-
-def _window_mean(values: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-    return functional.avg_pool2d(values, WINDOW_PX, 1, WINDOW_PX // 2, count_include_pad=False)
-
-
-def _neighbours(camera: Tensor, time: Tensor, image: int) -> list[int]:
-    """Images of the same camera around one."""
-    same = torch.nonzero(camera == camera[image]).flatten().tolist()
-    order = sorted(same, key=lambda k: (float(time[k]), k))
-    place = order.index(image)
-    return [order[place + step] for step in NEIGHBOURS if 0 <= place + step < len(order)]
-
-
-def _cost(
-    points: Float[Tensor, "d h w 3"], own: Float[Tensor, "1 h w"], other: Float[Tensor, "1 h w"], view: _View
+def _expectation(
+    ground_m: Float[Tensor, "h w"], there: Float[Tensor, "h w"], log_m: Float[Tensor, " d"]
 ) -> Float[Tensor, "d h w"]:
+    """Cost of depths before anything is compared: of points below the ground, off it, and unusually near or far."""
+    depths = log_m[:, None, None]
+    beyond = depths - ground_m.log()
+    below = ((beyond - BELOW) / (WELL_BELOW - BELOW)).clamp(0, 1) * BELOW_GROUND
+    on = torch.exp(-0.5 * (beyond / GROUND_WIDTH) ** 2) * ON_GROUND
+    return there * (below - on) + UNUSUAL * (depths - math.log(USUAL_M)) ** 2
+
+
+def _cost(seen: Places, own: Float[Tensor, "1 h w"], other: Float[Tensor, "1 h w"]) -> Float[Tensor, "d h w"]:
     """How badly each depth fits, 0..1."""
-    place, inside = view.places(points)
-    difference = (_sampled(other[None], place)[0] - own).abs().clamp(max=2) / 2
-    return torch.where(inside, _window_mean(difference[:, None])[:, 0], OUTSIDE)
+    difference = (sampled(other[None], seen.place)[0] - own).abs().clamp(max=2) / 2
+    return torch.where(seen.inside, window_mean(difference[:, None], WINDOW_PX)[:, 0], OUTSIDE)
+
+
+def _of_the_better_half(costs: list[Float[Tensor, "d h w"]]) -> Float[Tensor, "d h w"]:
+    """Mean over the images that fit better: others do not see the point. One, two or three of them."""
+    if len(costs) == len(NEIGHBOURS):
+        return (torch.stack(costs).sum(0) - torch.stack(costs).amax(0)) / 2
+    return torch.stack(costs).amin(0)
 
 
 def _agreement(
-    found: Float[Tensor, "v h w 2"],
-    rays: Float[Tensor, "h w 6"],
-    along: Float[Tensor, "h w"],
-    views: list[_View],
-    image: int,
-    neighbours: list[int],
+    found: Float[Tensor, "v h w 3"], images: SmallImages, image: int, others: list[int]
 ) -> Float[Tensor, "h w"]:
-    """1 where a neighbour has found the same point, ``ALONE`` elsewhere."""
-    distance = found[image, ..., 0].exp() / along.clamp(min=1e-3)
-    points = rays[..., :3] + distance[..., None] * functional.normalize(rays[..., 3:], dim=-1)
-    same = torch.zeros_like(distance, dtype=torch.bool)
-    for n in neighbours:
-        place, inside = views[n].places(points[None])
-        depth = ((points - views[n].eye) @ views[n].turn)[..., 2].clamp(min=1e-3).log()
-        theirs = functional.grid_sample(found[n, None, None, ..., 0], place, mode="nearest", align_corners=False)
-        same |= inside[0] & ((theirs[0, 0] - depth).abs() < AGREEING)
-    return torch.where(same, 1.0, ALONE)
+    """1 where another image has found the same point, falling to 0 the more its depth differs."""
+    distance = found[image, ..., 0].exp() / images.along[image].clamp(min=1e-3)
+    best = torch.zeros_like(distance)
+    for n in others:
+        seen = images.views[n].places(images.rays[image], distance[None])
+        theirs = functional.grid_sample(found[n, None, None, ..., 0], seen.place, mode="nearest", align_corners=False)
+        apart = theirs[0, 0] - seen.depth_m[0].clamp(min=1e-3).log()
+        close = torch.exp(-0.5 * (apart / AGREEING) ** 2)
+        best = torch.maximum(best, torch.where(seen.inside[0], close, 0.0))
+    return best
 
 
-def _chosen(costs: Float[Tensor, "n d h w"], log_m: Float[Tensor, " d"]) -> Float[Tensor, "h w 2"]:
-    """Mean of the log depths weighted by how well they fit, and how much weight lies around it."""
-    best = costs.sort(dim=0).values[: max(1, (len(costs) + 1) // 2)].mean(0)
-    weight = (-SHARPNESS * best).softmax(0)
-    peak = weight.argmax(0)
+def _chosen(
+    fits: Float[Tensor, "d h w"], cost: Float[Tensor, "d h w"], log_m: Float[Tensor, " d"]
+) -> Float[Tensor, "h w 3"]:
+    """Mean of the log depths around the cheapest, weighted by their cost, and the two numbers about it."""
+    weight = (-SHARPNESS * cost).softmax(0)
+    peak = weight.argmax(0, keepdim=True)
     near = (torch.arange(len(log_m), device=peak.device)[:, None, None] - peak).abs() <= 2
     around = weight * near
     share = around.sum(0)
-    return torch.stack([(around * log_m[:, None, None]).sum(0) / share, share], dim=-1)
-
-
-def _nothing(size: tuple[int, int], log_m: Tensor) -> Float[Tensor, "h w 2"]:
-    """Of an image without neighbours: the farthest depth, with no confidence."""
-    return torch.stack([log_m.new_full(size, float(log_m[-1])), log_m.new_zeros(size)], dim=-1)
+    better = (fits.mean(0) - fits.gather(0, peak)[0]).clamp(min=0)
+    return torch.stack([(around * log_m[:, None, None]).sum(0) / share, share, better], dim=-1)

@@ -100,6 +100,9 @@ class Profile:
         motion: size of the motion decoder.
         sky: size of the learned sky; None uses the sky that the images show.
         observed_sky_px: edge of the cubemap of the observed sky.
+        footprints: whether Gaussians begin as the footprints of their pixels, which the released network does not know.
+        motion_search: whether movable things are searched for in the frames around, whatever the motion decoder says of
+            them, which the released network does not do.
         isp_heads: attention heads of the decoder of camera responses.
         training_buffers: whether the state dict holds the constants that files of the training code hold.
         checkpoint: id of the released file, None if there is none.
@@ -118,6 +121,8 @@ class Profile:
     motion: MotionSize = MotionSize()
     sky: SkySize | None = None
     observed_sky_px: int = 448
+    footprints: bool = False
+    motion_search: bool = False
     isp_heads: int = 16
     training_buffers: bool = False
     checkpoint: str | None = None
@@ -132,10 +137,12 @@ _TINY = Profile(
     keeps_aspect=True,
     encoder=EncoderSize(144, 10, 3, 2, (3, 5, 7, 9), 16, 1, 4, car_view=True),
     head=HeadSize((24, 48, 72, 72), 48, 16, depth_detail=True),
-    selective=SelectiveSize(depth=1, heads=6),
+    selective=SelectiveSize(depth=1, heads=6, road_slots=80),
     motion=MotionSize(64),
     sky=SkySize(112, 48, 1, 3, (24, 48, 48, 48)),
     observed_sky_px=112,
+    footprints=True,
+    motion_search=True,
     isp_heads=6,
 )
 _TINY_SKY_MLP = SkySize(112, 96, heads=3, kind="mlp")
@@ -148,7 +155,7 @@ PROFILES: Mapping[str, Profile] = {
         Profile("pq-front", decoder="selective", checkpoint="instant_nurec_pq_road_1.0.0"),
         Profile("pa-full", sky=SkySize(), training_buffers=True),
         _TINY,
-        dataclasses.replace(_TINY, name="tiny-selective", decoder="selective"),
+        dataclasses.replace(_TINY, name="tiny-selective", height_px=224, decoder="selective"),
         dataclasses.replace(_TINY, name="tiny-sky-mlp", sky=_TINY_SKY_MLP),
     )
 }

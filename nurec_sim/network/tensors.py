@@ -57,7 +57,7 @@ class NetworkInputs:
     time_before: Float[Tensor, "b v"]
     time_after: Float[Tensor, "b v"]
     rig_from_scene: Float[Tensor, "b 4 4"] | None = None
-    matches: Float[Tensor, "b v h w 2"] | None = None
+    matches: Float[Tensor, "b v h w 4"] | None = None
 
     def to(self, device: torch.device | str) -> NetworkInputs:
         """The same on another device."""

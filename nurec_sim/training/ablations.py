@@ -117,8 +117,6 @@ def _applies(name: str, stage: Stage) -> bool:
         return bool({"encoder", "context"} & set(stage.trains))
     if name in ("sky", "motion"):
         return name in stage.trains
-    if name == "footprint":
-        return "gaussians" in stage.trains
     return stage.targets > 0
 
 

@@ -21,8 +21,8 @@ class LossWeights(Strict):
 
     The paper's context losses are ``depth``, ``normal`` and ``semantic``, its motion loss is ``motion``, its render
     losses are ``colour``, ``perceptual`` and ``opacity`` (section 4.1). Ours beside them: ``edges`` (slopes of the
-    depth), ``rgb`` (the colour head against the image), ``sky`` (the sky decoder against pixels that show sky),
-    ``rendered_depth``, and ``footprint`` (a Gaussian is about as wide as its pixel).
+    depth), ``rgb`` (the colour head against the image), ``sky`` (the sky decoder against pixels that show sky) and
+    ``rendered_depth``.
     """
 
     depth: float = Field(1.0, ge=0)
@@ -36,7 +36,6 @@ class LossWeights(Strict):
     perceptual: float = Field(0.5, ge=0)
     opacity: float = Field(0.1, ge=0)
     rendered_depth: float = Field(0.1, ge=0)
-    footprint: float = Field(0.05, ge=0)
 
 
 class Stage(Strict):

@@ -21,7 +21,7 @@ from nurec_sim.types import CameraModel, Rig, SensorRequest, Shutter, Track, Tra
 if TYPE_CHECKING:
     from nurec_sim.world import TrueWorld
 
-GENERATOR = 2
+GENERATOR = 3
 """To be raised when the same settings would give other clips, so that old ones are not mixed with new ones."""
 CAMERAS = {1: 0.4, 3: 0.5, 5: 0.1}
 """How often a rig has so many cameras."""

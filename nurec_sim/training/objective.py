@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from nurec_sim.network.model import InstantNuRec
 from nurec_sim.network.tensors import ContextMaps, NetworkInputs, QueryGaussians
 from nurec_sim.training.config import Part, Stage
 from nurec_sim.training.losses import context_losses, motion_loss, sky_loss
-from nurec_sim.training.rendering import PerceptualLoss, Rendering, footprint_loss, psnr_db, render_losses, render_view
+from nurec_sim.training.rendering import PerceptualLoss, Rendering, psnr_db, render_losses, render_view
 from nurec_sim.training.sample import TrainingSample
 
 PREFIXES: Mapping[Part, tuple[str, ...]] = {
@@ -86,9 +87,11 @@ class Objective(nn.Module):
             frozen = "encoder" not in stage.trains
             with torch.no_grad() if frozen else contextlib.nullcontext():
                 features = model.features(inputs)
-            motion = "motion" in stage.trains or stage.targets > 0
-            context = model.decoder.context(features, inputs, motion)
+            context = model.decoder.context(features, inputs, motion="motion" in stage.trains)
             if stage.targets:
+                if context.motion_m is None:
+                    # Shapes and opacities are learned where things are, not where they are thought to be.
+                    context = dataclasses.replace(context, motion_m=sample.truth.motion_m)
                 gaussians = model.decoder.gaussians(features, context, inputs)
                 isp = model.post_processing(features[-1].patches, inputs.camera_idxs)
             if model.sky is not None and ("sky" in stage.trains or stage.targets):
@@ -126,6 +129,4 @@ class Objective(nn.Module):
                 for rendering, view in zip(outputs.renderings, sample.targets, strict=False)
             ]
             losses |= {name: torch.stack([one[name] for one in each]).mean() for name in each[0]}
-        if weights.footprint and outputs.gaussians is not None and "gaussians" in trains:
-            losses["footprint"] = footprint_loss(outputs.gaussians, outputs.context.depth_m, sample.inputs)
         return losses

@@ -23,9 +23,6 @@ from nurec_sim.training.sample import TargetView
 
 PerceptualLoss = Callable[[Tensor, Tensor], Tensor]
 """Takes two images [h, w, 3] in 0..1."""
-PIXEL_SHARE = 0.6
-"""Standard deviation of a Gaussian that covers its pixel, in pixels; neighbours then leave no holes."""
-LARGEST_SCALE_M = 0.3
 
 
 @dataclass(frozen=True)
@@ -82,16 +79,6 @@ def render_losses(
         error = rendering.depth_m.clamp(min=0.1).log() - view.depth_m.clamp(min=0.1).log()
         losses["rendered_depth"] = torch.where(both, error.abs(), 0).sum() / both.sum().clamp(min=1)
     return losses
-
-
-def footprint_loss(query: QueryGaussians, depth_m: Float[Tensor, "b v h w"], inputs: NetworkInputs) -> Tensor:
-    """How far the logarithms of the scales are from those of Gaussians that just cover their pixels."""
-    width = inputs.rgb.shape[3]
-    pixel_rad = 2 * (inputs.fov[0, :, 0] / 2).tan() / width
-    image = query.source[0] // depth_m[0, 0].numel()
-    wanted = depth_m[0].flatten()[query.source[0]].detach() * pixel_rad[image] * PIXEL_SHARE
-    wanted = wanted.clamp(1e-3, LARGEST_SCALE_M)
-    return (query.scale_m[0].log() - wanted.log()[:, None]).abs().mean()
 
 
 def psnr_db(rgb: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:

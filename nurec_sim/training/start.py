@@ -1,4 +1,4 @@
-"""How training begins: colours as in the image, depth as ground and matches say, Gaussians small and nearly opaque.
+"""How training begins: colours as in the image, depth as matches and ground say, Gaussians as footprints of pixels.
 
 A network that starts so has only to learn how the world differs from that before its renderings look right.
 """
@@ -13,20 +13,20 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nurec_sim.errors import TrainingError
-from nurec_sim.network.car_view import BEST_GUESS
+from nurec_sim.network.car_view import GROUND_DEPTH
 from nurec_sim.network.checkpoints import load_state_dict
 from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
 from nurec_sim.network.dpt import DptHead
 from nurec_sim.network.model import InstantNuRec
 
-FIRST_LOG_SCALE = 1.0
-"""Of the raw scale; about 4.5 cm."""
-FIRST_RAW_OPACITY = 3.5
-"""An opacity of 0.82."""
+FIRST_RAW_OPACITY = 5.0
+"""An opacity of 0.95."""
 LINEAR_PART = 3.0
 """GELU is nearly the identity from here on; what passes is shifted by it on its way."""
-GUESS_CHANNEL = 3 + BEST_GUESS
-"""Of what the depth head's fusion sees: the colours come first."""
+GROUND_CHANNEL = 3 + GROUND_DEPTH
+"""Of what the depth head's detail sees: the colours come first."""
+FIRST_TRUST = 2.0
+"""A logit: nine tenths of the first depth are those of matching, the rest that of flat ground."""
 
 
 def prepare(model: InstantNuRec) -> None:
@@ -39,7 +39,9 @@ def prepare(model: InstantNuRec) -> None:
         if decoder.depth_fusion is not None:
             # The depth head puts out the logarithm, which is what the car's view holds.
             log_depth = torch.linspace(-1.2, 2.9, 10)
-            _pass_through(decoder.depth_fusion, decoder.depth_head, (GUESS_CHANNEL,), log_depth, log_depth)
+            _pass_through(decoder.depth_fusion.pixels, decoder.depth_head, (GROUND_CHANNEL,), log_depth, log_depth)
+            _first_channel_untouched(decoder.depth_fusion.hourglass.last)
+            _biases(decoder.depth_head.fusion_head.after_conv[2])[1] = FIRST_TRUST
         _first_gaussians(decoder)
 
 
@@ -71,6 +73,10 @@ def _pass_through(
     _biases(last)[: len(channels)] = wanted.mean() - slope * passed.mean()
 
 
+def _first_channel_untouched(layer: nn.Conv2d) -> None:
+    layer.weight[0] = 0
+
+
 def _biases(layer: nn.Conv2d | nn.Linear) -> Tensor:
     assert layer.bias is not None
     return layer.bias
@@ -78,7 +84,7 @@ def _biases(layer: nn.Conv2d | nn.Linear) -> Tensor:
 
 def _first_gaussians(decoder: DenseDecoder | SelectiveDecoder) -> None:
     """Biases of the last layer: scale 3, quaternion 4, opacity 1, for each Gaussian of a cluster."""
-    first = torch.tensor([FIRST_LOG_SCALE] * 3 + [1.0, 0, 0, 0] + [FIRST_RAW_OPACITY])
+    first = torch.tensor([0.0] * 3 + [1.0, 0, 0, 0] + [FIRST_RAW_OPACITY])
     last: nn.Module
     if isinstance(decoder, DenseDecoder):
         last = decoder.gaussians_head.fusion_head.after_conv[2]

@@ -37,7 +37,7 @@ from nurec_sim.training.start import load_shared, prepare
 WEIGHTS, RECIPE, CURVES, SAMPLES = "weights.safetensors", "recipe.json", "curves.csv", "samples"
 COLUMNS = (
     "step", "stage", "seconds", "rate", "loss", "abs_rel", "psnr", "depth", "edges", "normal", "semantic", "rgb", "sky",
-    "motion", "colour", "perceptual", "opacity", "rendered_depth", "footprint", "gradient", "skipped",
+    "motion", "colour", "perceptual", "opacity", "rendered_depth", "gradient", "skipped",
 )  # fmt: skip
 Progress = Callable[[str, float], None]
 
@@ -99,6 +99,8 @@ class Trainer:
     def _train_stage(self, stage: Stage, first: int, last: int, report: Progress) -> None:
         objective = Objective(self.model, stage, self.perceptual, self.config.precision, self.threads)
         objective.train()
+        # Moments of weights without gradients shrink until they are denormal, and then take many times as long.
+        torch.set_flush_denormal(True)
         trained = objective.trained()
         optimiser = torch.optim.AdamW(
             _groups(trained, self.config.weight_decay), lr=stage.learning_rate, betas=(0.9, 0.98), eps=1e-8
