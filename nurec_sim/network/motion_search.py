@@ -6,13 +6,15 @@ constant velocity from the frame before to the frame after. What is not found ag
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
-from nurec_sim.network.matching import ImageView, SmallImages, neighbours, sampled, small_images
+from nurec_sim.network.matching import ImageView, neighbours, sampled, small_images
 from nurec_sim.network.tensors import NetworkInputs
 
 FARTHEST_M = (12.0, 6.0)
@@ -49,11 +51,12 @@ def searched_motion(
     """
     if inputs.rig_from_scene is None:
         raise ValueError("motion_search needs inputs with rig_from_scene, the scene frame as seen from the car")
+    car_axes = inputs.rig_from_scene[:, :2, :3]  # the car's x and y in the scene frame
     found = motion_m.clone()
     with torch.autocast(depth_m.device.type, enabled=False):
         for clip in range(len(depth_m)):
             if movable[clip].any():
-                _search_clip(inputs, clip, depth_m[clip].float(), movable[clip], found[clip])
+                _search_clip(inputs, clip, depth_m[clip].float(), movable[clip], car_axes[clip], found[clip])
     return found
 
 
@@ -62,6 +65,7 @@ def _search_clip(
     clip: int,
     depth_m: Float[Tensor, "v h w"],
     movable: Bool[Tensor, "v h w"],
+    car_axes: Float[Tensor, "2 3"],
     motion_m: Float[Tensor, "v h w 2 3"],
 ) -> None:
     """Writes what is found into ``motion_m``."""
@@ -71,24 +75,19 @@ def _search_clip(
     gaps = torch.stack([inputs.time_before[clip] - time, inputs.time_after[clip] - time], dim=-1)
     distance = depth_m / inputs.distance_to_depth_scale[clip, ..., 0].clamp(min=1e-3)
     points = inputs.rays[clip, ..., :3] + inputs.rays[clip, ..., 3:] * distance[..., None]
-    car_axes = inputs.rig_from_scene[clip, :2, :3]  # the car's x and y in the scene frame
     for k in range(len(depth_m)):
         others = neighbours(inputs.camera_idxs[clip], time, k, (-1, 1))
         spans = [float(time[n] - time[k]) for n in others]
         if not others or min(abs(span) for span in spans) <= 0:
             continue
         unit = min(abs(span) for span in spans)
+        frames = [_Frame(images.views[n], looks[n], span / unit) for n, span in zip(others, spans, strict=True)]
         thing_of = torch.from_numpy(things(depth_m[k], movable[k])).to(depth_m.device)
         for number in range(1, int(thing_of.max()) + 1):
             mine = thing_of == number
             thing = _Thing(points[k][mine], _looks_at(looks[k], mine))
-            shift = thing.search(
-                [(images.views[n], looks[n], span / unit) for n, span in zip(others, spans, strict=True)],
-                car_axes,
-                images,
-            )
-            if shift is not None:
-                motion_m[k][mine] = (gaps[k, :, None] / unit * shift)[None].to(motion_m.dtype)
+            shift = thing.search(frames, car_axes, images.size[1])
+            motion_m[k][mine] = (gaps[k, :, None] / unit * shift)[None].to(motion_m.dtype)
 
 
 def things(depth_m: Float[Tensor, "h w"], movable: Bool[Tensor, "h w"]) -> Int32[np.ndarray, "h w"]:
@@ -118,6 +117,14 @@ def _looks_at(look: Float[Tensor, "4 h w"], mine: Bool[Tensor, "h w"]) -> Float[
     return sampled(look[None], place[None, None])[:, 0, 0]
 
 
+class _Frame(NamedTuple):
+    """A frame to look into: projection, looks, and how long after the thing's own (in units of the least gap)."""
+
+    view: ImageView
+    look: Float[Tensor, "4 h w"]
+    span: float
+
+
 class _Thing:
     """Some points of one thing and how they look."""
 
@@ -125,45 +132,41 @@ class _Thing:
         step = max(1, len(points) // SAMPLES)
         self.points, self.look = points[::step], look[:, ::step]
 
-    def search(
-        self, others: list[tuple[ImageView, Tensor, float]], car_axes: Float[Tensor, "2 3"], images: SmallImages
-    ) -> Float[Tensor, " 3"] | None:
-        """The shift (metres in the scene frame, from one frame to the next) that fits best; None for none.
+    def search(self, frames: list[_Frame], car_axes: Float[Tensor, "2 3"], width_px: int) -> Float[Tensor, " 3"]:
+        """The shift in the least gap (metres, scene frame) that fits best; zero unless it beats standing still.
 
         Args:
-            others: projection, normalized brightness and time (in units of the least gap) of the frames around.
+            frames: the frames around.
             car_axes: forward and left of the car in the scene frame.
-            images: of the clip.
+            width_px: of the smaller images.
         """
-        view = others[0][0]
+        view = frames[0].view
         distance = float((self.points - view.eye).norm(dim=-1).median())
-        pixel = float(2 / (view.lines[0].slope * images.size[1]))  # of the smaller image, at 1 m
+        pixel_m = 2 / (view.lines[0].slope * width_px) * distance
         along = max(STEP_ALONG_M, STEP_ALONG_SHARE * distance)
-        across = max(STEP_PX * pixel * distance, FARTHEST_M[1] / MOST_STEPS)
-        steps = torch.tensor([along, across], device=car_axes.device)
-        best, standing = torch.zeros(2, device=car_axes.device), None
+        across = max(STEP_PX * pixel_m, FARTHEST_M[1] / MOST_STEPS)
+        steps = car_axes.new_tensor([along, across])
         reach = (int(FARTHEST_M[0] / along), int(FARTHEST_M[1] / across))
+        best = car_axes.new_zeros(2)
+        standing = least = self._cost(best[None], frames, car_axes)[0]
         for _ in range(1 + ROUNDS):
             grid = torch.cartesian_prod(*(torch.arange(-n, n + 1, device=car_axes.device) for n in reach))
             tried = best + grid * steps
-            cost = self._cost(tried, others, car_axes)
-            standing = self._cost(torch.zeros_like(tried[:1]), others, car_axes)[0] if standing is None else standing
+            cost = self._cost(tried, frames, car_axes)
             best, least = tried[cost.argmin()], cost.min()
             reach, steps = (2, 2), steps / FINER
-        if least > standing - BETTER:
-            return torch.zeros(3, device=car_axes.device)
-        return best @ car_axes
+        return best @ car_axes if least < standing - BETTER else car_axes.new_zeros(3)
 
     def _cost(
         self,
         tried: Float[Tensor, "d 2"],
-        others: list[tuple[ImageView, Tensor, float]],
+        frames: list[_Frame],
         car_axes: Float[Tensor, "2 3"],
     ) -> Float[Tensor, " d"]:
         """How badly each shift (along and across, metres) fits, about 0..1."""
         total = (tried.abs() / tried.new_tensor(FARTHEST_M)).sum(-1) * FAR_PENALTY
-        for view, look, span in others:
+        for view, look, span in frames:
             seen = view.places_of_moved(self.points, span * (tried @ car_axes))
             difference = (sampled(look[None], seen.place) - self.look[:, None, None]).abs().clamp(max=1).mean(0)
-            total = total + torch.where(seen.inside, difference, OUTSIDE).mean((1, 2)) / len(others)
+            total = total + torch.where(seen.inside, difference, OUTSIDE).mean((1, 2)) / len(frames)
         return total

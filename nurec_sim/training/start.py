@@ -41,7 +41,7 @@ def prepare(model: InstantNuRec) -> None:
             log_depth = torch.linspace(-1.2, 2.9, 10)
             _pass_through(decoder.depth_fusion.pixels, decoder.depth_head, (GROUND_CHANNEL,), log_depth, log_depth)
             _first_channel_untouched(decoder.depth_fusion.hourglass.last)
-            _biases(decoder.depth_head.fusion_head.after_conv[2])[1] = FIRST_TRUST
+            _biases(_convolutions(decoder.depth_head.fusion_head.after_conv)[1])[1] = FIRST_TRUST
         _first_gaussians(decoder)
 
 
@@ -54,8 +54,8 @@ def _pass_through(
 ) -> None:
     """The head's first outputs become these channels of what its fusion sees, by the line that takes seen to wanted."""
     kept = range(len(channels))
-    into, last = (layer for layer in head.fusion_head.after_conv if isinstance(layer, nn.Conv2d))
-    layers = [layer for layer in fusion if isinstance(layer, nn.Conv2d)]
+    into, last = _convolutions(head.fusion_head.after_conv)
+    layers = _convolutions(fusion)
     # The first channels of every layer hand on these inputs, and nothing else.
     for layer, sources in zip((*layers, into), (channels, kept, kept, kept), strict=True):
         layer.weight[: len(channels)] = 0
@@ -71,6 +71,10 @@ def _pass_through(
     last.weight[: len(channels)] = 0
     last.weight[list(kept), list(kept), 0, 0] = slope
     _biases(last)[: len(channels)] = wanted.mean() - slope * passed.mean()
+
+
+def _convolutions(layers: nn.Sequential) -> list[nn.Conv2d]:
+    return [layer for layer in layers if isinstance(layer, nn.Conv2d)]
 
 
 def _first_channel_untouched(layer: nn.Conv2d) -> None:
