@@ -137,7 +137,7 @@ _TINY = Profile(
     keeps_aspect=True,
     encoder=EncoderSize(144, 10, 3, 2, (3, 5, 7, 9), 16, 1, 4, car_view=True),
     head=HeadSize((24, 48, 72, 72), 48, 16, depth_detail=True),
-    selective=SelectiveSize(depth=1, heads=6, road_slots=80),
+    selective=SelectiveSize(depth=1, heads=6, road_slots=60),
     motion=MotionSize(64),
     sky=SkySize(112, 48, 1, 3, (24, 48, 48, 48)),
     observed_sky_px=112,
