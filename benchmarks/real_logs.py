@@ -32,8 +32,6 @@ from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings
 from nurec_sim.scene.validate import validate_archive
 
 HEADING = (
-    "log",
-    "shown",
     "method",
     "PSNR full size",
     "PSNR",

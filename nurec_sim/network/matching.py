@@ -108,14 +108,16 @@ class ImageView:
 
     def _placed(self, x: Float[Tensor, "d h w"], y: Float[Tensor, "d h w"], z: Float[Tensor, "d h w"]) -> Places:
         nearness = 1 / z.clamp(min=0.1)
-        wanted = torch.stack([x * nearness, y * nearness], dim=-1)
-        slope = wanted.new_tensor([line.slope for line in self.lines])
-        place = wanted * slope + wanted.new_tensor([line.start for line in self.lines])
+        wanted = [x * nearness, y * nearness]
+        place = [each * line.slope + line.start for each, line in zip(wanted, self.lines, strict=True)]
         for _ in range(self.steps):
-            reached = sampled(self.plane, place)
-            place = place + (wanted - reached.permute(1, 2, 3, 0)) * slope
-        inside = (z > 0.3) & (place[..., 0].abs() < 1) & (place[..., 1].abs() < 1)
-        return Places(place, z, inside)
+            reached = sampled(self.plane, torch.stack(place, dim=-1))
+            place = [
+                at + (goal - now) * line.slope
+                for at, goal, now, line in zip(place, wanted, reached, self.lines, strict=True)
+            ]
+        inside = (z > 0.3) & (place[0].abs() < 1) & (place[1].abs() < 1)
+        return Places(torch.stack(place, dim=-1), z, inside)
 
 
 class Places(NamedTuple):

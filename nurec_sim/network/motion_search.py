@@ -33,8 +33,10 @@ FAR_PENALTY, BETTER = 0.05, 0.06
 """Cost of going as far as possible; and how much better than standing still a motion must fit."""
 EDGE = 0.15
 """Things end where the logarithm of the depth jumps by more."""
-LEAST_PIXELS, MOST_THINGS, SAMPLES = 24, 16, 128
-"""Of a thing; in an image, the largest ones; and points that are compared of each."""
+LEAST_PIXELS, MOST_THINGS = 32, 8
+"""Of a thing; and in an image, the largest ones."""
+SAMPLES, FIRST_SAMPLES = 128, 40
+"""Points that are compared of each thing, about, and in the first search."""
 
 
 @torch.no_grad()
@@ -149,12 +151,13 @@ class _Thing:
         reach = (int(FARTHEST_M[0] / along), int(FARTHEST_M[1] / across))
         best = car_axes.new_zeros(2)
         standing = least = self._cost(best[None], frames, car_axes)[0]
+        every = max(1, len(self.points) // FIRST_SAMPLES)
         for _ in range(1 + ROUNDS):
             grid = torch.cartesian_prod(*(torch.arange(-n, n + 1, device=car_axes.device) for n in reach))
             tried = best + grid * steps
-            cost = self._cost(tried, frames, car_axes)
+            cost = self._cost(tried, frames, car_axes, every)
             best, least = tried[cost.argmin()], cost.min()
-            reach, steps = (2, 2), steps / FINER
+            reach, steps, every = (2, 2), steps / FINER, 1
         return best @ car_axes if least < standing - BETTER else car_axes.new_zeros(3)
 
     def _cost(
@@ -162,11 +165,13 @@ class _Thing:
         tried: Float[Tensor, "d 2"],
         frames: list[_Frame],
         car_axes: Float[Tensor, "2 3"],
+        every: int = 1,
     ) -> Float[Tensor, " d"]:
-        """How badly each shift (along and across, metres) fits, about 0..1."""
+        """How badly each shift (along and across, metres) fits, about 0..1, by every so manieth point."""
+        points, own = self.points[::every], self.look[:, None, None, ::every]
         total = (tried.abs() / tried.new_tensor(FARTHEST_M)).sum(-1) * FAR_PENALTY
         for view, look, span in frames:
-            seen = view.places_of_moved(self.points, span * (tried @ car_axes))
-            difference = (sampled(look[None], seen.place) - self.look[:, None, None]).abs().clamp(max=1).mean(0)
+            seen = view.places_of_moved(points, span * (tried @ car_axes))
+            difference = (sampled(look[None], seen.place) - own).abs().clamp(max=1).mean(0)
             total = total + torch.where(seen.inside, difference, OUTSIDE).mean((1, 2)) / len(frames)
         return total
