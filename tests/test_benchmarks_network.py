@@ -42,9 +42,9 @@ def test_the_quick_run_writes_a_row_of_every_kind(tmp_path):
     assert (once["images"], once["width"], once["height"], once["gaussians"]) == (3, 336, 196, 3 * 336 * 196)
     assert once["tflop"] > 0.01 and once["gflop_per_s"] == pytest.approx(1e3 * once["tflop"] / once["s_median"])
     assert 0.2 < once["peak_gb"] < 4 and once["threads"] == 1 and once["cpu_s_median"] > 0
-    # 2 images of 12 x 21 strided clusters; 5 rows of 42 cells show road only where a quarter of the image does.
-    assert (bare["tokens"], bare["tokens_release"]) == (2 * 252, 2 * (252 + 512))
-    assert (road["tokens"], road["tokens_release"]) == (2 * (252 + 210), 2 * (252 + 512))
+    # 2 images of 14 x 21 strided clusters; one row of 42 cells shows road where a 25th of the image does.
+    assert (bare["tokens"], bare["tokens_release"]) == (2 * 294, 2 * (294 + 60))
+    assert (road["tokens"], road["tokens_release"]) == (2 * (294 + 42), 2 * (294 + 60))
     assert bare["tflop"] < road["tflop"] < road["tflop_release"]
     assert clip["chunks"] == 1 and clip["gaussians"] > 0
     assert clip["s_median"] == pytest.approx(sum(clip["stages"].values())) and "network" in clip["stages"]

@@ -15,7 +15,9 @@ REGULAR = 3 * 5
 
 @pytest.fixture(scope="module")
 def model():
-    profile = dataclasses.replace(network.PROFILES["tiny-selective"], sky=None, observed_sky_px=14)
+    small = network.PROFILES["tiny-selective"]
+    slots = dataclasses.replace(small.selective, road_slots=512)
+    profile = dataclasses.replace(small, sky=None, observed_sky_px=14, selective=slots)
     return network.build(profile, seed=2)
 
 
