@@ -99,8 +99,6 @@ class Trainer:
     def _train_stage(self, stage: Stage, first: int, last: int, report: Progress) -> None:
         objective = Objective(self.model, stage, self.perceptual, self.config.precision, self.threads)
         objective.train()
-        # Moments of weights without gradients shrink until they are denormal, and then take many times as long.
-        torch.set_flush_denormal(True)
         trained = objective.trained()
         optimiser = torch.optim.AdamW(
             _groups(trained, self.config.weight_decay), lr=stage.learning_rate, betas=(0.9, 0.98), eps=1e-8
