@@ -10,7 +10,7 @@ from nurec_sim.network.tensors import NetworkInputs
 
 FARTHEST_GROUND_M = 40.0
 """Flat ground counts up to here."""
-HIGHEST_RAY = -1e-3
+LEAST_DOWN = 1e-3
 """Rays must point down by more than this share of their length to meet the ground."""
 
 
@@ -41,5 +41,5 @@ def flat_ground(inputs: NetworkInputs) -> tuple[Float[Tensor, "b v h w"], Bool[T
     origin, direction = rays_from_car(inputs)
     down = -direction[..., 2]
     depth_m = origin[..., 2] / down.clamp(min=1e-4) * inputs.distance_to_depth_scale[..., 0]
-    there = (down > -HIGHEST_RAY) & (depth_m > 0) & (depth_m < FARTHEST_GROUND_M)
+    there = (down > LEAST_DOWN) & (depth_m > 0) & (depth_m < FARTHEST_GROUND_M)
     return torch.where(there, depth_m.clamp(min=1e-3), FARTHEST_GROUND_M), there

@@ -100,9 +100,8 @@ def _cost(seen: Places, own: Float[Tensor, "1 h w"], other: Float[Tensor, "1 h w
 
 def _of_the_better_half(costs: list[Float[Tensor, "d h w"]]) -> Float[Tensor, "d h w"]:
     """Mean over the images that fit better: others do not see the point. One, two or three of them."""
-    if len(costs) == len(NEIGHBOURS):
-        return (torch.stack(costs).sum(0) - torch.stack(costs).amax(0)) / 2
-    return torch.stack(costs).amin(0)
+    stacked = torch.stack(costs)
+    return (stacked.sum(0) - stacked.amax(0)) / 2 if len(costs) == len(NEIGHBOURS) else stacked.amin(0)
 
 
 def _agreement(
