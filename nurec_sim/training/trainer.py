@@ -156,8 +156,10 @@ class Trainer:
         return self.position.seconds + spent
 
     def _write_weights(self) -> None:
+        # Of files only their names: weights travel, folders don't.
+        named = {key: Path(path.name) for key in ("start", "lpips") if (path := getattr(self.config, key))}
         facts = {
-            "recipe": self.config.model_dump_json(),
+            "recipe": self.config.model_copy(update=named).model_dump_json(),
             "seed": str(self.config.seed),
             "steps": str(self.position.step),
             "seconds": f"{self.position.seconds:.0f}",
