@@ -136,6 +136,7 @@ def main() -> None:
         Contender(options.profile, "dense", plain),
         Contender(f"{options.profile} + scale", "dense", dataclasses.replace(plain, lidar_depth="scale")),
         Contender(f"{options.profile} + affine", "dense", dataclasses.replace(plain, lidar_depth="affine")),
+        Contender(f"{options.profile} + local", "dense", dataclasses.replace(plain, lidar_depth="local")),
     ]
     rows = []
     for name in options.names:

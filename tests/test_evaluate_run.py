@@ -115,6 +115,8 @@ def test_choosing_methods():
     assert [each.name for each in contenders(tuple(CHOICES))] == list(CHOICES)
     both = contenders(("dense-concatenated", "selective"), FeedForwardSettings(profile="tiny", random_weights=1))
     assert both[0].settings.merge == "concatenate" and both[0].settings.profile == "tiny"
+    fitted, plain = contenders(("dense-lidar", "dense"), FeedForwardSettings(random_weights=1))
+    assert (fitted.settings.lidar_depth, plain.settings.lidar_depth) == ("local", "off")
     assert both[1].settings.profile is None and both[1].settings.random_weights == 1
     assert describe(both[1])["settings"]["profile"] == "tiny-selective"
     given = FeedForwardSettings(profile="pq-front", checkpoint=Path("a.pt"))

@@ -17,11 +17,11 @@ from nurec_sim.errors import NurecSimError
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 
 ProtocolName = Literal["storm", "clip", "shift"]
-Compared = Literal["dense", "selective", "dense-concatenated", "lift", "copy"]
+Compared = Literal["dense", "dense-lidar", "selective", "dense-concatenated", "lift", "copy"]
 USUAL_METHODS: dict[str, tuple[Compared, ...]] = {
-    "storm": ("dense", "selective", "lift", "copy"),
-    "clip": ("dense", "dense-concatenated", "lift", "copy"),
-    "shift": ("dense", "selective", "lift", "copy"),
+    "storm": ("dense", "dense-lidar", "selective", "lift", "copy"),
+    "clip": ("dense", "dense-lidar", "dense-concatenated", "lift", "copy"),
+    "shift": ("dense", "dense-lidar", "selective", "lift", "copy"),
 }
 USUAL_WORLDS = {"storm": 12, "clip": 3, "shift": 6}
 

@@ -22,8 +22,9 @@ Show = Callable[[SensorRequest], CameraFrame]
 CHOICES: Mapping[str, str] = {
     "dense": "the network, one Gaussian per pixel",
     "selective": "the network, clusters around chosen points",
+    "dense-lidar": "dense, its depth fitted to the LiDAR that lift sees, from place to place",
     "dense-concatenated": "dense, all Gaussians of all chunks kept instead of merged by ownership",
-    "lift": "coloured LiDAR and stereo, no learning; the only one that sees LiDAR",
+    "lift": "coloured LiDAR and stereo, no learning",
     "copy": "the input image nearest in time, as it is; knows no depth",
 }
 
@@ -87,6 +88,8 @@ def _contender(name: str, network: FeedForwardSettings, selective: Path | None, 
     method = "selective" if name == "selective" else "dense"
     if name == "dense-concatenated":
         network = dataclasses.replace(network, merge="concatenate")
+    if name == "dense-lidar":
+        network = dataclasses.replace(network, lidar_depth="local")
     owner = "dense" if network.profile is None else _decoder(network.profile)
     given = network.checkpoint if owner == method else None
     checkpoint = selective if method == "selective" and selective is not None else given
@@ -149,11 +152,16 @@ def build(contender: Contender, window: Window) -> Built:
     from nurec_sim.reconstruct import reconstruct
     from nurec_sim.render.renderer import Renderer
 
-    _look(window, sweeps=contender.method == "lift")
+    _look(window, sweeps=_sees_lidar(contender))
     started = time.perf_counter()
     scene = reconstruct(window.clip, contender.method, cameras=window.cameras, settings=contender.settings)
     renderer, spent = Renderer(scene), time.perf_counter() - started
     return Built(lambda request: renderer.render_camera(request, ("rgb", "depth")), scene, spent)
+
+
+def _sees_lidar(contender: Contender) -> bool:
+    settings = contender.settings
+    return settings.lidar_depth != "off" if isinstance(settings, FeedForwardSettings) else settings is not None
 
 
 def _look(window: Window, sweeps: bool) -> None:

@@ -14,7 +14,14 @@ import numpy as np
 Record = Mapping[str, Any]
 FULL = ("psnr_db", "ssim", "abs_rel", "delta1", "abs_rel_metric", "delta1_metric", "depth_scale", "depth_coverage")
 DYNAMIC = FULL[:6]
-PAIRS = (("dense", "lift"), ("dense", "copy"), ("selective", "dense"), ("dense", "dense-concatenated"))
+PAIRS = (
+    ("dense", "lift"),
+    ("dense-lidar", "lift"),
+    ("dense", "copy"),
+    ("dense-lidar", "copy"),
+    ("selective", "dense"),
+    ("dense", "dense-concatenated"),
+)
 """Methods whose difference is told, where both took part."""
 DRAWS = 2000
 CURVE = ("psnr_db", "ssim", "abs_rel", "abs_rel_metric", "depth_coverage")

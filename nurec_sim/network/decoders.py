@@ -11,11 +11,11 @@ from torch.nn import functional
 
 from nurec_sim.network.attention import KeyValueProjector, QueryBlock
 from nurec_sim.network.car_view import CHANNELS, MATCHED_DEPTH, car_view
-from nurec_sim.network.depth_detail import DepthDetail, chosen_depth, pixel_layers
 from nurec_sim.network.dpt import DptHead
 from nurec_sim.network.encoder import Features
 from nurec_sim.network.footprints import Footprints, footprints
 from nurec_sim.network.motion import MotionDecoder
+from nurec_sim.network.pixel_detail import PixelDetail, chosen_depth, pixel_layers
 from nurec_sim.network.profiles import Profile
 from nurec_sim.network.tensors import SCENE_RESCALE, ContextMaps, NetworkInputs, QueryGaussians, SemanticClass
 
@@ -38,18 +38,26 @@ class ContextDecoder(nn.Module):
         # Margin around cuboids, metres; kept in the released state dicts, read by nothing here.
         self.register_buffer("cuboids_dims_padding", torch.ones(3))
         self.depth_head = DptHead(width, profile.head, out=2)
-        self.depth_fusion = DepthDetail(3 + CHANNELS, profile.head.fused // 2) if profile.head.depth_detail else None
-        self.rgb_fusion = pixel_layers(3, profile.head.fused // 2)
+        seen, wide = 3 + CHANNELS, profile.head.fused // 2
+        detailed = profile.head.pixel_detail
+        self.depth_fusion = PixelDetail(seen, wide) if detailed else None
+        self.rgb_fusion: nn.Module = PixelDetail(seen, wide, near=3) if detailed else pixel_layers(3, wide)
         self.context_head = DptHead(width, profile.head, out=3 + 3 + len(SemanticClass))
         self.context_motion_head = MotionDecoder(profile)
-        self.begins_as_footprints = profile.footprints
+        self.begins_as_footprints = profile.log_geometry
 
     def context(self, features: Sequence[Features], inputs: NetworkInputs, motion: bool) -> ContextMaps:
         """Maps of all images."""
         clips, size = inputs.rgb.shape[:2], (inputs.rgb.shape[2], inputs.rgb.shape[3])
         levels = [feature.patches.flatten(0, 1) for feature in features]
         images = inputs.rgb.flatten(0, 1).permute(0, 3, 1, 2)
-        depth = self._log_depth(levels, size, images, inputs)
+        if self.depth_fusion is None:
+            depth = self.depth_head(levels, size)[:, 0].float()
+        else:
+            view = car_view(inputs).flatten(0, 1).permute(0, 3, 1, 2)
+            images = torch.cat([images, view.to(images.dtype)], dim=1)
+            predicted, trust = self.depth_head(levels, size, self.depth_fusion, images).float().unbind(1)
+            depth = chosen_depth(predicted, trust, view[:, MATCHED_DEPTH])
         context = self.context_head(levels, size, self.rgb_fusion, images).float().permute(0, 2, 3, 1)
         rgb, normal, logits = context.split([3, 3, len(SemanticClass)], dim=-1)
         moved = None
@@ -62,17 +70,6 @@ class ContextDecoder(nn.Module):
             logits=logits.unflatten(0, clips),
             motion_m=moved,
         )
-
-    def _log_depth(
-        self, levels: list[Tensor], size: tuple[int, int], images: Float[Tensor, "n 3 h w"], inputs: NetworkInputs
-    ) -> Float[Tensor, "n h w"]:
-        """Logarithm of the depth in the network's unit."""
-        if self.depth_fusion is None:
-            return self.depth_head(levels, size)[:, 0].float()
-        view = car_view(inputs).flatten(0, 1).permute(0, 3, 1, 2)
-        seen = torch.cat([images, view.to(images.dtype)], dim=1)
-        predicted, trust = self.depth_head(levels, size, self.depth_fusion, seen).float().unbind(1)
-        return chosen_depth(predicted, trust, view[:, MATCHED_DEPTH])
 
 
 class DenseDecoder(ContextDecoder):

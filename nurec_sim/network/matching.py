@@ -1,6 +1,6 @@
-"""Comparing a camera's frames with one another: smaller images of normalized brightness, and projection by rays alone.
+"""Comparing a camera's frames with one another: images of normalized brightness, and projection by rays alone.
 
-What ``plane_sweep`` and ``motion_search`` share. Nothing is learned; any lens will do.
+What ``plane_sweep``, ``motion_search`` and ``depth_refinement`` share. Nothing is learned; any lens will do.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LENS_STEPS, STRAIGHT_PX = 2, 0.05
 
 @dataclass(frozen=True)
 class SmallImages:
-    """The images of a clip, ``SHRINK`` times smaller.
+    """The images of a clip, mostly ``SHRINK`` times smaller.
 
     Attributes:
         rgb: colours.
@@ -50,10 +50,10 @@ class SmallImages:
         return self.grey.shape[2], self.grey.shape[3]
 
 
-def small_images(inputs: NetworkInputs, clip: int) -> SmallImages:
-    """Those of a clip of the batch."""
+def small_images(inputs: NetworkInputs, clip: int, shrink: int = SHRINK) -> SmallImages:
+    """Those of a clip of the batch, so many times smaller."""
     rgb, rays = inputs.rgb[clip].float(), inputs.rays[clip].float()
-    size = (max(1, rgb.shape[1] // SHRINK), max(1, rgb.shape[2] // SHRINK))
+    size = (max(1, rgb.shape[1] // shrink), max(1, rgb.shape[2] // shrink))
 
     def smoothed(values: Float[Tensor, "v h w c"]) -> Float[Tensor, "v hh ww c"]:
         small = functional.interpolate(values.permute(0, 3, 1, 2), size, mode="bilinear", antialias=True)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from nurec_sim.network.car_view import car_view
 from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
+from nurec_sim.network.depth_refinement import depth_factor
 from nurec_sim.network.encoder import Encoder, Features
 from nurec_sim.network.isp import IspDecoder
 from nurec_sim.network.learned_sky import SkyDecoder
@@ -19,7 +20,7 @@ from nurec_sim.network.observed_sky import observed_sky
 from nurec_sim.network.plane_sweep import plane_sweep
 from nurec_sim.network.profiles import PATCH_PX, Profile, SkySize
 from nurec_sim.network.sky_mlp import SkyMlp
-from nurec_sim.network.tensors import NetworkInputs, NetworkOutputs, SemanticClass
+from nurec_sim.network.tensors import ContextMaps, NetworkInputs, NetworkOutputs, SemanticClass
 
 Precision = Literal["float32", "bfloat16", "float16"]
 TOKENS_AND_POSITIONS = ("cls_tokens", "cls_pos_embed", "img_pos_embed", "affine_token", "sky.token")
@@ -66,10 +67,12 @@ class InstantNuRec(nn.Module):
             deepest = features[-1].patches
             # What every pixel shows: depth, colour, normal, class, and where its point moves.
             context = self.decoder.context(features, inputs, motion)
-            if context.motion_m is not None and self.profile.motion_search:
-                movable = context.logits.argmax(-1) == SemanticClass.MOVABLE
-                found = searched_motion(inputs, context.depth_m, movable, context.motion_m)
-                context = dataclasses.replace(context, motion_m=found)
+            if self.profile.log_geometry:
+                context = self.refined(context, inputs)
+                if context.motion_m is not None:
+                    movable = context.logits.argmax(-1) == SemanticClass.MOVABLE
+                    found = searched_motion(inputs, context.depth_m, movable, context.motion_m)
+                    context = dataclasses.replace(context, motion_m=found)
             # Pixels lifted to points, points grown to Gaussians.
             gaussians = self.decoder.gaussians(features, context, inputs)
             # What lies behind everything.
@@ -82,6 +85,12 @@ class InstantNuRec(nn.Module):
             # How each camera shows these colours.
             isp = self.post_processing(deepest, inputs.camera_idxs)
         return NetworkOutputs(context, gaussians, sky, seen, self.sky is not None, isp)
+
+    def refined(self, context: ContextMaps, inputs: NetworkInputs) -> ContextMaps:
+        """Context with the depth of what stands as matching refines it; a factor, so that gradients pass through."""
+        semantic = context.logits.argmax(-1)
+        stands = (semantic == SemanticClass.OTHERS) | (semantic == SemanticClass.ROAD)
+        return dataclasses.replace(context, depth_m=context.depth_m * depth_factor(inputs, context.depth_m, stands))
 
     def features(self, inputs: NetworkInputs) -> tuple[Features, ...]:
         """Four levels of the encoder's features, from early to deep."""

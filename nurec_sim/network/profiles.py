@@ -38,14 +38,15 @@ class EncoderSize:
 class HeadSize:
     """A DPT head: channels of the four levels from fine to coarse, of their fusion, and of the last two layers.
 
-    ``depth_detail`` shows the image and the ``car_view`` to the depth head's last layers too, as the released network
-    shows the image to those of the colours only: where patches are coarse, the edges of things are in the image alone.
+    ``pixel_detail`` shows the image and the ``car_view`` to the last layers of the depth and the context head, as the
+    released network shows the image to those of the context head only: where patches are coarse, the edges of things
+    are in the image alone.
     """
 
     levels: tuple[int, int, int, int] = (96, 192, 384, 768)
     fused: int = 128
     last: int = 32
-    depth_detail: bool = False
+    pixel_detail: bool = False
 
 
 @dataclass(frozen=True)
@@ -100,9 +101,8 @@ class Profile:
         motion: size of the motion decoder.
         sky: size of the learned sky; None uses the sky that the images show.
         observed_sky_px: edge of the cubemap of the observed sky.
-        footprints: whether Gaussians begin as the footprints of their pixels, which the released network does not know.
-        motion_search: whether movable things are searched for in the frames around, whatever the motion decoder says of
-            them, which the released network does not do.
+        log_geometry: whether matching refines the depth and finds the motion of movable things, and Gaussians begin as
+            the footprints of their pixels; the released network has learned all that.
         isp_heads: attention heads of the decoder of camera responses.
         training_buffers: whether the state dict holds the constants that files of the training code hold.
         checkpoint: id of the released file, None if there is none.
@@ -121,8 +121,7 @@ class Profile:
     motion: MotionSize = MotionSize()
     sky: SkySize | None = None
     observed_sky_px: int = 448
-    footprints: bool = False
-    motion_search: bool = False
+    log_geometry: bool = False
     isp_heads: int = 16
     training_buffers: bool = False
     checkpoint: str | None = None
@@ -136,13 +135,12 @@ _TINY = Profile(
     frames=(1, 18),
     keeps_aspect=True,
     encoder=EncoderSize(144, 10, 3, 2, (3, 5, 7, 9), 16, 1, 4, car_view=True),
-    head=HeadSize((24, 48, 72, 72), 48, 16, depth_detail=True),
+    head=HeadSize((24, 48, 72, 72), 48, 16, pixel_detail=True),
     selective=SelectiveSize(depth=1, heads=6, road_slots=60),
     motion=MotionSize(64),
     sky=SkySize(112, 48, 1, 3, (24, 48, 48, 48)),
     observed_sky_px=112,
-    footprints=True,
-    motion_search=True,
+    log_geometry=True,
     isp_heads=6,
 )
 _TINY_SKY_MLP = SkySize(112, 96, heads=3, kind="mlp")

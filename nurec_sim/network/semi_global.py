@@ -10,43 +10,49 @@ from jaxtyping import Float
 from torch import Tensor
 
 SMALL_STEP, LARGE_STEP = 0.05, 2.0
-"""What it costs to go to the next depth, and to any other, from a pixel to its neighbour."""
+"""What it costs to go to the next depth, and to any other, from a pixel to its neighbour; if nothing else is said."""
 EDGE = 40.0
 """How much cheaper a large step is where the brightness (0..1) changes."""
 
 
-def semi_global(cost: Float[Tensor, "d h w"], guide: Float[Tensor, "h w"]) -> Float[Tensor, "d h w"]:
+def semi_global(
+    cost: Float[Tensor, "d h w"], guide: Float[Tensor, "h w"], small: float = SMALL_STEP, large: float = LARGE_STEP
+) -> Float[Tensor, "d h w"]:
     """Cost of each pixel's depths with what its neighbours along the row and the column would have to pay.
 
     Args:
         cost: of each pixel alone; about 0..1.
         guide: brightness 0..1, whose edges are likely those of the depth.
+        small: what it costs to go to the next depth, from a pixel to its neighbour.
+        large: what it costs to go to any other.
     """
-    across = _along(cost.permute(2, 0, 1), guide.T)
-    down = _along(cost.permute(1, 0, 2), guide)
+    across = _along(cost.permute(2, 0, 1), guide.T, small, large)
+    down = _along(cost.permute(1, 0, 2), guide, small, large)
     return (across.permute(1, 2, 0) + down.permute(1, 0, 2)) / 4
 
 
-def _along(cost: Float[Tensor, "length d m"], guide: Float[Tensor, "length m"]) -> Float[Tensor, "length d m"]:
+def _along(
+    cost: Float[Tensor, "length d m"], guide: Float[Tensor, "length m"], small: float, large: float
+) -> Float[Tensor, "length d m"]:
     """The sum of both directions along the first axis."""
     cost = cost.contiguous()
-    jump = SMALL_STEP + LARGE_STEP / (1 + EDGE * (guide[1:] - guide[:-1]).abs())
+    jump = small + large / (1 + EDGE * (guide[1:] - guide[:-1]).abs())
     total = torch.zeros_like(cost)
     for order, jumps in ((range(len(cost)), jump), (range(len(cost) - 1, -1, -1), jump.flip(0))):
         before: Tensor | None = None
         for number, place in enumerate(order):
             now = cost[place]
             if before is not None:
-                now = now + _carried(before, jumps[number - 1])
+                now = now + _carried(before, jumps[number - 1], small)
             total[place] += now
             before = now
     return total
 
 
-def _carried(before: Float[Tensor, "d m"], jump: Float[Tensor, " m"]) -> Float[Tensor, "d m"]:
+def _carried(before: Float[Tensor, "d m"], jump: Float[Tensor, " m"], small: float) -> Float[Tensor, "d m"]:
     """Least cost of getting to each depth from the pixel before."""
     least = before.amin(0)
     carried = torch.minimum(before, least + jump)
-    carried[1:] = torch.minimum(carried[1:], before[:-1] + SMALL_STEP)
-    carried[:-1] = torch.minimum(carried[:-1], before[1:] + SMALL_STEP)
+    carried[1:] = torch.minimum(carried[1:], before[:-1] + small)
+    carried[:-1] = torch.minimum(carried[:-1], before[1:] + small)
     return carried - least

@@ -19,6 +19,8 @@ EDGE_SCALES = (1, 2, 4)
 """Pixels between the neighbours whose depths are compared."""
 CLASS_WEIGHTS = {SemanticClass.MOVABLE: 3.0}
 """Weights of the classes; 1 where not named. Movable pixels are few, and what is missed stands still as a ghost."""
+MOVABLE_DEPTH_WEIGHT = 4.0
+"""Of movable pixels' depth: matching says little of what moves, so that all of it has to be learned."""
 MOVED_M = 0.05
 """Points that go farther count as moving."""
 STANDING_SHARE = 0.3
@@ -38,7 +40,8 @@ def context_losses(
     known = truth.depth_m > 0
     error = torch.where(known, context.depth_m.log() - truth.depth_m.clamp(min=1e-3).log(), 0)
     if weights.depth:
-        losses["depth"] = _mean(error.abs(), known)
+        weight = torch.where(truth.semantic == SemanticClass.MOVABLE, MOVABLE_DEPTH_WEIGHT, 1.0) * known
+        losses["depth"] = (weight * error.abs()).sum() / weight.sum().clamp(min=1)
     if weights.edges:
         losses["edges"] = _slope_error(error, known)
     if weights.normal:

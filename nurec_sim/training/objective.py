@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from nurec_sim.network.consensus import find_consensus
 from nurec_sim.network.model import InstantNuRec
 from nurec_sim.network.tensors import ContextMaps, NetworkInputs, QueryGaussians
 from nurec_sim.training.config import Part, Stage
@@ -89,15 +90,21 @@ class Objective(nn.Module):
                 features = model.features(inputs)
             context = model.decoder.context(features, inputs, motion="motion" in stage.trains)
             if stage.targets:
-                if context.motion_m is None:
+                shown = model.refined(context, inputs) if model.profile.log_geometry else context
+                if shown.motion_m is None:
                     # Shapes and opacities are learned where things are, not where they are thought to be.
-                    context = dataclasses.replace(context, motion_m=sample.truth.motion_m)
-                gaussians = model.decoder.gaussians(features, context, inputs)
+                    shown = dataclasses.replace(shown, motion_m=sample.truth.motion_m)
+                gaussians = self._agreed(model.decoder.gaussians(features, shown, inputs), shown, inputs)
                 isp = model.post_processing(features[-1].patches, inputs.camera_idxs)
             if model.sky is not None and ("sky" in stage.trains or stage.targets):
                 sky = model.sky(features[-1].patches, inputs.rgb, inputs.rays[..., 3:])
         renderings = self._renderings(sample, inputs, gaussians, sky, isp)
         return StepOutputs(context, gaussians, sky, isp, renderings)
+
+    def _agreed(self, gaussians: QueryGaussians, context: ContextMaps, inputs: NetworkInputs) -> QueryGaussians:
+        """The Gaussians that a reconstruction would show."""
+        semantic = context.logits[0].argmax(-1).cpu().numpy()
+        return find_consensus(inputs, context.depth_m[0].detach().cpu().numpy(), semantic).apply(gaussians, inputs)
 
     def _renderings(
         self,

@@ -18,6 +18,7 @@ from nurec_sim.network.checkpoints import load_state_dict
 from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
 from nurec_sim.network.dpt import DptHead
 from nurec_sim.network.model import InstantNuRec
+from nurec_sim.network.pixel_detail import PixelDetail
 
 FIRST_RAW_OPACITY = 5.0
 """An opacity of 0.95."""
@@ -35,12 +36,17 @@ def prepare(model: InstantNuRec) -> None:
     with torch.no_grad():
         # Raw colours r are shown as sigmoid(2 r).
         grey = torch.linspace(0.05, 0.95, 10)
-        _pass_through(decoder.rgb_fusion, decoder.context_head, (0, 1, 2), grey, torch.logit(grey) / 2)
+        colours = decoder.rgb_fusion
+        if isinstance(colours, PixelDetail):
+            colours.hourglass.last.weight[:3] = 0
+            colours = colours.pixels
+        assert isinstance(colours, nn.Sequential)
+        _pass_through(colours, decoder.context_head, (0, 1, 2), grey, torch.logit(grey) / 2)
         if decoder.depth_fusion is not None:
             # The depth head puts out the logarithm, which is what the car's view holds.
             log_depth = torch.linspace(-1.2, 2.9, 10)
             _pass_through(decoder.depth_fusion.pixels, decoder.depth_head, (GROUND_CHANNEL,), log_depth, log_depth)
-            _first_channel_untouched(decoder.depth_fusion.hourglass.last)
+            decoder.depth_fusion.hourglass.last.weight[0] = 0
             _biases(_convolutions(decoder.depth_head.fusion_head.after_conv)[1])[1] = FIRST_TRUST
         _first_gaussians(decoder)
 
@@ -75,10 +81,6 @@ def _pass_through(
 
 def _convolutions(layers: nn.Sequential) -> list[nn.Conv2d]:
     return [layer for layer in layers if isinstance(layer, nn.Conv2d)]
-
-
-def _first_channel_untouched(layer: nn.Conv2d) -> None:
-    layer.weight[0] = 0
 
 
 def _biases(layer: nn.Conv2d | nn.Linear) -> Tensor:

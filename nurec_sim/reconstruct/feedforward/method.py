@@ -12,6 +12,7 @@ import torch
 from nurec_sim import network
 from nurec_sim.errors import ReconstructError
 from nurec_sim.network.checkpoints import load_weights
+from nurec_sim.network.consensus import find_consensus
 from nurec_sim.network.download import find_weights
 from nurec_sim.network.model import InstantNuRec, Precision
 from nurec_sim.reconstruct.feedforward.chunks import ChunkLayers
@@ -161,12 +162,16 @@ def _chunk(
     progress("network", 0.2)
     with torch.inference_mode():
         outputs = model(chunk.tensors.to(device))
-    fit = None
+    fit, gaussians, depth_m = None, outputs.gaussians, outputs.context.depth_m[0].cpu().numpy()
     if settings.lidar_depth != "off":
-        progress("LiDAR depth", 0.8)
-        depth_m = outputs.context.depth_m[0].cpu().numpy()
+        progress("LiDAR depth", 0.7)
         fit = fit_depth(clip, chunk, depth_m, hold_out, settings.lidar_depth)
-        outputs = dataclasses.replace(outputs, gaussians=fit.apply(outputs.gaussians, chunk))
+        gaussians, depth_m = fit.apply(gaussians, chunk), fit.factor * depth_m
+    if settings.consensus:
+        progress("consensus", 0.8)
+        semantic = outputs.context.logits[0].argmax(-1).cpu().numpy()
+        gaussians = find_consensus(chunk.tensors, depth_m, semantic, chunk.ego).apply(gaussians, chunk.tensors)
+    outputs = dataclasses.replace(outputs, gaussians=gaussians)
     progress("layers", 0.9)
     return chunk_layers(clip, chunk, outputs, settings), fit
 

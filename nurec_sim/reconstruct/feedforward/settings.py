@@ -31,7 +31,10 @@ class FeedForwardSettings:
         ownership_tolerance_m: how much farther than the nearest chunk an owner may be.
         max_gaussians: static Gaussians are merged into voxels until at most so many are left; None keeps all.
         lidar_depth: how predicted depth is fitted to the log's sweeps, per frame: not at all (``off``), by a factor
-            (``scale``), or by a factor and a slope over inverse depth (``affine``).
+            (``scale``), by a factor and a slope over inverse depth (``affine``), or by a factor and a field of factors
+            that follow the points from surface to surface (``local``).
+        consensus: whether the images of a chunk agree on where a surface lies and which of them shows it; without, all
+            of them show it where each sees it, as in the paper.
         ego_masks: folder with ``<camera>.png``: pixels of the car's own body, not black where it covers the view.
         sky_px: edge of the scene's sky cubemap.
         learned_sky: whether the sky that no image shows comes from the profile's sky decoder, if it has one.
@@ -51,7 +54,8 @@ class FeedForwardSettings:
     merge: Literal["ownership", "concatenate"] = "ownership"
     ownership_tolerance_m: float = 5.0
     max_gaussians: int | None = 2_000_000
-    lidar_depth: Literal["off", "scale", "affine"] = "off"
+    lidar_depth: Literal["off", "scale", "affine", "local"] = "off"
+    consensus: bool = True
     ego_masks: Path | None = None
     sky_px: int = 256
     learned_sky: bool = True

@@ -1,4 +1,4 @@
-"""What the depth head of our own profiles sees beside features of patches: pixels, and what a log says of their depth.
+"""What the heads of our own profiles see beside features of patches: pixels, and what a log says of their depth.
 
 Not part of the released network, whose patches are trained on enough images to do without.
 """
@@ -14,17 +14,24 @@ CHANNELS = (24, 48, 72, 96)
 """Of the hourglass, at 1/2, 1/4, 1/8 and 1/16 of the resolution."""
 
 
-class DepthDetail(nn.Module):
-    """Maps of every pixel for a head's last layers: from the pixel and those around it (``pixels``), and from afar."""
+class PixelDetail(nn.Module):
+    """Maps of every pixel for a head's last layers: from the pixel and those around it (``pixels``), and from afar.
 
-    def __init__(self, channels: int, out: int) -> None:
+    Args:
+        channels: of the images.
+        out: of the maps.
+        near: how many channels, the first ones, ``pixels`` sees; None is all.
+    """
+
+    def __init__(self, channels: int, out: int, near: int | None = None) -> None:
         super().__init__()
-        self.pixels = pixel_layers(channels, out)
+        self.near = channels if near is None else near
+        self.pixels = pixel_layers(self.near, out)
         self.hourglass = Hourglass(channels, out)
 
     def forward(self, images: Float[Tensor, "n c h w"]) -> Float[Tensor, "n out h w"]:
         """The sum of both."""
-        return self.pixels(images) + self.hourglass(images)
+        return self.pixels(images[:, : self.near]) + self.hourglass(images)
 
 
 def pixel_layers(channels: int, out: int) -> nn.Sequential:
