@@ -159,7 +159,7 @@ def _compare(image, others, depth, kind, rays, along, eye, turn, line, steps, pl
                     x, y = x + (a - in_x) * line[k, 0, 0], y + (b - in_y) * line[k, 1, 0]
                 if not (abs(x) < 1 and abs(y) < 1):
                     continue
-                v, u = int((y + 1) / 2 * height), int((x + 1) / 2 * width)
+                v, u = min(int((y + 1) / 2 * height), height - 1), min(int((x + 1) / 2 * width), width - 1)
                 inside = abs(x) < 1 - 2 * BORDER and abs(y) < 1 - BORDER
                 if kind[k, v, u] == UNKNOWN:
                     continue
