@@ -106,9 +106,9 @@ def test_an_untrained_network_puts_out_footprints(profile):
 
 
 def test_the_released_profiles_have_absolute_scales():
-    assert not network.PROFILES["pa-front"].footprints
+    assert not network.PROFILES["pa-front"].log_geometry
     sample = ground_sample(images=1)
-    plain = dataclasses.replace(network.PROFILES["tiny"], footprints=False)
+    plain = dataclasses.replace(network.PROFILES["tiny"], log_geometry=False)
     from nurec_sim.network.model import InstantNuRec
 
     with torch.no_grad():

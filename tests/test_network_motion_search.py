@@ -120,7 +120,7 @@ def test_the_same_bits_every_time():
 
 
 def test_the_network_searches_only_in_profiles_that_say_so_and_needs_the_cars_place():
-    assert network.PROFILES["tiny"].motion_search and not network.PROFILES["pa-front"].motion_search
+    assert network.PROFILES["tiny"].log_geometry and not network.PROFILES["pa-front"].log_geometry
     inputs, depth, movable = scene((0.6, 0.0, 0.0))
     with pytest.raises(ValueError, match="rig_from_scene"):
         search(dataclasses.replace(inputs, rig_from_scene=None), depth, movable)
