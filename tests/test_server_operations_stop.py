@@ -66,9 +66,7 @@ def test_a_signal_under_load_lets_calls_finish_and_takes_no_new_ones(archive):
     frames = [outcome for outcome in outcomes if isinstance(outcome, int)]
     refusals = [outcome for outcome in outcomes if not isinstance(outcome, int)]
     assert len(frames) >= 8 and set(frames) == {320 * 180 * 3}
-    # Each client's first call after the signal; gRPC cancels one that reaches it in the instant in which it closes.
-    assert len(refusals) == 8 and set(refusals) <= {Code.UNAVAILABLE, Code.CANCELLED}
-    assert refusals.count(Code.UNAVAILABLE) >= 4
+    assert refusals == [Code.UNAVAILABLE] * 8  # each client's first call after the signal
 
 
 def test_a_second_signal_ends_the_process_at_once(archive):
