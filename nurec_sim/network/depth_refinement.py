@@ -49,6 +49,7 @@ def depth_factor(
 
 def _clip_factor(inputs: NetworkInputs, clip: int, depth_m: Float[Tensor, "v h w"]) -> Float[Tensor, "v h w"]:
     images = small_images(inputs, clip, shrink=1)
+    look = torch.cat([images.local, images.rgb], dim=1)
     change = torch.linspace(-LARGEST, LARGEST, STEPS, device=depth_m.device)
     doubt = DOUBT * (DOUBT_M / depth_m).clamp(*MOST_DOUBT) ** 2
     factors = []
@@ -58,7 +59,7 @@ def _clip_factor(inputs: NetworkInputs, clip: int, depth_m: Float[Tensor, "v h w
             factors.append(torch.ones_like(depth))
             continue
         distance = depth * change.exp()[:, None, None] / images.along[k].clamp(min=1e-3)
-        costs = torch.stack([_cost(images, k, n, distance) for n in others])
+        costs = torch.stack([_cost(images, look, k, n, distance) for n in others])
         # Half of the images, those that fit better: the others may not see the point.
         fits = costs.sort(0).values[: (len(others) + 1) // 2].mean(0)
         cost = fits + doubt[k] * (change**2)[:, None, None]
@@ -66,10 +67,11 @@ def _clip_factor(inputs: NetworkInputs, clip: int, depth_m: Float[Tensor, "v h w
     return torch.stack(factors)
 
 
-def _cost(images: SmallImages, image: int, other: int, distance: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
-    """How badly each depth fits."""
+def _cost(
+    images: SmallImages, look: Float[Tensor, "v 4 h w"], image: int, other: int, distance: Float[Tensor, "d h w"]
+) -> Float[Tensor, "d h w"]:
+    """How badly each depth fits, by normalized brightness and colours (``look``)."""
     seen = images.views[other].places(images.rays[image], distance)
-    look = torch.cat([images.local, images.rgb], dim=1)
     apart = (sampled(look[other, None], seen.place) - look[image][:, None]).abs()
     difference = apart[0].clamp(max=2) / 2 + COLOUR * apart[1:].sum(0).clamp(max=MOST_COLOUR)
     return torch.where(seen.inside, window_mean(difference[:, None], WINDOW_PX)[:, 0], OUTSIDE)
