@@ -22,6 +22,9 @@ from nurec_sim.server.telemetry import Telemetry
 Code = grpc.StatusCode
 _HEALTH = "Health/"
 _DRAIN_STEP_S = 0.02
+_QUIET_S = 0.1
+"""A client that has read its last reply asks again within this time, and is to hear that the server is stopping."""
+_LONGEST_WAIT_FOR_QUIET_S = 1.0
 _SECRETS = ("authorization", "cookie")
 
 
@@ -39,11 +42,12 @@ class Gate(grpc.aio.ServerInterceptor):
         self.calls = 0
         """Calls in progress, but for those that ask for health."""
         self._stopping = False
+        self._last_change_s = -math.inf
         self.unread = UnreadReplies(options.max_unread_bytes)
         self._rate = RateLimit(options.rate_per_s, options.rate_burst) if options.rate_per_s else None
 
     async def drain(self, seconds: float) -> None:
-        """Lets no more calls in, and waits until those in progress have ended and their replies are read.
+        """Lets no more calls in, and waits until those in progress have ended, their replies are read, and it is quiet.
 
         gRPC's own way to stop would cut off calls that it has received and not begun with CANCELLED, which clients do
         not take for a reason to ask elsewhere.
@@ -51,6 +55,9 @@ class Gate(grpc.aio.ServerInterceptor):
         self._stopping = True
         end = time.monotonic() + seconds
         while (self.calls or self.unread.total) and time.monotonic() < end:
+            await asyncio.sleep(_DRAIN_STEP_S)
+        end = min(end, time.monotonic() + _LONGEST_WAIT_FOR_QUIET_S)
+        while time.monotonic() < min(end, self._last_change_s + _QUIET_S):
             await asyncio.sleep(_DRAIN_STEP_S)
 
     async def intercept_service(
@@ -105,7 +112,7 @@ class Gate(grpc.aio.ServerInterceptor):
         call = Call(name, context.peer(), public, deadline_s)
         enter_call(call)
         counted = not name.startswith(_HEALTH)
-        self.calls += counted
+        self._change_calls(counted)
         begin, code = time.perf_counter(), Code.OK
         try:
             yield
@@ -117,8 +124,13 @@ class Gate(grpc.aio.ServerInterceptor):
             code = _code(context) or Code.UNKNOWN
             raise
         finally:
-            self.calls -= counted
+            self._change_calls(-counted)
             self._note(name, code, time.perf_counter() - begin, call)
+
+    def _change_calls(self, by: int) -> None:
+        if by:
+            self.calls += by
+            self._last_change_s = time.monotonic()
 
     async def _admit(self, name: str, context: grpc.aio.ServicerContext) -> None:
         if name.startswith(_HEALTH):
@@ -146,7 +158,11 @@ class Gate(grpc.aio.ServerInterceptor):
         if refusal := self.unread.refusal(peer, size):
             await context.abort(Code.RESOURCE_EXHAUSTED, refusal)
         self.unread.add(peer, size)
-        context.add_done_callback(lambda _: self.unread.remove(peer, size))
+        context.add_done_callback(lambda _: self._release(peer, size))
+
+    def _release(self, peer: str, size: int) -> None:
+        self.unread.remove(peer, size)
+        self._last_change_s = time.monotonic()
 
     def _note(self, name: str, code: grpc.StatusCode, seconds: float, call: Call) -> None:
         if self.telemetry is not None:
