@@ -9,9 +9,8 @@ import torch
 from nurec_sim import geometry, sensors
 from nurec_sim.network.tensors import ContextMaps, NetworkInputs, NetworkOutputs, QueryGaussians, SemanticClass
 from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ContextImage
-from nurec_sim.reconstruct.feedforward.layers import MIN_DYNAMIC_OPACITY, chunk_layers
+from nurec_sim.reconstruct.feedforward.layers import COVERED_WEIGHT, MIN_DYNAMIC_OPACITY, chunk_layers
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
-from nurec_sim.reconstruct.sky_fill import SURE
 from nurec_sim.types import CameraModel, Label, Pinhole, Shutter, Track, Trajectory
 
 EPOCH_US = 1_550_000_000_000_000
@@ -197,9 +196,10 @@ def test_camera_responses_and_sky():
     assert list(layers.isp) == ["front", "left"]
     assert all(np.array_equal(layers.isp[name], result.isp[0, k].numpy()) for k, name in enumerate(layers.isp))
     assert layers.isp["left"].dtype == np.float64
-    assert layers.sky.shape == (6, 8, 8, 3) and np.allclose(layers.sky, 0.4) and np.allclose(layers.sky_seen, SURE)
+    unlooked = layers.sky_seen == 0
+    assert layers.sky.shape == (6, 8, 8, 3) and unlooked.mean() > 0.5 and np.allclose(layers.sky[unlooked], 0.4)
     observed = chunk_layers(drive, drive.chunk(), result, dataclasses.replace(SETTINGS, learned_sky=False))
-    assert observed.sky.shape == (6, 8, 8, 3) and not observed.sky_seen.any()  # no pixel is sky
+    assert observed.sky.shape == (6, 8, 8, 3) and observed.sky_seen.max() < 0.2  # no pixel is sky
     assert layers.images == drive.images
 
 
@@ -212,8 +212,24 @@ def test_the_sky_that_images_show_replaces_the_learned_one_where_they_show_it():
     layers = chunk_layers(drive, drive.chunk(), dataclasses.replace(result, context=context), SETTINGS)
     shown = layers.sky_seen == 1
     assert shown.any() and np.allclose(layers.sky[shown], 0.7)
-    elsewhere = layers.sky_seen == SURE
+    elsewhere = layers.sky_seen == 0
     assert elsewhere.any() and np.allclose(layers.sky[elsewhere], 0.4)
+
+
+def test_behind_surfaces_lies_their_own_colour_and_counts_less_than_a_sky_that_others_see():
+    drive = Drive()
+    result = outputs(drive)
+    sky = chunk_layers(drive, drive.chunk(), result, SETTINGS).sky
+    logits = result.context.logits.clone()
+    logits[..., SemanticClass.SKY] = 10
+    context = dataclasses.replace(result.context, rgb=torch.full_like(result.context.rgb, 0.7))
+    covered = chunk_layers(drive, drive.chunk(), dataclasses.replace(result, context=context), SETTINGS)
+    behind = covered.sky_seen > 0
+    assert np.allclose(covered.sky[behind], 0.7, atol=1e-5) and np.allclose(covered.sky_seen[behind], COVERED_WEIGHT)
+    assert behind.any() and np.array_equal(covered.sky[~behind], sky[~behind])
+    # The car's own pixels say nothing of what is behind them.
+    hidden = drive.chunk(ego=np.ones((4, HEIGHT, WIDTH), bool))
+    assert not chunk_layers(drive, hidden, dataclasses.replace(result, context=context), SETTINGS).sky_seen.any()
 
 
 # -------------------------------------------------------------------------------------------------------- pruning

@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from training_samples import ground_sample
 
 from nurec_sim import network
 from nurec_sim.network.footprints import SHARE, STEEPEST, THICKNESS, footprints, product
 from nurec_sim.network.tensors import ContextMaps
 from nurec_sim.training.start import prepare
-from tests.training_samples import ground_sample
 
 
 def ground_context(sample):

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -32,6 +31,9 @@ OWNER_RING = 0.1
 BORDER = 0.04
 """Images own nothing, and see through nothing, in this part of their width at the sides and half of it of their height
 above and below: there nothing checks their depth."""
+OVERLAP = 0.03
+"""A ring reaches so much farther for the pixel's own image than for others: where rings meet, both show the surface,
+and rounding leaves no gap."""
 MOVES = 2
 """How often points are moved to their owner's depth, which moves too."""
 MOST_OTHERS = 24
@@ -79,19 +81,24 @@ def find_consensus(
     if ego is not None:
         kind[ego] = UNKNOWN
     predicted_m = depth_m = np.ascontiguousarray(depth_m, np.float32)
+    everything = agreed = np.ones(depth_m.shape, np.bool_)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         for _ in range(MOVES):
-            depth_m = np.stack([moved for moved, _ in _compare_all(pool, depth_m, kind, views)])
-        shown = np.stack([shown for _, shown in _compare_all(pool, depth_m, kind, views)])
-    return Consensus(depth_m / predicted_m, shown)
+            depth_m, _, agreed = _compare_all(pool, depth_m, kind, everything, views)
+        _, owned, agreed = _compare_all(pool, depth_m, kind, agreed, views)
+    return Consensus(depth_m / predicted_m, owned & agreed)
 
 
 def _compare_all(
-    pool: ThreadPoolExecutor, depth_m: np.ndarray, kind: np.ndarray, views: tuple[np.ndarray, ...]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    pool: ThreadPoolExecutor, depth_m: np.ndarray, kind: np.ndarray, stands: np.ndarray, views: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, ...]:
     """``_compare`` of every image."""
     count = len(depth_m)
-    return pool.map(lambda image: _compare(image, _others(image, count), depth_m, kind, *views), range(count))
+
+    def compare(image: int) -> tuple[np.ndarray, ...]:
+        return _compare(image, _others(image, count), depth_m, kind, stands, *views)
+
+    return tuple(np.stack(maps) for maps in zip(*pool.map(compare, range(count)), strict=True))
 
 
 def _others(image: int, count: int) -> Int64[np.ndarray, " n"]:
@@ -129,13 +136,13 @@ def _plane_at(plane, x, y):
 
 
 @njit(cache=True, nogil=True)
-def _compare(image, others, depth, kind, rays, along, eye, turn, line, steps, plane):
+def _compare(image, others, depth, kind, stands, rays, along, eye, turn, line, steps, plane):
     """An image's depth moved to that of the owners, and which pixels are shown as they are.
 
     ``rays`` are origins and directions, ``along`` the z of directions; what follows projects (``ImageView``).
     """
     height, width = depth.shape[1:]
-    moved, shown = depth[image].copy(), np.ones((height, width), np.bool_)
+    moved, owned, agreed = depth[image].copy(), np.ones((height, width), np.bool_), np.ones((height, width), np.bool_)
     for row in range(height):
         for column in range(width):
             if kind[image, row, column] != SURFACE:
@@ -169,8 +176,8 @@ def _compare(image, others, depth, kind, rays, along, eye, turn, line, steps, pl
                 difference = np.log(depth[k, v, u] / z)
                 if abs(difference) < AGREEMENT:
                     agree += 1
-                    its_ring = np.floor(np.log(z) / OWNER_RING)
-                    if inside and (its_ring, k) < (ring, owner):
+                    its_ring = np.floor((np.log(z) + OVERLAP) / OWNER_RING)
+                    if inside and stands[k, v, u] and (its_ring, k) < (ring, owner):
                         ring, owner = its_ring, k
                         # A step along the ray is so much of a step along the owner's axis.
                         slope = ray[3] * turn[k, 0, 2] + ray[4] * turn[k, 1, 2] + ray[5] * turn[k, 2, 2]
@@ -178,5 +185,5 @@ def _compare(image, others, depth, kind, rays, along, eye, turn, line, steps, pl
                 elif difference > 0:
                     through += inside
             moved[row, column] = here + shift * along[image, row, column]
-            shown[row, column] = owner == image and through <= agree
-    return moved, shown
+            owned[row, column], agreed[row, column] = owner == image, through <= agree
+    return moved, owned, agreed

@@ -16,9 +16,9 @@ from torch.nn import functional
 from nurec_sim.network.encoder import quaternion_xyzw
 from nurec_sim.network.tensors import ContextMaps, NetworkInputs
 
-SHARE = 0.7
+SHARE = 0.55
 """Standard deviation across the view, in pixels at the point's distance: the sharpest pictures without holes."""
-STEEPEST = 4.0
+STEEPEST = 6.0
 """Footprints are stretched along the view by the slope of the surface, by this factor at most."""
 THICKNESS = 0.5
 """Across the surface, as a share of the width."""

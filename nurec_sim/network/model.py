@@ -9,10 +9,12 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from nurec_sim.network.background import stands
 from nurec_sim.network.car_view import car_view
 from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
 from nurec_sim.network.depth_refinement import depth_factor
 from nurec_sim.network.encoder import Encoder, Features
+from nurec_sim.network.image_colours import image_colours
 from nurec_sim.network.isp import IspDecoder
 from nurec_sim.network.learned_sky import SkyDecoder
 from nurec_sim.network.motion_search import searched_motion
@@ -73,8 +75,6 @@ class InstantNuRec(nn.Module):
                     movable = context.logits.argmax(-1) == SemanticClass.MOVABLE
                     found = searched_motion(inputs, context.depth_m, movable, context.motion_m)
                     context = dataclasses.replace(context, motion_m=found)
-            # Pixels lifted to points, points grown to Gaussians.
-            gaussians = self.decoder.gaussians(features, context, inputs)
             # What lies behind everything.
             directions = inputs.rays[..., 3:]
             if self.sky is None:
@@ -84,13 +84,17 @@ class InstantNuRec(nn.Module):
                 seen = torch.ones_like(sky[..., :1])
             # How each camera shows these colours.
             isp = self.post_processing(deepest, inputs.camera_idxs)
+            if self.profile.image_colours:
+                rgb, sky, isp = image_colours(inputs, sky, isp)
+                context = dataclasses.replace(context, rgb=rgb)
+            # Pixels lifted to points, points grown to Gaussians.
+            gaussians = self.decoder.gaussians(features, context, inputs)
         return NetworkOutputs(context, gaussians, sky, seen, self.sky is not None, isp)
 
     def refined(self, context: ContextMaps, inputs: NetworkInputs) -> ContextMaps:
         """Context with the depth of what stands as matching refines it; a factor, so that gradients pass through."""
-        semantic = context.logits.argmax(-1)
-        stands = (semantic == SemanticClass.OTHERS) | (semantic == SemanticClass.ROAD)
-        return dataclasses.replace(context, depth_m=context.depth_m * depth_factor(inputs, context.depth_m, stands))
+        factor = depth_factor(inputs, context.depth_m, stands(context.logits))
+        return dataclasses.replace(context, depth_m=context.depth_m * factor)
 
     def features(self, inputs: NetworkInputs) -> tuple[Features, ...]:
         """Four levels of the encoder's features, from early to deep."""

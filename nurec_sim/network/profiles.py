@@ -103,6 +103,7 @@ class Profile:
         observed_sky_px: edge of the cubemap of the observed sky.
         log_geometry: whether matching refines the depth and finds the motion of movable things, and Gaussians begin as
             the footprints of their pixels; the released network has learned all that.
+        image_colours: whether canonical colours are those of the images (``network.image_colours``) or decoded ones.
         isp_heads: attention heads of the decoder of camera responses.
         training_buffers: whether the state dict holds the constants that files of the training code hold.
         checkpoint: id of the released file, None if there is none.
@@ -122,6 +123,7 @@ class Profile:
     sky: SkySize | None = None
     observed_sky_px: int = 448
     log_geometry: bool = False
+    image_colours: bool = False
     isp_heads: int = 16
     training_buffers: bool = False
     checkpoint: str | None = None
@@ -129,8 +131,8 @@ class Profile:
 
 _TINY = Profile(
     name="tiny",
-    width_px=336,
-    height_px=196,
+    width_px=392,
+    height_px=238,
     cameras=(1, 3, 5),
     frames=(1, 18),
     keeps_aspect=True,
@@ -141,6 +143,7 @@ _TINY = Profile(
     sky=SkySize(112, 48, 1, 3, (24, 48, 48, 48)),
     observed_sky_px=112,
     log_geometry=True,
+    image_colours=True,
     isp_heads=6,
 )
 _TINY_SKY_MLP = SkySize(112, 96, heads=3, kind="mlp")
@@ -153,7 +156,7 @@ PROFILES: Mapping[str, Profile] = {
         Profile("pq-front", decoder="selective", checkpoint="instant_nurec_pq_road_1.0.0"),
         Profile("pa-full", sky=SkySize(), training_buffers=True),
         _TINY,
-        dataclasses.replace(_TINY, name="tiny-selective", height_px=224, decoder="selective"),
+        dataclasses.replace(_TINY, name="tiny-selective", height_px=252, decoder="selective"),
         dataclasses.replace(_TINY, name="tiny-sky-mlp", sky=_TINY_SKY_MLP),
     )
 }

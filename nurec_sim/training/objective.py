@@ -10,7 +10,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from nurec_sim.network.background import background, stands
 from nurec_sim.network.consensus import find_consensus
+from nurec_sim.network.image_colours import image_colours
 from nurec_sim.network.model import InstantNuRec
 from nurec_sim.network.tensors import ContextMaps, NetworkInputs, QueryGaussians
 from nurec_sim.training.config import Part, Stage
@@ -89,37 +91,42 @@ class Objective(nn.Module):
             with torch.no_grad() if frozen else contextlib.nullcontext():
                 features = model.features(inputs)
             context = model.decoder.context(features, inputs, motion="motion" in stage.trains)
-            if stage.targets:
-                shown = model.refined(context, inputs) if model.profile.log_geometry else context
-                if shown.motion_m is None:
-                    # Shapes and opacities are learned where things are, not where they are thought to be.
-                    shown = dataclasses.replace(shown, motion_m=sample.truth.motion_m)
-                gaussians = self._agreed(model.decoder.gaussians(features, shown, inputs), shown, inputs)
-                isp = model.post_processing(features[-1].patches, inputs.camera_idxs)
             if model.sky is not None and ("sky" in stage.trains or stage.targets):
                 sky = model.sky(features[-1].patches, inputs.rgb, inputs.rays[..., 3:])
-        renderings = self._renderings(sample, inputs, gaussians, sky, isp)
+            behind = None
+            if stage.targets and sky is not None:
+                isp = model.post_processing(features[-1].patches, inputs.camera_idxs)
+                shown, behind, isp = self._shown(sample, context, sky, isp)
+                gaussians = self._agreed(model.decoder.gaussians(features, shown, inputs), shown, inputs)
+        renderings: tuple[Rendering, ...] = ()
+        if gaussians is not None and behind is not None and isp is not None:
+            renderings = tuple(
+                render_view(gaussians, behind, isp[0, view.camera_idx], inputs, view, self.threads)
+                for view in sample.targets[: stage.targets]
+            )
         return StepOutputs(context, gaussians, sky, isp, renderings)
+
+    def _shown(
+        self, sample: TrainingSample, context: ContextMaps, sky: Tensor, isp: Tensor
+    ) -> tuple[ContextMaps, Tensor, Tensor]:
+        """Context as a reconstruction takes it, what is behind everything, and the responses to its colours."""
+        inputs, profile = sample.inputs, self.model.profile
+        shown = self.model.refined(context, inputs) if profile.log_geometry else context
+        if shown.motion_m is None:
+            # Shapes and opacities are learned where things are, not where they are thought to be.
+            shown = dataclasses.replace(shown, motion_m=sample.truth.motion_m)
+        if profile.image_colours:
+            rgb, sky, isp = image_colours(inputs, sky, isp)
+            shown = dataclasses.replace(shown, rgb=rgb)
+        surface = stands(shown.logits[0])
+        colour, direction = shown.rgb[0][surface], inputs.rays[0, ..., 3:][surface]
+        colour, covered = (torch.from_numpy(each).to(sky) for each in background(colour, direction, sky.shape[2]))
+        return shown, torch.lerp(sky[0], colour, covered[..., None]), isp
 
     def _agreed(self, gaussians: QueryGaussians, context: ContextMaps, inputs: NetworkInputs) -> QueryGaussians:
         """The Gaussians that a reconstruction would show."""
         semantic = context.logits[0].argmax(-1).cpu().numpy()
         return find_consensus(inputs, context.depth_m[0].detach().cpu().numpy(), semantic).apply(gaussians, inputs)
-
-    def _renderings(
-        self,
-        sample: TrainingSample,
-        inputs: NetworkInputs,
-        gaussians: QueryGaussians | None,
-        sky: Tensor | None,
-        isp: Tensor | None,
-    ) -> tuple[Rendering, ...]:
-        if gaussians is None or sky is None or isp is None:
-            return ()
-        views = sample.targets[: self.stage.targets]
-        return tuple(
-            render_view(gaussians, sky[0], isp[0, view.camera_idx], inputs, view, self.threads) for view in views
-        )
 
     def _losses(self, sample: TrainingSample, outputs: StepOutputs) -> dict[str, Tensor]:
         weights, trains = self.stage.losses, self.stage.trains

@@ -5,6 +5,7 @@ anti-aliasing, centre crop; pixel p (corner-origin) becomes ``p * resized / orig
 release the resampling also has ``align_corners=True``. Together with anti-aliasing this samples
 ``p * (resized - 1) / (original - 1)``, so their images are up to 0.6 pixels off their intrinsics at the right and the
 lower edge; the released weights were trained so. Our own profiles resample without it, where image and camera agree.
+Those that keep the cameras' aspect rather stretch the image a little than cut something away.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from nurec_sim.network.profiles import PATCH_PX, Profile
 from nurec_sim.types import CameraModel, Shutter
 
 SMALLEST_PX = 2 * PATCH_PX
+MOST_STRETCH = 1.1
+"""Of the aspect of images that are not cropped."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,9 @@ def input_size(profile: Profile, camera: CameraModel, pixels: int | None = None)
 
 def plan_crop(profile: Profile, camera: CameraModel, size: tuple[int, int]) -> Crop:
     """How images of a camera come to ``size``."""
+    stretch = size[0] / size[1] / (camera.width_px / camera.height_px)
+    if profile.keeps_aspect and 1 / MOST_STRETCH < stretch < MOST_STRETCH:
+        return Crop(size, (0, 0), size, align_corners=False)
     scale = max(size[0] / camera.width_px, size[1] / camera.height_px)
     width = max(size[0], round(camera.width_px * scale))
     height = max(size[1], round(camera.height_px * scale))

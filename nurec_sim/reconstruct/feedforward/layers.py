@@ -21,12 +21,13 @@ from nurec_sim import geometry, sensors
 from nurec_sim.network.tensors import NetworkOutputs, QueryGaussians, SemanticClass
 from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ChunkLayers, ContextImage
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
-from nurec_sim.reconstruct.feedforward.sky import observed_world_sky, world_sky
+from nurec_sim.reconstruct.feedforward.sky import observed_world_sky, world_background, world_sky
 from nurec_sim.reconstruct.feedforward.tracks import knots_along, owners_of_points, owners_of_rays, scene_actors
 from nurec_sim.reconstruct.lift.points import Actor
-from nurec_sim.reconstruct.sky_fill import SURE
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Label
 
+COVERED_WEIGHT = 0.1
+"""What the surfaces that a chunk sees before the sky count in a mean with the sky that another chunk sees there."""
 MIN_DYNAMIC_OPACITY = 0.75
 """Dynamic Gaussians are at least this opaque, as in the released model."""
 _LABELS = {
@@ -91,15 +92,21 @@ def chunk_layers(clip: Clip, chunk: ChunkInputs, outputs: NetworkOutputs, settin
 def _sky(
     chunk: ChunkInputs, outputs: NetworkOutputs, settings: FeedForwardSettings
 ) -> tuple[Float32[np.ndarray, "6 s s 3"], Float32[np.ndarray, "6 s s"]]:
-    """What the images show of the sky; elsewhere the learned one, or what goes on from what was seen."""
-    rays = chunk.tensors.rays.to(outputs.context.rgb.device)
-    observed, shown = observed_world_sky(outputs.context, rays, chunk.world_from_scene, settings.sky_px, chunk.ego)
-    if not (settings.learned_sky and outputs.sky_learned):
-        return observed, shown
-    sky, seen = (_float32(values[0]) for values in (outputs.sky, outputs.sky_seen))
-    learned, _ = world_sky(sky, seen[..., 0], chunk.world_from_scene, settings.sky_px)
-    # All of it is known surely enough to stay, what an image showed still more so.
-    return learned + shown[..., None] * (observed - learned), SURE + (1 - SURE) * shown
+    """What lies behind everything, and how surely each texel was seen.
+
+    Sky where images show sky; standing surfaces where they show those (``network.background``); elsewhere the learned
+    sky, or what goes on from the sky that was seen.
+    """
+    context, size = outputs.context, settings.sky_px
+    rays = chunk.tensors.rays.to(context.rgb.device)
+    observed, shown = observed_world_sky(context, rays, chunk.world_from_scene, size, chunk.ego)
+    sky = observed
+    if settings.learned_sky and outputs.sky_learned:
+        learned, seen = (_float32(values[0]) for values in (outputs.sky, outputs.sky_seen))
+        sky, _ = world_sky(learned, seen[..., 0], chunk.world_from_scene, size)
+    surfaces, covered = world_background(context, rays, chunk.world_from_scene, size, chunk.ego)
+    sky = sky + covered[..., None] * (surfaces - sky)
+    return sky + shown[..., None] * (observed - sky), shown + (1 - shown) * COVERED_WEIGHT * covered
 
 
 # ------------------------------------------------------------------------------------------------- scene to world

@@ -20,7 +20,13 @@ from nurec_sim.network.depth_change import with_changed_depth
 from nurec_sim.network.tensors import QueryGaussians
 from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ContextImage
 from nurec_sim.reconstruct.feedforward.lidar_field import field_factor
-from nurec_sim.reconstruct.feedforward.lidar_points import Seen, Values, visible_points
+from nurec_sim.reconstruct.feedforward.lidar_points import (
+    STANDING_SWEEPS,
+    STANDING_TIME_US,
+    Seen,
+    Values,
+    visible_points,
+)
 from nurec_sim.types import Clip
 
 MIN_POINTS = 50
@@ -104,6 +110,7 @@ def fit_depth(
     depth_m: Float32[np.ndarray, "v h w"],
     hold_out_sweeps: set[int],
     kind: Kind,
+    stands: Bool[np.ndarray, "v h w"] | None = None,
 ) -> DepthFit:
     """Fit the predicted depth of every image of a chunk to the sweeps around its time.
 
@@ -114,6 +121,7 @@ def fit_depth(
         hold_out_sweeps: sweeps that must not be read, by index, of every LiDAR.
         kind: a factor per image; a factor and a slope over inverse depth (where the points allow one); or a factor and
             local ones.
+        stands: pixels of what stands, to which local factors also come from sweeps farther in time.
 
     Raises:
         ReconstructError: the log has no sweeps, or all of them are held out.
@@ -123,14 +131,27 @@ def fit_depth(
     fits = _fit_images(chunk.images, pairs, kind)
     factor = np.stack([fit.factor(depth) for fit, depth in zip(fits, depth_m, strict=True)])
     if kind == "local":
-        for number, use in enumerate(~chunk.ego):
-            factor[number] *= field_factor(factor[number] * depth_m[number], use, *seen[number])
+        rough_m, use = factor * depth_m, ~chunk.ego
+        if stands is None:
+            factor *= _local_factors(rough_m, use, seen)
+        else:
+            more = visible_points(clip, chunk, hold_out_sweeps, STANDING_TIME_US, STANDING_SWEEPS)
+            standing, rest = _local_factors(rough_m, use & stands, more), _local_factors(rough_m, use & ~stands, seen)
+            factor *= np.where(stands, standing, rest)
     after = [_compared(*each) for each in zip(factor * depth_m, ~chunk.ego, seen, strict=True)]
     fits = [
         dataclasses.replace(fit, error_before=_error([before]), error_after=_error([fitted]))
         for fit, before, fitted in zip(fits, pairs, after, strict=True)
     ]
     return DepthFit(kind, tuple(fits), factor.astype(np.float32), _error(pairs), _error(after))
+
+
+def _local_factors(
+    depth_m: Float64[np.ndarray, "v h w"], use: Bool[np.ndarray, "v h w"], seen: Sequence[Seen]
+) -> Float64[np.ndarray, "v h w"]:
+    """``field_factor`` of every image."""
+    images = zip(depth_m, use, seen, strict=True)
+    return np.stack([field_factor(depth, compared, *points) for depth, compared, points in images])
 
 
 def _compared(

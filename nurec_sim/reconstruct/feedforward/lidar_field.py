@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-CELLS_PER_WIDTH = (10, 20, 40, 80)
-LOG_DEPTH_CELLS = (0.8, 0.4, 0.2, 0.1)
+CELLS_PER_WIDTH = (10, 20, 40, 80, 160)
+LOG_DEPTH_CELLS = (0.8, 0.4, 0.2, 0.1, 0.05)
 """Edges of the cells, across the image and in the logarithm of depth, from coarse to fine."""
 SPREAD_CELLS = 1.0
 """Standard deviation by which a point's factor spreads."""

@@ -18,6 +18,8 @@ MAX_TIME_US = 150_000
 """Sweeps farther in time from an image than this say nothing about it."""
 SWEEPS_PER_IMAGE = 2
 """Nearest sweeps of every LiDAR that are compared with an image."""
+STANDING_TIME_US, STANDING_SWEEPS = 1_000_000, 8
+"""The same for what stands: it is where it was, and more sweeps tell more of it."""
 MIN_RANGE_M = 1.0
 BODY_MARGIN_M = 0.3
 CONE_MARGIN_RAD = 0.1
@@ -31,13 +33,21 @@ Seen = tuple[Float64[np.ndarray, "n 2"], Values]
 """Pixels (u, v) of points, and their depth along the optical axis in metres."""
 
 
-def visible_points(clip: Clip, chunk: ChunkInputs, hold_out_sweeps: set[int]) -> list[Seen]:
+def visible_points(
+    clip: Clip,
+    chunk: ChunkInputs,
+    hold_out_sweeps: set[int],
+    most_us: int = MAX_TIME_US,
+    most_sweeps: int = SWEEPS_PER_IMAGE,
+) -> list[Seen]:
     """What every image of a chunk sees of the sweeps around its time.
 
     Args:
         clip: the log.
         chunk: the images.
         hold_out_sweeps: sweeps that must not be read, by index, of every LiDAR.
+        most_us: from the middle of a sweep to that of an image.
+        most_sweeps: of every LiDAR for each image, the nearest in time.
 
     Raises:
         ReconstructError: the log has no sweeps, or all of them are held out.
@@ -55,11 +65,12 @@ def visible_points(clip: Clip, chunk: ChunkInputs, hold_out_sweeps: set[int]) ->
             else f"fitting depth to LiDAR needs sweeps, and clip {clip.id!r} has none; use lidar_depth='off'"
         )
     # In the order of time, images that share a sweep come one after the other.
-    read = functools.lru_cache(maxsize=4 * SWEEPS_PER_IMAGE)(functools.partial(_sweep_points, clip))
+    read = functools.lru_cache(maxsize=4 * most_sweeps)(functools.partial(_sweep_points, clip))
     seen: list[Seen] = [(np.zeros((0, 2)), np.zeros(0))] * len(chunk.images)
     for index in sorted(range(len(chunk.images)), key=lambda i: chunk.images[i].centre_t_us):
         image = chunk.images[index]
-        seen[index] = _visible(image, _points_around(clip.tracks, kept, read, image.centre_t_us))
+        near = _nearest(kept, image.centre_t_us, most_us, most_sweeps)
+        seen[index] = _visible(image, _points_of(clip.tracks, near, read, image.centre_t_us))
     return seen
 
 
@@ -75,17 +86,23 @@ def _sweep_points(clip: Clip, lidar: str, index: int) -> Points:
     return xyz[keep], sweep.point_t_us[keep]
 
 
-def _points_around(
-    tracks: Sequence[Track], kept: dict[str, list[tuple[int, int]]], read: Callable[[str, int], Points], t_us: int
-) -> Float64[np.ndarray, "n 3"]:
-    """Points of the sweeps nearest in time, where they were in the world at ``t_us``."""
-    parts = [np.zeros((0, 3))]
+def _nearest(
+    kept: dict[str, list[tuple[int, int]]], t_us: int, most_us: int, most_sweeps: int
+) -> list[tuple[str, int]]:
+    """LiDAR and index of the sweeps nearest in time; ``kept`` has their middle and index."""
+    found = []
     for lidar, sweeps in kept.items():
-        near = sorted((abs(middle - t_us), i) for middle, i in sweeps if abs(middle - t_us) <= MAX_TIME_US)
-        for _, index in near[:SWEEPS_PER_IMAGE]:
-            xyz, point_t_us = read(lidar, index)
-            parts.append(_carried(tracks, xyz, point_t_us, t_us))
-    return np.concatenate(parts)
+        near = sorted((abs(middle - t_us), i) for middle, i in sweeps if abs(middle - t_us) <= most_us)
+        found += [(lidar, index) for _, index in near[:most_sweeps]]
+    return found
+
+
+def _points_of(
+    tracks: Sequence[Track], sweeps: Sequence[tuple[str, int]], read: Callable[[str, int], Points], t_us: int
+) -> Float64[np.ndarray, "n 3"]:
+    """Points of some sweeps, where they were in the world at ``t_us``."""
+    parts = [_carried(tracks, *read(lidar, index), t_us) for lidar, index in sweeps]
+    return np.concatenate([np.zeros((0, 3)), *parts])
 
 
 def _carried(

@@ -11,6 +11,7 @@ import torch
 
 from nurec_sim import network
 from nurec_sim.errors import ReconstructError
+from nurec_sim.network.background import stands
 from nurec_sim.network.checkpoints import load_weights
 from nurec_sim.network.consensus import find_consensus
 from nurec_sim.network.download import find_weights
@@ -165,7 +166,8 @@ def _chunk(
     fit, gaussians, depth_m = None, outputs.gaussians, outputs.context.depth_m[0].cpu().numpy()
     if settings.lidar_depth != "off":
         progress("LiDAR depth", 0.7)
-        fit = fit_depth(clip, chunk, depth_m, hold_out, settings.lidar_depth)
+        standing = stands(outputs.context.logits[0]).cpu().numpy()
+        fit = fit_depth(clip, chunk, depth_m, hold_out, settings.lidar_depth, standing)
         gaussians, depth_m = fit.apply(gaussians, chunk), fit.factor * depth_m
     if settings.consensus:
         progress("consensus", 0.8)

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from nurec_sim import geometry
 from nurec_sim.network import cubemap
-from nurec_sim.network.observed_sky import sky_pixels, texture
-from nurec_sim.network.tensors import ContextMaps
+from nurec_sim.network.background import background, stands
+from nurec_sim.network.observed_sky import texture
+from nurec_sim.network.tensors import ContextMaps, SemanticClass
 from nurec_sim.reconstruct.sky_fill import fill_unseen
 
 CUBE_FROM_WORLD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -37,19 +38,40 @@ def observed_world_sky(
     instead of upwards. ``rays`` are those of the inputs, in the scene frame; pixels where ``ego`` is True show the car
     and no sky, whatever the network says.
     """
-    rgb, logits, rays = context.rgb[0], context.logits[0], rays[0]
-    if ego is not None:
-        shown = torch.from_numpy(~ego).to(rgb.device)
-        rgb, logits, rays = rgb[shown], logits[shown], rays[shown]
-    colour, direction = sky_pixels(rgb, logits, rays)
-    turn = torch.as_tensor(CUBE_FROM_WORLD @ world_from_scene[:3, :3], dtype=direction.dtype, device=direction.device)
-    # Not a matrix product: those may round differently with another number of threads.
-    direction = (direction[:, None, :] * turn).sum(dim=-1)
+    shows_sky = context.logits[0].argmax(dim=-1) == SemanticClass.SKY
+    colour, direction = _pixels(shows_sky, context, rays, world_from_scene, ego)
     mean, hits = (values.cpu().numpy() for values in texture(colour, direction, size))
     seen = (hits > 0).astype(np.float32)
     soft = np.stack([cv2.GaussianBlur(face, (0, 0), FEATHER_PX, borderType=cv2.BORDER_REPLICATE) for face in seen])
     # Images may be coarser than the cubemap and leave texels between their pixels: half of them is as good as all.
     return fill_unseen(mean, seen), np.minimum(2 * soft, 1)
+
+
+def world_background(
+    context: ContextMaps,
+    rays: Float[Tensor, "1 v h w 6"],
+    world_from_scene: Float64[np.ndarray, "4 4"],
+    size: int,
+    ego: Bool[np.ndarray, "v h w"] | None = None,
+) -> tuple[Float32[np.ndarray, "6 size size 3"], Float32[np.ndarray, "6 size size"]]:
+    """``network.background`` over the world, of what one chunk shows of all that stands."""
+    return background(*_pixels(stands(context.logits[0]), context, rays, world_from_scene, ego), size)
+
+
+def _pixels(
+    chosen: Bool[Tensor, "v h w"],
+    context: ContextMaps,
+    rays: Float[Tensor, "1 v h w 6"],
+    world_from_scene: Float64[np.ndarray, "4 4"],
+    ego: Bool[np.ndarray, "v h w"] | None,
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Colours of pixels and where they look, in the axes of the world's cubemap; none on the car."""
+    if ego is not None:
+        chosen = chosen & torch.from_numpy(~ego).to(chosen.device)
+    direction = rays[0][chosen][:, 3:]
+    turn = torch.as_tensor(CUBE_FROM_WORLD @ world_from_scene[:3, :3], dtype=direction.dtype, device=direction.device)
+    # Not a matrix product: those may round differently with another number of threads.
+    return context.rgb[0][chosen].detach(), (direction[:, None, :] * turn).sum(dim=-1)
 
 
 def world_sky(
