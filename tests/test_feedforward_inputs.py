@@ -61,11 +61,24 @@ def test_sizes_that_keep_the_aspect(width, height):
     size = input_size(TINY, camera)
     assert size[0] % 14 == 0 and size[1] % 14 == 0 and min(size) >= 28
     if 0.3 < width / height < 4:
-        assert abs(size[0] * size[1] / (336 * 196) - 1) < 0.1
+        assert abs(size[0] * size[1] / (TINY.width_px * TINY.height_px) - 1) < 0.1
         assert abs(size[0] / size[1] / (width / height) - 1) < 0.1
     crop = plan_crop(TINY, camera, size)
     assert crop.resized[0] >= size[0] and crop.resized[1] >= size[1] and min(crop.offset) >= 0
     assert crop.resized[0] == size[0] or crop.resized[1] == size[1]
+
+
+def test_own_profiles_stretch_a_little_rather_than_cut_away():
+    camera = pinhole("a", width=480, height=320)
+    crop = plan_crop(TINY, camera, (308, 210))
+    assert (crop.resized, crop.offset, crop.size) == ((308, 210), (0, 0), (308, 210))
+    cropped = crop_camera(camera, crop)
+    corners = np.array([[0.0, 0.0], [308.0, 210.0]])
+    whole = np.array([[0.0, 0.0], [480.0, 320.0]])
+    assert np.allclose(sensors.unproject(cropped, corners)[0], sensors.unproject(camera, whole)[0], atol=1e-9)
+    # A camera of quite another aspect is cut.
+    wide = plan_crop(TINY, pinhole("b", width=640, height=320), (308, 210))
+    assert wide.resized == (420, 210) and wide.offset == (56, 0) and wide.size == (308, 210)
 
 
 def given_fields(tensors):
@@ -292,7 +305,7 @@ def test_the_demo_log_becomes_two_chunks():
     assert len(set(first.frames["camera_front"]) & set(last.frames["camera_front"])) == 4
     few = dataclasses.replace(last, frames={camera: frames[-2:] for camera, frames in last.frames.items()})
     chunk = chunk_inputs(clip, TINY, few, FeedForwardSettings())
-    assert chunk.tensors.rgb.shape == (1, 6, 196, 336, 3) and chunk.index == 1
+    assert chunk.tensors.rgb.shape == (1, 6, 224, 406, 3) and chunk.index == 1
     # The car drives ahead: the second frame lies along z of the first.
     ahead = chunk.tensors.c2w[0, 1, :3, 3]
     assert ahead[2] > 0.3 and ahead[:2].abs().max() < 0.2 * ahead[2]

@@ -83,7 +83,7 @@ def true_outputs(log, chunk):
 @pytest.fixture(scope="module", params=["boxes", "no boxes"])
 def world(request):
     log = street(request.param == "boxes")
-    settings = FeedForwardSettings(sky_px=64)
+    settings = FeedForwardSettings(sky_px=64, image_pixels=336 * 196)
     window = ChunkWindow(0, (int(log.t_us[0]), int(log.t_us[-1])), {"front": tuple(range(0, FRAMES, 2))})
     chunk = chunk_inputs(log, PROFILES["tiny"], window, settings)
     with torch.inference_mode():
