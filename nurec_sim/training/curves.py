@@ -155,13 +155,20 @@ def curves_image(curves: Curves) -> UInt8[np.ndarray, "h w 3"]:
     names = list(curves.values)
     columns = min(COLUMNS, len(names))
     rows = -(-len(names) // columns)
-    sheet = np.full((LEGEND_PX + rows * PANEL_PX[1], columns * PANEL_PX[0], 3), 255, np.uint8)
-    place = MARGIN[0]
+    width, place, lines = columns * PANEL_PX[0], MARGIN[0], 1
+    legend = []
     for stage, colour in _coloured(curves):
-        _write(sheet, stage, place, LEGEND_PX - 5, 0.5, _rgb(colour))
-        place += 30 + 10 * len(stage)
+        wide = 30 + 10 * len(stage)
+        if place + wide > width and place > MARGIN[0]:
+            place, lines = MARGIN[0], lines + 1
+        legend.append((stage, place, lines * LEGEND_PX - 5, colour))
+        place += wide
+    above = lines * LEGEND_PX
+    sheet = np.full((above + rows * PANEL_PX[1], width, 3), 255, np.uint8)
+    for stage, left, baseline, colour in legend:
+        _write(sheet, stage, left, baseline, 0.5, _rgb(colour))
     for index, name in enumerate(names):
-        top, left = LEGEND_PX + (index // columns) * PANEL_PX[1], (index % columns) * PANEL_PX[0]
+        top, left = above + (index // columns) * PANEL_PX[1], (index % columns) * PANEL_PX[0]
         _draw_panel(sheet[top : top + PANEL_PX[1], left : left + PANEL_PX[0]], curves, name)
     return sheet
 
