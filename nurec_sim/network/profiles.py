@@ -156,7 +156,7 @@ PROFILES: Mapping[str, Profile] = {
         Profile("pq-front", decoder="selective", checkpoint="instant_nurec_pq_road_1.0.0"),
         Profile("pa-full", sky=SkySize(), training_buffers=True),
         _TINY,
-        dataclasses.replace(_TINY, name="tiny-selective", height_px=252, decoder="selective"),
+        dataclasses.replace(_TINY, name="tiny-selective", height_px=294, decoder="selective"),
         dataclasses.replace(_TINY, name="tiny-sky-mlp", sky=_TINY_SKY_MLP),
     )
 }
