@@ -37,7 +37,8 @@ def shown(colour: Float[Tensor, "*n 3"], response: Float[Tensor, "*n 3 4"]) -> F
 
 
 def _inverse(response: Float[Tensor, "*n 3 4"]) -> Float[Tensor, "*n 3 4"]:
-    matrix = torch.linalg.inv(response[..., :3].double()).to(response.dtype)
+    """Takes a response back; not finite where it cannot be, so that broken weights give no colours and no exception."""
+    matrix = torch.linalg.inv_ex(response[..., :3].double()).inverse.to(response.dtype)
     return torch.cat([matrix, -(matrix * response[..., None, :, 3]).sum(-1, keepdim=True)], dim=-1)
 
 
