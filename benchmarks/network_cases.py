@@ -64,7 +64,7 @@ CASES: Mapping[str, Case] = {
 }
 QUICK_CASES: Mapping[str, Case] = {
     "tiny-quick": Case("tiny", 3, 1),
-    "tiny-quick-slots": Case("tiny-selective", 1, 2, road_shares=(0.0, 0.04)),
+    "tiny-quick-slots": Case("tiny-selective", 1, 2, road_shares=(0.0, 0.05)),
     "tiny-quick-clip": Case("tiny", 1, 2, clip_s=1.0),
 }
 

@@ -39,12 +39,12 @@ def test_the_quick_run_writes_a_row_of_every_kind(tmp_path):
     assert [row["kind"] for row in rows] == ["pass", "slots", "slots", "clip"], done.stdout
     once, bare, road, clip = rows
     assert once["parameters"] == sum(p.numel() for p in network.build("tiny").parameters())
-    assert (once["images"], once["width"], once["height"], once["gaussians"]) == (3, 336, 196, 3 * 336 * 196)
+    assert (once["images"], once["width"], once["height"], once["gaussians"]) == (3, 392, 238, 3 * 392 * 238)
     assert once["tflop"] > 0.01 and once["gflop_per_s"] == pytest.approx(1e3 * once["tflop"] / once["s_median"])
     assert 0.2 < once["peak_gb"] < 4 and once["threads"] == 1 and once["cpu_s_median"] > 0
-    # 2 images of 14 x 21 strided clusters; one row of 42 cells shows road where a 25th of the image does.
-    assert (bare["tokens"], bare["tokens_release"]) == (2 * 294, 2 * (294 + 60))
-    assert (road["tokens"], road["tokens_release"]) == (2 * (294 + 42), 2 * (294 + 60))
+    # 2 images of 18 x 24 strided clusters; one row of 49 cells shows road where a 20th of the image does.
+    assert (bare["tokens"], bare["tokens_release"]) == (2 * 432, 2 * (432 + 60))
+    assert (road["tokens"], road["tokens_release"]) == (2 * (432 + 49), 2 * (432 + 60))
     assert bare["tflop"] < road["tflop"] < road["tflop_release"]
     assert clip["chunks"] == 1 and clip["gaussians"] > 0
     assert clip["s_median"] == pytest.approx(sum(clip["stages"].values())) and "network" in clip["stages"]
@@ -84,9 +84,9 @@ def test_limits_are_told_in_words(modules):
 def test_inputs_are_the_same_every_time_and_their_rays_are_those_of_their_poses(modules):
     case = modules["cases"].Case("tiny", 3, 2)
     first, second = (modules["cases"].inputs_of(case, 1) for _ in range(2))
-    assert torch.equal(first.rgb, second.rgb) and first.rgb.shape == (1, 6, 196, 336, 3)
+    assert torch.equal(first.rgb, second.rgb) and first.rgb.shape == (1, 6, 238, 392, 3)
     assert first.camera_idxs.tolist() == [[0, 0, 1, 1, 2, 2]]
-    middle = torch.nn.functional.normalize(first.rays[0, :, 97:99, 167:169, 3:].mean((1, 2)), dim=-1)
+    middle = torch.nn.functional.normalize(first.rays[0, :, 118:120, 195:197, 3:].mean((1, 2)), dim=-1)
     assert torch.allclose(middle, first.c2w[0, :, :3, 2], atol=1e-6)
     assert torch.allclose(first.rays[0, :, 0, 0, :3] * 0.15, first.c2w[0, :, :3, 3])
 

@@ -29,6 +29,7 @@ from nurec_sim.types import CameraModel, Fisheye, FTheta, GaussianScene, LidarMo
 CHUNK_ID = "dummy_chunk_id"  # CARLA's client looks for this very key
 FIRST_FRAME_US = 100_000
 _FTHETA_TERMS = 6
+_ROUNDING = 1e-9
 SHUTTER_NAMES = {
     Shutter.GLOBAL: "GLOBAL",
     Shutter.TOP_TO_BOTTOM: "ROLLING_TOP_TO_BOTTOM",
@@ -61,7 +62,9 @@ def fit_error_px(camera: CameraModel, fit: FTheta) -> dict[str, float]:
     columns, rows = np.linspace(0.0, camera.width_px, 33), np.linspace(0.0, camera.height_px, 25)
     uv = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     rays, seen = sensors.unproject(camera, uv)
-    fitted, inside = sensors.project(dataclasses.replace(camera, lens=fit), rays)
+    # The farthest corner lies at the fit's largest angle: rounding must not decide whether it counts.
+    wider = dataclasses.replace(fit, max_angle_rad=min(fit.max_angle_rad * (1 + _ROUNDING), float(np.pi)))
+    fitted, inside = sensors.project(dataclasses.replace(camera, lens=wider), rays)
     off = np.linalg.norm(fitted - uv, axis=1)[seen & inside]
     return {"rms": float(np.sqrt(np.mean(off**2))), "max": float(off.max())}
 
