@@ -72,8 +72,10 @@ def test_metrics_count_calls_by_method_and_code():
 def test_metrics_show_what_waits_and_what_renders(gated):
     server = gated_server(gated)
     with server as address, Stub(address) as stub:
-        calls = [stub.render_rgb.future(camera_message(camera_request(t_us=5_100_000 + k))) for k in range(5)]
+        # The first two render; then the others, of which the last is cancelled, surely wait.
+        calls = [stub.render_rgb.future(camera_message(camera_request(t_us=5_100_000 + k))) for k in range(2)]
         wait_until(lambda: metric(server.metrics_address, "renders_in_flight") == 2)
+        calls += [stub.render_rgb.future(camera_message(camera_request(t_us=5_100_000 + k))) for k in range(2, 5)]
         wait_until(lambda: metric(server.metrics_address, "renders_waiting") == 3)
         assert metric(server.metrics_address, "requests_in_progress") == 5
         calls[-1].cancel()
