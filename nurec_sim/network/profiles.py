@@ -92,6 +92,7 @@ class Profile:
         height_px: image height, a multiple of 14.
         cameras: numbers of cameras that it was trained with.
         frames: fewest and most frames per camera.
+        frames_alone: most frames of a camera that is the only one, None for no more than of several.
         decoder: one Gaussian per pixel (``dense``), or clusters around chosen points (``selective``).
         keeps_aspect: whether the input size follows the cameras' aspect ratio at about the same number of pixels;
             otherwise images are cropped to ``width_px`` x ``height_px``, as the release does.
@@ -114,6 +115,7 @@ class Profile:
     height_px: int = 448
     cameras: tuple[int, ...] = (1,)
     frames: tuple[int, int] = (1, 18)
+    frames_alone: int | None = None
     decoder: Literal["dense", "selective"] = "dense"
     keeps_aspect: bool = False
     encoder: EncoderSize = EncoderSize()
@@ -135,6 +137,7 @@ _TINY = Profile(
     height_px=238,
     cameras=(1, 3, 5),
     frames=(1, 18),
+    frames_alone=36,
     keeps_aspect=True,
     encoder=EncoderSize(144, 10, 3, 2, (3, 5, 7, 9), 16, 1, 4, car_view=True),
     head=HeadSize((24, 48, 72, 72), 48, 16, pixel_detail=True),

@@ -126,7 +126,8 @@ class Objective(nn.Module):
     def _agreed(self, gaussians: QueryGaussians, context: ContextMaps, inputs: NetworkInputs) -> QueryGaussians:
         """The Gaussians that a reconstruction would show."""
         semantic = context.logits[0].argmax(-1).cpu().numpy()
-        return find_consensus(inputs, context.depth_m[0].detach().cpu().numpy(), semantic).apply(gaussians, inputs)
+        depth_m, rgb = (each[0].detach().float().cpu().numpy() for each in (context.depth_m, context.rgb))
+        return find_consensus(inputs, depth_m, semantic, rgb).apply(gaussians, inputs)
 
     def _losses(self, sample: TrainingSample, outputs: StepOutputs) -> dict[str, Tensor]:
         weights, trains = self.stage.losses, self.stage.trains

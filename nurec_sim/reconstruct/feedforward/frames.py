@@ -141,7 +141,8 @@ def chunk_windows(
 
     ``overlapping`` (paper section 3.4): reference times from the first to the last frame that all cameras have, evenly
     at 2 to 4 Hz; a chunk holds as many as the profile takes and repeats the share ``settings.overlap`` of the one
-    before. ``non-overlapping`` (the release): equal chunks of at most 750 ms per frame, sampled without a half step,
+    before. A single camera may show more frames (``profile.frames_alone``), not for longer but as much more often.
+    ``non-overlapping`` (the release): equal chunks of at most 750 ms per frame, sampled without a half step,
     over the interval that lies within 0.1 s of every camera's frames. No frame occurs twice in a chunk: where a log has
     fewer frames than asked for, the chunk has fewer, always as many for every camera.
 
@@ -149,15 +150,16 @@ def chunk_windows(
         ReconstructError: cameras that do not record at the same time, more than ``settings.max_chunks`` chunks, or a
             number of frames that the profile does not take.
     """
-    fewest, most = profile.frames
+    fewest, usual = profile.frames
+    release = settings.chunking == "non-overlapping"
+    most = usual if release or len(cameras) > 1 else profile.frames_alone or usual
     count = most if settings.frames is None else settings.frames
     if not fewest <= count <= most:
         raise ReconstructError(f"profile {profile.name!r} takes {fewest} to {most} frames per camera, got {count}")
     exposures = {camera: np.asarray(clip.camera_times_us(camera), np.int64) for camera in cameras}
-    release = settings.chunking == "non-overlapping"
     start, end = _usable_interval(clip, exposures, RELEASE_MARGIN_US if release else 0)
     chunks, references = (
-        _separate_times(end - start, count) if release else _shared_times(end - start, count, settings.overlap)
+        _separate_times(end - start, count) if release else _shared_times(end - start, count, settings.overlap, usual)
     )
     if chunks > settings.max_chunks:
         raise ReconstructError(
@@ -199,16 +201,20 @@ def _separate_times(span: int, count: int) -> tuple[int, list[Int64[np.ndarray, 
     return chunks, np.split(times, chunks)
 
 
-def _shared_times(span: int, count: int, overlap: float) -> tuple[int, list[Int64[np.ndarray, " n"]]]:
-    """Number of chunks, and the overlapping chunks' times from the start of the interval; the last is ``span``."""
+def _shared_times(span: int, count: int, overlap: float, usual: int) -> tuple[int, list[Int64[np.ndarray, " n"]]]:
+    """Number of chunks, and the overlapping chunks' times from the start of the interval; the last is ``span``.
+
+    Chunks of more times than ``usual`` have them the more often.
+    """
+    slowest, fastest = (step * usual // max(count, usual) for step in (SLOWEST_STEP_US, FASTEST_STEP_US))
     advance = max(1, count - round(count * overlap))
-    beyond = span - (count - 1) * SLOWEST_STEP_US
+    beyond = span - (count - 1) * slowest
     if beyond > 0:
-        chunks = 1 - (-beyond // (advance * SLOWEST_STEP_US))
+        chunks = 1 - (-beyond // (advance * slowest))
         total = count + (chunks - 1) * advance
     else:
         chunks = 1
-        total = count = min(count, max(span // FASTEST_STEP_US + 1, 2 if span else 1))
+        total = count = min(count, max(span // fastest + 1, 2 if span else 1))
     times = np.arange(total, dtype=np.int64) * span // max(total - 1, 1)
     return chunks, [times[first : first + count] for first in range(0, chunks * advance, advance)]
 

@@ -169,11 +169,14 @@ def _chunk(
         standing = stands(outputs.context.logits[0]).cpu().numpy()
         fit = fit_depth(clip, chunk, depth_m, hold_out, settings.lidar_depth, standing)
         gaussians, depth_m = fit.apply(gaussians, chunk), fit.factor * depth_m
+    outputs = dataclasses.replace(outputs, gaussians=gaussians)
     if settings.consensus:
         progress("consensus", 0.8)
-        semantic = outputs.context.logits[0].argmax(-1).cpu().numpy()
-        gaussians = find_consensus(chunk.tensors, depth_m, semantic, chunk.ego).apply(gaussians, chunk.tensors)
-    outputs = dataclasses.replace(outputs, gaussians=gaussians)
+        semantic, rgb = outputs.context.logits[0].argmax(-1).cpu().numpy(), outputs.context.rgb[0].float().cpu().numpy()
+        consensus = find_consensus(chunk.tensors, depth_m, semantic, rgb, chunk.ego)
+        outputs = consensus.coloured(
+            dataclasses.replace(outputs, gaussians=consensus.apply(gaussians, chunk.tensors)), chunk.tensors
+        )
     progress("layers", 0.9)
     return chunk_layers(clip, chunk, outputs, settings), fit
 
