@@ -155,6 +155,27 @@ def test_overlapping_chunks_share_frames():
     assert min(rates) >= 2 and max(rates) <= 4
 
 
+def test_a_single_camera_shows_more_frames_in_the_same_time():
+    tiny, both = PROFILES["tiny"], clip_of(pinhole("a"), pinhole("b", looking(60)), times=frame_times(601, 33_333))
+    for seconds, alone, with_another in ((5, 36, 18), (1, 8, 4)):
+        log = clip_of(pinhole("a"), pinhole("b", looking(60)), times=frame_times(30 * seconds + 1, 33_333))
+        one, two = (
+            chunk_windows(log, names, tiny, FeedForwardSettings(profile="tiny")) for names in (("a",), ("a", "b"))
+        )
+        assert len(one) == len(two) == 1
+        assert [len(chunk.frames["a"]) for chunk in (*one, *two)] == [alone, with_another]
+    alone, together = (chunk_windows(both, names, tiny, FeedForwardSettings()) for names in (("a",), ("a", "b")))
+    assert len(alone) == len(together) and alone[0].span_us[1] == pytest.approx(together[0].span_us[1], rel=0.1)
+    asked = chunk_windows(both, ("a",), tiny, FeedForwardSettings(frames=18))
+    assert [chunk.frames["a"] for chunk in asked] == [chunk.frames["a"] for chunk in together]
+    with pytest.raises(ReconstructError, match=r"'tiny' takes 1 to 36 frames per camera, got 37"):
+        chunk_windows(both, ("a",), tiny, FeedForwardSettings(frames=37))
+    with pytest.raises(ReconstructError, match=r"'tiny' takes 1 to 18 frames per camera, got 36"):
+        chunk_windows(both, ("a", "b"), tiny, FeedForwardSettings(frames=36))
+    release = chunk_windows(both, ("a",), tiny, FeedForwardSettings(chunking="non-overlapping"))
+    assert max(len(chunk.frames["a"]) for chunk in release) <= 18
+
+
 @pytest.mark.parametrize("chunking", ["overlapping", "non-overlapping"])
 @pytest.mark.parametrize(
     ("count", "step_us"), [(1, 100_000), (2, 100_000), (3, 1_000_000), (10, 100_000), (51, 103_439)]

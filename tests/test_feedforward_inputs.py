@@ -362,7 +362,8 @@ def test_real_logs_become_inputs(realdata, pack, views, frames, count, profile):
     settings = FeedForwardSettings(frames=frames)
     windows = chunk_windows(clip, cameras, profile, settings)
     chunk = chunk_inputs(clip, profile, windows[-1], settings)
-    assert len(chunk.images) == len(cameras) * count
+    alone = profile is TINY and len(cameras) == 1 and frames is None  # 0.9 s, eight times a second
+    assert len(chunk.images) == len(cameras) * (2 * count if alone else count)
     for field in given_fields(chunk.tensors):
         assert torch.isfinite(getattr(chunk.tensors, field.name)).all(), field.name
     assert 0.1 < chunk.tensors.rgb.mean() < 0.9 and chunk.tensors.rgb.std() > 0.1

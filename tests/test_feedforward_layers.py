@@ -210,7 +210,7 @@ def test_the_sky_that_images_show_replaces_the_learned_one_where_they_show_it():
     logits[..., SemanticClass.SKY] = 10
     context = dataclasses.replace(result.context, logits=logits, rgb=torch.full_like(result.context.rgb, 0.7))
     layers = chunk_layers(drive, drive.chunk(), dataclasses.replace(result, context=context), SETTINGS)
-    shown = layers.sky_seen == 1
+    shown = layers.sky_seen > 0.9 * layers.sky_seen.max()
     assert shown.any() and np.allclose(layers.sky[shown], 0.7)
     elsewhere = layers.sky_seen == 0
     assert elsewhere.any() and np.allclose(layers.sky[elsewhere], 0.4)

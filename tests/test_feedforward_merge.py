@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from render_scenes import camera, cloud, gaussians, moving_cloud, request, scene
 
 from nurec_sim.errors import ReconstructError
-from nurec_sim.reconstruct.feedforward.alignment import LARGEST_GAIN, colour_map
+from nurec_sim.reconstruct.feedforward.alignment import LARGEST_GAIN, UNSEEN_WEIGHT, colour_map
 from nurec_sim.reconstruct.feedforward.merge import merge_chunks
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.render import Renderer
@@ -167,7 +167,9 @@ def test_view_dependent_colours_change_with_the_others():
 
 def test_skies_are_weighted_by_how_surely_they_were_seen():
     merged = merge_chunks([chunk(sky=0.2, seen=1.0), chunk(sky=0.8, seen=0.0)], KEEP_ALL)
-    assert np.allclose(merged.sky, (1.01 * 0.2 + 0.01 * 0.8) / 1.02, atol=1e-6)
+    assert np.allclose(
+        merged.sky, ((1 + UNSEEN_WEIGHT) * 0.2 + UNSEEN_WEIGHT * 0.8) / (1 + 2 * UNSEEN_WEIGHT), atol=1e-6
+    )
     assert merged.sky.dtype == np.float32
     unseen = merge_chunks([chunk(sky=0.2, seen=0.0), chunk(sky=0.8, seen=0.0)], KEEP_ALL)
     assert np.allclose(unseen.sky, 0.5, atol=1e-6)

@@ -1,5 +1,7 @@
 """The sky over the world: turned without seams, complete in every direction, and never grey overhead."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -166,7 +168,8 @@ def test_half_seen_texels_are_a_blend():
 def test_observed_sky_lies_where_the_camera_saw_it():
     pose = camera_in_world()
     context, rays = camera_maps(pose)
-    sky, seen = observed_world_sky(context, rays, pose, 48)
+    observed = observed_world_sky(context, rays, pose, 48)
+    sky, seen = observed.rgb, observed.shown
     direction = geometry.cubemap_directions(48)
     ahead = direction @ pose[:3, :3]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -176,7 +179,7 @@ def test_observed_sky_lies_where_the_camera_saw_it():
     assert seen[inside].min() > 0.5 and seen[ahead[..., 2] < 0].max() < 1e-3
     ego = np.ones((2, 70, 110), bool)
     ego[:, :, :55] = False  # the right half shows the car
-    _, half = observed_world_sky(context, rays, pose, 48, ego)
+    half = observed_world_sky(context, rays, pose, 48, ego).shown
     assert half[inside & (u > 0.1)].max() < 0.4 and half[inside & (u < -0.1)].min() > 0.5
 
 
@@ -184,7 +187,7 @@ def test_defect_4_sky_goes_on_by_height_and_not_by_the_scene_z():
     pose = camera_in_world()
     context, rays = camera_maps(pose)
     direction = geometry.cubemap_directions(48)
-    ours, _ = observed_world_sky(context, rays, pose, 48)
+    ours = observed_world_sky(context, rays, pose, 48).rgb
     sky, seen = (values[0].numpy() for values in observed_sky(context.rgb, context.logits, rays, 48))
     released, _ = world_sky(sky, seen[..., 0], pose, 48)
     # Behind the car red falls from the horizon up, as it does in front. Along the scene's z there is no such thing.
@@ -201,7 +204,7 @@ def test_defect_4_sky_goes_on_by_height_and_not_by_the_scene_z():
 def test_defect_7_the_zenith_is_sky_and_not_road():
     pose = camera_in_world()
     context, rays = camera_maps(pose)
-    sky, _ = observed_world_sky(context, rays, pose, 48)
+    sky = observed_world_sky(context, rays, pose, 48).rgb
     direction = geometry.cubemap_directions(48)
     overhead = sky[direction[..., 2] > 0.8]
     assert (overhead[:, 2] - overhead[:, 0]).min() > 0.1  # blue, as high up as anyone looked; houses are 0.1 grey
@@ -221,4 +224,26 @@ def test_observed_sky_is_the_same_at_any_thread_count():
         many = observed_world_sky(context, rays, pose, 64)
     finally:
         torch.set_num_threads(threads)
-    assert all(np.array_equal(a, b) for a, b in zip(alone, many, strict=True))
+    assert all(np.array_equal(getattr(alone, name), getattr(many, name)) for name in ("rgb", "shown", "sure"))
+
+
+def test_what_stands_before_the_sky_leaves_no_outline_in_it():
+    """Pixels at the edge of the sky are half house; where another image shows sky, they count for nothing."""
+    pose = camera_in_world()
+    context, rays = camera_maps(pose)
+    rgb, logits = context.rgb.clone(), context.logits.clone()
+    logits[0, 0, :30, 40:70, SemanticClass.SKY] = -3  # a house in the first image
+    rgb[0, 0, :30, 40:70] = 0.1
+    rgb[0, 0, :31, [39, 70]] = 0.3
+    edged = observed_world_sky(dataclasses.replace(context, rgb=rgb, logits=logits), rays, pose, 96)
+    clean = observed_world_sky(context, rays, pose, 96)
+    assert np.abs(edged.rgb - clean.rgb)[clean.sure > 0.5].max() < 0.02
+
+
+def test_skies_of_chunks_meet_softly():
+    pose = camera_in_world()
+    context, rays = camera_maps(pose)
+    observed = observed_world_sky(context, rays, pose, 96)
+    assert (observed.sure <= observed.shown + 1e-6).all() and observed.sure.max() > 0.95
+    along = observed.sure[observed.shown > 0.999]
+    assert along.min() < 0.1 and ((along > 0.2) & (along < 0.8)).mean() > 0.1

@@ -22,7 +22,7 @@ LARGEST_GAIN = 4.0
 """Chunks of one log differ by exposure and white balance: no colour is made brighter or darker by more than this."""
 RIDGES = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Weights of staying at the identity, against one camera's row, that are tried from the least on."""
-UNSEEN_WEIGHT = 0.01
+UNSEEN_WEIGHT = 1e-5
 """What sky counts in a mean with others where its chunk did not see it."""
 
 Rows = Mapping[str, Float64[np.ndarray, "3 4"]]

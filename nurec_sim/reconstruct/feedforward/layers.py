@@ -26,7 +26,7 @@ from nurec_sim.reconstruct.feedforward.tracks import knots_along, owners_of_poin
 from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Label
 
-COVERED_WEIGHT = 0.1
+COVERED_WEIGHT = 3e-4
 """What the surfaces that a chunk sees before the sky count in a mean with the sky that another chunk sees there."""
 MIN_DYNAMIC_OPACITY = 0.75
 """Dynamic Gaussians are at least this opaque, as in the released model."""
@@ -99,14 +99,15 @@ def _sky(
     """
     context, size = outputs.context, settings.sky_px
     rays = chunk.tensors.rays.to(context.rgb.device)
-    observed, shown = observed_world_sky(context, rays, chunk.world_from_scene, size, chunk.ego)
-    sky = observed
+    observed = observed_world_sky(context, rays, chunk.world_from_scene, size, chunk.ego)
+    sky = observed.rgb
     if settings.learned_sky and outputs.sky_learned:
         learned, seen = (_float32(values[0]) for values in (outputs.sky, outputs.sky_seen))
         sky, _ = world_sky(learned, seen[..., 0], chunk.world_from_scene, size)
     surfaces, covered = world_background(context, rays, chunk.world_from_scene, size, chunk.ego)
     sky = sky + covered[..., None] * (surfaces - sky)
-    return sky + shown[..., None] * (observed - sky), shown + (1 - shown) * COVERED_WEIGHT * covered
+    covered = np.maximum(covered, observed.shown)
+    return sky + observed.shown[..., None] * (observed.rgb - sky), np.maximum(observed.sure, COVERED_WEIGHT * covered)
 
 
 # ------------------------------------------------------------------------------------------------- scene to world

@@ -5,11 +5,14 @@ Chunks merge as means of their skies, weighted by ``seen`` plus a little (``alig
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor
+from torch.nn import functional
 
 from nurec_sim import geometry
 from nurec_sim.network import cubemap
@@ -23,6 +26,28 @@ CUBE_FROM_WORLD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]
 
 FEATHER_PX = 2.0
 """How softly what was seen ends, in texels."""
+EDGE_PX = 3
+"""So near to something else, in pixels of an image, sky may show a little of it."""
+SEAM_PX = 6.0
+"""How softly the skies of chunks meet, in texels."""
+LEAST_SURE = 0.05
+"""What sky counts at its edge, where chunks meet."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedSky:
+    """Sky of one chunk from the pixels that the network calls sky.
+
+    Attributes:
+        rgb: complete in every direction.
+        shown: whether the texel was seen, 0..1.
+        sure: what it counts among chunks that saw it, less towards the edge of what was seen: there, things show that
+            stand before the sky, and chunks differ a little in their colours.
+    """
+
+    rgb: Float32[np.ndarray, "6 size size 3"]
+    shown: Float32[np.ndarray, "6 size size"]
+    sure: Float32[np.ndarray, "6 size size"]
 
 
 def observed_world_sky(
@@ -31,20 +56,29 @@ def observed_world_sky(
     world_from_scene: Float64[np.ndarray, "4 4"],
     size: int,
     ego: Bool[np.ndarray, "v h w"] | None = None,
-) -> tuple[Float32[np.ndarray, "6 size size 3"], Float32[np.ndarray, "6 size size"]]:
-    """Sky of one chunk from the pixels that the network calls sky, and how surely each texel was seen.
+) -> ObservedSky:
+    """Sky of one chunk over the world.
 
     Takes the place of ``NetworkOutputs.sky`` where there is no learned sky: that one grows brighter or darker forwards
     instead of upwards. ``rays`` are those of the inputs, in the scene frame; pixels where ``ego`` is True show the car
     and no sky, whatever the network says.
     """
     shows_sky = context.logits[0].argmax(dim=-1) == SemanticClass.SKY
-    colour, direction = _pixels(shows_sky, context, rays, world_from_scene, ego)
-    mean, hits = (values.cpu().numpy() for values in texture(colour, direction, size))
-    seen = (hits > 0).astype(np.float32)
-    soft = np.stack([cv2.GaussianBlur(face, (0, 0), FEATHER_PX, borderType=cv2.BORDER_REPLICATE) for face in seen])
+    near_other = functional.max_pool2d((~shows_sky).float(), 2 * EDGE_PX + 1, stride=1, padding=EDGE_PX) > 0
+    (edge, edge_hits), (clear, clear_hits) = (
+        (each.cpu().numpy() for each in texture(*_pixels(chosen, context, rays, world_from_scene, ego), size))
+        for chosen in (shows_sky & near_other, shows_sky & ~near_other)
+    )
+    rgb = np.where((clear_hits > 0)[..., None], clear, edge)
+    seen = (clear_hits + edge_hits > 0).astype(np.float32)
     # Images may be coarser than the cubemap and leave texels between their pixels: half of them is as good as all.
-    return fill_unseen(mean, seen), np.minimum(2 * soft, 1)
+    surely = np.minimum(2 * _blurred((clear_hits > 0).astype(np.float32), FEATHER_PX), 1)
+    sure = surely**2 * np.clip(2 * _blurred(surely, SEAM_PX) - 1, LEAST_SURE, 1)
+    return ObservedSky(fill_unseen(rgb, seen), np.minimum(2 * _blurred(seen, FEATHER_PX), 1), sure)
+
+
+def _blurred(faces: Float32[np.ndarray, "6 s s"], sigma_px: float) -> Float32[np.ndarray, "6 s s"]:
+    return np.stack([cv2.GaussianBlur(face, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE) for face in faces])
 
 
 def world_background(
