@@ -75,7 +75,7 @@ def test_images_that_look_through_a_point_from_nearer_count_more():
     chunk, true_m, semantic = street(frames=44)
 
     def shown(nearer):
-        """How much is shown of a wall that three images take to stand at 50 m instead of 70 m; a fourth knows better."""
+        """How much is shown of a wall that three images see at 50 m instead of 70 m, where a fourth knows better."""
         few = [0, 1, 2, nearer]
         names = ("rays", "c2w", "distance_to_depth_scale", "camera_idxs")
         inputs = dataclasses.replace(chunk.tensors, **{name: getattr(chunk.tensors, name)[:, few] for name in names})
@@ -106,8 +106,7 @@ def test_one_of_many_images_cannot_make_a_place_movable():
     assert (find_consensus(chunk.tensors, true_m, wrong, grey(true_m)).semantic == semantic)[:, 36:44, 62:73].all()
 
 
-def test_movable_things_that_an_image_sees_through_to_hide_no_points():
-    """A point in front of what another image sees is looked through, whatever that image sees."""
+def test_points_before_movable_things_are_looked_through_too():
     chunk, true_m, semantic = street()
     depth_m = true_m.copy()
     depth_m[1, 30:45, 60:90] *= 0.5

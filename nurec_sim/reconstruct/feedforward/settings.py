@@ -33,8 +33,8 @@ class FeedForwardSettings:
         lidar_depth: how predicted depth is fitted to the log's sweeps, per frame: not at all (``off``), by a factor
             (``scale``), by a factor and a slope over inverse depth (``affine``), or by a factor and a field of factors
             that follow the points from surface to surface (``local``).
-        consensus: whether the images of a chunk agree on where a surface lies and which of them shows it; without, all
-            of them show it where each sees it, as in the paper.
+        consensus: whether the images of a chunk agree on where a surface lies, which of them shows it, in what colour,
+            and what can move; without, all of them show it where each sees it, as in the paper.
         ego_masks: folder with ``<camera>.png``: pixels of the car's own body, not black where it covers the view.
         sky_px: edge of the scene's sky cubemap.
         learned_sky: whether the sky that no image shows comes from the profile's sky decoder, if it has one.
