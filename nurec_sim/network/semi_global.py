@@ -5,8 +5,10 @@ Hirschmueller, Stereo Processing by Semiglobal Matching and Mutual Information (
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
+from numba import njit
 from torch import Tensor
 
 SMALL_STEP, LARGE_STEP = 0.05, 2.0
@@ -37,6 +39,15 @@ def _along(
     """The sum of both directions along the first axis."""
     cost = cost.contiguous()
     jump = small + large / (1 + EDGE * (guide[1:] - guide[:-1]).abs())
+    if cost.device.type == "cpu" and cost.dtype == torch.float32:
+        return torch.from_numpy(_summed(cost.numpy(), jump.contiguous().numpy(), np.float32(small)))
+    return _summed_by_torch(cost, jump, small)
+
+
+def _summed_by_torch(
+    cost: Float[Tensor, "length d m"], jump: Float[Tensor, "length-1 m"], small: float
+) -> Float[Tensor, "length d m"]:
+    """``_summed`` on any device."""
     total = torch.zeros_like(cost)
     for order, jumps in ((range(len(cost)), jump), (range(len(cost) - 1, -1, -1), jump.flip(0))):
         before: Tensor | None = None
@@ -56,3 +67,35 @@ def _carried(before: Float[Tensor, "d m"], jump: Float[Tensor, " m"], small: flo
     carried[1:] = torch.minimum(carried[1:], before[:-1] + small)
     carried[:-1] = torch.minimum(carried[:-1], before[1:] + small)
     return carried - least
+
+
+@njit(cache=True, nogil=True)
+def _summed(
+    cost: Float32[np.ndarray, "length d m"], jump: Float32[np.ndarray, "length-1 m"], small: np.float32
+) -> Float32[np.ndarray, "length d m"]:
+    """Costs summed along the first axis in both directions; to the bit as ``_summed_by_torch``."""
+    length, depths, width = cost.shape
+    total = np.zeros_like(cost)
+    before, now, least = np.empty_like(cost[0]), np.empty_like(cost[0]), np.empty(width, np.float32)
+    for backwards in (False, True):
+        for number in range(length):
+            place = length - 1 - number if backwards else number
+            now[:] = cost[place]
+            if number:
+                jumps = jump[place] if backwards else jump[place - 1]
+                least[:] = before[0]
+                for d in range(1, depths):
+                    for m in range(width):
+                        least[m] = min(least[m], before[d, m])
+                for d in range(depths):
+                    nearer, farther = before[max(d - 1, 0)], before[min(d + 1, depths - 1)]
+                    for m in range(width):
+                        carried = min(before[d, m], least[m] + jumps[m])
+                        if d > 0:
+                            carried = min(carried, nearer[m] + small)
+                        if d < depths - 1:
+                            carried = min(carried, farther[m] + small)
+                        now[d, m] += carried - least[m]
+            total[place] += now
+            before, now = now, before
+    return total
