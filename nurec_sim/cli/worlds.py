@@ -82,7 +82,7 @@ def world(
             readout_us=random_readout_us(car_seed),
             responses=random_responses(rig, car_seed) if imperfect else None,
             truth=truth,
-            command=_command(plan, out_path, plan_path),
+            command=_command(plan, plan_path),
             progress=advance,
             overwrite=overwrite,
         )
@@ -143,9 +143,9 @@ def _seconds(plan: TownPlan) -> float:
     return (plan.span_us[1] - plan.span_us[0]) / 1e6
 
 
-def _command(plan: TownPlan, out_path: Path, plan_path: Path | None) -> str:
-    """What makes the same town again."""
+def _command(plan: TownPlan, plan_path: Path | None) -> str:
+    """What makes the same town again, wherever it is written to: the same log has the same bytes."""
     if plan_path is not None:
-        return f"nurec-sim world --plan {plan_path.name} --out {out_path.name}"
+        return f"nurec-sim world --plan {plan_path.name}"
     town = f"--seed {plan.seed} --split {plan.split} --template {plan.template} --seconds {_seconds(plan):g}"
-    return f"nurec-sim world {town} --out {out_path.name}"
+    return f"nurec-sim world {town}"
