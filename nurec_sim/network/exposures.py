@@ -7,7 +7,7 @@ can be wrong by a factor of two and more, and a seam shows wherever their images
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 
 LEAST_SHARED = 200
 """Two cameras are compared if they share so many pixels."""
@@ -18,7 +18,7 @@ STAY = 1e-6
 
 
 def camera_gains(
-    camera: Float64[np.ndarray, " v"], pairs: Float64[np.ndarray, "v cameras 7"]
+    camera: Int64[np.ndarray, " v"], pairs: Float64[np.ndarray, "v cameras 7"]
 ) -> Float32[np.ndarray, "cameras 3"]:
     """Factors to the colours of each camera that make them alike on shared surfaces; the largest of a channel is 1.
 
