@@ -169,3 +169,16 @@ def test_tables_say_what_is_not_known(name):
         assert {len(cells) for cells in table.rows} == {len(table.heading)}
         assert table.markdown().startswith(f"## {table.title}\n")
         assert table.csv().count("\n") == len(table.rows) + 1
+
+
+def test_intervals_leave_out_a_fortieth_on_each_side():
+    """Means of three draws from 0, 0, 3: all three draws are the 3 in 1 of 27, more often than 1 in 40, less than in
+    20. So a 95 % interval ends at 3, a 90 % one would at 2."""
+    assert interval([0.0, 0.0, 3.0]) == [0.0, 3.0]
+
+
+def test_depth_of_what_moves_is_scaled_by_its_whole_frame():
+    target = street_window(boxes=True).targets[0]
+    figures = score_view(View(target.true.rgb, target.true.depth_m * 2), target)["dynamic"]
+    assert figures["abs_rel"] == pytest.approx(0, abs=1e-6) and figures["delta1"] == 1
+    assert figures["abs_rel_metric"] == pytest.approx(1) and figures["delta1_metric"] == 0

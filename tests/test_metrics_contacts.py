@@ -9,7 +9,7 @@ from metrics_worlds import CAR_M, STEP_US, T0_US, rig, rollout, standing, straig
 
 from nurec_sim import geometry
 from nurec_sim.metrics import find_contacts, score_rollout
-from nurec_sim.metrics.boxes import BoxPath, body_boxes, outline_gap, rectangle_distance
+from nurec_sim.metrics.boxes import BoxPath, body_boxes, heights_overlap, outline_gap, rectangle_distance
 
 EGO_NOSE_M = 1.4 + 4.9 / 2
 
@@ -172,3 +172,11 @@ def test_outline_gap_is_that_of_eroded_and_dilated_polygons(place_a, place_b):
         polygons.append(shrunk.buffer(-radius, join_style="mitre").buffer(radius, quad_segs=64))
         boxes.append(box)
     assert outline_gap(*boxes)[0] == pytest.approx(shapely.distance(*polygons), abs=1e-3)
+
+
+def test_boxes_meet_in_height_up_to_half_of_both_heights():
+    """A 1.5 m and a 2.5 m box: centres 2 m apart just touch."""
+    lower = BoxPath(standing(2, 0.0, 0.0, z=0.75), (4.0, 2.0, 1.5))
+    above = standing(2, 0.0, 0.0)
+    above[:, 2, 3] = 0.75 + np.array([1.95, 2.05])
+    assert heights_overlap(lower, BoxPath(above, (4.0, 2.0, 2.5))).tolist() == [True, False]

@@ -131,3 +131,34 @@ def test_every_metric_is_there_for_every_rollout_even_one_without_states():
             assert np.isfinite(one.values[one.valid]).all() and np.isnan(one.values[~one.valid]).all()
     assert not any(one.valid.any() for one in series if one.name != "eval_relevant")
     assert series[0].t_us[0] == T0_US
+
+
+def moving(accel_mps2, speed_mps, yaw_rad):
+    """A rollout with given signals, one value per 0.1 s; places don't matter to comfort."""
+    count = len(accel_mps2)
+    run = rollout(np.stack([geometry.pose_from_xyyaw(0.1 * i, 0, yaw_rad[i]) for i in range(count)]))
+    states = [
+        dataclasses.replace(state, accel_mps2=float(a), speed_mps=float(v))
+        for state, a, v in zip(run.states, accel_mps2, speed_mps, strict=True)
+    ]
+    return dataclasses.replace(run, states=tuple(states))
+
+
+def test_jerk_is_the_rate_of_the_length_of_the_acceleration():
+    """3 m/s2 ahead and 5 t to the side: the length sqrt(9 + 25 t^2) grows by 25 t / length, 4 m/s3 at t = 0.8 s.
+
+    A window of eight states has its middle half a step late, so the turn begins half a step late too.
+    """
+    t = 0.1 * np.arange(21)
+    found = scores(moving(np.full(21, 3.0), np.full(21, 10.0), 0.25 * (t - 0.05) ** 2))
+    assert found["lat_accel_mps2"].values[8] == pytest.approx(4.0, rel=1e-6)
+    assert found["jerk_mps3"].values[8] == pytest.approx(4.0, rel=0.02)
+
+
+def test_accelerations_are_smoothed_by_a_parabola_over_eight_states():
+    """A single 2 m/s2: the least-squares parabola through 8 places +-0.5 ... +-3.5 gives a neighbour of its middle
+    (388.5 - 42 / 4) / 1344 of it, from the sums 8, 42 and 388.5 of x^0, x^2 and x^4."""
+    accel = np.zeros(21)
+    accel[10] = 2.0
+    found = scores(moving(accel, np.full(21, 10.0), np.zeros(21)))
+    assert np.nanmax(found["lon_accel_mps2"].values) == pytest.approx(2.0 * 378 / 1344)

@@ -187,3 +187,18 @@ def test_a_parked_cars_shadow_in_the_road_is_filled_but_one_at_the_kerb_is_not_r
     column, row = ((middle - np.array(grid.origin_m)) / grid.cell_m).astype(int)
     assert 0 <= row < rows and 0 <= column < columns and grid.state[row, column] == Cell.ROAD
     assert T0_US > 1_000_000
+
+
+@pytest.mark.parametrize(("beyond_m", "off"), [(0.25, False), (0.35, True)])
+def test_a_body_is_off_road_from_30_cm_beyond_the_border(beyond_m, off):
+    """Road to the left up to y = 3 m; a straight ego whose left side lies so far beyond it."""
+    y = 3.0 - BODY.size_m[1] / 2 + beyond_m
+    poses = np.stack([geometry.pose_from_xyyaw(x, y, 0.0) for x in np.linspace(10.0, 20.0, 20)])
+    recorded = np.stack([geometry.pose_from_xyyaw(x, 0.0, 0.0) for x in np.linspace(10.0, 20.0, 20)])
+    border = np.array([[-20.0, -10], [60, -10], [60, 3], [-20, 3]])
+    found = {s.name: s for s in score_rollout(rollout(poses, recorded=recorded), None, RoadMap(drivable=((border,),)))}
+    assert found["offroad_true"].value() == off
+    rows, columns = np.indices((400, 800))  # cells of 0.1 m from (-20, -20)
+    state = np.where(-20 + (rows + 0.5) * 0.1 < 3.0, Cell.ROAD, Cell.NONROAD)
+    grid = OffroadGrid.from_state((-20.0, -20.0), 0.1, state, 0.1, 0.0)
+    assert (judge_footprints(grid, poses, BODY).verdict == (Verdict.OFF if off else Verdict.ON)).all()

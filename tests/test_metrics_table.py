@@ -160,3 +160,9 @@ def test_time_to_event_counts_from_take_over():
     assert value(values, "time_to_first_event_s") == pytest.approx((first - T0_US - 5 * STEP_US) / 1e6)
     empty = dataclasses.replace(run, actors={}, actor_sizes_m={})
     assert value(rollout_values(metric_table([(empty, score_rollout(empty, None))], "r")), "collision_any") is None
+
+
+def test_scene_score_reaches_one_at_four_fifths_of_the_way():
+    for progress, score in ((0.6, 0.75), (0.8, 1.0), (0.4, 0.5)):
+        run = drive(collision_at_fault=np.zeros(40), progress=np.linspace(0, progress, 40))
+        assert value(rollout_values(metric_table([run], "r")), "scene_score") == pytest.approx(score)

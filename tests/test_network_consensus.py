@@ -1,6 +1,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 from wall_street import WallStreet, pixel_gaussians, street_chunk
 
@@ -199,3 +200,21 @@ def test_the_same_input_gives_the_same_bytes():
     noisy = (true_m * np.exp(rng.normal(0, 0.05, true_m.shape))).astype(np.float32)
     first, second = (find_consensus(chunk.tensors, noisy, semantic, grey(noisy)) for _ in range(2))
     assert first.factor.tobytes() == second.factor.tobytes() and first.shown.tobytes() == second.shown.tobytes()
+
+
+def test_what_lies_at_the_edge_of_an_image_counts_as_farther():
+    """By exp(0.2) at the middle of an edge, exp(0.4) in a corner: two and four rings of exp(0.1)."""
+    middle = _ring(7.0, 0.0, 0.0)
+    assert _ring(7.0, 1.0, 0.0) - middle == pytest.approx(2) and _ring(7.0, 1.0, -1.0) - middle == pytest.approx(4)
+
+
+def test_surfaces_move_twice_so_that_a_chain_of_images_meets():
+    """The first image agrees with the second only, the second with the third, which is right."""
+    chunk, true_m, semantic = street(frames=13)
+    order = [0, 6, 12]
+    names = ("rays", "c2w", "distance_to_depth_scale", "camera_idxs")
+    inputs = dataclasses.replace(chunk.tensors, **{name: getattr(chunk.tensors, name)[:, order] for name in names})
+    true_m, semantic = true_m[order], semantic[order]
+    predicted = true_m * np.array([1.12, 1.06, 1.0], np.float32)[:, None, None]
+    error = np.abs(find_consensus(inputs, predicted, semantic, grey(true_m)).factor * predicted / true_m - 1)
+    assert np.median(error[0, 35:45, 50:80]) < 0.02

@@ -2,9 +2,11 @@
 
 import dataclasses
 import hashlib
+import io
 import os
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -257,3 +259,13 @@ def test_summary_counts_what_is_there():
     assert rows["time"] == "4.00 s from 1700000000123457 us"
     assert rows["road map"] == "2 drivable areas, 1 lanes"
     assert dict(summary(empty_scene()))["cameras"] == "none"
+
+
+def test_the_faces_of_the_sky_are_archived_in_their_order(tmp_path):
+    """Read without our reader: a cubemap whose face n has the colour n."""
+    sky = np.broadcast_to(np.arange(6, dtype=np.float32)[:, None, None, None] / 8, (6, 4, 4, 3)).copy()
+    write_scene(dataclasses.replace(full_scene(0), sky=sky), tmp_path / "a.usdz")
+    with zipfile.ZipFile(tmp_path / "a.usdz") as package:
+        kept = np.load(io.BytesIO(package.read("nurec_sim/sky_cubemap.npy")))
+    assert kept[:, 0, 0, 0].tolist() == [0, 0.125, 0.25, 0.375, 0.5, 0.625]
+    assert np.array_equal(read_scene(tmp_path / "a.usdz").sky, sky)

@@ -132,3 +132,20 @@ def test_unknown_tables_and_columns_are_refused():
         sensors.lidar_model("OS1", np.eye(4))
     with pytest.raises(ValueError, match="needs at least 1 column, got 0"):
         sensors.lidar_model("AT128", np.eye(4), columns=0)
+
+
+@pytest.mark.parametrize(("beams", "valid"), [(0.48, True), (0.52, False)])
+def test_a_scanner_ends_half_a_beam_beyond_its_outermost_beams(beams, valid):
+    model = lidar("AT128")
+    step_up = model.elevation_rad[0] - model.elevation_rad[1]
+    step_down = model.elevation_rad[-2] - model.elevation_rad[-1]
+    step_aside = abs(model.azimuth_rad[1] - model.azimuth_rad[0])
+    ahead = model.azimuth_rad[len(model.azimuth_rad) // 2]
+    places = [
+        (model.elevation_rad[0] + beams * step_up, ahead),
+        (model.elevation_rad[-1] - beams * step_down, ahead),
+        (model.elevation_rad[40], model.azimuth_rad[0] + beams * step_aside),
+        (model.elevation_rad[40], model.azimuth_rad[-1] - beams * step_aside),
+    ]
+    points = [[np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)] for up, turn in places]
+    assert sensors.beam_coordinates(model, 12 * np.array(points))[2].tolist() == [valid] * 4
