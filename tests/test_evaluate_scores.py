@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from evaluation_worlds import street_window
@@ -87,6 +89,19 @@ def test_the_truth_scores_best_and_a_wrong_scale_is_seen():
     assert flat["full"]["abs_rel"] is None and flat["dynamic"]["delta1_metric"] is None
 
 
+def test_what_cannot_move_is_scored_apart():
+    target = street_window(boxes=True).targets[0]
+    error = np.where(target.movable[..., None], 0.1, 0.01).astype(np.float32)  # 20 dB where things can move, else 40
+    flat = View(np.full_like(target.true.rgb, 0.5), None)
+    found = score_view(View(flat.rgb + error, None), replace(target, true=flat))
+    assert found["dynamic"]["psnr_db"] == pytest.approx(20, abs=1e-3)
+    assert found["static"]["psnr_db"] == pytest.approx(40, abs=1e-3)
+    nothing = replace(target, movable=np.zeros_like(target.movable))
+    whole = score_view(target.true, nothing)
+    assert whole["dynamic"] is None and whole["static"]["psnr_db"] == 100
+    assert score_view(target.true, replace(target, movable=None))["static"] is None
+
+
 def test_copying_shows_the_nearest_seen_frame():
     window = street_window()
     scored = score_window(Contender("copy", "copy"), window)
@@ -104,7 +119,8 @@ def row(psnr_db, abs_rel=0.1, left_m=0.0, beyond=False, dynamic=None):
     full = {"psnr_db": psnr_db, "ssim": 0.5, "abs_rel": abs_rel, "delta1": 0.9, "abs_rel_metric": abs_rel,
             "delta1_metric": 0.9, "depth_scale": 1.0, "depth_coverage": 1.0}  # fmt: skip
     moving = None if dynamic is None else {**full, "psnr_db": dynamic}
-    return {"name": "x", "left_m": left_m, "beyond": beyond, "full": full, "dynamic": moving}
+    standing = None if dynamic is None else {**full, "psnr_db": psnr_db + 1}
+    return {"name": "x", "left_m": left_m, "beyond": beyond, "full": full, "dynamic": moving, "static": standing}
 
 
 def record(*rows, gaussians=100):
@@ -118,7 +134,7 @@ def test_figures_are_means_over_views_on_the_path():
         {"id": "c", "methods": {"dense": {"error": "no"}}},
     ]
     dense = summarize(windows, ["dense"])["methods"]["dense"]
-    assert dense["full"]["psnr_db"] == 24 and dense["dynamic"]["psnr_db"] == 15
+    assert dense["full"]["psnr_db"] == 24 and dense["dynamic"]["psnr_db"] == 15 and dense["static"]["psnr_db"] == 31
     assert dense["between"]["psnr_db"] == 25 and dense["beyond"]["psnr_db"] == 22
     assert (dense["views"], dense["dynamic_views"], dense["windows"], dense["failed"]) == (3, 1, 2, 1)
     assert dense["curve"]["2"]["psnr_db"] == 1
@@ -163,6 +179,7 @@ def test_tables_say_what_is_not_known(name):
     else:
         assert made["paper"].rows[0][:3] == ("dense", "20.00", "0.500")
         assert made["paper"].rows[1][3] == "-"
+        assert ("static" in made) == (name == "storm")
         assert "without boxes" in made["paper"].note
     assert made["cost"].rows[1][1] == "-"
     for table in made.values():

@@ -1,6 +1,6 @@
 """The protocols: which windows there are, what the methods see of them and what they are asked for.
 
-``storm``  2 s at 10 Hz; frames 0, 5, 10 and 15 are seen, the other 16 are asked for (paper section 4.1, Table 1).
+``storm``  2 s at 10 Hz; frames 0, 5, 10 and 15 are seen, the other 16 are asked for (paper section 5.1, Table 1).
 ``clip``   a whole log through the chunked pipeline; every k-th frame is asked for, the rest is seen (Table 2).
 ``shift``  as ``storm``, but asked for are views beside the driven path, where a drawn world has the answer.
 """

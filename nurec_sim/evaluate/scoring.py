@@ -1,4 +1,4 @@
-"""Scores of one method on one window: images and depth, over all pixels and over those that can move."""
+"""Scores of one method on one window: images and depth, over all pixels, what can move, and what cannot."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def score_window(contender: Contender, window: Window, progress: Callable[[str, 
 
     Returns:
         The record: ``gaussians``, ``seconds`` (``reconstruct``; ``render`` per view), ``unknown``, and per target
-        ``name``, ``left_m``, ``beyond``, ``full`` and ``dynamic`` (see ``score_view``).
+        ``name``, ``left_m``, ``beyond``, ``full``, ``dynamic`` and ``static`` (see ``score_view``).
 
     Raises:
         ReconstructError, WeightsError: see ``methods.build``.
@@ -58,11 +58,12 @@ def score_window(contender: Contender, window: Window, progress: Callable[[str, 
 
 
 def score_view(view: View, target: Target) -> dict[str, Figures | None]:
-    """Figures of one view: ``full``, and ``dynamic`` where the truth knows what can move and some of it is in view.
+    """Figures of one view: ``full``; where the truth knows what can move, ``dynamic`` (its pixels) and ``static``.
 
-    Each has ``psnr_db``, ``ssim``, and where depth is known ``abs_rel`` and ``delta1`` after the frame's least-squares
-    scale over all pixels, ``abs_rel_metric`` and ``delta1_metric`` as predicted; ``full`` also ``depth_scale`` and
-    ``depth_coverage``. None stands for what cannot be computed.
+    ``static`` are all other pixels; each of the two is None where it has none. Each has ``psnr_db``, ``ssim``, and
+    where depth is known ``abs_rel`` and ``delta1`` after the frame's least-squares scale over all pixels,
+    ``abs_rel_metric`` and ``delta1_metric`` as predicted; ``full`` also ``depth_scale`` and ``depth_coverage``. None
+    stands for what cannot be computed.
     """
     true, mask = target.true, target.movable
     full: Figures = {"psnr_db": _capped(psnr(view.rgb, true.rgb)), "ssim": ssim(view.rgb, true.rgb)}
@@ -72,14 +73,18 @@ def score_view(view: View, target: Target) -> dict[str, Figures | None]:
         whole = depth_score(view.depth_m, true.depth_m)
         full |= {"depth_scale": scale, "depth_coverage": _known(whole.coverage)}
     full |= _depth_figures(view, true, scale, None)
-    dynamic: Figures | None = None
-    if mask is not None and mask.any():
-        dynamic = {
-            "psnr_db": _capped(masked_psnr(view.rgb, true.rgb, mask)),
-            "ssim": _known(masked_ssim(view.rgb, true.rgb, mask)),
-            **_depth_figures(view, true, scale, mask),
-        }
-    return {"full": full, "dynamic": dynamic}
+    parts = {"dynamic": mask, "static": None if mask is None else ~mask}
+    return {"full": full} | {name: _figures_inside(view, true, scale, part) for name, part in parts.items()}
+
+
+def _figures_inside(view: View, true: View, scale: float, mask: Bool[np.ndarray, "h w"] | None) -> Figures | None:
+    if mask is None or not mask.any():
+        return None
+    return {
+        "psnr_db": _capped(masked_psnr(view.rgb, true.rgb, mask)),
+        "ssim": _known(masked_ssim(view.rgb, true.rgb, mask)),
+        **_depth_figures(view, true, scale, mask),
+    }
 
 
 def _depth_figures(view: View, true: View, scale: float, mask: Bool[np.ndarray, "h w"] | None) -> Figures:

@@ -13,7 +13,7 @@ import numpy as np
 
 Record = Mapping[str, Any]
 FULL = ("psnr_db", "ssim", "abs_rel", "delta1", "abs_rel_metric", "delta1_metric", "depth_scale", "depth_coverage")
-DYNAMIC = FULL[:6]
+MASKED = FULL[:6]
 PAIRS = (
     ("dense", "lift"),
     ("dense-lidar", "lift"),
@@ -35,9 +35,9 @@ def summarize(windows: Sequence[Record], methods: Iterable[str]) -> dict[str, An
         methods: names in the order of the tables.
 
     Returns:
-        ``methods``: by name ``full``, ``dynamic``, ``between``, ``beyond`` (means), ``curve`` (means by the offset from
-        the path in metres), ``abs_rel_doubles_at_m``, ``gaussians``, ``seconds``, ``views``, ``dynamic_views``,
-        ``windows`` and ``failed``; ``differences``: a list of paired differences.
+        ``methods``: by name ``full``, ``dynamic``, ``static``, ``between``, ``beyond`` (means), ``curve`` (means by the
+        offset from the path in metres), ``abs_rel_doubles_at_m``, ``gaussians``, ``seconds``, ``views``,
+        ``dynamic_views``, ``windows`` and ``failed``; ``differences``: a list of paired differences.
     """
     names = list(methods)
     figures = {name: _method([window["methods"][name] for window in windows]) for name in names}
@@ -50,10 +50,12 @@ def _method(records: Sequence[Record]) -> dict[str, Any]:
     rows = [row for record in good for row in record["targets"]]
     on_path = [row for row in rows if row["left_m"] == 0]
     moving = [row["dynamic"] for row in on_path if row["dynamic"] is not None]
+    standing = [row["static"] for row in on_path if row["static"] is not None]
     curve = _curve(rows)
     return {
         "full": _means([row["full"] for row in on_path], FULL),
-        "dynamic": _means(moving, DYNAMIC),
+        "dynamic": _means(moving, MASKED),
+        "static": _means(standing, MASKED),
         "between": _means([row["full"] for row in on_path if not row["beyond"]], FULL),
         "beyond": _means([row["full"] for row in on_path if row["beyond"]], FULL),
         "curve": curve,

@@ -52,7 +52,7 @@ def tables(results: Mapping[str, Any]) -> list[Table]:
     else:
         made.append(_paper_table(results))
         if name == "storm":
-            made.append(_times(methods))
+            made += [_static(methods), _times(methods)]
     made += [_metric_depth(methods, ", on the path" if name == "shift" else ""), _cost(methods)]
     if summary["differences"]:
         made.append(_differences(summary["differences"]))
@@ -92,6 +92,12 @@ def _paper_table(results: Mapping[str, Any]) -> Table:
 
 def _paper_cells(figures: Mapping[str, float | None]) -> list[str]:
     return [number(figures[column], 2 if column == "psnr_db" else 3) for column in PAPER_COLUMNS]
+
+
+def _static(methods: Mapping[str, Any]) -> Table:
+    rows = tuple((name, *_paper_cells(row["static"])) for name, row in methods.items())
+    note = "All pixels but those of things that can move; the depth has the scale of the whole frame."
+    return Table("static", "What cannot move", ("method", *PAPER_HEADING), rows, note)
 
 
 def _times(methods: Mapping[str, Any]) -> Table:

@@ -1,4 +1,4 @@
-"""How right a depth image is: AbsRel and delta1, as predicted or after a least-squares scale (paper section 4.1).
+"""How right a depth image is: AbsRel and delta1, as predicted or after a least-squares scale (paper section 5.1).
 
 Depths are z-depths in metres; 0 means that there is none. A pixel with a true depth for which none was predicted
 counts as predicted 0: its relative error is 1 and it misses delta1.
