@@ -9,8 +9,8 @@ from typing import Unpack
 import grpc
 
 from nurec_sim import wire
-from nurec_sim.connection import Connection, ConnectionOptions, our_errors
-from nurec_sim.errors import ServerError
+from nurec_sim.connection import Connection, ConnectionOptions, malformed_reply, our_errors
+from nurec_sim.errors import RequestError, ServerError
 from nurec_sim.types import CameraModel, LidarModel, SensorFrame, SensorRequest, Track, Trajectory
 from nurec_sim.wire import common, sensorsim
 
@@ -47,7 +47,7 @@ class RemoteSensors(Connection):
 
         Raises:
             RequestError: a request is malformed or beyond the server's scene or limits.
-            ServerError: the server cannot be reached in time, or failed.
+            ServerError: the server cannot be reached in time, failed, or sent a malformed reply.
         """
         calls = []
         for indices in _batches(requests):
@@ -66,9 +66,10 @@ class RemoteSensors(Connection):
             for indices, call in calls:
                 reply = self._outcome(call)
                 if isinstance(reply, sensorsim.LidarRenderReturn):
-                    frames[indices[0]] = wire.read_lidar_frame(reply, requests[indices[0]])
+                    with malformed_reply(self.address, "render_lidar"):
+                        frames[indices[0]] = wire.read_lidar_frame(reply, requests[indices[0]])
                 else:
-                    frames |= _read_batch(reply, requests, indices)
+                    frames |= self._read_batch(reply, requests, indices)
         finally:
             for _, call in calls:
                 call.cancel()  # without effect on those that are done
@@ -85,8 +86,9 @@ class RemoteSensors(Connection):
         reply = self._call("get_available_cameras", sensorsim.AvailableCamerasRequest(scene_id=self.scene_id))
         result = {}
         for entry in reply.available_cameras:
-            mounting = wire.read_mounting(entry.rig_to_camera, f"rig_to_camera of {entry.logical_id!r}")
-            camera = wire.read_camera(entry.intrinsics, 0, 0, {})
+            with malformed_reply(self.address, f"get_available_cameras: camera {entry.logical_id!r}"):
+                mounting = wire.read_mounting(entry.rig_to_camera, "rig_to_camera")
+                camera = wire.read_camera(entry.intrinsics, 0, 0, {})
             result[entry.logical_id] = replace(camera, id=entry.logical_id, rig_from_camera=mounting)
         return result
 
@@ -95,8 +97,9 @@ class RemoteSensors(Connection):
         reply = self._call("get_available_lidars", sensorsim.AvailableLidarsRequest(scene_id=self.scene_id))
         result = {}
         for entry in reply.available_lidars:
-            mounting = wire.read_mounting(entry.rig_from_lidar, f"rig_from_lidar of {entry.logical_id!r}")
-            lidar = wire.read_lidar(entry.lidar_config)
+            with malformed_reply(self.address, f"get_available_lidars: LiDAR {entry.logical_id!r}"):
+                mounting = wire.read_mounting(entry.rig_from_lidar, "rig_from_lidar")
+                lidar = wire.read_lidar(entry.lidar_config)
             result[entry.logical_id] = replace(lidar, id=entry.logical_id, rig_from_lidar=mounting)
         return result
 
@@ -106,12 +109,14 @@ class RemoteSensors(Connection):
         found = self._call("get_available_trajectories", request).available_trajectories
         if not found:
             raise ServerError(f"{self.address}: scene {self.scene_id!r} has no trajectory")
-        return wire.read_trajectory(found[0].trajectory, "available_trajectories[0]")
+        with malformed_reply(self.address, "get_available_trajectories"):
+            return wire.read_trajectory(found[0].trajectory, "available_trajectories[0]")
 
     def tracks(self) -> list[Track]:
         """Tracks of the scene."""
         reply = self._call("get_dynamic_objects", sensorsim.DynamicObjectsRequest(scene_id=self.scene_id))
-        return [wire.read_track(track) for track in reply.dynamic_objects]
+        with malformed_reply(self.address, "get_dynamic_objects"):
+            return [wire.read_track(track) for track in reply.dynamic_objects]
 
     def server_config(self) -> Mapping[str, str]:
         """Options of the server as text."""
@@ -129,6 +134,21 @@ class RemoteSensors(Connection):
     def _outcome(self, call: grpc.Future):
         with our_errors(self.address):
             return call.result()
+
+    def _read_batch(self, reply, requests: Sequence[SensorRequest], indices: list[int]) -> dict[int, SensorFrame]:
+        """Frames of a batch by index of the request; replies may come in any order."""
+        items = {item.camera_name: item for item in reply.items}
+        frames: dict[int, SensorFrame] = {}
+        for i in indices:
+            name = requests[i].sensor.id
+            item = items.get(name)
+            if item is not None and not item.success:
+                raise wire.error_of(item.error_code, f"camera {name!r}: {item.error_message}")
+            with malformed_reply(self.address, "batch_render_rgb"):
+                if item is None:
+                    raise RequestError(f"items lack camera {name!r}; have {sorted(items)}")
+                frames[i] = wire.read_camera_frame(item.result, requests[i])
+        return frames
 
 
 def _batches(requests: Sequence[SensorRequest]) -> Iterator[list[int]]:
@@ -149,17 +169,3 @@ def _batches(requests: Sequence[SensorRequest]) -> Iterator[list[int]]:
         size += image_bytes
     if group:
         yield group
-
-
-def _read_batch(reply, requests: Sequence[SensorRequest], indices: list[int]) -> dict[int, SensorFrame]:
-    """Frames of a batch by index of the request; replies may come in any order."""
-    items = {item.camera_name: item for item in reply.items}
-    frames: dict[int, SensorFrame] = {}
-    for i in indices:
-        item = items.get(requests[i].sensor.id)
-        if item is None:
-            raise ServerError(f"the server's reply lacks camera {requests[i].sensor.id!r}; has {sorted(items)}")
-        if not item.success:
-            raise wire.error_of(item.error_code, f"camera {requests[i].sensor.id!r}: {item.error_message}")
-        frames[i] = wire.read_camera_frame(item.result, requests[i])
-    return frames

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from nurec_sim import wire
-from nurec_sim.connection import Connection, ConnectionOptions, our_errors
+from nurec_sim.connection import Connection, ConnectionOptions, malformed_reply, our_errors
 from nurec_sim.errors import RequestError, ServerError
 from nurec_sim.types import CameraFrame, LidarFrame, LidarModel, SensorRequest
 from nurec_sim.wire import nurec_sim_v1 as v1
@@ -135,14 +135,17 @@ class SceneClient(Connection):
         message = v1.RenderCameraRequest(outputs=[wire.CameraOutput[name.upper()] for name in {"rgb", *outputs}])
         wire.write_camera_request(request, message.request, scene_id=request.scene_id)
         reply = self._call("RenderCamera", message)
-        frame = wire.read_camera_frame(wire.sensorsim.RGBRenderReturn(image_bytes=reply.rgb), request)
-        return CameraFrame(frame.camera, frame.start_us, frame.end_us, frame.rgb, **wire.read_outputs(reply))
+        with malformed_reply(self.address, "RenderCamera"):
+            frame = wire.read_camera_frame(wire.sensorsim.RGBRenderReturn(image_bytes=reply.rgb), request, "rgb")
+            return CameraFrame(frame.camera, frame.start_us, frame.end_us, frame.rgb, **wire.read_outputs(reply))
 
     def render_lidar(self, request: SensorRequest) -> LidarFrame:
         """A sweep as points, bit for bit as ``render.Renderer`` gives it."""
         message = v1.RenderLidarRequest(form=wire.SweepForm.POINTS)
         wire.write_lidar_request(request, message.request, scene_id=request.scene_id)
-        return wire.read_lidar_frame(self._call("RenderLidar", message).points, request)
+        reply = self._call("RenderLidar", message)
+        with malformed_reply(self.address, "RenderLidar"):
+            return wire.read_lidar_frame(reply.points, request)
 
     def range_map(
         self, request: SensorRequest
@@ -152,4 +155,6 @@ class SceneClient(Connection):
             raise RequestError(f"the sensor must be a LidarModel, got {type(request.sensor).__name__}")
         message = v1.RenderLidarRequest(form=wire.SweepForm.RANGE_MAP)
         wire.write_lidar_request(request, message.request, scene_id=request.scene_id)
-        return wire.read_range_map(self._call("RenderLidar", message).range_map, request)
+        reply = self._call("RenderLidar", message)
+        with malformed_reply(self.address, "RenderLidar"):
+            return wire.read_range_map(reply.range_map, request)

@@ -12,7 +12,7 @@ import grpc
 from google.protobuf import message_factory
 
 from nurec_sim import wire
-from nurec_sim.errors import ServerError
+from nurec_sim.errors import RequestError, ServerError
 
 _RETRY = {
     "maxAttempts": 5,
@@ -129,6 +129,15 @@ def our_errors(address: str) -> Iterator[None]:
     except grpc.RpcError as error:
         ours = wire.error_of(error.code(), error.details() or "no reason given")
         raise (ServerError(f"{address}: {ours}") if isinstance(ours, ServerError) else ours) from error
+
+
+@contextlib.contextmanager
+def malformed_reply(address: str, procedure: str) -> Iterator[None]:
+    """What cannot be read in a reply is the server's fault: the readers' ``RequestError`` becomes ``ServerError``."""
+    try:
+        yield
+    except RequestError as error:
+        raise ServerError(f"{address}: malformed reply to {procedure}: {error}") from error
 
 
 def _credentials(

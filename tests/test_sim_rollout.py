@@ -11,7 +11,8 @@ from nurec_sim.plugins import load_policy
 from nurec_sim.sim import Scenario, run_rollout
 from nurec_sim.sim.rollout import start_offset, timeline
 from nurec_sim.sim.scenario import ActorEdit, Perturbation, SensorSettings
-from nurec_sim.types import CameraFrame, Fisheye, LidarFrame, Needs, Pinhole, Plan, Rig
+from nurec_sim.sim.sensing import exposure_us
+from nurec_sim.types import CameraFrame, Fisheye, LidarFrame, Needs, Pinhole, Plan, Rig, Shutter
 
 
 class Scripted:
@@ -373,3 +374,19 @@ def test_timeline_is_cut_to_whole_states():
     times = timeline(Scenario(name="x", duration_s=10.0), world)
     assert times.start_us == world.span_us[0] and (times.end_us - times.start_us) % 100_000 == 0
     assert times.end_us < world.span_us[1] and times.clipped
+
+
+# ------------------------------------------------------------------------------------------- exposures
+
+
+@pytest.mark.parametrize("form", ["mapping", "method"])
+def test_exposures_last_as_long_as_the_log_says(form):
+    """A scene tells them by a mapping, a clip by a method; the usual one of 30, 30 and 10 ms is 30 ms."""
+    times = np.array([[0, 30_000], [100_000, 130_000], [200_000, 210_000]])
+    known = {"front_wide": times}
+    world = worlds.straight_road()
+    world = replace(world, camera_times_us=known if form == "mapping" else lambda camera: known.get(camera, ()))
+    rolling = replace(world.rig.cameras["front_wide"], shutter=Shutter.TOP_TO_BOTTOM)
+    assert exposure_us(world, rolling) == 30_000
+    assert exposure_us(world, replace(rolling, shutter=Shutter.GLOBAL)) == 0
+    assert exposure_us(world, replace(rolling, id="other")) == 0

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Int64, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.sensors import beam_directions, lidar_model, pixel_rays
@@ -52,6 +52,7 @@ class FlatWorld:
     span_us: tuple[int, int]
     road_m: Float64[np.ndarray, "k 2"]
     road_width_m: float = 7.0
+    camera_times_us: Mapping[str, Int64[np.ndarray, "frames 2"]] = field(default_factory=dict)
 
     def sense(self, requests: Sequence[SensorRequest]) -> list[SensorFrame]:
         """One frame per request."""

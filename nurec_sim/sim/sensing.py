@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from nurec_sim.errors import RequestError, ScenarioError
 from nurec_sim.sim.scenario import SensorSettings
@@ -36,6 +36,7 @@ from nurec_sim.types import (
 MAX_VIRTUAL_FOV_RAD = math.radians(100.0)
 FRONT_TOLERANCE_RAD = math.radians(10.0)
 PoseAt = Callable[[int], Float64[np.ndarray, "4 4"]]
+Exposures = Int64[np.ndarray, "frames 2"]
 
 
 class SceneFacts(Protocol):
@@ -55,6 +56,11 @@ class SceneFacts(Protocol):
 
     @property
     def span_us(self) -> tuple[int, int]: ...  # noqa: D102
+
+    @property
+    def camera_times_us(self) -> Mapping[str, Exposures] | Callable[[str], Exposures]:
+        """Start and end of every exposure by camera: a scene has a mapping, a clip a method; cameras may be missing."""
+        ...
 
 
 class SensorSuite:
@@ -185,12 +191,9 @@ def exposure_us(facts: SceneFacts, camera: CameraModel) -> int:
     """Usual duration of this camera's exposures in the log; 0 for a global shutter or where the log does not say."""
     if camera.shutter is Shutter.GLOBAL:
         return 0
-    times = getattr(facts, "camera_times_us", None)
-    if isinstance(times, Mapping):
-        frames = times.get(camera.id)
-    else:
-        frames = times(camera.id) if callable(times) else None
-    if frames is None or len(frames) == 0:
+    times = facts.camera_times_us
+    frames = times.get(camera.id, ()) if isinstance(times, Mapping) else times(camera.id)
+    if len(frames) == 0:
         return 0
     frames = np.asarray(frames, np.int64)
     return int(np.median(frames[:, 1] - frames[:, 0]))

@@ -61,7 +61,7 @@ def read_outputs(message) -> dict[str, np.ndarray]:
         data = getattr(message, name)
         if not data:
             continue
-        values = np.frombuffer(data, kind)
+        values = _values(data, kind, name)
         if values.size != np.prod((*shape, *channels)):
             raise RequestError(f"{name} has {values.size:,} values, which do not make {message.width}x{message.height}")
         found[name] = values.reshape(*shape, *channels).astype(np.dtype(kind).newbyteorder("="))
@@ -88,9 +88,18 @@ def read_range_map(
     """
     shape = (message.rows, message.columns)
     asked = (len(request.sensor.elevation_rad), len(request.sensor.azimuth_rad))  # type: ignore[union-attr]
-    maps = [np.frombuffer(data, "<f4") for data in (message.range_m, message.intensity)]
+    maps = [_values(getattr(message, name), "<f4", name) for name in ("range_m", "intensity")]
     if shape != asked or any(values.size != np.prod(shape) for values in maps):
         sizes = [values.size for values in maps]
-        raise RequestError(f"asked for a range map of {asked} beams, got {shape} with {sizes} values")
+        raise RequestError(
+            f"range_m and intensity must hold {asked[0]}x{asked[1]} values, got {sizes} and (rows, columns) = {shape}"
+        )
     range_m, intensity = (values.reshape(shape).astype(np.float32) for values in maps)
     return range_m, intensity
+
+
+def _values(data: bytes, kind: str, name: str) -> np.ndarray:
+    size = np.dtype(kind).itemsize
+    if len(data) % size:
+        raise RequestError(f"{name} must hold {size} bytes a value, got {len(data):,} bytes")
+    return np.frombuffer(data, kind)

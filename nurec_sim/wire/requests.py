@@ -181,8 +181,10 @@ def write_image(rgb: UInt8[np.ndarray, "h w 3"], options: ImageOptions, message)
     message.image_bytes = encode_image(rgb, _ENCODER[options.format], options.quality)
 
 
-def read_camera_frame(message, request: SensorRequest) -> CameraFrame:
+def read_camera_frame(message, request: SensorRequest, field: str = "image_bytes") -> CameraFrame:
     """The frame of an ``RGBRenderReturn`` to a request made by ``write_camera_request``.
+
+    ``field`` is what errors call the picture.
 
     Raises:
         RequestError: the reply has another size than asked for.
@@ -191,8 +193,8 @@ def read_camera_frame(message, request: SensorRequest) -> CameraFrame:
     shape = (3, camera.height_px, camera.width_px)
     if len(message.image_bytes) != int(np.prod(shape)):
         raise RequestError(
-            f"camera {camera.id!r}: asked for {camera.width_px}x{camera.height_px} planar RGB, "
-            f"got {len(message.image_bytes)} bytes"
+            f"camera {camera.id!r}: {field} must hold {camera.width_px}x{camera.height_px} planar RGB, "
+            f"{int(np.prod(shape)):,} bytes, got {len(message.image_bytes):,}"
         )
     import cv2
 
@@ -229,8 +231,8 @@ def read_lidar_frame(message, request: SensorRequest) -> LidarFrame:
     )
     if len(xyz) != 3 * n or len(intensity) != n or len(ranges) not in (0, n) or len(beam) not in (0, n):
         raise RequestError(
-            f"lidar {lidar.id!r}: the reply says {n} points but holds {len(xyz)} coordinates, "
-            f"{len(intensity)} intensities, {len(ranges)} ranges and {len(beam)} beams"
+            f"lidar {lidar.id!r}: num_points says {n}, but there are {len(xyz)} point_xyzs, {len(intensity)} "
+            f"point_intensities, {len(ranges)} point_ranges and {len(beam)} point_beams"
         )
     xyz = xyz.reshape(n, 3).astype(np.float32)
     ranges = ranges.astype(np.float32) if len(ranges) else np.linalg.norm(xyz, axis=1)

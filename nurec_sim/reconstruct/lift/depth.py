@@ -129,9 +129,9 @@ def _sweep_path(cost, gray, dy, dx, total, line, fresh):
     rows = range(height) if dy > 0 or (dy == 0 and dx > 0) else range(height - 1, -1, -1)
     for row in rows:
         for step in range(width):
-            column = step if (dx > 0 or (dx == 0)) else width - 1 - step
+            column = step if dx >= 0 else width - 1 - step
             r, c = row - dy, column - dx
-            here = fresh[column] if dy != 0 else fresh[column]
+            here = fresh[column]
             if r < 0 or r >= height or c < 0 or c >= width:
                 for k in range(levels):
                     here[k] = cost[row, column, k]
