@@ -11,7 +11,7 @@ from typing import Any, Self, TypedDict
 import grpc
 from google.protobuf import message_factory
 
-from nurec_sim import wire
+from nurec_sim import channels, wire
 from nurec_sim.errors import RequestError, ServerError
 
 _RETRY = {
@@ -103,11 +103,8 @@ def open_channel(
     Raises:
         ServerError: a PEM file cannot be read, or a certificate comes without its key or without ``root_ca``.
     """
-    credentials = _credentials(root_ca, client_cert, client_key)
     options = channel_options({"methodConfig": [{"name": [{}], "retryPolicy": _RETRY}]})
-    if credentials is None:
-        return grpc.insecure_channel(address, options)
-    return grpc.secure_channel(address, credentials, options)
+    return channels.open_channel(address, root_ca, client_cert, client_key, options)
 
 
 def channel_options(service_config: Mapping[str, Any]) -> list[tuple[str, Any]]:
@@ -116,7 +113,7 @@ def channel_options(service_config: Mapping[str, Any]) -> list[tuple[str, Any]]:
         ("grpc.max_receive_message_length", wire.MAX_MESSAGE_BYTES),
         ("grpc.max_send_message_length", wire.MAX_MESSAGE_BYTES),
         ("grpc.max_reconnect_backoff_ms", 1000),
-        ("grpc.enable_http_proxy", 0),  # servers of ours are near; a proxy for the web is not for them
+        channels.NO_PROXY,
         ("grpc.service_config", json.dumps(service_config)),
     ]
 
@@ -138,21 +135,6 @@ def malformed_reply(address: str, procedure: str) -> Iterator[None]:
         yield
     except RequestError as error:
         raise ServerError(f"{address}: malformed reply to {procedure}: {error}") from error
-
-
-def _credentials(
-    root_ca: Path | None, client_cert: Path | None, client_key: Path | None
-) -> grpc.ChannelCredentials | None:
-    """TLS of a channel; None for plain text."""
-    if (client_cert is None) != (client_key is None) or (client_cert and root_ca is None):
-        raise ServerError("mutual TLS needs root_ca, client_cert and client_key together")
-    if root_ca is None:
-        return None
-    try:
-        roots, key, cert = (None if path is None else path.read_bytes() for path in (root_ca, client_key, client_cert))
-    except OSError as error:
-        raise ServerError(f"TLS cannot be set up: {error}") from None
-    return grpc.ssl_channel_credentials(roots, key, cert)
 
 
 def _procedure(channel: grpc.Channel, service: str, method: Any) -> Any:

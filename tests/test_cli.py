@@ -51,6 +51,37 @@ def test_help_names_every_verb_and_loads_nothing_heavy() -> None:
     assert not loaded & {"torch", "numba", "mujoco", "pxr", "plotly", "cv2", "polars", "grpc", "scipy"}
 
 
+def test_health_starts_with_next_to_nothing(tmp_path: Path) -> None:
+    """It is asked every few seconds: 0.15 s of CPU time, half of which is gRPC's own."""
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "nurec_sim.cli", "health", "127.0.0.1:1", "--timeout", "0.2"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1 and "nurec-sim: 127.0.0.1:1: UNAVAILABLE" in done.stderr
+    loaded = {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
+    assert "grpc" in loaded
+    heavy = {"torch", "numba", "mujoco", "pxr", "cv2", "scipy", "numpy", "polars", "tyro", "rich", "yaml", "pydantic"}
+    assert not loaded & heavy
+    ours = {name for name in loaded if name.startswith("nurec_sim")}
+    assert ours == {"nurec_sim", "nurec_sim.cli", "nurec_sim.cli.health", "nurec_sim.channels", "nurec_sim.errors"}
+
+
+def test_health_takes_no_other_words(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, said in (
+        ([], "HOST:PORT"),
+        (["127.0.0.1:1", "--time", "1"], "unrecognized arguments: --time 1"),
+        (["127.0.0.1:1", "--timeout", "nan"], "must be more than 0"),
+        (["127.0.0.1:1", "--timeout", "-1"], "must be more than 0"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["health", *words])
+        assert stop.value.code == 2 and said in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["health", "127.0.0.1:1", "--root-ca", "/nowhere.pem"])
+    assert stop.value.code == 1 and "TLS cannot be set up" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_explains_every_option(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:

@@ -1,73 +1,21 @@
-"""The command line: one function per verb; heavy modules are imported by the verb that needs them."""
+"""The command line: one function per verb; a verb imports what it needs, and ``health`` next to nothing."""
 
 from __future__ import annotations
 
-import logging
-import os
 import sys
 from collections.abc import Sequence
 
-from nurec_sim.cli import (
-    conformance,
-    drive,
-    driving,
-    evaluation,
-    exchange,
-    remote,
-    scenes,
-    serving,
-    training,
-    validation,
-    weights,
-    worlds,
-)
-from nurec_sim.cli.console import app, err
-from nurec_sim.errors import NurecSimError
-
-__all__ = [
-    "conformance",
-    "drive",
-    "driving",
-    "evaluation",
-    "exchange",
-    "main",
-    "remote",
-    "scenes",
-    "serving",
-    "training",
-    "validation",
-    "weights",
-    "worlds",
-]
-
-KEPT = {
-    "run": "finished rollouts are kept: go on with --resume runs/latest (or your run folder)",
-    "demo": "finished rollouts are kept: go on with --resume runs/latest (or your run folder)",
-    "evaluate": "finished windows of a protocol are kept: go on with --resume evaluations/latest (or your run folder)",
-}
-"""What an interrupted verb leaves behind."""
+__all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb; errors of ours become one line and exit status 1, Ctrl-C becomes 130."""
-    logging.basicConfig(format="%(message)s", level=logging.ERROR)
     words = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        if words[:1] == ["serve-grpc"]:
-            words[1:] = serving.sort_serve_grpc(words[1:])
-        app.cli(
-            prog="nurec-sim",
-            description="An open closed-loop sensor simulator for driving. A log becomes a Gaussian world, a gRPC "
-            "server renders it, policies drive through it, a report says which is better. Start with: nurec-sim demo",
-            args=words,
-        )
-    except NurecSimError as error:
-        err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
-        raise SystemExit(1) from None
-    except BrokenPipeError:
-        # Whoever read the output has left, as `head` does; nothing more can be said, not even at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(1) from None
-    except KeyboardInterrupt:
-        err.print(f"interrupted; {KEPT.get(words[0] if words else '', 'nothing half-written was left')}")
-        raise SystemExit(130) from None
+    if words[:1] == ["health"]:  # asked every few seconds by whoever watches over a server
+        from nurec_sim.cli import health
+
+        health.run(words[1:])
+    else:
+        from nurec_sim.cli import verbs
+
+        verbs.run(words)

@@ -1,0 +1,55 @@
+"""All verbs together; heavy modules are imported by the verb that needs them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+
+from nurec_sim.cli import (  # noqa: F401  (each adds its verbs to the app)
+    conformance,
+    drive,
+    driving,
+    evaluation,
+    exchange,
+    remote,
+    scenes,
+    serving,
+    training,
+    validation,
+    weights,
+    worlds,
+)
+from nurec_sim.cli.console import app, err
+from nurec_sim.errors import NurecSimError
+
+KEPT = {
+    "run": "finished rollouts are kept: go on with --resume runs/latest (or your run folder)",
+    "demo": "finished rollouts are kept: go on with --resume runs/latest (or your run folder)",
+    "evaluate": "finished windows of a protocol are kept: go on with --resume evaluations/latest (or your run folder)",
+}
+"""What an interrupted verb leaves behind."""
+
+
+def run(words: list[str]) -> None:
+    """Run one verb; errors of ours become one line and exit status 1, Ctrl-C becomes 130."""
+    logging.basicConfig(format="%(message)s", level=logging.ERROR)
+    try:
+        if words[:1] == ["serve-grpc"]:
+            words[1:] = serving.sort_serve_grpc(words[1:])
+        app.cli(
+            prog="nurec-sim",
+            description="An open closed-loop sensor simulator for driving. A log becomes a Gaussian world, a gRPC "
+            "server renders it, policies drive through it, a report says which is better. Start with: nurec-sim demo",
+            args=words,
+        )
+    except NurecSimError as error:
+        err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+        raise SystemExit(1) from None
+    except BrokenPipeError:
+        # Whoever read the output has left, as `head` does; nothing more can be said, not even at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        err.print(f"interrupted; {KEPT.get(words[0] if words else '', 'nothing half-written was left')}")
+        raise SystemExit(130) from None
