@@ -15,3 +15,13 @@ def realdata() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real driving packs at {folder}; set NUREC_SIM_REALDATA to their folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def alpasim_messages() -> Path:
+    """Folder of all recorded AlpaSim messages; those of the demo log alone are part of the repository."""
+    shared = Path(__file__).parents[2] / "shared" / "alpasim_messages"
+    folder = Path(os.environ.get("NUREC_SIM_ALPASIM_MESSAGES", shared))
+    if not folder.is_dir():
+        pytest.skip(f"no AlpaSim messages at {folder}; set NUREC_SIM_ALPASIM_MESSAGES to their folder")
+    return folder

@@ -12,7 +12,7 @@ from nurec_sim.driving import DriverOptions, DriverServer
 from nurec_sim.render.encode import encode_image
 from nurec_sim.sim.flat_world import demo_rig
 from nurec_sim.types import EgoState, Needs, Plan
-from nurec_sim.wire import driving, egodriver
+from nurec_sim.wire import driving, driving_states, egodriver
 
 START_US = 5_000_000
 NOW_US = START_US + 500_000
@@ -111,7 +111,7 @@ def ego_state(t_us=NOW_US, x=0.0, y=0.0, yaw=0.0, speed=5.0):
 
 def ego_message(*states, session="s"):
     message = egodriver.RolloutEgoTrajectory(session_uuid=session)
-    driving.write_states(states or (ego_state(),), message)
+    driving_states.write_states(states or (ego_state(),), message)
     return message
 
 

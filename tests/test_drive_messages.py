@@ -9,14 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nurec_sim import geometry
+from nurec_sim.driving.motion import ego_states
 from nurec_sim.errors import RequestError
 from nurec_sim.types import ActorState, EgoState, Needs, Plan
-from nurec_sim.wire import driving, driving_paths, egodriver
+from nurec_sim.wire import driving, driving_paths, driving_states, egodriver
+from nurec_sim.wire.driving_states import read_states
 
 PROPERTY = settings(max_examples=60, deadline=None)
 ANGLES = st.floats(-math.pi, math.pi, exclude_max=True)
 TILTS = st.floats(-0.3, 0.3)
 METRES = st.floats(-80, 80)
+PADDING = {"x": math.nan, "y": math.nan, "z": math.nan}
+"""What AlpaSim fills routes up with."""
 
 
 def turned(roll, pitch, yaw):
@@ -106,29 +110,42 @@ def test_paths_of_another_time_are_moved_to_now(then, now, xyyaw):
 def test_states_travel_exactly(states):
     states = [EgoState(NOW_US + i, s.world_from_rig, s.speed_mps, s.accel_mps2) for i, s in enumerate(states)]
     message = egodriver.RolloutEgoTrajectory()
-    driving.write_states(states, message)
-    for one, two in zip(states, driving.read_states(message), strict=True):
+    driving_states.write_states(states, message)
+    told = read_states(message)
+    for one, two in zip(states, ego_states(told, range(len(told))), strict=True):
         assert np.array_equal(one.world_from_rig, two.world_from_rig)
         assert (one.t_us, one.speed_mps, one.accel_mps2) == (two.t_us, two.speed_mps, two.accel_mps2)
+        assert (one.yaw_rate_radps, one.steering_rad) == (two.yaw_rate_radps, two.steering_rad)
+
+
+@pytest.mark.parametrize("given", [20, 3, 1, 0])
+def test_padding_at_the_end_of_a_route_is_cut(given):
+    route = egodriver.Route(timestamp_us=NOW_US)
+    for i in range(given):
+        route.waypoints.add(x=4.0 * i, y=1.0)
+    for _ in range(20 - given):
+        route.waypoints.add(**PADDING)
+    seen = driving_paths.read_route(route).seen_from_above(ego_state())
+    assert seen.tolist() == [[4.0 * i, 1.0] for i in range(given)]
 
 
 def test_states_without_our_additions_keep_their_motion_in_float32():
     message = egodriver.RolloutEgoTrajectory()
-    driving.write_states([ego_state(speed=5.1)], message)
-    (found,) = driving.read_states(like_alpasim(message))
-    assert found.speed_mps == np.float32(5.1) and found.yaw_rate_radps == np.float32(0.1)
-    assert found.steering_rad == pytest.approx(math.atan(0.1 * 2.85 / 5.1), abs=1e-6)
+    driving_states.write_states([ego_state(speed=5.1)], message)
+    (found,) = read_states(like_alpasim(message))
+    assert found.motion.velocity_mps == (np.float32(5.1), 0.0) and not found.motion.exact
+    assert (found.motion.accel_mps2, found.motion.yaw_rate_radps) == (np.float32(0.3), np.float32(0.1))
     message.dynamic_states[0].ClearField("linear_velocity")
-    assert math.isnan(driving.read_states(message)[0].speed_mps)
+    assert read_states(message)[0].motion is None
 
 
 def test_fewer_dynamic_states_belong_to_the_last_poses():
     message = egodriver.RolloutEgoTrajectory()
-    driving.write_states([ego_state(NOW_US - 100_000, speed=3.0), ego_state(NOW_US, speed=4.0)], message)
+    driving_states.write_states([ego_state(NOW_US - 100_000, speed=3.0), ego_state(NOW_US, speed=4.0)], message)
     like_alpasim(message)
     del message.dynamic_states[0]
-    first, second = driving.read_states(message)
-    assert math.isnan(first.speed_mps) and second.speed_mps == 4.0
+    first, second = read_states(message)
+    assert first.motion is None and second.motion.velocity_mps == (4.0, 0.0)
 
 
 def test_actors_and_descriptions_travel_exactly():
@@ -156,10 +173,14 @@ def test_a_car_on_its_side_is_refused():
     ("read", "kind", "values", "text"),
     [
         (driving_paths.read_route, "Route", {"timestamp_us": 2**63}, "route.timestamp_us must be microseconds"),
-        (driving_paths.read_route, "Route", {"waypoints": [{"x": math.nan}]}, r"waypoints\[0\] must lie within"),
+        (driving_paths.read_route, "Route", {"waypoints": [{"x": math.inf}]}, r"waypoints\[0\] must lie within"),
+        (driving_paths.read_route, "Route", {"waypoints": [PADDING, {"x": 1.0}]}, "only at the end of a route"),
+        (driving_paths.read_route, "Route", {"waypoints": [{"x": 1.0, "z": math.nan}]}, r"waypoints\[0\] must lie"),
+        (driving_paths.read_route, "Route", {"waypoints": [{"x": 1.0, "y": math.nan}]}, r"waypoints\[0\] must lie"),
+        (driving_paths.read_route, "Route", {"waypoints": [PADDING], "exact_xy": [1.0, 2.0]}, "for each of 0 poses"),
         (driving_paths.read_route, "Route", {"exact_xy": [1.0]}, "route.exact_xy must have 2 values"),
-        (driving.read_states, "RolloutEgoTrajectory", {"dynamic_states": [{}]}, "dynamic_states must be at most one"),
-        (driving.read_states, "RolloutEgoTrajectory", {"trajectory": {"poses": [{}]}}, "must have a unit quaternion"),
+        (read_states, "RolloutEgoTrajectory", {"dynamic_states": [{}]}, "dynamic_states must be at most one"),
+        (read_states, "RolloutEgoTrajectory", {"trajectory": {"poses": [{}]}}, "must have a unit quaternion"),
         (
             driving.read_encoded_image,
             "RolloutCameraImage",

@@ -19,7 +19,7 @@ from nurec_sim.connection import channel_options
 from nurec_sim.errors import PlanError, RequestError, ScenarioError, ServerError
 from nurec_sim.render.encode import encode_image
 from nurec_sim.types import CameraFrame, Needs, Observation, Plan, Rig
-from nurec_sim.wire import common, driving, driving_paths, egodriver
+from nurec_sim.wire import common, driving, driving_paths, driving_states, egodriver
 
 SCHEME = "grpc"
 OTHER_NEEDS = Needs(cameras=("front",), image_width_px=512)
@@ -182,7 +182,7 @@ class RemotePolicy:
         ego, session = observation.ego, {"session_uuid": self._session_id}
         states = [state for state in observation.history if state.t_us > self._sent_us]
         ego_message, route = egodriver.RolloutEgoTrajectory(**session), egodriver.RouteRequest(**session)
-        driving.write_states([*(state for state in states if state.t_us < ego.t_us), ego], ego_message)
+        driving_states.write_states([*(state for state in states if state.t_us < ego.t_us), ego], ego_message)
         driving_paths.write_route(ego, observation.route_m, observation.route_speed_mps, route.route)
         said: list[tuple[str, object]] = [("submit_egomotion_observation", ego_message), ("submit_route", route)]
         for frame in {frame.camera.id: frame for frame in observation.cameras.values()}.values():

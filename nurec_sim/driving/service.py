@@ -32,7 +32,7 @@ from nurec_sim.errors import (
 from nurec_sim.service.discovery import API_VERSION
 from nurec_sim.sim.plans import check_plan
 from nurec_sim.types import EgoState, Plan, Policy
-from nurec_sim.wire import MAX_MESSAGE_BYTES, common, driving, driving_paths, egodriver
+from nurec_sim.wire import MAX_MESSAGE_BYTES, common, driving, driving_paths, driving_states, egodriver
 
 log = logging.getLogger(__name__)
 
@@ -178,7 +178,7 @@ class DriverService:
 
     async def submit_egomotion_observation(self, request):
         """Keeps ego poses and how the car moved."""
-        self._opened(request.session_uuid).session.add_states(driving.read_states(request))
+        self._opened(request.session_uuid).session.add_states(driving_states.read_states(request))
         return common.Empty()
 
     async def submit_route(self, request):

@@ -6,7 +6,6 @@ counts. The car is where its newest ego pose says, so a plan is one of that time
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_right, insort
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,11 +15,13 @@ from jaxtyping import Float64, Int64
 
 from nurec_sim import geometry
 from nurec_sim.driving.images import image_size, see_image
+from nurec_sim.driving.motion import ego_states
 from nurec_sim.errors import RequestError, ScenarioError, SessionError, TooLargeError
 from nurec_sim.sim.sensing import find_camera, find_lidar
 from nurec_sim.types import ActorState, EgoState, LidarFrame, Needs, Observation, Rig, Trajectory
 from nurec_sim.wire.driving import EncodedImage, SessionStart
-from nurec_sim.wire.driving_paths import RecordedFuture, Route, moved
+from nurec_sim.wire.driving_paths import Placed, RecordedFuture, Route, moved
+from nurec_sim.wire.driving_states import ToldState
 
 MAX_AGE_US = 1_000_000
 """Older than this, a pose, an image or a sweep says nothing about now."""
@@ -37,8 +38,8 @@ class Question:
     history: tuple[EgoState, ...]
     images: Mapping[str, EncodedImage]
     sweeps: Mapping[str, LidarFrame]
-    route: tuple[Route, EgoState] | None
-    recorded: tuple[RecordedFuture, EgoState] | None
+    route: tuple[Route, Placed] | None
+    recorded: tuple[RecordedFuture, Placed] | None
     actors: tuple[ActorState, ...] | None
 
 
@@ -53,7 +54,7 @@ class Session:
 
     def __init__(self, start: SessionStart, needs: Needs, route_speed_mps: float) -> None:
         self.start, self.needs, self.route_speed_mps = start, needs, route_speed_mps
-        self._states: list[EgoState] = []
+        self._states: list[ToldState] = []
         self._images: dict[str, list[EncodedImage]] = {}
         self._sweeps: dict[str, list[LidarFrame]] = {}
         self._route: Route | None = None
@@ -62,7 +63,7 @@ class Session:
 
     # ------------------------------------------------------------------------------------------------- what comes in
 
-    def add_states(self, states: list[EgoState]) -> None:
+    def add_states(self, states: list[ToldState]) -> None:
         """Ego states; one at a time that is known already replaces it."""
         by_time = {state.t_us: state for state in (*self._states, *states)}
         self._states = [by_time[t_us] for t_us in sorted(by_time)][-KEPT_STATES:]
@@ -119,17 +120,17 @@ class Session:
         if last == 0:
             first = f"; the first one is of {self._states[0].t_us}" if self._states else ""
             raise SessionError(f"no ego pose up to time_now_us {now_us} has been submitted{first}")
-        states = _moving(self._states[:last])
-        ego = states[-1]
-        _check_age("the newest ego pose", ego.t_us, now_us)
+        states = self._states[:last]
+        _check_age("the newest ego pose", states[-1].t_us, now_us)
+        history = tuple(ego_states(states, _history(states)))
         images = {
             name: _newest(f"camera {name!r}", self._frames_of_camera(name), now_us) for name in self.needs.cameras
         }
         sweeps = {name: _newest(f"LiDAR {name!r}", self._frames_of_lidar(name), now_us) for name in self.needs.lidars}
         route, recorded = self._route, self._recorded
         return Question(
-            ego,
-            _history(states),
+            history[-1],
+            history,
             images,
             sweeps,
             None if route is None else (route, _state_at(states, route.t_us)),
@@ -226,38 +227,18 @@ def _check_age(name: str, t_us: int, now_us: int) -> None:
         )
 
 
-def _moving(states: list[EgoState]) -> list[EgoState]:
-    """States whose unknown speed (NaN) and yaw rate are filled in from how the poses change."""
-    if not any(math.isnan(state.speed_mps) for state in states):
-        return states
-    result = []
-    for i, state in enumerate(states):
-        if not math.isnan(state.speed_mps):
-            result.append(state)
-            continue
-        one, two = states[max(i - 1, 0)], states[max(i, min(1, len(states) - 1))]
-        elapsed_s = (two.t_us - one.t_us) / 1e6
-        if elapsed_s <= 0:
-            result.append(replace(state, speed_mps=0.0))
-            continue
-        step = geometry.inverse(one.world_from_rig) @ two.world_from_rig
-        yaw_rate = float(geometry.yaw_of(step)) / elapsed_s
-        result.append(replace(state, speed_mps=float(step[0, 3]) / elapsed_s, yaw_rate_radps=yaw_rate))
-    return result
-
-
-def _history(states: list[EgoState]) -> tuple[EgoState, ...]:
-    """The last 2 s at about 10 Hz, the present last."""
-    kept = [states[-1]]
-    for state in reversed(states[:-1]):
+def _history(states: list[ToldState]) -> list[int]:
+    """Which states are those of the last 2 s at about 10 Hz, the present last."""
+    kept = [len(states) - 1]
+    for index in range(len(states) - 2, -1, -1):
         if len(kept) == HISTORY_STATES:
             break
-        if kept[-1].t_us - state.t_us >= HISTORY_STEP_US - STEP_SLACK_US:
-            kept.append(state)
-    return tuple(reversed(kept))
+        if states[kept[-1]].t_us - states[index].t_us >= HISTORY_STEP_US - STEP_SLACK_US:
+            kept.append(index)
+    return kept[::-1]
 
 
-def _state_at(states: list[EgoState], t_us: int) -> EgoState:
+def _state_at(states: list[ToldState], t_us: int) -> ToldState:
     """The car at a time of a route (0: now), between the poses where it has to be."""
     if t_us == 0 or t_us >= states[-1].t_us:
         return states[-1]

@@ -1,12 +1,7 @@
-"""Driving sessions, ego states, images, sweeps and actors <-> messages of the egodriver interface.
-
-Ego poses are of the rig in the session's local frame, which is our world. A dynamic state is in the rig frame of its
-pose: x forward, so a car that does not slide has no other speed.
-"""
+"""Driving sessions, images, sweeps and actors <-> messages of the egodriver interface."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +13,6 @@ from nurec_sim.types import (
     ActorState,
     Box,
     CameraModel,
-    EgoState,
     LidarFrame,
     LidarModel,
     Needs,
@@ -42,8 +36,6 @@ DRIVER_METHODS = {
 MAX_SENSORS, MAX_POSES, MAX_ACTORS = 64, 5_000, 5_000
 LARGEST = 1e6
 """No size, speed or rate is larger."""
-WHEELBASE_M = 2.85
-"""Of the car that a client does not describe: its steering angle follows from its yaw rate."""
 
 
 @dataclass(frozen=True)
@@ -142,62 +134,6 @@ def read_policy(message) -> tuple[str, Needs]:
     return message.name, needs
 
 
-# ----------------------------------------------------------------------------------------------------------------- ego
-
-
-def write_states(states: Sequence[EgoState], message) -> None:
-    """Fills a ``RolloutEgoTrajectory``."""
-    samples = [message.trajectory.poses.add(timestamp_us=state.t_us) for state in states]
-    write_poses(np.array([state.world_from_rig for state in states]), [sample.pose for sample in samples])
-    for state in states:
-        dynamic = message.dynamic_states.add()
-        dynamic.linear_velocity.x, dynamic.linear_acceleration.x = state.speed_mps, state.accel_mps2
-        dynamic.linear_acceleration.y = state.speed_mps * state.yaw_rate_radps
-        dynamic.angular_velocity.z = state.yaw_rate_radps
-        message.motion.add(
-            speed_mps=state.speed_mps, accel_mps2=state.accel_mps2, yaw_rate_radps=state.yaw_rate_radps,
-            steering_rad=state.steering_rad,
-        )  # fmt: skip
-
-
-def read_states(message) -> list[EgoState]:
-    """The ego states of a ``RolloutEgoTrajectory``; the speed is NaN where the message does not tell it.
-
-    Fewer dynamic states than poses belong to the last poses.
-
-    Raises:
-        RequestError: a pose, a time or a motion is malformed; the text names it.
-    """
-    poses, dynamic, motion = message.trajectory.poses, message.dynamic_states, message.motion
-    if len(poses) > MAX_POSES:
-        raise RequestError(f"a trajectory may have {MAX_POSES} poses, got {len(poses)}")
-    if len(dynamic) > len(poses) or len(motion) not in (0, len(poses)):
-        raise RequestError(
-            f"dynamic_states must be at most one a pose, and motion one a pose or none; "
-            f"got {len(dynamic)} and {len(motion)} for {len(poses)} poses"
-        )
-    world_from_rig = read_poses([p.pose for p in poses], [f"trajectory[{i}]" for i in range(len(poses))])
-    states, first = [], len(poses) - len(dynamic)
-    for i, sample in enumerate(poses):
-        check_time(f"trajectory[{i}].timestamp_us", sample.timestamp_us)
-        values: tuple[float, ...] = (math.nan, 0.0, 0.0, 0.0)
-        if len(motion):
-            values = _bounded(f"motion[{i}]", (motion[i].speed_mps, motion[i].accel_mps2, motion[i].yaw_rate_radps,
-                                              motion[i].steering_rad))  # fmt: skip
-        elif i >= first and dynamic[i - first].HasField("linear_velocity"):
-            values = _read_dynamic(f"dynamic_states[{i - first}]", dynamic[i - first])
-        states.append(EgoState(sample.timestamp_us, world_from_rig[i], *values))
-    return states
-
-
-def _read_dynamic(name: str, dynamic) -> tuple[float, ...]:
-    speed, accel = dynamic.linear_velocity.x, dynamic.linear_acceleration.x
-    yaw_rate = dynamic.angular_velocity.z
-    _bounded(name, (speed, accel, yaw_rate))
-    steering = math.atan(yaw_rate * WHEELBASE_M / speed) if speed > 0.5 else 0.0
-    return speed, accel, yaw_rate, steering
-
-
 # -------------------------------------------------------------------------------------------------- sensors and actors
 
 
@@ -270,8 +206,8 @@ def read_actors(message) -> tuple[ActorState, ...]:
     for pose, entry in zip(poses, message.actors, strict=True):
         if len(entry.size_m) != 3 or len(entry.velocity_mps) != 2:
             raise RequestError(f"actor {entry.id!r} needs 3 size_m and 2 velocity_mps")
-        x, y, z = _bounded(f"actor {entry.id!r}: size_m", tuple(entry.size_m))
-        velocity = np.array(_bounded(f"actor {entry.id!r}: velocity_mps", tuple(entry.velocity_mps)))
+        x, y, z = bounded(f"actor {entry.id!r}: size_m", tuple(entry.size_m))
+        velocity = np.array(bounded(f"actor {entry.id!r}: velocity_mps", tuple(entry.velocity_mps)))
         result.append(ActorState(entry.id, entry.label, (x, y, z), pose, velocity))
     return tuple(result)
 
@@ -292,7 +228,12 @@ def _check_exposure(start_us: int, end_us: int) -> None:
         raise RequestError(f"a frame must not end before it starts, got [{start_us}, {end_us}]")
 
 
-def _bounded(name: str, values: tuple[float, ...]) -> tuple[float, ...]:
+def bounded(name: str, values: tuple[float, ...]) -> tuple[float, ...]:
+    """The values, if they can be sizes, speeds or rates.
+
+    Raises:
+        RequestError: they are not finite, or too large.
+    """
     if not all(abs(value) < LARGEST for value in values):  # false for what is not finite
         raise RequestError(f"{name} must be finite and below {LARGEST:g}, got {values}")
     return values

@@ -8,6 +8,7 @@ session's local frame. What we write lies in the plane on which the car stands.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -26,6 +27,18 @@ FARTHEST = 1e9
 
 Points2 = Float64[np.ndarray, "k 2"]
 Poses2 = Float64[np.ndarray, "k 3"]
+
+
+class Placed(Protocol):
+    """Where the car is at a time: an ``EgoState``, or a ``ToldState``."""
+
+    @property
+    def t_us(self) -> int:
+        """Microseconds."""
+
+    @property
+    def world_from_rig(self) -> Matrix4:
+        """Its rig pose."""
 
 
 def level_frame(world_from_rig: Matrix4) -> Matrix4:
@@ -59,7 +72,7 @@ def _from_above(level_poses: Float64[np.ndarray, "k 4 4"]) -> Poses2:
     return np.column_stack([level_poses[:, :2, 3], geometry.yaw_of(level_poses)])
 
 
-def moved(xyyaw: Poses2, then: EgoState, now: EgoState) -> Poses2:
+def moved(xyyaw: Poses2, then: Placed, now: Placed) -> Poses2:
     """Poses seen from above by the car of ``then``, as the car of ``now`` sees them."""
     if then.t_us == now.t_us:
         return xyyaw
@@ -81,7 +94,7 @@ class Route:
     exact_xy: Points2 | None = None
     speed_mps: Float64[np.ndarray, " k"] | None = None
 
-    def seen_from_above(self, ego: EgoState) -> Points2:
+    def seen_from_above(self, ego: Placed) -> Points2:
         """The way points as the car of the route's time sees them."""
         if self.exact_xy is not None:
             return self.exact_xy
@@ -98,20 +111,27 @@ def write_route(ego: EgoState, route_m: Points2, speed_mps: Float64[np.ndarray, 
 
 
 def read_route(message) -> Route:
-    """The route of a ``Route``.
+    """The route of a ``Route``, without the way points at its end that are not a number.
+
+    AlpaSim pads to 20 points with them once less way is left. All of them is no route: no way points.
 
     Raises:
         RequestError: too long, not finite, or additions of another length.
     """
-    count = len(message.waypoints)
-    if count > MAX_POSES:
-        raise RequestError(f"a route may have {MAX_POSES} way points, got {count}")
+    if len(message.waypoints) > MAX_POSES:
+        raise RequestError(f"a route may have {MAX_POSES} way points, got {len(message.waypoints)}")
     check_time("route.timestamp_us", message.timestamp_us)
     xyz = np.array([(p.x, p.y, p.z) for p in message.waypoints], np.float64).reshape(-1, 3)
+    told = np.flatnonzero(~np.isnan(xyz[:, :2]).all(axis=1))
+    count = int(told[-1]) + 1 if len(told) else 0
+    xyz = xyz[:count]
     good = (np.abs(xyz) < FARTHEST).all(axis=1)  # false for what is not finite
     if not good.all():
         bad = int(np.argmin(good))
-        raise RequestError(f"route.waypoints[{bad}] must lie within {FARTHEST:g} m, got {xyz[bad].tolist()}")
+        raise RequestError(
+            f"route.waypoints[{bad}] must lie within {FARTHEST:g} m, got {xyz[bad].tolist()}; "
+            "only at the end of a route, points may be not a number"
+        )
     exact, speed = (
         _exact(message.exact_xy, count, 2, "route.exact_xy"),
         _exact(message.speed_mps, count, 1, "speed_mps"),
@@ -131,7 +151,7 @@ class RecordedFuture:
     rig_from_pose: Float64[np.ndarray, "m 4 4"]
     exact_xyyaw: Poses2 | None = None
 
-    def seen_from_above(self, ego: EgoState) -> Poses2:
+    def seen_from_above(self, ego: Placed) -> Poses2:
         """The poses as the car of the message's time sees them."""
         if self.exact_xyyaw is not None:
             return self.exact_xyyaw
