@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
-from numba import njit
 
+from nurec_sim.kernels import inner, kernel
 from nurec_sim.network.matching import ImageView
 from nurec_sim.network.tensors import NetworkInputs
 
@@ -116,7 +116,7 @@ def _others(image: int, count: int) -> Int64[np.ndarray, " n"]:
     return others[np.arange(MOST_OTHERS) * len(others) // MOST_OTHERS]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _plane_at(plane, x, y):
     """A map at the place (x, y), -1..1 from edge to edge, bilinear; beyond its edge the edge's value."""
     height, width = plane.shape
@@ -129,7 +129,7 @@ def _plane_at(plane, x, y):
     return (1 - b) * upper + b * lower
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _projected(k, px, py, pz, z, views):
     """Where image k shows what lies at (px, py, pz) from its eye, z along its axis: -1..1 from edge to edge."""
     turn, line, plane = views.turn[k], views.line[k], views.plane[k]
@@ -142,19 +142,19 @@ def _projected(k, px, py, pz, z, views):
     return x, y
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _ring(distance, x, y):
     """From how near a surface is seen, in rings, what is off the axis counting as farther."""
     return (np.log(distance) + OFF_AXIS * (x * x + y * y)) / OWNER_RING
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _exposed(rgb):
     """Whether no channel may have been cut."""
     return min(rgb[0], rgb[1], rgb[2]) > EXPOSED[0] and max(rgb[0], rgb[1], rgb[2]) < EXPOSED[1]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _compare(image, others, pictures, views):
     """One image's part of ``Compared``."""
     depth, kind, stands, rgb, camera = pictures

@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
-from numba import njit
 from torch import Tensor
+
+from nurec_sim.kernels import kernel
 
 SMALL_STEP, LARGE_STEP = 0.05, 2.0
 """What it costs to go to the next depth, and to any other, from a pixel to its neighbour; if nothing else is said."""
@@ -69,7 +70,7 @@ def _carried(before: Float[Tensor, "d m"], jump: Float[Tensor, " m"], small: flo
     return carried - least
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _summed(
     cost: Float32[np.ndarray, "length d m"], jump: Float32[np.ndarray, "length-1 m"], small: np.float32
 ) -> Float32[np.ndarray, "length d m"]:

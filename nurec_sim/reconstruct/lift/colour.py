@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
-from numba import njit
 
+from nurec_sim.kernels import kernel
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import View
 
@@ -15,7 +15,7 @@ ENOUGH_SHARED = 300
 """Points that two cameras must share before their colours are compared."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, tolerance):
     """Colour of each point as its three best views show it, and how well the best of them resolves it.
 

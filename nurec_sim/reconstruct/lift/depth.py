@@ -9,7 +9,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt64
-from numba import njit
+
+from nurec_sim.kernels import inner, kernel
 
 PRIOR_COST, PRIOR_CAP = 40.0, 220.0
 SKY_COST, NOT_SKY_COST = 60.0, 40.0
@@ -29,7 +30,7 @@ def census(gray: UInt8[np.ndarray, "h w"]) -> UInt64[np.ndarray, "h w"]:
     return bits
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _popcount(x):
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
     x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
@@ -37,7 +38,7 @@ def _popcount(x):
     return (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, other_codes, step, levels, cost):
     """Fill ``cost[h, w, levels]`` (0..100): mean of the two best neighbours of census and colour differences.
 
@@ -106,7 +107,7 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
                     cost[row, column, level] = unseen
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_prior(cost, prior, sky, step):
     """Bend the costs towards the measured inverse depth where there is one, and towards infinity in the sky."""
     height, width, levels = cost.shape
@@ -123,7 +124,7 @@ def add_prior(cost, prior, sky, step):
                 cost[row, column, 0] += NOT_SKY_COST
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _sweep_path(cost, gray, dy, dx, total, line, fresh):
     height, width, levels = cost.shape
     rows = range(height) if dy > 0 or (dy == 0 and dx > 0) else range(height - 1, -1, -1)
@@ -154,7 +155,7 @@ def _sweep_path(cost, gray, dy, dx, total, line, fresh):
         line, fresh = fresh, line
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def smooth_depth(cost, gray, step):
     """Semi-global minimum over 8 paths; inverse depth with a parabola between levels [h, w] float32."""
     height, width, levels = cost.shape

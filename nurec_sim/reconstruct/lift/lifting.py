@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
-from numba import njit
 
+from nurec_sim.kernels import kernel
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import View
 
@@ -96,7 +96,7 @@ def normals_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64
     return -normal @ view.world_from_view[:3, :3].T
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, tolerance, ring, border):
     """Which points no other view owns, and that few views look through.
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
-from numba import njit
 
 from nurec_sim import geometry
+from nurec_sim.kernels import kernel
 from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.types import MOVABLE_LABELS, Clip, Track, Trajectory
 
@@ -283,7 +283,7 @@ def seen_through(cloud: Cloud, range_images: list[tuple[np.ndarray, np.ndarray]]
     return (through >= votes) & (through >= 2 * cloud.sweeps)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count_through(xyz, lidar_from_world, nearest, through):
     m = lidar_from_world
     for i in range(len(xyz)):

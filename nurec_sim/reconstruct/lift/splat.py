@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float32, Int32
-from numba import njit
+
+from nurec_sim.kernels import inner, kernel
 
 SPLAT_RADIUS = 0.5
 """Radius of a drawn surfel per metre of its spacing; what stays open is filled by matching."""
 
 
-@njit(cache=True, nogil=True)
+@inner
 def project_point(view, x, y, z):
     """Pixel and depth of a point: (u, v, depth); depth <= 0 if behind. ``view`` is ``View.packed``."""
     a = view[5] * x + view[6] * y + view[7] * z + view[14]
@@ -33,7 +34,7 @@ def project_point(view, x, y, z):
     return u, v, c
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def splat(view, xyz, normal, spacing, offset, front, total, weight, nearest, index, second):
     """Draw surfels: in the first pass keep the smallest depth in ``front``, in the second average near it.
 
@@ -75,7 +76,7 @@ def splat(view, xyz, normal, spacing, offset, front, total, weight, nearest, ind
                         index[row, column] = offset + i
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def drop_shine_through(inverse_depth, index):
     """Empty pixels that most of their 7x7 surroundings lie well in front of: seen through gaps of a surface."""
     height, width = inverse_depth.shape
@@ -100,7 +101,7 @@ def drop_shine_through(inverse_depth, index):
                 index[row, column] = -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def trim_silhouettes(inverse_depth, index, gray):
     """Empty pixels at the rim of a nearer surface that look unlike its inside: splats reach over silhouettes."""
     height, width = inverse_depth.shape
