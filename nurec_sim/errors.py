@@ -17,6 +17,7 @@
     ├── GivenUpError     work ended because nobody waits for it       (gRPC CANCELLED)
     ├── DeadlinePassedError  the client's deadline passed before the answer  (gRPC DEADLINE_EXCEEDED)
     ├── PlanError        a policy failed, or answered what cannot be driven  (gRPC ABORTED)
+    │   └── PolicyError        it raised, tried to end the process, or did not answer in time
     ├── SessionError     a driving session lacks what it is asked for (gRPC FAILED_PRECONDITION)
     │   ├── UnknownSessionError  no such session                      (gRPC NOT_FOUND)
     │   └── SessionExistsError   a session of that id is open         (gRPC ALREADY_EXISTS)
@@ -88,6 +89,10 @@ class NotAllowedError(RequestError):
 
 class PlanError(NurecSimError):
     """A policy failed, or answered something that cannot be driven."""
+
+
+class PolicyError(PlanError):
+    """A policy raised, tried to end the process, or did not answer in time."""
 
 
 class SessionError(NurecSimError):

@@ -73,7 +73,7 @@ def _load_file(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit, GeneratorExit) as error:
         raise ScenarioError(f"policy file '{path}' cannot be imported: {type(error).__name__}: {error}") from error
     return module
 
@@ -100,7 +100,7 @@ def _make(factory: object, reference: str) -> Policy:
         raise ScenarioError(f"policy '{reference}' must be a class, got {type(factory).__name__}")
     try:
         policy = factory()
-    except Exception as error:
+    except (Exception, SystemExit, GeneratorExit) as error:
         raise ScenarioError(f"policy '{reference}' cannot be made: {type(error).__name__}: {error}") from error
     faults = [name for name in ("reset", "plan") if not callable(getattr(policy, name, None))]
     if not isinstance(getattr(policy, "name", None), str):

@@ -45,6 +45,8 @@ def test_a_file_gives_its_class(tmp_path):
     ("text", "said"),
     [
         ("import nowhere_at_all", "cannot be imported: ModuleNotFoundError"),
+        ("raise SystemExit(0)", "cannot be imported: SystemExit: 0"),
+        (GOOD.replace("name = ", "def __init__(self): exit()\n    name = "), "cannot be made: SystemExit"),
         (GOOD.replace("needs = Needs()", ""), r"is not a policy: it lacks needs \(nurec_sim.types.Needs\)"),
         (GOOD.replace("def reset(self, rig, seed): pass", ""), "it lacks reset"),
         (GOOD.replace("name = ", "def __init__(self): 1 / 0\n    name = "), "cannot be made: ZeroDivisionError"),

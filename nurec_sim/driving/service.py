@@ -18,7 +18,6 @@ import numpy as np
 
 import nurec_sim
 from nurec_sim.driving.session import Question, Session
-from nurec_sim.driving.worker import PolicyThread
 from nurec_sim.errors import (
     DeadlinePassedError,
     NurecSimError,
@@ -31,6 +30,9 @@ from nurec_sim.errors import (
 )  # fmt: skip
 from nurec_sim.service.discovery import API_VERSION
 from nurec_sim.sim.plans import check_plan
+from nurec_sim.sim.policy_host import described
+from nurec_sim.sim.policy_thread import PolicyThread
+from nurec_sim.sim.sealed import sealed
 from nurec_sim.types import EgoState, Plan, Policy
 from nurec_sim.wire import MAX_MESSAGE_BYTES, common, driving, driving_paths, driving_states, egodriver
 
@@ -150,7 +152,7 @@ class DriverService:
     def _made(self, start: driving.SessionStart) -> Policy:
         with _answering_for(self._name):
             policy = self._make_policy()
-            policy.reset(start.rig, start.seed)
+            policy.reset(sealed(start.rig), start.seed)
         return policy
 
     def _opened(self, session_id: str) -> _Open:
@@ -224,7 +226,7 @@ class DriverService:
             ) from None
 
     def _answer(self, opened: _Open, question: Question):
-        observation = opened.session.observation(question)
+        observation = sealed(opened.session.observation(question))
         with _answering_for(self._name):
             plan = check_plan(opened.policy.plan(observation), observation.t_us)
             if plan.stop_session:
@@ -263,7 +265,7 @@ def _answering_for(name: str) -> Iterator[None]:
         raise PlanError(f"policy {name!r}: {error}") from error
     except BaseException as error:
         log.info("policy %r failed", name, exc_info=error)
-        raise PlanError(f"policy {name!r} failed: {type(error).__name__}: {error}") from error
+        raise PlanError(f"policy {name!r} failed: {described(error)}") from error
 
 
 def _last_plan(plan: Plan, ego: EgoState) -> Plan:

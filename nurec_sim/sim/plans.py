@@ -13,9 +13,10 @@ FARTHEST_M = 10_000.0
 
 
 def check_plan(plan: object, now_us: int) -> Plan:
-    """The plan with arrays of int64 and float64, or an error that says what cannot be driven.
+    """A copy of the plan with arrays of int64 and float64, or an error that says what cannot be driven.
 
-    A plan that asks to stop the session is passed on unchecked: nobody will drive along it.
+    The poses of a plan that asks to stop the session are not checked, for nobody will drive along them; they are left
+    out where they cannot be read.
 
     Raises:
         PlanError: no Plan, wrong shapes, empty, not finite, times that do not increase, all in the past, or too short.
@@ -23,9 +24,9 @@ def check_plan(plan: object, now_us: int) -> Plan:
     if not isinstance(plan, Plan):
         raise PlanError(f"the policy must return a nurec_sim.types.Plan, got {type(plan).__name__}")
     if plan.stop_session:
-        return plan
+        return _last(plan)
     try:
-        t_raw, pose = np.asarray(plan.t_us), np.asarray(plan.pose, np.float64)
+        t_raw, pose = np.array(plan.t_us), np.array(plan.pose, np.float64)
     except (TypeError, ValueError) as error:
         raise PlanError(f"plan poses must be numbers [k,3] (x, y, yaw): {error}") from error
     if t_raw.size == 0:
@@ -49,3 +50,14 @@ def check_plan(plan: object, now_us: int) -> Plan:
     if np.abs(pose[:, :2]).max() > FARTHEST_M:
         raise PlanError(f"plan positions must lie within {FARTHEST_M:.0f} m, got {np.abs(pose[:, :2]).max():.0f} m")
     return Plan(t_us, pose)
+
+
+def _last(plan: Plan) -> Plan:
+    """A plan that asks to stop, with the poses that it has, or none."""
+    try:
+        t_us, pose = np.array(plan.t_us, np.int64), np.array(plan.pose, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        t_us, pose = np.zeros(0, np.int64), np.zeros((0, 3))
+    if t_us.ndim != 1 or pose.shape != (len(t_us), 3):
+        t_us, pose = np.zeros(0, np.int64), np.zeros((0, 3))
+    return Plan(t_us, pose, stop_session=True)

@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from nurec_sim import geometry
-from nurec_sim.errors import PlanError, ScenarioError
+from nurec_sim.errors import PlanError, PolicyError, ScenarioError
 from nurec_sim.sim.actors import Actors
 from nurec_sim.sim.control import CONTROLLERS, PlannedPath
-from nurec_sim.sim.plans import check_plan
+from nurec_sim.sim.policy_host import PLAN_TIMEOUT_S, PolicyHost, described
 from nurec_sim.sim.recorded import RecordedDrive
 from nurec_sim.sim.scenario import STATE_S, Perturbation, Scenario
 from nurec_sim.sim.sensing import SceneFacts, SensorSuite
@@ -47,14 +47,27 @@ def run_rollout(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
     on_frames: OnFrames | None = None,
+    plan_timeout_s: float = PLAN_TIMEOUT_S,
 ) -> Rollout:
     """Drive ``policy`` through a scene and keep everything that metrics need.
 
-    Whatever goes wrong inside (a policy that raises or answers a bad plan, a renderer that fails, a sensor that the rig
-    lacks, a scenario that does not fit the scene) gives a rollout of status ``failed`` with the text of the error and
-    all states so far; nothing is raised. ``progress`` hears fractions of the scenario; ``on_frames`` hears time and
-    frames by sensor name whenever sensors were rendered.
+    Whatever goes wrong inside (a policy that raises, tries to exit, hangs or answers a bad plan, a renderer that fails,
+    a sensor that the rig lacks, a scenario that does not fit the scene) gives a rollout of status ``failed`` with the
+    text of the error and all states so far; nothing is raised but by a real Ctrl-C. ``progress`` hears fractions of the
+    scenario; ``on_frames`` hears time and frames by sensor name whenever sensors were rendered.
+
+    The policy works in a thread of its own for this rollout, with ``plan_timeout_s`` for each call, unless it is a
+    ``PolicyHost``, which has its own thread and limit. It gets copies that cannot be written to.
     """
+    if not isinstance(policy, PolicyHost):
+        host = PolicyHost(lambda: policy, plan_timeout_s)
+        try:
+            return run_rollout(
+                scenario, host, sense, facts, reconstruction=reconstruction, seed=seed, progress=progress,
+                on_frames=on_frames,
+            )  # fmt: skip
+        finally:
+            host.close()
     drive = _Drive(scenario, policy, sense, facts, seed, progress or (lambda fraction: None), on_frames)
     error = ""
     try:
@@ -139,8 +152,10 @@ def _failing_as(kind: str) -> Iterator[None]:
         yield
     except _Failure:
         raise
+    except PolicyError as error:
+        raise _Failure("policy_error", str(error)) from error
     except Exception as error:
-        raise _Failure(kind, f"{type(error).__name__}: {error}") from error
+        raise _Failure(kind, described(error)) from error
 
 
 class _Drive:
@@ -189,6 +204,8 @@ class _Drive:
             suite = SensorSuite(self.policy.needs, self.scenario.sensors, self.facts)
         except ScenarioError as error:
             raise _Failure("sensor_missing", f"policy '{self.policy.name}': {error}") from None
+        except Exception as error:  # needs of other kinds than Needs says
+            raise _Failure("policy_error", f"its needs cannot be met: {described(error)}") from error
         with _failing_as("policy_error"):
             self.policy.reset(self.facts.rig, self.seed)
         self.closed_loop(suite, times, speed_factor)
@@ -237,12 +254,11 @@ class _Drive:
     def ask(self, suite: SensorSuite, t_us: int, frames: Mapping[str, SensorFrame]) -> Plan:
         """The policy's checked answer to what it sees at ``t_us``."""
         observation = self.observe(suite, t_us, frames)
-        with _failing_as("policy_error"):
-            answer = self.policy.plan(observation)
         try:
-            return check_plan(answer, t_us)
+            return self.policy.plan(observation)
         except PlanError as error:
-            raise _Failure("plan_error", str(error)) from None
+            kind = "policy_error" if isinstance(error, PolicyError) else "plan_error"
+            raise _Failure(kind, str(error)) from None
 
     def observe(self, suite: SensorSuite, t_us: int, frames: Mapping[str, SensorFrame]) -> Observation:
         """All that the policy may know at ``t_us``."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import queue
 import threading
 from collections.abc import Callable
@@ -10,6 +11,8 @@ from concurrent.futures import Future
 from typing import TypeVar
 
 T = TypeVar("T")
+
+_abandoned: list[threading.Thread] = []
 
 
 class PolicyThread:
@@ -20,7 +23,14 @@ class PolicyThread:
 
     def __init__(self, name: str) -> None:
         self._jobs: queue.SimpleQueue[tuple[Future, Callable[[], object]] | None] = queue.SimpleQueue()
-        threading.Thread(target=self._work, name=name, daemon=True).start()
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
+
+    def submit(self, function: Callable[[], T]) -> Future[T]:
+        """What ``function`` will give, or raise, whatever that is."""
+        future: Future[T] = Future()
+        self._jobs.put((future, function))
+        return future
 
     async def run(self, function: Callable[[], T], timeout_s: float) -> T:
         """What ``function`` gives; it is not begun if the await is cancelled or times out before its turn.
@@ -28,14 +38,26 @@ class PolicyThread:
         Raises:
             TimeoutError: it took longer than ``timeout_s``; if it had begun, it goes on and the next one waits for it.
         """
-        future: Future[T] = Future()
-        self._jobs.put((future, function))
         async with asyncio.timeout(timeout_s):
-            return await asyncio.wrap_future(future)
+            return await asyncio.wrap_future(self.submit(function))
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still works or waits for work."""
+        return self._thread.is_alive()
 
     def stop(self) -> None:
         """Ends the thread after what it is doing; does not wait."""
         self._jobs.put(None)
+
+    def abandon(self) -> None:
+        """Ends the thread now if it runs Python code; one that is inside of a library ends when that returns."""
+        self.stop()
+        _abandoned.append(self._thread)
+        ident = self._thread.ident
+        if ident is not None:
+            # SystemExit, because threads end by it without a message.
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), ctypes.py_object(SystemExit))
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
@@ -49,3 +71,9 @@ class PolicyThread:
             else:
                 future.set_result(result)
             del job, future, function
+
+
+def still_abandoned() -> int:
+    """How many threads were abandoned and have not ended."""
+    _abandoned[:] = [thread for thread in _abandoned if thread.is_alive()]
+    return len(_abandoned)
