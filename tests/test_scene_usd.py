@@ -1,7 +1,12 @@
 """OpenUSD's own validators and API agree with what we write: types, orders, times, poses, the sky."""
 
+import dataclasses
+import os
 import re
+import shutil
 import struct
+import subprocess
+import sys
 import zipfile
 
 import numpy as np
@@ -10,7 +15,7 @@ from pxr import Usd, UsdGeom, UsdLux, UsdSemantics, UsdValidation, UsdVol
 from scene_worlds import END_US, START_US, empty_scene, full_scene
 
 from nurec_sim import geometry
-from nurec_sim.scene import write_scene
+from nurec_sim.scene import read_scene, write_scene
 from nurec_sim.scene.sky import encode_exr, latlong_directions, latlong_exr, sample_cubemap
 from nurec_sim.types import Label
 
@@ -40,6 +45,34 @@ def test_validators_find_nothing_but_foreign_files(make, tmp_path):
     assert [f for f in findings if f[0] != "UnsupportedFileExtensionInPackage"] == []
     foreign = {re.search(r"extension '(\w+)'", text).group(1) for _, text in findings}
     assert {"yaml"} <= foreign <= {"json", "yaml", "npy", "ply", "xodr"}  # USD layers and the sky pass
+
+
+def without_road():
+    """No Gaussian is road: that field is empty."""
+    scene = full_scene()
+    return dataclasses.replace(scene, static=scene.static[scene.static.label != Label.ROAD])
+
+
+def test_a_field_of_no_gaussians_is_not_on_the_stage_but_read(tmp_path):
+    scene = without_road()
+    path = write_scene(scene, tmp_path / "a.usdz")
+    stage = Usd.Stage.Open(str(path))
+    assert [str(prim.GetPath()) for prim in stage.Traverse() if "/Static/" in str(prim.GetPath())] == [
+        "/World/Static/background"
+    ]
+    assert np.array_equal(read_scene(path).static.mean_m, scene.static.mean_m)
+
+
+@pytest.mark.parametrize("make", [full_scene, without_road])
+def test_nvidias_validator_passes(make, tmp_path):
+    """VG.035 of the package omniverse-asset-validator: https://pypi.org/project/omniverse-asset-validator."""
+    folders = os.pathsep.join([os.path.dirname(sys.executable), os.environ.get("PATH", "")])
+    program = shutil.which("omni_asset_validate", path=folders)
+    if program is None:
+        pytest.skip("omni_asset_validate (pip install omniverse-asset-validator) is not on the PATH")
+    path = write_scene(make(), tmp_path / "a.usdz")
+    done = subprocess.run([program, "--requirement", "VG.035", str(path)], capture_output=True, text=True, timeout=300)
+    assert "VG.035" not in done.stdout + done.stderr and done.returncode == 0, done.stdout + done.stderr
 
 
 def test_package_is_stored_aligned_and_dated_alike(path):
@@ -80,6 +113,7 @@ def test_static_fields(scene, stage, name, is_road):
     assert field.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 2
     radiance = field.GetRadianceSphericalHarmonicsCoefficientsAttr()
     assert radiance.GetMetadata("elementSize") == 9
+    assert UsdGeom.Primvar(radiance).GetInterpolation() == "vertex"
     coefficients = np.array(radiance.Get()).reshape(-1, 9, 3)
     assert np.allclose(0.5 + SH_C0 * coefficients[:, 0], wanted.rgb, atol=1e-6)
     assert np.array_equal(coefficients[:, 1:], wanted.sh_rest)

@@ -85,8 +85,17 @@ TWO = """
         float3[] radiance:sphericalHarmonicsCoefficients = [(0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0),
                                                             (0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0)] (
             elementSize = 4
+            interpolation = "vertex"
         )
         float3[] extent = [(-3, -3, -3), (4, 3, 3)]"""
+NONE = """
+        point3f[] positions = []
+        quatf[] orientations = []
+        float3[] scales = []
+        float[] opacities = []
+        uniform int radiance:sphericalHarmonicsDegree = 0
+        float3[] radiance:sphericalHarmonicsCoefficients = []
+        float3[] extent = [(0, 0, 0), (0, 0, 0)]"""
 BARE = b'#usda 1.0\n(\n    defaultPrim = "World"\n    upAxis = "Z"\n    metersPerUnit = 1\n)\ndef Xform "World"\n{\n}\n'
 
 USD_BREAKS = {
@@ -107,6 +116,12 @@ USD_BREAKS = {
     "coefficients of another degree": (splat_prim(TWO.replace("Degree = 1", "Degree = 2")), {"openusd splat-arrays"}),
     "no extent": (splat_prim(TWO.replace("float3[] extent", "float3[] other")), {"openusd splat-bounds"}),
     "another element size": (splat_prim(TWO.replace("Size = 4", "Size = 3")), {"openusd splat-bounds"}),
+    "harmonics that are constant": (
+        splat_prim(TWO.replace('interpolation = "vertex"', "")),
+        {"openusd vg-035"},
+    ),
+    "a flat splat": (splat_prim(TWO.replace("[(1, 1, 1), ", "[(1, 0, 1), ")), {"openusd vg-035"}),
+    "a prim without splats": (splat_prim(NONE), {"openusd vg-035"}),
     "short quaternions": (splats(quat_wxyz=lambda quat: quat / 2), {"openusd splat-arrays", "own reads"}),
     "opacities above one": (splats(opacity=lambda opacity: opacity * 9), {"openusd splat-arrays", "own reads"}),
     "infinite means": (splats(mean_m=lambda mean: mean * np.float32(np.inf)), {"openusd splat-arrays", "own reads"}),
@@ -127,7 +142,7 @@ def nothing(scene: GaussianScene) -> GaussianScene:
 
 
 POOR_SCENES = {
-    "no Gaussians": (nothing, {"own gaussians", "own intensity"}),
+    "no Gaussians": (nothing, {"openusd splats", "own gaussians", "own intensity"}),
     "no camera": (
         lambda scene: dataclasses.replace(scene, rig=Rig({}, {}), camera_times_us={}),
         {"alpasim calibrations", "carla calibrations", "own cameras"},

@@ -156,7 +156,10 @@ def _to_float32(values: Float64[np.ndarray, "*n"]) -> Float32[np.ndarray, "*n"]:
 
 
 def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray, " n"]):
-    """Adds Gaussians as one ParticleField; ``index`` tells their places in the scene. Returns the schema object."""
+    """Adds Gaussians as one ParticleField; ``index`` tells their places in the scene. Returns the schema object.
+
+    A field of none is there for our reader, but inactive: NVIDIA's asset requirement VG.035 refuses empty fields.
+    """
     from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
@@ -174,6 +177,7 @@ def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray
         Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(coefficients.reshape(-1, 3)))
     )
     radiance.SetMetadata("elementSize", terms)
+    radiance.SetMetadata("interpolation", UsdGeom.Tokens.vertex)  # not stated it is "constant"; VG.035 asks for it
     field.CreateSortingModeHintAttr("cameraDistance")
     field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent_of([gaussians.mean_m], gaussians.scale_m)))
     Usd.ColorSpaceAPI.Apply(field.GetPrim()).CreateColorSpaceNameAttr("srgb_rec709_display")
@@ -192,6 +196,8 @@ def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray
         columns.append(("rayDrop", types.FloatArray, drop))
     for name, kind, array in columns:
         primvars.CreatePrimvar(f"{NAMESPACE}:{name}", kind, UsdGeom.Tokens.vertex).Set(array)
+    if not len(gaussians):
+        field.GetPrim().SetActive(False)
     return field
 
 

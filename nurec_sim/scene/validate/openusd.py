@@ -41,6 +41,11 @@ RULES = {
         "that prim is not drawn, or wrongly",
     ),
     "splat-bounds": Rule("warning", "an extent and elementSize on each splat prim", "bounds and culling are wrong"),
+    "vg-035": Rule(
+        "warning",
+        'per splat prim: harmonics with interpolation = "vertex", one Gaussian or more, scales above 0',
+        "NVIDIA's asset validator refuses it (requirement VG.035)",
+    ),
     "validators": Rule("error", "no error of UsdValidation", "strict tools refuse the package"),
     "advice": Rule("warning", "no warning of UsdValidation", "some tools may behave otherwise"),
 }

@@ -87,7 +87,7 @@ def _composed_faults(path: Path) -> Iterator[Fault]:
     if not prims:
         yield "splats", "the stage has no splat prim"
     faults = [fault for prim in prims for fault in _splat_faults(prim)]
-    for rule in ("splat-arrays", "splat-bounds"):
+    for rule in ("splat-arrays", "splat-bounds", "vg-035"):
         texts = [text for name, text in faults if name == rule]
         if texts:
             yield rule, texts[0] + (f" (and {len(texts) - 1} more)" if len(texts) > 1 else "")
@@ -96,7 +96,7 @@ def _composed_faults(path: Path) -> Iterator[Fault]:
 
 def _splat_faults(prim) -> Iterator[Fault]:
     """(rule, what) of one prim; arrays with time samples are looked at where they start."""
-    from pxr import Usd
+    from pxr import Usd, UsdGeom
 
     path = prim.GetPath()
 
@@ -119,6 +119,7 @@ def _splat_faults(prim) -> Iterator[Fault]:
         yield "splat-arrays", f"{path} has {told}, {len(coefficients)} coefficients of degree {degree}"
         return
     if count == 0:
+        yield "vg-035", f"{path} has no Gaussians; leave the prim out or make it inactive"
         return
     finite = {**arrays, "coefficients": coefficients}
     wild = [name for name, array in finite.items() if not np.isfinite(array).all()]
@@ -138,6 +139,12 @@ def _splat_faults(prim) -> Iterator[Fault]:
     radiance = radiance if radiance and radiance.HasValue() else prim.GetAttribute(f"{radiance.GetName()}h")
     if terms > 1 and radiance.GetMetadata("elementSize") != terms:
         yield "splat-bounds", f"{path}: elementSize is {radiance.GetMetadata('elementSize')}, not {terms}"
+    interpolation = UsdGeom.Primvar(radiance).GetInterpolation()
+    if interpolation != UsdGeom.Tokens.vertex:
+        text = f'{path}: the harmonics have interpolation = "{interpolation}"'
+        yield "vg-035", f"{text}; `nurec-sim import` writes the archive anew with the right one"
+    elif not (arrays["scales"] > 0).all():
+        yield "vg-035", f"{path}: a scale is {float(arrays['scales'].min()):.3g}"
 
 
 def _validator_faults(stage) -> Iterator[Fault]:
