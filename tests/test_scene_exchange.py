@@ -13,10 +13,11 @@ from nurec_sim import cli, geometry
 from nurec_sim.errors import ArchiveError
 from nurec_sim.render.layers import view_colour
 from nurec_sim.render.renderer import Renderer
-from nurec_sim.scene import export_scene, import_scene, read_ply, read_scene, write_scene
-from nurec_sim.scene.exchange import UP_AXES
+from nurec_sim.scene import export_scene, import_scene, read_ply, read_scene, scene_hash, write_scene
 from nurec_sim.scene.harmonics import rotate_harmonics
 from nurec_sim.scene.sky_sidecar import SkySidecar, write_sky
+from nurec_sim.scene.transform import UP_AXES
+from nurec_sim.scene.usd_layers import static_layer
 from nurec_sim.types import Label
 
 
@@ -55,7 +56,8 @@ def test_moving_gaussians_are_written_as_they_are_at_an_instant(tmp_path, after_
     scene = dataclasses.replace(street(sh=0), span_us=(900_000, 2_000_000))
     t_us = worlds.START_US + after_us
     exported = export_scene(scene, tmp_path / "a.ply", at_us=t_us)
-    back = import_scene(tmp_path / "a.ply", like=scene)
+    back = import_scene(tmp_path / "a.ply", like=dataclasses.replace(scene, span_us=(1_000_000, 2_000_000)))
+    back = dataclasses.replace(back, span_us=scene.span_us)
     assert 2000 < exported.written < 2200 and exported.moving_left_out == 0
     assert worlds.psnr_db(view(back, t_us), view(scene, t_us)) > 50
     bare = dataclasses.replace(scene, dynamic=worlds.scene().dynamic)
@@ -149,6 +151,53 @@ def test_surroundings_come_from_a_scene_and_skies_from_the_nearest_file(tmp_path
     write_sky(SkySidecar(textured_sky(2)), tmp_path / "other.npz")
     assert import_scene(path, like=like).sky.shape == (6, 4, 4, 3)
     assert import_scene(path, like=like, sky=tmp_path / "other.npz").sky.shape == (6, 2, 2, 3)
+
+
+def test_a_layer_takes_sky_and_colours_from_a_scene(tmp_path):
+    """Of OpenUSD files too: what SCENE has and the file has not."""
+    scene = dataclasses.replace(street(sh=0), dynamic=worlds.scene().dynamic)
+    (tmp_path / "splats.usdc").write_bytes(static_layer(scene.static))
+    back = import_scene(tmp_path / "splats.usdc", like=scene)
+    for yaw in (0.0, 2.0):
+        assert worlds.psnr_db(view(back, yaw=yaw), view(scene, yaw=yaw)) > 50
+    assert back.sky is scene.sky and back.tracks is scene.tracks and not any("sky" in t for t in unknown_of(back))
+    assert back.provenance["like"] == "test"
+    alone = import_scene(tmp_path / "splats.usdc")
+    assert not alone.sky.any() and any("no sky" in text for text in unknown_of(alone))
+    write_sky(SkySidecar(textured_sky(4)), tmp_path / "mine.npz")
+    mine = import_scene(tmp_path / "splats.usdc", like=scene, sky=tmp_path / "mine.npz")
+    assert mine.sky.shape == (6, 4, 4, 3) and mine.provenance["sky_file"] == "mine.npz" and not mine.isp
+    assert not any(
+        "sky" in text for text in unknown_of(import_scene(tmp_path / "splats.usdc", sky=tmp_path / "mine.npz"))
+    )
+
+
+def unknown_of(scene):
+    return scene.provenance["unknown"]
+
+
+def test_a_sky_file_without_corrections_leaves_those_of_the_scene(tmp_path):
+    scene = street(sh=0)
+    export_scene(scene, tmp_path / "a.ply")
+    assert import_scene(
+        tmp_path / "a.ply", like=dataclasses.replace(scene, isp={"other": np.eye(3, 4)})
+    ).isp.keys() == {"front"}
+    np.savez(tmp_path / "a.sky.npz", format_version=1, sky_cubemap=np.zeros((6, 2, 2, 3), np.float16))
+    back = import_scene(tmp_path / "a.ply", like=scene)
+    assert back.isp is scene.isp and back.sky.shape == (6, 2, 2, 3)
+
+
+def test_an_archive_of_ours_stays_what_it_is(tmp_path):
+    scene = street()
+    write_scene(scene, tmp_path / "a.usdz")
+    back = import_scene(tmp_path / "a.usdz")
+    assert scene_hash(back) == scene_hash(read_scene(tmp_path / "a.usdz"))
+    like = scene_worlds.full_scene()
+    back = import_scene(tmp_path / "a.usdz", like=like)
+    assert back.road_map is like.road_map and list(back.rig.cameras) == ["front"]
+    assert np.array_equal(back.sky, scene.sky) and len(back.dynamic) == 200
+    with pytest.raises(ArchiveError, match="has z up; got 'y'"):
+        import_scene(tmp_path / "a.usdz", up="y")
 
 
 # ---------------------------------------------------------------------------------------------------- command line

@@ -3,10 +3,10 @@
 import foreign_files as made
 import numpy as np
 import pytest
+import scene_worlds
 from test_scene_foreign import AT_US, IDS, archive, arrays, picture, psnr, truth
 
 from nurec_sim import cli
-from nurec_sim.errors import ArchiveError
 from nurec_sim.scene import import_scene, read_scene
 from nurec_sim.scene_store import SceneStore
 
@@ -43,8 +43,17 @@ def test_surroundings_for_files_without(nurec, tmp_path):
     (tmp_path / "garden.nurec").write_bytes(made.volume(made.nurec_arrays({"gaussians": world.static[:50]})))
     scene = import_scene(tmp_path / "garden.nurec", like=world)
     assert scene.rig is world.rig and scene.tracks == world.tracks and len(scene.static) == 50
-    with pytest.raises(ArchiveError, match="has tracks of its own"):
-        import_scene(nurec, like=world)
+
+
+def test_what_a_file_brings_stays_its_own(nurec):
+    world = read_scene(nurec)
+    like = scene_worlds.full_scene()
+    scene = import_scene(nurec, like=like)
+    assert [track.id for track in scene.tracks] == [track.id for track in world.tracks] != [t.id for t in like.tracks]
+    assert list(scene.rig.cameras) == list(world.rig.cameras) and scene.span_us == world.span_us
+    assert np.array_equal(scene.sky, world.sky) and scene.road_map is like.road_map is not None
+    assert "no road map is read" in world.provenance["unknown"] and world.provenance["unknown"][1:]
+    assert "no road map is read" not in scene.provenance["unknown"]
 
 
 def test_the_server_offers_them(nurec, tmp_path):

@@ -11,6 +11,8 @@ from nurec_sim.cli.console import OnePath, app, err, out, print_table, progress
 from nurec_sim.cli.scenes import load_scene
 from nurec_sim.errors import NurecSimError
 
+UpAxis = Literal["z", "-z", "y", "-y", "x", "-x"]
+
 
 @app.command
 def export(
@@ -57,7 +59,7 @@ def import_(
     out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     sky: Path | None = None,
     like: Path | None = None,
-    up: Literal["z", "-z", "y", "-y", "x", "-x"] = "z",
+    up: UpAxis | None = None,
     overwrite: bool = False,
 ) -> None:
     """Make a scene archive (.usdz) from a file of another program.
@@ -65,9 +67,9 @@ def import_(
     A 3DGS PLY: ours, the Instant NuRec release's, or any trained one. A NuRec archive (.usdz), or its volume.nurec or
     checkpoint.ckpt alone. OpenUSD particle fields (.usdz, .usda, .usdc, .usd).
 
-    What a file does not know, sensors, path, times, boxes or map, comes from --like; without it the car stands at the
-    origin for one second with one camera that looks along x. What is not known or not read is listed below the table.
-    A PLY's lengths are taken for metres.
+    What a file does not know, sensors with path and times, boxes, map, sky or colour corrections, comes from --like;
+    without it the car stands at the origin for one second with one camera that looks along x, under a black sky. What
+    is not known or not read is listed below the table. A PLY's lengths are taken for metres.
 
     Ours again: nurec-sim import demo.ply --like scenarios/demo_clip.zip
 
@@ -77,7 +79,7 @@ def import_(
         file: the file (docs/exchange.md says what a PLY must have, docs/foreign_scenes.md what is read of others).
         out_path: the archive to write; the file's name with .usdz in the current folder if not given.
         sky: a .sky.npz file; X.sky.npz beside X.ply if not given and it is there.
-        like: a scene archive or a clip of the same place.
+        like: a scene archive or a clip of the same place; a clip has no sky and no colour corrections.
         up: which axis of a PLY points up; -y for most trained files, y for those made for OpenGL.
         overwrite: replace an archive that is there.
     """
@@ -94,9 +96,9 @@ def import_(
         world = scene.import_scene(file, sky=sky, like=known, up=up)
     with err.status(f"writing {target.name}"):
         scene.write_scene(world, target, overwrite=overwrite)
-    dropped = world.provenance["dropped"]
+    dropped = world.provenance.get("dropped")
     rows = [("dropped: not finite, or without extent", f"{dropped:,}")] if dropped else []
     print_table(f"scene {world.id}", [*scene.summary(world), *rows])
-    for text in world.provenance["unknown"]:
+    for text in world.provenance.get("unknown", ()):
         out.print(f"not known: {text}", markup=False)
     out.print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)

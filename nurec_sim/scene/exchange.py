@@ -3,42 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
-from nurec_sim.scene.ply import Progress, read_ply, write_ply
+from nurec_sim.scene.archive import is_foreign, read_scene
+from nurec_sim.scene.foreign import read_foreign
+from nurec_sim.scene.ply import Progress, write_ply
 from nurec_sim.scene.sky_sidecar import SkySidecar, read_sky, sky_paths, write_sky
+from nurec_sim.scene.surroundings import colours_in, first_colours, surroundings_of, taken_from
 from nurec_sim.scene.transform import joined, transformed
-from nurec_sim.types import (
-    CameraModel,
-    Clip,
-    DynamicGaussians,
-    Gaussians,
-    GaussianScene,
-    Label,
-    Pinhole,
-    Rig,
-    Trajectory,
-)
-
-UP_AXES: Mapping[str, tuple[tuple[int, int, int], ...]] = {
-    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
-    "y": ((0, 0, -1), (-1, 0, 0), (0, 1, 0)),
-    "-y": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
-    "x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
-    "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
-}
-"""world_from_file by the axis of the file that points up. The world's x is what such files have ahead: +z where y
-points down (COLMAP, most trained 3DGS files), -z where y points up (OpenGL)."""
-DEFAULT_SPAN_US = (1_000_000, 2_000_000)
-CAMERA_HEIGHT_M = 1.5
+from nurec_sim.types import Clip, Gaussians, GaussianScene
 
 
 @dataclass(frozen=True)
@@ -90,85 +67,32 @@ def export_scene(
 
 
 def import_scene(
-    path: Path | str, *, sky: Path | str | None = None, like: GaussianScene | Clip | None = None, up: str = "z"
+    path: Path | str, *, sky: Path | str | None = None, like: GaussianScene | Clip | None = None, up: str | None = None
 ) -> GaussianScene:
     """A scene from a file of another program; ``provenance["unknown"]`` says what could not be known.
 
     Args:
-        path: a PLY, whose Gaussians become the static layer, its stem the scene's id; or any file that
-            ``foreign.read_foreign`` reads.
+        path: a file that ``foreign.read_foreign`` reads; an archive of ours stays what it is.
         sky: a sky file with colour corrections; ``X.sky.npz`` beside ``X.ply`` is taken if None and it is there.
-        like: a scene or a log in the same world: its rig, path, span, tracks and map are taken, and of a scene also
-            sky and colour correction where no sky file gives them. Else the car stands at the origin for one second,
+        like: a scene or a log in the same world, for what the file lacks: sensors with path and times, tracks, the map,
+            and, from a scene, the sky and the colour correction. Else the car stands at the origin for one second,
             with one camera, 1.5 m up, that looks along x, under a black sky.
-        up: axis of the PLY that points up, one of ``UP_AXES``; the file is turned so that it is z. Other files say it
-            themselves.
+        up: axis of a PLY or SPZ file that points up, one of ``UP_AXES``; the file is turned so that it is z. z for a
+            PLY and y for SPZ if None. Other files say it themselves.
 
     Raises:
         ArchiveError: a file cannot be read, or ``up`` is no axis.
     """
     path = Path(path)
-    if path.suffix.lower() != ".ply":
-        return _import_other(path, sky, like, up)
-    if up not in UP_AXES:
-        raise ArchiveError(f"up must be one of {list(UP_AXES)}, got {up!r}")
-    world_from_file = np.array(UP_AXES[up], np.float64)
-    gaussians, dropped = read_ply(path)
-    if up != "z":
-        gaussians = transformed(gaussians, geometry.pose(world_from_file, np.zeros(3)))
-    unknown = ["no moving Gaussians: a PLY holds one instant", "no LiDAR intensity: a PLY holds none"]
-    if not (gaussians.label == Label.ROAD).any():
-        unknown.append("no road: no vertex has a road_mask")
-    surroundings = default_surroundings() if like is None else _surroundings(like)
-    if like is None:
-        unknown.append(
-            "no sensors, path, times, tracks and map: the car stands at the origin, one camera looks along x"
-        )
-    sky = sky or next((file for file in sky_paths(path)[:1] if file.exists()), None)
-    if sky is not None:
-        sidecar = read_sky(sky, world_from_file)
-    elif isinstance(like, GaussianScene):
-        sidecar = SkySidecar(like.sky, isp=like.isp)
-    else:
-        sidecar = SkySidecar(np.zeros((6, 1, 1, 3), np.float32))
-        unknown.append("no sky: it is black")
-    provenance = {
-        "method": "import",
-        "file": path.name,
-        "sky_file": None if sky is None else Path(sky).name,
-        "like": None if like is None else like.id,
-        "up": up,
-        "dropped": dropped,
-        "unknown": unknown,
-    }
-    return GaussianScene(
-        id=path.stem,
-        static=gaussians,
-        dynamic=DynamicGaussians.empty(),
-        sky=sidecar.sky,
-        isp=sidecar.isp,
-        provenance=provenance,
-        **surroundings,
-    )
-
-
-def _import_other(path: Path, sky: Path | str | None, like: GaussianScene | Clip | None, up: str) -> GaussianScene:
-    """A scene from a file that says itself which way is up, and may know sensors, path and sky."""
-    from nurec_sim.scene.foreign import read_foreign
-
-    if up != "z":
-        raise ArchiveError(f"{path}: only for PLY files can another axis than z be given as up; got {up!r}")
-    scene = read_foreign(path)
-    changes: dict[str, Any] = {}
-    if sky is not None:
-        sidecar = read_sky(sky)
-        changes |= {"sky": sidecar.sky, "isp": dict(scene.isp) | dict(sidecar.isp)}
-    if like is not None and scene.tracks:
-        raise ArchiveError(f"{path} has tracks of its own; like is for files without")
-    if like is not None:
-        changes |= _surroundings(like)
-    used = {"sky_file": None if sky is None else Path(sky).name, "like": None if like is None else like.id}
-    return dataclasses.replace(scene, provenance=dict(scene.provenance) | used, **changes)
+    if path.suffix.lower() != ".usdz" or not path.is_file() or is_foreign(path):
+        return read_foreign(path, sky=sky, like=like, up=up)
+    if up not in (None, "z"):
+        raise ArchiveError(f"{path}: an archive of nurec_sim has z up; got {up!r}")
+    scene = read_scene(path)
+    cubemap, isp = first_colours([colours_in(None if sky is None else read_sky(sky)), (scene.sky, scene.isp)], [])
+    road_map = scene.road_map or surroundings_of(like)["road_map"]
+    provenance = dict(scene.provenance) | taken_from(sky, like)
+    return dataclasses.replace(scene, sky=cubemap, isp=isp, road_map=road_map, provenance=provenance)
 
 
 def _with_moving(scene: GaussianScene, at_us: int) -> Gaussians:
@@ -186,29 +110,3 @@ def _with_moving(scene: GaussianScene, at_us: int) -> Gaussians:
         if path.covers(at_us):
             parts.append(transformed(moving[in_box & (owner == index)], path.at(at_us)))
     return joined(parts)
-
-
-def default_surroundings() -> dict[str, Any]:
-    """Everything of a scene beside Gaussians, sky and colours, where nothing is known: a car that stands at the origin.
-
-    It stands there for ``DEFAULT_SPAN_US``, with one camera, ``CAMERA_HEIGHT_M`` up, that looks along x.
-    """
-    ahead = geometry.pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.0, 0, CAMERA_HEIGHT_M]))
-    camera = CameraModel("camera", 1280, 720, Pinhole(640.0, 640.0, 640.0, 360.0), ahead)
-    start_us = DEFAULT_SPAN_US[0]
-    return {
-        "rig": Rig({camera.id: camera}, {}),
-        "ego": Trajectory(np.array([start_us]), np.eye(4)[None]),
-        "tracks": [],
-        "road_map": None,
-        "span_us": DEFAULT_SPAN_US,
-        "camera_times_us": {camera.id: np.array([[start_us, start_us]])},
-    }
-
-
-def _surroundings(like: GaussianScene | Clip) -> dict[str, Any]:
-    """The same, taken from a scene or a log of the same place."""
-    known = {name: getattr(like, name) for name in ("rig", "ego", "tracks", "road_map", "span_us")}
-    if isinstance(like, GaussianScene):
-        return known | {"camera_times_us": like.camera_times_us}
-    return known | {"camera_times_us": {name: like.camera_times_us(name) for name in like.rig.cameras}}

@@ -10,7 +10,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -40,13 +40,13 @@ class SkySidecar:
     Attributes:
         sky: colours, faces as in ``geometry.cubemap_directions``; not clamped.
         seen: how surely each texel was seen, 0..1; None if not known.
-        isp: per camera id, as in ``GaussianScene.isp``.
+        isp: per camera id, as in ``GaussianScene.isp``; None if the file does not say.
         source: where the sky comes from, free text.
     """
 
     sky: Float32[np.ndarray, "6 s s 3"]
     seen: Float32[np.ndarray, "6 s s"] | None = None
-    isp: Mapping[str, Float64[np.ndarray, "3 4"]] = field(default_factory=dict)
+    isp: Mapping[str, Float64[np.ndarray, "3 4"]] | None = None
     source: str = ""
 
 
@@ -55,7 +55,13 @@ def sky_paths(ply: Path) -> tuple[Path, Path]:
     return ply.with_name(f"{ply.stem}.sky.npz"), ply.with_name(f"{ply.stem}.sky.png")
 
 
-def write_sky(sidecar: SkySidecar, npz: Path, png: Path | None = None, cameras: Sequence[str] = ()) -> None:
+def write_sky(
+    sidecar: SkySidecar,
+    npz: Path,
+    png: Path | None = None,
+    cameras: Sequence[str] = (),
+    world_from_file: Float64[np.ndarray, "3 3"] | None = None,
+) -> None:
     """Writes the sky file and, if asked for, its faces as a picture; files that are there are replaced.
 
     Args:
@@ -63,20 +69,21 @@ def write_sky(sidecar: SkySidecar, npz: Path, png: Path | None = None, cameras: 
         npz: the sky file.
         png: the picture: +X -X -Y above +Y +Z -Z, 8 bits, clamped to 0..1.
         cameras: the order that ``affine_sensor_indices`` counts in; that of ``sidecar.isp`` if not given.
+        world_from_file: a rotation by multiples of 90 degrees from the file's axes to the world; none if None.
     """
-    size = sidecar.sky.shape[1]
-    ours = our_texels(size)
+    size, isp = sidecar.sky.shape[1], sidecar.isp or {}
+    ours = our_texels(size, world_from_file)
     sky = np.clip(sidecar.sky.reshape(-1, 3)[ours], -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16)
     seen = np.ones(ours.shape) if sidecar.seen is None else sidecar.seen.reshape(-1)[ours]
-    order = {name: k for k, name in enumerate(dict.fromkeys([*cameras, *sidecar.isp]))}
-    matrices = [np.asarray(matrix, np.float32) for matrix in sidecar.isp.values()]
+    order = {name: k for k, name in enumerate(dict.fromkeys([*cameras, *isp]))}
+    matrices = [np.asarray(matrix, np.float32) for matrix in isp.values()]
     arrays = {
         "format_version": np.array(FORMAT_VERSION, np.int64),
         "sky_cubemap": sky,
         "sky_cubemap_mask": seen[..., None].astype(np.float16),
         "affine_matrix": np.stack(matrices) if matrices else np.zeros((0, 3, 4), np.float32),
-        "affine_sensor_indices": np.array([order[name] for name in sidecar.isp], np.int64),
-        "affine_sensor_ids": np.array(list(sidecar.isp), np.str_),
+        "affine_sensor_indices": np.array([order[name] for name in isp], np.int64),
+        "affine_sensor_ids": np.array(list(isp), np.str_),
         "face_order": np.array(FACE_ORDER),
         "face_axes": np.array(FACE_AXES),
         "uv_convention": np.array(UV_CONVENTION),
@@ -175,9 +182,9 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _isp(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Float64[np.ndarray, "3 4"]]:
+def _isp(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Float64[np.ndarray, "3 4"]] | None:
     if "affine_matrix" not in arrays or "affine_sensor_ids" not in arrays:
-        return {}
+        return None
     ids = [str(name) for name in np.atleast_1d(arrays["affine_sensor_ids"])]
     _check_shape(path, "affine_matrix", arrays["affine_matrix"], (len(ids), 3, 4))
     if len(set(ids)) != len(ids):

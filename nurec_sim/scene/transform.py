@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,6 +11,17 @@ from jaxtyping import Float64
 from nurec_sim import geometry
 from nurec_sim.scene.harmonics import rotate_harmonics
 from nurec_sim.types import Gaussians
+
+UP_AXES: Mapping[str, tuple[tuple[int, int, int], ...]] = {
+    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "y": ((0, 0, -1), (-1, 0, 0), (0, 1, 0)),
+    "-y": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
+    "x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+}
+"""world_from_file by the axis of the file that points up. The world's x is what such files have ahead: +z where y
+points down (COLMAP, most trained 3DGS files), -z where y points up (OpenGL)."""
 
 
 def transformed(gaussians: Gaussians, a_from_b: Float64[np.ndarray, "4 4"]) -> Gaussians:

@@ -19,11 +19,10 @@ import nurec_sim
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene import codec
 from nurec_sim.scene.columns import Columns
-from nurec_sim.scene.exchange import UP_AXES
 from nurec_sim.scene.foreign.found import Found
 from nurec_sim.scene.harmonics import SH_C0
 from nurec_sim.scene.npy import array_from_npy
-from nurec_sim.scene.transform import transformed
+from nurec_sim.scene.transform import UP_AXES, transformed
 from nurec_sim.types import Label
 
 MAX_SECONDS = 600

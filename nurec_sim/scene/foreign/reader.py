@@ -6,6 +6,7 @@ Of an archive with several kinds of Gaussians the first that can be read is take
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +18,6 @@ from jaxtyping import Float64
 from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene.checks import check_scene
-from nurec_sim.scene.exchange import default_surroundings, import_scene
 from nurec_sim.scene.foreign.found import Found
 from nurec_sim.scene.foreign.nurec_checkpoint import read_checkpoint
 from nurec_sim.scene.foreign.nurec_layers import found_in
@@ -27,36 +27,61 @@ from nurec_sim.scene.foreign.rig_sidecars import DATA_INFO, MAP, RIG, TRACKS, Su
 from nurec_sim.scene.foreign.usd_inside import may_hold
 from nurec_sim.scene.ply import read_ply
 from nurec_sim.scene.sky import sample_cubemap
-from nurec_sim.scene.transform import joined, transformed
+from nurec_sim.scene.sky_sidecar import SkySidecar, read_sky, sky_paths
+from nurec_sim.scene.surroundings import colours_in, colours_of, first_colours, surroundings_of, taken_from
+from nurec_sim.scene.transform import UP_AXES, joined, transformed
 from nurec_sim.scene.usd_layers import LAYER_SUFFIXES
 from nurec_sim.scene.zip_package import Package
-from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Track
+from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene, Label, Track
 
 FIELDS = "particle fields"
+SPLAT_FILES: dict[str, tuple[Callable[[Path], tuple[Gaussians, int]], str]] = {".ply": (read_ply, "z")}
+"""Files of Gaussians and nothing else: how they are read, and the axis that points up unless somebody says another."""
 _MESHES = ("mesh.ply", "mesh_ground.ply")
 
 
-def read_foreign(path: Path | str) -> GaussianScene:
+def read_foreign(
+    path: Path | str,
+    *,
+    sky: Path | str | None = None,
+    like: GaussianScene | Clip | None = None,
+    up: str | None = None,
+) -> GaussianScene:
     """Reads a scene that another program wrote.
 
     Args:
         path: a ``.usdz`` of NuRec or with particle fields, a USD layer, a ``.ply``, ``.nurec`` or ``.ckpt`` file.
+        sky: a sky file, for sky and colour corrections instead of those of the file; ``X.sky.npz`` beside ``X.ply`` is
+            taken if None and it is there.
+        like: a scene or a log in the same world, for what the file lacks.
+        up: axis of the file that points up, one of ``UP_AXES``, for files that do not say it; z for a PLY if None.
 
     Returns:
         A sound scene; ``provenance["unknown"]`` lists what the file holds but is not read, and what it lacks.
 
     Raises:
-        ArchiveError: not such a file, damaged, unsafe, or without Gaussians.
+        ArchiveError: not such a file, damaged, unsafe, or without Gaussians; or ``up`` is no axis, or not needed.
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix == ".ply":
-        return import_scene(path)
+    if up is not None and up not in UP_AXES:
+        raise ArchiveError(f"up must be one of {list(UP_AXES)}, got {up!r}")
+    if up not in (None, "z") and suffix not in SPLAT_FILES:
+        raise ArchiveError(f"{path}: only for {' and '.join(SPLAT_FILES)} can another axis than z be up; got {up!r}")
     if not path.is_file():
         raise ArchiveError(f"{path}: cannot be opened ({'Is a directory' if path.is_dir() else 'No such file'})")
-    around = Surroundings(unknown=["no sensors, path, times and tracks: the file holds Gaussians only"])
+    around = Surroundings(missing=["no sensors, path, times and tracks: the file holds Gaussians only"])
+    sidecar = None
     try:
-        if suffix in LAYER_SUFFIXES:
+        if suffix in SPLAT_FILES:
+            read, usual_up = SPLAT_FILES[suffix]
+            up = up or usual_up
+            world_from_file = np.array(UP_AXES[up], np.float64)
+            around.nre_from_world = geometry.pose(world_from_file.T, np.zeros(3))
+            sky = sky or next((file for file in sky_paths(path)[:1] if file.exists()), None)
+            sidecar = None if sky is None else read_sky(sky, world_from_file)
+            found, source = _splats(read, path), path.name
+        elif suffix in LAYER_SUFFIXES:
             found, source = read_particle_fields(path), path.name
         elif suffix == ".nurec":
             found, source = found_in(read_volume(path.read_bytes(), str(path)), str(path)), path.name
@@ -68,11 +93,15 @@ def read_foreign(path: Path | str) -> GaussianScene:
                 around = read_surroundings(package)
                 found, source = _find(package, around)
         else:
-            allowed = (".usdz", *LAYER_SUFFIXES, ".ply", ".nurec", ".ckpt")
+            allowed = (".usdz", *LAYER_SUFFIXES, *SPLAT_FILES, ".nurec", ".ckpt")
             raise ArchiveError(f"{path}: no scene; names of scenes end in {', '.join(allowed)}")
         if not found.count:
             raise ArchiveError(f"{path}: {source} holds no Gaussians. {' '.join(found.unknown)}")
-        scene = _assembled(path, found, around, source)
+        if sky is not None and sidecar is None:
+            sidecar = read_sky(sky)
+        scene = _assembled(path, found, around, source, like, sidecar)
+        taken = taken_from(sky, like) | ({} if up is None else {"up": up})
+        scene = dataclasses.replace(scene, provenance=dict(scene.provenance) | taken)
         check_scene(scene)
     except OSError as error:
         raise ArchiveError(f"{path}: cannot be read ({error.strerror or error})") from error
@@ -82,6 +111,15 @@ def read_foreign(path: Path | str) -> GaussianScene:
 
 
 # ------------------------------------------------------------------------------------------------- where Gaussians are
+
+
+def _splats(read: Callable[[Path], tuple[Gaussians, int]], path: Path) -> Found:
+    """The Gaussians of a file that holds nothing else."""
+    gaussians, dropped = read(path)
+    unknown = ["no moving Gaussians: the file holds one instant", "no LiDAR intensity: the file holds none"]
+    if not (gaussians.label == Label.ROAD).any():
+        unknown.append("no road: no Gaussian has a road_mask (off-road cannot be judged from the scene)")
+    return Found(static=[gaussians], dropped=dropped, unknown=unknown)
 
 
 def _find(package: Package, around: Surroundings) -> tuple[Found, str]:
@@ -170,40 +208,52 @@ def _name_the_rest(package: Package, found: Found, source: str) -> None:
 # ---------------------------------------------------------------------------------------------------------- the scene
 
 
-def _assembled(path: Path, found: Found, around: Surroundings, source: str) -> GaussianScene:
-    unknown = [*around.unknown, *found.unknown]
-    known = default_surroundings()
+def _assembled(
+    path: Path,
+    found: Found,
+    around: Surroundings,
+    source: str,
+    like: GaussianScene | Clip | None,
+    sidecar: SkySidecar | None,
+) -> GaussianScene:
+    unknown = [*(around.missing if like is None else ()), *around.unknown, *found.unknown]
+    known = surroundings_of(like)
     if around.ego is not None and around.rig is not None:
-        known |= {"ego": around.ego, "rig": around.rig, "tracks": around.tracks}
+        known |= {"ego": around.ego, "rig": around.rig, "span_us": around.span_us}
+        known["tracks"] = around.tracks or known["tracks"]
         known["camera_times_us"] = {name: times for name, times in around.camera_times_us.items() if len(times)}
-        known["span_us"] = around.span_us
-    else:
+    elif like is None:
         unknown.append("the car stands at the origin for one second, one camera looks along x")
-    if around.road_map is None:
+    known["road_map"] = around.road_map or known["road_map"]
+    if known["road_map"] is None:
         unknown.append("no road map is read")
     world_from_nre = geometry.inverse(around.nre_from_world)
     static = joined([_moved(part, world_from_nre) for part in found.static])
     dynamic = _dynamic(found, known["tracks"], known["span_us"][0], unknown)
-    sky = found.sky
-    if sky is None:
-        unknown.append("no sky: it is black")
-    cameras = [name for name in around.camera_order if name in known["rig"].cameras]
-    if found.exposure and len(found.exposure) != len(around.camera_order):
-        unknown.append(f"colour correction: exposure of {len(found.exposure)} cameras, of {len(around.camera_order)}")
-        cameras = []
-    gains = dict(zip(around.camera_order, found.exposure, strict=False))
+    own_sky = None if found.sky is None else _turned_sky(found.sky, world_from_nre[:3, :3])
+    own_isp = _exposure(found, around, unknown)
+    sky, isp = first_colours([colours_in(sidecar), (own_sky, own_isp or None), colours_of(like)], unknown)
     provenance = {"method": "foreign", "file": path.name, "source": source, "dropped": found.dropped,
                   "unknown": unknown}  # fmt: skip
     return GaussianScene(
         id=around.id or path.stem,
         static=static,
         dynamic=dynamic,
-        sky=np.zeros((6, 1, 1, 3), np.float32) if sky is None else _turned_sky(sky, world_from_nre[:3, :3]),
-        isp={name: np.eye(3, 4) * gains[name] for name in cameras if name in gains},
+        sky=sky,
+        isp=isp,
         provenance=provenance,
-        road_map=around.road_map,
-        **{name: value for name, value in known.items() if name != "road_map"},
+        **known,
     )
+
+
+def _exposure(found: Found, around: Surroundings, unknown: list[str]) -> dict[str, Float64[np.ndarray, "3 4"]]:
+    """Gains on the colours of the cameras that are read."""
+    if found.exposure and len(found.exposure) != len(around.camera_order):
+        unknown.append(f"colour correction: exposure of {len(found.exposure)} cameras, of {len(around.camera_order)}")
+        return {}
+    gains = zip(around.camera_order, found.exposure, strict=False)
+    known = () if around.rig is None else around.rig.cameras
+    return {name: np.eye(3, 4) * gain for name, gain in gains if name in known}
 
 
 def _dynamic(found: Found, tracks: list[Track], t_us: int, unknown: list[str]) -> DynamicGaussians:

@@ -32,7 +32,8 @@ RIG, TRACKS, DATA_INFO, MAP = "rig_trajectories.json", "sequence_tracks.json", "
 class Surroundings:
     """What the JSON files of an archive say; None where they say nothing.
 
-    ``camera_order`` are the ids of all cameras, also of those that could not be read, in the order of the file.
+    ``camera_order`` are the ids of all cameras, also of those that could not be read, in the order of the file;
+    ``missing`` names what another scene of the same place may stand for.
     """
 
     id: str | None = None
@@ -45,6 +46,7 @@ class Surroundings:
     nre_from_world: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     camera_order: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
 
 
 def read_surroundings(package: Package) -> Surroundings:
@@ -59,12 +61,12 @@ def read_surroundings(package: Package) -> Surroundings:
         _add_rig(around, content, f"{package.path}: {RIG}")
         _add_map(around, package, content.get("T_world_base"))
     else:
-        around.unknown.append(f"no sensors and no path: the archive has no {RIG}")
+        around.missing.append(f"no sensors and no path: the archive has no {RIG}")
     if TRACKS in package.names:
         around.tracks, faults = tracks_from(_load(package, TRACKS), f"{package.path}: {TRACKS}")
         around.unknown += faults
     else:
-        around.unknown.append(f"no tracks: the archive has no {TRACKS}")
+        around.missing.append(f"no tracks: the archive has no {TRACKS}")
     if around.tracks and not np.array_equal(around.nre_from_world, np.eye(4)):
         around.unknown.append(f"{TRACKS} does not say its frame; taken for the world's")
     if DATA_INFO in package.names:
