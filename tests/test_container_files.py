@@ -43,7 +43,9 @@ def test_what_is_copied_is_here_and_is_all_that_the_package_needs(name):
 @pytest.mark.parametrize("name", FILES)
 def test_what_is_installed_is_this_package_in_known_versions(name):
     (install,) = [line for line in of_kind(name, "RUN") if "pip install" in line]
-    assert "--constraint constraints.txt" in install and not re.search(r"https?://", install)
+    assert "--constraint constraints.txt" in install and not re.search(r"https?://|index|find-links", install)
+    assert of_kind(name, "ARG") == ["BASE=python:3.12-slim-bookworm", "TORCH=torch"] and '"${TORCH}"' in install
+    assert "INDEX" not in (REPO / name).read_text(), "no package may come from a second index"
     (target,) = re.findall(r'(?<=\s)"?\.(?:\[(\w+)\])?"?$', install)
     assert target == ("gpu" if name.endswith("cuda") else "")
     assert not target or target in PROJECT["project"]["optional-dependencies"]
@@ -58,7 +60,7 @@ def test_the_image_starts_our_server_and_not_as_root(name):
     order = [instruction for instruction, _ in instructions(name)]
     assert order.index("USER") < order.index("ENTRYPOINT") and of_kind(name, "USER") == ["nurec"]
     assert any("useradd" in line and "nurec" in line for line in of_kind(name, "RUN"))
-    assert of_kind(name, "FROM") == ["python:3.12-slim-bookworm"]
+    assert of_kind(name, "FROM") == ["${BASE}"] and "BASE=python:3.12-slim-bookworm" in of_kind(name, "ARG")
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -69,6 +71,12 @@ def test_health_is_asked_where_the_server_answers_it(name):
     port = address.rpartition(":")[2]
     assert f"--health-port={port}" in json.loads(of_kind(name, "CMD")[0])
     assert port in of_kind(name, "EXPOSE")[0].split()
+
+
+def test_documented_runs_publish_on_this_machine_only():
+    pages = [REPO / "README.md", *(REPO / "docs").glob("*.md"), *(REPO / name for name in FILES)]
+    published = [port for page in pages for port in re.findall(r"docker run[^\n]* -p (\S+)", page.read_text())]
+    assert len(published) >= 3 and set(published) == {"127.0.0.1:8080:8080"}
 
 
 def test_the_two_images_differ_only_where_they_must():

@@ -4,6 +4,7 @@ import contextlib
 import json
 import re
 import signal
+from pathlib import Path
 
 import pytest
 from grpc import StatusCode as Code
@@ -14,7 +15,7 @@ from serving_world import scene
 
 from nurec_sim import cli, geometry
 from nurec_sim.cli.nre_flags import IGNORED_SWITCHES, IGNORED_VALUES, sort_flags
-from nurec_sim.cli.serving import sort_serve_grpc
+from nurec_sim.cli.serving import _glob_folder, sort_serve_grpc
 from nurec_sim.errors import NurecSimError
 from nurec_sim.scene import write_scene
 from nurec_sim.wire import ImageFormat, common
@@ -239,6 +240,22 @@ def test_an_empty_server_is_fine_without_a_glob(not_served):
     cli.main(["serve-grpc"])
     ((store, choices),) = not_served
     assert store.ids == () and (choices["host"], choices["port"]) == ("localhost", 8080)
+
+
+def test_files_of_clients_lie_in_the_folders_that_were_given(not_served, scenes, tmp_path, capsys, monkeypatch):
+    (tmp_path / "more").mkdir()
+    own = scenes / "scenes"
+    cli.main(["serve-grpc", f"--artifact-glob={scenes}/**/*.usdz", "--scene-dirs", str(tmp_path / "more")])
+    cli.main(["serve-grpc", "--allow-any-file"])
+    cli.main(["serve", str(own)])
+    monkeypatch.chdir(own)
+    cli.main(["serve", "other.usdz"])
+    globbed, anything, folder, file = (choices["options"] for _, choices in not_served)
+    assert {tmp_path / "more", scenes, own} <= set(globbed.scene_dirs) and not globbed.allow_any_file
+    assert anything.allow_any_file and anything.scene_dirs == ()
+    assert folder.scene_dirs == (own,) and own in file.scene_dirs
+    assert "--scene-dirs '/no/where' is no folder" in fails(capsys, "--scene-dirs", "/no/where")
+    assert _glob_folder("/a/*/b/*.usdz") == [Path("/a")] and _glob_folder("x.usdz") == [Path()]
 
 
 def test_scenes_are_tested_before_they_are_served(not_served, scenes, tmp_path, capsys):

@@ -64,8 +64,9 @@ def web(monkeypatch):
         thread.join()
 
 
-def serving(tmp_path, **options):
-    options = ServiceOptions(download_cache_dir=tmp_path / "downloads", **options)
+def serving(tmp_path, *folders, **options):
+    folders = {"scene_dirs": (tmp_path, *folders)} if folders else {}
+    options = ServiceOptions(download_cache_dir=tmp_path / "downloads", **folders, **options)
     return SensorServer(SceneStore([scene()], threads=2, cache_dir=tmp_path), port=0, options=options)
 
 
@@ -82,7 +83,7 @@ def refusal(stub, url, name=None):
 
 
 def test_a_file_is_served_under_the_name_that_is_asked_for(archive, tmp_path):
-    with serving(tmp_path) as address, Stub(address) as stub:
+    with serving(tmp_path, archive.parent) as address, Stub(address) as stub:
         assert scenes(stub) == ["clipgt-street"]
         url = archive.as_uri()
         assert "%20" in url
@@ -108,7 +109,14 @@ def test_a_file_that_is_served_already_is_found_again_however_its_path_is_spelt(
 WRONG = {
     "no archive": ("file:///tmp/x.txt", "a", Code.INVALID_ARGUMENT, "must be a file:// or http(s):// address"),
     "another scheme": ("ftp://h/x.usdz", "a", Code.INVALID_ARGUMENT, "must be a file:// or http(s):// address"),
-    "no such file": ("file:///no/where.usdz", "a", Code.INVALID_ARGUMENT, "there is no file /no/where.usdz"),
+    "no such file": (
+        "file:///no/where.usdz",
+        "a",
+        Code.INVALID_ARGUMENT,
+        "is no file in the scene folders",
+    ),
+    "a NUL": ("file:///tmp/a%00.usdz", "a", Code.INVALID_ARGUMENT, "is no file in the scene folders"),
+    "a folder": ("file:///tmp/../.usdz", "a", Code.INVALID_ARGUMENT, "is no file in the scene folders"),
     "another host": ("file://host/x.usdz", "a", Code.INVALID_ARGUMENT, "without a host"),
     "a name with dots": ("file:///x.usdz", "../a", Code.INVALID_ARGUMENT, "x-nre-scene-id must be 1 to 200"),
     "the web": ("http://127.0.0.1/x.usdz", "a", Code.PERMISSION_DENIED, "fetches no scenes from the web"),
@@ -119,7 +127,7 @@ WRONG = {
 
 
 def test_wrong_addresses_are_explained_and_change_nothing(archive, tmp_path):
-    with serving(tmp_path) as address, Stub(address) as stub:
+    with serving(tmp_path, archive.parent) as address, Stub(address) as stub:
         for case, (url, name, code, text) in WRONG.items():
             got, details = refusal(stub, url, name)
             assert got == code and text in details, case
@@ -128,6 +136,68 @@ def test_wrong_addresses_are_explained_and_change_nothing(archive, tmp_path):
         (tmp_path / "junk.usdz").write_bytes(b"junk")
         assert refusal(stub, (tmp_path / "junk.usdz").as_uri(), "junk")[0] == Code.FAILED_PRECONDITION
         assert scenes(stub) == ["clipgt-street"]
+
+
+def test_files_outside_the_scene_folders_are_as_if_they_were_not_there(archive, tmp_path):
+    """By their path, by ``..``, by a link, in a folder whose name begins alike; and the text tells nothing apart."""
+    inside, beside, secret = tmp_path / "scenes", tmp_path / "scenes-private", tmp_path / "secret"
+    for folder in (inside, beside, secret):
+        folder.mkdir()
+        (folder / "there.usdz").write_bytes(archive.read_bytes())
+    (inside / "link.usdz").symlink_to(secret / "there.usdz")
+    (inside / "out").symlink_to(secret)
+    (inside / "loop.usdz").symlink_to(inside / "loop.usdz")
+    (secret / "back.usdz").symlink_to(inside / "there.usdz")
+    refused = [
+        secret / "there.usdz",
+        secret / "absent.usdz",
+        beside / "there.usdz",
+        f"{inside}/../secret/there.usdz",
+        f"{inside}/%2e%2e/secret/there.usdz",
+        f"{inside}/../secret/absent.usdz",
+        inside / "link.usdz",
+        inside / "out" / "there.usdz",
+        inside / "out" / "absent.usdz",
+        inside / "loop.usdz",
+        inside / "absent.usdz",
+        inside,
+    ]
+    options = ServiceOptions(scene_dirs=(inside,))
+    with (
+        SensorServer(SceneStore([scene()], cache_dir=tmp_path), port=0, options=options) as address,
+        Stub(address) as stub,
+    ):
+        said = set()
+        for path in refused:
+            url = f"file://{path}" + ("/.usdz" if path == inside else "")
+            code, text = refusal(stub, url, "mine")
+            said.add((code, text.replace(url, "URL")))
+        ((code, text),) = said
+        assert code == Code.INVALID_ARGUMENT and text.startswith(
+            "x-nre-scene-url: 'URL' is no file in the scene folders"
+        )
+        assert scenes(stub, (inside / "there.usdz").as_uri(), "mine") == ["clipgt-street", "clipgt-mine"]
+        assert "clipgt-back" in scenes(stub, (secret / "back.usdz").as_uri(), "back"), "what counts is where it leads"
+
+
+def test_by_default_files_lie_where_the_first_scenes_do(archive, tmp_path):
+    """In the folder of each, and where a link to one leads; everywhere with ``allow_any_file``."""
+    first, blobs = tmp_path / "first", tmp_path / "blobs"
+    first.mkdir()
+    blobs.mkdir()
+    for name in ("blob", "other.usdz"):
+        (blobs / name).write_bytes(archive.read_bytes())
+    (first / "a.usdz").symlink_to(blobs / "blob")
+    (first / "b.usdz").write_bytes(archive.read_bytes())
+    for options, allowed in ((ServiceOptions(), False), (ServiceOptions(allow_any_file=True), True)):
+        store = SceneStore([first / "a.usdz"], cache_dir=tmp_path)
+        with SensorServer(store, port=0, options=options) as address, Stub(address) as stub:
+            assert scenes(stub, (first / "a.usdz").as_uri()) == ["clipgt-brought"]
+            assert scenes(stub, (first / "b.usdz").as_uri(), "b") == ["clipgt-brought", "clipgt-b"]
+            if allowed:
+                assert "clipgt-c" in scenes(stub, (blobs / "other.usdz").as_uri(), "c")
+            else:
+                assert refusal(stub, (blobs / "other.usdz").as_uri(), "c")[0] == Code.INVALID_ARGUMENT
 
 
 def test_a_scene_of_the_web_is_fetched_once_and_kept_for_the_next_server(archive, tmp_path, web):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -55,7 +56,11 @@ class OperationFlags:
     allow_shut_down: bool = False
     """Let clients stop the server with shut_down."""
     allow_remote_scenes: bool = False
-    """Let clients name scenes by http(s) address; by file:// they may always."""
+    """Let clients name scenes by http(s) address, and not only by file://."""
+    scene_dirs: tuple[Path, ...] = ()
+    """Folders that a file:// address may lead to, beside those of the scenes given here."""
+    allow_any_file: bool = False
+    """Let a file:// address lead to any .usdz file that the server can read."""
     upload_dir: Path | None = None
     """Let clients upload scenes and clips, and keep them here."""
     clip_dirs: tuple[Path, ...] = ()
@@ -120,11 +125,25 @@ def service_options(flags: OperationFlags, **more: Any) -> ServiceOptions:
             warm_up=True,
             allow_shut_down=flags.allow_shut_down,
             allow_remote_scenes=flags.allow_remote_scenes,
+            allow_any_file=flags.allow_any_file,
             **chosen,
             **more,
         )
     except ValueError as error:
         raise NurecSimError(str(error)) from None
+
+
+def scene_dirs(flags: OperationFlags, sources: Iterable[str | Path]) -> tuple[Path, ...]:
+    """What ``file://`` addresses may lead to: the sources, the folders of those that are files, and ``--scene-dirs``.
+
+    Raises:
+        NurecSimError: one of ``--scene-dirs`` is no folder.
+    """
+    for folder in flags.scene_dirs:
+        if not folder.is_dir():
+            raise NurecSimError(f"--scene-dirs {str(folder)!r} is no folder")
+    given = [Path(source) for source in sources]
+    return (*flags.scene_dirs, *given, *(path.absolute().parent for path in given if not path.is_dir()))
 
 
 def warn(text: str) -> None:

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING
 
 from nurec_sim.cli.console import Paths, app, err
 from nurec_sim.cli.nre_flags import sort_flags
-from nurec_sim.cli.operation import NO_FLAGS, Operation, OperationFlags, server_options, service_options, warn
+from nurec_sim.cli.operation import (
+    NO_FLAGS,
+    Operation,
+    OperationFlags,
+    scene_dirs,
+    server_options,
+    service_options,
+    warn,
+)
 from nurec_sim.errors import NurecSimError
 
 if TYPE_CHECKING:
@@ -58,7 +66,8 @@ def serve(
     store = _store(sources, cache_size, cache_dir=cache, threads=threads, gigabytes=cache_gb, device=operation.device)
     if not store.ids and operation.upload_dir is None:
         raise NurecSimError("nothing to serve: " + ("; ".join(store.faults.values()) or "give archives or clips"))
-    _run(store, host, port, service_options(operation, ego_mask_dir=ego_mask_dir), options, operation)
+    chosen = service_options(operation, ego_mask_dir=ego_mask_dir, scene_dirs=scene_dirs(operation, sources))
+    _run(store, host, port, chosen, options, operation)
 
 
 @app.command(name="serve-grpc")
@@ -103,7 +112,8 @@ def serve_grpc(
         warn(f"anybody who can reach {host}:{port} may call; --tls-cert and --tls-key, or --token-file, protect it")
     if max_workers is not None and operation.workers is None:
         operation = dataclasses.replace(operation, workers=max_workers)
-    store = _store(_matches(artifact_glob), cache_size, device=operation.device)
+    matches = _matches(artifact_glob)
+    store = _store(matches, cache_size, device=operation.device)
     if artifact_glob is not None and not store.ids:
         raise NurecSimError("nothing to serve: " + "; ".join(store.faults.values()))
     if test_scenes_are_valid:
@@ -114,6 +124,7 @@ def serve_grpc(
         only_listed_actors=enable_editing_actors,
         download_cache_dir=download_cache_dir,
         download_cache_size=download_cache_size,
+        scene_dirs=scene_dirs(operation, [*_glob_folder(artifact_glob), *matches]),
     )
     _run(store, host, port, chosen, options, operation)
 
@@ -215,6 +226,15 @@ def _matches(pattern: str | None) -> list[str]:
     if not found:
         raise NurecSimError(f"--artifact-glob {pattern!r} matches no file")
     return found
+
+
+def _glob_folder(pattern: str | None) -> list[Path]:
+    """The folder that a pattern searches: what comes before the first part with a wildcard."""
+    if pattern is None:
+        return []
+    parts = Path(pattern).parent.parts
+    fixed = next((i for i, part in enumerate(parts) if glob.has_magic(part)), len(parts))
+    return [Path(*parts[:fixed])]
 
 
 def _test_scenes(store: SceneStore) -> None:

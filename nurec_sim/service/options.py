@@ -32,6 +32,11 @@ class ServiceOptions:
     """Scenes of which ``edit_assets`` keeps an edited copy in memory."""
     allow_remote_scenes: bool = False
     """Whether clients may name ``http(s)://`` addresses of scenes, and not only ``file://`` ones."""
+    scene_dirs: tuple[Path, ...] | None = None
+    """Folders, and files, that ``file://`` addresses may lead to; None for the folders of the scenes that the store has
+    when the service starts."""
+    allow_any_file: bool = False
+    """Whether ``file://`` addresses may lead to any file that the server can read."""
     download_cache_dir: Path | None = None
     """Where downloaded scenes are kept; None for a folder in that of the store."""
     download_cache_size: int = 5

@@ -1,7 +1,8 @@
 """Scenes that clients bring along: their address travels as metadata beside any request.
 
 ``x-nre-scene-url`` is ``file://`` or ``http(s)://`` and ends in ``.usdz``; ``x-nre-scene-id`` is the name under which
-the scene is served from then on, the archive's own if it is left out.
+the scene is served from then on, the archive's own if it is left out. A ``file://`` address leads to the folders of
+scenes only, and of files elsewhere a client does not even learn whether they exist.
 """
 
 from __future__ import annotations
@@ -30,12 +31,13 @@ class SceneUrls:
 
     Args:
         store: where they are offered.
-        options: whether web addresses are allowed, and how much may be fetched.
+        options: whether web addresses are allowed, how much may be fetched, and which folders files may lie in.
     """
 
     def __init__(self, store: SceneStore, options: ServiceOptions) -> None:
         self._store = store
         self._allow_web = options.allow_remote_scenes
+        self._places = None if options.allow_any_file else _places(store, options.scene_dirs)
         self._cache = DownloadCache(
             options.download_cache_dir or store.cache_dir / "downloads",
             options.download_cache_size,
@@ -53,7 +55,7 @@ class SceneUrls:
         """Makes the store offer the scene that metadata names; fetches it if it lies on the web.
 
         Raises:
-            RequestError: the address or the name is malformed, or nothing can be fetched from there.
+            RequestError: the address or the name is malformed, or there is nothing that a client may have.
             NotAllowedError: it lies on the web, and this server does not go there.
             TooLargeError: it is larger than allowed.
             ArchiveError: it cannot be opened, or another scene has the name.
@@ -65,12 +67,30 @@ class SceneUrls:
         with self._turn(url):
             if self._served(key) is not None:
                 return
-            path = self._cache.fetch(url) if is_web(url) else _local_path(url)
+            path = self._cache.fetch(url) if is_web(url) else self._local_path(url)
             source = self._offer(path, name)
             assert isinstance(source.origin, Path)
             self._offered[key] = (source.id, source.origin)
             if is_web(url):
                 self._make_room()
+
+    def _local_path(self, url: str) -> Path:
+        """The file at an address; where it may not lie and where there is none is the same to who asks."""
+        parts = urlsplit(url)
+        if parts.netloc not in ("", "localhost"):
+            raise RequestError(f"{URL_KEY}: a file:// address names a file of the server, without a host; got {url!r}")
+        path = Path(unquote(parts.path))
+        try:
+            real = path.resolve(strict=True)
+            allowed = self._places is None or any(real.is_relative_to(place) for place in self._places)
+            if allowed and real.is_file():
+                return path
+        except (OSError, ValueError, RuntimeError):  # absent, no name of a file, or a link that leads to itself
+            pass
+        raise RequestError(
+            f"{URL_KEY}: {url!r} is no file in the scene folders of this server; whoever starts it may add folders "
+            "with --scene-dirs, or all with --allow-any-file"
+        )
 
     @contextlib.contextmanager
     def _turn(self, url: str) -> Iterator[None]:
@@ -132,11 +152,12 @@ def _check(url: str, name: str) -> None:
         )
 
 
-def _local_path(url: str) -> Path:
-    parts = urlsplit(url)
-    if parts.netloc not in ("", "localhost"):
-        raise RequestError(f"{URL_KEY}: a file:// address names a file of the server, without a host; got {url!r}")
-    path = Path(unquote(parts.path))
-    if not path.is_file():
-        raise RequestError(f"{URL_KEY}: there is no file {path} on the server")
-    return path
+def _places(store: SceneStore, given: tuple[Path, ...] | None) -> tuple[Path, ...]:
+    """Folders and files that ``file://`` addresses may lead to, without links.
+
+    A scene that the store has may lie elsewhere behind a link: its own file counts beside the folder of the link.
+    """
+    if given is None:
+        files = [source.origin for source in store.sources if isinstance(source.origin, Path)]
+        given = tuple(place for file in files for place in (file.absolute().parent, file))
+    return tuple(dict.fromkeys(place.resolve() for place in given))
