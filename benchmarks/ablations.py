@@ -25,8 +25,8 @@ from nurec_sim.evaluate import Contender, Protocol, run_protocol
 from nurec_sim.evaluate.run import settings_of
 from nurec_sim.evaluate.summary import interval
 from nurec_sim.evaluate.tables import Table
+from nurec_sim.new_files import write_file
 from nurec_sim.reconstruct import FeedForwardSettings
-from nurec_sim.runs.folder import write_text
 from nurec_sim.training.ablations import ABLATIONS, ablated, scaled
 from nurec_sim.training.checkpoint import read_position
 from nurec_sim.training.clips import ready_clips
@@ -107,8 +107,8 @@ def main() -> None:
     table = table_of(results["rows"])
     results |= {"recipe": json.loads(config.model_dump_json()), "machine": machine_name()}
     results["seconds"] = round(time.perf_counter() - began, 1)
-    write_text(options.out / "ablations.json", json.dumps(results, indent=1) + "\n")
-    write_text(options.out / "ablations.md", table.markdown())
+    write_file(options.out / "ablations.json", json.dumps(results, indent=1) + "\n")
+    write_file(options.out / "ablations.md", table.markdown())
     out.print(table.markdown(), **PLAIN)
     out.print(f"wrote {options.out / 'ablations.json'} and .md", **PLAIN)
 

@@ -25,7 +25,8 @@
     ├── GpuError         the CUDA back end cannot be used here
     ├── ServerError      a sensor server cannot be reached, or failed
     ├── RunError         a run folder or a file in it cannot be read or written
-    └── TrainingError    a recipe, its data or its checkpoints are wrong
+    ├── TrainingError    a recipe, its data or its checkpoints are wrong
+    └── WriteError       a file or a folder cannot be written (an OSError too)
 
 Texts say what was wrong, what was given and what is allowed.
 """
@@ -125,3 +126,10 @@ class RunError(NurecSimError):
 
 class TrainingError(NurecSimError):
     """A training recipe, its data or its checkpoints are wrong."""
+
+
+class WriteError(NurecSimError, OSError):
+    """A file or a folder cannot be written: ``errno``, what is wrong and what to do (``strerror``), ``filename``."""
+
+    def __str__(self) -> str:
+        return f"cannot write {self.filename}: {self.strerror}"

@@ -13,6 +13,7 @@ import tyro
 
 from nurec_sim.cli.console import OnePath, Paths, app, out, print_faults, print_table, progress
 from nurec_sim.errors import NurecSimError
+from nurec_sim.new_files import check_writable
 
 if TYPE_CHECKING:
     from nurec_sim.types import GaussianScene, Sense
@@ -129,6 +130,7 @@ def drive(
     store = SceneStore(sources or [scenario_path.parent / str(scenario.clip)], cache_dir=cache)
     for fault in store.faults.values():
         raise NurecSimError(fault)
+    check_writable(resume or out_dir, folder=True)
     with progress("reconstructing") as advance:
         scenes = [store.get(scene_id, progress=advance).scene for scene_id in store.ids]
     with contextlib.ExitStack() as stack:

@@ -14,6 +14,7 @@ import tyro
 from nurec_sim.cli.console import app, err, out, print_table, progress
 from nurec_sim.cli.scenes import NO_FLAGS, Method, NetworkFlags, network_settings
 from nurec_sim.errors import NurecSimError
+from nurec_sim.new_files import check_writable, write_file
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 
 ProtocolName = Literal["storm", "clip", "shift"]
@@ -131,6 +132,10 @@ def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> N
     from nurec_sim.evaluate import evaluate as run_evaluation
 
     log = logs.open_clip(path)
+    if flags.json is not None:
+        check_writable(flags.json)
+    if flags.images is not None:
+        check_writable(flags.images, folder=True)
     with progress("evaluating") as advance:
         figures = run_evaluation(
             log,
@@ -144,7 +149,7 @@ def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> N
             settings=network_settings(flags.method, network),
         )
     if flags.json is not None:
-        flags.json.write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
+        write_file(flags.json, json.dumps(figures, indent=1, sort_keys=True) + "\n")
     print_table(f"{flags.method} on {log.id}", flatten(figures))
 
 

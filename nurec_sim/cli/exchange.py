@@ -10,6 +10,7 @@ import tyro
 from nurec_sim.cli.console import OnePath, app, err, out, print_table, progress
 from nurec_sim.cli.scenes import load_scene
 from nurec_sim.errors import NurecSimError
+from nurec_sim.new_files import check_writable
 
 UpAxis = Literal["z", "-z", "y", "-y", "x", "-x"]
 
@@ -36,6 +37,7 @@ def export(
     """
     from nurec_sim.scene import export_scene
 
+    check_writable(out_path)
     world = load_scene(scene)
     with progress("exporting") as advance:
         exported = export_scene(world, out_path, at_us=at_us, overwrite=overwrite, progress=advance)
@@ -90,6 +92,7 @@ def import_(
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
     if file.resolve() == target.resolve():
         raise NurecSimError(f"{target} is the file to import; give another --out")
+    check_writable(target)
     with err.status(f"reading {file.name}"):
         opened = scene.read_scene if like and like.suffix.lower() in scene.SCENE_SUFFIXES else logs.open_clip
         known = None if like is None else opened(like)

@@ -11,6 +11,7 @@ import tyro
 from nurec_sim.cli.console import OnePath, app, err, out, print_faults, print_table, progress
 from nurec_sim.cli.validation import inspect_scene
 from nurec_sim.errors import NurecSimError
+from nurec_sim.new_files import check_writable
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 
 if TYPE_CHECKING:
@@ -77,6 +78,7 @@ def reconstruct(
     target = out_path or Path(f"{log.id}.usdz")
     if target.exists() and not overwrite:
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
+    check_writable(target)
     with progress("reconstructing") as advance:
         world_scene = run_method(
             log, method, cameras=cameras or None, progress=advance, settings=network_settings(method, network)
@@ -114,6 +116,7 @@ def render(
     """
     from nurec_sim.render.still import render_still
 
+    check_writable(out_path)
     scene_ = load_scene(source)
     render_still(scene_, out_path, camera, frame, left_m=left_m, yaw_deg=yaw_deg, layer=layer, width_px=width)
     out.print(f"wrote {out_path}", soft_wrap=True)

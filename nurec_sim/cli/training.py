@@ -9,6 +9,7 @@ import tyro
 
 from nurec_sim.cli.console import OnePath, app, err, out, progress
 from nurec_sim.errors import TrainingError
+from nurec_sim.new_files import check_writable
 
 AblationName = Literal["full", "single_stage", "sky_mlp", "no_perceptual", "no_depth_loss", "concatenation"]
 
@@ -56,6 +57,8 @@ def train(
         )
     config = ablated(read_config(recipe), ablation)
     folder = out_path or Path("runs/train") / (recipe.stem if ablation == "full" else f"{recipe.stem}-{ablation}")
+    for place in (folder, clips):
+        check_writable(place, folder=True)
     if threads is not None:
         torch.set_num_threads(threads)
     perceptual = perceptual_distance if config.lpips is None else load_lpips(config.lpips)

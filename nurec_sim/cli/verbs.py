@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import sys
@@ -37,19 +38,37 @@ def run(words: list[str]) -> None:
     try:
         if words[:1] == ["serve-grpc"]:
             words[1:] = serving.sort_serve_grpc(words[1:])
-        app.cli(
-            prog="nurec-sim",
-            description="An open closed-loop sensor simulator for driving. A log becomes a Gaussian world, a gRPC "
-            "server renders it, policies drive through it, a report says which is better. Start with: nurec-sim demo",
-            args=words,
-        )
+        try:
+            app.cli(
+                prog="nurec-sim",
+                description="An open closed-loop sensor simulator for driving. A log becomes a Gaussian world, a gRPC "
+                "server renders it, policies drive through it, a report says which is better. Start with: nurec-sim "
+                "demo",
+                args=words,
+            )
+        finally:
+            sys.stdout.flush()
     except NurecSimError as error:
         err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(1) from None
     except BrokenPipeError:
-        # Whoever read the output has left, as `head` does; nothing more can be said, not even at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _forget_output()  # whoever read the output has left, as `head` does
+        raise SystemExit(1) from None
+    except OSError as error:
+        if error.errno is None:  # not the system's: a bug
+            raise
+        where = error.filename
+        if where is None and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO):
+            where = "standard output"  # whatever else is written has a name
+            _forget_output()
+        text = f"{where}: {error.strerror}" if where else error.strerror
+        err.print(f"nurec-sim: {text}", style="red", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         err.print(f"interrupted; {KEPT.get(words[0] if words else '', 'nothing half-written was left')}")
         raise SystemExit(130) from None
+
+
+def _forget_output() -> None:
+    """Lets what cannot be written to standard output go, which Python would try once more at the end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

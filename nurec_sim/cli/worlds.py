@@ -9,6 +9,7 @@ import tyro
 
 from nurec_sim.cli.console import app, out, print_table, progress
 from nurec_sim.errors import ClipError, NurecSimError
+from nurec_sim.new_files import check_writable
 
 if TYPE_CHECKING:
     from nurec_sim.types import Rig
@@ -73,6 +74,7 @@ def world(
     rig = _rig(car_seed, cameras, lens, pixels, lidar, chosen=rig_seed is not None)
     if not 0.1 <= hz <= 25.0:
         raise NurecSimError(f"--hz must be within 0.1..25, got {hz:g}")
+    check_writable(out_path, folder=out_path.suffix != ".zip")
     with progress("drawing the town") as advance:
         path = write_town_clip(
             plan,

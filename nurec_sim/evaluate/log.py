@@ -22,6 +22,7 @@ from nurec_sim.metrics.images import psnr, ssim
 from nurec_sim.metrics.lidar_scores import LidarScore, scanner_along, score_sweep
 from nurec_sim.metrics.offroad import offroad_agreement
 from nurec_sim.metrics.offroad_grid import scene_offroad_grid
+from nurec_sim.new_files import write_file
 from nurec_sim.types import CameraFrame, Clip, GaussianScene, LidarFrame, Sense, SensorRequest, Sweep
 
 Progress = Callable[[str, float], None]
@@ -221,8 +222,8 @@ def _nearest_input(clip: Clip, camera: str, index: int, inputs: Sequence[str]) -
 def _write_pair(path: Path, recorded: np.ndarray, rendered: np.ndarray) -> None:
     import cv2
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.ascontiguousarray(np.vstack([recorded, rendered])[..., ::-1]))
+    pair = np.ascontiguousarray(np.vstack([recorded, rendered])[..., ::-1])
+    write_file(path, cv2.imencode(path.suffix, pair)[1].tobytes())
 
 
 # ------------------------------------------------------------------------------------------------------------- road

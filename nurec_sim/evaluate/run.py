@@ -25,7 +25,7 @@ from nurec_sim.evaluate.sheet import draw_sheet
 from nurec_sim.evaluate.summary import summarize
 from nurec_sim.evaluate.tables import tables
 from nurec_sim.evaluate.windows import Window
-from nurec_sim.runs.folder import write_text
+from nurec_sim.new_files import write_file
 
 Progress = Callable[[str, float], None]
 SETTINGS, RESULTS, TABLES, REPORT = "settings.json", "results.json", "tables.md", "report.html"
@@ -101,7 +101,7 @@ def _window(
         if folder is not None:
             shown = {n: s for n, s in scored.items() if isinstance(s, Scored)}
             draw_sheet(folder / "sheets" / f"{name}.png", window, shown)
-            write_text(folder / "windows" / f"{name}.json", _json(record))
+            write_file(folder / "windows" / f"{name}.json", _json(record))
     return record
 
 
@@ -128,7 +128,7 @@ def _open_folder(folder: Path, settings: dict[str, Any]) -> None:
         (folder / part).mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
     if not path.exists():
-        write_text(path, _json(settings))
+        write_file(path, _json(settings))
         return
     found = _read(path)
     if found != settings:
@@ -168,11 +168,11 @@ def _read(path: Path) -> Any:
 
 def _write_results(folder: Path, results: dict[str, Any]) -> None:
     made = tables(results)
-    write_text(folder / TABLES, "\n".join(table.markdown() for table in made))
+    write_file(folder / TABLES, "\n".join(table.markdown() for table in made))
     for table in made:
-        write_text(folder / f"{table.name}.csv", table.csv())
-    write_text(folder / RESULTS, _json(results))
-    write_text(folder / REPORT, render_page(results, made, sorted((folder / "sheets").glob("*.png"))))
+        write_file(folder / f"{table.name}.csv", table.csv())
+    write_file(folder / RESULTS, _json(results))
+    write_file(folder / REPORT, render_page(results, made, sorted((folder / "sheets").glob("*.png"))))
 
 
 def _json(values: Any) -> str:

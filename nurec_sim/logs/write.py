@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -9,7 +10,7 @@ import re
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from nurec_sim.errors import ClipError
 from nurec_sim.logs import calibration, sweeps, tables
 from nurec_sim.logs.consistency import EARLIEST_US
 from nurec_sim.logs.storage import META_FILE
+from nurec_sim.new_files import writing
 from nurec_sim.types import Rig, RoadMap, Sweep, Track, Trajectory
 
 SCHEMA = "nurec-sim-clip-1"
@@ -89,6 +91,7 @@ def write_clip(
     Raises:
         ClipError: something is at ``path`` already, an entry names no sensor of the rig, has another size than its
             camera, a time below 1 s, times that go back, or values that are not finite.
+        WriteError: the disk is full, or the place cannot be written.
     """
     path = Path(path)
     if path.exists() and not overwrite:
@@ -96,9 +99,7 @@ def write_clip(
     _check_rig(rig)
     if ego.start_us < EARLIEST_US:
         raise ClipError(f"clips start at {EARLIEST_US} us or later; the ego's first pose is at {ego.start_us}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    try:
+    with writing(path), _work_folder(path) as work:
         folder = work / "clip"
         folder.mkdir()
         records = _write_frames(folder, rig, frames, jpeg_quality)
@@ -122,9 +123,18 @@ def write_clip(
                 raise ClipError(f"attachment {name!r} needs a plain file name that the clip does not use itself")
             _write_bytes(folder / name, data)
         _move_into_place(folder, path, work)
+    return path
+
+
+@contextlib.contextmanager
+def _work_folder(path: Path) -> Iterator[Path]:
+    """A hidden folder beside ``path`` for the time of the block."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        yield work
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    return path
 
 
 def _check_rig(rig: Rig) -> None:

@@ -6,7 +6,7 @@ One row per rollout, metric and time. Ids are uuid5 of what they name, so the sa
 from __future__ import annotations
 
 import hashlib
-import os
+import io
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nurec_sim.new_files import write_file
 from nurec_sim.types import Rollout, Series
 
 if TYPE_CHECKING:
@@ -92,9 +93,9 @@ def write_table(table: pl.DataFrame, folder: Path) -> tuple[Path, Path]:
     """Write ``metrics.parquet`` and ``metrics.csv`` into a folder, each in one step; returns both paths."""
     parquet, text = Path(folder) / "metrics.parquet", Path(folder) / "metrics.csv"
     for path, write in ((parquet, table.write_parquet), (text, table.write_csv)):
-        part = path.with_name(f".{path.name}.{os.getpid()}")
-        write(part)
-        os.replace(part, path)
+        content = io.BytesIO()  # of an error of the disk polars would tell the text only
+        write(content)
+        write_file(path, content.getvalue())
     return parquet, text
 
 

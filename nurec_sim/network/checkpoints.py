@@ -6,7 +6,6 @@ Files are told apart by their first bytes, not by their names. Nothing in a file
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from torch import Tensor, nn
 from nurec_sim.errors import WeightsError
 from nurec_sim.network.shared_weights import with_shared
 from nurec_sim.network.torch_archive import read_torch_archive
+from nurec_sim.new_files import write_file
 
 _LEGACY_PROJECTOR = re.compile(r"^(post_processing\.affine_attention)\.(to_k|to_v)\.")
 _METADATA_KEY = "nurec_sim"
@@ -149,13 +149,7 @@ def save_weights(module: nn.Module, path: Path, metadata: Mapping[str, str], *, 
     _refuse_non_finite(path, tensors)
     # One entry only: the library writes several in an order that changes from run to run.
     data = safetensors.torch.save(tensors, {_METADATA_KEY: json.dumps(dict(metadata), sort_keys=True)})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        part.write_bytes(data)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_file(path, data)
 
 
 def read_metadata(path: Path) -> dict[str, str]:

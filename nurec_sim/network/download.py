@@ -8,9 +8,10 @@ import os
 from pathlib import Path
 from types import ModuleType
 
-from nurec_sim.errors import WeightsError
+from nurec_sim.errors import WeightsError, WriteError
 from nurec_sim.network.profiles import PROFILES
 from nurec_sim.network.released import RELEASED, ReleasedFile
+from nurec_sim.new_files import writing
 
 CHECKPOINT_VARIABLE = "INSTANT_NUREC_FULL_PT"
 """Environment variable that names a weights file for whatever profile is asked for."""
@@ -83,14 +84,18 @@ def fetch(released: ReleasedFile, revision: str | None = None, folder: Path | No
         folder: where to put it; the cache of Hugging Face (``$HF_HOME``) if not given.
 
     Raises:
+        WriteError: the disk is full, or the folder cannot be written.
         WeightsError: the extra 'hub' is not installed, the file cannot be had, or it is not the released one. A file of
             the right size and the wrong digest is removed.
     """
     hub = hub_library()
     try:
-        path = hub.hf_hub_download(
-            released.repository, released.filename, revision=revision or released.revision, local_dir=folder
-        )
+        with writing(folder or "the cache of Hugging Face ($HF_HOME)"):
+            path = hub.hf_hub_download(
+                released.repository, released.filename, revision=revision or released.revision, local_dir=folder
+            )
+    except WriteError:
+        raise
     except Exception as error:  # its errors have no base in common: network, access, revision, disk
         first_line = str(error).strip().split("\n")[0]
         raise WeightsError(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor
 
 from nurec_sim.errors import WeightsError
+from nurec_sim.new_files import write_file
 
 KEY = "nurec_sim_shared"
 
@@ -72,12 +72,7 @@ def save_difference(full: Path, other: Path, out: Path) -> int:
     digest = hashlib.sha256(other.read_bytes()).hexdigest()
     facts[KEY] = json.dumps({"file": other.name, "sha256": digest, "tensors": shared}, sort_keys=True)
     own = {name: tensors[name] for name in sorted(tensors) if name not in shared}
-    part = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
-        part.write_bytes(_sorted_metadata(safetensors.torch.save(own, facts), facts))
-        os.replace(part, out)
-    finally:
-        part.unlink(missing_ok=True)
+    write_file(out, _sorted_metadata(safetensors.torch.save(own, facts), facts))
     return len(shared)
 
 

@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
+from nurec_sim.new_files import write_file
 from nurec_sim.render.encode import encode_image
 from nurec_sim.render.renderer import Renderer
 from nurec_sim.types import CameraFrame, GaussianScene, Label, SensorRequest
@@ -50,6 +51,7 @@ def render_still(
 
     Raises:
         RequestError: no such camera or frame.
+        WriteError: the file cannot be written; one that was there is as it was.
     """
     if not scene.rig.cameras:
         raise RequestError(f"scene {scene.id!r} has no cameras")
@@ -67,8 +69,7 @@ def render_still(
     poses = scene.ego.at(np.array([start_us, end_us])) @ moved @ camera.rig_from_camera
     request = SensorRequest(scene.id, camera, start_us, max(end_us, start_us + 1), poses)
     shown = picture(Renderer(scene).render_camera(request, ("rgb", layer)), layer)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(encode_image(shown))
+    write_file(path, encode_image(shown))
 
 
 def picture(frame: CameraFrame, layer: Layer) -> UInt8[np.ndarray, "h w 3"]:

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import yaml
 
-from nurec_sim.errors import NurecSimError, ScenarioError
+from nurec_sim.errors import NurecSimError, ScenarioError, WriteError
+from nurec_sim.new_files import writing
 from nurec_sim.plugins import load_policy
 from nurec_sim.runs import folder as layout
 from nurec_sim.runs.results import write_report
@@ -175,15 +176,18 @@ def _record(job: _Job, rollout: Rollout, sense: Sense, part: Path, advance: Call
     try:
         camera = find_camera(job.scene.rig, "front")
         actors = Actors(job.scene.tracks, job.scenario.actors)
-        record_video(
-            rollout,
-            sense,
-            camera,
-            part / layout.VIDEO,
-            grid=job.record.grid,
-            overrides=actors.overrides,
-            progress=advance,
-        )
+        with writing(part / layout.VIDEO):
+            record_video(
+                rollout,
+                sense,
+                camera,
+                part / layout.VIDEO,
+                grid=job.record.grid,
+                overrides=actors.overrides,
+                progress=advance,
+            )
+    except WriteError:
+        raise
     except NurecSimError as error:
         (part / layout.VIDEO).unlink(missing_ok=True)
         (part / layout.VIDEO_ERROR).write_text(f"{error}\n", encoding="utf-8")

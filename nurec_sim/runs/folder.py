@@ -19,7 +19,8 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from nurec_sim.errors import RunError
+from nurec_sim.errors import RunError, WriteError
+from nurec_sim.new_files import writing
 
 ROLLOUT, SCENARIO, VERSIONS, VIDEO, ERROR = "rollout.npz", "scenario.yaml", "versions.json", "front.mp4", "error.txt"
 VIDEO_ERROR = "video_error.txt"
@@ -29,13 +30,14 @@ SCENE, ROAD, REPORT = "scene.json", "road.npz", "report.html"
 def new_run_folder(out_dir: Path, stamp: str) -> Path:
     """Make ``out_dir/<stamp>`` (numbered if it is taken) and let ``out_dir/latest`` point to it."""
     out_dir = Path(out_dir)
-    out_dir.mkdir(parents=True, exist_ok=True)
-    for number in range(1, 1000):
-        folder = out_dir / (stamp if number == 1 else f"{stamp}-{number}")
-        with contextlib.suppress(FileExistsError):
-            folder.mkdir()
-            point_latest(folder)
-            return folder
+    with writing(out_dir):
+        out_dir.mkdir(parents=True, exist_ok=True)
+        for number in range(1, 1000):
+            folder = out_dir / (stamp if number == 1 else f"{stamp}-{number}")
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir()
+                point_latest(folder)
+                return folder
     raise RunError(f"{out_dir} already has 999 runs named {stamp}")
 
 
@@ -93,23 +95,24 @@ def scene_folders(run: Path) -> list[Path]:
 @contextlib.contextmanager
 def written_at_once(target: Path) -> Iterator[Path]:
     """Fill a hidden folder that becomes ``target`` at the end; whatever goes wrong leaves ``target`` as it was."""
-    target.parent.mkdir(parents=True, exist_ok=True)
     part, old = (target.with_name(f".{target.name}.{kind}.{os.getpid()}") for kind in ("part", "old"))
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    try:
-        yield part
-        if target.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            os.rename(target, old)
-        os.rename(part, target)
-    finally:
+    with writing(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(part, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a small file in one step."""
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
+        part.mkdir()
+        try:
+            yield part
+            if target.exists():
+                shutil.rmtree(old, ignore_errors=True)
+                os.rename(target, old)
+            try:
+                os.rename(part, target)
+            except OSError:
+                if old.exists():
+                    os.rename(old, target)
+                raise
+        except WriteError as error:  # of a file in the folder, which nobody knows by its hidden name
+            raise WriteError(error.errno, error.strerror, error.filename.replace(str(part), str(target))) from error
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)

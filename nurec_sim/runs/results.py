@@ -11,6 +11,7 @@ from nurec_sim.metrics.aggregate import rollout_values, summarize
 from nurec_sim.metrics.collision import find_contacts
 from nurec_sim.metrics.score import score_rollout
 from nurec_sim.metrics.table import metric_table, read_table, write_table
+from nurec_sim.new_files import write_file
 from nurec_sim.report import ReportRollout, ReportScene, RunReport, render_report
 from nurec_sim.runs import folder as layout
 from nurec_sim.runs.rollout_file import load_rollout
@@ -58,7 +59,7 @@ def write_report(run: Path | str, progress: Callable[[str, float], None] | None 
         versions=_versions(places),
     )
     path = run / layout.REPORT
-    layout.write_text(path, render_report(report))
+    write_file(path, render_report(report))
     return path
 
 

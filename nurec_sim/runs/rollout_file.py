@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from nurec_sim.errors import RunError
+from nurec_sim.new_files import new_file
 from nurec_sim.scene import codec
 from nurec_sim.types import EgoState, Event, Plan, Rig, Rollout, Trajectory
 
@@ -63,10 +63,8 @@ def save_rollout(rollout: Rollout, path: Path | str) -> Path:
         "plan_stops": np.array([plan.stop_session for plan in plans], np.bool_),
     }
     path = Path(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    with part.open("wb") as file:
+    with new_file(path) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
-    os.replace(part, path)
     return path
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,7 +12,8 @@ import numpy as np
 
 from nurec_sim.errors import ArchiveError, ReconstructError, RunError
 from nurec_sim.metrics.offroad_grid import OffroadGrid, scene_offroad_grid
-from nurec_sim.runs.folder import ROAD, SCENE, write_text
+from nurec_sim.new_files import new_file, write_file
+from nurec_sim.runs.folder import ROAD, SCENE
 from nurec_sim.scene import codec, scene_hash
 from nurec_sim.types import GaussianScene, Label, RoadMap
 
@@ -76,14 +76,12 @@ def save_scene_record(record: SceneRecord, folder: Path) -> None:
     if record.grid is None:
         road.unlink(missing_ok=True)
     else:
-        part = folder / f".{ROAD}.{os.getpid()}"
         grid = record.grid
         place = np.array([*grid.origin_m, grid.cell_m, grid.bandwidth_m, grid.overruled_frac], np.float64)
-        with part.open("wb") as file:
+        with new_file(road) as file:
             np.savez_compressed(file, state=grid.state, place=place)
-        os.replace(part, road)
     facts = {name: value for name, value in vars(record).items() if name != "grid"}
-    write_text(folder / SCENE, codec.dump(facts, "the scene record", indent=1).decode())
+    write_file(folder / SCENE, codec.dump(facts, "the scene record", indent=1).decode())
 
 
 def load_scene_record(folder: Path) -> SceneRecord:

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.new_files import new_file
 from nurec_sim.scene.columns import Columns, sigmoid
 from nurec_sim.scene.harmonics import SH_C0
-from nurec_sim.scene.new_file import new_file
 from nurec_sim.scene.ply_table import VertexTable
 from nurec_sim.types import Gaussians, Label
 

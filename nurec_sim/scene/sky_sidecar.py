@@ -18,7 +18,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
-from nurec_sim.scene.new_file import new_file
+from nurec_sim.new_files import new_file
 from nurec_sim.scene.npy import array_from_npy, npy_bytes
 from nurec_sim.scene.zip_package import write_package
 

@@ -10,7 +10,8 @@ rounds it), the normal, the semantic class, LiDAR intensity and ray drop, and ``
 
 from __future__ import annotations
 
-import tempfile
+import errno
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.new_files import temporary_folder
 from nurec_sim.scene.crate_check import check_crate
 from nurec_sim.scene.harmonics import SH_C0
 from nurec_sim.scene.zip_package import Package
@@ -102,11 +104,22 @@ def new_stage(root_prim: str):
 
 
 def crate_bytes(stage) -> bytes:
-    """A stage's root layer in the binary format."""
-    with tempfile.TemporaryDirectory(prefix="nurec_sim_") as folder:
-        path = Path(folder) / "layer.usdc"
-        if not stage.GetRootLayer().Export(str(path)):
-            raise ArchiveError("OpenUSD could not write a layer; is the disk full?")
+    """A stage's root layer in the binary format.
+
+    Raises:
+        WriteError: the disk of temporary files is full.
+    """
+    from pxr import Tf
+
+    with temporary_folder() as folder:
+        path = folder / "layer.usdc"
+        try:
+            text = "" if stage.GetRootLayer().Export(str(path)) else "no reason given"
+        except Tf.ErrorException as error:
+            text = str(error)
+        if text:  # OpenUSD tells what went wrong in the system's words only
+            number = next((number for number in errno.errorcode if os.strerror(number) in text), errno.EIO)
+            raise OSError(number, os.strerror(number))
         return path.read_bytes()
 
 

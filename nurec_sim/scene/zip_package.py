@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from types import TracebackType
 
 from nurec_sim.errors import ArchiveError
-from nurec_sim.scene.new_file import new_file
+from nurec_sim.new_files import new_file
 
 ALIGNMENT = 64
 MAX_PACKAGE_BYTES = 2**32 - 1

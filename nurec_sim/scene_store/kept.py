@@ -13,7 +13,8 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from nurec_sim.errors import ArchiveError
+from nurec_sim.errors import ArchiveError, WriteError
+from nurec_sim.new_files import writing
 from nurec_sim.scene_store.owned_files import owned_file, remove_abandoned
 from nurec_sim.scene_store.recipes import Progress, Recipe, content_key
 from nurec_sim.types import GaussianScene
@@ -60,9 +61,10 @@ class KeptReconstructions:
         with ExitStack() as block:
             try:
                 waiting = "waiting for another process that reconstructs it"
-                block.enter_context(owned_file(self.folder / f".{key}.lock", lambda: progress(waiting, 0.0)))
-            except OSError as error:
-                self._complain(kept, error)
+                with writing(kept):
+                    block.enter_context(owned_file(self.folder / f".{key}.lock", lambda: progress(waiting, 0.0)))
+            except WriteError as error:
+                self._complain(error)
                 return self._make(clip_path, recipe, progress)
             if (scene := _read(kept)) is not None:  # made by the one who held the lock
                 return scene
@@ -77,14 +79,14 @@ class KeptReconstructions:
 
         try:
             write_scene(scene, kept, overwrite=True)
-        except OSError as error:
-            self._complain(kept, error)
+        except WriteError as error:
+            self._complain(error)
             return scene
         return read_scene(kept)
 
-    def _complain(self, kept: Path, error: OSError) -> None:
+    def _complain(self, error: WriteError) -> None:
         level = logging.DEBUG if self._complained else logging.WARNING
-        log.log(level, "a reconstruction could not be kept at %s: %s; the scene is served all the same", kept, error)
+        log.log(level, "a reconstruction could not be kept, the scene is served all the same: %s", error)
         self._complained = True
 
     def _remove_leftovers(self) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from nurec_sim.errors import ArchiveError, RequestError, TooLargeError
-from nurec_sim.scene.new_file import sync_folder
+from nurec_sim.new_files import sync_folder
 from nurec_sim.scene_store.owned_files import owned_file, remove_abandoned
 from nurec_sim.scene_store.sources import identify, is_archive
 from nurec_sim.scene_store.store import SceneStore

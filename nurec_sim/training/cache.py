@@ -6,6 +6,7 @@ crash costs one of them, and what they leak ends with them. Clips lie in ``<fold
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 import multiprocessing
@@ -13,10 +14,12 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from nurec_sim.errors import ClipError
+from nurec_sim.errors import ClipError, WriteError
+from nurec_sim.new_files import writing
 from nurec_sim.training.clips import UNFINISHED_PREFIX, CachedClip, ready_clips
 from nurec_sim.training.generate import ClipSettings, clip_ids, generate_town, town_of
 from nurec_sim.training.workers import work_in_background
@@ -60,10 +63,12 @@ class ClipCache:
         """Where the complete clips lie."""
         self._first_town, self._report = first_town, report or (lambda line: None)
         self._plans: dict[str, str] = {}
+        self._fault: WriteError | None = None
         self._threads: list[threading.Thread] = []
         self._stop = threading.Event()
         self._lock = threading.Lock()
-        self.clips.mkdir(parents=True, exist_ok=True)
+        with writing(self.clips):
+            self.clips.mkdir(parents=True, exist_ok=True)
         self._drop_unfinished()
         self._drop_damaged()
 
@@ -84,6 +89,15 @@ class ClipCache:
             ClipError: it is not there (any more), or damaged.
         """
         return CachedClip(self.clips / clip_id)
+
+    def check(self) -> None:
+        """Raises why drawing has ended for good, if it has.
+
+        Raises:
+            WriteError: the disk does not take clips.
+        """
+        if self._fault is not None:
+            raise self._fault
 
     def data_hash(self) -> str:
         """SHA-256 over the sorted ids of the clips and the plans that they were drawn from."""
@@ -122,6 +136,7 @@ class ClipCache:
 
         Raises:
             ClipError: the workers gave up before.
+            WriteError: the disk does not take clips.
         """
         try:
             self.start(workers, backend=backend, niceness=0)
@@ -131,6 +146,7 @@ class ClipCache:
                     progress(len(self.clip_ids()), self.size)
         finally:
             self.close()
+        self.check()
         if len(self.clip_ids()) < self.size:
             raise ClipError(f"{self.clips} holds {len(self.clip_ids())} of {self.size} clips; its workers failed")
 
@@ -165,18 +181,27 @@ class ClipCache:
                 status = self._run(batch, backend, niceness, refresh)
                 if self._stop.is_set() or status == 0:
                     break
+                if self._fault is not None:
+                    self._report(f"no more towns are drawn: {self._fault}")
+                    return
                 self._report(f"drawing the towns {list(batch)} ended with status {status}, trial {trial} of {TRIALS}")
 
     def _run(self, batch: tuple[int, ...], backend: str, niceness: int, refresh: bool) -> int | None:
         """The exit status of a process that draws a few towns."""
-        process = multiprocessing.get_context("spawn").Process(
-            target=_draw_towns, args=(batch, self.settings, self.clips, backend, niceness), daemon=True
+        context = multiprocessing.get_context("spawn")
+        faults, theirs = context.Pipe(duplex=False)
+        process = context.Process(
+            target=_draw_towns, args=(batch, self.settings, self.clips, backend, niceness, theirs), daemon=True
         )
         process.start()
+        theirs.close()
         while process.is_alive() and not self._stop.is_set():
             process.join(POLL_S)
             if refresh:
                 self._drop_oldest()
+        with faults, contextlib.suppress(EOFError):
+            if faults.poll():
+                self._fault = faults.recv()
         return _ended(process)
 
     def _drop_oldest(self) -> None:
@@ -222,9 +247,15 @@ def is_alive(process_id: int) -> bool:
     return True
 
 
-def _draw_towns(towns: tuple[int, ...], settings: ClipSettings, folder: Path, backend: str, niceness: int) -> None:
-    """What a worker process does."""
+def _draw_towns(
+    towns: tuple[int, ...], settings: ClipSettings, folder: Path, backend: str, niceness: int, faults: Connection
+) -> None:
+    """What a worker process does; it sends the error of a disk that takes no more."""
     work_in_background(niceness)
-    for town in towns:
-        for _ in generate_town(town, settings, folder, backend):
-            pass
+    try:
+        for town in towns:
+            for _ in generate_town(town, settings, folder, backend):
+                pass
+    except WriteError as error:
+        faults.send(error)
+        raise SystemExit(1) from None

@@ -7,7 +7,6 @@ metadata. Nothing random needs saving: what step k sees depends on the seed and 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from nurec_sim.errors import TrainingError
+from nurec_sim.new_files import write_file
 
 CHECKPOINT = "checkpoint.safetensors"
 _KEY = "nurec_sim_training"
@@ -53,12 +53,7 @@ def save_checkpoint(
     contiguous = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     data = safetensors.torch.save(contiguous, {_KEY: json.dumps(asdict(position), sort_keys=True)})
     path = folder / CHECKPOINT
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        part.write_bytes(data)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_file(path, data)
     return path
 
 

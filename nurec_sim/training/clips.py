@@ -28,6 +28,7 @@ from jaxtyping import Float16, Float32, Float64, Int8, Int64, UInt8, UInt16
 
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.calibration import rig_from_json, rig_to_json
+from nurec_sim.new_files import writing
 from nurec_sim.types import Clip, Rig, RoadMap, Sweep, Track, Trajectory
 
 FORMAT = 1
@@ -91,7 +92,6 @@ def write_training_clip(
     """
     unfinished = folder.with_name(f"{UNFINISHED_PREFIX}{os.getpid()}-{folder.name}")
     shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
     knots = [track.path for track in tracks]
     arrays = {
         "ego_t_us": ego.t_us,
@@ -101,8 +101,6 @@ def write_training_clip(
     }
     for number, record in enumerate(records):
         arrays |= {f"{number}_{name}": value for name, value in vars(record).items()}
-    for name, array in arrays.items():
-        np.save(unfinished / f"{name}.npy", array, allow_pickle=False)
     meta = {
         "format": FORMAT,
         "id": folder.name,
@@ -113,14 +111,17 @@ def write_training_clip(
              "controllable": track.controllable} for track in tracks
         ],
     }  # fmt: skip
-    (unfinished / META_FILE).write_text(json.dumps(meta, indent=1) + "\n")
-    try:
-        unfinished.rename(folder)
-    except OSError:
-        # Somebody else wrote the same clip in the meantime.
-        shutil.rmtree(unfinished)
-        if not folder.is_dir():
-            raise
+    with writing(folder):
+        try:
+            unfinished.mkdir(parents=True)
+            for name, array in arrays.items():
+                np.save(unfinished / f"{name}.npy", array, allow_pickle=False)
+            (unfinished / META_FILE).write_text(json.dumps(meta, indent=1) + "\n")
+            unfinished.rename(folder)
+        except OSError:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            if not folder.is_dir():  # else somebody else wrote the same clip in the meantime
+                raise
     return folder
 
 

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,10 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from nurec_sim.errors import TrainingError
+from nurec_sim.new_files import write_file
 from nurec_sim.report.cells import escape
 from nurec_sim.report.figure import base_layout
 from nurec_sim.report.template import STYLE
-from nurec_sim.runs.folder import write_text
 
 FIXED = ("step", "stage", "seconds")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
@@ -103,10 +102,8 @@ def write_curves(folder: Path) -> tuple[Path, Path]:
     if not curves.values:
         raise TrainingError(f"{folder / 'curves.csv'} holds no values yet")
     page, picture = folder / "curves.html", folder / "curves.png"
-    write_text(page, curves_page(curves, folder.name))
-    part = picture.with_name(f".{picture.name}.{os.getpid()}")
-    part.write_bytes(cv2.imencode(".png", np.ascontiguousarray(curves_image(curves)[..., ::-1]))[1].tobytes())
-    os.replace(part, picture)
+    write_file(page, curves_page(curves, folder.name))
+    write_file(picture, cv2.imencode(".png", np.ascontiguousarray(curves_image(curves)[..., ::-1]))[1].tobytes())
     return page, picture
 
 

@@ -66,7 +66,14 @@ class TownSamples:
         profile = PROFILES[self.config.profile]
         settings = self.config.data.window_settings(profile, stage.pixels, stage.targets)
         return SampleStream(
-            self.cache.clips, settings, self.config.seed, step, self.loaders, processes.rank, processes.count
+            self.cache.clips,
+            settings,
+            self.config.seed,
+            step,
+            self.loaders,
+            processes.rank,
+            processes.count,
+            check=self.cache.check,
         )
 
     def data_hash(self) -> str:

@@ -11,7 +11,7 @@ import hashlib
 import multiprocessing
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
@@ -67,6 +67,7 @@ class SampleStream:
         rank: of this process in a run of several.
         world_size: how many there are.
         wait_s: how long to wait for a first clip.
+        check: called again and again meanwhile; what it raises ends the wait.
 
     Raises:
         ValueError: a number is out of range.
@@ -82,11 +83,13 @@ class SampleStream:
         rank: int = 0,
         world_size: int = 1,
         wait_s: float = 600.0,
+        check: Callable[[], None] | None = None,
     ) -> None:
         if min(seed, start, workers, rank) < 0 or rank >= world_size:
             raise ValueError("seed, start, workers and rank must not be negative, and rank below world_size; got "
                              f"{seed}, {start}, {workers}, {rank} of {world_size}")  # fmt: skip
         self._folder, self._settings, self._seed, self._wait_s = folder, settings, seed, wait_s
+        self._check = check or (lambda: None)
         self._next, self._stride = start * world_size + rank, world_size
         self._depth = AHEAD * max(workers, 1)
         self._ahead: deque[Future[TrainingSample]] = deque()
@@ -107,6 +110,7 @@ class SampleStream:
         """
         deadline = time.monotonic() + self._wait_s
         while not self._ahead and not ready_clips(self._folder) and time.monotonic() < deadline:
+            self._check()
             time.sleep(EMPTY_PAUSE_S)
         while len(self._ahead) < self._depth:
             coming = self._workers.submit(draw_sample, self._folder, self._settings, self._seed, self._next)

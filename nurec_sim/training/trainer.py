@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import csv
 import dataclasses
+import io
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -23,6 +24,7 @@ from torch import Tensor, nn
 from nurec_sim import network
 from nurec_sim.errors import TrainingError
 from nurec_sim.network.checkpoints import save_weights
+from nurec_sim.new_files import write_file, writing
 from nurec_sim.training import checkpoint
 from nurec_sim.training.checkpoint import Position
 from nurec_sim.training.config import Stage, TrainingConfig
@@ -87,8 +89,7 @@ class Trainer:
         """Train to the end of the recipe, or for tests up to a step."""
         report = progress or (lambda stage, fraction: None)
         if self.processes.first:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / RECIPE).write_text(self.config.model_dump_json(indent=1) + "\n")
+            write_file(self.folder / RECIPE, self.config.model_dump_json(indent=1) + "\n")
         last = self.config.steps if until is None else min(until, self.config.steps)
         for stage, first in _stages_with_starts(self.config):
             if self.position.step < first + stage.steps and self.position.step < last:
@@ -173,9 +174,8 @@ class Trainer:
 
         renders = [rendering.rgb.detach().numpy() for rendering in outputs.renderings]
         sheet = sample_sheet(sample, outputs.context, renders)
-        folder = self.folder / SAMPLES
-        folder.mkdir(exist_ok=True)
-        cv2.imwrite(str(folder / f"{step:06d}.png"), np.ascontiguousarray(sheet[..., ::-1]))
+        picture = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))[1]
+        write_file(self.folder / SAMPLES / f"{step:06d}.png", picture.tobytes())
 
 
 def learning_rate(stage: Stage, step: int) -> float:
@@ -211,10 +211,11 @@ class _Curve:
         if path.is_file():
             with path.open(newline="") as file:
                 kept = [row for row in csv.DictReader(file) if row["step"].isdigit() and int(row["step"]) <= step]
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows({name: row.get(name, "") for name in COLUMNS} for row in kept)
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, COLUMNS)
+        writer.writeheader()
+        writer.writerows({name: row.get(name, "") for name in COLUMNS} for row in kept)
+        write_file(path, text.getvalue())
 
     def add(self, stage: str, values: Mapping[str, float]) -> None:
         self.stage = stage
@@ -224,7 +225,7 @@ class _Curve:
 
     def write(self, step: int, seconds: float) -> None:
         means = {name: f"{total / count:.6g}" for name, (total, count) in self.sums.items()}
-        with self.path.open("a", newline="") as file:
+        with writing(self.path), self.path.open("a", newline="") as file:
             csv.DictWriter(file, COLUMNS).writerow(
                 {"step": step, "stage": self.stage, "seconds": f"{seconds:.1f}"} | means
             )

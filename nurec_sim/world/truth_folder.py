@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from nurec_sim.errors import ClipError
+from nurec_sim.new_files import writing
 from nurec_sim.world.isp import CameraResponse
 from nurec_sim.world.plan import TownPlan
 from nurec_sim.world.scan import LidarResponse
@@ -34,6 +35,7 @@ class TruthFolder:
 
     Raises:
         ClipError: ``path`` exists.
+        WriteError: it cannot be written.
     """
 
     def __init__(self, path: str | Path):
@@ -42,10 +44,11 @@ class TruthFolder:
             raise ClipError(f"{str(self.path)!r} exists; choose another folder for the truth")
 
     def __enter__(self) -> TruthFolder:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._work = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", dir=self.path.parent))
-        self._folder = self._work / "truth"
-        self._folder.mkdir()
+        with writing(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._work = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", dir=self.path.parent))
+            self._folder = self._work / "truth"
+            self._folder.mkdir()
         return self
 
     def __exit__(
@@ -53,26 +56,29 @@ class TruthFolder:
     ) -> None:
         try:
             if kind is None:
-                os.replace(self._folder, self.path)
+                with writing(self.path):
+                    os.replace(self._folder, self.path)
         finally:
             shutil.rmtree(self._work, ignore_errors=True)
 
     def add_plan(self, plan: TownPlan, responses: Mapping[str, CameraResponse | LidarResponse]) -> None:
         """The plan, and what each sensor does to light or echoes."""
-        (self._folder / PLAN_FILE).write_text(plan.to_json(), encoding="utf-8")
         known = {name: dataclasses.asdict(response) for name, response in responses.items()}
-        (self._folder / RESPONSES_FILE).write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+        with writing(self.path):
+            (self._folder / PLAN_FILE).write_text(plan.to_json(), encoding="utf-8")
+            (self._folder / RESPONSES_FILE).write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
 
     def add_view(self, camera_id: str, index: int, view: TrueView, flow_m: Float32[np.ndarray, "h w 3"]) -> None:
         """The truth of one image; ``flow_m`` is how far each pixel's point moves until the next one."""
         file = self._folder / camera_id / f"{index:04d}.npz"
-        file.parent.mkdir(exist_ok=True)
-        np.savez_compressed(
-            file,
-            allow_pickle=False,
-            depth_m=view.depth_m,
-            surface=view.surface,
-            instance=view.instance.astype(np.uint16),
-            normal=view.normal.astype(np.float16),
-            flow_m=flow_m.astype(np.float16),
-        )
+        with writing(self.path):
+            file.parent.mkdir(exist_ok=True)
+            np.savez_compressed(
+                file,
+                allow_pickle=False,
+                depth_m=view.depth_m,
+                surface=view.surface,
+                instance=view.instance.astype(np.uint16),
+                normal=view.normal.astype(np.float16),
+                flow_m=flow_m.astype(np.float16),
+            )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 
 import nurec_sim
 from nurec_sim.errors import ArchiveError
+from nurec_sim.new_files import temporary_folder
 from nurec_sim.scene import codec
 from nurec_sim.scene.columns import Columns
 from nurec_sim.scene.foreign.found import Found
@@ -38,9 +38,9 @@ def read_particle_fields(path: Path) -> Found:
     Raises:
         ArchiveError: the file cannot be read, or a field is damaged.
     """
-    with tempfile.TemporaryDirectory(prefix="nurec_sim_") as folder:
-        _run(path.resolve(), Path(folder))
-        report = codec.load((Path(folder) / "fields.json").read_bytes(), f"{path}: the stage")
+    with temporary_folder() as folder:
+        _run(path.resolve(), folder)
+        report = codec.load((folder / "fields.json").read_bytes(), f"{path}: the stage")
         found = Found(unknown=list(report["notes"]))
         scale = report["meters_per_unit"]
         if not 0 < scale < np.inf:
@@ -51,7 +51,7 @@ def read_particle_fields(path: Path) -> Found:
             placed = world_from_stage @ _invertible(volume["matrix"], f"{path}: a volume")
             found.volumes |= dict.fromkeys(volume["files"], placed)
         for number, field in enumerate(report["fields"]):
-            _add_field(found, Path(folder), number, field, world_from_stage, f"{path}: {field['path']}")
+            _add_field(found, folder, number, field, world_from_stage, f"{path}: {field['path']}")
     return found
 
 

@@ -7,7 +7,6 @@ Of an archive with several kinds of Gaussians the first that can be read is take
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -17,6 +16,7 @@ from jaxtyping import Float64
 
 from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
+from nurec_sim.new_files import temporary_folder
 from nurec_sim.scene.checks import check_scene
 from nurec_sim.scene.foreign.found import Found
 from nurec_sim.scene.foreign.nurec_checkpoint import read_checkpoint
@@ -178,13 +178,13 @@ def _plys(package: Package, names: list[str]) -> Found:
     """The Gaussians of all PLY members that hold such."""
     found, faults = Found(), []
     for name in names:
-        with tempfile.NamedTemporaryFile(suffix=".ply", prefix="nurec_sim_") as file:
-            file.write(package.read(name))
-            file.flush()
+        with temporary_folder() as folder:
+            path = folder / "part.ply"
+            path.write_bytes(package.read(name))
             try:
-                gaussians, dropped = read_ply(file.name)
+                gaussians, dropped = read_ply(path)
             except ArchiveError as error:
-                faults.append(str(error).replace(file.name, name))
+                faults.append(str(error).replace(str(path), name))
                 continue
         found.static.append(gaussians)
         found.dropped += dropped
