@@ -24,6 +24,7 @@ from nurec_sim.types import Label
 def street(sh=8):
     """Static and moving Gaussians in front of a camera, under a sky, with a colour correction."""
     static = worlds.cloud(2000, sh=sh)
+    static.label[:500] = Label.ROAD
     isp = {"front": np.array([[0.9, 0.05, 0.0, 0.02], [0.0, 1.1, 0.0, -0.03], [0.02, 0.0, 0.95, 0.0]])}
     dynamic = dataclasses.replace(worlds.moving_cloud(200), track=np.full(200, 0, np.int32))
     scene = worlds.scene(static, dynamic, [worlds.track()], textured_sky(32), isp)
@@ -39,16 +40,36 @@ def view(scene, t_us=worlds.START_US, yaw=0.0):
     return Renderer(scene, threads=1).render_camera(request).rgb
 
 
-@pytest.mark.parametrize("sh", [0, 8])
-def test_a_scene_looks_the_same_after_the_round_trip(tmp_path, sh):
+@pytest.mark.parametrize(
+    "sh, layout, up", [(0, "inria", "z"), (0, "release", "-y"), (8, "inria", "y"), (8, "release", "z")]
+)
+def test_a_scene_looks_the_same_after_the_round_trip(tmp_path, sh, layout, up):
     scene = dataclasses.replace(street(sh), dynamic=worlds.scene().dynamic)
-    exported = export_scene(scene, tmp_path / "a.ply")
+    exported = export_scene(scene, tmp_path / "a.ply", layout=layout, up=up)
     assert [path.name for path in exported.paths] == ["a.ply", "a.sky.npz", "a.sky.png"]
-    back = import_scene(tmp_path / "a.ply", like=scene)
+    back = import_scene(tmp_path / "a.ply", like=scene, up=up)
     for yaw in (0.0, 2.0):
         assert worlds.psnr_db(view(back, yaw=yaw), view(scene, yaw=yaw)) > 50
     assert view(scene).std() > 20
-    assert np.array_equal(back.static.label == Label.ROAD, scene.static.label == Label.ROAD)
+    assert np.array_equal(back.sky, scene.sky.astype(np.float16)) and np.isfinite(back.sky).all()
+    road = scene.static.label == Label.ROAD
+    assert np.array_equal(back.static.label == Label.ROAD, road if layout == "release" else road & False)
+    assert any("no road:" in text for text in unknown_of(back)) == (layout == "inria")
+
+
+@pytest.mark.parametrize("up", list(UP_AXES))
+def test_an_export_has_the_axis_asked_for_up(tmp_path, up):
+    """A Gaussian high above the origin, its normal upwards, lies on that axis; ahead (x) is as an import takes it."""
+    above = dataclasses.replace(
+        worlds.gaussians([[0, 0, 5.0], [7.0, 0, 0]]), normal=np.array([[0, 0, 1], [1, 0, 0]], np.float32)
+    )
+    export_scene(worlds.scene(above), tmp_path / "a.ply", up=up)
+    plain, _ = read_ply(tmp_path / "a.ply")
+    file_up = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+    assert np.allclose(plain.mean_m[0], 5 * file_up) and np.allclose(plain.normal[0], file_up)
+    assert f" {up} up\n".encode() in (tmp_path / "a.ply").read_bytes()[:200]
+    ahead = {"z": (0, 1), "-z": (0, 1), "y": (2, -1), "-y": (2, 1), "x": (2, -1), "-x": (2, 1)}[up]  # docs/exchange.md
+    assert plain.mean_m[1, ahead[0]] == pytest.approx(7 * ahead[1])
 
 
 @pytest.mark.parametrize("after_us", [-30_000, 0, 70_001])
@@ -88,6 +109,10 @@ def test_an_export_replaces_nothing_unasked(tmp_path):
     export_scene(street(), tmp_path / "a.ply", overwrite=True)
     with pytest.raises(ArchiveError, match=r"must end in \.ply"):
         export_scene(street(), tmp_path / "a.usdz")
+    for wrong in ({"layout": "spark"}, {"up": "w"}):
+        with pytest.raises(ArchiveError, match="must be one of"):
+            export_scene(street(), tmp_path / "b.ply", **wrong)
+    assert not list(tmp_path.glob("b*"))
 
 
 def test_a_foreign_file_becomes_a_scene_that_can_be_written(tmp_path):
@@ -162,8 +187,6 @@ def test_a_layer_takes_sky_and_colours_from_a_scene(tmp_path):
         assert worlds.psnr_db(view(back, yaw=yaw), view(scene, yaw=yaw)) > 50
     assert back.sky is scene.sky and back.tracks is scene.tracks and not any("sky" in t for t in unknown_of(back))
     assert back.provenance["like"] == "test"
-    alone = import_scene(tmp_path / "splats.usdc")
-    assert not alone.sky.any() and any("no sky" in text for text in unknown_of(alone))
     write_sky(SkySidecar(textured_sky(4)), tmp_path / "mine.npz")
     mine = import_scene(tmp_path / "splats.usdc", like=scene, sky=tmp_path / "mine.npz")
     assert mine.sky.shape == (6, 4, 4, 3) and mine.provenance["sky_file"] == "mine.npz" and not mine.isp

@@ -34,12 +34,28 @@ def same(a: Gaussians, b: Gaussians, tolerance=1e-5):
 # -------------------------------------------------------------------------------------------------------- writing
 
 
-def test_a_vertex_has_77_bytes_in_the_released_order(tmp_path):
-    one = dataclasses.replace(
+def one_gaussian():
+    return dataclasses.replace(
         worlds.gaussians([[1.5, -2.25, 3.0]], scale=(0.1, 0.2, 0.3), opacity=0.75, rgb=(0.0, 0.5, 1.0), label=1),
         normal=np.array([[0, 0.6, 0.8]], np.float32), quat_wxyz=np.array([[0.5, -0.5, 0.5, 0.5]], np.float32),
     )  # fmt: skip
-    assert write_ply(one, tmp_path / "a.ply") == 1
+
+
+def test_a_vertex_has_the_properties_of_inrias_code_all_floats(tmp_path):
+    """One property more, or one that is no float, and viewers draw black dots or refuse the file."""
+    assert write_ply(one_gaussian(), tmp_path / "a.ply") == 1
+    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    lines = header.decode().splitlines()
+    assert [line for line in lines if line.startswith("property")] == [f"property float {name}" for name in names]
+    c0 = 0.28209479177387814
+    expected = [1.5, -2.25, 3.0, 0.0, 0.6, 0.8, -0.5 / c0, 0.0, 0.5 / c0, np.log(3.0), np.log(0.1), np.log(0.2),
+                np.log(0.3), 0.5, -0.5, 0.5, 0.5]  # fmt: skip
+    assert np.allclose(struct.unpack("<17f", body), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_a_vertex_has_77_bytes_in_the_released_order(tmp_path):
+    assert write_ply(one_gaussian(), tmp_path / "a.ply", layout="release") == 1
     header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     lines = header.decode().splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"] and "element vertex 1" in lines
@@ -54,17 +70,26 @@ def test_a_vertex_has_77_bytes_in_the_released_order(tmp_path):
 
 def test_view_dependent_coefficients_follow_channel_by_channel(tmp_path):
     one = dataclasses.replace(worlds.gaussians([[0, 0, 0]]), sh_rest=np.arange(24, dtype=np.float32).reshape(1, 8, 3))
-    write_ply(one, tmp_path / "a.ply")
-    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
-    assert len(body) == 77 + 4 * 24
-    assert header.index(b"f_dc_2") < header.index(b"f_rest_0") < header.index(b"f_rest_23") < header.index(b"road_mask")
-    rest = struct.unpack("<24f", body[72 : 72 + 96])
-    assert rest[:8] == tuple(range(0, 24, 3)) and rest[8:16] == tuple(range(1, 24, 3))
+    for layout, size, at, follows in (("release", 77, 72, b"road_mask"), ("inria", 68, 36, b"opacity")):
+        write_ply(one, tmp_path / "a.ply", layout=layout, overwrite=True)
+        header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+        assert len(body) == size + 4 * 24
+        assert header.index(b"f_dc_2") < header.index(b"f_rest_0") < header.index(b"f_rest_23") < header.index(follows)
+        rest = struct.unpack("<24f", body[at : at + 96])
+        assert rest[:8] == tuple(range(0, 24, 3)) and rest[8:16] == tuple(range(1, 24, 3))
+
+
+def test_a_layout_or_axis_that_is_none(tmp_path):
+    with pytest.raises(ArchiveError, match=r"layout must be one of \['inria', 'release'\], got 'spz'"):
+        write_ply(one_gaussian(), tmp_path / "a.ply", layout="spz")
+    with pytest.raises(ArchiveError, match=r"up must be one of \['z', '-z', .*\], got 'w'"):
+        write_ply(one_gaussian(), tmp_path / "a.ply", up="w")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("opacity", [0.0, 1.0])
 def test_full_and_no_opacity_stay_finite(tmp_path, opacity):
-    write_ply(worlds.gaussians([[0, 0, 0]], opacity=opacity), tmp_path / "a.ply")
+    write_ply(worlds.gaussians([[0, 0, 0]], opacity=opacity), tmp_path / "a.ply", layout="release")
     logit = struct.unpack("<f", (tmp_path / "a.ply").read_bytes()[-77:][56:60])[0]
     assert np.isfinite(logit)
     assert read_ply(tmp_path / "a.ply")[0].opacity[0] == pytest.approx(opacity, abs=2e-6)
@@ -79,13 +104,16 @@ def test_what_has_no_finite_form_is_left_out(tmp_path):
     assert dropped == 0 and np.array_equal(back.mean_m, cloud.mean_m[4:]) and not back.normal[0].any()
 
 
+@pytest.mark.parametrize("layout", ["inria", "release"])
 @pytest.mark.parametrize("k", [0, 3, 8, 15])
-def test_gaussians_come_back(tmp_path, k):
+def test_gaussians_come_back(tmp_path, k, layout):
     cloud = worlds.cloud(300, sh=k)
     cloud.label[:] = np.random.default_rng(1).choice([Label.OTHER, Label.ROAD, Label.SKY], 300)
     cloud.intensity[:] = np.nan
     cloud = dataclasses.replace(cloud, quat_wxyz=geometry.quat_normalize(cloud.quat_wxyz).astype(np.float32))
-    write_ply(cloud, tmp_path / "a.ply")
+    write_ply(cloud, tmp_path / "a.ply", layout=layout)
+    if layout == "inria":  # which has no place for labels
+        cloud.label[:] = Label.OTHER
     back, dropped = read_ply(tmp_path / "a.ply")
     assert dropped == 0
     same(back, cloud, 2e-6)
@@ -216,7 +244,9 @@ def test_a_file_cut_short(tmp_path, form):
         (b"element vertex 2", b"element vertex -2", "header line 'element vertex -2'"),
         (b"element vertex 2", b"element vertex 1e3", "header line 'element vertex 1e3'"),
         (b"element vertex 2", b"element vertex 9999999999999999999999", "header line 'element vertex 999"),
-        (b"element vertex 2", b"element face 2", r"first element must be 'vertex', got \['face'\]"),
+        (b"element vertex 2", b"element face 2", r"no element 'vertex'; it has \['face'\]"),
+        (b"element vertex 2", b"element face 1\nproperty list uchar int i\nelement vertex 2", "lists come before"),
+        (b"element vertex 2", b"element camera 1\nproperty float f\nelement vertex 2", "only the first element"),
         (b"float y", b"float x", "header line 'property float x'"),
         (b"float y", b"quad y", "header line 'property quad y'"),
         (b"float y", b"list uchar float y", "header line 'property list uchar float y'"),

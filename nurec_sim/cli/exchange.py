@@ -20,32 +20,42 @@ def export(
     scene: OnePath,
     *,
     out_path: Annotated[Path, tyro.conf.arg(name="out")],
+    layout: Literal["inria", "release"] = "inria",
+    up: UpAxis = "z",
     at_us: int | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write a scene as a 3DGS PLY, for viewers and other simulators, with its sky beside it.
 
     Three files: X.ply holds the Gaussians, X.sky.npz the sky cubemap and the cameras' colour corrections, X.sky.png the
-    sky as a picture. The layout is that of the public Instant NuRec release; most 3DGS viewers open the PLY as it is
-    (docs/exchange.md). A PLY holds one instant: without --at-us the moving Gaussians are left out.
+    sky as a picture. A PLY holds one instant: without --at-us the moving Gaussians are left out. docs/exchange.md says
+    which viewers were tried and what a PLY does not keep.
 
     Args:
         scene: a scene archive or a clip.
         out_path: the PLY to write.
+        layout: inria has the properties that all 3DGS programs know; release those of the public Instant NuRec release,
+            which keep what is road, but which some viewers misread.
+        up: axis of the files that points up; y for viewers based on three.js (Spark, gsplat.js).
         at_us: also write the moving Gaussians, where and as opaque as they are at this time.
         overwrite: replace files that are there.
     """
     from nurec_sim.scene import export_scene
+    from nurec_sim.types import Label
 
     check_writable(out_path)
     world = load_scene(scene)
     with progress("exporting") as advance:
-        exported = export_scene(world, out_path, at_us=at_us, overwrite=overwrite, progress=advance)
+        exported = export_scene(
+            world, out_path, layout=layout, up=up, at_us=at_us, overwrite=overwrite, progress=advance
+        )
     left_out = [("left out: not finite, or without extent", f"{exported.not_finite:,}")] if exported.not_finite else []
     if exported.moving_left_out:
         start_us, end_us = world.span_us
         hint = f"{exported.moving_left_out:,} (--at-us {start_us} to {end_us - 1} has them as they are then)"
         left_out.append(("left out: moving", hint))
+    if layout == "inria" and (world.static.label == Label.ROAD).any():
+        left_out.append(("not kept", "which Gaussians are road (--layout release keeps it)"))
     sky = f"6 x {world.sky.shape[1]} x {world.sky.shape[2]}"
     rows = [("Gaussians", f"{exported.written:,}"), *left_out, ("sky", sky),
             ("colour correction", ", ".join(world.isp) or "none")]  # fmt: skip
@@ -66,8 +76,8 @@ def import_(
 ) -> None:
     """Make a scene archive (.usdz) from a file of another program.
 
-    A 3DGS PLY: ours, the Instant NuRec release's, or any trained one. A NuRec archive (.usdz), or its volume.nurec or
-    checkpoint.ckpt alone. OpenUSD particle fields (.usdz, .usda, .usdc, .usd).
+    A 3DGS PLY: ours, the Instant NuRec release's, any trained one, or a compressed one (SuperSplat); SPZ. A NuRec
+    archive (.usdz), or its volume.nurec or checkpoint.ckpt alone. OpenUSD particle fields (.usdz, .usda, .usdc, .usd).
 
     What a file does not know, sensors with path and times, boxes, map, sky or colour corrections, comes from --like;
     without it the car stands at the origin for one second with one camera that looks along x, under a black sky. What
@@ -82,7 +92,7 @@ def import_(
         out_path: the archive to write; the file's name with .usdz in the current folder if not given.
         sky: a .sky.npz file; X.sky.npz beside X.ply if not given and it is there.
         like: a scene archive or a clip of the same place; a clip has no sky and no colour corrections.
-        up: which axis of a PLY points up; -y for most trained files, y for those made for OpenGL.
+        up: which axis of a PLY or SPZ file points up, z and y unless given; -y for most trained PLY files.
         overwrite: replace an archive that is there.
     """
     from nurec_sim import logs, scene

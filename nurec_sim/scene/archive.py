@@ -47,7 +47,7 @@ KNOT_TIMES, KNOTS, OWNERS, IN_BOX = (
 TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY, KNOT_TIMES, KNOTS, OWNERS)
 """The members that a scene is read from, with ``IN_BOX`` where it has such; all others are for other programs."""
 
-FOREIGN_SUFFIXES = (".ply", ".usd", ".usda", ".usdc", ".nurec", ".ckpt")
+FOREIGN_SUFFIXES = (".ply", ".spz", ".usd", ".usda", ".usdc", ".nurec", ".ckpt")
 SCENE_SUFFIXES = (".usdz", *FOREIGN_SUFFIXES)
 """Names of files that ``read_scene`` opens end in one of these, in capitals or not."""
 
@@ -99,7 +99,7 @@ def read_scene(path: Path | str) -> GaussianScene:
     """Reads a scene archive written by ``write_scene``, every value exactly; or what another program wrote.
 
     Of an archive of ours nothing is extracted, unpickled or run, and no file outside of it is opened. For other
-    archives and for ``.ply``, ``.usd``, ``.usda``, ``.usdc``, ``.nurec`` and ``.ckpt`` files see
+    archives and for ``.ply``, ``.spz``, ``.usd``, ``.usda``, ``.usdc``, ``.nurec`` and ``.ckpt`` files see
     ``foreign.read_foreign``.
 
     Raises:

@@ -11,10 +11,10 @@ import numpy as np
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene.archive import is_foreign, read_scene
 from nurec_sim.scene.foreign import read_foreign
-from nurec_sim.scene.ply import Progress, write_ply
+from nurec_sim.scene.ply import LAYOUTS, Layout, Progress, write_ply
 from nurec_sim.scene.sky_sidecar import SkySidecar, read_sky, sky_paths, write_sky
 from nurec_sim.scene.surroundings import colours_in, first_colours, surroundings_of, taken_from
-from nurec_sim.scene.transform import joined, transformed
+from nurec_sim.scene.transform import joined, transformed, world_from_up
 from nurec_sim.types import Clip, Gaussians, GaussianScene
 
 
@@ -32,6 +32,8 @@ def export_scene(
     scene: GaussianScene,
     path: Path | str,
     *,
+    layout: Layout = "inria",
+    up: str = "z",
     at_us: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -41,16 +43,22 @@ def export_scene(
     Args:
         scene: what to write: the static layer, the sky and the colour correction.
         path: ends in ``.ply``.
+        layout: which properties a vertex of the PLY has, one of ``LAYOUTS``.
+        up: axis of the files that points up, one of ``UP_AXES``; what is written is turned, the sky too.
         at_us: also write the moving Gaussians, as they are at this instant; left out if None.
         overwrite: whether existing files may be replaced.
         progress: hears what is being done and the fraction of it that is.
 
     Raises:
-        ArchiveError: a file exists, the name does not end in ``.ply``, or the instant is outside of the scene's span.
+        ArchiveError: a file exists, the name does not end in ``.ply``, the instant is outside of the scene's span,
+            or there is no such layout or axis.
     """
     path = Path(path)
     if path.suffix != ".ply":
         raise ArchiveError(f"the name of a PLY file must end in .ply, got {path.name!r}")
+    if layout not in LAYOUTS:
+        raise ArchiveError(f"layout must be one of {list(LAYOUTS)}, got {layout!r}")
+    world_from_file = world_from_up(up)
     npz, png = sky_paths(path)
     taken = [str(file) for file in (path, npz, png) if file.exists()]
     if taken and not overwrite:
@@ -60,8 +68,8 @@ def export_scene(
         raise ArchiveError(f"instant {at_us} us is outside of the scene, which spans [{start_us}, {end_us}) us")
     gaussians = scene.static if at_us is None else _with_moving(scene, at_us)
     sidecar = SkySidecar(scene.sky, isp=scene.isp, source=str(scene.provenance.get("method", "unknown")))
-    write_sky(sidecar, npz, png, cameras=list(scene.rig.cameras))
-    written = write_ply(gaussians, path, overwrite=overwrite, progress=progress)
+    write_sky(sidecar, npz, png, cameras=list(scene.rig.cameras), world_from_file=world_from_file)
+    written = write_ply(gaussians, path, layout=layout, up=up, overwrite=overwrite, progress=progress)
     left_out = len(scene.dynamic) if at_us is None else 0
     return Exported((path, npz, png), written, len(gaussians) - written, left_out)
 

@@ -1,4 +1,4 @@
-"""Gaussians as a 3DGS PLY file: the released network's layout written, that and everyone else's read.
+"""Gaussians as a 3DGS PLY file: two layouts written, everyone's read.
 
 In the file scales are logarithms, opacities logits, quaternions ``wxyz``, colours coefficients of spherical harmonics
 (docs/exchange.md).
@@ -8,18 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
 from nurec_sim.new_files import new_file
 from nurec_sim.scene.columns import Columns, sigmoid
+from nurec_sim.scene.compressed_ply import is_compressed, read_compressed
 from nurec_sim.scene.harmonics import SH_C0
 from nurec_sim.scene.ply_table import VertexTable
+from nurec_sim.scene.transform import transformed, world_from_up
 from nurec_sim.types import Gaussians, Label
 
 Progress = Callable[[str, float], None]
+Layout = Literal["inria", "release"]
+LAYOUTS = get_args(Layout)
 
 MOST_OPAQUE = 1 - 1e-6
 """Opacities are kept this far from 0 and 1, whose logits are infinite."""
@@ -29,8 +35,15 @@ SCALE, ROTATION = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2",
 NEEDED = (*POSITION, *ROTATION, *SCALE, "opacity", *COLOUR)
 
 
-def vertex_type(k: int = 0) -> np.dtype:
-    """A vertex of the released layout, 77 bytes; 3 k coefficients of view-dependent colour follow ``f_dc``."""
+def vertex_type(k: int = 0, layout: Layout = "inria") -> np.dtype:
+    """A vertex with 3 k coefficients of view-dependent colour; 68 bytes, or 77 in the released layout, if k is 0.
+
+    ``inria`` is what the code of Kerbl et al., "3D Gaussian Splatting" (2023) writes, floats only; many viewers take
+    any other property for a float as well. ``release`` is what the released Instant NuRec network writes.
+    """
+    if layout == "inria":
+        names = (*POSITION, *NORMAL, *COLOUR, *_rest_names(k), "opacity", *SCALE, *ROTATION)
+        return np.dtype([(name, "<f4") for name in names])
     floats = (*ROTATION, *SCALE, "opacity", *COLOUR, *_rest_names(k))
     return np.dtype(
         [(name, "<f4") for name in POSITION + NORMAL]
@@ -41,16 +54,24 @@ def vertex_type(k: int = 0) -> np.dtype:
 
 
 def write_ply(
-    gaussians: Gaussians, path: Path | str, *, overwrite: bool = False, progress: Progress | None = None
+    gaussians: Gaussians,
+    path: Path | str,
+    *,
+    layout: Layout = "inria",
+    up: str = "z",
+    overwrite: bool = False,
+    progress: Progress | None = None,
 ) -> int:
     """Writes a binary little-endian PLY; the file appears complete or not at all.
 
     Gaussians that have no finite form in the file are left out: a value that is not finite, a scale of zero.
-    Labels other than road and sky, LiDAR intensities and ray drop are not kept.
+    LiDAR intensities and ray drop are not kept; of the labels, road and sky by the layout ``release`` only.
 
     Args:
         gaussians: what to write, world frame.
         path: the file; its folder is made if need be.
+        layout: which properties a vertex has.
+        up: axis of the file that points up, one of ``UP_AXES``; Gaussians are turned, colours with them.
         overwrite: whether an existing file may be replaced.
         progress: hears what is being done and the fraction of it that is.
 
@@ -58,17 +79,22 @@ def write_ply(
         How many were written.
 
     Raises:
-        ArchiveError: the file exists.
+        ArchiveError: the file exists, or there is no such layout or axis.
     """
     path = Path(path)
+    if layout not in LAYOUTS:
+        raise ArchiveError(f"layout must be one of {list(LAYOUTS)}, got {layout!r}")
+    file_from_world = geometry.pose(world_from_up(up).T, np.zeros(3))
     if path.exists() and not overwrite:
         raise ArchiveError(f"{path} exists; pass overwrite=True to replace it")
     rows = np.flatnonzero(_writable(gaussians))
     k = 0 if gaussians.sh_rest is None else gaussians.sh_rest.shape[1]
     with new_file(path) as file:
-        file.write(_header(vertex_type(k), len(rows)))
+        file.write(_header(vertex_type(k, layout), len(rows), up))
         for first in range(0, len(rows), BLOCK):
-            file.write(_vertices(gaussians[rows[first : first + BLOCK]], k).tobytes())
+            block = gaussians[rows[first : first + BLOCK]]
+            turned = block if up == "z" else transformed(block, file_from_world)
+            file.write(_vertices(turned, vertex_type(k, layout)).tobytes())
             if progress is not None:
                 progress("writing vertices", min(first + BLOCK, len(rows)) / len(rows))
     return len(rows)
@@ -77,10 +103,10 @@ def write_ply(
 def read_ply(path: Path | str) -> tuple[Gaussians, int]:
     """Reads Gaussians from the PLY file of any 3DGS program.
 
-    Properties may have any order and type; ``nx ny nz``, ``f_rest_*`` (0, 9, 24 or 45 of them, channel-major),
-    ``road_mask`` and ``sky_mask`` are optional, others are ignored. An infinite opacity means 1 (the released
-    network writes it), a normal that is not finite is unknown; any other value that is not finite, a quaternion of
-    zero or a scale of zero drops its Gaussian.
+    Compressed files (``compressed_ply``) are known by their properties. In others these may have any order and type;
+    ``nx ny nz``, ``f_rest_*`` (0, 9, 24 or 45 of them, channel-major), ``road_mask`` and ``sky_mask`` are optional,
+    others are ignored. An infinite opacity means 1 (the released network writes it), a normal that is not finite is
+    unknown; any other value that is not finite, a quaternion of zero or a scale of zero drops its Gaussian.
 
     Returns:
         The Gaussians, and how many were dropped.
@@ -89,6 +115,8 @@ def read_ply(path: Path | str) -> tuple[Gaussians, int]:
         ArchiveError: not a PLY file, damaged, cut short, or without the properties of Gaussians.
     """
     table = VertexTable(Path(path))
+    if is_compressed(table):
+        return read_compressed(table)
     if missing := [name for name in NEEDED if name not in table.names]:
         raise ArchiveError(f"{path}: no Gaussians: the vertices lack {missing}; they have {list(table.names)}")
     k = _harmonics_of(table)
@@ -119,35 +147,36 @@ def _writable(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
     return sound
 
 
-def _header(dtype: np.dtype, count: int) -> bytes:
+def _header(dtype: np.dtype, count: int, up: str) -> bytes:
     names = {"<f4": "float", "|u1": "uchar"}
     properties = [f"property {names[dtype[name].str]} {name}" for name in dtype.names or ()]
-    lines = ["ply", "format binary_little_endian 1.0", "comment 3D Gaussians, world frame, metres, z up",
+    lines = ["ply", "format binary_little_endian 1.0", f"comment 3D Gaussians, metres, {up} up",
              f"element vertex {count}", *properties, "end_header"]  # fmt: skip
     return "".join(f"{line}\n" for line in lines).encode("ascii")
 
 
-def _vertices(gaussians: Gaussians, k: int) -> np.ndarray:
+def _vertices(gaussians: Gaussians, dtype: np.dtype) -> np.ndarray:
     """Gaussians in the file's units, as an array of ``vertex_type``."""
+    k = 0 if gaussians.sh_rest is None else gaussians.sh_rest.shape[1]
     opacity = np.clip(gaussians.opacity.astype(np.float64), 1 - MOST_OPAQUE, MOST_OPAQUE)
-    columns = {
+    columns: dict[tuple[str, ...], np.ndarray] = {
         POSITION: gaussians.mean_m,
         NORMAL: np.where(np.isfinite(gaussians.normal).all(axis=1, keepdims=True), gaussians.normal, 0),
-        ("red", "green", "blue"): np.round(np.clip(gaussians.rgb, 0, 1) * 255),
         ROTATION: gaussians.quat_wxyz,
         SCALE: np.log(gaussians.scale_m.astype(np.float64)),
         COLOUR: (gaussians.rgb.astype(np.float64) - 0.5) / SH_C0,
     }
     if gaussians.sh_rest is not None:
         columns[_rest_names(k)] = gaussians.sh_rest.transpose(0, 2, 1).reshape(len(gaussians), 3 * k)
-    vertices = np.zeros(len(gaussians), vertex_type(k))
+    if "alpha" in (dtype.names or ()):
+        columns[("red", "green", "blue")] = np.round(np.clip(gaussians.rgb, 0, 1) * 255)
+        columns[("alpha",)] = np.full((len(gaussians), 1), 255)
+        columns[("road_mask", "sky_mask")] = np.stack([gaussians.label == each for each in (Label.ROAD, Label.SKY)], 1)
+    vertices = np.zeros(len(gaussians), dtype)
+    vertices["opacity"] = np.log(opacity / (1 - opacity))
     for names, values in columns.items():
         for name, column in zip(names, values.T, strict=True):
             vertices[name] = column
-    vertices["alpha"] = 255
-    vertices["opacity"] = np.log(opacity / (1 - opacity))
-    vertices["road_mask"] = gaussians.label == Label.ROAD
-    vertices["sky_mask"] = gaussians.label == Label.SKY
     return vertices
 
 

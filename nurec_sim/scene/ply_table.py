@@ -1,4 +1,4 @@
-"""The vertices of a PLY file as columns of numbers: ascii or binary of either byte order, read with suspicion.
+"""The elements of a PLY file as columns of numbers: ascii or binary of either byte order, read with suspicion.
 
 Format: Greg Turk, "The PLY Polygon File Format" (1994).
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -28,34 +29,45 @@ BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">
 
 
 class VertexTable:
-    """The ``vertex`` element of a PLY file; a binary one is mapped, so that only the columns asked for take memory.
+    """An element of a PLY file; a binary one is mapped, so that only the columns asked for take memory.
 
     Attributes:
         path: the file.
         names: properties, in the file's order.
+        elements: names of all elements of the file.
 
     Raises:
-        ArchiveError: not a PLY file, a header that is wrong or not supported, or fewer vertices than promised.
+        ArchiveError: not a PLY file, a header that is wrong or not supported, no such element, or fewer rows than
+            promised.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, element: str = "vertex") -> None:
         self.path = path
         try:
             with path.open("rb") as file:
-                form, count, types = _read_header(file, path)
-                self.names = tuple(types)
+                form, elements = _read_header(file, path)
+                before, count, types = _find(elements, element, path)
+                self.names, self.elements = tuple(types), tuple(each.name for each in elements)
                 start, size = file.tell(), os.fstat(file.fileno()).st_size
                 if form == "ascii":
+                    if before:
+                        raise ArchiveError(f"{path}: of an ascii file only the first element is read, not {element!r}")
                     self._rows: np.ndarray = _read_text(file, path, count, len(types), size - start)
                     return
         except OSError as error:
             raise ArchiveError(f"{path}: cannot be opened ({error.strerror or error})") from error
-        dtype = np.dtype([(name, BYTE_ORDERS[form] + kind) for name, kind in types.items()])
+        order = BYTE_ORDERS[form]
+        start += sum(each.count * _row_type(each.types, order).itemsize for each in before)
+        dtype = _row_type(types, order)
         _check_size(path, count, dtype.itemsize, size - start, "")
         self._rows = np.memmap(path, dtype, "r", start, (count,)) if count else np.zeros(0, dtype)
 
     def __len__(self) -> int:
         return len(self._rows)
+
+    def column(self, name: str) -> np.ndarray:
+        """A property of a binary file as it is, ``[n]``."""
+        return self._rows[name]
 
     def columns(self, names: Sequence[str]) -> Float32[np.ndarray, "n names"]:
         """Some properties side by side; numbers too large for a float become infinite.
@@ -101,12 +113,22 @@ def _read_text(file: BinaryIO, path: Path, count: int, width: int, held_bytes: i
 # --------------------------------------------------------------------------------------------------------- header
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, dict[str, str]]:
-    """Format, number of vertices, and their properties with NumPy's types; the file is left at the first vertex."""
+@dataclass
+class _Element:
+    """``types`` are NumPy's, by the names of the properties; ``lists`` says whether there are others."""
+
+    name: str
+    count: int
+    types: dict[str, str] = field(default_factory=dict)
+    lists: bool = False
+
+
+def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Element]]:
+    """Format and elements; the file is left at the first row of the first one."""
     if file.readline(8).strip() != b"ply":
         raise ArchiveError(f"{path}: not a PLY file; its first line must be 'ply'")
     form: str | None = None
-    elements: list[tuple[str, int, dict[str, str]]] = []
+    elements: list[_Element] = []
     for line in _header_lines(file, path):
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
@@ -114,22 +136,35 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, dict[str, str]]:
             case ["format", name, "1.0"] if name in BYTE_ORDERS and form is None:
                 form = name
             case ["element", name, count] if count.isdecimal() and len(count) <= 18:
-                elements.append((name, int(count), {}))
-            case ["property", "list", _, _, _] if elements and elements[-1][0] != "vertex":
-                pass
-            case ["property", kind, name] if elements and kind in TYPES and name not in elements[-1][2]:
-                elements[-1][2][name] = TYPES[kind]
-                if len(elements[-1][2]) > MAX_PROPERTIES:
-                    raise ArchiveError(f"{path}: more than {MAX_PROPERTIES} properties of {elements[-1][0]!r}")
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", _, _, _] if elements and elements[-1].name != "vertex":
+                elements[-1].lists = True
+            case ["property", kind, name] if elements and kind in TYPES and name not in elements[-1].types:
+                elements[-1].types[name] = TYPES[kind]
+                if len(elements[-1].types) > MAX_PROPERTIES:
+                    raise ArchiveError(f"{path}: more than {MAX_PROPERTIES} properties of {elements[-1].name!r}")
             case _:
                 raise ArchiveError(f"{path}: the header line {line[:80]!r} is wrong or not supported")
     if form is None:
         raise ArchiveError(f"{path}: the header names no format; allowed are {list(BYTE_ORDERS)}")
-    if not elements or elements[0][0] != "vertex":
-        raise ArchiveError(f"{path}: the first element must be 'vertex', got {[name for name, _, _ in elements]}")
-    if not elements[0][2]:
-        raise ArchiveError(f"{path}: the vertices have no properties")
-    return form, elements[0][1], elements[0][2]
+    return form, elements
+
+
+def _find(elements: list[_Element], name: str, path: Path) -> tuple[list[_Element], int, dict[str, str]]:
+    """The elements before the one of a name, its count and its types."""
+    names = [element.name for element in elements]
+    if name not in names:
+        raise ArchiveError(f"{path}: no element {name!r}; it has {names}")
+    before, found = elements[: names.index(name)], elements[names.index(name)]
+    if any(element.lists for element in before):
+        raise ArchiveError(f"{path}: lists come before the element {name!r}; that is not supported; it has {names}")
+    if not found.types or found.lists:
+        raise ArchiveError(f"{path}: the element {name!r} has {'lists' if found.lists else 'no properties'}")
+    return before, found.count, found.types
+
+
+def _row_type(types: dict[str, str], order: str) -> np.dtype:
+    return np.dtype([(name, order + kind) for name, kind in types.items()])
 
 
 def _header_lines(file: BinaryIO, path: Path) -> Iterator[str]:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from nurec_sim import geometry
+from nurec_sim.errors import ArchiveError
 from nurec_sim.scene.harmonics import rotate_harmonics
 from nurec_sim.types import Gaussians
 
@@ -22,6 +23,17 @@ UP_AXES: Mapping[str, tuple[tuple[int, int, int], ...]] = {
 }
 """world_from_file by the axis of the file that points up. The world's x is what such files have ahead: +z where y
 points down (COLMAP, most trained 3DGS files), -z where y points up (OpenGL)."""
+
+
+def world_from_up(up: str) -> Float64[np.ndarray, "3 3"]:
+    """The rotation from a file whose axis ``up`` points up to the world.
+
+    Raises:
+        ArchiveError: no such axis.
+    """
+    if up not in UP_AXES:
+        raise ArchiveError(f"up must be one of {list(UP_AXES)}, got {up!r}")
+    return np.array(UP_AXES[up], np.float64)
 
 
 def transformed(gaussians: Gaussians, a_from_b: Float64[np.ndarray, "4 4"]) -> Gaussians:

@@ -31,7 +31,7 @@ def read_volume(data: bytes, where: str) -> NurecState:
     Raises:
         ArchiveError: no such file, cut short, damaged, or one that unpacks to more than it may.
     """
-    content = _unpacked(_gunzipped(data, where), where)
+    content = _unpacked(gunzipped(data, where), where)
     nre = content.get("nre_data") if isinstance(content, dict) else None
     if not isinstance(nre, dict) or not isinstance(nre.get("state_dict"), dict):
         raise ArchiveError(f"{where}: no NuRec volume: 'nre_data' with a 'state_dict' is missing")
@@ -58,7 +58,12 @@ def read_volume(data: bytes, where: str) -> NurecState:
     )
 
 
-def _gunzipped(data: bytes, where: str) -> bytes:
+def gunzipped(data: bytes, where: str) -> bytes:
+    """What a gzip file holds.
+
+    Raises:
+        ArchiveError: no such file, cut short, damaged, or one that unpacks to more than it may.
+    """
     limit = MAX_GROWTH * len(data) + FREE_BYTES
     unpacker = zlib.decompressobj(wbits=31)
     try:

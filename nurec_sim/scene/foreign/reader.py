@@ -24,19 +24,24 @@ from nurec_sim.scene.foreign.nurec_layers import found_in
 from nurec_sim.scene.foreign.nurec_volume import read_volume
 from nurec_sim.scene.foreign.particle_field import read_particle_fields
 from nurec_sim.scene.foreign.rig_sidecars import DATA_INFO, MAP, RIG, TRACKS, Surroundings, read_surroundings
+from nurec_sim.scene.foreign.spz import read_spz
 from nurec_sim.scene.foreign.usd_inside import may_hold
 from nurec_sim.scene.ply import read_ply
 from nurec_sim.scene.sky import sample_cubemap
 from nurec_sim.scene.sky_sidecar import SkySidecar, read_sky, sky_paths
 from nurec_sim.scene.surroundings import colours_in, colours_of, first_colours, surroundings_of, taken_from
-from nurec_sim.scene.transform import UP_AXES, joined, transformed
+from nurec_sim.scene.transform import joined, transformed, world_from_up
 from nurec_sim.scene.usd_layers import LAYER_SUFFIXES
 from nurec_sim.scene.zip_package import Package
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene, Label, Track
 
 FIELDS = "particle fields"
-SPLAT_FILES: dict[str, tuple[Callable[[Path], tuple[Gaussians, int]], str]] = {".ply": (read_ply, "z")}
+SPLAT_FILES: dict[str, tuple[Callable[[Path], tuple[Gaussians, int]], str]] = {
+    ".ply": (read_ply, "z"),
+    ".spz": (read_spz, "y"),
+}
 """Files of Gaussians and nothing else: how they are read, and the axis that points up unless somebody says another."""
+CONVERTIBLE = (".sog", ".ksplat", ".splat", ".lcc")
 _MESHES = ("mesh.ply", "mesh_ground.ply")
 
 
@@ -50,11 +55,13 @@ def read_foreign(
     """Reads a scene that another program wrote.
 
     Args:
-        path: a ``.usdz`` of NuRec or with particle fields, a USD layer, a ``.ply``, ``.nurec`` or ``.ckpt`` file.
+        path: a ``.usdz`` of NuRec or with particle fields, a USD layer, a ``.ply``, ``.spz``, ``.nurec`` or ``.ckpt``
+            file.
         sky: a sky file, for sky and colour corrections instead of those of the file; ``X.sky.npz`` beside ``X.ply`` is
             taken if None and it is there.
         like: a scene or a log in the same world, for what the file lacks.
-        up: axis of the file that points up, one of ``UP_AXES``, for files that do not say it; z for a PLY if None.
+        up: axis of the file that points up, one of ``UP_AXES``, for files that do not say it; z for a PLY and y
+            for SPZ if None.
 
     Returns:
         A sound scene; ``provenance["unknown"]`` lists what the file holds but is not read, and what it lacks.
@@ -64,8 +71,8 @@ def read_foreign(
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if up is not None and up not in UP_AXES:
-        raise ArchiveError(f"up must be one of {list(UP_AXES)}, got {up!r}")
+    if up is not None:
+        world_from_up(up)
     if up not in (None, "z") and suffix not in SPLAT_FILES:
         raise ArchiveError(f"{path}: only for {' and '.join(SPLAT_FILES)} can another axis than z be up; got {up!r}")
     if not path.is_file():
@@ -76,7 +83,7 @@ def read_foreign(
         if suffix in SPLAT_FILES:
             read, usual_up = SPLAT_FILES[suffix]
             up = up or usual_up
-            world_from_file = np.array(UP_AXES[up], np.float64)
+            world_from_file = world_from_up(up)
             around.nre_from_world = geometry.pose(world_from_file.T, np.zeros(3))
             sky = sky or next((file for file in sky_paths(path)[:1] if file.exists()), None)
             sidecar = None if sky is None else read_sky(sky, world_from_file)
@@ -94,7 +101,12 @@ def read_foreign(
                 found, source = _find(package, around)
         else:
             allowed = (".usdz", *LAYER_SUFFIXES, *SPLAT_FILES, ".nurec", ".ckpt")
-            raise ArchiveError(f"{path}: no scene; names of scenes end in {', '.join(allowed)}")
+            text = f"{path}: no scene; names of scenes end in {', '.join(allowed)}"
+            if suffix in CONVERTIBLE:
+                text += (
+                    f"; `splat-transform {path.name} {path.stem}.ply` (npm: @playcanvas/splat-transform) makes a PLY"
+                )
+            raise ArchiveError(text)
         if not found.count:
             raise ArchiveError(f"{path}: {source} holds no Gaussians. {' '.join(found.unknown)}")
         if sky is not None and sidecar is None:
