@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nurec_sim import geometry, logs
+from nurec_sim.decoding import Limits
 from nurec_sim.errors import ClipError
 from nurec_sim.logs import storage
 
@@ -36,7 +37,7 @@ def test_a_sound_clip_has_no_faults(clip_folder):
     assert logs.check_clip(clip_folder) == []
 
 
-@pytest.mark.parametrize("keep, text", [(0, "is neither a JPEG nor a PNG"), (300, "is truncated (300 bytes")])
+@pytest.mark.parametrize("keep, text", [(0, "must be a PNG or a JPEG file"), (300, "is truncated: 300 bytes")])
 def test_truncated_images_are_found(clip_folder, keep, text):
     file = clip_folder / "images/left/0001.jpg"
     file.write_bytes(file.read_bytes()[:keep])
@@ -45,7 +46,9 @@ def test_truncated_images_are_found(clip_folder, keep, text):
 
 
 def test_images_that_cannot_be_decoded_are_found(clip_folder):
-    (clip_folder / "images/left/0001.jpg").write_bytes(b"\xff\xd8" + b"garbage" * 9 + b"\xff\xd9")
+    (clip_folder / "images/left/0001.jpg").write_bytes(
+        b"\xff\xd8\xff\xc0\0\x11\x08\0\x10\0\x10" + b"garbage" * 9 + b"\xff\xd9"
+    )
     assert only_fault(clip_folder) == "camera 'left' frame 1: clip: image images/left/0001.jpg cannot be decoded"
 
 
@@ -83,7 +86,7 @@ def test_truncated_sweeps_are_found(clip_folder):
         ),
         ({"dxyz_mm": np.zeros((3, 0), np.int32)}, "it holds no points"),
         ({"dxyz_mm": np.full((3, 4), 2**30, np.int32)}, "m away"),
-        ({"dxyz_mm": np.array([[{}]], object)}, "Object arrays cannot be loaded"),
+        ({"dxyz_mm": np.array([[{}]], object)}, "dxyz_mm must hold plain values, got object"),
     ],
 )
 def test_sweeps_with_wrong_arrays_are_found(clip_folder, arrays, text):
@@ -250,7 +253,7 @@ def test_zips_without_a_clip_or_too_large_are_refused(tmp_path, monkeypatch):
         archive.writestr("readme.txt", "x" * 100)
     with pytest.raises(ClipError, match="no meta.json in the zip; this is not a clip"):
         logs.open_clip(tmp_path / "other.zip")
-    monkeypatch.setattr(storage, "MAX_FILE_BYTES", 99)
+    monkeypatch.setattr(storage, "LIMITS", Limits(file_bytes=99))
     with pytest.raises(ClipError, match="readme.txt unpacks to 100 bytes; at most 99 are allowed"):
         logs.open_clip(tmp_path / "other.zip")
 
@@ -266,7 +269,7 @@ def test_damaged_zips_are_found(tmp_path):
 
 
 def test_large_files_are_not_read(clip_folder, monkeypatch):
-    monkeypatch.setattr(storage, "MAX_FILE_BYTES", 10)
+    monkeypatch.setattr(storage, "LIMITS", Limits(file_bytes=10))
     with pytest.raises(ClipError, match="file meta.json has .* bytes; at most 10 are allowed"):
         logs.open_clip(clip_folder)
 

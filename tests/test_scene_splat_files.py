@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import render_scenes as worlds
 
-from nurec_sim import cli, geometry
+from nurec_sim import cli, decoding, geometry
+from nurec_sim.decoding import Limits
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene import import_scene, read_ply, read_scene, write_ply
-from nurec_sim.scene.foreign import nurec_volume
 from nurec_sim.scene.foreign.spz import read_spz
 from nurec_sim.scene.transform import transformed
 from nurec_sim.types import Gaussians
@@ -227,7 +227,7 @@ def test_harmonics_of_an_spz_file(tmp_path):
     ],
 )  # fmt: skip
 def test_spz_files_that_are_wrong(tmp_path, make, text, monkeypatch):
-    monkeypatch.setattr(nurec_volume, "FREE_BYTES", 1000)
+    monkeypatch.setattr(decoding, "LIMITS", Limits(free_bytes=1000))
     make(tmp_path / "a.spz")
     with pytest.raises(ArchiveError, match=text):
         read_spz(tmp_path / "a.spz")

@@ -12,6 +12,7 @@ from scene_worlds import full_scene
 from spoilt_archives import INFO, RIG, TRACKS, Members, clipgt, complete_scene, edit, members_of
 
 from nurec_sim import cli
+from nurec_sim.decoding import Limits
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene import write_scene
 from nurec_sim.scene.validate import CONSUMERS, RULES, contents, openusd, same_scene_ids, validate_archive
@@ -133,7 +134,7 @@ def test_hostile_members(members, tmp_path, name, data):
 
 
 def test_a_member_that_grows_when_unpacked(members, tmp_path, monkeypatch):
-    monkeypatch.setattr(contents, "MAX_JSON_BYTES", 100_000)
+    monkeypatch.setattr(contents, "LIMITS", Limits(json_bytes=100_000))
     path = plain_zip(tmp_path / "a.usdz", members | {TRACKS: bytes(5_000_000)}, zipfile.ZIP_DEFLATED)
     assert any(f"{TRACKS} has more than 100,000 bytes" in text for text in lines(path))
 

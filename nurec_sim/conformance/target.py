@@ -11,6 +11,7 @@ from jaxtyping import Float64, UInt8
 
 from nurec_sim import wire
 from nurec_sim.conformance.kit import Failed, Skipped, expect
+from nurec_sim.decoding import TooMuchError, check_image
 from nurec_sim.types import Matrix4, Trajectory
 from nurec_sim.wire import ImageFormat, sensorsim
 from nurec_sim.wire.poses import write_poses
@@ -170,7 +171,14 @@ def decode(data: bytes) -> UInt8[np.ndarray, "h w 3"]:
     """Pixels of an image file."""
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    try:
+        if data.startswith((b"\x89PNG", b"\xff\xd8")):  # OpenCV bounds others itself, less tightly
+            check_image(data)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    except TooMuchError as error:
+        raise Failed(f"a picture {error}") from None
+    except (ValueError, cv2.error):
+        image = None
     if image is None:
         raise Failed(f"{len(data)} bytes came that are no image; they begin with {data[:8]!r}")
     return image[:, :, ::-1]

@@ -6,12 +6,10 @@ image is rendered; a client of the egodriver interface sends what its camera see
 
 from __future__ import annotations
 
-import struct
-
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from nurec_sim import sensors
+from nurec_sim import decoding, sensors
 from nurec_sim.errors import RequestError, TooLargeError
 from nurec_sim.sim.sensing import policy_camera
 from nurec_sim.types import CameraFrame, CameraModel, Pinhole
@@ -20,8 +18,6 @@ from nurec_sim.wire.driving import EncodedImage
 MAX_IMAGE_PIXELS = 4096 * 4096
 MAX_SEEN_PIXELS = 2048 * 2048
 """Of an image as a policy sees it; a very tall one of a small width would have far more than its width says."""
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-_NO_JPEG_SIZE = (0xC4, 0xC8, 0xCC)  # tables that sit between the frame headers C0..CF
 
 
 def image_size(data: bytes, name: str) -> tuple[int, int]:
@@ -31,35 +27,12 @@ def image_size(data: bytes, name: str) -> tuple[int, int]:
         RequestError: it is neither, or ends early.
         TooLargeError: it has more than ``MAX_IMAGE_PIXELS``.
     """
-    if data.startswith(_PNG):
-        header, complete = data[16:24], b"IEND" in data[-64:]
-        size = struct.unpack(">II", header) if len(header) == 8 else None
-    elif data.startswith(_JPEG):
-        size, complete = _jpeg_size(data), b"\xff\xd9" in data[-64:]
-    else:
-        raise RequestError(f"{name} must be a PNG or a JPEG file, got {len(data)} bytes that begin with {data[:8]!r}")
-    if size is None or not complete:
-        raise RequestError(f"{name} is truncated: {len(data)} bytes without an end mark or a size")
-    width, height = size
-    if width < 1 or height < 1:
-        raise RequestError(f"{name} has no pixels: {width} x {height}")
-    if width * height > MAX_IMAGE_PIXELS:
-        raise TooLargeError(f"{name} may have {MAX_IMAGE_PIXELS} pixels, got {width} x {height}")
-    return width, height
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == 0xFF:  # fill byte
-            at += 1
-            continue
-        if 0xC0 <= marker <= 0xCF and marker not in _NO_JPEG_SIZE:
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return width, height
-        at += 2 + struct.unpack_from(">H", data, at + 2)[0]
-    return None
+    try:
+        return decoding.check_image(data, MAX_IMAGE_PIXELS)
+    except decoding.TooMuchError as error:
+        raise TooLargeError(f"{name} {error}") from None
+    except ValueError as error:
+        raise RequestError(f"{name} {error}") from None
 
 
 def decode_image(data: bytes, name: str) -> UInt8[np.ndarray, "h w 3"]:

@@ -1,12 +1,10 @@
 """Where the files of a clip lie: a folder, or a zip file read in place; every name and size is checked.
 
-Paths inside of a clip are relative, with forward slashes.
+Paths inside of a clip are relative, with forward slashes. Sizes are those of ``decoding.Limits``.
 """
 
 from __future__ import annotations
 
-import io
-import json
 import lzma
 import struct
 import zipfile
@@ -18,10 +16,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from nurec_sim.decoding import LIMITS, TooMuchError, check_directory, check_image, check_member, json_value, npz_arrays
 from nurec_sim.errors import ClipError
 
-MAX_FILE_BYTES = 1 << 30
-MAX_ZIP_FILES = 1_000_000
 META_FILE = "meta.json"
 # What the zip and numpy readers raise for broken bytes.
 _DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, ValueError, EOFError, OSError, KeyError,
@@ -58,26 +55,25 @@ class Storage:
         if not zipfile.is_zipfile(self.path):
             raise ClipError(f"{str(self.path)!r} is neither a clip folder nor a zip file")
         try:
+            with self.path.open("rb") as file:
+                check_directory(file)
             self._archive = zipfile.ZipFile(self.path)
         except _DAMAGE as error:
-            raise ClipError(f"{self.path.name}: the zip file is damaged: {error}") from error
+            raise ClipError(f"{self.path.name}: the zip file is damaged or too large: {error}") from error
         self._prefix = self._check_archive(self._archive)
 
     def _check_archive(self, archive: zipfile.ZipFile) -> str:
         """Check all names and sizes; return the folder of the clip in the archive."""
         infos = archive.infolist()
-        if len(infos) > MAX_ZIP_FILES:
-            raise ClipError(f"{self.path.name}: {len(infos)} files in the zip; at most {MAX_ZIP_FILES} are allowed")
         for info in infos:
             try:
                 checked_name(info.filename)
             except ClipError as error:
                 raise ClipError(f"{self.path.name}: {error}") from None
-            if info.file_size > MAX_FILE_BYTES:
-                raise ClipError(
-                    f"{self.path.name}: {info.filename} unpacks to {info.file_size} bytes; "
-                    f"at most {MAX_FILE_BYTES} are allowed"
-                )
+            try:
+                check_member(info, LIMITS.file_bytes)
+            except TooMuchError as error:
+                raise ClipError(f"{self.path.name}: {info.filename} {error}") from None
         metas = [info.filename for info in infos if PurePosixPath(info.filename).name == META_FILE]
         if not metas:
             raise ClipError(f"{self.path.name}: no {META_FILE} in the zip; this is not a clip")
@@ -106,8 +102,8 @@ class Storage:
                 raise ClipError(f"{self.path.name}: file {name} in the zip is damaged: {error}") from error
         file = self.path / name
         size = file.stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise ClipError(f"{self.path.name}: file {name} has {size} bytes; at most {MAX_FILE_BYTES} are allowed")
+        if size > LIMITS.file_bytes:
+            raise ClipError(f"{self.path.name}: file {name} has {size} bytes; at most {LIMITS.file_bytes} are allowed")
         return file.read_bytes()
 
     def read_json(self, name: str) -> dict[str, Any]:
@@ -121,7 +117,9 @@ class Storage:
             raise ValueError(f"{constant} is not a number that JSON knows")
 
         try:
-            value = json.loads(self.read(name), parse_constant=refuse)
+            value = json_value(self.read(name), parse_constant=refuse)
+        except TooMuchError as error:
+            raise ClipError(f"{self.path.name}: {name} {error}") from None
         except (ValueError, RecursionError) as error:
             raise ClipError(f"{self.path.name}: {name} is not valid JSON: {error}") from error
         if not isinstance(value, dict):
@@ -132,20 +130,15 @@ class Storage:
         """A JPEG or PNG file as RGB.
 
         Raises:
-            ClipError: it is missing, truncated or not an image.
+            ClipError: it is missing, truncated, not an image, or has too many pixels.
         """
         import cv2
 
         data = self.read(name)
-        # A decoder fills the missing part of a truncated file with grey and says nothing: look for the end mark.
-        if data[:2] == b"\xff\xd8":
-            complete = b"\xff\xd9" in data[-64:]
-        elif data[:8] == b"\x89PNG\r\n\x1a\n":
-            complete = b"IEND" in data[-64:]
-        else:
-            raise ClipError(f"{self.path.name}: {name} is neither a JPEG nor a PNG image")
-        if not complete:
-            raise ClipError(f"{self.path.name}: image {name} is truncated ({len(data)} bytes, no end mark)")
+        try:  # a decoder fills the missing part of a truncated file with grey and says nothing
+            check_image(data)
+        except ValueError as error:
+            raise ClipError(f"{self.path.name}: image {name} {error}") from None
         try:
             bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         except cv2.error:
@@ -160,15 +153,9 @@ class Storage:
         Raises:
             ClipError: it is missing, truncated, holds objects, or is too large.
         """
-        data = self.read(name)
         try:
-            with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                size = sum(info.file_size for info in archive.infolist())
-            if size > MAX_FILE_BYTES:
-                raise ClipError(
-                    f"{self.path.name}: {name} unpacks to {size} bytes; at most {MAX_FILE_BYTES} are allowed"
-                )
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                return {key: arrays[key] for key in arrays.files}
+            return npz_arrays(self.read(name))
+        except TooMuchError as error:
+            raise ClipError(f"{self.path.name}: {name} {error}") from None
         except _DAMAGE as error:
             raise ClipError(f"{self.path.name}: {name} is not a readable .npz file: {error}") from error

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from nurec_sim import geometry, sensors
+from nurec_sim.decoding import LIMITS
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.storage import Storage
 from nurec_sim.types import Matrix4, Spin, Sweep, Trajectory
@@ -68,6 +69,10 @@ def _checked_arrays(storage: Storage, file: str) -> dict[str, np.ndarray]:
     if points is None or points.ndim != 2 or points.shape[0] != 3 or points.dtype.kind not in "iu":
         found = "nothing" if points is None else f"{points.dtype} {points.shape}"
         raise ClipError(f"{storage.path.name}: {file} needs whole numbers dxyz_mm [3,n], got {found}")
+    if points.shape[1] > LIMITS.sweep_points:
+        raise ClipError(
+            f"{storage.path.name}: {file} has {points.shape[1]:,} points; a sweep may have {LIMITS.sweep_points:,}"
+        )
     for name in ("intensity", "dt_us"):
         if name in arrays and arrays[name].shape != points.shape[1:]:
             raise ClipError(

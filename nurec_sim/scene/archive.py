@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from nurec_sim.decoding import LIMITS
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene import codec
 from nurec_sim.scene.checks import check_scene
@@ -114,7 +115,7 @@ def read_scene(path: Path | str) -> GaussianScene:
         manifest = _read_manifest(package)
         _check_hashes(package, manifest, TRUTH)
         counts = manifest["counts"]
-        facts_json = codec.load(package.read(FACTS, codec.MAX_JSON_BYTES), f"{path}: {FACTS}")
+        facts_json = codec.load(package.read(FACTS, LIMITS.json_bytes), f"{path}: {FACTS}")
         facts = facts_from_json(facts_json, f"{path}: {FACTS}")
         static_usd = open_member(path, STATIC_LAYER)
         static = _read_fields(static_usd, ["/Static/background", "/Static/road"], counts["static"], f"{path}: static")
@@ -130,7 +131,7 @@ def read_scene(path: Path | str) -> GaussianScene:
             in_box = array_from_npy(package.read(IN_BOX), f"{path}: {IN_BOX}", kinds="b")
         knot_t_us, knot_m, owners = (_array(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS))
         dynamic = DynamicGaussians(moving, knot_t_us, knot_m, owners, in_box)
-        isp_json = codec.load(package.read(ISP, codec.MAX_JSON_BYTES), f"{path}: {ISP}")
+        isp_json = codec.load(package.read(ISP, LIMITS.json_bytes), f"{path}: {ISP}")
         isp = codec.from_json(codec.mapping(codec.array(np.float64, 3, 4)), isp_json, f"{path}: {ISP}")
         scene = GaussianScene(static=static, dynamic=dynamic, sky=_array(package, SKY), isp=isp, **facts)
     try:
@@ -201,7 +202,7 @@ def _read_manifest(package: Package) -> dict[str, Any]:
             "what was changed in archives of other programs cannot be told"
         )
     where = f"{package.path}: {MANIFEST}"
-    manifest = codec.load(package.read(MANIFEST, codec.MAX_JSON_BYTES), where)
+    manifest = codec.load(package.read(MANIFEST, LIMITS.json_bytes), where)
     if not isinstance(manifest, dict) or manifest.get("format") != "nurec_sim scene archive":
         raise ArchiveError(f"{where}: not the manifest of a nurec_sim scene archive")
     if manifest.get("version") != FORMAT_VERSION:

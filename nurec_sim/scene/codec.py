@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from nurec_sim.decoding import TooMuchError, json_value
 from nurec_sim.errors import ArchiveError
 from nurec_sim.types import (
     Box,
@@ -34,10 +35,6 @@ from nurec_sim.types import (
 )
 
 Decoder = Callable[[Any], Any]
-
-
-MAX_JSON_BYTES = 256 * 2**20
-"""Of one JSON file of an archive."""
 
 
 def to_json(value: Any) -> Any:
@@ -76,7 +73,7 @@ def load(text: bytes, what: str) -> Any:
     """The value of a JSON text; duplicate keys, NaN and infinity are refused.
 
     Raises:
-        ArchiveError: not JSON.
+        ArchiveError: not JSON, or too much of it.
     """
 
     def refuse(constant: str) -> None:
@@ -89,7 +86,9 @@ def load(text: bytes, what: str) -> Any:
         return result
 
     try:
-        return json.loads(text.decode("utf-8"), parse_constant=refuse, object_pairs_hook=unique)
+        return json_value(text, parse_constant=refuse, object_pairs_hook=unique)
+    except TooMuchError as error:
+        raise ArchiveError(f"{what} {error}") from None
     except (ValueError, RecursionError) as error:
         raise ArchiveError(f"{what} is not valid JSON: {error}") from error
 

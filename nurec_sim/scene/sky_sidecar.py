@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from nurec_sim import geometry
+from nurec_sim.decoding import check_directory
 from nurec_sim.errors import ArchiveError
 from nurec_sim.new_files import new_file
 from nurec_sim.scene.npy import array_from_npy, npy_bytes
@@ -155,7 +156,9 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     }  # fmt: skip
     arrays = {}
     try:
-        with path.open("rb") as file, zipfile.ZipFile(file) as package:
+        with path.open("rb") as file:
+            check_directory(file)
+        with zipfile.ZipFile(path) as package:
             held = {entry.filename: entry for entry in package.infolist()}
             for name, limit in limits.items():
                 entry = held.get(f"{name}.npy")

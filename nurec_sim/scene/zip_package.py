@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 
+from nurec_sim.decoding import TooMuchError, check_directory
 from nurec_sim.errors import ArchiveError
 from nurec_sim.new_files import new_file
 
@@ -92,9 +93,12 @@ class Package:
                     raise ArchiveError(
                         f"{path}: {self._size:,} bytes; a scene archive has 22 to {MAX_PACKAGE_BYTES:,} bytes"
                     )
+                check_directory(file)
                 with zipfile.ZipFile(file) as archive:
                     entries = archive.infolist()
                 self._bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except TooMuchError as error:
+            raise ArchiveError(f"{path} {error}") from None
         except OSError as error:
             raise ArchiveError(f"{path}: cannot be opened ({error.strerror or error})") from error
         except (zipfile.BadZipFile, NotImplementedError, struct.error, ValueError) as error:

@@ -7,6 +7,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from nurec_sim.decoding import TooMuchError, check_directory
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene.foreign.nurec_state import NurecState, is_read, plain_name, track_ids_of
 from nurec_sim.scene.torch_pickle import StoredTensor, read_tensor_pickle
@@ -35,6 +36,7 @@ def read_checkpoint(file: BinaryIO, where: str) -> NurecState:
     """
     try:
         size = file.seek(0, 2)
+        check_directory(file)
         with zipfile.ZipFile(file) as package:
             entries = stored_entries(package, size)
             root = root_of(entries)
@@ -42,7 +44,7 @@ def read_checkpoint(file: BinaryIO, where: str) -> NurecState:
                 raise ArchiveError(f"{where}: written on a big-endian machine; only little-endian files are read")
             contents = read_tensor_pickle(package.read(f"{root}/data.pkl"))
             return _state(package, entries, root, contents, where, size)
-    except TorchZipError as error:
+    except (TorchZipError, TooMuchError) as error:
         raise ArchiveError(f"{where} {error}") from error
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, OSError) as error:
         raise ArchiveError(f"{where}: no file of torch.save, damaged, or cut short ({error})") from error

@@ -13,14 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from nurec_sim.decoding import TooMuchError, msgpack_value, unpacked_limit
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene.foreign.nurec_state import NurecState, is_read, plain_name, track_ids_of
 
-MAX_GROWTH = 64
-"""Times its own length that a file may unpack to, beside ``FREE_BYTES``; learned values hardly shrink at all."""
-FREE_BYTES = 64 * 2**20
-MAX_ITEMS = 2**17
-"""Entries of one list or mapping; arrays are bytes, so these are names, settings and shapes."""
 _INTEGERS = ("gaussian_cuboid_ids", "n_active_features")
 _MAX_DIMENSIONS = 8
 
@@ -64,7 +60,7 @@ def gunzipped(data: bytes, where: str) -> bytes:
     Raises:
         ArchiveError: no such file, cut short, damaged, or one that unpacks to more than it may.
     """
-    limit = MAX_GROWTH * len(data) + FREE_BYTES
+    limit = unpacked_limit(len(data))
     unpacker = zlib.decompressobj(wbits=31)
     try:
         content = unpacker.decompress(data, limit)
@@ -82,22 +78,10 @@ def gunzipped(data: bytes, where: str) -> bytes:
 def _unpacked(content: bytes, where: str) -> Any:
     import msgpack
 
-    def refuse(code: int, _: bytes) -> None:
-        raise ValueError(f"extension type {code}; none is read")
-
-    size = len(content)
     try:
-        return msgpack.unpackb(
-            content,
-            raw=False,
-            strict_map_key=False,
-            ext_hook=refuse,
-            max_str_len=size,
-            max_bin_len=size,
-            max_array_len=MAX_ITEMS,
-            max_map_len=MAX_ITEMS,
-            max_ext_len=16,
-        )
+        return msgpack_value(content)
+    except TooMuchError as error:
+        raise ArchiveError(f"{where}: {error}") from None
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise ArchiveError(f"{where}: damaged, or no msgpack object ({error or type(error).__name__})") from error
 

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from nurec_sim import geometry
+from nurec_sim.decoding import LIMITS
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene import codec
 from nurec_sim.scene.checks import MIN_START_US
 from nurec_sim.scene.foreign.sensor_models import camera_from, lidar_from
 from nurec_sim.scene.foreign.track_sidecar import tracks_from
 from nurec_sim.scene.foreign.xodr_lanes import road_map_from
-from nurec_sim.scene.opendrive_xml import MAX_XML_BYTES
 from nurec_sim.scene.zip_package import Package
 from nurec_sim.types import Box, CameraModel, LidarModel, Rig, RoadMap, Track, Trajectory
 
@@ -77,7 +77,7 @@ def read_surroundings(package: Package) -> Surroundings:
 
 def _load(package: Package, name: str) -> dict[str, Any]:
     where = f"{package.path}: {name}"
-    value = codec.load(package.read(name, codec.MAX_JSON_BYTES), where)
+    value = codec.load(package.read(name, LIMITS.json_bytes), where)
     if not isinstance(value, dict):
         raise ArchiveError(f"{where}: must hold an object, got {type(value).__name__}")
     return value
@@ -132,7 +132,7 @@ def _add_map(around: Surroundings, package: Package, world_base: object) -> None
         place = codec.from_json(codec.array(np.float64, 4, 4), world_base, f"{package.path}: {RIG}: T_world_base")
         if not geometry.is_rotation(place[:3, :3]):
             place = None
-    around.road_map, note = road_map_from(package.read(MAP, MAX_XML_BYTES), place, around.ego, where)
+    around.road_map, note = road_map_from(package.read(MAP, LIMITS.xml_bytes), place, around.ego, where)
     around.unknown.append(note)
 
 

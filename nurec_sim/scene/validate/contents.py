@@ -5,7 +5,6 @@ Unlike ``zip_package.Package`` this accepts what other programs accept: compress
 
 from __future__ import annotations
 
-import json
 import reprlib
 import struct
 import zipfile
@@ -16,11 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from nurec_sim.decoding import LIMITS, TooMuchError, check_directory, json_value, unpacked_limit
 from nurec_sim.errors import ArchiveError
-from nurec_sim.scene.codec import MAX_JSON_BYTES
 from nurec_sim.scene.zip_package import MAX_MEMBERS
 
-MAX_YAML_BYTES = 2**20
 MAX_MEMBER_BYTES = 2 * 2**30
 
 _short = reprlib.Repr()
@@ -44,7 +42,11 @@ class Contents:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
+            with path.open("rb") as file:
+                check_directory(file)
             self._zip = zipfile.ZipFile(path)
+        except TooMuchError as error:
+            raise ArchiveError(f"{path.name} {error}") from None
         except OSError as error:
             raise ArchiveError(f"{path.name} cannot be opened ({error.strerror or error})") from error
         except (zipfile.BadZipFile, NotImplementedError, struct.error, ValueError) as error:
@@ -70,6 +72,7 @@ class Contents:
         """
         if name not in self.names:
             raise ArchiveError(f"{name} is missing")
+        limit_bytes = min(limit_bytes, unpacked_limit(self.names[name].compress_size))
         try:
             with self._zip.open(self.names[name]) as member:
                 data = member.read(limit_bytes + 1)
@@ -88,7 +91,9 @@ class Contents:
             ArchiveError: missing, damaged, or not JSON.
         """
         try:
-            return json.loads(self.read(name, MAX_JSON_BYTES).decode("utf-8"))
+            return json_value(self.read(name, LIMITS.json_bytes))
+        except TooMuchError as error:
+            raise ArchiveError(f"{name} {error}") from None
         except (ValueError, RecursionError) as error:
             raise ArchiveError(f"{name} is not JSON ({error})") from error
 
@@ -100,7 +105,7 @@ class Contents:
         """
         import yaml
 
-        text = self.read(name, MAX_YAML_BYTES)
+        text = self.read(name, LIMITS.yaml_bytes)
         try:
             return yaml.safe_load(text)
         except (yaml.YAMLError, ValueError, OverflowError, TypeError, AttributeError, RecursionError) as error:

@@ -7,8 +7,9 @@ import re
 from typing import Any
 from xml.etree import ElementTree
 
+from nurec_sim.decoding import LIMITS
 from nurec_sim.errors import ArchiveError
-from nurec_sim.scene.opendrive_xml import MAX_XML_BYTES, opendrive_root
+from nurec_sim.scene.opendrive_xml import opendrive_root
 from nurec_sim.scene.validate.contents import Contents, entry_of, numbers_of
 from nurec_sim.scene.validate.finding import Report
 
@@ -51,7 +52,7 @@ def road_root(contents: Contents) -> ElementTree.Element:
     Raises:
         ArchiveError: missing, damaged, no OpenDRIVE, or without roads.
     """
-    root = opendrive_root(contents.read(XODR, MAX_XML_BYTES), XODR)
+    root = opendrive_root(contents.read(XODR, LIMITS.xml_bytes), XODR)
     if root.find("road") is None:
         raise ArchiveError(f"{XODR} has no road")
     return root
