@@ -47,7 +47,8 @@ def test_a_scene_looks_the_same_after_the_round_trip(tmp_path, sh, layout, up):
     scene = dataclasses.replace(street(sh), dynamic=worlds.scene().dynamic)
     exported = export_scene(scene, tmp_path / "a.ply", layout=layout, up=up)
     assert [path.name for path in exported.paths] == ["a.ply", "a.sky.npz", "a.sky.png"]
-    back = import_scene(tmp_path / "a.ply", like=scene, up=up)
+    back = import_scene(tmp_path / "a.ply", like=scene)  # the file says what is up
+    assert back.provenance["up"] == up
     for yaw in (0.0, 2.0):
         assert worlds.psnr_db(view(back, yaw=yaw), view(scene, yaw=yaw)) > 50
     assert view(scene).std() > 20

@@ -92,7 +92,8 @@ def import_(
         out_path: the archive to write; the file's name with .usdz in the current folder if not given.
         sky: a .sky.npz file; X.sky.npz beside X.ply if not given and it is there.
         like: a scene archive or a clip of the same place; a clip has no sky and no colour corrections.
-        up: which axis of a PLY or SPZ file points up, z and y unless given; -y for most trained PLY files.
+        up: which axis of a PLY or SPZ file points up; -y for most trained PLY files. Unless given it is y for SPZ, and
+            for a PLY what our export noted in it, else z.
         overwrite: replace an archive that is there.
     """
     from nurec_sim import logs, scene

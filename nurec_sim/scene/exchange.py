@@ -85,8 +85,8 @@ def import_scene(
         like: a scene or a log in the same world, for what the file lacks: sensors with path and times, tracks, the map,
             and, from a scene, the sky and the colour correction. Else the car stands at the origin for one second,
             with one camera, 1.5 m up, that looks along x, under a black sky.
-        up: axis of a PLY or SPZ file that points up, one of ``UP_AXES``; the file is turned so that it is z. z for a
-            PLY and y for SPZ if None. Other files say it themselves.
+        up: axis of a PLY or SPZ file that points up, one of ``UP_AXES``; the file is turned so that it is z. If
+            None, y for SPZ, and for a PLY what the export noted in it or z. Other files say it themselves.
 
     Raises:
         ArchiveError: a file cannot be read, or ``up`` is no axis.

@@ -20,7 +20,7 @@ from nurec_sim.scene.columns import Columns, sigmoid
 from nurec_sim.scene.compressed_ply import is_compressed, read_compressed
 from nurec_sim.scene.harmonics import SH_C0
 from nurec_sim.scene.ply_table import VertexTable
-from nurec_sim.scene.transform import transformed, world_from_up
+from nurec_sim.scene.transform import UP_AXES, transformed, world_from_up
 from nurec_sim.types import Gaussians, Label
 
 Progress = Callable[[str, float], None]
@@ -30,6 +30,7 @@ LAYOUTS = get_args(Layout)
 MOST_OPAQUE = 1 - 1e-6
 """Opacities are kept this far from 0 and 1, whose logits are infinite."""
 BLOCK = 1 << 18
+_UP_COMMENT = "3D Gaussians, metres, {up} up"
 POSITION, NORMAL, COLOUR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE, ROTATION = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
 NEEDED = (*POSITION, *ROTATION, *SCALE, "opacity", *COLOUR)
@@ -135,6 +136,16 @@ def read_ply(path: Path | str) -> tuple[Gaussians, int]:
     return columns.gaussians(_labels(table), _normals(table))
 
 
+def ply_up(path: Path | str) -> str:
+    """The axis of a file that points up, as ``write_ply`` notes it in a comment; z for other programs' files.
+
+    Raises:
+        ArchiveError: as of ``read_ply``.
+    """
+    notes = {_UP_COMMENT.format(up=up): up for up in UP_AXES}
+    return next((notes[text] for text in VertexTable(Path(path)).comments if text in notes), "z")
+
+
 # -------------------------------------------------------------------------------------------------------- writing
 
 
@@ -150,7 +161,7 @@ def _writable(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
 def _header(dtype: np.dtype, count: int, up: str) -> bytes:
     names = {"<f4": "float", "|u1": "uchar"}
     properties = [f"property {names[dtype[name].str]} {name}" for name in dtype.names or ()]
-    lines = ["ply", "format binary_little_endian 1.0", f"comment 3D Gaussians, metres, {up} up",
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {_UP_COMMENT.format(up=up)}",
              f"element vertex {count}", *properties, "end_header"]  # fmt: skip
     return "".join(f"{line}\n" for line in lines).encode("ascii")
 

@@ -35,6 +35,7 @@ class VertexTable:
         path: the file.
         names: properties, in the file's order.
         elements: names of all elements of the file.
+        comments: the header's, without the word ``comment``.
 
     Raises:
         ArchiveError: not a PLY file, a header that is wrong or not supported, no such element, or fewer rows than
@@ -45,7 +46,7 @@ class VertexTable:
         self.path = path
         try:
             with path.open("rb") as file:
-                form, elements = _read_header(file, path)
+                form, elements, self.comments = _read_header(file, path)
                 before, count, types = _find(elements, element, path)
                 self.names, self.elements = tuple(types), tuple(each.name for each in elements)
                 start, size = file.tell(), os.fstat(file.fileno()).st_size
@@ -123,15 +124,18 @@ class _Element:
     lists: bool = False
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Element]]:
-    """Format and elements; the file is left at the first row of the first one."""
+def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Element], list[str]]:
+    """Format, elements and comments; the file is left at the first row of the first one."""
     if file.readline(8).strip() != b"ply":
         raise ArchiveError(f"{path}: not a PLY file; its first line must be 'ply'")
     form: str | None = None
     elements: list[_Element] = []
+    comments: list[str] = []
     for line in _header_lines(file, path):
         match line.split():
-            case [] | ["comment" | "obj_info", *_]:
+            case ["comment", *words]:
+                comments.append(" ".join(words))
+            case [] | ["obj_info", *_]:
                 pass
             case ["format", name, "1.0"] if name in BYTE_ORDERS and form is None:
                 form = name
@@ -147,7 +151,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Element]]:
                 raise ArchiveError(f"{path}: the header line {line[:80]!r} is wrong or not supported")
     if form is None:
         raise ArchiveError(f"{path}: the header names no format; allowed are {list(BYTE_ORDERS)}")
-    return form, elements
+    return form, elements, comments
 
 
 def _find(elements: list[_Element], name: str, path: Path) -> tuple[list[_Element], int, dict[str, str]]:

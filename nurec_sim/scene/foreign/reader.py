@@ -26,7 +26,7 @@ from nurec_sim.scene.foreign.particle_field import read_particle_fields
 from nurec_sim.scene.foreign.rig_sidecars import DATA_INFO, MAP, RIG, TRACKS, Surroundings, read_surroundings
 from nurec_sim.scene.foreign.spz import read_spz
 from nurec_sim.scene.foreign.usd_inside import may_hold
-from nurec_sim.scene.ply import read_ply
+from nurec_sim.scene.ply import ply_up, read_ply
 from nurec_sim.scene.sky import sample_cubemap
 from nurec_sim.scene.sky_sidecar import SkySidecar, read_sky, sky_paths
 from nurec_sim.scene.surroundings import colours_in, colours_of, first_colours, surroundings_of, taken_from
@@ -36,9 +36,9 @@ from nurec_sim.scene.zip_package import Package
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene, Label, Track
 
 FIELDS = "particle fields"
-SPLAT_FILES: dict[str, tuple[Callable[[Path], tuple[Gaussians, int]], str]] = {
-    ".ply": (read_ply, "z"),
-    ".spz": (read_spz, "y"),
+SPLAT_FILES: dict[str, tuple[Callable[[Path], tuple[Gaussians, int]], Callable[[Path], str]]] = {
+    ".ply": (read_ply, ply_up),
+    ".spz": (read_spz, lambda _: "y"),
 }
 """Files of Gaussians and nothing else: how they are read, and the axis that points up unless somebody says another."""
 CONVERTIBLE = (".sog", ".ksplat", ".splat", ".lcc")
@@ -60,8 +60,8 @@ def read_foreign(
         sky: a sky file, for sky and colour corrections instead of those of the file; ``X.sky.npz`` beside ``X.ply`` is
             taken if None and it is there.
         like: a scene or a log in the same world, for what the file lacks.
-        up: axis of the file that points up, one of ``UP_AXES``, for files that do not say it; z for a PLY and y
-            for SPZ if None.
+        up: axis of the file that points up, one of ``UP_AXES``, for files that do not say it; y for SPZ, and for a PLY
+            what its comment says or z, if None.
 
     Returns:
         A sound scene; ``provenance["unknown"]`` lists what the file holds but is not read, and what it lacks.
@@ -82,7 +82,7 @@ def read_foreign(
     try:
         if suffix in SPLAT_FILES:
             read, usual_up = SPLAT_FILES[suffix]
-            up = up or usual_up
+            up = up or usual_up(path)
             world_from_file = world_from_up(up)
             around.nre_from_world = geometry.pose(world_from_file.T, np.zeros(3))
             sky = sky or next((file for file in sky_paths(path)[:1] if file.exists()), None)
