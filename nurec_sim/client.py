@@ -9,7 +9,7 @@ from typing import Unpack
 import grpc
 
 from nurec_sim import wire
-from nurec_sim.connection import Connection, ConnectionOptions, malformed_reply, our_errors
+from nurec_sim.connection import Connection, ConnectionOptions, malformed_reply
 from nurec_sim.errors import RequestError, ServerError
 from nurec_sim.types import CameraModel, LidarModel, SensorFrame, SensorRequest, Track, Trajectory
 from nurec_sim.wire import common, sensorsim
@@ -132,7 +132,7 @@ class RemoteSensors(Connection):
         return self._procedures[name].future(request, **self._options(self._timeout_s))
 
     def _outcome(self, call: grpc.Future):
-        with our_errors(self.address):
+        with self._errors():
             return call.result()
 
     def _read_batch(self, reply, requests: Sequence[SensorRequest], indices: list[int]) -> dict[int, SensorFrame]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from nurec_sim import wire
-from nurec_sim.connection import Connection, ConnectionOptions, malformed_reply, our_errors
+from nurec_sim.connection import Connection, ConnectionOptions, malformed_reply
 from nurec_sim.errors import RequestError, ServerError
 from nurec_sim.types import CameraFrame, LidarFrame, LidarModel, SensorRequest
 from nurec_sim.wire import nurec_sim_v1 as v1
@@ -77,7 +77,7 @@ class SceneClient(Connection):
                     sent += len(data)
                     said("sending", sent / size)
 
-        with our_errors(self.address):
+        with self._errors():
             return self._procedures[procedure](parts(), **self._options(timeout_s)).scene_id
 
     def reconstruct(
@@ -106,7 +106,7 @@ class SceneClient(Connection):
         """
         clip = {"path": path} if path else {"scene_id": scene_id}
         request = v1.ReconstructClipRequest(**clip, name=name, method=method, profile=profile, cameras=cameras)
-        with our_errors(self.address):
+        with self._errors():
             events = self._procedures["ReconstructClip"](request, **self._options(timeout_s))
             try:
                 for event in events:

@@ -1,5 +1,6 @@
 """Run folders: round trips, atomic writes, resuming, videos that decode."""
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -217,8 +218,8 @@ def test_a_run_folder_holds_everything(finished):
     for policy in ("log_replay", "constant_velocity", "crash"):
         for seed in ("0", "1"):
             names = {path.name for path in (run / "street" / "lift" / policy / seed).iterdir()}
-            wanted = {"scenario.yaml", "rollout.npz", "versions.json", "front.mp4"}
-            assert names == wanted | ({"error.txt"} if policy == "crash" else set())
+            wanted = {"scenario.yaml", "rollout.npz", "versions.json"}
+            assert names == wanted | {"error.txt" if policy == "crash" else "front.mp4"}
     place = run / "street" / "lift" / "constant_velocity" / "1"
     resolved = sim.load_scenario(place / "scenario.yaml")
     assert resolved.seeds == (1,) and resolved.policies == ("constant_velocity",) and resolved.duration_s == 2.0
@@ -260,6 +261,70 @@ def test_resume_keeps_what_is_finished_and_drives_the_rest(finished):
     assert len(load_rollout(place / "log_replay" / "0" / "rollout.npz").states) == 16
     assert len(load_rollout(place / "log_replay" / "1" / "rollout.npz").states) == 21
     assert layout.rollout_folders(run)
+
+
+@pytest.mark.parametrize("spoil", ["cut", "bit", "empty", "other file"])
+def test_a_damaged_rollout_is_driven_again_with_a_line_that_says_so(tmp_path, spoil):
+    scene, _ = flat_street()
+
+    def go(**more):
+        return runs.execute([scene], SCENARIO, ["log_replay", "constant_velocity"], lambda scene_id: striped, tmp_path,
+                            seeds=[0], video=False, **more)  # fmt: skip
+
+    run = go(stamp="a")
+    path = run / "street" / "lift" / "log_replay" / "0" / "rollout.npz"
+    whole, report = path.read_bytes(), (run / "report.html").read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 3] ^= 0x10
+    path.write_bytes(
+        {"cut": whole[: len(whole) // 2], "bit": bytes(flipped), "empty": b"", "other file": b"not a zip" * 99}[spoil]
+    )
+    heard = []
+    go(resume=run, notice=heard.append)
+    assert path.read_bytes() == whole and (run / "report.html").read_bytes() == report
+    assert len(heard) == 1
+    assert heard[0].startswith(
+        f"log_replay in street (lift), seed 0 is driven again: {path} is no readable rollout file"
+    )
+
+
+def test_no_damage_of_a_rollout_file_gets_past_the_reader(tmp_path):
+    """Every byte of the file may be wrong; the reader either says so or gives a rollout."""
+    path = save_rollout(full_rollout(), tmp_path / "r.npz")
+    whole, random = path.read_bytes(), np.random.default_rng(5)
+    for number in range(300):
+        spoilt = bytearray(whole[: random.integers(len(whole))] if number % 3 == 0 else whole)
+        for place in random.integers(0, max(len(spoilt), 1), 3):
+            if place < len(spoilt):
+                spoilt[place] ^= int(random.integers(1, 256))
+        path.write_bytes(spoilt)
+        with contextlib.suppress(RunError):
+            load_rollout(path)
+
+
+def test_failed_rollouts_are_told_and_get_no_video(tmp_path):
+    scene, _ = flat_street()
+    rendered, heard = [], []
+
+    def sense(requests):
+        rendered.append(len(requests))
+        return striped(requests)
+
+    run = runs.execute([scene], SCENARIO, [Crash()], lambda i: sense, tmp_path, notice=heard.append)
+    assert heard == [
+        f"crash in street (lift), seed {seed} failed: RuntimeError: out of ideas </script>" for seed in (0, 1)
+    ]
+    assert not rendered and not list(run.rglob("*.mp4")) and not list(run.rglob("video_error.txt"))
+
+
+def test_policies_are_loaded_once_and_used_by_several_runs(tmp_path):
+    scene, _ = flat_street()
+    loaded = runs.load_policies(["constant_velocity"], plan_timeout_s=5.0)
+    for stamp in ("a", "b"):
+        run = runs.execute([scene], SCENARIO, loaded, lambda i: striped, tmp_path, stamp=stamp, video=False, seeds=[0])
+        assert "failed" not in (run / "metrics.csv").read_text()
+    with pytest.raises(ScenarioError, match="above 0 s, got 0"):
+        runs.load_policies(["constant_velocity"], plan_timeout_s=0)
 
 
 def test_an_interrupted_rollout_leaves_nothing(tmp_path):

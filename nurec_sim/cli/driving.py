@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import os
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from nurec_sim.cli.console import OnePath, Paths, app, out, print_faults, print_table, progress
+from nurec_sim.cli.console import OnePath, Paths, app, err, out, print_faults, print_table, progress
 from nurec_sim.errors import NurecSimError
 from nurec_sim.new_files import check_writable
 
@@ -32,8 +34,9 @@ def run(
     true_world: Path | None = None,
     cache: Path | None = None,
     video: bool = True,
+    plan_timeout: float = 60.0,
 ) -> None:
-    """Drive policies closed-loop through scenes, measure, and write a report.
+    """Drive policies closed-loop through scenes, measure, and write a report; exit status 1 if a rollout failed.
 
     Starts a server of its own unless --address names one. The run folder holds report.html, metrics.parquet,
     metrics.csv and one folder per rollout; runs/latest points to the newest.
@@ -50,8 +53,9 @@ def run(
             report shows it as the reconstruction `truth` (docs/world.md).
         cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
         video: also record the front camera of every rollout.
+        plan_timeout: seconds for making a policy and for each of its answers; one that takes longer has failed.
     """
-    drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video, true_world)
+    drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video, true_world, plan_timeout)
 
 
 @app.command
@@ -115,8 +119,9 @@ def drive(
     cache: Path | None,
     video: bool,
     true_world: Path | None = None,
+    plan_timeout_s: float = 60.0,
 ) -> None:
-    """Scenes, server, rollouts, report: what `run` and `demo` share."""
+    """Policies, scenes, server, rollouts, report: what `run` and `demo` share."""
     from nurec_sim import runs, sim
     from nurec_sim.client import RemoteSensors
     from nurec_sim.scene_store import SceneStore
@@ -127,6 +132,10 @@ def drive(
     scenario = sim.load_scenario(scenario_path)
     if not sources and scenario.clip is None:
         raise NurecSimError(f"scenario {scenario.name!r} names no clip; give clips or scenes to drive through")
+    loaded = runs.load_policies(policy_names or scenario.policies, plan_timeout_s)
+    if address is not None:
+        with RemoteSensors(address) as sensors:
+            sensors.version()  # a server that is not there ends this here
     store = SceneStore(sources or [scenario_path.parent / str(scenario.clip)], cache_dir=cache)
     for fault in store.faults.values():
         raise NurecSimError(fault)
@@ -152,15 +161,37 @@ def drive(
                 folder = runs.execute(
                     driven,
                     scenario,
-                    policy_names or scenario.policies,
+                    loaded,
                     sense_for,
                     out_dir,
                     seeds=seeds or scenario.seeds,
                     resume=folder,
                     video=video,
                     progress=advance,
+                    notice=_notice,
                 )
     assert folder is not None
     heading, *rows = runs.headline(folder)
     print_table("means over rollouts", rows, heading)
     out.print(f"{time.monotonic() - started:.0f} s. Report: {(folder / 'report.html').resolve()}", soft_wrap=True)
+    rollouts, failed = (sum(int(row[heading.index(name)]) for row in rows) for name in ("rollouts", "failed"))
+    if failed:
+        _notice(f"{failed} of {rollouts} rollouts failed; the report has their reasons")
+        _leave(1)
+
+
+def _notice(text: str) -> None:
+    """A line beside the progress."""
+    err.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
+
+
+def _leave(status: int) -> None:
+    """Ends the verb with a status, whatever threads of policies that were given up still do."""
+    from nurec_sim.sim.policy_thread import still_abandoned
+
+    if still_abandoned():
+        # Python would wait for threads that a policy has started, or trip over one that writes to the console.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    raise SystemExit(status)

@@ -9,6 +9,7 @@ from typing import Any
 _HOMES = {
     "execute": "drive",
     "headline": "results",
+    "load_policies": "policies",
     "load_rollout": "rollout_file",
     "record_video": "video",
     "save_rollout": "rollout_file",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import json
 import platform
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -13,20 +12,22 @@ from pathlib import Path
 
 import yaml
 
-from nurec_sim.errors import NurecSimError, ScenarioError, WriteError
+from nurec_sim.errors import NurecSimError, RunError, ScenarioError, WriteError
 from nurec_sim.new_files import writing
-from nurec_sim.plugins import load_policy
 from nurec_sim.runs import folder as layout
+from nurec_sim.runs.policies import LoadedPolicy, load_policies
 from nurec_sim.runs.results import write_report
 from nurec_sim.runs.rollout_file import load_rollout, save_rollout
 from nurec_sim.runs.scene_file import SceneRecord, record_scene, save_scene_record
 from nurec_sim.runs.video import record_video
 from nurec_sim.sim import Scenario, run_rollout
 from nurec_sim.sim.actors import Actors
+from nurec_sim.sim.policy_host import PLAN_TIMEOUT_S
 from nurec_sim.sim.sensing import find_camera
 from nurec_sim.types import GaussianScene, Policy, Rollout, Sense
 
 Progress = Callable[[str, float], None]
+Notice = Callable[[str], None]
 DRIVING_SHARE = 0.6
 """Share of a rollout's progress that driving takes; its video takes the rest."""
 
@@ -37,8 +38,7 @@ class _Job:
 
     scene: GaussianScene
     record: SceneRecord
-    reference: str
-    policy: Policy
+    policy: LoadedPolicy
     seed: int
     scenario: Scenario
     target: Path
@@ -46,7 +46,7 @@ class _Job:
     @property
     def scenario_text(self) -> str:
         """The scenario as it is run, every key written out; it can be loaded again."""
-        resolved = self.scenario.model_copy(update={"seeds": (self.seed,), "policies": (self.reference,)})
+        resolved = self.scenario.model_copy(update={"seeds": (self.seed,), "policies": (self.policy.reference,)})
         return yaml.safe_dump(resolved.model_dump(mode="json"), sort_keys=False)
 
     @property
@@ -61,23 +61,32 @@ class _Job:
         facts = {"python": platform.python_version(), "machine": platform.machine(), "packages": packages}
         return json.dumps({**facts, "scene_sha256": self.record.sha256}, indent=1) + "\n"
 
-    def finished(self) -> bool:
-        """Whether the folder holds this very rollout: it did not fail, same scenario, same scene."""
+    @property
+    def title(self) -> str:
+        """The rollout in words."""
+        return f"{self.policy.name} in {self.scene.id} ({self.record.reconstruction}), seed {self.seed}"
+
+    def finished(self, notice: Notice) -> Rollout | None:
+        """This very rollout if the folder holds it: it did not fail, same scenario, same scene, and can be read."""
         files = {name: self.target / name for name in (layout.ROLLOUT, layout.SCENARIO, layout.VERSIONS)}
         if not all(path.is_file() for path in files.values()) or (self.target / layout.ERROR).exists():
-            return False
-        if files[layout.SCENARIO].read_text(encoding="utf-8") != self.scenario_text:
-            return False
+            return None
         try:
-            return json.loads(files[layout.VERSIONS].read_text(encoding="utf-8"))["scene_sha256"] == self.record.sha256
+            if files[layout.SCENARIO].read_text(encoding="utf-8") != self.scenario_text:
+                return None
+            driven_in = json.loads(files[layout.VERSIONS].read_text(encoding="utf-8"))["scene_sha256"]
+            return load_rollout(files[layout.ROLLOUT]) if driven_in == self.record.sha256 else None
         except (ValueError, KeyError, TypeError):
-            return False
+            return None
+        except RunError as error:
+            notice(f"{self.title} is driven again: {error}")
+            return None
 
 
 def execute(
     scenes: Sequence[GaussianScene],
     scenario: Scenario,
-    policies: Sequence[str | Policy],
+    policies: Sequence[str | Policy | LoadedPolicy],
     sense_for: Callable[[str], Sense],
     out_dir: Path | str,
     *,
@@ -85,25 +94,29 @@ def execute(
     resume: Path | str | None = None,
     video: bool = True,
     progress: Progress | None = None,
+    notice: Notice | None = None,
     stamp: str | None = None,
+    plan_timeout_s: float = PLAN_TIMEOUT_S,
 ) -> Path:
     """Drive every policy through every scene with every seed, score all, and write the report.
 
-    A rollout that fails is kept with its error and is a row of every table. Interrupted at any time, the folder holds
-    complete rollouts only; the same call with ``resume`` drives those that are missing, failed, or were driven under
-    another scenario or scene.
+    A rollout that fails is kept with its error and is a row of every table; its video is left out. Interrupted at any
+    time, the folder holds complete rollouts only; the same call with ``resume`` drives those that are missing, failed,
+    damaged, or were driven under another scenario or scene.
 
     Args:
         scenes: what to drive through.
         scenario: how.
-        policies: references as ``plugins.load_policy`` takes them, or policies.
+        policies: references as ``plugins.load_policy`` takes them, policies, or what ``load_policies`` gave.
         sense_for: scene id -> the renderer of that scene; called once per scene, when it is first needed.
         out_dir: folder that collects run folders.
         seeds: the scenario's own if None.
         resume: a run folder to go on with, instead of a new one.
         video: also record the front camera of every rollout.
         progress: hears what is being done and the share that is done.
+        notice: hears a line of text for every rollout that fails, and for files that are damaged.
         stamp: name of the new run folder; the local date and time if None.
+        plan_timeout_s: for making a policy, and for each of its answers.
 
     Returns:
         The run folder.
@@ -112,25 +125,41 @@ def execute(
         ScenarioError: nothing to drive, a policy cannot be loaded, or two policies or scenes have the same name.
         RunError: ``resume`` is no folder.
     """
-    say = progress or (lambda stage, share: None)
+    say, tell = progress or (lambda stage, share: None), notice or (lambda text: None)
     seeds = tuple(scenario.seeds if seeds is None or len(seeds) == 0 else seeds)
-    loaded = _load_policies(policies)
     _check_scenes(scenes)
-    if resume is None:
-        stamp = stamp or datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        run = layout.new_run_folder(Path(out_dir), stamp)
-    else:
-        run = layout.existing_run_folder(Path(resume))
-        layout.point_latest(run)
-    jobs = []
-    for index, scene in enumerate(scenes):
-        say(f"reading the road of {scene.id}", 0.05 * index / len(scenes))
-        record = record_scene(scene)
-        save_scene_record(record, layout.scene_folder(run, record.id, record.reconstruction))
-        for reference, policy in loaded:
-            for seed in seeds:
-                target = layout.rollout_folder(run, scene.id, record.reconstruction, policy.name, seed)
-                jobs.append(_Job(scene, record, reference, policy, seed, scenario, target))
+    loaded = load_policies(policies, plan_timeout_s)
+    try:
+        if resume is None:
+            stamp = stamp or datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+            run = layout.new_run_folder(Path(out_dir), stamp)
+        else:
+            run = layout.existing_run_folder(Path(resume))
+            layout.point_latest(run)
+        jobs = []
+        for index, scene in enumerate(scenes):
+            say(f"reading the road of {scene.id}", 0.05 * index / len(scenes))
+            record = record_scene(scene)
+            save_scene_record(record, layout.scene_folder(run, record.id, record.reconstruction))
+            for policy in loaded:
+                for seed in seeds:
+                    target = layout.rollout_folder(run, scene.id, record.reconstruction, policy.name, seed)
+                    jobs.append(_Job(scene, record, policy, seed, scenario, target))
+        _drive_all(jobs, sense_for, video, say, tell)
+    finally:
+        for policy in loaded:
+            if policy not in policies:
+                policy.host.close()
+    say("scoring", 0.95)
+    write_report(run, progress=lambda stage, share: say(stage, 0.95 + 0.05 * share))
+    say("", 1.0)
+    return run
+
+
+def _drive_all(
+    jobs: Sequence[_Job], sense_for: Callable[[str], Sense], video: bool, say: Progress, tell: Notice
+) -> None:
+    """Drive what is not finished."""
     senses: dict[str, Sense] = {}
     for index, job in enumerate(jobs):
 
@@ -140,25 +169,22 @@ def execute(
 
         advance(0.0)
         wants_video = video and bool(job.scene.rig.cameras)
-        done = job.finished()
-        if done and (not wants_video or (job.target / layout.VIDEO).exists()):
+        done = job.finished(tell)
+        if done is not None and (not wants_video or (job.target / layout.VIDEO).exists()):
             continue
         if job.scene.id not in senses:
             senses[job.scene.id] = sense_for(job.scene.id)
-        _drive(job, senses[job.scene.id], wants_video, done, advance)
-    say("scoring", 0.95)
-    write_report(run, progress=lambda stage, share: say(stage, 0.95 + 0.05 * share))
-    say("", 1.0)
-    return run
+        rollout = _drive(job, senses[job.scene.id], wants_video, done, advance)
+        if rollout.status != "ok":
+            tell(f"{job.title} failed: {rollout.error}")
 
 
-def _drive(job: _Job, sense: Sense, video: bool, driven: bool, advance: Callable[[float], None]) -> None:
-    """Drive one job (unless only its video is missing) and put its folder in place."""
-    if driven:
-        rollout = load_rollout(job.target / layout.ROLLOUT)
-    else:
+def _drive(job: _Job, sense: Sense, video: bool, driven: Rollout | None, advance: Callable[[float], None]) -> Rollout:
+    """Drive one job (unless it is driven and only its video is missing) and put its folder in place."""
+    rollout = driven
+    if rollout is None:
         rollout = run_rollout(
-            job.scenario, job.policy, sense, job.scene, reconstruction=job.record.reconstruction, seed=job.seed,
+            job.scenario, job.policy.host, sense, job.scene, reconstruction=job.record.reconstruction, seed=job.seed,
             progress=lambda share: advance(share * (DRIVING_SHARE if video else 1.0)),
         )  # fmt: skip
     with layout.written_at_once(job.target) as part:
@@ -167,8 +193,9 @@ def _drive(job: _Job, sense: Sense, video: bool, driven: bool, advance: Callable
         (part / layout.VERSIONS).write_text(job.versions_text, encoding="utf-8")
         if rollout.status != "ok":
             (part / layout.ERROR).write_text(rollout.error + "\n", encoding="utf-8")
-        if video and rollout.states:
+        elif video:
             _record(job, rollout, sense, part, lambda share: advance(DRIVING_SHARE + share * (1 - DRIVING_SHARE)))
+    return rollout
 
 
 def _record(job: _Job, rollout: Rollout, sense: Sense, part: Path, advance: Callable[[float], None]) -> None:
@@ -191,20 +218,6 @@ def _record(job: _Job, rollout: Rollout, sense: Sense, part: Path, advance: Call
     except NurecSimError as error:
         (part / layout.VIDEO).unlink(missing_ok=True)
         (part / layout.VIDEO_ERROR).write_text(f"{error}\n", encoding="utf-8")
-
-
-def _load_policies(policies: Sequence[str | Policy]) -> list[tuple[str, Policy]]:
-    if not policies:
-        raise ScenarioError("no policy to drive: name one, or let the scenario list some under 'policies'")
-    loaded = [(entry, load_policy(entry)) if isinstance(entry, str) else (entry.name, entry) for entry in policies]
-    names = [layout.folder_name(policy.name) for _, policy in loaded]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ScenarioError(f"policies need different names, but {twice} come more than once")
-    odd = [policy.name for _, policy in loaded if not re.search(r"[A-Za-z0-9]", policy.name)]
-    if odd:
-        raise ScenarioError(f"a policy's name needs a letter or a digit, got {odd}")
-    return loaded
 
 
 def _check_scenes(scenes: Sequence[GaussianScene]) -> None:

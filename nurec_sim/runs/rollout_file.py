@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -89,10 +88,10 @@ def load_rollout(path: Path | str) -> Rollout:
         raise RunError(f"rollout file {path} does not exist") from None
     except RunError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, zipfile.BadZipFile) as error:
-        raise RunError(f"{path} is no readable rollout file: {type(error).__name__}: {error}") from error
     except codec.ArchiveError as error:
         raise RunError(f"{path} is no readable rollout file: {error}") from error
+    except Exception as error:  # a damaged file makes zipfile, zlib, numpy and json raise whatever they like
+        raise RunError(f"{path} is no readable rollout file: {type(error).__name__}: {error}") from error
 
 
 def _checked(path: Path, name: str, array: np.ndarray) -> np.ndarray:

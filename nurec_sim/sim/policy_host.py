@@ -75,12 +75,12 @@ class PolicyHost:
 
     def _make_anew(self) -> None:
         busy, before = self._thread.alive, self._policy
-        thread, policy, name, needs = self._made()
+        thread, policy, _, needs = self._made()
         if busy and policy is before:
             thread.stop()
             self._usable = False
             raise PolicyError("it is still busy with a call that it did not answer in time")
-        self._thread, self._policy, self.name, self.needs = thread, policy, name, needs
+        self._thread, self._policy, self.needs = thread, policy, needs
 
     def _made(self) -> tuple[PolicyThread, Policy, str, Needs]:
         thread = PolicyThread("policy")
