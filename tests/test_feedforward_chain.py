@@ -10,8 +10,10 @@ from nurec_sim import scene
 from nurec_sim.errors import ReconstructError, WeightsError
 from nurec_sim.evaluate import evaluate
 from nurec_sim.logs import open_clip
+from nurec_sim.plugins import load_policy
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, reconstruct
 from nurec_sim.render.renderer import Renderer
+from nurec_sim.sim import Scenario, run_rollout
 from nurec_sim.types import Label, SensorRequest
 
 CAMERAS = ["front", "left", "wide"]
@@ -59,6 +61,22 @@ def test_several_chunks_become_one_scene():
     assert counts["chunks"] == len(result.provenance["chunks"]) == 2
     assert sum(counts["owned_by_others"]) > 0
     assert counts["static"] == sum(counts["static_before"]) - sum(counts["owned_by_others"])
+
+
+def test_actors_and_blind_driving_are_the_same_whatever_the_method(world, clip):
+    """Both methods take the actors from the log; what the network saw move besides is in the picture only."""
+    scenes = [world[0], reconstruct(clip, "lift", cameras=["front"])]
+    assert any(not track.actor for track in world[0].tracks), "random weights see things move"
+    scenario = Scenario(name="brief", duration_s=0.2, warm_up_s=0.0)
+    drives = [run_rollout(scenario, load_policy("route_follower"), lambda requests: [], each) for each in scenes]
+    for drive in drives:
+        assert drive.status == "ok" and drive.actor_labels == {track.id: track.label for track in clip.tracks}
+    dense, lift = drives
+    assert dense.world_from_rig.tobytes() == lift.world_from_rig.tobytes()
+    assert dense.actor_sizes_m == lift.actor_sizes_m
+    assert all(dense.actors[name].tobytes() == lift.actors[name].tobytes() for name in lift.actors)
+    for (made, plan), (made_too, same) in zip(dense.plans, lift.plans, strict=True):
+        assert made == made_too and plan.pose.tobytes() == same.pose.tobytes()
 
 
 def test_progress_names_every_stage(world):

@@ -12,8 +12,8 @@ from nurec_sim.reconstruct.feedforward.tracks import (
     owners_of_points,
     owners_of_rays,
     scene_actors,
-    scene_tracks,
 )
+from nurec_sim.reconstruct.lift.actors import tracks_of
 from nurec_sim.types import Track, Trajectory
 
 START_US = 1_000_000
@@ -193,7 +193,7 @@ def test_a_track_that_stands_lives_over_the_whole_clip():
     times, knots = knots_along(actor, xyz, t_us, (START_US + 8_500_000, START_US + 9_500_000), log.span_us)
     assert (times[:, 0] < log.span_us[0]).all() and (times[:, 2] > log.span_us[1]).all()
     assert np.array_equal(knots, np.repeat(xyz[:, None], 3, axis=1))
-    (shown,) = scene_tracks(log, [actor])
+    (shown,) = tracks_of(log, [actor])
     assert (shown.path.start_us, shown.path.end_us) == log.span_us
 
 
@@ -204,8 +204,7 @@ def test_moving_tracks_go_on_for_one_label_step_within_the_clip():
     assert actor.path.start_us == log.span_us[0] and actor.path.end_us == track.path.end_us + 100_000
     assert actor.path.position_m[0, 0] == pytest.approx(10.0 - 0.3)
     assert actor.path.position_m[-1, 0] == pytest.approx(10.0 + 40 + 1)
-    (shown,) = scene_tracks(log, [actor])
-    assert np.array_equal(shown.path.t_us, actor.path.t_us)
+    assert tracks_of(log, [actor]) == (track,), "what is measured against is where the labels say"
     outside = np.full(2, track.path.end_us + 150_000)
     assert (owners_of_points([actor], actor.path.position_m[-1:].repeat(2, 0), outside, yes(2)) == -1).all()
 
@@ -215,7 +214,7 @@ def test_things_that_do_not_move_by_themselves_are_no_actors():
     log = Log(cone, car("car"))
     actors = scene_actors(log)
     assert [actor.index for actor in actors] == [1]
-    assert scene_tracks(log, actors)[0] is cone
+    assert tracks_of(log, actors)[0] is cone
 
 
 def test_a_single_label_holds_for_a_moment():

@@ -1,7 +1,5 @@
 """Layers of a street of which the network knows everything: what is drawn from them must be the street."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import reconstruct_street
@@ -11,12 +9,11 @@ import torch
 from nurec_sim import geometry
 from nurec_sim.network.profiles import PROFILES
 from nurec_sim.network.tensors import ContextMaps, NetworkOutputs, QueryGaussians, SemanticClass
-from nurec_sim.reconstruct.feedforward.clusters import group_into_tracks
 from nurec_sim.reconstruct.feedforward.frames import ChunkWindow
 from nurec_sim.reconstruct.feedforward.inputs import chunk_inputs
 from nurec_sim.reconstruct.feedforward.layers import chunk_layers
+from nurec_sim.reconstruct.feedforward.method import _tracks
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
-from nurec_sim.reconstruct.feedforward.tracks import scene_actors, scene_tracks
 from nurec_sim.render.renderer import Renderer
 from nurec_sim.types import GaussianScene, SensorRequest
 
@@ -80,19 +77,18 @@ def true_outputs(log, chunk):
     return NetworkOutputs(context, gaussians, sky, sky[..., :1], False, torch.eye(3, 4)[None, None])
 
 
-@pytest.fixture(scope="module", params=["boxes", "no boxes"])
+@pytest.fixture(scope="module", params=["boxes", "no boxes", "a box of the car only"])
 def world(request):
-    log = street(request.param == "boxes")
+    log = street(request.param != "no boxes")
+    if request.param == "a box of the car only":
+        log.tracks = tuple(track for track in log.tracks if track.id == "car")
     settings = FeedForwardSettings(sky_px=64, image_pixels=336 * 196)
     window = ChunkWindow(0, (int(log.t_us[0]), int(log.t_us[-1])), {"front": tuple(range(0, FRAMES, 2))})
     chunk = chunk_inputs(log, PROFILES["tiny"], window, settings)
     with torch.inference_mode():
         outputs = true_outputs(log, chunk)
     layers = chunk_layers(log, chunk, outputs, settings)
-    known = scene_tracks(log, scene_actors(log))
-    found, track = group_into_tracks(layers.dynamic, log.ego, len(known))
-    dynamic = dataclasses.replace(layers.dynamic, track=track)
-    tracks = (*known, *found)
+    tracks, dynamic = _tracks(log, layers.dynamic)
     scene = GaussianScene("street", layers.static, dynamic, layers.sky, layers.isp, log.rig, log.ego, tracks, None,
                           log.span_us)  # fmt: skip
     return log, scene, Renderer(scene, threads=1)
@@ -118,6 +114,15 @@ def test_two_tracks_hold_all_moving_gaussians(world):
     _, scene, _ = world
     assert len(scene.tracks) == 2 and set(scene.dynamic.track.tolist()) == {0, 1}
     assert {track.label for track in scene.tracks} in ({"automobile"}, {"automobile", "person"})
+
+
+def test_where_a_log_has_boxes_they_alone_are_actors(world):
+    log, scene, _ = world
+    labelled = {track.id for track in log.tracks}
+    for track in scene.tracks:
+        assert track.labelled == (track.id in labelled)
+        assert track.actor == track.controllable == (track.labelled or not labelled)
+    assert len([track for track in scene.tracks if track.actor]) == (len(labelled) or 2)
 
 
 @pytest.mark.parametrize("frame", [3, 4])

@@ -193,9 +193,10 @@ def _all_metrics(summary: pl.DataFrame) -> str:
 def _reconstructions(scenes: Sequence[ReportScene]) -> str:
     cards = []
     for scene in scenes:
-        facts: dict[str, object] = {f"{name} Gaussians": f"{count:,}" for name, count in scene.counts.items()}
-        if "tracks Gaussians" in facts:
-            facts["tracks"] = facts.pop("tracks Gaussians")
+        counts = dict(scene.counts)
+        tracks = {"actors": counts.pop("tracks", 0), "unlabelled movers": counts.pop("unlabelled movers", 0)}
+        facts: dict[str, object] = {f"{name} Gaussians": f"{count:,}" for name, count in counts.items()}
+        facts |= {name: count for name, count in tracks.items() if name == "actors" or count}
         if scene.grid is not None:
             rows, columns = scene.grid.state.shape
             facts["road grid"] = (

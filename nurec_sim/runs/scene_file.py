@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,7 +15,9 @@ from nurec_sim.metrics.offroad_grid import OffroadGrid, scene_offroad_grid
 from nurec_sim.new_files import new_file, write_file
 from nurec_sim.runs.folder import ROAD, SCENE
 from nurec_sim.scene import codec, scene_hash
-from nurec_sim.types import GaussianScene, Label, RoadMap
+from nurec_sim.types import GaussianScene, Label, RoadMap, Track
+
+MOST_LISTED = 50
 
 
 @dataclass(frozen=True)
@@ -48,13 +50,26 @@ def record_scene(scene: GaussianScene) -> SceneRecord:
     listed = scene.provenance.get("unknown", ())
     unknown = tuple(str(text) for text in listed) if isinstance(listed, (list, tuple)) else (str(listed),)
     no_boxes = any(word in text.lower() for text in unknown for word in ("box", "actor", "track"))
-    actors_known = bool(scene.tracks) or ("unknown" in scene.provenance and not no_boxes)
+    actors = [track for track in scene.tracks if track.actor]
+    movers, found = [t for t in scene.tracks if not t.actor], [t for t in actors if not t.labelled]
+    actors_known = bool(actors) or ("unknown" in scene.provenance and not no_boxes)
     if not actors_known and not no_boxes:
         unknown += ("the scene has no actor boxes: collisions cannot be measured",)
     if (scene.road_map is None or not scene.road_map.drivable) and not any("map" in text.lower() for text in unknown):
         unknown += ("the scene has no road map: off-road is measured on the road-class Gaussians only",)
+    if movers:
+        unknown += (
+            f"{len(movers)} unlabelled movers, which no box of the log names, are in the picture but are no actors: "
+            f"nothing is measured against them, and policies are not told of them: {_listed(movers, scene)}",
+        )
+    if found:
+        unknown += (
+            f"{len(found)} actors were found by how they move and nobody has labelled them; what is measured against "
+            f"them may be wrong: {_listed(found, scene)}",
+        )
     labels = np.bincount(scene.static.label, minlength=len(Label))
-    counts = {"static": len(scene.static), "dynamic": len(scene.dynamic), "tracks": len(scene.tracks)}
+    counts = {"static": len(scene.static), "dynamic": len(scene.dynamic), "tracks": len(actors)}
+    counts |= {"unlabelled movers": len(movers)} if movers else {}
     counts |= {f"static {label.name.lower()}": int(labels[label]) for label in Label if labels[label]}
     grid, road_error = None, ""
     try:
@@ -67,6 +82,16 @@ def record_scene(scene: GaussianScene) -> SceneRecord:
         scene.id, reconstruction_of(scene), scene_hash(scene), counts, provenance, unknown, actors_known,
         scene.road_map, grid, road_error,
     )  # fmt: skip
+
+
+def _listed(tracks: Sequence[Track], scene: GaussianScene) -> str:
+    """Ids, what each looks like, and when it is there."""
+    said = [
+        f"{track.id} (like {track.label}, {(track.path.start_us - scene.span_us[0]) / 1e6:.1f} to "
+        f"{(track.path.end_us - scene.span_us[0]) / 1e6:.1f} s)"
+        for track in tracks[:MOST_LISTED]
+    ]
+    return ", ".join(said) + (f" and {len(tracks) - MOST_LISTED} more" if len(tracks) > MOST_LISTED else "")
 
 
 def save_scene_record(record: SceneRecord, folder: Path) -> None:

@@ -50,7 +50,7 @@ def true_world(
 
 
 def _check_same_town(plan: TownPlan, scene: GaussianScene) -> None:
-    strangers = sorted({track.id for track in scene.tracks} - {actor.id for actor in plan.actors})
+    strangers = sorted({track.id for track in scene.tracks if track.actor} - {actor.id for actor in plan.actors})
     if strangers:
         raise RunError(f"scene {scene.id!r} is not from this town: the plan has no actor {strangers[0]!r}")
     driven = plan.ego_trajectory()

@@ -41,6 +41,9 @@ def to_json(value: Any) -> Any:
     """Plain JSON of a value made of the types of this module, numbers, strings, arrays, sequences and mappings."""
     if dataclasses.is_dataclass(value):
         fields = {field.name: to_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        for name, default in _ADDED.get(type(value), {}).items():
+            if fields[name] == default:
+                del fields[name]
         return {"type": type(value).__name__, **fields}
     if isinstance(value, enum.Enum):
         return value.value
@@ -193,7 +196,7 @@ def record(*kinds: type) -> Decoder:
             given = value.get("type") if isinstance(value, dict) else value
             raise ValueError(f"expected an object of type {sorted(allowed)}, got {given!r:.60}")
         kind = allowed[value["type"]]
-        fields = _FIELDS[kind]
+        fields, value = _FIELDS[kind], {**_ADDED.get(kind, {}), **value}
         if set(value) - {"type"} != set(fields):
             raise ValueError(f"{value['type']} needs the fields {sorted(fields)}, got {sorted(set(value) - {'type'})}")
         return kind(**{name: _within(name, decoder, value[name]) for name, decoder in fields.items()})
@@ -242,11 +245,16 @@ _FIELDS: dict[type, dict[str, Decoder]] = {
     Rig: {"cameras": mapping(record(CameraModel)), "lidars": mapping(record(LidarModel)), "body": record(Box)},
     Track: {
         "id": text, "label": text, "size_m": numbers(3), "path": record(Trajectory), "controllable": flag,
+        "labelled": flag, "actor": flag,
     },
     RoadMap: {
         "drivable": sequence(sequence(array(np.float64, -1, 2))), "lanes": sequence(array(np.float64, -1, 3)),
     },
 }  # fmt: skip
+
+
+_ADDED: dict[type, dict[str, Any]] = {Track: {"labelled": True, "actor": True}}
+"""Fields that older archives lack, and their values there; they are written only where they differ from these."""
 
 
 def from_json(decoder: Decoder, value: Any, what: str) -> Any:

@@ -58,7 +58,7 @@ def summary(scene: GaussianScene) -> list[tuple[str, str]]:
         ("recorded path", f"{path_m:.1f} m, {len(scene.ego.t_us)} poses"),
         ("static Gaussians", f"{len(scene.static):,} ({labels or 'none'}), harmonics degree {degree}"),
         ("moving Gaussians", f"{len(scene.dynamic):,} of {len(owners)} tracks"),
-        ("tracks", f"{len(scene.tracks)}"),
+        ("tracks", _tracks(scene)),
         ("sky", f"6 x {scene.sky.shape[1]} x {scene.sky.shape[2]}"),
         ("colour correction", ", ".join(scene.isp) or "none"),
         ("cameras", ", ".join(cameras) or "none"),
@@ -67,3 +67,12 @@ def summary(scene: GaussianScene) -> list[tuple[str, str]]:
         ("method", str(scene.provenance.get("method", "unknown"))),
         ("in memory", f"{sum(array.nbytes for array in arrays.values()) / 2**20:.1f} MiB"),
     ]
+
+
+def _tracks(scene: GaussianScene) -> str:
+    """How many actors there are, and how many of them, or beside them, nobody has labelled."""
+    actors = [track for track in scene.tracks if track.actor]
+    found, movers = sum(not track.labelled for track in actors), len(scene.tracks) - len(actors)
+    notes = [f"{found} of them found by how they move, not labelled"] * (found > 0)
+    notes += [f"{movers} unlabelled movers beside them"] * (movers > 0)
+    return ", ".join([f"{len(actors)} actors" if notes else f"{len(actors)}", *notes])

@@ -257,17 +257,18 @@ def _lidar_calibration(scene: GaussianScene, index: int, lidar: LidarModel) -> d
 
 
 def _sequence_tracks(scene: GaussianScene) -> dict[str, Any]:
-    samples = [_track_samples(track) for track in scene.tracks]
+    tracks = [track for track in scene.tracks if track.actor]  # clients take all that is listed for road users
+    samples = [_track_samples(track) for track in tracks]
     return {
         CHUNK_ID: {
             "tracks_data": {
-                "tracks_id": [track.id for track in scene.tracks],
-                "tracks_label_class": [track.label for track in scene.tracks],
-                "tracks_flags": ["CONTROLLABLE|DYNAMIC" if track.controllable else "NONE" for track in scene.tracks],
+                "tracks_id": [track.id for track in tracks],
+                "tracks_label_class": [track.label for track in tracks],
+                "tracks_flags": ["CONTROLLABLE|DYNAMIC" if track.controllable else "NONE" for track in tracks],
                 "tracks_timestamps_us": [t_us for t_us, _ in samples],
                 "tracks_poses": [poses for _, poses in samples],
             },
-            "cuboidtracks_data": {"cuboids_dims": [track.size_m for track in scene.tracks]},
+            "cuboidtracks_data": {"cuboids_dims": [track.size_m for track in tracks]},
         }
     }
 

@@ -66,11 +66,11 @@ class Editing(ServiceCore):
         return common.Empty()
 
     async def get_dynamic_objects(self, request):
-        """All tracks of the scene as it is now; ``asset_id`` says whom one looks like."""
+        """All actors of the scene as it is now; ``asset_id`` says whom one looks like."""
         scene = await self._scene(request.scene_id)
         reply = sensorsim.DynamicObjectsReturn()
         foreign = _foreign(scene)
-        for track in scene.tracks:
+        for track in (each for each in scene.tracks if each.actor):
             entry = reply.dynamic_objects.add()
             wire.write_track(track, entry)
             entry.asset_id = foreign.get(track.id, track.id)

@@ -20,12 +20,14 @@ VELOCITY_WINDOW_US = 100_000
 class Actors:
     """Recorded tracks under the edits of a scenario. An actor is present only while its recorded path covers the time.
 
+    Tracks that are no actors (``types.Track.actor``) are left out: they are part of the picture only.
+
     Raises:
         ScenarioError: an edit names a track that the scene does not have.
     """
 
     def __init__(self, tracks: Sequence[Track], edits: Mapping[str, ActorEdit]) -> None:
-        self.tracks = {track.id: track for track in tracks}
+        self.tracks = {track.id: track for track in tracks if track.actor}
         self.edits = dict(edits)
         unknown = sorted(set(edits) - set(self.tracks))
         if unknown:

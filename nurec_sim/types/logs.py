@@ -18,13 +18,20 @@ MOVABLE_LABELS = ("automobile", "heavy_truck", "bus", "trailer", "train", "other
 
 @dataclass(frozen=True)
 class Track:
-    """One labelled object over time; ``path`` holds the poses of its box centre (x forward, y left, z up)."""
+    """One object over time; ``path`` holds the poses of its box centre (x forward, y left, z up).
+
+    ``labelled`` is False for what a reconstruction found by how it moves, and nobody has labelled. ``actor`` says
+    whether the object counts as one for metrics, privileged policies and clients; where a log has boxes, they alone do,
+    and what else moves is part of the picture only.
+    """
 
     id: str
     label: str
     size_m: tuple[float, float, float]
     path: Trajectory
     controllable: bool = True
+    labelled: bool = True
+    actor: bool = True
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ from nurec_sim.reconstruct.feedforward.layers import chunk_layers
 from nurec_sim.reconstruct.feedforward.lidar_depth import DepthFit, fit_depth
 from nurec_sim.reconstruct.feedforward.merge import merge_chunks
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
-from nurec_sim.reconstruct.feedforward.tracks import scene_actors, scene_tracks
+from nurec_sim.reconstruct.feedforward.tracks import scene_actors
+from nurec_sim.reconstruct.lift.actors import tracks_of
 from nurec_sim.types import Clip, DynamicGaussians, GaussianScene, Track
 
 Progress = Callable[[str, float], None]
@@ -187,9 +188,14 @@ def _within(progress: Progress, index: int, count: int) -> Progress:
 
 
 def _tracks(clip: Clip, dynamic: DynamicGaussians) -> tuple[tuple[Track, ...], DynamicGaussians]:
-    """Tracks of the clip and those found in the motion of the Gaussians, which get them as their own."""
-    known = scene_tracks(clip, scene_actors(clip))
+    """Tracks of the clip and those found in the motion of the Gaussians, which get them as their own.
+
+    The latter are actors only where the log has no boxes.
+    """
+    known = tracks_of(clip, scene_actors(clip))
     found, track = group_into_tracks(dynamic, clip.ego, len(known), [each.id for each in known])
+    alone = not known
+    found = tuple(dataclasses.replace(each, labelled=False, actor=alone, controllable=alone) for each in found)
     return (*known, *found), dataclasses.replace(dynamic, track=track)
 
 

@@ -16,7 +16,7 @@ from nurec_sim import geometry
 from nurec_sim.reconstruct.lift.actors import windows_of
 from nurec_sim.reconstruct.lift.points import Actor, actors_of
 from nurec_sim.reconstruct.lift.settings import LiftSettings, PointSettings
-from nurec_sim.types import Clip, Track, Trajectory
+from nurec_sim.types import Clip, Trajectory
 
 PADDING_M = 0.5
 """Boxes grow by this on every side for movable points: 1 m on each whole dimension, as in the released model."""
@@ -36,17 +36,6 @@ def scene_actors(clip: Clip) -> list[Actor]:
     """
     actors = actors_of(clip, PointSettings())
     return [a if a.standing else dataclasses.replace(a, path=_longer(a.path, clip.span_us)) for a in actors]
-
-
-def scene_tracks(clip: Clip, actors: Sequence[Actor]) -> tuple[Track, ...]:
-    """The clip's tracks as the scene shows them: those of ``actors`` with the paths that their points follow."""
-    tracks = list(clip.tracks)
-    for actor in actors:
-        path = actor.path
-        if actor.standing:
-            path = Trajectory(np.array(clip.span_us), np.repeat(path.world_from_body, 2, axis=0))
-        tracks[actor.index] = dataclasses.replace(actor.track, path=path)
-    return tuple(tracks)
 
 
 def owners_of_points(
