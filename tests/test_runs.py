@@ -302,6 +302,41 @@ def test_no_damage_of_a_rollout_file_gets_past_the_reader(tmp_path):
             load_rollout(path)
 
 
+def test_parts_of_killed_writers_are_removed_by_the_next_run_and_live_ones_are_not(tmp_path):
+    scene, _ = flat_street()
+
+    def go(**more):
+        return runs.execute(
+            [scene], SCENARIO, ["log_replay"], lambda i: striped, tmp_path, seeds=[0], video=False, **more
+        )
+
+    run = go(stamp="a")
+    place = run / "street" / "lift"
+    (place / "log_replay" / "0" / "rollout.npz").unlink()
+    left = [run / ".report.html.x7_.part", place / ".road.npz.ab.part", place / "log_replay" / ".0.part.4711",
+            place / "log_replay" / ".0.old.4711"]  # fmt: skip
+    mine = [tmp_path / ".other.part", run / ".notes"]
+
+    def leave():
+        for path in left[:2] + mine:
+            path.write_text("half")
+        for path in left[2:]:
+            path.mkdir()
+            (path / "rollout.npz").write_text("half")
+
+    with layout.owned(run.resolve()):
+        leave()
+        go(stamp="b")  # beside a run that is alive: its parts stay
+        assert all(path.exists() for path in left)
+        with pytest.raises(RunError, match="another run is writing to .*/a; wait for its end"):
+            go(resume=run)
+    go(resume=run)
+    assert not any(path.exists() for path in left) and all(path.exists() for path in mine)
+    leave()
+    go(stamp="c")  # a new run tidies up after the latest one
+    assert not any(path.exists() for path in left) and all(path.exists() for path in mine)
+
+
 def test_failed_rollouts_are_told_and_get_no_video(tmp_path):
     scene, _ = flat_street()
     rendered, heard = [], []

@@ -123,7 +123,7 @@ def execute(
 
     Raises:
         ScenarioError: nothing to drive, a policy cannot be loaded, or two policies or scenes have the same name.
-        RunError: ``resume`` is no folder.
+        RunError: ``resume`` is no folder, or another run is writing to it.
     """
     say, tell = progress or (lambda stage, share: None), notice or (lambda text: None)
     seeds = tuple(scenario.seeds if seeds is None or len(seeds) == 0 else seeds)
@@ -131,29 +131,40 @@ def execute(
     loaded = load_policies(policies, plan_timeout_s)
     try:
         if resume is None:
+            layout.tidy(Path(out_dir) / "latest")
             stamp = stamp or datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
             run = layout.new_run_folder(Path(out_dir), stamp)
         else:
             run = layout.existing_run_folder(Path(resume))
+        with layout.owned(run):
             layout.point_latest(run)
-        jobs = []
-        for index, scene in enumerate(scenes):
-            say(f"reading the road of {scene.id}", 0.05 * index / len(scenes))
-            record = record_scene(scene)
-            save_scene_record(record, layout.scene_folder(run, record.id, record.reconstruction))
-            for policy in loaded:
-                for seed in seeds:
-                    target = layout.rollout_folder(run, scene.id, record.reconstruction, policy.name, seed)
-                    jobs.append(_Job(scene, record, policy, seed, scenario, target))
-        _drive_all(jobs, sense_for, video, say, tell)
+            jobs = _jobs(run, scenes, scenario, loaded, seeds, say)
+            _drive_all(jobs, sense_for, video, say, tell)
+            say("scoring", 0.95)
+            write_report(run, progress=lambda stage, share: say(stage, 0.95 + 0.05 * share))
     finally:
         for policy in loaded:
             if policy not in policies:
                 policy.host.close()
-    say("scoring", 0.95)
-    write_report(run, progress=lambda stage, share: say(stage, 0.95 + 0.05 * share))
     say("", 1.0)
     return run
+
+
+def _jobs(
+    run: Path, scenes: Sequence[GaussianScene], scenario: Scenario, policies: Sequence[LoadedPolicy],
+    seeds: Sequence[int], say: Progress,
+) -> list[_Job]:  # fmt: skip
+    """Every rollout of the run; what is known of the scenes is written."""
+    jobs = []
+    for index, scene in enumerate(scenes):
+        say(f"reading the road of {scene.id}", 0.05 * index / len(scenes))
+        record = record_scene(scene)
+        save_scene_record(record, layout.scene_folder(run, record.id, record.reconstruction))
+        for policy in policies:
+            for seed in seeds:
+                target = layout.rollout_folder(run, scene.id, record.reconstruction, policy.name, seed)
+                jobs.append(_Job(scene, record, policy, seed, scenario, target))
+    return jobs
 
 
 def _drive_all(

@@ -7,12 +7,15 @@
       <scene>/<reconstruction>/scene.json  road.npz
       <scene>/<reconstruction>/<policy>/<seed>/scenario.yaml  rollout.npz  versions.json  front.mp4  [error.txt]
 
-A rollout's folder is filled under another name and renamed, so a folder that is there is complete.
+A rollout's folder is filled under another name and renamed, so a folder that is there is complete. A run owns its
+folder while it writes: by an advisory lock of the system (``flock``) on the folder itself, which ends with its process,
+whatever ends that. So hidden parts in a folder that nobody owns were left by killed writers; the next run removes them.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import re
 import shutil
@@ -24,6 +27,8 @@ from nurec_sim.new_files import writing
 
 ROLLOUT, SCENARIO, VERSIONS, VIDEO, ERROR = "rollout.npz", "scenario.yaml", "versions.json", "front.mp4", "error.txt"
 VIDEO_ERROR = "video_error.txt"
+_LEFTOVER = re.compile(r"\..+\.(part|part\.\d+|old\.\d+)")
+"""Names of ``new_files.new_file`` and of ``written_at_once``."""
 SCENE, ROAD, REPORT = "scene.json", "road.npz", "report.html"
 
 
@@ -46,7 +51,7 @@ def point_latest(folder: Path) -> None:
     link = folder.parent / "latest"
     if link.exists() and not link.is_symlink():
         return
-    part = folder.parent / f".latest.{os.getpid()}"
+    part = folder.parent / ".latest.part"
     with contextlib.suppress(FileNotFoundError):
         part.unlink()
     with contextlib.suppress(OSError):  # a file system without links goes without
@@ -64,6 +69,46 @@ def existing_run_folder(path: Path) -> Path:
     if not path.is_dir():
         raise RunError(f"run folder {path} does not exist; give a folder that `nurec-sim run` made")
     return path.resolve()
+
+
+@contextlib.contextmanager
+def owned(run: Path) -> Iterator[None]:
+    """Own a run folder for the time of the block; what killed writers left in it is removed first.
+
+    Raises:
+        RunError: another process owns it.
+    """
+    handle = os.open(run, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunError(
+                f"another run is writing to {run}; wait for its end, or begin a new one without --resume"
+            ) from None
+        except OSError:  # a file system without locks: whose the parts are is not known
+            pass
+        else:
+            _remove_leftovers(run)
+        yield
+    finally:
+        os.close(handle)
+
+
+def tidy(run: Path) -> None:
+    """Remove what killed writers left in a run folder, unless somebody owns it."""
+    if run.is_dir():
+        with contextlib.suppress(RunError, OSError), owned(run):
+            pass
+
+
+def _remove_leftovers(run: Path) -> None:
+    for place in ("", "*/*/", "*/*/*/"):
+        for path in [path for path in run.glob(f"{place}.*") if _LEFTOVER.fullmatch(path.name)]:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
 
 
 def scene_folder(run: Path, scene_id: str, reconstruction: str) -> Path:
