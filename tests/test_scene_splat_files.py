@@ -14,6 +14,7 @@ from nurec_sim import cli, decoding, geometry
 from nurec_sim.decoding import Limits
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene import import_scene, read_ply, read_scene, write_ply
+from nurec_sim.scene.checks import check_gaussians
 from nurec_sim.scene.foreign.spz import read_spz
 from nurec_sim.scene.transform import transformed
 from nurec_sim.types import Gaussians
@@ -231,6 +232,24 @@ def test_spz_files_that_are_wrong(tmp_path, make, text, monkeypatch):
     make(tmp_path / "a.spz")
     with pytest.raises(ArchiveError, match=text):
         read_spz(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("name", ["cloud.compressed.ply", "cloud.spz"])
+def test_damaged_bytes_read_or_are_refused(tmp_path, name):
+    """Whatever is flipped: Gaussians that a scene may hold, or an ArchiveError."""
+    rng = np.random.default_rng(0)
+    path, whole = tmp_path / name, (MADE / name).read_bytes()
+    whole = gzip.decompress(whole) if name.endswith("spz") else whole
+    for _ in range(100):
+        data = bytearray(whole[: len(whole) - int(rng.integers(0, 3)) * int(rng.integers(0, 200))])
+        for at in rng.integers(0, rng.choice([20, 1000, len(data)]), rng.integers(1, 6)):
+            data[at] = rng.integers(0, 256)
+        path.write_bytes(gzip.compress(data, 1) if name.endswith("spz") else data)
+        try:
+            gaussians, _ = (read_spz if name.endswith("spz") else read_ply)(path)
+        except ArchiveError:
+            continue
+        check_gaussians(gaussians, "read")
 
 
 @pytest.mark.parametrize("name", ["a.sog", "a.splat"])
