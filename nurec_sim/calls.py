@@ -26,15 +26,25 @@ class Call:
     scene: str = ""
     """The scene that the request names, for the log; whoever reads the request sets it."""
 
+    @property
+    def client(self) -> tuple[str, str]:
+        """Whose call it is: the address, and the connection, for several programs may share an address."""
+        return address_of(self.peer), self.peer
+
     def check_deadline(self) -> None:
-        """Refuses to begin work that nobody waits for.
+        """Ends work that nobody waits for.
 
         Raises:
             DeadlinePassedError: the client has stopped waiting.
         """
         late_s = time.monotonic() - self.deadline_s
         if late_s >= 0:
-            raise DeadlinePassedError(f"the deadline passed {1e3 * late_s:.0f} ms before the work could begin")
+            raise DeadlinePassedError(f"the deadline passed {1e3 * late_s:.0f} ms before the work was done")
+
+
+def address_of(peer: str) -> str:
+    """The address of a client without its port, which every connection has anew: ``ipv4:127.0.0.1``."""
+    return peer.rsplit(":", 1)[0] if peer.startswith(("ipv4:", "ipv6:")) else peer
 
 
 _current: ContextVar[Call] = ContextVar("call")

@@ -54,7 +54,8 @@ class RemoteSensors(Connection):
             batch = sensorsim.BatchRGBRenderRequest()
             for i in indices:
                 item = batch.items.add(camera_name=requests[i].sensor.id)
-                wire.write_camera_request(requests[i], item.request, scene_id=self.scene_id, apply_isp=self._apply_isp)
+                request = requests[i] if self._apply_isp else replace(requests[i], apply_isp=False)
+                wire.write_camera_request(request, item.request, scene_id=self.scene_id)
             calls.append((indices, self._begin("batch_render_rgb", batch)))
         for i, request in enumerate(requests):
             if isinstance(request.sensor, LidarModel):

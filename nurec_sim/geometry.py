@@ -106,9 +106,18 @@ def wrap_angle(angle_rad: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"
 def is_rotation(rotation: Float64[np.ndarray, "3 3"], tolerance: float = 1e-3) -> bool:
     """Whether a matrix is orthonormal and right-handed within ``tolerance``."""
     m = np.asarray(rotation, np.float64)
-    if m.shape != (3, 3) or not np.isfinite(m).all():
-        return False
-    return bool(np.abs(m @ m.T - np.eye(3)).max() <= tolerance and np.linalg.det(m) > 0)
+    return m.shape == (3, 3) and bool(np.all(are_rotations(m[None], tolerance)))
+
+
+def are_rotations(rotations: Float64[np.ndarray, "n 3 3"], tolerance: float = 1e-3) -> Bool[np.ndarray, " n"]:
+    """``is_rotation`` of many matrices."""
+    m = np.asarray(rotations, np.float64)
+    sound = np.asarray(
+        (np.abs(m) < 2).all(axis=(1, 2))
+    )  # NaN is not; larger entries are none of a rotation, and may overflow
+    m = np.where(sound[:, None, None], m, 0.0)
+    errors = np.abs(m @ m.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    return np.asarray(sound & (errors <= tolerance) & (np.linalg.det(m) > 0))
 
 
 # ------------------------------------------------------------------------------------------------------ transforms
@@ -180,6 +189,19 @@ def interpolate_pose_pair(
         quats = quat_from_matrix(pair[:, :3, :3])
         result[:, :3, :3] = matrix_from_quat(slerp(quats[0], quats[1], flat))
     return result.reshape(*fraction.shape, 4, 4)
+
+
+def interpolate_pose_pairs(pairs: Float64[np.ndarray, "n 2 4 4"], fraction: float) -> Float64[np.ndarray, "n 4 4"]:
+    """``interpolate_pose_pair`` of many pairs at one fraction."""
+    pairs = np.asarray(pairs, np.float64).reshape(-1, 2, 4, 4)
+    result = pairs[:, 0].copy()
+    result[:, :3, 3] += fraction * (pairs[:, 1, :3, 3] - pairs[:, 0, :3, 3])
+    turned = (pairs[:, 0, :3, :3] != pairs[:, 1, :3, :3]).any(axis=(1, 2))
+    if turned.any():
+        quats = quat_from_matrix(pairs[turned, :, :3, :3])
+        fractions = np.full(len(quats), fraction)
+        result[turned, :3, :3] = matrix_from_quat(slerp(quats[:, 0], quats[:, 1], fractions))
+    return result
 
 
 # -------------------------------------------------------------------------------------------------- boxes, polygons

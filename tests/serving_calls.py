@@ -15,6 +15,7 @@ from nurec_sim.render import Renderer
 from nurec_sim.scene_store import SceneStore
 from nurec_sim.server import SensorServer
 from nurec_sim.service import ServiceOptions
+from nurec_sim.turns import rest
 from nurec_sim.wire import ImageFormat, sensorsim
 from nurec_sim.wire.poses import write_poses
 
@@ -109,7 +110,7 @@ class Failing:
     def __init__(self, scene):
         self.scene = scene
 
-    def render_camera(self, request, outputs=()):
+    def sense(self, requests, outputs=()):
         raise ZeroDivisionError("oh no")
 
 
@@ -119,10 +120,14 @@ class Gated:
     def __init__(self, scene):
         self.inner, self.gate, self.begun = Renderer(scene, threads=2), threading.Event(), []
 
-    def render_camera(self, request, outputs=()):
-        self.begun.append(request.start_us)
-        assert self.gate.wait(30)
-        return self.inner.render_camera(request, outputs)
+    def sense(self, requests, outputs=()):
+        frames = []
+        for request in requests:
+            rest()
+            self.begun.append(request.start_us)
+            assert self.gate.wait(30)
+            frames += self.inner.sense([request], outputs)
+        return frames
 
 
 def wait_until(condition, seconds=20):

@@ -95,6 +95,8 @@ def test_isp_and_its_switch(launcher):
     assert_same_image(launcher, world, asked)
     plain = GpuRenderer(world, launcher, apply_isp=False).render_camera(asked)
     assert psnr_db(plain.rgb, spec.render_camera(world, asked, apply_isp=False).rgb) >= 60
+    asked_for = GpuRenderer(world, launcher).render_camera(dataclasses.replace(asked, apply_isp=False))
+    assert np.array_equal(asked_for.rgb, plain.rgb)
 
 
 def test_moving_actors(launcher):
@@ -103,6 +105,7 @@ def test_moving_actors(launcher):
     actors = {"car": np.stack([pose, moved() @ pose]), "unknown": np.stack([np.eye(4)] * 2)}
     asked = request(camera(shutter=Shutter.TOP_TO_BOTTOM), end_from_rig=moved(), actors=actors)
     assert_same_image(launcher, world, asked)
+    assert_same_image(launcher, world, dataclasses.replace(asked, hidden=frozenset({"car"})))
 
 
 @pytest.mark.parametrize("name", list(LIDARS))

@@ -51,7 +51,7 @@ def layer(n=400, sh=0, seed=3):
 def placed(dynamic, t_us, actors, threads=2):
     """The packed layer at an instant, its arrays copied."""
     with Buffers().lend() as array:
-        result = PackedMoving.of(dynamic, TRACKS).at(t_us, actors, EYE, Workers(threads), array)
+        result = PackedMoving.of(dynamic, TRACKS).at(t_us, actors, frozenset(), EYE, Workers(threads), array)
         return dataclasses.replace(result, fields=result.fields.copy())
 
 

@@ -85,6 +85,7 @@ def test_isp_and_its_switch():
     assert_same_image(world, asked)
     plain = Renderer(world, apply_isp=False).render_camera(asked)
     assert psnr_db(plain.rgb, spec.render_camera(world, asked, apply_isp=False).rgb) >= 60
+    assert np.array_equal(plain.rgb, Renderer(world).render_camera(dataclasses.replace(asked, apply_isp=False)).rgb)
     assert psnr_db(plain.rgb, Renderer(world).render_camera(asked).rgb) < 30
     other = Renderer(world).render_camera(request(camera(id="rear")))
     assert np.array_equal(other.rgb, plain.rgb)

@@ -12,7 +12,10 @@ import pytest
 from render_scenes import START_US, camera, cloud, moved, moving_cloud, request, scene, track
 
 from nurec_sim import geometry, sensors
-from nurec_sim.render import Renderer
+from nurec_sim.render import Renderer, spec
+from nurec_sim.render import renderer as renderer_module
+from nurec_sim.render.cpu import pipeline
+from nurec_sim.sensors import camera as camera_rays
 from nurec_sim.types import Fisheye, FTheta, FThetaReference, Pinhole, Shutter
 
 LIDAR = sensors.lidar_model("VLP-16", np.eye(4), columns=240)
@@ -87,6 +90,49 @@ def test_a_batch_gives_what_one_by_one_gives_in_any_order(world, alone):
     assert_same_bytes(frames, [alone[k] for k in order])
     assert_same_bytes([renderer.render_camera(asked[0]), renderer.render_lidar(asked[-1])], [alone[0], alone[-1]])
     assert renderer.sense([]) == []
+
+
+def test_groups_slices_and_strips_do_not_change_a_byte(world, alone, monkeypatch):
+    """As large images are drawn: tables by strips of rows, frames in groups, kernels in many short calls."""
+    monkeypatch.setattr(camera_rays, "KEPT_PIXELS", 0)
+    monkeypatch.setattr(camera_rays, "PIXELS_AT_ONCE", 1000)
+    monkeypatch.setattr(renderer_module, "GROUP_BYTES", 3_000_000)
+    monkeypatch.setattr(renderer_module, "SLICE_RAYS", 141 * 16)
+    for name in ("SLICE_PAIRS", "SLICE_BLOCKS", "SLICE_RECORDS"):
+        monkeypatch.setattr(pipeline, name, 5)
+    drawn, draw = [], renderer_module.draw
+    monkeypatch.setattr(
+        renderer_module, "draw", lambda group, workers: drawn.append(len(group)) or draw(group, workers)
+    )
+    assert_same_bytes(Renderer(world, threads=1).sense(list(mixture())), alone)
+    assert len(drawn) > 3 and sum(drawn) == len(alone)
+
+
+def test_memory_of_many_frames_does_not_grow_with_their_number(world, monkeypatch):
+    """Scratch memory is that of a group, and reused by the next one."""
+    monkeypatch.setattr(renderer_module, "GROUP_BYTES", 1)
+    renderer = Renderer(world, threads=1)
+    lent = []
+    lend = renderer._buffers.lend
+    monkeypatch.setattr(renderer._buffers, "lend", lambda: lent.append(1) or lend())
+    assert len(renderer.sense([request(camera(141, 90), moved(0.1 * k)) for k in range(20)], ("rgb",))) == 20
+    assert len(lent) == 1
+
+
+@pytest.mark.parametrize("boxed", [False, True])
+def test_hidden_tracks_are_not_drawn(world, boxed):
+    if boxed:
+        world = dataclasses.replace(world, dynamic=dataclasses.replace(world.dynamic, in_box=world.dynamic.track >= 0))
+    without = dataclasses.replace(
+        world, dynamic=dataclasses.replace(world.dynamic, knot_m=np.where(
+            (world.dynamic.track == 0)[:, None, None], np.float32(1e9), world.dynamic.knot_m)),
+    )  # fmt: skip
+    asked = request(camera(141, 90), actors=ACTORS)
+    hidden = dataclasses.replace(asked, hidden=frozenset({"car", "unknown"}))
+    expected = Renderer(without).render_camera(request(camera(141, 90))).rgb
+    assert np.array_equal(Renderer(world).render_camera(hidden).rgb, expected)
+    assert not np.array_equal(Renderer(world).render_camera(asked).rgb, expected)
+    assert np.abs(spec.render_camera(world, hidden).rgb.astype(int) - expected).max() <= 2
 
 
 def test_sixteen_threads_share_a_renderer(world, alone):

@@ -115,13 +115,9 @@ class Counting:
     def __init__(self, world):
         self.inner, self.drawn = one_thread(world), []
 
-    def render_camera(self, request, outputs=()):
-        self.drawn.append(request.sensor.id)
-        return self.inner.render_camera(request, outputs)
-
-    def render_lidar(self, request, filter=None):
-        self.drawn.append(request.sensor.id)
-        return self.inner.render_lidar(request, filter)
+    def sense(self, requests, outputs=()):
+        self.drawn += [request.sensor.id for request in requests]
+        return self.inner.sense(requests, outputs)
 
 
 def test_a_server_can_warm_up_before_somebody_asks(caplog):

@@ -14,9 +14,10 @@ from serving_world import camera_request, scene
 from slow_reader import SlowReader
 
 from nurec_sim import wire
+from nurec_sim.calls import address_of
 from nurec_sim.scene_store import SceneStore
 from nurec_sim.server import SensorServer, ServerOptions
-from nurec_sim.server.limits import RateLimit, UnreadReplies, address_of
+from nurec_sim.server.limits import RateLimit, UnreadReplies
 from nurec_sim.service import ServiceOptions
 from nurec_sim.wire import common, sensorsim
 

@@ -163,7 +163,7 @@ def test_a_call_is_one_line_of_text_whatever_its_scene_is_called(log_lines):
 
 def test_calls_are_not_logged_above_level_info_and_bugs_are(log_lines):
     class Failing:
-        def render_camera(self, request, outputs=()):
+        def sense(self, requests, outputs=()):
             raise ZeroDivisionError("oh no")
 
     lines = log_lines("json", "warning")
@@ -215,7 +215,7 @@ def test_health_says_so_first_when_the_server_stops(gated):
 def test_work_is_refused_once_the_deadline_has_passed():
     Call("a", deadline_s=time.monotonic() + 60).check_deadline()
     Call("a").check_deadline()
-    with pytest.raises(DeadlinePassedError, match="the deadline passed .* ms before the work could begin"):
+    with pytest.raises(DeadlinePassedError, match="the deadline passed .* ms before the work was done"):
         Call("a", deadline_s=time.monotonic() - 1).check_deadline()
 
 

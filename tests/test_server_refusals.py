@@ -128,7 +128,7 @@ def test_a_bad_lidar_request_is_explained_and_the_server_goes_on(stub, case):
 
 @pytest.mark.parametrize(
     ("rows", "columns", "text"),
-    [(400, 100_000, "got 400x100000 beams = 40,000,000"), (40, 100_000, "may take 96,000,000 bytes of 67,108,864")],
+    [(400, 100_000, "got 400x100000 beams = 40,000,000"), (800, 5000, "may take 96,000,000 bytes of 67,108,864")],
 )
 def test_too_many_beams_are_refused(stub, rows, columns, text):
     lidar = replace(

@@ -283,14 +283,14 @@ def test_a_bad_lidar_is_explained(change, text):
 def test_camera_requests_travel_bit_for_bit():
     actors = {"car-1": np.stack([POSE, geometry.pose_from_xyyaw(1, 2, 3)])}
     request, message = camera_request("wide", actors=actors), sensorsim.RGBRenderRequest()
-    wire.write_camera_request(request, message, scene_id="s", apply_isp=False)
+    wire.write_camera_request(replace(request, apply_isp=False), message, scene_id="s")
     received = sensorsim.RGBRenderRequest.FromString(message.SerializeToString())
     back, options = wire.read_camera_request(received, {})
     assert (back.scene_id, back.start_us, back.end_us) == ("s", request.start_us, request.end_us)
     assert np.array_equal(back.world_from_sensor, request.world_from_sensor)
     assert list(back.actors) == ["car-1"] and np.array_equal(back.actors["car-1"], actors["car-1"])
     assert back.sensor.lens == request.sensor.lens and back.sensor.id == "wide"
-    assert options == wire.ImageOptions(wire.ImageFormat.RGB_UINT8_PLANAR, apply_isp=False)
+    assert not back.apply_isp and options == wire.ImageOptions(wire.ImageFormat.RGB_UINT8_PLANAR)
 
 
 def test_lidar_requests_travel_bit_for_bit():

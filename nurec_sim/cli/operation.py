@@ -39,8 +39,16 @@ class OperationFlags:
     """Pixels, or beams, of one frame; 33.2 million if not given."""
     max_batch_items: int | None = None
     """Frames of one call; 64 if not given."""
+    max_call_rays: int | None = None
+    """Pixels and beams of all frames of one call; 134 million if not given."""
+    max_client_rays: int | None = None
+    """Pixels and beams that the calls of one connection may ask for at a time; 268 million if not given."""
+    max_actors: int | None = None
+    """Actors that a request for a frame may place; 4096 if not given."""
+    max_request_mb: int | None = None
+    """Megabytes (2^20 bytes) of a request other than an upload; 16 if not given."""
     max_message_mb: int | None = None
-    """Megabytes (2^20 bytes) of a request or a reply; 64 if not given."""
+    """Megabytes (2^20 bytes) of a part of an upload, or of a reply; 64 if not given."""
     device: str = "cpu"
     """What renders: cpu, or a CUDA device such as cuda or cuda:1."""
     workers: int | None = None
@@ -117,6 +125,10 @@ def service_options(flags: OperationFlags, **more: Any) -> ServiceOptions:
         "render_workers": flags.workers,
         "max_pixels": flags.max_pixels,
         "max_batch_items": flags.max_batch_items,
+        "max_call_rays": flags.max_call_rays,
+        "max_client_rays": flags.max_client_rays,
+        "max_actors": flags.max_actors,
+        "max_request_bytes": None if flags.max_request_mb is None else flags.max_request_mb << 20,
         "max_message_bytes": None if flags.max_message_mb is None else flags.max_message_mb << 20,
     }
     chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from nurec_sim import geometry
-from nurec_sim.render.rays import RayGrid, reference_pose
+from nurec_sim.render.rays import RayGrid, actors_at, reference_pose
 from nurec_sim.scene.harmonics import sh_basis
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, SensorRequest, Track
 
@@ -24,16 +24,13 @@ def visible_gaussians(
 ) -> tuple[Gaussians, Int64[np.ndarray, " k"]]:
     """Both layers at the reference instant, coloured for the view, and the order of those that can be drawn."""
     world_from_sensor, t_us = reference_pose(request, grid.reference)
-    actors = {
-        name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(grid.reference))
-        for name, pair in request.actors.items()
-    }
+    actors = actors_at(request, grid.reference, {track.id for track in scene.tracks})
     eye = world_from_sensor[:3, 3]
     static = scene.static
     if static.sh_rest is not None:
         rgb = view_colour(static.rgb, static.sh_rest, static.mean_m - eye).astype(np.float32)
         static = dataclasses.replace(static, rgb=rgb, sh_rest=None)
-    moving = moving_gaussians(scene.dynamic, scene.tracks, t_us, actors, eye)
+    moving = moving_gaussians(scene.dynamic, scene.tracks, t_us, actors, eye, request.hidden)
     gaussians = Gaussians.concatenate([static, moving])
     rows = np.flatnonzero(drawable(gaussians))
     centre = geometry.transform_points(geometry.inverse(world_from_sensor), gaussians.mean_m[rows])
@@ -66,6 +63,7 @@ def moving_gaussians(
     t_us: int,
     actors: Mapping[str, Float64[np.ndarray, "4 4"]],
     eye_m: Float64[np.ndarray, " 3"],
+    hidden: Set[str] = frozenset(),
 ) -> Gaussians:
     """The dynamic layer at ``t_us`` (``types.DynamicGaussians``), only those that can still be seen.
 
@@ -76,6 +74,7 @@ def moving_gaussians(
         actors: requested ``world_from_box`` at the instant by track id; ids that no track has are ignored.
         eye_m: view point in the world. View-dependent colour is evaluated here, in the recorded frame of a
             re-posed actor, so the result has no ``sh_rest``.
+        hidden: ids of tracks that are left out.
 
     Returns:
         Gaussians with their position, rotation and faded opacity of the instant.
@@ -88,6 +87,7 @@ def moving_gaussians(
     requested = {k: actors[track.id] for k, track in enumerate(tracks) if track.id in actors}
     gone = [k for k, track in enumerate(tracks) if k not in requested and not track.path.covers(t_us)]
     seen &= ~(boxed[alive] & np.isin(dynamic.track[alive], gone))
+    seen &= ~np.isin(dynamic.track[alive], [k for k, track in enumerate(tracks) if track.id in hidden])
     alive, mean, opacity = alive[seen], mean[seen], opacity[seen]
     gaussians = dynamic.gaussians[alive]
     quat, normal = gaussians.quat_wxyz.astype(np.float64), gaussians.normal.astype(np.float64)

@@ -6,6 +6,7 @@ renderer does afterwards is the same for both.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,20 +43,25 @@ def ray_grid(sensor: CameraModel | LidarModel) -> RayGrid:
         direction = np.asarray(sensors.beam_directions(sensor), np.float64)
         fraction = np.broadcast_to(sensors.column_fraction(sensor), direction.shape[:2])
         valid = np.ones(direction.shape[:2], bool)
-        return RayGrid(direction, valid, fraction, _reference(fraction), True, max(NEAR_M, sensor.range_m[0]))
+        return RayGrid(direction, valid, fraction, reference_fraction(fraction), True, max(NEAR_M, sensor.range_m[0]))
     direction, valid = sensors.pixel_rays(sensor)
-    by_column = sensor.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
-    line = np.arange(sensor.width_px if by_column else sensor.height_px) + 0.5
-    shared = np.asarray(sensors.shutter_fraction(sensor, np.stack([line, line], axis=-1)))
+    shared, by_column = line_fractions(sensor)
     fraction = np.broadcast_to(shared if by_column else shared[:, None], valid.shape)
     direction = np.where(valid[..., None], direction, (0.0, 0.0, 1.0))
     by_range = not isinstance(sensor.lens, Pinhole)
-    return RayGrid(direction, valid, fraction, _reference(fraction), by_range, NEAR_M)
+    return RayGrid(direction, valid, fraction, reference_fraction(shared), by_range, NEAR_M)
 
 
-def _reference(fraction: Float64[np.ndarray, "h w"]) -> float:
+def line_fractions(camera: CameraModel) -> tuple[Float64[np.ndarray, " lines"], bool]:
+    """When within the exposure each row, or each column, is taken, and whether it is columns."""
+    by_column = camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
+    line = np.arange(camera.width_px if by_column else camera.height_px) + 0.5
+    return np.asarray(sensors.shutter_fraction(camera, np.stack([line, line], axis=-1))), by_column
+
+
+def reference_fraction(fraction: Float64[np.ndarray, "*n"]) -> float:
     """``RayGrid.reference`` of rays fired at the given fractions."""
-    first = float(fraction[0, 0])
+    first = float(fraction.flat[0])
     return first if (fraction == first).all() else 0.5
 
 
@@ -63,6 +69,13 @@ def reference_pose(request: SensorRequest, reference: float) -> tuple[Float64[np
     """``world_from_sensor`` and time in microseconds at the fraction ``reference`` of the exposure."""
     pose = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), np.array(reference))
     return pose, request.start_us + int(round(reference * (request.end_us - request.start_us)))
+
+
+def actors_at(request: SensorRequest, reference: float, known: Container[str]) -> dict[str, Float64[np.ndarray, "4 4"]]:
+    """``world_from_box`` of the request's actors that are known and not hidden, at a fraction of the exposure."""
+    names = [name for name in request.actors if name in known and name not in request.hidden]
+    pairs = np.array([request.actors[name] for name in names], np.float64)
+    return dict(zip(names, geometry.interpolate_pose_pairs(pairs, reference), strict=True))
 
 
 def world_rays(

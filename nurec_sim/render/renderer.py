@@ -25,11 +25,22 @@ from nurec_sim.render.cpu.tiles import AFFINE, ROLLING
 from nurec_sim.render.cpu.view import View
 from nurec_sim.render.cpu.workers import Buffers, Lend, Workers
 from nurec_sim.render.lod import Detail, ray_spacing
-from nurec_sim.render.rays import reference_pose
-from nurec_sim.render.requests import SENSED_OUTPUTS, check_camera_call, check_lidar_call, check_request
+from nurec_sim.render.rays import actors_at, reference_pose
+from nurec_sim.render.requests import (
+    SENSED_OUTPUTS,
+    check_camera_call,
+    check_lidar_call,
+    check_outputs,
+    check_request,
+)
+from nurec_sim.turns import rest
 from nurec_sim.types import CameraFrame, CameraModel, GaussianScene, LidarFilter, LidarFrame, SensorFrame, SensorRequest
 
 IDENTITY_ISP = np.eye(3, 4, dtype=np.float32)
+GROUP_BYTES = 256 << 20
+"""Scratch memory of the frames that go through the stages together, or of a single larger one."""
+SLICE_RAYS = 1 << 16
+"""Rays finished in one call of a kernel, about a millisecond of work."""
 KEPT_RAYS = 50_000_000
 """Rays of the sensors whose tables are kept, in all; some 60 bytes each."""
 
@@ -47,13 +58,22 @@ class _Sensor:
     spacing_rad: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """A frame on its way."""
+
+    request: SensorRequest
+    sensor: _Sensor
+    picture: Picture
+
+
 class Renderer:
     """A scene made ready for rendering. Immutable but for caches; all methods can be called from many threads.
 
     Args:
         scene: the world.
         threads: that work on a frame, the caller's own among them; as many as the process may use if None.
-        apply_isp: whether ``scene.isp`` of the request's sensor id is applied.
+        apply_isp: whether ``scene.isp`` of the request's sensor id is applied to requests that ask for it.
         detail_px: level of detail: distant static Gaussians are drawn merged where that paints no more than about a
             square of this side wrong, in pixels or beams; 0 draws all of them. 0.15 keeps 50 dB where surfaces have
             several layers and 45 where they have one (``lod``). Merging takes seconds per million Gaussians.
@@ -80,13 +100,16 @@ class Renderer:
         self._sensors: OrderedDict[tuple, _Sensor] = OrderedDict()
         self._sensors_lock = threading.Lock()
 
-    def sense(self, requests: Sequence[SensorRequest]) -> list[SensorFrame]:
-        """One frame per request, in order: ``types.Sense``. All frames go through the stages together.
+    def sense(self, requests: Sequence[SensorRequest], outputs: Sequence[str] = SENSED_OUTPUTS) -> list[SensorFrame]:
+        """One frame per request, in order: ``types.Sense``; cameras with ``rgb`` and what else ``outputs`` names.
+
+        Frames go through the stages in groups that fit ``GROUP_BYTES``.
 
         Raises:
-            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
+            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or an unknown output.
         """
-        return self.measure(requests)[0]
+        check_outputs(outputs)
+        return self.measure(requests, outputs)[0]
 
     def render_camera(self, request: SensorRequest, outputs: Sequence[str] = SENSED_OUTPUTS) -> CameraFrame:
         """A camera frame with ``rgb`` and those of depth, alpha, label and normal that ``outputs`` names.
@@ -123,29 +146,42 @@ class Renderer:
         """
         for request in requests:
             check_request(request, self.scene)
+        frames: list[SensorFrame] = []
+        stats: list[FrameStats] = []
         with ExitStack() as loans:
-            pictures, sensors = [], []
-            for request in requests:
-                array = loans.enter_context(self._buffers.lend())
-                sensor = self._sensor(request)
-                view = View.of(sensor.grid, request.world_from_sensor)
-                kind = (
-                    LIDAR if not isinstance(request.sensor, CameraModel) else NORMALS if "normal" in outputs else CAMERA
-                )
-                sensors.append(sensor)
-                rays = NO_TABLE if view.way in (AFFINE, ROLLING) else self._ray_tables(sensor)
-                pictures.append(Picture(view, rays, kind, self._layers(request, sensor, view, array), array))
-            planes = draw(pictures, self._workers)
-            began = time.perf_counter()
-            frames: list[SensorFrame] = [
-                self._camera_frame(request, picture, sensor, plane, outputs)
-                if isinstance(request.sensor, CameraModel)
-                else self._lidar_frame(request, picture, plane, filter or LidarFilter())
-                for request, picture, sensor, plane in zip(requests, pictures, sensors, planes, strict=True)
-            ]
-            for picture in pictures:
-                picture.stats.seconds["finish"] = time.perf_counter() - began
-            return frames, [picture.stats for picture in pictures]
+            lends: list[Lend] = []
+            group: list[_Begun] = []
+            for number, request in enumerate(requests):
+                rest()
+                if len(group) == len(lends):
+                    lends.append(loans.enter_context(self._buffers.lend()))
+                group.append(self._begin(request, outputs, lends[len(group)]))
+                held = sum(begun.picture.scratch_bytes for begun in group)
+                if held >= GROUP_BYTES or number == len(requests) - 1:
+                    frames += self._finish(group, outputs, filter or LidarFilter())
+                    stats += [begun.picture.stats for begun in group]
+                    group = []
+        return frames, stats
+
+    def _begin(self, request: SensorRequest, outputs: Sequence[str], array: Lend) -> _Begun:
+        sensor = self._sensor(request)
+        view = View.of(sensor.grid, request.world_from_sensor)
+        kind = LIDAR if not isinstance(request.sensor, CameraModel) else NORMALS if "normal" in outputs else CAMERA
+        rays = NO_TABLE if view.way in (AFFINE, ROLLING) else self._ray_tables(sensor)
+        return _Begun(request, sensor, Picture(view, rays, kind, self._layers(request, sensor, view, array), array))
+
+    def _finish(self, group: Sequence[_Begun], outputs: Sequence[str], filter: LidarFilter) -> list[SensorFrame]:
+        planes = draw([begun.picture for begun in group], self._workers)
+        began = time.perf_counter()
+        frames: list[SensorFrame] = [
+            self._camera_frame(begun.request, begun.picture, begun.sensor, plane, outputs)
+            if isinstance(begun.request.sensor, CameraModel)
+            else self._lidar_frame(begun.request, begun.picture, plane, filter)
+            for begun, plane in zip(group, planes, strict=True)
+        ]
+        for begun in group:
+            begun.picture.stats.seconds["finish"] = time.perf_counter() - began
+        return frames
 
     def _camera_frame(
         self, request: SensorRequest, picture: Picture, sensor: _Sensor, planes: np.ndarray, outputs: Sequence[str]
@@ -156,7 +192,8 @@ class Renderer:
         rgb, label = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.uint8)
         depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
         normal = np.empty((height, width, 3) if picture.kind == NORMALS else (0, 0, 3), np.float32)
-        isp = self._isp.get(request.sensor.id, IDENTITY_ISP) if self.apply_isp else IDENTITY_ISP
+        corrected = self.apply_isp and request.apply_isp
+        isp = self._isp.get(request.sensor.id, IDENTITY_ISP) if corrected else IDENTITY_ISP
         turn = view.world_from_line[:, :3, :3].astype(np.float32)
         linear = view.way in (AFFINE, ROLLING)
         ray_z = np.zeros((0, 0), np.float32) if linear else sensor.ray_z
@@ -164,7 +201,7 @@ class Renderer:
             composite,
             [(first, last, planes, ray_z, grid.direction, grid.valid, grid.line, turn, self._sky, isp, rgb, depth,
               alpha, label, normal)
-             for first, last in self._workers.ranges(height, 16)],
+             for first, last in self._workers.ranges(height, 16, SLICE_RAYS // width)],
         )  # fmt: skip
         return CameraFrame(
             camera=request.sensor,
@@ -191,7 +228,7 @@ class Renderer:
         filters = (filter.raydrop_threshold, filter.opacity_threshold, limit)
         ranges, intensities = np.empty(rows * columns, np.float32), np.empty(rows * columns, np.float32)
         points, beams = np.empty((rows * columns, 3), np.float32), np.empty(rows * columns, np.int32)
-        parts = self._workers.ranges(rows, 4)
+        parts = self._workers.ranges(rows, 4, SLICE_RAYS // columns)
         counts = self._workers.run(
             sweep_returns,
             [(first, last, planes, grid.direction, grid.beam, grid.line, np.ascontiguousarray(end_from_line[:, :3]),
@@ -217,11 +254,8 @@ class Renderer:
             layers = [(self._static, blocks_in_view(view, self._static))]
         if len(self.scene.dynamic):
             _, t_us = reference_pose(request, view.grid.reference)
-            actors = {
-                name: geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(view.grid.reference))
-                for name, pair in request.actors.items()
-            }
-            moving = self._moving.at(t_us, actors, eye, self._workers, array)
+            actors = actors_at(request, view.grid.reference, self._moving.track_of)
+            moving = self._moving.at(t_us, actors, request.hidden, eye, self._workers, array)
             layers.append((moving, blocks_in_view(view, moving)))
         return layers
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float64
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import OutOfRangeError, RequestError, TooLargeError
@@ -15,6 +16,14 @@ MAX_RAYS = 7680 * 4320
 CAMERA_OUTPUTS = ("rgb", "depth", "alpha", "label", "normal")
 SENSED_OUTPUTS = ("rgb", "depth", "alpha", "label")
 """What ``sense`` asks of cameras."""
+
+
+def ray_count(request: SensorRequest) -> int:
+    """Pixels or beams of a frame."""
+    sensor = request.sensor
+    if isinstance(sensor, LidarModel):
+        return len(sensor.elevation_rad) * len(sensor.azimuth_rad)
+    return sensor.width_px * sensor.height_px
 
 
 def check_request(request: SensorRequest, scene: GaussianScene) -> None:
@@ -45,8 +54,7 @@ def check_request(request: SensorRequest, scene: GaussianScene) -> None:
             f"at most {MAX_SIDE_PX} a side and {MAX_RAYS} in all"
         )
     check_pose_pair(f"sensor {sensor.id!r}: world_from_sensor", request.world_from_sensor)
-    for name, pair in request.actors.items():
-        check_pose_pair(f"actor {name!r}: world_from_box", pair)
+    _check_actors(request)
     if request.end_us <= request.start_us:
         raise RequestError(f"an exposure must end after it starts, got [{request.start_us}, {request.end_us}) us")
     first, end = scene.span_us
@@ -57,15 +65,24 @@ def check_request(request: SensorRequest, scene: GaussianScene) -> None:
         )
 
 
+def check_outputs(outputs: Sequence[str]) -> None:
+    """Check that there are such outputs of a camera.
+
+    Raises:
+        RequestError: one is unknown.
+    """
+    unknown = sorted(set(outputs) - set(CAMERA_OUTPUTS))
+    if unknown:
+        raise RequestError(f"unknown outputs {unknown}; have {list(CAMERA_OUTPUTS)}")
+
+
 def check_camera_call(request: SensorRequest, outputs: Sequence[str]) -> None:
     """Check that a camera is asked for, and for outputs that there are.
 
     Raises:
         RequestError: it is a LiDAR, or an output is unknown.
     """
-    unknown = sorted(set(outputs) - set(CAMERA_OUTPUTS))
-    if unknown:
-        raise RequestError(f"unknown outputs {unknown}; have {list(CAMERA_OUTPUTS)}")
+    check_outputs(outputs)
     if isinstance(request.sensor, LidarModel):
         raise RequestError(f"render_camera needs a camera, sensor {request.sensor.id!r} is a LiDAR")
 
@@ -78,6 +95,24 @@ def check_lidar_call(request: SensorRequest) -> None:
     """
     if isinstance(request.sensor, CameraModel):
         raise RequestError(f"render_lidar needs a LiDAR, sensor {request.sensor.id!r} is a camera")
+
+
+def _check_actors(request: SensorRequest) -> None:
+    """``check_pose_pair`` of every actor, all at once."""
+    if not request.actors:
+        return
+    pairs = [np.asarray(pair) for pair in request.actors.values()]
+    if all(pair.shape == (2, 4, 4) and pair.dtype.kind in "fiu" for pair in pairs):
+        poses = np.array(pairs, np.float64).reshape(-1, 4, 4)
+        if (geometry.are_rotations(poses[:, :3, :3]) & are_affine(poses)).all():
+            return
+    for name, pair in request.actors.items():  # one of them is wrong
+        check_pose_pair(f"actor {name!r}: world_from_box", pair)
+
+
+def are_affine(poses: Float64[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, " n"]:
+    """Which matrices are finite and end in the row 0 0 0 1."""
+    return np.isfinite(poses).all(axis=(1, 2)) & (poses[:, 3] == (0, 0, 0, 1)).all(axis=1)
 
 
 def check_pose_pair(name: str, pair: np.ndarray) -> None:

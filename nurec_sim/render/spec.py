@@ -83,7 +83,7 @@ def render_camera(
     Args:
         scene: the world.
         request: a camera's.
-        apply_isp: whether ``scene.isp`` of the camera is applied.
+        apply_isp: whether ``scene.isp`` of the camera is applied to a request that asks for it.
         pixels: flat indices (row * width + column) of the pixels to draw; the frame is then one row of them.
     """
     assert isinstance(request.sensor, CameraModel)
@@ -98,7 +98,7 @@ def render_camera(
             a.reshape(-1, *a.shape[2:])[pixels][None] for a in (origin, direction, ray, valid)
         )
     sums = blend_rays(gaussians, features, order, origin, direction, grid.near_m, valid)
-    isp = scene.isp.get(request.sensor.id) if apply_isp else None
+    isp = scene.isp.get(request.sensor.id) if apply_isp and request.apply_isp else None
     colour = finish_colour(sums.features[..., :3], sums.alpha, sky_colour(scene.sky, direction), isp)
     surface = sums.alpha >= SURFACE_ALPHA
     depth = np.maximum(sums.distance / np.maximum(sums.alpha, MIN_ALPHA) * ray[..., 2], 0)

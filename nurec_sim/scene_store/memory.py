@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,14 +14,14 @@ from typing import Protocol
 
 from nurec_sim.errors import GivenUpError
 from nurec_sim.scene_store.sizes import array_bytes
-from nurec_sim.types import CameraFrame, GaussianScene, LidarFilter, LidarFrame, SensorRequest
+from nurec_sim.types import GaussianScene, LidarFilter, LidarFrame, SensorFrame, SensorRequest
 
 
 class SceneRenderer(Protocol):
     """What a server needs of ``render.Renderer``."""
 
-    def render_camera(self, request: SensorRequest, outputs: tuple[str, ...] = ...) -> CameraFrame:
-        """One image."""
+    def sense(self, requests: Sequence[SensorRequest], outputs: Sequence[str] = ...) -> list[SensorFrame]:
+        """Images with ``rgb`` and what else ``outputs`` names, and sweeps; one frame per request, in order."""
         ...
 
     def render_lidar(self, request: SensorRequest, filter: LidarFilter | None = ...) -> LidarFrame:

@@ -226,7 +226,7 @@ class SceneStore:
         ::
 
             with store.lease("street") as loaded:
-                frame = loaded.renderer.render_camera(request)
+                (frame,) = loaded.renderer.sense([request])
 
         Callers that come while it loads wait for the same load. ``progress`` hears of a reconstruction: what is being
         done, and the fraction of it that is. It may raise ``GivenUpError`` to end it.

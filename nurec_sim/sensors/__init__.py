@@ -3,6 +3,7 @@
 from nurec_sim.sensors.camera import (
     check_camera,
     in_image,
+    pixel_ray_strips,
     pixel_rays,
     project,
     project_rolling,
@@ -33,6 +34,7 @@ __all__ = [
     "fit_ftheta",
     "in_image",
     "lidar_model",
+    "pixel_ray_strips",
     "pixel_rays",
     "project",
     "project_rolling",

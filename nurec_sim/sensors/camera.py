@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -14,12 +15,14 @@ from jaxtyping import Bool, Float64
 from nurec_sim import geometry
 from nurec_sim.sensors import windshield
 from nurec_sim.sensors.lens import check_lens, project_lens, unproject_lens
+from nurec_sim.turns import rest
 from nurec_sim.types import CameraModel, FTheta, Lens, Shutter, Windshield
 
 ROLLING_ITERATIONS = 10
 KEPT_PIXELS = 1 << 22
 """Rays of images up to this size are kept for the next caller."""
-PIXELS_AT_ONCE = 1 << 16
+PIXELS_AT_ONCE = 1 << 14
+"""Of a strip: a few milliseconds of work, and what happens in between fits into the caches."""
 
 Points2 = Float64[np.ndarray, "n 2"]
 Points3 = Float64[np.ndarray, "n 3"]
@@ -65,21 +68,44 @@ def unproject(camera: CameraModel, uv_px: Points2) -> tuple[Points3, Mask]:
 
 def pixel_rays(camera: CameraModel) -> tuple[Float64[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Unit rays through all pixel centres, and which are valid; read-only, the latest few of usual size are kept."""
-    usual = camera.width_px * camera.height_px <= KEPT_PIXELS
-    make = _kept_pixel_rays if usual else _pixel_rays
+    make = _kept_pixel_rays if _is_usual(camera) else _pixel_rays
     return make(camera.lens, camera.windshield, camera.width_px, camera.height_px)
+
+
+def pixel_ray_strips(
+    camera: CameraModel,
+) -> Iterator[tuple[slice, Float64[np.ndarray, "r w 3"], Bool[np.ndarray, "r w"]]]:
+    """``pixel_rays`` by strips of rows, each with its place, for images that are too large to hold in double precision.
+
+    Raises:
+        GivenUpError, DeadlinePassedError: see ``turns.rest``.
+    """
+    if _is_usual(camera):
+        yield slice(0, camera.height_px), *pixel_rays(camera)
+    else:
+        yield from _strips(camera)
+
+
+def _is_usual(camera: CameraModel) -> bool:
+    return camera.width_px * camera.height_px <= KEPT_PIXELS
+
+
+def _strips(camera: CameraModel) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    width, height = camera.width_px, camera.height_px
+    step = max(1, PIXELS_AT_ONCE // width)
+    for first in range(0, height, step):
+        rest()
+        last = min(first + step, height)
+        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(first, last) + 0.5)
+        strip, seen = unproject(camera, np.stack([columns, rows], axis=-1).reshape(-1, 2))
+        yield slice(first, last), strip.reshape(-1, width, 3), seen.reshape(-1, width)
 
 
 def _pixel_rays(lens: Lens, glass: Windshield | None, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     camera = CameraModel("", width, height, lens, np.eye(4), windshield=glass)
     rays, valid = np.empty((height, width, 3)), np.empty((height, width), bool)
-    # In strips, so that what happens in between fits into the caches, and an image of any size into memory.
-    step = max(1, PIXELS_AT_ONCE // width)
-    for first in range(0, height, step):
-        last = min(first + step, height)
-        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(first, last) + 0.5)
-        strip, seen = unproject(camera, np.stack([columns, rows], axis=-1).reshape(-1, 2))
-        rays[first:last], valid[first:last] = strip.reshape(-1, width, 3), seen.reshape(-1, width)
+    for place, strip, seen in _strips(camera):
+        rays[place], valid[place] = strip, seen
     rays.setflags(write=False)
     valid.setflags(write=False)
     return rays, valid

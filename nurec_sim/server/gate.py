@@ -11,8 +11,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
 import grpc
 
-from nurec_sim.calls import Call, enter_call
-from nurec_sim.server.limits import RateLimit, UnreadReplies, address_of
+from nurec_sim.calls import Call, address_of, enter_call
+from nurec_sim.server.limits import RateLimit, UnreadReplies
 from nurec_sim.server.options import ServerOptions
 from nurec_sim.server.registration import HANDLER_KINDS
 from nurec_sim.server.request_log import log_call

@@ -68,8 +68,3 @@ class UnreadReplies:
         self._by_peer[peer] -= size
         if self._by_peer[peer] <= 0:
             del self._by_peer[peer]
-
-
-def address_of(peer: str) -> str:
-    """The address of a client without its port, which every connection has anew: ``ipv4:127.0.0.1``."""
-    return peer.rsplit(":", 1)[0] if peer.startswith(("ipv4:", "ipv6:")) else peer

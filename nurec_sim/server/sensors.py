@@ -65,8 +65,13 @@ class _Sensors:
         self._service = SensorService(store, options, request_stop)
         self._scenes = SceneService(store, self._service, scene_options)
         self.services: Sequence[Service] = (
-            Service(wire.SERVICE, self._service, wire.SERVICE_PATHS, self._service.prepare),
-            Service(wire.SCENE_SERVICE, self._scenes, prepare=self._service.prepare),
+            Service(wire.SERVICE, self._service, wire.SERVICE_PATHS, self._service.prepare, options.max_request_bytes),
+            Service(
+                wire.SCENE_SERVICE,
+                self._scenes,
+                prepare=self._service.prepare,
+                max_request_bytes=options.max_request_bytes,
+            ),
         )
 
     async def warm_up(self) -> None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import contextlib
+from collections import Counter
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import TypeVar
 
 from nurec_sim.calls import current_call
 from nurec_sim.ego_masks import EgoMasks
@@ -16,8 +19,12 @@ from nurec_sim.service.options import ServiceOptions
 from nurec_sim.service.scene_urls import SceneUrls
 from nurec_sim.types import GaussianScene
 
+T = TypeVar("T")
+
 _LOADING_THREADS = 4
 _FETCHING_THREADS = 4  # of their own, so that a slow web does not hold up scenes that are here
+_FEW_ACTORS = 64
+"""A request with no more is read at once: that takes less than a millisecond."""
 
 
 class ServiceCore:
@@ -41,6 +48,8 @@ class ServiceCore:
         self._fetching = ThreadPoolExecutor(_FETCHING_THREADS, thread_name_prefix="fetch")
         self._reading = ThreadPoolExecutor(1, thread_name_prefix="request")
         self.renders = RenderQueue(options.render_workers)
+        self._asked_rays: Counter[tuple[str, ...]] = Counter()
+        """Pixels and beams of calls in progress, by client."""
 
     def close(self) -> None:
         """Drops what has not begun and waits for the rest; reconstructions end at their next step."""
@@ -100,11 +109,52 @@ class ServiceCore:
         if count > self._options.max_batch_items:
             raise TooLargeError(f"a batch may have {self._options.max_batch_items} items, got {count}")
 
+    async def _read(self, actors: int, function: Callable[..., T], *arguments) -> T:
+        """What reading a request gives; one with many actors waits for its client's turn."""
+        if actors > self._options.max_actors:
+            raise TooLargeError(
+                f"a frame may place {self._options.max_actors:,} actors (max_actors), got {actors:,} dynamic_objects"
+            )
+        if actors > _FEW_ACTORS:
+            return await self.renders.run(actors, function, *arguments)
+        result: T = await self._run(self._reading, function, *arguments)
+        return result
+
     def _check_pixels(self, count: int, text: str) -> None:
         if count > self._options.max_pixels:
             raise TooLargeError(
                 f"a frame may have {self._options.max_pixels:,} pixels or beams, got {text} = {count:,}"
             )
+
+    @contextlib.contextmanager
+    def spending(self, rays: int) -> Iterator[None]:
+        """Counts what the current call costs while it is in progress.
+
+        Args:
+            rays: pixels and beams of all its frames.
+
+        Raises:
+            TooLargeError: more than a call may ask for, or than its client may together with its other calls.
+        """
+        options, client = self._options, current_call().client
+        if rays > options.max_call_rays:
+            raise TooLargeError(
+                f"a call may ask for {options.max_call_rays:,} pixels and beams in all (max_call_rays), got {rays:,}; "
+                "ask for fewer or smaller frames"
+            )
+        others = self._asked_rays[client]
+        if others and others + rays > options.max_client_rays:
+            raise TooLargeError(
+                f"the calls of a connection may ask for {options.max_client_rays:,} pixels and beams at a time "
+                f"(max_client_rays); {others:,} are in progress, and this call asks for {rays:,}; try again later"
+            )
+        self._asked_rays[client] += rays
+        try:
+            yield
+        finally:
+            self._asked_rays[client] -= rays
+            if not self._asked_rays[client]:
+                del self._asked_rays[client]
 
     def check_reply(self, size: int, what: str, fewer: str) -> None:
         """Refuses a reply that would not fit a message, before it is made.

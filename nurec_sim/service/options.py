@@ -20,8 +20,16 @@ class ServiceOptions:
     max_pixels: int = MAX_RAYS
     """Pixels, or beams, of one frame; the renderer takes no more than the default."""
     max_batch_items: int = 64
+    max_call_rays: int = 1 << 27
+    """Pixels and beams of all frames of a call: 64 images of 1920 x 1080."""
+    max_client_rays: int = 1 << 28
+    """Pixels and beams that the calls of one connection ask for at a time; one call always may."""
+    max_actors: int = 4096
+    """Actors that a request for a frame may place; logs have a few hundred."""
+    max_request_bytes: int = 16 << 20
+    """Of a request that is a single message, not a part of an upload; what is larger is not even parsed."""
     max_message_bytes: int = wire.MAX_MESSAGE_BYTES
-    """Of a request or a reply."""
+    """Of a part of an upload, or of a reply."""
     only_listed_actors: bool = False
     """Whether a request that lists actors hides the controllable ones that it does not list."""
     ego_mask_dir: Path | None = None
@@ -47,8 +55,8 @@ class ServiceOptions:
     """For one scene."""
 
     def __post_init__(self) -> None:
-        counts = ("render_workers", "max_pixels", "max_batch_items", "max_message_bytes", "download_cache_size",
-                  "max_download_bytes")  # fmt: skip
+        counts = ("render_workers", "max_pixels", "max_batch_items", "max_call_rays", "max_client_rays", "max_actors",
+                  "max_request_bytes", "max_message_bytes", "download_cache_size", "max_download_bytes")  # fmt: skip
         for name in counts:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")

@@ -10,26 +10,37 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Iterable
+from collections.abc import Awaitable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from nurec_sim import wire
 from nurec_sim.errors import NurecSimError, OutOfRangeError
+from nurec_sim.render.cpu.workers import Workers
+from nurec_sim.render.requests import check_request, ray_count
+from nurec_sim.render_queue import LARGE_RAYS
 from nurec_sim.scene_store import LoadedScene
 from nurec_sim.service.core import ServiceCore
 from nurec_sim.service.options import describe
-from nurec_sim.types import CameraFrame, CameraModel, GaussianScene, LidarFilter, LidarFrame, LidarModel, SensorRequest
+from nurec_sim.turns import aside, rest
+from nurec_sim.types import (
+    CameraFrame,
+    CameraModel,
+    GaussianScene,
+    LidarFilter,
+    LidarFrame,
+    LidarModel,
+    SensorRequest,
+)
 from nurec_sim.wire import sensorsim
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-_BURIED_M = 10_000.0
 BYTES_A_POINT = 24  # xyz, intensity, range, beam
 
 
@@ -46,14 +57,6 @@ class CameraJob:
     def planar_bytes(self) -> int:
         """Size of the reply if it is raw pixels, else 0: compressed images are small."""
         return 3 * self.pixels if self.options.format == wire.ImageFormat.RGB_UINT8_PLANAR else 0
-
-    def render(self, outputs: tuple[str, ...]) -> CameraFrame:
-        """The frame, with or without the camera's colour correction."""
-        request = self.request
-        if not self.options.apply_isp:
-            # The correction is found by the camera's id; an id that no scene knows renders without.
-            request = replace(request, sensor=replace(request.sensor, id=""))
-        return self.loaded.renderer.render_camera(request, outputs=outputs)
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,10 @@ class LidarJob:
 class Rendering(ServiceCore):
     """Images and sweeps."""
 
+    def __init__(self, *arguments) -> None:
+        super().__init__(*arguments)
+        self._encoders = Workers(self._options.render_workers)
+
     async def warm_up(self) -> None:
         """Loads the first scene and draws one image and one sweep of it; what fails is logged only."""
         try:
@@ -84,11 +91,9 @@ class Rendering(ServiceCore):
                     pose = ego.at(start_us) @ rig_from_sensor
                     return SensorRequest(loaded.scene.id, sensor, start_us, start_us + 1, np.stack([pose, pose]))
 
-                for camera in list(rig.cameras.values())[:1]:
-                    request = look(camera, camera.rig_from_camera)
-                    await self.renders.run(loaded.renderer.render_camera, request, ("rgb",))
-                for lidar in list(rig.lidars.values())[:1]:
-                    await self.renders.run(loaded.renderer.render_lidar, look(lidar, lidar.rig_from_lidar))
+                first = [look(camera, camera.rig_from_camera) for camera in list(rig.cameras.values())[:1]]
+                first += [look(lidar, lidar.rig_from_lidar) for lidar in list(rig.lidars.values())[:1]]
+                await self.renders.run(0, loaded.renderer.sense, first, ("rgb",))
         except Exception as error:
             log.warning("the server could not warm up: %s", error)
 
@@ -97,7 +102,8 @@ class Rendering(ServiceCore):
         with ExitStack() as held:
             job = await self.admit_camera(request, held)
             self._check_images([job])
-            return await self._render_camera(job)
+            (reply,) = _raise_first(await self._render_cameras([job]))
+            return reply
 
     async def batch_render_rgb(self, batch):
         """Several images; what is wrong with one item is said in that item."""
@@ -106,8 +112,10 @@ class Rendering(ServiceCore):
             admitted = await asyncio.gather(
                 *(self.admit_camera(item.request, held) for item in batch.items), return_exceptions=True
             )
-            self._check_images(job for job in admitted if isinstance(job, CameraJob))
-            results = await asyncio.gather(*(self._finish(job) for job in admitted), return_exceptions=True)
+            jobs = [job for job in admitted if isinstance(job, CameraJob)]
+            self._check_images(jobs)
+            rendered = iter(await self._render_cameras(jobs))
+            results = [next(rendered) if isinstance(job, CameraJob) else job for job in admitted]
         reply = sensorsim.BatchRGBRenderReturn()
         for item, result in zip(batch.items, results, strict=True):
             entry = reply.items.add(camera_name=item.camera_name)
@@ -125,7 +133,8 @@ class Rendering(ServiceCore):
         with ExitStack() as held:
             job = await self.admit_lidar(request, held)
             self.check_reply(BYTES_A_POINT * job.beams, "points", "beams")
-            return await self._render_lidar(job)
+            with self.spending(job.beams):
+                return await self._render_lidar(job)
 
     async def render_aggregated(self, request):
         """Images and sweeps together; one that fails fails all, there is no place for its error in the reply."""
@@ -135,36 +144,60 @@ class Rendering(ServiceCore):
             sweeps = await _all(self.admit_lidar(item, held) for item in request.lidar_requests)
             self._check_images(jobs)
             self.check_reply(BYTES_A_POINT * sum(sweep.beams for sweep in sweeps), "points", "beams")
-            rgb_returns = await _all(self._render_camera(job) for job in jobs)
-            lidar_returns = await _all(self._render_lidar(sweep) for sweep in sweeps)
+            with self.spending(sum(job.pixels for job in jobs) + sum(sweep.beams for sweep in sweeps)):
+                rgb_returns = _raise_first(await self._render_all(jobs))
+                lidar_returns = await _all(self._render_lidar(sweep) for sweep in sweeps)
         return sensorsim.AggregatedRenderReturn(rgb_returns=rgb_returns, lidar_returns=lidar_returns)
 
     async def admit_camera(self, message, held: ExitStack) -> CameraJob:
         """Checks a request and borrows its scene until ``held`` ends."""
         loaded = held.enter_context(await self.lease(message.scene_id))
-        request, options = await self._run(self._reading, wire.read_camera_request, message, loaded.scene.rig.cameras)
-        if options.ego_mask:
-            options = replace(options, ego_mask=self._masks.find(options.ego_mask))
-        camera = request.sensor
-        pixels = camera.width_px * camera.height_px
-        self._check_pixels(pixels, f"{camera.width_px}x{camera.height_px} pixels")
-        return CameraJob(loaded, self._admit(request, loaded.scene), options, pixels)
+        return await self._read(len(message.dynamic_objects), self._read_camera, message, loaded)
 
     async def admit_lidar(self, message, held: ExitStack) -> LidarJob:
         """Checks a request and borrows its scene until ``held`` ends."""
         loaded = held.enter_context(await self.lease(message.scene_id))
-        request, filter = await self._run(self._reading, wire.read_lidar_request, message)
-        rows, columns = len(request.sensor.elevation_rad), len(request.sensor.azimuth_rad)
-        self._check_pixels(rows * columns, f"{rows}x{columns} beams")
-        return LidarJob(loaded, self._admit(request, loaded.scene), filter, rows * columns)
+        return await self._read(len(message.dynamic_objects), self._read_lidar, message, loaded)
 
-    async def _finish(self, job: CameraJob | BaseException):
-        if isinstance(job, BaseException):
-            raise job
-        return await self._render_camera(job)
+    def _read_camera(self, message, loaded: LoadedScene) -> CameraJob:
+        request, options = wire.read_camera_request(message, loaded.scene.rig.cameras)
+        if options.ego_mask:
+            options = replace(options, ego_mask=self._masks.find(options.ego_mask))
+        camera = request.sensor
+        assert isinstance(camera, CameraModel)
+        self._check_pixels(ray_count(request), f"{camera.width_px}x{camera.height_px} pixels")
+        return CameraJob(loaded, self._admit(request, loaded.scene), options, ray_count(request))
 
-    async def _render_camera(self, job: CameraJob):
-        return await self.renders.run(lambda: self.finish_image(job.render(("rgb",)), job.options))
+    def _read_lidar(self, message, loaded: LoadedScene) -> LidarJob:
+        request, filter = wire.read_lidar_request(message)
+        lidar = request.sensor
+        assert isinstance(lidar, LidarModel)
+        rows, columns = len(lidar.elevation_rad), len(lidar.azimuth_rad)
+        self._check_pixels(ray_count(request), f"{rows}x{columns} beams")
+        return LidarJob(loaded, self._admit(request, loaded.scene), filter, ray_count(request))
+
+    async def _render_cameras(self, jobs: Sequence[CameraJob]) -> list[Any]:
+        """An ``RGBRenderReturn``, or an error, for each job; all of them are one call."""
+        with self.spending(sum(job.pixels for job in jobs)):
+            return await self._render_all(jobs)
+
+    async def _render_all(self, jobs: Sequence[CameraJob]) -> list[Any]:
+        """As ``_render_cameras``; those of one scene are rendered together."""
+        groups: dict[int, list[int]] = {}
+        for number, job in enumerate(jobs):
+            groups.setdefault(id(job.loaded), []).append(number)
+        asked = [[jobs[number] for number in numbers] for numbers in groups.values()]
+        works = [self.renders.run(sum(job.pixels for job in group), self._draw, group) for group in asked]
+        results: list[Any] = [None] * len(jobs)
+        for numbers, done in zip(groups.values(), await asyncio.gather(*works, return_exceptions=True), strict=True):
+            for place, number in enumerate(numbers):
+                results[number] = done if isinstance(done, BaseException) else done[place]
+        return results
+
+    def _draw(self, jobs: Sequence[CameraJob]) -> list[Any]:
+        """Replies, or errors, to jobs of one scene."""
+        frames = jobs[0].loaded.renderer.sense([job.request for job in jobs], ("rgb",))
+        return self.finish_images(frames, [job.options for job in jobs])
 
     async def _render_lidar(self, job: LidarJob):
         def render():
@@ -172,14 +205,29 @@ class Rendering(ServiceCore):
             wire.write_lidar_frame(job.render(), reply)
             return reply
 
-        return await self.renders.run(render)
+        return await self.renders.run(job.beams, render)
 
-    def finish_image(self, frame: CameraFrame, options: wire.ImageOptions):
-        """An ``RGBRenderReturn``: the colours of a frame with the ego mask over them, in the format asked for."""
-        rgb = self._masks.lay_over(frame.rgb, options.ego_mask) if options.ego_mask else frame.rgb
-        reply = sensorsim.RGBRenderReturn()
-        wire.write_image(rgb, options, reply)
-        return reply
+    def finish_images(self, frames: Sequence[Any], options: Sequence[wire.ImageOptions]) -> list[Any]:
+        """An ``RGBRenderReturn``, or an error, for each frame: its colours in the format asked for."""
+        calls = [(self._finished, *pair) for pair in zip(frames, options, strict=True)]
+        if all(frame.rgb.size <= 3 * LARGE_RAYS for frame in frames):
+            return self._encoders.run_calls(calls)
+        results = []
+        for first in range(0, len(calls), self._encoders.threads):
+            rest()
+            with aside():  # an encoder cannot be interrupted
+                results += self._encoders.run_calls(calls[first : first + self._encoders.threads])
+        return results
+
+    def _finished(self, frame: CameraFrame, options: wire.ImageOptions):
+        """An ``RGBRenderReturn``, with the ego mask over the image, or what went wrong."""
+        try:
+            rgb = self._masks.lay_over(frame.rgb, options.ego_mask) if options.ego_mask else frame.rgb
+            reply = sensorsim.RGBRenderReturn()
+            wire.write_image(rgb, options, reply)
+            return reply
+        except Exception as error:
+            return error
 
     def _admit(self, request: SensorRequest, scene: GaussianScene) -> SensorRequest:
         """The request as the renderer takes it: in the scene's time, with actors that the scene knows."""
@@ -193,7 +241,13 @@ class Rendering(ServiceCore):
             )
         start_us = min(max(request.start_us, span_start), span_end)
         end_us = max(min(request.end_us, span_end + 1), start_us + 1)
-        return replace(request, start_us=start_us, end_us=end_us, actors=self._actors(request, scene))
+        actors = self._actors(request, scene)
+        hidden: frozenset[str] = frozenset()
+        if self._options.only_listed_actors and request.actors:
+            hidden = frozenset(track.id for track in scene.tracks if track.controllable and track.id not in actors)
+        admitted = replace(request, start_us=start_us, end_us=end_us, actors=actors, hidden=hidden)
+        check_request(admitted, scene)
+        return admitted
 
     def _actors(self, request: SensorRequest, scene: GaussianScene) -> dict[str, np.ndarray]:
         known = {track.id for track in scene.tracks}
@@ -201,20 +255,20 @@ class Rendering(ServiceCore):
         if len(actors) < len(request.actors):
             unknown = sorted(request.actors.keys() - known)
             log.info("scene %s has no %d of the actors listed, as %r", scene.id, len(unknown), unknown[0])
-        if self._options.only_listed_actors and request.actors:
-            buried = np.tile(np.eye(4), (2, 1, 1))
-            buried[:, 2, 3] = -_BURIED_M
-            actors |= {t.id: buried for t in scene.tracks if t.controllable and t.id not in actors}
         return actors
 
     def _check_images(self, jobs: Iterable[CameraJob]) -> None:
         self.check_reply(sum(job.planar_bytes for job in jobs), "pixels", "or smaller images, or for PNG or JPEG")
 
 
-async def _all(tasks: Iterable[Awaitable[T]]) -> list[T]:
-    """What all give once all have ended, so that none is left behind; raises what the first to fail raised."""
-    results = await asyncio.gather(*tasks, return_exceptions=True)
+def _raise_first(results: list[Any]) -> list[Any]:
+    """The results, if none of them is an error."""
     for result in results:
         if isinstance(result, BaseException):
             raise result
-    return [result for result in results if not isinstance(result, BaseException)]
+    return results
+
+
+async def _all(tasks: Iterable[Awaitable[T]]) -> list[T]:
+    """What all give once all have ended, so that none is left behind; raises what the first to fail raised."""
+    return _raise_first(await asyncio.gather(*tasks, return_exceptions=True))

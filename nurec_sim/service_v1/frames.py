@@ -38,13 +38,18 @@ class Frames:
             self._sensors.check_reply(size, "pixels", "or smaller images, or for fewer outputs")
 
             def render():
-                frame, reply = job.render(outputs), v1.RenderCameraReply()
+                (frame,) = job.loaded.renderer.sense([job.request], outputs)
+                reply = v1.RenderCameraReply()
                 wire.write_outputs(frame, reply)
                 if "rgb" in outputs:
-                    reply.rgb = self._sensors.finish_image(frame, job.options).image_bytes
+                    (image,) = self._sensors.finish_images([frame], [job.options])
+                    if isinstance(image, Exception):
+                        raise image
+                    reply.rgb = image.image_bytes
                 return reply
 
-            return await self._sensors.renders.run(render)
+            with self._sensors.spending(job.pixels):
+                return await self._sensors.renders.run(job.pixels, render)
 
     async def lidar(self, message):
         """A ``RenderLidarReply``."""
@@ -66,4 +71,5 @@ class Frames:
                     wire.write_lidar_frame(job.render(), reply.points)
                 return reply
 
-            return await self._sensors.renders.run(render)
+            with self._sensors.spending(job.beams):
+                return await self._sensors.renders.run(job.beams, render)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,7 +17,9 @@ from nurec_sim.types.sensors import CameraModel, LidarModel
 class SensorRequest:
     """Ask for one frame: sensor, exposure [start, end), its poses at both ends, and actors to re-pose.
 
-    ``actors`` maps track ids to ``world_from_box`` at start and end; tracks not named move as recorded.
+    ``actors`` maps track ids to ``world_from_box`` at start and end; tracks not named move as recorded. Tracks in
+    ``hidden`` are not drawn, whatever ``actors`` says; ids that the scene does not have are ignored. ``apply_isp`` says
+    whether a camera's image gets the colour correction that the scene has for it.
     """
 
     scene_id: str
@@ -26,6 +28,8 @@ class SensorRequest:
     end_us: int
     world_from_sensor: Float64[np.ndarray, "2 4 4"]
     actors: Mapping[str, Float64[np.ndarray, "2 4 4"]] = field(default_factory=dict)
+    hidden: Set[str] = frozenset()
+    apply_isp: bool = True
 
 
 @dataclass(frozen=True)

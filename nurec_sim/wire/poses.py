@@ -6,14 +6,14 @@ The wire's poses are float32 position and ``wxyz`` quaternion; ours travel besid
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from nurec_sim import geometry
 from nurec_sim.errors import RequestError
-from nurec_sim.types import Matrix4, Track, Trajectory
+from nurec_sim.types import Track, Trajectory
 
 QUAT_TOLERANCE = 1e-3
 """How far a quaternion's squared norm may be from 1; clients round to float32, AlpaSim itself allows 1e-4."""
@@ -54,27 +54,38 @@ def read_poses(messages: Sequence, names: Sequence[str]) -> Float64[np.ndarray, 
     result = np.tile(np.eye(4), (len(messages), 1, 1))
     result[:, :3, 3] = position
     result[:, :3, :3] = geometry.matrix_from_quat(quat)
-    for i, message in enumerate(messages):
-        if len(message.exact):
-            exact = _read_exact(message.exact, names[i])
-            # A client that copied a message of ours and edited `vec` or `quat` leaves a stale `exact` behind.
-            turned = np.abs(exact[:3, :3] - result[i, :3, :3]).max()
-            moved = np.abs(exact[:3, 3] - position[i]).max()
-            if turned <= 1e-6 and moved <= 1e-6 * max(1.0, float(np.abs(position[i]).max())):
-                result[i] = exact
+    given, exact = _read_exact(messages, names)
+    # A client that copied a message of ours and edited `vec` or `quat` leaves a stale `exact` behind.
+    turned = np.abs(exact[:, :3, :3] - result[given, :3, :3]).max(axis=(1, 2), initial=0)
+    moved = np.abs(exact[:, :3, 3] - position[given]).max(axis=1, initial=0)
+    fresh = (turned <= 1e-6) & (moved <= 1e-6 * np.maximum(1.0, np.abs(position[given]).max(axis=1, initial=0)))
+    result[given[fresh]] = exact[fresh]
     return result
 
 
-def _read_exact(values: Iterable[float], name: str) -> Matrix4:
-    matrix = np.array(values, np.float64)
-    if matrix.shape != (16,):
-        raise RequestError(f"{name}.exact must have 16 values (a row-major 4x4) or none, got {len(matrix)}")
-    matrix = matrix.reshape(4, 4)
-    # The bound spares `is_rotation` an overflow.
-    rigid = np.isfinite(matrix).all() and np.abs(matrix[:3, :3]).max() < 2 and geometry.is_rotation(matrix[:3, :3])
-    if not rigid or (matrix[3] != (0, 0, 0, 1)).any():
-        raise RequestError(f"{name}.exact must be a rigid transform with last row 0 0 0 1, got {_text(matrix.ravel())}")
-    return matrix
+def _read_exact(
+    messages: Sequence, names: Sequence[str]
+) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 4 4"]]:
+    """Which messages have ``exact``, and it."""
+    given: list[int] = []
+    values: list[float] = []
+    for i, message in enumerate(messages):
+        count = len(message.exact)
+        if count == 0:
+            continue
+        if count != 16:
+            raise RequestError(f"{names[i]}.exact must have 16 values (a row-major 4x4) or none, got {count}")
+        given.append(i)
+        values.extend(message.exact)
+    exact = np.array(values, np.float64).reshape(-1, 4, 4)
+    sound = geometry.are_rotations(exact[:, :3, :3]) & np.isfinite(exact).all(axis=(1, 2))
+    bad = np.flatnonzero(~(sound & (exact[:, 3] == (0, 0, 0, 1)).all(axis=1)))
+    if len(bad):
+        raise RequestError(
+            f"{names[given[bad[0]]]}.exact must be a rigid transform with last row 0 0 0 1, "
+            f"got {_text(exact[bad[0]].ravel())}"
+        )
+    return np.array(given, np.int64), exact
 
 
 def _text(values: np.ndarray) -> str:

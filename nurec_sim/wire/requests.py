@@ -37,12 +37,11 @@ Sensor = TypeVar("Sensor", CameraModel, LidarModel)
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """How a camera image is finished: file format, quality, colour correction, and the ego mask laid over it."""
+    """How a camera image is finished: file format, quality, and the ego mask laid over it."""
 
     format: int = ImageFormat.PNG
     quality: int = DEFAULT_QUALITY
     """1..100; without effect on PNG and raw planes."""
-    apply_isp: bool = True
     ego_mask: tuple[str, str] | None = None
     """(rig, camera) of the mask, or None. The rig may be empty: the one that has a mask of this camera."""
 
@@ -50,17 +49,17 @@ class ImageOptions:
 # ------------------------------------------------------------------------------------------------------------ requests
 
 
-def write_camera_request(request: SensorRequest, message, *, scene_id: str, apply_isp: bool = True) -> None:
+def write_camera_request(request: SensorRequest, message, *, scene_id: str) -> None:
     """Fills an ``RGBRenderRequest`` that asks for lossless pixels (``RGB_UINT8_PLANAR``).
 
     Raises:
-        RequestError: the frame is empty, or a pose is not finite or not rigid.
+        RequestError: the frame is empty, a pose is not finite or not rigid, or tracks are hidden.
     """
     camera = _sensor_of(request, CameraModel)
     message.resolution_w, message.resolution_h = camera.width_px, camera.height_px
     write_camera(camera, message.camera_intrinsics)
     message.image_format = ImageFormat.RGB_UINT8_PLANAR
-    if not apply_isp:
+    if not request.apply_isp:
         message.apply_isp = False
     _write_frame(request, message, scene_id)
 
@@ -69,7 +68,7 @@ def write_lidar_request(request: SensorRequest, message, *, scene_id: str) -> No
     """Fills a ``LidarRenderRequest``.
 
     Raises:
-        RequestError: the frame is empty, or a pose is not finite or not rigid.
+        RequestError: the frame is empty, a pose is not finite or not rigid, or tracks are hidden.
     """
     write_lidar(_sensor_of(request, LidarModel), message.lidar_config)
     _write_frame(request, message, scene_id)
@@ -83,6 +82,11 @@ def _sensor_of(request: SensorRequest, kind: type[Sensor]) -> Sensor:
 
 def _write_frame(request: SensorRequest, message, scene_id: str) -> None:
     message.scene_id = scene_id
+    if request.hidden:
+        raise RequestError(
+            f"hidden must be empty, got {sorted(request.hidden)}: the interface has no field for it; a server whose "
+            "option only_listed_actors is on hides the moving actors that a request does not list"
+        )
     check_interval(request.start_us, request.end_us)
     message.frame_start_us, message.frame_end_us = request.start_us, request.end_us
     _write_pair(f"sensor {request.sensor.id!r}: world_from_sensor", request.world_from_sensor, message.sensor_pose)
@@ -104,7 +108,8 @@ def read_camera_request(message, cameras: Mapping[str, CameraModel]) -> tuple[Se
     """
     options = _read_image_options(message)
     camera = read_camera(message.camera_intrinsics, message.resolution_w, message.resolution_h, cameras)
-    return _read_frame(message, camera), options
+    apply_isp = message.apply_isp if message.HasField("apply_isp") else True
+    return dataclasses.replace(_read_frame(message, camera), apply_isp=apply_isp), options
 
 
 def read_lidar_request(message) -> tuple[SensorRequest, LidarFilter]:
@@ -134,15 +139,15 @@ def _read_lidar_filter(message) -> LidarFilter:
 
 def _read_frame(message, sensor) -> SensorRequest:
     check_interval(message.frame_start_us, message.frame_end_us)
-    pairs = {"sensor_pose": message.sensor_pose} if message.HasField("sensor_pose") else {}
-    pairs |= {f"dynamic_objects[{d.track_id!r}].pose_pair": d.pose_pair for d in message.dynamic_objects}
-    if "sensor_pose" not in pairs:
+    if not message.HasField("sensor_pose"):
         raise RequestError("sensor_pose is missing: the sensor's poses in the world at the frame's start and end")
+    tracks = {entry.track_id: entry.pose_pair for entry in message.dynamic_objects}
+    pairs = {"sensor_pose": message.sensor_pose}
+    pairs |= {f"dynamic_objects[{track_id!r}].pose_pair": pair for track_id, pair in tracks.items()}
     names = [f"{name}.{end}" for name in pairs for end in ("start_pose", "end_pose")]
     poses = read_poses([pose for pair in pairs.values() for pose in (pair.start_pose, pair.end_pose)], names)
     first, *others = poses.reshape(-1, 2, 4, 4)
-    track_ids = dict.fromkeys(d.track_id for d in message.dynamic_objects)
-    actors = dict(zip(track_ids, others, strict=True))
+    actors = dict(zip(tracks, others, strict=True))
     return SensorRequest(message.scene_id, sensor, message.frame_start_us, message.frame_end_us, first, actors)
 
 
@@ -163,7 +168,6 @@ def _read_image_options(message) -> ImageOptions:
     return ImageOptions(
         message.image_format,
         round(quality),
-        message.apply_isp if message.HasField("apply_isp") else True,
         mask if message.insert_ego_mask else None,
     )
 

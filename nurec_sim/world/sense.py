@@ -181,6 +181,8 @@ class TrueWorld:
             raise RequestError(f"sensor {sensor.id!r}: world_from_sensor must be two poses [2,4,4] with rotations")
         if not np.isfinite(pair).all() or request.end_us < request.start_us:
             raise RequestError(f"sensor {sensor.id!r}: poses must be finite and end_us not before start_us")
+        if request.hidden:
+            raise RequestError(f"this town draws all of its actors; hidden must be empty, got {sorted(request.hidden)}")
         for name, actor in request.actors.items():
             if name not in self._recorded:
                 raise RequestError(f"no actor {name!r} in this town; have {sorted(self._recorded)}")

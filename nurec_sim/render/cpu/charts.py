@@ -50,9 +50,11 @@ class Chart:
     bends: Float32[np.ndarray, "w s t"]
 
 
-def lens_chart(camera: CameraModel, direction: Float32[np.ndarray, "h w 3"], valid: np.ndarray) -> Chart:
-    """Chart of a camera whose pixels have the given unit rays."""
-    field = float(np.arccos(np.clip(direction[valid][:, 2].min(), -1, 1))) if valid.any() else 0.0
+def lens_chart(
+    camera: CameraModel, field_cos: float, direction: Float32[np.ndarray, "h w 3"], valid: np.ndarray
+) -> Chart:
+    """Chart of a camera whose pixels have the given unit rays, none more than ``acos(field_cos)`` off the axis."""
+    field = float(np.arccos(np.clip(np.float32(field_cos), -1, 1)))
     half_width = np.tan(min(field + FIELD_MARGIN_RAD, 0.97 * np.pi) / 2)
     place = _lens_places(camera, half_width, field + IMAGE_MARGIN_RAD)
     texel = 2 * half_width / (LENS_SIZE - 1)

@@ -181,6 +181,7 @@ def composite(
                 valid_at = rays.ctypes.data
                 z_at = heights.ctypes.data if table else np.int64(0)
             shown = sky_mask(at, valid_at)
+            behind[:] = f4(0)  # what is left of other pixels would make a frame depend on the rows done before
             if shown != 0:
                 for k in range(min(LANES, width - x)):
                     if (shown >> k) & 1:

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Int32
 
 from nurec_sim import sensors
 from nurec_sim.render.cpu.charts import PARAMETERS, Chart, lens_chart, lidar_chart
-from nurec_sim.render.rays import ray_grid
+from nurec_sim.render.rays import NEAR_M, line_fractions, ray_grid, reference_fraction
 from nurec_sim.types import CameraModel, LidarModel, Pinhole, Shutter, Spin
 
 PINHOLE, LENS, LIDAR = 0, 1, 2
@@ -60,25 +60,26 @@ def grid_key(sensor: CameraModel | LidarModel) -> tuple:
 
 
 def _camera_grid(camera: CameraModel) -> Grid:
-    rays = ray_grid(camera)
-    height, width = rays.valid.shape
-    direction = rays.direction.astype(np.float32)
-    by_column = camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
+    height, width = camera.height_px, camera.width_px
+    direction, valid = np.empty((height, width, 3), np.float32), np.empty((height, width), np.uint8)
+    field_cos = 1.0
+    for place, rays, seen in sensors.pixel_ray_strips(camera):
+        direction[place], valid[place] = np.where(seen[..., None], rays, (0.0, 0.0, 1.0)), seen
+        field_cos = min(field_cos, float(direction[place][..., 2].min()))  # 1 where a pixel has no ray
+    fraction, by_column = line_fractions(camera)
     if camera.shutter is Shutter.GLOBAL:
         line, fraction = np.zeros((height, width), np.int32), np.zeros(1)
     else:
-        line = np.indices((height, width), np.int32)[1 if by_column else 0]
-        fraction = rays.fraction[0] if by_column else rays.fraction[:, 0]
-    field_cos = float(direction[rays.valid][:, 2].min()) if rays.valid.any() else 1.0
+        number = np.arange(len(fraction), dtype=np.int32)
+        line = np.ascontiguousarray(np.broadcast_to(number if by_column else number[:, None], (height, width)))
     lens = camera.lens
     ideal = lens if isinstance(lens, Pinhole) and not lens.distorted and camera.windshield is None else None
-    chart = NO_CHART if ideal and len(fraction) == 1 else lens_chart(camera, direction, rays.valid)
+    chart = NO_CHART if ideal and len(fraction) == 1 else lens_chart(camera, field_cos, direction, valid > 0)
     kind, intrinsics = LENS, np.zeros(4, np.float32)
     if ideal:
         kind, intrinsics = PINHOLE, np.array([ideal.fx_px, ideal.fy_px, ideal.cx_px, ideal.cy_px], np.float32)
-    return Grid(kind, direction, rays.valid.astype(np.uint8), np.ascontiguousarray(line), np.asarray(fraction), None,
-                intrinsics, rays.reference, rays.by_range, rays.near_m, field_cos,
-                int(by_column), chart)  # fmt: skip
+    return Grid(kind, direction, valid, line, fraction, None, intrinsics, reference_fraction(fraction),
+                not isinstance(lens, Pinhole), NEAR_M, field_cos, int(by_column), chart)  # fmt: skip
 
 
 def _lidar_grid(lidar: LidarModel) -> Grid:

@@ -6,7 +6,7 @@ so most blocks are passed over at any instant, and a re-posed actor turns whole 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -140,6 +140,7 @@ class PackedMoving:
         self,
         t_us: int,
         actors: Mapping[str, Float64[np.ndarray, "4 4"]],
+        hidden: Set[str],
         eye_m: Float64[np.ndarray, " 3"],
         workers: Workers,
         array: Callable[[str, tuple[int, ...], type], np.ndarray],
@@ -149,12 +150,15 @@ class PackedMoving:
         Args:
             t_us: instant.
             actors: requested ``world_from_box`` by track id; ids that no track has are ignored.
+            hidden: ids of tracks that are left out.
             eye_m: view point in the world.
             workers: threads to run on.
             array: lends the frame's arrays (``pipeline.Buffers``); the result lives as long as the loan.
         """
         instant = float(t_us - self.base_us)
         motions, gone = self._motions(t_us, actors, np.asarray(eye_m, np.float64))
+        left_out = np.array([k for name, k in self.track_of.items() if name in hidden], np.int64)
+        gone = np.concatenate([gone, left_out, left_out + len(self.span_us)])
         lives = (self.life_us[:, 0] <= instant) & (instant <= self.life_us[:, 1])
         blocks = np.flatnonzero(lives & ~np.isin(self.track, gone))
         count = len(blocks)

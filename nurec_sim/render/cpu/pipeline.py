@@ -29,6 +29,9 @@ from nurec_sim.render.cpu.tiles import AFFINE, ROLLING
 from nurec_sim.render.cpu.view import View
 from nurec_sim.render.cpu.workers import SPLIT, Lend, Workers
 
+SLICE_PAIRS, SLICE_BLOCKS, SLICE_RECORDS = 8192, 512, 200_000
+"""Pairs of records and macro tiles, blocks of Gaussians, and records in one call of a kernel, at most about; a few
+milliseconds of work: the machine is shared out between calls (``turns``)."""
 NO_TABLE = RayTiles(np.zeros((1, 1, 1, 1), np.float32), np.zeros((1, 1, 1), np.int16), np.zeros((1, 1, 1), np.float32))
 """What a pinhole has instead of a table of rays."""
 
@@ -87,6 +90,19 @@ class Picture:
         """Macro tiles in all."""
         return self.tile_columns * -(-self.cells[1] // MACRO)
 
+    @property
+    def capacity(self) -> int:
+        """Records that there is room for: around the seam of a LiDAR's turn a Gaussian has two."""
+        most = BLOCK * (2 if self.view.grid.kind == LIDAR_GRID else 1)
+        return most * sum(len(blocks) for _, blocks in self.layers) + LANES
+
+    @property
+    def scratch_bytes(self) -> int:
+        """About how much memory it takes on its way: planes, records, and what sorting them takes."""
+        width, height = self.cells
+        planes, normal = (9, 16) if self.kind == NORMALS else (6, 0)
+        return 4 * planes * width * height + (4 * RECORD + 44 + normal) * self.capacity
+
 
 def draw(pictures: Sequence[Picture], workers: Workers) -> list[Float32[np.ndarray, "p h w"]]:
     """Blended planes of each picture, see ``draw.draw_tiles``; their sides are rounded up to whole blocks."""
@@ -119,7 +135,7 @@ def bin_pictures(pictures: Sequence[Picture], workers: Workers) -> None:
 def tile_ranges(picture: Picture, threads: int) -> list[Int64[np.ndarray, " t"]]:
     """Runs of neighbouring macro tiles, which share records, of about equal work."""
     work = np.cumsum(np.diff(picture.starts) + 8)
-    parts = max(1, threads * SPLIT) if threads > 1 else 1
+    parts = max(threads * SPLIT if threads > 1 else 1, int(-(-work[-1] // SLICE_PAIRS)))
     cuts = np.searchsorted(work, np.linspace(0, work[-1], parts + 1)[1:-1])
     return [tiles for tiles in np.split(np.arange(picture.tiles), cuts) if len(tiles)]
 
@@ -145,15 +161,14 @@ def _project(pictures: Sequence[Picture], workers: Workers) -> None:
     owners = []
     for picture in pictures:
         view, grid = picture.view, picture.view.grid
-        most = BLOCK * (2 if grid.kind == LIDAR_GRID else 1)  # around the seam of a turn a Gaussian has two records
-        capacity = most * sum(len(blocks) for _, blocks in picture.layers) + LANES
+        most, capacity = BLOCK * (2 if grid.kind == LIDAR_GRID else 1), picture.capacity
         picture.records = picture.array("records", (capacity, RECORD), np.float32)
         picture.keys = picture.array("keys", (capacity,), np.float32)
         picture.spans = picture.array("spans", (capacity, 4), np.int16)
         picture.sources = picture.array("sources", (capacity,), np.int32)
         picture.runs, base = [], 0
         for number, (layer, blocks) in enumerate(picture.layers):
-            for first, last in workers.ranges(len(blocks), 4):
+            for first, last in workers.ranges(len(blocks), 4, SLICE_BLOCKS):
                 outputs = (picture.records, picture.keys, picture.spans, picture.sources, base)
                 what = (layer.fields, layer.sh_rest, blocks, first, last, view.parameters)
                 if view.way in (AFFINE, ROLLING):
@@ -201,7 +216,7 @@ def _sort(pictures: Sequence[Picture], workers: Workers) -> None:
 
 
 def _bin(pictures: Sequence[Picture], workers: Workers) -> None:
-    splits = [workers.ranges(len(picture.order), 20_000) for picture in pictures]
+    splits = [workers.ranges(len(picture.order), 20_000, SLICE_RECORDS) for picture in pictures]
     counts = [
         np.zeros((len(ranges), picture.tiles), np.int64) for picture, ranges in zip(pictures, splits, strict=True)
     ]

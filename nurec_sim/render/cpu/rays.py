@@ -35,6 +35,7 @@ from nurec_sim.render.cpu.tiles import (
     RAYS,
     WIDE,
 )
+from nurec_sim.turns import rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,18 +56,24 @@ def tile_rays(grid: Grid) -> RayTiles:
     columns, rows = -(-width // MACRO), -(-height // MACRO)
 
     def by_block(plane: np.ndarray) -> np.ndarray:
-        full = np.zeros((rows * MACRO, columns * MACRO), plane.dtype)
-        full[:height, :width] = plane
-        parts = full.reshape(rows, DOWN, HIGH, columns, ACROSS, WIDE).transpose(0, 3, 1, 4, 2, 5)
-        return parts.reshape(rows * columns, BLOCKS, RAYS)
+        """Up to ``MACRO`` rows of cells as macro tiles."""
+        full = np.zeros((MACRO, columns * MACRO), plane.dtype)
+        full[: len(plane), :width] = plane
+        parts = full.reshape(DOWN, HIGH, columns, ACROSS, WIDE).transpose(2, 0, 3, 1, 4)
+        return parts.reshape(columns, BLOCKS, RAYS)
 
     table = np.zeros((rows * columns, BLOCKS, RAY_PLANES, RAYS), np.float32)
-    for plane in range(3):
-        table[:, :, DX + plane] = by_block(np.ascontiguousarray(grid.direction[..., plane]))
-    table[:, :, VALID] = by_block(grid.valid.astype(np.float32))
+    line = np.zeros((rows * columns, BLOCKS, RAYS), np.int16)
     basis = np.zeros((rows * columns, BANDS, BASIS), np.float32)
-    _all_bases(table, columns, width, height, basis)
-    return RayTiles(table, by_block(grid.line.astype(np.int16)), basis)
+    for row in range(rows):
+        rest()
+        cells, tiles = slice(row * MACRO, (row + 1) * MACRO), slice(row * columns, (row + 1) * columns)
+        for plane in range(3):
+            table[tiles, :, DX + plane] = by_block(grid.direction[cells, :, plane])
+        table[tiles, :, VALID] = by_block(grid.valid[cells])
+        line[tiles] = by_block(grid.line[cells])
+        _all_bases(table[tiles], columns, width, len(grid.valid[cells]), basis[tiles])
+    return RayTiles(table, line, basis)
 
 
 @inner

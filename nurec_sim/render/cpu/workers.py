@@ -10,6 +10,8 @@ from concurrent.futures import ThreadPoolExecutor, wait
 
 import numpy as np
 
+from nurec_sim.turns import current_turn
+
 SPLIT = 16
 """Ranges per thread: enough to even out tiles of very different cost."""
 KEPT = 4
@@ -27,16 +29,35 @@ class Workers:
         self._pool = ThreadPoolExecutor(threads - 1, thread_name_prefix="render") if threads > 1 else None
 
     def run_calls(self, calls: Sequence[tuple]) -> list:
-        """The results of calls (function, argument, ...), in order; all have ended when this returns or fails."""
+        """The results of calls (function, argument, ...), in order; all have ended when this returns or fails.
+
+        Between calls, the work rests when its turn is over (``turns``); its helpers are then free for others.
+
+        Raises:
+            GivenUpError, DeadlinePassedError: see ``turns.rest``.
+        """
         results: list = [None] * len(calls)
         numbers = itertools.count()  # next() of it is atomic
+        turn, begun_all = current_turn(), False
 
         def work() -> None:
-            while (number := next(numbers)) < len(calls):
+            nonlocal begun_all
+            while turn is None or not turn.is_over:
+                if (number := next(numbers)) >= len(calls):
+                    begun_all = True
+                    return
                 function, *arguments = calls[number]
                 results[number] = function(*arguments)
 
-        helpers = min(self.threads, len(calls)) - 1
+        while True:
+            self._together(work, min(self.threads, len(calls)) - 1)
+            if begun_all:
+                return results
+            assert turn is not None
+            turn.rest()
+
+    def _together(self, work: Callable[[], None], helpers: int) -> None:
+        """Does the work here and in as many other threads as are free; all have ended when this returns or fails."""
         futures = [self._pool.submit(work) for _ in range(helpers)] if self._pool is not None else []
         try:
             work()
@@ -46,15 +67,16 @@ class Workers:
             wait(futures)
         for future in futures:
             future.result()
-        return results
 
     def run(self, function: Callable, arguments: Sequence[tuple]) -> list:
         """``function`` of each tuple of arguments, in order."""
         return self.run_calls([(function, *each) for each in arguments])
 
-    def ranges(self, count: int, least: int) -> list[tuple[int, int]]:
-        """0..count cut into about ``SPLIT`` ranges per thread of at least ``least``."""
+    def ranges(self, count: int, least: int, most: int | None = None) -> list[tuple[int, int]]:
+        """0..count cut into about ``SPLIT`` ranges per thread of at least ``least``, and at most about ``most``."""
         parts = max(1, min(self.threads * SPLIT if self.threads > 1 else 1, count // max(least, 1)))
+        if most is not None:
+            parts = max(parts, -(-count // max(most, 1)))
         edges = np.linspace(0, count, parts + 1).astype(np.int64)
         return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 

@@ -107,6 +107,10 @@ class MovingLayer:
     def _fill(self, motions: np.ndarray, request: SensorRequest, reference: float, t_us: int) -> None:
         """Where each track's Gaussians are shown, those in the world first, then those in its box."""
         for k, track in enumerate(self.tracks):
+            if track.id in request.hidden:
+                for row in (motions[k], motions[k + len(self.tracks)]):
+                    row["moved"] = row["gone"] = 1
+                continue
             recorded, pair = track.path.at(t_us), request.actors.get(track.id)
             shown = recorded
             if pair is not None:

@@ -17,7 +17,15 @@ from nurec_sim.render.gpu.launcher import THREADS, CudaLauncher, Launcher
 from nurec_sim.render.gpu.moving import MovingLayer
 from nurec_sim.render.gpu.pipeline import ALPHA, Blocks, draw
 from nurec_sim.render.gpu.views import Batch, GridTensors, SensorView, make_batch
-from nurec_sim.render.requests import SENSED_OUTPUTS, check_camera_call, check_lidar_call, check_request
+from nurec_sim.render.requests import (
+    SENSED_OUTPUTS,
+    check_camera_call,
+    check_lidar_call,
+    check_outputs,
+    check_request,
+    ray_count,
+)
+from nurec_sim.turns import rest
 from nurec_sim.types import (
     CameraFrame,
     CameraModel,
@@ -33,6 +41,8 @@ if TYPE_CHECKING:
     import torch
 
 KEPT_GRIDS = 24
+GROUP_RAYS = 1 << 24
+"""Pixels and beams that are drawn together, or of a single larger frame; some hundred bytes each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +72,7 @@ class GpuRenderer:
     Args:
         scene: the world.
         device: a CUDA device such as ``cuda:1``, or a ``Launcher``.
-        apply_isp: whether ``scene.isp`` of the request's sensor id is applied.
+        apply_isp: whether ``scene.isp`` of the request's sensor id is applied to requests that ask for it.
 
     Raises:
         GpuError: there is no such device, or the extra ``gpu`` is missing.
@@ -81,13 +91,24 @@ class GpuRenderer:
         self._grids: OrderedDict[tuple, GridTensors] = OrderedDict()
         self._lock = threading.Lock()
 
-    def sense(self, requests: Sequence[SensorRequest]) -> list[SensorFrame]:
-        """One frame per request, in order: ``types.Sense``. All are drawn together.
+    def sense(self, requests: Sequence[SensorRequest], outputs: Sequence[str] = SENSED_OUTPUTS) -> list[SensorFrame]:
+        """One frame per request, in order: ``types.Sense``; cameras with ``rgb`` and what else ``outputs`` names.
+
+        They are drawn together, in groups of up to ``GROUP_RAYS``.
 
         Raises:
-            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
+            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or an unknown output.
         """
-        return self._frames(requests, SENSED_OUTPUTS, LidarFilter())
+        check_outputs(outputs)
+        frames: list[SensorFrame] = []
+        group: list[SensorRequest] = []
+        for number, request in enumerate(requests):
+            group.append(request)
+            if sum(map(ray_count, group)) >= GROUP_RAYS or number == len(requests) - 1:
+                rest()
+                frames += self._frames(group, outputs, LidarFilter())
+                group = []
+        return frames
 
     def render_camera(self, request: SensorRequest, outputs: Sequence[str] = SENSED_OUTPUTS) -> CameraFrame:
         """A camera frame with ``rgb`` and those of the other outputs that ``outputs`` names.
@@ -152,7 +173,7 @@ class GpuRenderer:
 
     def _view(self, request: SensorRequest, number: int) -> SensorView:
         """The sensor of the request of that number."""
-        isp = self.scene.isp.get(request.sensor.id) if self.apply_isp else None
+        isp = self.scene.isp.get(request.sensor.id) if self.apply_isp and request.apply_isp else None
         blocks = len(self._moving)
         return SensorView(self._grid(request), request.world_from_sensor, isp, number * blocks, blocks)
 
