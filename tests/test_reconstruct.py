@@ -177,4 +177,5 @@ def test_progress_names_stages_in_order(street):
     reconstruct(Street(frames=1), settings=SMALL, progress=lambda stage, fraction: seen.append((stage, fraction)))
     stages = list(dict.fromkeys(stage for stage, _ in seen))
     assert stages == ["sweeps", "ground and surfaces", "images", "depth", "colours", "lifting", "sky"]
-    assert all(0 <= fraction <= 1 for _, fraction in seen)
+    told = [fraction for _, fraction in seen]
+    assert told == sorted(told) and (told[0], told[-1]) == (0.0, 1.0)

@@ -1,54 +1,44 @@
-"""What every verb shares: consoles, tables, progress bars."""
+"""What every verb shares: consoles, tables, progress."""
 
 from __future__ import annotations
 
-import contextlib
+import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+
+from nurec_sim.cli.progress import Report, shown
+from nurec_sim.cli.tables import draw_table
+
+PIPED_WIDTH = 160
 
 app = tyro.extras.SubcommandApp()
-out = Console(width=None if sys.stdout.isatty() else 120)
+out = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else PIPED_WIDTH)
 err = Console(stderr=True)
 
 Paths = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH...")]
 OnePath = Annotated[Path, tyro.conf.Positional]
-Report = Callable[[str, float], None]
 
 
-@contextlib.contextmanager
-def progress(title: str) -> Iterator[Report]:
-    """A progress bar on stderr, fed with (what is being done, fraction 0..1)."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:3.0f}%"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=err, transient=True) as bar:
-        task = bar.add_task(title, total=1.0)
+def progress(title: str) -> AbstractContextManager[Report]:
+    """How far the work of the block is, on stderr, fed with (what is being done, fraction 0..1)."""
+    return shown(err, title)
 
-        def advance(stage: str, fraction: float) -> None:
-            bar.update(task, description=f"{title}: {stage}" if stage else title, completed=fraction)
 
-        yield advance
+def part_of(advance: Report, index: int, count: int, name: str) -> Report:
+    """Reports one of several equal parts of some work."""
+    start = f"{name} ({index + 1} of {count}), " if count > 1 else ""
+    return lambda stage, fraction: advance(start + stage, (index + fraction) / count)
 
 
 def print_table(title: str, rows: Sequence[Sequence[object]], heading: Sequence[str] = ()) -> None:
     """Rows as a table, with or without a heading."""
-    table = Table(title=title, title_justify="left", show_header=bool(heading))
-    for name in heading or [""] * max((len(row) for row in rows), default=0):
-        table.add_column(name, no_wrap=name == "policy")
-    for row in rows:
-        table.add_row(*(escape(str(cell)) for cell in row))
-    out.print(table)
+    draw_table(out, title, rows, heading)
 
 
 def print_faults(faults: Sequence[str]) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from nurec_sim.cli.console import OnePath, Paths, app, err, out, print_faults, print_table, progress
+from nurec_sim.cli.console import OnePath, Paths, app, err, out, part_of, print_faults, print_table, progress
 from nurec_sim.errors import NurecSimError
 from nurec_sim.new_files import check_writable
 
@@ -84,7 +84,9 @@ def report(run_folder: OnePath) -> None:
     """
     from nurec_sim import runs
 
-    out.print(f"wrote {runs.write_report(run_folder)}", soft_wrap=True)
+    with progress("reporting") as advance:
+        path = runs.write_report(run_folder, advance)
+    out.print(f"wrote {path}", soft_wrap=True)
 
 
 @app.command
@@ -140,8 +142,11 @@ def drive(
     for fault in store.faults.values():
         raise NurecSimError(fault)
     check_writable(resume or out_dir, folder=True)
-    with progress("reconstructing") as advance:
-        scenes = [store.get(scene_id, progress=advance).scene for scene_id in store.ids]
+    with progress("loading") as advance:
+        scenes = [
+            store.get(scene_id, part_of(advance, index, len(store.ids), scene_id)).scene
+            for index, scene_id in enumerate(store.ids)
+        ]
     with contextlib.ExitStack() as stack:
         if address is None:
             address = stack.enter_context(SensorServer(store, port=0))

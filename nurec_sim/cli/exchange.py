@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from nurec_sim.cli.console import OnePath, app, err, out, print_table, progress
+from nurec_sim.cli.console import OnePath, app, out, print_table, progress
 from nurec_sim.cli.scenes import load_scene
 from nurec_sim.errors import NurecSimError
 from nurec_sim.new_files import check_writable
@@ -104,11 +104,11 @@ def import_(
     if file.resolve() == target.resolve():
         raise NurecSimError(f"{target} is the file to import; give another --out")
     check_writable(target)
-    with err.status(f"reading {file.name}"):
+    with progress(f"reading {file.name}"):
         opened = scene.read_scene if like and like.suffix.lower() in scene.SCENE_SUFFIXES else logs.open_clip
         known = None if like is None else opened(like)
         world = scene.import_scene(file, sky=sky, like=known, up=up)
-    with err.status(f"writing {target.name}"):
+    with progress(f"writing {target.name}"):
         scene.write_scene(world, target, overwrite=overwrite)
     dropped = world.provenance.get("dropped")
     rows = [("dropped: not finite, or without extent", f"{dropped:,}")] if dropped else []

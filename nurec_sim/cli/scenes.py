@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from nurec_sim.cli.console import OnePath, app, err, out, print_faults, print_table, progress
+from nurec_sim.cli.console import OnePath, app, out, print_faults, print_table, progress
 from nurec_sim.cli.validation import inspect_scene
 from nurec_sim.errors import NurecSimError
 from nurec_sim.new_files import check_writable
@@ -41,7 +41,7 @@ def inspect(source: OnePath) -> None:
     summary = logs.describe_clip(log)
     print_table(f"clip {log.id}", summary.facts)
     print_table("sensors", summary.sensors, SENSOR_COLUMNS)
-    with err.status("reading every image and sweep"):
+    with progress("reading every image and sweep"):
         faults = logs.check_clip(log)
     print_faults(faults)
     out.print("no faults")
@@ -83,7 +83,8 @@ def reconstruct(
         world_scene = run_method(
             log, method, cameras=cameras or None, progress=advance, settings=network_settings(method, network)
         )
-    scene.write_scene(world_scene, target, overwrite=overwrite)
+    with progress(f"writing {target.name}"):
+        scene.write_scene(world_scene, target, overwrite=overwrite)
     print_table(f"scene {world_scene.id}", scene.summary(world_scene))
     for text in world_scene.provenance.get("unknown", ()):
         out.print(f"not known: {text}", markup=False)

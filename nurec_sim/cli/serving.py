@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nurec_sim.cli.console import Paths, app, err
+from nurec_sim.cli.console import Paths, app, err, progress
 from nurec_sim.cli.nre_flags import sort_flags
 from nurec_sim.cli.operation import (
     NO_FLAGS,
@@ -244,11 +244,13 @@ def _test_scenes(store: SceneStore) -> None:
         NurecSimError: some are bad; the text names them.
     """
     bad = dict(store.faults)
-    for scene_id in store.ids:
-        try:
-            store.get(scene_id)
-        except NurecSimError as error:
-            bad[scene_id] = str(error)
+    with progress("loading") as advance:
+        for index, scene_id in enumerate(store.ids):
+            advance(scene_id, index / len(store.ids))
+            try:
+                store.get(scene_id)
+            except NurecSimError as error:
+                bad[scene_id] = str(error)
     if bad:
         texts = "".join(f"\n  {name}: {reason}" for name, reason in bad.items())
         raise NurecSimError(f"{len(bad)} of {len(store.ids) + len(store.faults)} scenes are bad:{texts}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from nurec_sim.cli.console import Paths, app, err, out, print_table
+from nurec_sim.cli.console import Paths, app, out, print_table
 from nurec_sim.errors import NurecSimError
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def validate(
         raise NurecSimError("give at least one scene archive")
     found = {}
     for path in scenes:
-        with err.status(f"looking at {path.name}"):
+        with progress(f"looking at {path.name}"):
             found[path] = validate_archive(path, consumers, usd_limit_s=USD_LIMIT_S)
     shared = same_scene_ids(scenes) if "alpasim" in consumers else []
     errors = len(shared) + sum(finding.severity == "error" for findings in found.values() for finding in findings)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from nurec_sim.cli.console import OnePath, app, err, out, print_faults, print_table
+from nurec_sim.cli.console import OnePath, app, out, print_faults, print_table
 
 weights = tyro.extras.SubcommandApp()
 app.command(
@@ -30,7 +30,7 @@ def list_weights() -> None:
     from nurec_sim.network import PROFILES, download
     from nurec_sim.network.released import RELEASED
 
-    with err.status("counting parameters"):
+    with progress("counting parameters"):
         from nurec_sim.network.weights_check import count_parameters
 
         parameters = {name: f"{count_parameters(name) / 1e6:.1f} M" for name in PROFILES}
@@ -94,7 +94,7 @@ def check(path: OnePath, *, profile: Checkable | None = None) -> None:
         path: the file.
         profile: what it should fit; whichever it does if not given.
     """
-    with err.status(f"reading {path.name}"):
+    with progress(f"reading {path.name}"):
         from nurec_sim.network.weights_check import check_weights
 
         report = check_weights(path, profile)

@@ -52,7 +52,7 @@ def evaluate(
         hold_out_sweeps: further sweeps to hold out, by index.
         via_grpc: whether frames come from a sensor server in this process over gRPC, or from a renderer directly.
         images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
-        progress: called with a stage and the fraction of it that is done.
+        progress: called with a stage and the fraction of all work that is done, about.
         options: passed on to ``reconstruct``.
 
     Returns:
@@ -75,7 +75,7 @@ def evaluate(
     if hold_out_every < 0:
         raise ReconstructError(f"hold_out_every must be 0 or more, got {hold_out_every}")
     held = held_out(clip, hold_out_every, hold_out_sweeps)
-    stages = _StageClock(report)
+    stages = _StageClock(_part(report, 0.0, 0.6))
     scene = reconstruct(clip, method, cameras=input_cameras, hold_out_sweeps=held, progress=stages, **options)
     stages.stop()
     inputs = list(scene.provenance["cameras"])
@@ -84,10 +84,10 @@ def evaluate(
     seconds["reconstruct"] = round(sum(stages.seconds.values()), 3)
     with sensing(scene, via_grpc) as sense:
         started = time.perf_counter()
-        image = _score_images(clip, inputs, targets, sense, images_dir, report)
+        image = _score_images(clip, inputs, targets, sense, images_dir, _part(report, 0.6, 0.9))
         seconds["images"] = round(time.perf_counter() - started, 3)
         started = time.perf_counter()
-        lidar = _score_lidars(clip, held, sense, report) if held else None
+        lidar = _score_lidars(clip, held, sense, _part(report, 0.9, 1.0)) if held else None
         seconds["lidar"] = round(time.perf_counter() - started, 3)
     return {
         "clip": clip.id,
@@ -104,6 +104,11 @@ def evaluate(
         | dict(scene.provenance.get("counts", {})),
         "unknown": list(scene.provenance.get("unknown", [])),
     }
+
+
+def _part(report: Progress, begin: float, end: float) -> Progress:
+    """Reports a part of all work."""
+    return lambda stage, fraction: report(stage, begin + fraction * (end - begin))
 
 
 class _StageClock:
@@ -155,12 +160,12 @@ def _score_images(
     clip: Clip, inputs: Sequence[str], targets: Sequence[str], sense: Sense, images_dir: Path | None, report: Progress
 ) -> dict[str, object]:
     per_camera: dict[str, dict[str, Any]] = {}
-    for camera in targets:
+    for done, camera in enumerate(targets):
         shown: dict[str, list[float]] = {"psnr_db": [], "ssim": []}
         floor: dict[str, list[float]] = {"psnr_db": [], "ssim": []}
         times = clip.camera_times_us(camera)
         for index in range(len(times)):
-            report(f"images of {camera}", index / len(times))
+            report(f"images of {camera}", (done + index / len(times)) / len(targets))
             recorded = clip.image(camera, index)
             start_us, end_us = int(times[index, 0]), max(int(times[index, 1]), int(times[index, 0]) + 1)
             request = SensorRequest(
@@ -175,7 +180,7 @@ def _score_images(
                 _append(floor, copied, recorded)
             if images_dir is not None:
                 _write_pair(images_dir / f"{camera}_{index:04d}.png", recorded, rendered)
-        report(f"images of {camera}", 1.0)
+        report(f"images of {camera}", (done + 1) / len(targets))
         per_camera[camera] = {**_with_means(shown), "input": camera in inputs, "floor": _with_means(floor)}
     means: dict[str, float | None] = {}
     for name in ("psnr_db", "ssim"):

@@ -41,7 +41,7 @@ def reconstruct(
         method: one of ``METHODS``.
         cameras: ids of the cameras to use; if None all, or as many as the network's profile takes.
         hold_out_sweeps: indices of sweeps that must not be read, of every LiDAR.
-        progress: called with the stage's name and the fraction of it that is done.
+        progress: called with the stage's name and the fraction of all work that is done, about.
         settings: ``LiftSettings`` for ``lift``, ``FeedForwardSettings`` for the others; the defaults if None.
 
     Raises:

@@ -90,6 +90,7 @@ class Trainer:
         report = progress or (lambda stage, fraction: None)
         if self.processes.first:
             write_file(self.folder / RECIPE, self.config.model_dump_json(indent=1) + "\n")
+        report("waiting for a first town", self.position.step / self.config.steps)
         last = self.config.steps if until is None else min(until, self.config.steps)
         for stage, first in _stages_with_starts(self.config):
             if self.position.step < first + stage.steps and self.position.step < last:

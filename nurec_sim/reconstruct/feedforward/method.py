@@ -29,6 +29,8 @@ from nurec_sim.reconstruct.lift.actors import tracks_of
 from nurec_sim.types import Clip, DynamicGaussians, GaussianScene, Track
 
 Progress = Callable[[str, float], None]
+CHUNKS_SHARE = 0.9
+"""Of all work; merging and tracks take the rest."""
 
 
 def feedforward(
@@ -46,7 +48,7 @@ def feedforward(
         method: ``dense`` or ``selective``, which the profile must be.
         cameras: ids of the cameras to use; None picks as many as the profile takes.
         hold_out: sweeps that must not be read.
-        progress: called with the stage's name and the fraction of it that is done.
+        progress: called with the stage's name and the fraction of all work that is done, about.
         settings: how; its ``profile`` may be None for the method's small one.
 
     Raises:
@@ -67,8 +69,8 @@ def feedforward(
         chunk, chunk_fit = _chunk(clip, model, window, hold_out, settings, chunk_progress)
         layers.append(chunk)
         fits.append(chunk_fit)
-    merged = merge_chunks(layers, settings, progress)
-    progress("tracks", 0.0)
+    merged = merge_chunks(layers, settings, lambda stage, fraction: progress(stage, CHUNKS_SHARE + 0.07 * fraction))
+    progress("tracks", CHUNKS_SHARE + 0.07)
     tracks, dynamic = _tracks(clip, merged.dynamic)
     progress("tracks", 1.0)
     provenance = {
@@ -184,7 +186,9 @@ def _chunk(
 
 def _within(progress: Progress, index: int, count: int) -> Progress:
     """Progress of one chunk as part of all of them."""
-    return lambda stage, fraction: progress(f"chunk {index + 1} of {count}: {stage}", (index + fraction) / count)
+    return lambda stage, fraction: progress(
+        f"chunk {index + 1} of {count}: {stage}", CHUNKS_SHARE * (index + fraction) / count
+    )
 
 
 def _tracks(clip: Clip, dynamic: DynamicGaussians) -> tuple[tuple[Track, ...], DynamicGaussians]:

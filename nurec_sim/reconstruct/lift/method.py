@@ -109,23 +109,36 @@ def _sky_weight(picture: DepthPicture, view: View, settings: LiftSettings) -> np
     return np.where(far, np.where(picture.sky, 1.0, 0.02), 0.0)
 
 
+_ENDS = {
+    "sweeps": 0.1,
+    "ground and surfaces": 0.2,
+    "images": 0.21,
+    "depth": 0.8,
+    "colours": 0.81,
+    "lifting": 0.97,
+    "sky": 1.0,
+}
+"""The part of all work that is done at the end of each stage, about (on the demonstration's log)."""
+
+
 class _Stages:
     """Tells the caller which stage runs. Times are the caller's business: a scene must not depend on the clock."""
 
     def __init__(self, progress: Progress) -> None:
-        self.progress, self.stage = progress, ""
+        self.progress, self.stage, self.begun = progress, "", 0.0
 
     def start(self, stage: str) -> None:
         self.stop()
         self.stage = stage
-        self.progress(stage, 0.0)
+        self.fraction(0.0)
 
     def fraction(self, fraction: float) -> None:
-        self.progress(self.stage, fraction)
+        self.progress(self.stage, self.begun + fraction * (_ENDS[self.stage] - self.begun))
 
     def stop(self) -> None:
         if self.stage:
-            self.progress(self.stage, 1.0)
+            self.fraction(1.0)
+            self.begun = _ENDS[self.stage]
 
 
 def _unknown(
