@@ -47,6 +47,8 @@ class Limits:
     """Beginnings and ends of elements of one XML text; 100 to 400 bytes each."""
     msgpack_values: int = 1 << 18
     """Names, settings and shapes; arrays are one value each."""
+    table_rows: int = 1 << 20
+    """Of one parquet table."""
     yaml_bytes: int = 1 << 18
     """YAML takes a thousand bytes of memory for some of its letters, and a long time."""
 
@@ -222,18 +224,27 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 # ------------------------------------------------------------------------------------------------------------- texts
 
 
-def json_value(data: bytes, **hooks: Any) -> Any:
-    """The value of a JSON text in UTF-8; ``hooks`` are those of ``json.loads``.
+def check_json(data: bytes) -> None:
+    """Whether a JSON text is short enough to be parsed, or for us to write.
 
     Raises:
         TooMuchError: it is too long or holds too much.
-        ValueError, RecursionError: it is no JSON, or nested too deeply.
     """
     if len(data) > LIMITS.json_bytes:
         raise TooMuchError(f"has {len(data):,} bytes; at most {LIMITS.json_bytes:,} are read")
     values = 1 + sum(data.count(mark) for mark in (b",", b":", b"[", b"{"))
     if values > LIMITS.json_values:
         raise TooMuchError(f"holds up to {values:,} values; at most {LIMITS.json_values:,} are read")
+
+
+def json_value(data: bytes, **hooks: Any) -> Any:
+    """The value of a JSON text in UTF-8; ``hooks`` are those of ``json.loads``.
+
+    Raises:
+        TooMuchError: see ``check_json``.
+        ValueError, RecursionError: it is no JSON, or nested too deeply.
+    """
+    check_json(data)
     return json.loads(data.decode("utf-8"), **hooks)
 
 

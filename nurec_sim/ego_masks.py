@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from nurec_sim.decoding import check_image
 from nurec_sim.errors import RequestError
 
 
@@ -58,7 +59,11 @@ def _scaled_mask(path: Path, width_px: int, height_px: int) -> tuple[np.ndarray,
     """Colour [h,w,3] and cover [h,w,1] of a mask in float32."""
     import cv2
 
-    bgra = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    try:
+        check_image(data := path.read_bytes())
+        bgra = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError, cv2.error):
+        bgra = None
     if bgra is None:
         raise RequestError(f"the ego mask {path.parent.name}/{path.name} is not a readable PNG")
     scale = 65535 if bgra.dtype == np.uint16 else 255

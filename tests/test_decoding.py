@@ -23,6 +23,7 @@ from nurec_sim.logs.storage import Storage
 from nurec_sim.scene import codec
 from nurec_sim.scene.foreign.nurec_volume import read_volume
 from nurec_sim.scene.opendrive_xml import opendrive_root
+from nurec_sim.scene.validate import maps
 from nurec_sim.scene.validate.contents import Contents
 from nurec_sim.scene.zip_package import Package
 
@@ -250,6 +251,26 @@ def test_a_member_of_a_clip_may_not_grow_without_bound(tmp_path, memory):
     with Contents(tmp_path / "clip.zip") as contents, pytest.raises(ArchiveError, match="meta.json has more than"):
         contents.read("meta.json")
     assert memory() < 200 * MIB
+
+
+def test_json_that_could_not_be_read_again_is_not_written(monkeypatch):
+    monkeypatch.setattr(decoding, "LIMITS", replace(LIMITS, json_values=100))
+    assert len(codec.load(codec.dump(list(range(98)), "facts"), "facts")) == 98
+    with pytest.raises(ArchiveError, match="facts holds up to 151 values; at most 100 are read, so it is not written"):
+        codec.dump(list(range(150)), "facts")
+
+
+def test_a_table_of_too_many_rows_is_not_decoded(tmp_path, monkeypatch):
+    polars = pytest.importorskip("polars")
+    polars.select(key=polars.repeat(0, 2_000_000), lane=polars.repeat(0, 2_000_000)).write_parquet(tmp_path / "a")
+    assert (tmp_path / "a").stat().st_size < 20_000
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as package:
+        package.write(tmp_path / "a", "clipgt/lane.parquet")
+    with (
+        Contents(tmp_path / "a.zip") as contents,
+        pytest.raises(ArchiveError, match="2,000,000 rows; at most"),
+    ):
+        maps._table(contents, "clipgt/lane.parquet", "lane")
 
 
 def test_xml_of_too_many_tags_is_not_parsed(memory):

@@ -184,6 +184,12 @@ FRONT = ("cameras", "front")
             set_path("lidars", "top", "intensity_scale", value=0),
             "intensity_scale must be positive, got 0",
         ),
+        ("calib.json", set_path(*FRONT, "width", value=10**9), "may have 33,177,600 pixels, got 1000000000 x 48"),
+        (
+            "calib.json",
+            set_path("lidars", "top", value={"T_ego_lidar": np.eye(4).tolist(), "table": "VLP-16", "columns": 10**12}),
+            "'columns' must be at most 16384, got 1000000000000",
+        ),
         ("calib.json", set_path("lidars", "top", "table", value="X"), "no LiDAR table 'X'; have .'AT128'"),
         ("calib.json", set_path("lidars", "top", "azimuth_rad", value=[0, 1]), "azimuth_rad must run clockwise"),
         ("calib.json", set_path("body", value={"size_m": [1, 2, 3]}), "calib.json: body: 'center_m' is missing"),

@@ -258,6 +258,26 @@ def test_files_of_clients_lie_in_the_folders_that_were_given(not_served, scenes,
     assert _glob_folder("/a/*/b/*.usdz") == [Path("/a")] and _glob_folder("x.usdz") == [Path()]
 
 
+def test_flags_with_several_values_take_all_that_follow(not_served, tmp_path):
+    folders = [tmp_path / name for name in "abc"]
+    for folder in folders:
+        folder.mkdir()
+    cli.main(
+        [
+            "serve-grpc",
+            "--scene-dirs",
+            *map(str, folders[:2]),
+            "--port",
+            "1",
+            f"--clip-dirs={folders[2]}",
+            str(tmp_path),
+        ]
+    )
+    ((_, choices),) = not_served
+    assert choices["options"].scene_dirs == tuple(folders[:2]) and choices["port"] == 1
+    assert choices["scene_options"].clip_dirs == (folders[2], tmp_path)
+
+
 def test_scenes_are_tested_before_they_are_served(not_served, scenes, tmp_path, capsys):
     glob = f"--artifact-glob={scenes}/**/*.usdz"
     cli.main(["serve-grpc", glob, "--test-scenes-are-valid"])

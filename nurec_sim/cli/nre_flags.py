@@ -37,18 +37,22 @@ class Sorted:
     """Flags that were passed over, as they were given."""
 
 
-def sort_flags(arguments: Sequence[str], switches: Iterable[str], values: Iterable[str]) -> Sorted:
+def sort_flags(
+    arguments: Sequence[str], switches: Iterable[str], values: Iterable[str], lists: Iterable[str] = ()
+) -> Sorted:
     """Takes out of a command line what this renderer has no use for.
 
     Args:
         arguments: the words after the verb.
         switches: names of the flags without a value that apply, with hyphens.
         values: names of those with one.
+        lists: names of those with one or more.
 
     Raises:
         NurecSimError: a word is no flag, or none that is known; the text names the nearest one.
     """
-    ours, with_value = set(switches) | {"help"}, set(values)
+    ours, with_several = set(switches) | {"help"}, set(lists)
+    with_value = set(values) | with_several
     known = [*ours, *with_value, *IGNORED_SWITCHES, *IGNORED_VALUES, *IGNORED_FAMILIES]
     kept: list[str] = []
     ignored: list[str] = []
@@ -69,6 +73,8 @@ def sort_flags(arguments: Sequence[str], switches: Iterable[str], values: Iterab
             if not equals and not words:
                 raise NurecSimError(f"--{name} needs a value")
             kept += [f"--{name}", value if equals else words.pop(0)]
+            while name in with_several and words and not words[0].startswith("-"):
+                kept.append(words.pop(0))
         elif plain in ours:
             kept.append(_switch(plain, negated, value if equals else "true"))
         elif plain in IGNORED_SWITCHES:

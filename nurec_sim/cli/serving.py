@@ -148,7 +148,8 @@ def sort_serve_grpc(arguments: Sequence[str]) -> list[str]:
     kinds = [(p.name, p.default) for p in own] + [(f.name, f.default) for f in dataclasses.fields(OperationFlags)]
     switches = [name.replace("_", "-") for name, default in kinds if isinstance(default, bool)]
     values = [name.replace("_", "-") for name, default in kinds if not isinstance(default, bool)]
-    sorted_ = sort_flags(arguments, switches, values)
+    lists = [name.replace("_", "-") for name, default in kinds if isinstance(default, tuple)]
+    sorted_ = sort_flags(arguments, switches, values, lists)
     if sorted_.ignored:
         warn(f"these flags have no effect on this renderer: {', '.join(dict.fromkeys(sorted_.ignored))}")
     return sorted_.arguments

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from nurec_sim import geometry, sensors
+from nurec_sim.decoding import LIMITS
 from nurec_sim.errors import ClipError
 from nurec_sim.logs import fields
 from nurec_sim.types import (
@@ -30,6 +31,8 @@ from nurec_sim.types import (
 )
 
 CALIBRATION_FILE = "calib.json"
+MAX_COLUMNS = 1 << 14
+"""Of a LiDAR; those in use have up to 4,000 in a turn."""
 LENS_KINDS: dict[str, type[Pinhole] | type[Fisheye] | type[FTheta]] = {
     "pinhole": Pinhole,
     "fisheye": Fisheye,
@@ -155,6 +158,9 @@ def checked_camera(camera: CameraModel) -> CameraModel:
     """
     try:
         sensors.check_camera(camera)
+        if camera.width_px * camera.height_px > LIMITS.image_pixels:
+            size = f"{camera.width_px} x {camera.height_px}"
+            raise ValueError(f"camera {camera.id!r} may have {LIMITS.image_pixels:,} pixels, got {size}")
     except ValueError as error:
         raise ClipError(f"{CALIBRATION_FILE}: {error}") from error
     return camera
@@ -201,6 +207,8 @@ def lidar_from_json(name: str, row: Any, rig_from_ego: np.ndarray) -> LidarModel
     try:
         if "table" in row:
             columns = fields.integer(where, row, "columns") if "columns" in row else None
+            if columns is not None and columns > MAX_COLUMNS:  # each becomes an angle
+                raise ClipError(f"{where}: 'columns' must be at most {MAX_COLUMNS}, got {columns}")
             return sensors.lidar_model(fields.of_kind(where, row, "table", str), pose, id=name, columns=columns)
         near_far = fields.array(where, row, "range_m", (2,)) if "range_m" in row else (0.5, 200.0)
         lidar = LidarModel(
@@ -214,6 +222,9 @@ def lidar_from_json(name: str, row: Any, rig_from_ego: np.ndarray) -> LidarModel
             range_m=(float(near_far[0]), float(near_far[1])),
         )
         sensors.check_lidar(lidar)
+        beams = len(lidar.elevation_rad) * len(lidar.azimuth_rad)
+        if beams > LIMITS.sweep_points:
+            raise ValueError(f"LiDAR {name!r} may have {LIMITS.sweep_points:,} beams a turn, got {beams:,}")
     except ValueError as error:
         raise ClipError(f"{CALIBRATION_FILE}: {error}") from error
     return lidar

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from nurec_sim.decoding import TooMuchError, json_value
+from nurec_sim.decoding import TooMuchError, check_json, json_value
 from nurec_sim.errors import ArchiveError
 from nurec_sim.types import (
     Box,
@@ -62,12 +62,16 @@ def dump(value: Any, what: str, indent: int | None = None) -> bytes:
     """JSON text in UTF-8, keys in the given order.
 
     Raises:
-        ArchiveError: NaN, infinity, a key that is no text, or something that JSON does not know.
+        ArchiveError: NaN, infinity, a key that is no text, something that JSON does not know, or too much of it.
     """
     try:
         separators = (",", ": ") if indent else (",", ":")
         text = json.dumps(to_json(value), allow_nan=False, ensure_ascii=False, separators=separators, indent=indent)
-        return (text + "\n").encode("utf-8")
+        data = (text + "\n").encode("utf-8")
+        check_json(data)
+        return data
+    except TooMuchError as error:
+        raise ArchiveError(f"{what} {error}, so it is not written") from None
     except (TypeError, ValueError) as error:
         raise ArchiveError(f"{what} cannot be written as JSON: {error}") from error
 

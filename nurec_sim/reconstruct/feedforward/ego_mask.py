@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
+from nurec_sim.decoding import check_image
 from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.feedforward.crop import Crop
 from nurec_sim.types import Clip
@@ -42,7 +43,11 @@ def ego_masks(folder: Path | None, clip: Clip, crops: Mapping[str, Crop]) -> dic
 
 
 def _scaled(path: Path, crop: Crop) -> Bool[np.ndarray, "h w"]:
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    try:
+        check_image(data := path.read_bytes())
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError, cv2.error):
+        pixels = None
     if pixels is None:
         raise ReconstructError(f"the ego mask {path} is not a readable PNG")
     channels = np.atleast_3d(pixels)

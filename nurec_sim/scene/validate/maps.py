@@ -102,6 +102,9 @@ def _table(contents: Contents, name: str, payload: str) -> list[Any]:
 
     data = contents.read(name, MAX_TABLE_BYTES)
     try:
+        rows = polars.scan_parquet(io.BytesIO(data)).select(polars.len()).collect().item()  # from the file's last bytes
+        if rows > LIMITS.table_rows:
+            raise ArchiveError(f"{name} has {rows:,} rows; at most {LIMITS.table_rows:,} are read")
         table = polars.read_parquet(io.BytesIO(data))
     except (polars.exceptions.PolarsError, OSError, ValueError, polars.exceptions.PanicException) as error:
         raise ArchiveError(f"{name} is no readable parquet table ({str(error)[:200]})") from None
