@@ -1,3 +1,25 @@
-"""nurec_sim: an open closed-loop sensor simulator for driving."""
+"""nurec_sim: an open closed-loop sensor simulator for driving. Its parts are loaded on first use."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+_PARTS = (
+    "client", "client_v1", "conformance", "driving", "errors", "evaluate", "geometry", "logs", "metrics", "network",
+    "plugins", "reconstruct", "render", "report", "runs", "scene", "scene_store", "sensors", "server", "service", "sim",
+    "training", "types", "wire", "world",
+)  # fmt: skip
+__all__ = ["__version__", *_PARTS]
+
+if not TYPE_CHECKING:  # to a type checker they are modules, as ever
+
+    def __getattr__(name: str) -> Any:
+        """Import a part of the package."""
+        if name not in _PARTS:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return import_module(f"{__name__}.{name}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,13 +1,18 @@
 """The command line as a stranger meets it: help, mistakes, exit codes."""
 
 import re
+import rlcompleter
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import nurec_sim
+import nurec_sim.evaluate
+import nurec_sim.render
 from nurec_sim import cli
+from nurec_sim.driving import RemotePolicy
 
 REPO = Path(__file__).parent.parent
 VERBS = [
@@ -178,3 +183,87 @@ def test_a_server_lives_on_beside_a_corrupt_clip(spoilt_clip: Path, tmp_path: Pa
         with RemoteSensors(address, good.id) as remote:
             assert remote.sense([camera_request()])[0].rgb.any()
     assert not list(tmp_path.iterdir())
+
+
+# --------------------------------------------------------------------------------------------------------- first steps
+
+
+def test_version_and_first_steps_need_nothing_heavy(capsys: pytest.CaptureFixture[str]) -> None:
+    cli.main(["--version"])
+    assert capsys.readouterr().out == f"nurec-sim {nurec_sim.__version__}\n"
+    cli.main([])
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 120
+    steps = re.findall(r"^  nurec-sim ([\w-]+)", text, flags=re.MULTILINE)
+    assert steps == ["demo", "inspect", "run"] and set(steps) <= set(VERBS)
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [("rnder", "did you mean 'render'?"), ("inspct", "did you mean 'inspect'?"), ("zzz", "have conformance, ")],
+)
+def test_a_misspelt_verb_is_one_line_that_names_the_nearest(word: str, hint: str, capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main([word, "scene.usdz"])
+    assert stop.value.code == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and f"there is no verb '{word}'; {hint}" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("policy", "text"), [("log_repaly", "unknown policy 'log_repaly'"), ("grpc://127.0.0.1:9", "127.0.0.1:9")]
+)
+def test_a_policy_that_cannot_be_had_ends_a_run_before_its_scenes_are_read(policy, text, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("nurec_sim.scene_store.SceneStore.get", lambda *_, **__: pytest.fail("work was begun"))
+    monkeypatch.setattr("nurec_sim.driving.RemotePolicy.__init__.__kwdefaults__", {
+        **RemotePolicy.__init__.__kwdefaults__, "connect_timeout_s": 0.3,
+    })  # fmt: skip
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["run", str(REPO / "scenarios" / "demo_clip.zip"), "--policies", policy])
+    assert stop.value.code == 1
+    assert text in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------------------- at Python's prompt
+
+
+def test_lazy_packages_list_and_complete_their_names() -> None:
+    import nurec_sim.metrics
+    import nurec_sim.render.gpu
+    import nurec_sim.runs
+    import nurec_sim.world
+
+    assert {"logs", "render", "sim", "runs", "__version__"} <= set(dir(nurec_sim))
+    for package in (nurec_sim.evaluate, nurec_sim.metrics, nurec_sim.render, nurec_sim.render.gpu, nurec_sim.runs,
+                    nurec_sim.world):  # fmt: skip
+        assert dir(package) == sorted(package.__all__)
+    completer = rlcompleter.Completer({"nurec_sim": nurec_sim})
+    assert completer.complete("nurec_sim.metr", 0) == "nurec_sim.metrics"
+    assert completer.complete("nurec_sim.runs.exe", 0).startswith("nurec_sim.runs.execute(")
+
+
+def test_parts_of_the_package_load_on_first_use() -> None:
+    code = (
+        "import sys, nurec_sim; print('numpy' in sys.modules); nurec_sim.geometry.pose; print('numpy' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.split() == ["False", "True"], done.stderr
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = nurec_sim.nothing
+    for name in dir(nurec_sim):
+        assert getattr(nurec_sim, name) is not None
+
+
+def test_scenes_and_rollouts_show_themselves_in_three_lines() -> None:
+    from serving_world import scene
+    from test_runs import full_rollout
+
+    lines = repr(scene()).splitlines()
+    assert lines == [
+        "GaussianScene 'street', 2.00 s from 5000000 us",
+        "  Gaussians: 454 static, 60 dynamic; sky 6x8x8, 2 tracks, no road map",
+        "  cameras: front, wide, fish; LiDARs: roof",
+    ]
+    assert repr(scene().static) == "Gaussians(454, 0 harmonics beyond the colour)"
+    lines = repr(full_rollout()).splitlines()
+    assert len(lines) == 3 and lines[0].startswith("Rollout of ") and max(map(len, lines)) <= 160

@@ -11,6 +11,7 @@ from serving_world import LAST_US
 
 from nurec_sim import cli, geometry, wire
 from nurec_sim.conformance import CHECKS, Target, Verdict, run_checks
+from nurec_sim.conformance.target import CONNECT_S
 from nurec_sim.errors import OutOfRangeError, RequestError, UnsupportedError
 from nurec_sim.service import SensorService
 from nurec_sim.wire import ImageFormat
@@ -252,6 +253,18 @@ def test_the_command_line_lists_its_rules_and_refuses_unknown_checks(capsys):
     assert len(capsys.readouterr().out.splitlines()) == len(CHECKS)
     with pytest.raises(SystemExit):
         cli.main(["conformance", "127.0.0.1:1", "--only", "everything"])
+
+
+def test_an_absent_server_is_one_line_soon(monkeypatch, capsys):
+    assert CONNECT_S < 10
+    monkeypatch.setattr(Target.connect, "__defaults__", (0.3,))
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["conformance", "127.0.0.1:1"])
+    said = capsys.readouterr()
+    assert ended.value.code == 1 and said.out == ""
+    assert said.err == (
+        "nurec-sim: no gRPC server without TLS answers at 127.0.0.1:1 within 0.3 s; is it running there?\n"
+    )
 
 
 def test_an_absent_server_fails_every_check():

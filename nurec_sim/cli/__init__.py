@@ -5,7 +5,18 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+import nurec_sim
+
 __all__ = ["main"]
+
+FIRST_STEPS = """\
+nurec-sim, an open closed-loop sensor simulator for driving. To begin with:
+
+  nurec-sim demo           the whole chain on the log that ships with the package
+  nurec-sim inspect CLIP   what a log of yours holds, and its faults
+  nurec-sim run CLIP       reconstruct it, drive policies through it, report
+
+All verbs: nurec-sim --help; the options of one: nurec-sim VERB --help"""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -15,6 +26,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from nurec_sim.cli import health
 
         health.run(words[1:])
+    elif words == ["--version"]:
+        print(f"nurec-sim {nurec_sim.__version__}")
+    elif not words:
+        print(FIRST_STEPS)
     else:
         from nurec_sim.cli import verbs
 

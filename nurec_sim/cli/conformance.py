@@ -48,6 +48,7 @@ def conformance(
         raise NurecSimError(f"there are no checks {unknown}; have {sorted(CHECKS)}")
     outcomes = []
     with Target(address, scene, timeout_s=timeout_s, allow_changes=changes) as target:
+        target.connect()
         for outcome in run_checks(target, only):
             outcomes.append(outcome)
             if not as_json:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import logging
 import os
@@ -38,12 +39,13 @@ def run(words: list[str]) -> None:
     try:
         if words[:1] == ["serve-grpc"]:
             words[1:] = serving.sort_serve_grpc(words[1:])
+        _check_verb(words)
         try:
             app.cli(
                 prog="nurec-sim",
                 description="An open closed-loop sensor simulator for driving. A log becomes a Gaussian world, a gRPC "
                 "server renders it, policies drive through it, a report says which is better. Start with: nurec-sim "
-                "demo",
+                "demo. `nurec-sim --version` prints the version.",
                 args=words,
             )
         finally:
@@ -67,6 +69,18 @@ def run(words: list[str]) -> None:
     except KeyboardInterrupt:
         err.print(f"interrupted; {KEPT.get(words[0] if words else '', 'nothing half-written was left')}")
         raise SystemExit(130) from None
+
+
+def _check_verb(words: list[str]) -> None:
+    """Names the verb that was meant, and ends with 2, where the first word is none."""
+    known = list(getattr(app, "_subcommands", ()))  # tyro has no public name for them, and a help of its own without
+    if not known or not words or words[0].startswith("-") or words[0] in known:
+        return
+    near = difflib.get_close_matches(words[0], known, n=1, cutoff=0.5)
+    hint = f"did you mean '{near[0]}'?" if near else f"have {', '.join(known)}."
+    text = f"nurec-sim: there is no verb '{words[0]}'; {hint} All of them: nurec-sim --help"
+    err.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
+    raise SystemExit(2)
 
 
 def _forget_output() -> None:

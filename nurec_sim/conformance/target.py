@@ -12,11 +12,14 @@ from jaxtyping import Float64, UInt8
 from nurec_sim import wire
 from nurec_sim.conformance.kit import Failed, Skipped, expect
 from nurec_sim.decoding import TooMuchError, check_image
+from nurec_sim.errors import ServerError
 from nurec_sim.types import Matrix4, Trajectory
 from nurec_sim.wire import ImageFormat, sensorsim
 from nurec_sim.wire.poses import write_poses
 
 HEIGHT_PX = 90
+CONNECT_S = 5.0
+"""For the connection; a server that listens takes a moment, whatever it has to load."""
 
 
 class Target:
@@ -44,6 +47,19 @@ class Target:
                 ("grpc.enable_http_proxy", 0),
             ],
         )
+
+    def connect(self, timeout_s: float = CONNECT_S) -> None:
+        """Waits until something listens at the address.
+
+        Raises:
+            ServerError: nothing does.
+        """
+        try:
+            grpc.channel_ready_future(self.channel).result(timeout=timeout_s)
+        except grpc.FutureTimeoutError:
+            raise ServerError(
+                f"no gRPC server without TLS answers at {self.address} within {timeout_s:g} s; is it running there?"
+            ) from None
 
     def close(self) -> None:
         """Ends the connection."""

@@ -18,3 +18,7 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = importlib.import_module(_HOME[name])
     return module if name == "spec" else getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

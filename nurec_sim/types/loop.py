@@ -134,6 +134,16 @@ class Rollout:
     error: str = ""
     first_closed_loop_us: int = 0
 
+    def __repr__(self) -> str:
+        seconds = (self.states[-1].t_us - self.states[0].t_us) / 1e6 if self.states else 0.0
+        counts = {"states": self.states, "plans": self.plans, "actors": self.actors, "events": self.events}
+        return (
+            f"Rollout of {self.policy!r} in {self.scene_id!r} ({self.reconstruction}), scenario {self.scenario!r}, "
+            f"seed {self.seed}\n"
+            f"  {self.status}{': ' if self.error else ''}{self.error.split(chr(10))[0]}; {seconds:.1f} s\n"
+            f"  {', '.join(f'{len(items)} {name}' for name, items in counts.items())}"
+        )
+
     @property
     def t_us(self) -> Int64[np.ndarray, " t"]:
         """Times of the states."""

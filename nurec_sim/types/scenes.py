@@ -50,6 +50,10 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.mean_m)
 
+    def __repr__(self) -> str:
+        harmonics = 0 if self.sh_rest is None else self.sh_rest.shape[1]
+        return f"Gaussians({len(self):,}, {harmonics} harmonics beyond the colour)"
+
     def __getitem__(self, index: np.ndarray | slice) -> Gaussians:
         fields: dict[str, Any] = {name: getattr(self, name)[index] for name in GAUSSIAN_FIELDS}
         for name in OPTIONAL_GAUSSIAN_FIELDS:
@@ -119,6 +123,9 @@ class DynamicGaussians:
     def __len__(self) -> int:
         return len(self.gaussians)
 
+    def __repr__(self) -> str:
+        return f"DynamicGaussians({len(self):,} of {len(set(self.track.tolist()))} tracks)"
+
     @classmethod
     def concatenate(cls, parts: Sequence[DynamicGaussians]) -> DynamicGaussians:
         """All parts one after the other; a single part stays as it is."""
@@ -186,3 +193,14 @@ class GaussianScene:
     span_us: tuple[int, int]
     camera_times_us: Mapping[str, Int64[np.ndarray, "frames 2"]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        start_us, end_us = self.span_us
+        made = f" by {self.provenance['method']!r}" if "method" in self.provenance else ""
+        return (
+            f"GaussianScene {self.id!r}{made}, {(end_us - start_us) / 1e6:.2f} s from {start_us} us\n"
+            f"  Gaussians: {len(self.static):,} static, {len(self.dynamic):,} dynamic; "
+            f"sky {'x'.join(map(str, np.shape(self.sky)[:3]))}, {len(self.tracks)} tracks, "
+            f"{'no ' if self.road_map is None else ''}road map\n"
+            f"  cameras: {', '.join(self.rig.cameras) or 'none'}; LiDARs: {', '.join(self.rig.lidars) or 'none'}"
+        )

@@ -35,6 +35,9 @@ class Trajectory:
         object.__setattr__(self, "t_us", t_us)
         object.__setattr__(self, "world_from_body", poses)
 
+    def __repr__(self) -> str:
+        return f"Trajectory({len(self.t_us)} poses from {self.start_us} to {self.end_us} us)"
+
     @property
     def start_us(self) -> int:
         """First time."""
