@@ -128,12 +128,11 @@ def test_many_actors_are_read_alike_and_an_error_names_the_one():
         assert text.startswith("dynamic_objects['actor-321'].pose_pair.end_pose.exact must be a rigid transform")
 
 
-def test_a_request_that_is_too_large_is_not_parsed():
+def test_a_request_that_is_too_large_is_not_received():
     with street_server(max_request_bytes=1000) as address, Stub(address) as stub:
         send = stub.channel.unary_unary("/sensorsim.SensorsimService/render_rgb")
         code, text = refusal(send, b"\xff" * 1001)
-        assert code == Code.RESOURCE_EXHAUSTED
-        assert text == "a request may have 1,000 bytes (max_request_bytes), got 1,001"
+        assert code == Code.RESOURCE_EXHAUSTED and "1001 vs. 1000" in text
         assert refusal(send, b"\xff" * 1000)[0] == Code.INVALID_ARGUMENT
 
 

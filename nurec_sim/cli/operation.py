@@ -46,9 +46,9 @@ class OperationFlags:
     max_actors: int | None = None
     """Actors that a request for a frame may place; 4096 if not given."""
     max_request_mb: int | None = None
-    """Megabytes (2^20 bytes) of a request other than an upload; 16 if not given."""
+    """Megabytes (2^20 bytes) of a request, or of a part of an upload; 16 if not given."""
     max_message_mb: int | None = None
-    """Megabytes (2^20 bytes) of a part of an upload, or of a reply; 64 if not given."""
+    """Megabytes (2^20 bytes) of a reply; 64 if not given."""
     device: str = "cpu"
     """What renders: cpu, or a CUDA device such as cuda or cuda:1."""
     workers: int | None = None

@@ -38,7 +38,8 @@ class DriverServer(GrpcServer):
         server_options: ServerOptions | None = None,
     ) -> None:
         chosen = options or DriverOptions()
-        listening = replace(server_options or ServerOptions(), max_message_bytes=chosen.max_message_bytes)
+        size = chosen.max_message_bytes
+        listening = replace(server_options or ServerOptions(), max_request_bytes=size, max_message_bytes=size)
         super().__init__(lambda stop: _Driver(make_policy, chosen, stop), host, port, options=listening)
 
 

@@ -27,8 +27,10 @@ class ServerOptions:
     """Calls that it may make at once after a pause."""
     max_calls: int = 4096
     """Calls in progress; more are refused."""
+    max_request_bytes: int = wire.MAX_MESSAGE_BYTES
+    """Of a message from a client; what is larger is not even received."""
     max_message_bytes: int = wire.MAX_MESSAGE_BYTES
-    """Of a request or a reply."""
+    """Of a message to a client."""
     max_unread_bytes: int = 1 << 30
     """Of replies that their clients have not taken yet; one connection may leave a quarter of it, but one reply
     always."""
@@ -36,7 +38,14 @@ class ServerOptions:
     """Time that calls in progress get to finish when the server stops."""
 
     def __post_init__(self) -> None:
-        for name in ("rate_per_s", "rate_burst", "max_calls", "max_message_bytes", "max_unread_bytes"):
+        for name in (
+            "rate_per_s",
+            "rate_burst",
+            "max_calls",
+            "max_request_bytes",
+            "max_message_bytes",
+            "max_unread_bytes",
+        ):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name} must be above 0, got {value}")

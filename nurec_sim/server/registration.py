@@ -15,7 +15,7 @@ from google.protobuf.descriptor import MethodDescriptor
 
 from nurec_sim import wire
 from nurec_sim.calls import current_call
-from nurec_sim.errors import NurecSimError, TooLargeError
+from nurec_sim.errors import NurecSimError
 from nurec_sim.service import describe
 
 log = logging.getLogger(__name__)
@@ -41,15 +41,12 @@ class Service:
             reply message, or an asynchronous generator of them where the server streams. Errors become a status.
         paths: the names under which it answers; its own if none.
         prepare: awaited before every procedure; what it raises becomes a status too.
-        max_request_bytes: larger requests are refused before they are parsed, which nothing else can interrupt; parts
-            of a stream are not meant. None for any size that the server receives.
     """
 
     name: str
     implementation: Any
     paths: tuple[str, ...] = ()
     prepare: Callable[[], Awaitable[None]] | None = None
-    max_request_bytes: int | None = None
 
 
 def register(server: grpc.aio.Server, service: Service) -> None:
@@ -59,7 +56,7 @@ def register(server: grpc.aio.Server, service: Service) -> None:
         AttributeError: the implementation lacks a procedure.
     """
     handlers = {
-        method.name: _handler(getattr(service.implementation, _python_name(method.name)), method, service)
+        method.name: _handler(getattr(service.implementation, _python_name(method.name)), method, service.prepare)
         for method in wire.pool.FindServiceByName(service.name).methods
     }
     # The package of a message is not on the wire, so one set of handlers serves every spelling of the service.
@@ -72,14 +69,13 @@ def _python_name(procedure: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", procedure).lower()
 
 
-def _handler(procedure: Callable, method: MethodDescriptor, service: Service) -> grpc.RpcMethodHandler:
+def _handler(
+    procedure: Callable, method: MethodDescriptor, prepare: Callable[[], Awaitable[None]] | None
+) -> grpc.RpcMethodHandler:
     """A handler of raw bytes: what cannot be parsed gets an answer of ours, and the gate sees how long a reply is."""
-    kind, prepare = message_factory.GetMessageClass(method.input_type), service.prepare
-    most = None if method.client_streaming else service.max_request_bytes
+    kind = message_factory.GetMessageClass(method.input_type)
 
     def read(data: bytes):
-        if most is not None and len(data) > most:
-            raise TooLargeError(f"a request may have {most:,} bytes (max_request_bytes), got {len(data):,}")
         request = wire.parse(kind, data)
         call = current_call()
         call.scene = call.scene or _scene_of(request)

@@ -32,7 +32,7 @@ class SensorServer(GrpcServer):
         port: 0 picks a free one.
         options: what the service allows.
         scene_options: what the scene service allows.
-        server_options: how it listens, and to whom; the limit of a message is that of ``options``.
+        server_options: how it listens, and to whom; the limits of messages are those of ``options``.
     """
 
     def __init__(
@@ -46,7 +46,11 @@ class SensorServer(GrpcServer):
         server_options: ServerOptions | None = None,
     ) -> None:
         chosen = options or ServiceOptions()
-        listening = replace(server_options or ServerOptions(), max_message_bytes=chosen.max_message_bytes)
+        listening = replace(
+            server_options or ServerOptions(),
+            max_request_bytes=chosen.max_request_bytes,
+            max_message_bytes=chosen.max_message_bytes,
+        )
         super().__init__(lambda stop: _Sensors(store, chosen, scene_options, stop), host, port, options=listening)
 
 
@@ -65,13 +69,8 @@ class _Sensors:
         self._service = SensorService(store, options, request_stop)
         self._scenes = SceneService(store, self._service, scene_options)
         self.services: Sequence[Service] = (
-            Service(wire.SERVICE, self._service, wire.SERVICE_PATHS, self._service.prepare, options.max_request_bytes),
-            Service(
-                wire.SCENE_SERVICE,
-                self._scenes,
-                prepare=self._service.prepare,
-                max_request_bytes=options.max_request_bytes,
-            ),
+            Service(wire.SERVICE, self._service, wire.SERVICE_PATHS, self._service.prepare),
+            Service(wire.SCENE_SERVICE, self._scenes, prepare=self._service.prepare),
         )
 
     async def warm_up(self) -> None:

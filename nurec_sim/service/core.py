@@ -126,6 +126,18 @@ class ServiceCore:
                 f"a frame may have {self._options.max_pixels:,} pixels or beams, got {text} = {count:,}"
             )
 
+    def check_rays(self, rays: int) -> None:
+        """Refuses a call that asks for too many pixels and beams.
+
+        Raises:
+            TooLargeError: how many it may ask for.
+        """
+        if rays > self._options.max_call_rays:
+            raise TooLargeError(
+                f"a call may ask for {self._options.max_call_rays:,} pixels and beams in all (max_call_rays), "
+                f"got {rays:,}; ask for fewer or smaller frames"
+            )
+
     @contextlib.contextmanager
     def spending(self, rays: int) -> Iterator[None]:
         """Counts what the current call costs while it is in progress.
@@ -136,12 +148,8 @@ class ServiceCore:
         Raises:
             TooLargeError: more than a call may ask for, or than its client may together with its other calls.
         """
+        self.check_rays(rays)
         options, client = self._options, current_call().client
-        if rays > options.max_call_rays:
-            raise TooLargeError(
-                f"a call may ask for {options.max_call_rays:,} pixels and beams in all (max_call_rays), got {rays:,}; "
-                "ask for fewer or smaller frames"
-            )
         others = self._asked_rays[client]
         if others and others + rays > options.max_client_rays:
             raise TooLargeError(

@@ -27,9 +27,9 @@ class ServiceOptions:
     max_actors: int = 4096
     """Actors that a request for a frame may place; logs have a few hundred."""
     max_request_bytes: int = 16 << 20
-    """Of a request that is a single message, not a part of an upload; what is larger is not even parsed."""
+    """Of a request, or of a part of an upload; what is larger is not even received."""
     max_message_bytes: int = wire.MAX_MESSAGE_BYTES
-    """Of a part of an upload, or of a reply."""
+    """Of a reply."""
     only_listed_actors: bool = False
     """Whether a request that lists actors hides the controllable ones that it does not list."""
     ego_mask_dir: Path | None = None

@@ -108,6 +108,7 @@ class Rendering(ServiceCore):
     async def batch_render_rgb(self, batch):
         """Several images; what is wrong with one item is said in that item."""
         self._check_batch(len(batch.items))
+        self._check_sizes(item.request for item in batch.items)
         with ExitStack() as held:
             admitted = await asyncio.gather(
                 *(self.admit_camera(item.request, held) for item in batch.items), return_exceptions=True
@@ -139,6 +140,7 @@ class Rendering(ServiceCore):
     async def render_aggregated(self, request):
         """Images and sweeps together; one that fails fails all, there is no place for its error in the reply."""
         self._check_batch(len(request.rgb_requests) + len(request.lidar_requests))
+        self._check_sizes(request.rgb_requests)
         with ExitStack() as held:
             jobs = await _all(self.admit_camera(item, held) for item in request.rgb_requests)
             sweeps = await _all(self.admit_lidar(item, held) for item in request.lidar_requests)
@@ -256,6 +258,10 @@ class Rendering(ServiceCore):
             unknown = sorted(request.actors.keys() - known)
             log.info("scene %s has no %d of the actors listed, as %r", scene.id, len(unknown), unknown[0])
         return actors
+
+    def _check_sizes(self, messages: Iterable[Any]) -> None:
+        """Refuses a call that names more pixels than it may have, before anything of it is read."""
+        self.check_rays(sum(message.resolution_w * message.resolution_h for message in messages))
 
     def _check_images(self, jobs: Iterable[CameraJob]) -> None:
         self.check_reply(sum(job.planar_bytes for job in jobs), "pixels", "or smaller images, or for PNG or JPEG")

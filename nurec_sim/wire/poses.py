@@ -13,8 +13,11 @@ from jaxtyping import Float64, Int64
 
 from nurec_sim import geometry
 from nurec_sim.errors import RequestError
+from nurec_sim.turns import rest
 from nurec_sim.types import Track, Trajectory
 
+_AT_ONCE = 1024
+"""Poses read in a few milliseconds."""
 QUAT_TOLERANCE = 1e-3
 """How far a quaternion's squared norm may be from 1; clients round to float32, AlpaSim itself allows 1e-4."""
 
@@ -36,7 +39,16 @@ def read_poses(messages: Sequence, names: Sequence[str]) -> Float64[np.ndarray, 
 
     Raises:
         RequestError: a value is not finite, a quaternion is not a unit one, or ``exact`` is not a rigid transform.
+        GivenUpError, DeadlinePassedError: see ``turns.rest``.
     """
+    parts = []
+    for first in range(0, len(messages), _AT_ONCE):
+        rest()
+        parts.append(_read_some(messages[first : first + _AT_ONCE], names[first : first + _AT_ONCE]))
+    return np.concatenate([np.zeros((0, 4, 4)), *parts])
+
+
+def _read_some(messages: Sequence, names: Sequence[str]) -> Float64[np.ndarray, "n 4 4"]:
     position = np.array([(m.vec.x, m.vec.y, m.vec.z) for m in messages], np.float64).reshape(-1, 3)
     quat = np.array([(m.quat.w, m.quat.x, m.quat.y, m.quat.z) for m in messages], np.float64).reshape(-1, 4)
     norm2 = np.sum(quat * quat, axis=1)
