@@ -42,6 +42,8 @@ class MadeClip:
     def rig(self) -> Rig:
         return Rig(self.cameras, {})
 
+    time_offset_us = 0
+
     @property
     def span_us(self) -> tuple[int, int]:
         shown = [times for times in self.times.values() if len(times)]

@@ -37,6 +37,7 @@ class Street:
     gains: dict[str, float] = field(default_factory=dict)
     id: str = "street"
     road_map: RoadMap | None = None
+    time_offset_us: int = 0
 
     def __post_init__(self) -> None:
         rows, columns = 32, 360

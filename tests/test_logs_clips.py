@@ -248,3 +248,44 @@ def test_the_documented_example_runs(tmp_path, monkeypatch):
     exec(compile(example, "docs/clip_format.md", "exec"), {})
     clip = logs.open_clip(tmp_path / "my_clip")
     assert clip.frame_count("front") == 1 and logs.check_clip(clip) == []
+
+
+@pytest.mark.parametrize("start_us, offset_us", [(0, 1_000_000), (999_999, 1_000_000), (-2_300_000, 4_000_000)])
+def test_a_log_that_starts_too_early_is_read_later_by_whole_seconds(tmp_path, start_us, offset_us):
+    path = tiny_clip.write(tmp_path / "clip")
+    wanted = logs.open_clip(path)
+    shift = start_us - tiny_clip.START_US
+
+    def move(row: object) -> None:
+        if isinstance(row, dict):
+            for key, value in row.items():
+                if key in ("t_us", "start_us", "end_us"):
+                    row[key] = [t + shift for t in value] if isinstance(value, list) else value + shift
+                else:
+                    move(value)
+        elif isinstance(row, list):
+            for item in row:
+                move(item)
+
+    for name in ("frames.json", "tracks.json"):
+        value = json.loads((path / name).read_text())
+        move(value)
+        (path / name).write_text(json.dumps(value))
+    clip = logs.open_clip(path)
+    assert clip.time_offset_us == offset_us and clip.span_us[0] == start_us + offset_us
+    late_us = start_us + offset_us - tiny_clip.START_US
+    assert clip.span_us[1] == wanted.span_us[1] + late_us
+    assert np.array_equal(clip.ego.t_us, wanted.ego.t_us + late_us)
+    assert np.array_equal(clip.camera_times_us("left"), wanted.camera_times_us("left") + late_us)
+    assert np.array_equal(clip.tracks[0].path.t_us, wanted.tracks[0].path.t_us + late_us)
+    assert np.array_equal(clip.world_from_camera("front", 1), wanted.world_from_camera("front", 1))
+    sweep, same = clip.sweep("top", 1), wanted.sweep("top", 1)
+    assert np.array_equal(sweep.point_t_us, same.point_t_us + late_us) and sweep.t_us == same.t_us + late_us
+    assert np.array_equal(sweep.xyz_world_m, same.xyz_world_m)
+    assert dict(logs.describe_clip(clip).facts)["times"] == f"those of the log and {offset_us} us"
+    assert logs.check_clip(path) == []
+
+
+def test_a_log_that_starts_late_enough_keeps_its_times(tmp_path):
+    clip = logs.open_clip(tiny_clip.write(tmp_path / "clip"))
+    assert clip.time_offset_us == 0 and "times" not in dict(logs.describe_clip(clip).facts)

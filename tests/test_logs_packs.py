@@ -121,6 +121,17 @@ def test_boxes_become_tracks(pack):
     assert np.allclose(person.path.world_from_body[0, :3, :3], tilted(0)[:3, :3] @ tilted(3)[:3, :3])
 
 
+def test_a_pack_that_starts_at_zero_opens(pack):
+    file = pack / "frames.json"
+    file.write_text(file.read_text().replace("1600000000.", "0."))
+    clip = logs.open_clip(pack)
+    assert clip.time_offset_us == 1_000_000
+    assert clip.ego.t_us.tolist() == [1_000_000, 1_100_000]
+    assert clip.camera_times_us("cam")[:, 0].tolist() == [1_010_000, 1_110_000]
+    assert [record.t_us for record in clip.sweep_records("lidar")] == [1_000_000, 1_100_000]
+    assert logs.check_clip(clip) == []
+
+
 def test_exposures_of_zero_length_and_no_faults(pack):
     clip = logs.open_clip(pack)
     times = clip.camera_times_us("cam")

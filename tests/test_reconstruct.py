@@ -179,3 +179,9 @@ def test_progress_names_stages_in_order(street):
     assert stages == ["sweeps", "ground and surfaces", "images", "depth", "colours", "lifting", "sky"]
     told = [fraction for _, fraction in seen]
     assert told == sorted(told) and (told[0], told[-1]) == (0.0, 1.0)
+
+
+def test_the_provenance_says_by_how_much_times_were_moved():
+    moved = reconstruct(Street(frames=1, time_offset_us=1_000_000), settings=SMALL)
+    assert moved.provenance["time_offset_us"] == 1_000_000
+    assert "time_offset_us" not in reconstruct(Street(frames=1), settings=SMALL).provenance

@@ -1,4 +1,4 @@
-"""Verbs about one log or scene: inspect, reconstruct, render."""
+"""Verbs about one log or scene: reconstruct, render."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from nurec_sim.cli.console import OnePath, app, out, print_faults, print_table, progress
-from nurec_sim.cli.validation import inspect_scene
+from nurec_sim.cli.console import OnePath, app, out, print_table, progress
 from nurec_sim.errors import NurecSimError
 from nurec_sim.new_files import check_writable
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
@@ -20,31 +19,6 @@ if TYPE_CHECKING:
 Method = Literal["lift", "dense", "selective"]
 NetworkFlags = Annotated[FeedForwardSettings, tyro.conf.arg(name="")]
 NO_FLAGS = FeedForwardSettings()
-
-
-@app.command
-def inspect(source: OnePath) -> None:
-    """Show what a driving log or a scene archive holds, and check it.
-
-    Prints a table of sensors, rates, spans and boxes, then every fault as one line. Exit status 1 if there are faults.
-
-    Args:
-        source: a clip folder, or a .zip of one (docs/clip_format.md), or a scene archive (.usdz).
-    """
-    from nurec_sim import logs
-    from nurec_sim.logs.describe import SENSOR_COLUMNS
-    from nurec_sim.scene_store.sources import is_archive
-
-    if is_archive(source):
-        return inspect_scene(source)
-    log = logs.open_clip(source)
-    summary = logs.describe_clip(log)
-    print_table(f"clip {log.id}", summary.facts)
-    print_table("sensors", summary.sensors, SENSOR_COLUMNS)
-    with progress("reading every image and sweep"):
-        faults = logs.check_clip(log)
-    print_faults(faults)
-    out.print("no faults")
 
 
 @app.command

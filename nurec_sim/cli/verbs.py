@@ -14,6 +14,7 @@ from nurec_sim.cli import (  # noqa: F401  (each adds its verbs to the app)
     driving,
     evaluation,
     exchange,
+    inspection,
     remote,
     scenes,
     serving,

@@ -46,6 +46,7 @@ class ContextClip:
         shots: the frames of each camera, in time order.
         revolutions: the turns of each LiDAR, in time order.
         tracks: labelled objects; none where the methods shall not have them.
+        time_offset_us: how much later all times are than the log's own.
         road_map: what is known of the road.
     """
 
@@ -56,6 +57,7 @@ class ContextClip:
     shots: Mapping[str, Sequence[Shot]]
     revolutions: Mapping[str, Sequence[Revolution]] = field(default_factory=dict)
     tracks: Sequence[Track] = ()
+    time_offset_us: int = 0
     road_map: RoadMap | None = None
 
     def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from nurec_sim.logs.reader import read_tables
 from nurec_sim.types import Sweep
 
 POINTS_TRIED = 2000
+MOST_THREADS = 4
 FURTHEST_POINT_M = 10_000.0
 
 
@@ -29,33 +31,37 @@ def check_clip(clip: Clip | str | Path) -> list[str]:
             clip = read_tables(clip)
         except ClipError as error:
             return [str(error)]
-    return [*table_faults(clip), *_image_faults(clip), *_sweep_faults(clip)]
+    images = [(clip, name, index) for name in clip.rig.cameras for index in range(clip.frame_count(name))]
+    sweeps = [(clip, name, index) for name in clip.rig.lidars for index in range(clip.sweep_count(name))]
+    faults = table_faults(clip)
+    # Decoding and unpacking let other threads run.
+    with ThreadPoolExecutor(max_workers=min(MOST_THREADS, os.cpu_count() or 1)) as pool:
+        for fault, jobs in ((_image_fault, images), (_sweep_fault, sweeps)):
+            faults += [text for text in pool.map(fault, *zip(*jobs, strict=True)) if text is not None] if jobs else []
+    return faults
 
 
-def _image_faults(clip: Clip) -> Iterator[str]:
-    for name in clip.rig.cameras:
-        for index in range(clip.frame_count(name)):
-            try:
-                clip.image(name, index)
-            except ClipError as error:
-                yield f"camera {name!r} frame {index}: {error}"
+def _image_fault(clip: Clip, name: str, index: int) -> str | None:
+    try:
+        clip.image(name, index)
+    except ClipError as error:
+        return f"camera {name!r} frame {index}: {error}"
+    return None
 
 
-def _sweep_faults(clip: Clip) -> Iterator[str]:
-    for name in clip.rig.lidars:
-        for index, record in enumerate(clip.sweep_records(name)):
-            where = f"LiDAR {name!r} sweep {index} ({record.file})"
-            try:
-                sweep = clip.sweep(name, index)
-            except ClipError as error:
-                yield f"LiDAR {name!r} sweep {index}: {error}"
-                continue
-            if len(sweep.xyz_m) == 0:
-                yield f"{where}: it holds no points"
-            elif np.abs(sweep.xyz_m).max() > FURTHEST_POINT_M:
-                yield f"{where}: a point lies {np.abs(sweep.xyz_m).max():.0f} m away"
-            elif len(clip.rig.cameras) and not _seen(clip, sweep):
-                yield f"{where}: none of its points projects into any camera; a calibration or pose is wrong"
+def _sweep_fault(clip: Clip, name: str, index: int) -> str | None:
+    where = f"LiDAR {name!r} sweep {index} ({clip.sweep_records(name)[index].file})"
+    try:
+        sweep = clip.sweep(name, index)
+    except ClipError as error:
+        return f"LiDAR {name!r} sweep {index}: {error}"
+    if len(sweep.xyz_m) == 0:
+        return f"{where}: it holds no points"
+    if np.abs(sweep.xyz_m).max() > FURTHEST_POINT_M:
+        return f"{where}: a point lies {np.abs(sweep.xyz_m).max():.0f} m away"
+    if len(clip.rig.cameras) and not _seen(clip, sweep):
+        return f"{where}: none of its points projects into any camera; a calibration or pose is wrong"
+    return None
 
 
 def _seen(clip: Clip, sweep: Sweep) -> bool:

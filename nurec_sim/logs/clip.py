@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -14,12 +15,14 @@ from jaxtyping import Float64, Int64, UInt8
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.storage import Storage
 from nurec_sim.logs.sweeps import SweepRecord, read_sweep
-from nurec_sim.types import CameraModel, LidarModel, Rig, RoadMap, Sweep, Track, Trajectory
+from nurec_sim.types import CameraModel, LidarModel, Matrix4, Rig, RoadMap, Sweep, Track, Trajectory
 
 IMAGES_KEPT = 6
 SWEEPS_KEPT = 2
 
 T = TypeVar("T")
+R = TypeVar("R", "ImageRecord", SweepRecord)
+_TIMES = ("start_us", "t_us", "end_us")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +65,9 @@ class Clip:
         ego: poses of the rig.
         tracks: labelled objects; poses are those of box centres in the world.
         road_map: what the log knows of the road, or None.
+        rig_from_log: the log's own ego frame, in which its calibration is written, in the rig frame.
         facts: what else the log says of itself (dataset, licence, source of poses, ...), plain JSON.
+        time_offset_us: how much later all times are than the log's own.
     """
 
     def __init__(
@@ -76,6 +81,7 @@ class Clip:
         sweeps: Mapping[str, Sequence[SweepRecord]],
         storage: Storage,
         facts: Mapping[str, Any],
+        rig_from_log: Matrix4 | None = None,
     ) -> None:
         self.id = id
         self.rig = rig
@@ -83,6 +89,7 @@ class Clip:
         self.tracks = tuple(tracks)
         self.road_map = road_map
         self.facts = dict(facts)
+        self.rig_from_log = np.eye(4) if rig_from_log is None else rig_from_log
         self.storage = storage
         self._images = {name: tuple(records) for name, records in images.items()}
         self._sweeps = {name: tuple(records) for name, records in sweeps.items()}
@@ -90,11 +97,37 @@ class Clip:
         starts = [ego.start_us, *(record.start_us for record in records)]
         ends = [ego.end_us, *(record.end_us for record in records)]
         self._span_us = (min(starts), max(ends) + 1)
+        self.time_offset_us = 0
         self._recent_images = _Recent(IMAGES_KEPT)
         self._recent_sweeps = _Recent(SWEEPS_KEPT)
 
     def __repr__(self) -> str:
         return f"Clip({self.id!r}, cameras={list(self.rig.cameras)}, lidars={list(self.rig.lidars)})"
+
+    def later(self, offset_us: int) -> Clip:
+        """The same log with all its times ``offset_us`` later."""
+
+        def moved(path: Trajectory) -> Trajectory:
+            return Trajectory(path.t_us + offset_us, path.world_from_body)
+
+        def put_off(record: R) -> R:
+            changed = {name: getattr(record, name) + offset_us for name in _TIMES if hasattr(record, name)}
+            return dataclasses.replace(record, **changed)
+
+        clip = Clip(
+            id=self.id,
+            rig=self.rig,
+            ego=moved(self.ego),
+            tracks=[dataclasses.replace(track, path=moved(track.path)) for track in self.tracks],
+            road_map=self.road_map,
+            images={name: [put_off(record) for record in rows] for name, rows in self._images.items()},
+            sweeps={name: [put_off(record) for record in rows] for name, rows in self._sweeps.items()},
+            storage=self.storage,
+            facts=self.facts,
+            rig_from_log=self.rig_from_log,
+        )
+        clip.time_offset_us = self.time_offset_us + offset_us
+        return clip
 
     @property
     def span_us(self) -> tuple[int, int]:

@@ -35,6 +35,7 @@ def describe_clip(clip: Clip) -> ClipSummary:
         ("clip", clip.id),
         ("path", str(clip.storage.path)),
         ("span", f"{start_us} to {end_us} us ({(end_us - start_us) / 1e6:.3f} s)"),
+        *([("times", f"those of the log and {clip.time_offset_us} us")] if clip.time_offset_us else []),
         ("ego", f"{len(clip.ego.t_us)} poses{_rate_text(clip.ego.t_us)}, {path_m:.1f} m driven"),
         ("boxes", f"{sum(len(track.path.t_us) for track in clip.tracks)} in {len(clip.tracks)} tracks"),
         ("tracks", f"{moving} with more than one pose; {_counts(labels)}" if clip.tracks else "none"),

@@ -50,6 +50,7 @@ def read_native(storage: Storage, meta: dict[str, Any]) -> Clip:
         sweeps={name: list(_sweeps(rows, rig.lidars[name], ego, scales[name])) for name, rows in sweeps.items()},
         storage=storage,
         facts={key: value for key, value in meta.items() if key != "schema"},
+        rig_from_log=geometry.inverse(ego_from_rig),
     )
 
 

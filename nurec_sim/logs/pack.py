@@ -83,13 +83,14 @@ def read_pack(storage: Storage, meta: dict[str, Any]) -> Clip:
         sweeps={name: sweeps for name in lidars},
         storage=storage,
         facts=facts,
+        rig_from_log=rig_from_ego,
     )
 
 
 def _microseconds(where: str, row: Any, key: str) -> int:
     seconds = fields.number(where, row, key)
-    if not 1 <= seconds <= LATEST_S:
-        raise ClipError(f"{where}: {key!r} must lie between 1 and {LATEST_S:g} seconds, got {seconds}")
+    if not abs(seconds) <= LATEST_S:
+        raise ClipError(f"{where}: {key!r} must lie within {LATEST_S:g} seconds of 0, got {seconds}")
     return round(seconds * 1e6)
 
 

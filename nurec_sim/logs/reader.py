@@ -7,14 +7,18 @@ from pathlib import Path
 from nurec_sim.errors import ClipError
 from nurec_sim.logs import fields, native, pack, write
 from nurec_sim.logs.clip import Clip
-from nurec_sim.logs.consistency import table_faults
+from nurec_sim.logs.consistency import EARLIEST_US, table_faults
 from nurec_sim.logs.storage import META_FILE, Storage
 
+SECOND_US = 1_000_000
 _READERS = {pack.SCHEMA: pack.read_pack, write.SCHEMA: native.read_native}
 
 
 def open_clip(path: str | Path) -> Clip:
     """Open a driving log: a clip folder, or a zip file of one. Images and sweeps are read when asked for.
+
+    A log that starts before 1 000 000 us, at 0 for instance, is read with all its times later by whole seconds, so
+    that it starts in the second that begins there; ``Clip.time_offset_us`` says by how much.
 
     Raises:
         ClipError: nothing there, an unknown schema, a broken file, or poses and times that contradict themselves; the
@@ -42,7 +46,16 @@ def read_tables(path: str | Path) -> Clip:
         schema = fields.of_kind(META_FILE, meta, "schema", str)
         if schema not in _READERS:
             raise ClipError(f"unknown clip schema {schema!r}; known are {sorted(_READERS)}")
-        return _READERS[schema](storage, meta)
+        return _late_enough(_READERS[schema](storage, meta))
     except ClipError as error:
         # What the storage says begins with the clip's name already.
         raise error if str(error).startswith(f"{name}: ") else ClipError(f"{name}: {error}") from None
+
+
+def _late_enough(clip: Clip) -> Clip:
+    """The clip, put off by whole seconds if it starts too early.
+
+    Times travel as unsigned integers, and clients ask for frames from half a second before the first.
+    """
+    seconds = -((clip.span_us[0] - EARLIEST_US) // SECOND_US)
+    return clip.later(seconds * SECOND_US) if seconds > 0 else clip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -68,9 +69,16 @@ def reconstruct(
     if isinstance(settings, LiftSettings) and method == "lift":
         from nurec_sim.reconstruct.lift.method import lift
 
-        return lift(clip, chosen, held, report, settings)
+        return _timed(clip, lift(clip, chosen, held, report, settings))
     if isinstance(settings, FeedForwardSettings) and method != "lift":
         from nurec_sim.reconstruct.feedforward.method import feedforward
 
-        return feedforward(clip, method, cameras, held, report, settings)
+        return _timed(clip, feedforward(clip, method, cameras, held, report, settings))
     raise ReconstructError(f"method {method!r} takes {wanted.__name__}, got {type(settings).__name__}")
+
+
+def _timed(clip: Clip, scene: GaussianScene) -> GaussianScene:
+    """The scene; where its times are not those of the log, the provenance says so."""
+    if clip.time_offset_us == 0:
+        return scene
+    return dataclasses.replace(scene, provenance={**scene.provenance, "time_offset_us": clip.time_offset_us})

@@ -173,6 +173,11 @@ class CachedClip:
         times = np.concatenate(list(self._times.values()))
         return int(times[:, 0].min()), int(times[:, 1].max()) + 1
 
+    @property
+    def time_offset_us(self) -> int:
+        """None: captures keep their times."""
+        return 0
+
     def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:
         """Exposure start and end of every frame."""
         return self._times[camera_id]

@@ -84,6 +84,11 @@ class ReframedClip:
         """That of the clip."""
         return self._clip.span_us
 
+    @property
+    def time_offset_us(self) -> int:
+        """That of the clip."""
+        return self._clip.time_offset_us
+
     def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:
         """Exposure start and end of every frame; a cut across a rolling shutter shortens it."""
         whole = self._clip.camera_times_us(camera_id)

@@ -93,6 +93,11 @@ class Clip(Protocol):
         """[start, end) of the log; start >= 1_000_000."""
         ...
 
+    @property
+    def time_offset_us(self) -> int:
+        """How much later all times are than those that the log was recorded with; 0 unless it starts too early."""
+        ...
+
     def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:
         """Exposure start and end of every frame; equal when the log knows one time only."""
         ...

@@ -1,0 +1,68 @@
+"""The verb about what a log or a scene archive holds: inspect."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nurec_sim.cli.console import OnePath, app, out, print_faults, print_table, progress
+from nurec_sim.cli.validation import inspect_scene
+from nurec_sim.errors import NurecSimError
+from nurec_sim.new_files import new_file
+
+if TYPE_CHECKING:
+    from nurec_sim.logs import Clip
+
+
+@app.command
+def inspect(source: OnePath, *, overlay: Path | None = None, time_s: float | None = None) -> None:
+    """Show what a driving log or a scene archive holds, and check it.
+
+    Prints a table of sensors, rates, spans and boxes; whether ground, cameras, LiDARs and boxes fit together; then
+    every fault as one line. Exit status 1 if there are faults.
+
+    Args:
+        source: a clip folder, or a .zip of one (docs/clip_format.md), or a scene archive (.usdz).
+        overlay: a PNG to write with LiDAR points (red near, blue far) and boxes over the image of each camera; of
+            clips only.
+        time_s: which time the overlay shows, in seconds after the start of the clip; the middle if not given.
+    """
+    from nurec_sim import logs
+    from nurec_sim.logs.describe import SENSOR_COLUMNS
+    from nurec_sim.scene_store.sources import is_archive
+
+    if time_s is not None and overlay is None:
+        raise NurecSimError("--time-s is the time of the picture that --overlay writes; give both")
+    if time_s is not None and not math.isfinite(time_s):
+        raise NurecSimError(f"--time-s must be a number of seconds, got {time_s}")
+    if is_archive(source):
+        if overlay is not None:
+            raise NurecSimError(f"--overlay draws over the images of a clip; {source} is a scene archive")
+        return inspect_scene(source)
+    log = logs.open_clip(source)
+    summary = logs.describe_clip(log)
+    print_table(f"clip {log.id}", summary.facts)
+    print_table("sensors", summary.sensors, SENSOR_COLUMNS)
+    if overlay is not None:
+        _write_overlay(log, overlay, time_s)
+    with progress("reading every image and sweep"):
+        faults = logs.check_clip(log)
+    with progress("comparing ground, cameras and boxes with the LiDAR"):
+        measures = logs.measure_clip(log)
+    if measures:
+        print_table("do they fit together", [(each.what, each.found) for each in measures])
+    print_faults([*faults, *(fault for each in measures for fault in each.faults)])
+    out.print("no faults")
+
+
+def _write_overlay(log: Clip, path: Path, time_s: float | None) -> None:
+    from nurec_sim import logs
+    from nurec_sim.render.encode import encode_image
+
+    start_us, end_us = log.span_us
+    t_us = (start_us + end_us) // 2 if time_s is None else start_us + round(time_s * 1e6)
+    picture = encode_image(logs.draw_overlay(log, t_us))
+    with new_file(path) as file:
+        file.write(picture)
+    out.print(f"wrote {path}", soft_wrap=True)

@@ -1,0 +1,128 @@
+"""How well LiDAR points and an image fit together at a pose of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from nurec_sim import geometry, sensors
+from nurec_sim.logs.checks.borders import Pairs
+from nurec_sim.logs.checks.sampling import Points
+from nurec_sim.types import CameraModel, Matrix4
+
+WIDEST_PX = 960
+LEVELS = 65
+MOST_PAIRS = 1000
+MOST_PAIRS_OF_ALL = 3000
+FEWEST_IN_IMAGE = 10
+FEWEST_PAIRS = 30
+LEAST_GAIN = 0.02
+"""Real images gain 0.1 to 0.7; below are rounding errors of an image without content."""
+SHIFTS = np.array(
+    [(x * step, y * step) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y for step in (0.03, 0.05, 0.08)]
+)
+"""Where else the points are looked for, as shares of the image's width."""
+FEWEST_SHIFTS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An image and the points measured about when it was taken."""
+
+    camera: CameraModel
+    lab: Float32[np.ndarray, "h w 3"]
+    rig_m: Points
+    pairs: Pairs
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How much better points fit an image where they fall than around that place.
+
+    Attributes:
+        gain: by how much borders of the LiDAR are borders of the image more than elsewhere, in units of log colour
+            difference.
+        errors: the gain in its standard errors; 0 where there is none, or too few points fall into the images.
+    """
+
+    gain: float
+    errors: float
+
+
+def comparable_image(rgb: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """An image as CIELAB colours, at most 960 wide; its lightness is equalised, so that shade and glare count alike."""
+    import cv2
+
+    scale = WIDEST_PX / rgb.shape[1]
+    if scale < 1:
+        rgb = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    lab = cv2.GaussianBlur(cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), (0, 0), 1.0)
+    # The small ramp keeps the quantiles of a flat image increasing.
+    levels = np.quantile(lab[::4, ::4, 0], np.linspace(0, 1, LEVELS)) + 1e-4 * np.arange(LEVELS)
+    lab[..., 0] = np.interp(lab[..., 0], levels, np.linspace(0, 100, LEVELS))
+    return lab
+
+
+def fit(views: Sequence[View], rig_from_camera: Matrix4) -> Fit:
+    """How well the views fit if the camera sits at a pose.
+
+    The colour of the image changes where the LiDAR finds a border and stays where it finds none. The figure is the log
+    colour difference over pairs with a border less that over pairs without one, each less its mean over the same pairs
+    moved by a few percent of the image: a picture that is busy everywhere, or busy at the bottom, gains nothing. Pairs
+    of one patch of directions are not independent; the standard error takes patches for single observations.
+    """
+    most = min(MOST_PAIRS, MOST_PAIRS_OF_ALL // max(len(views), 1))
+    found = [values for view in views if (values := _gains(view, rig_from_camera, most)) is not None]
+    if not found:
+        return Fit(0.0, 0.0)
+    gain, border = np.concatenate([values[0] for values in found]), np.concatenate([values[1] for values in found])
+    patch = np.concatenate(
+        [np.stack([values[2], np.full_like(values[2], n)]) for n, values in enumerate(found)], axis=1
+    )
+    if min(border.sum(), (~border).sum()) < FEWEST_PAIRS:
+        return Fit(0.0, 0.0)
+    means = gain[border].mean(), gain[~border].mean()
+    share = np.where(border, (gain - means[0]) / border.sum(), (means[1] - gain) / (~border).sum())
+    _, number = np.unique(patch, axis=1, return_inverse=True)
+    error = float(np.linalg.norm(np.bincount(number.reshape(-1), share)))
+    difference = float(means[0] - means[1])
+    return Fit(difference, difference / error if abs(difference) > LEAST_GAIN else 0.0)
+
+
+def _gains(
+    view: View, rig_from_camera: Matrix4, most: int
+) -> tuple[Float64[np.ndarray, " n"], np.ndarray, np.ndarray] | None:
+    """Per pair: its colour difference less that around it, whether it is a border, and its patch."""
+    height, width = view.lab.shape[:2]
+    points = geometry.transform_points(geometry.inverse(rig_from_camera), view.rig_m)
+    uv, seen = sensors.project(view.camera, points)
+    seen &= sensors.in_image(view.camera, uv)
+    place = uv * (width / view.camera.width_px, height / view.camera.height_px)
+    pairs = view.pairs
+    inside = seen[pairs.first] & seen[pairs.second]
+    kinds = [np.flatnonzero(inside & pairs.border), np.flatnonzero(inside & ~pairs.border)]
+    if min(len(kind) for kind in kinds) < FEWEST_IN_IMAGE:
+        return None
+    draw = np.random.default_rng(0)
+    chosen = np.concatenate([kind if len(kind) <= most else draw.choice(kind, most, replace=False) for kind in kinds])
+    ends = np.stack([place[pairs.first[chosen]], place[pairs.second[chosen]]])
+    here = _difference(view.lab, ends)
+    around = np.stack([_difference(view.lab, ends + shift * width) for shift in SHIFTS])
+    valid = np.isfinite(around)
+    enough = valid.sum(axis=0) >= FEWEST_SHIFTS
+    mean = np.where(valid, around, 0.0).sum(axis=0)[enough] / valid.sum(axis=0)[enough]
+    return here[enough] - mean, pairs.border[chosen][enough], pairs.block[chosen][enough]
+
+
+def _difference(lab: Float32[np.ndarray, "h w 3"], ends: Float64[np.ndarray, "2 n 2"]) -> Float64[np.ndarray, " n"]:
+    """Log colour difference between both ends of each pair; NaN where one lies outside of the image."""
+    height, width = lab.shape[:2]
+    columns, rows = np.floor(ends).astype(np.int64).transpose(2, 0, 1)
+    inside = ((columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)).all(axis=0)
+    one, two = lab.reshape(-1, 3)[np.where(inside, rows * width + columns, 0)]
+    distance = np.sqrt(np.square(one - two).sum(axis=1))
+    # Differences of 2 and less cannot be seen.
+    return np.where(inside, np.log(distance + 2.0), np.nan)
