@@ -193,7 +193,7 @@ def test_version_and_first_steps_need_nothing_heavy(capsys: pytest.CaptureFixtur
     assert capsys.readouterr().out == f"nurec-sim {nurec_sim.__version__}\n"
     cli.main([])
     text = capsys.readouterr().out
-    assert max(map(len, text.splitlines())) <= 120
+    assert max(map(len, text.splitlines())) <= 80
     steps = re.findall(r"^  nurec-sim ([\w-]+)", text, flags=re.MULTILINE)
     assert steps == ["demo", "inspect", "run"] and set(steps) <= set(VERBS)
 

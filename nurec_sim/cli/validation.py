@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from nurec_sim.cli.console import Paths, app, out, print_table
+from nurec_sim.cli.console import Paths, app, out, print_table, progress
 from nurec_sim.errors import NurecSimError
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from nurec_sim.cli.console import OnePath, app, out, print_faults, print_table
+from nurec_sim.cli.console import OnePath, app, out, print_faults, print_table, progress
 
 weights = tyro.extras.SubcommandApp()
 app.command(
