@@ -143,3 +143,13 @@ def test_lidar_filters(filter):
     assert np.median(np.abs(distance[0] - distance[1])) < 1e-3
     everything = LidarFilter(raydrop_threshold=1.0, opacity_threshold=0.01)
     assert len(beam[0]) < 0.9 * len(Renderer(world).render_lidar(asked, everything).beam)
+
+
+def test_small_gaussians_are_found_while_the_shutter_rolls():
+    """Gaussians of about two pixels, which boxes that are too small by as much would lose."""
+    world = cloud(300, 5, low=(4, -3, -2), high=(8, 3, 2))
+    world = scene(dataclasses.replace(world, scale_m=np.full_like(world.scale_m, 0.04)))
+    asked = request(camera(shutter=Shutter.TOP_TO_BOTTOM), moved(0.0, 0.0, 0.0), moved(0.002, 0.05, 0.0))
+    got, expected = Renderer(world).render_camera(asked), spec.render_camera(world, asked)
+    assert (expected.alpha > 0.3).sum() > 100
+    assert (np.abs(got.alpha - expected.alpha) > 0.02).sum() == 0

@@ -8,8 +8,9 @@ from render_scenes import LENSES, START_US, camera, cloud, gaussians, moved, req
 
 from nurec_sim import geometry, sensors
 from nurec_sim.render import spec
+from nurec_sim.render.layers import drawable
 from nurec_sim.render.unscented import unscented_projection
-from nurec_sim.types import DynamicGaussians, Label, Pinhole, Shutter
+from nurec_sim.types import CameraModel, DynamicGaussians, Label, Pinhole, Shutter
 
 AHEAD = (np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]))
 """Origin and direction of one ray along x."""
@@ -289,3 +290,23 @@ def test_a_gaussian_that_the_lens_does_not_hold_has_no_image():
     )
     assert valid.tolist() == [True, False]
     assert uv[0] == pytest.approx([36, 24], abs=1e-9) and np.isnan(uv[1]).all() and np.isnan(spread[1]).all()
+
+
+def test_the_unscented_covariance_weighs_the_mean_twice():
+    """A Gaussian at 10 m, as long as +-5 m at its points along the axis: u = 0.5 f, f / 3 and f beside its four others.
+
+    In units of f its mean is (1/3 + 1 + 4/2) / 6 = 5/9, its variance 2 (1/18)^2 + (4 (1/18)^2 + (2/9)^2 + (4/9)^2) / 6.
+    """
+    lens = Pinhole(100.0, 100.0, 500.0, 500.0)
+    sensor = CameraModel("front", 1000, 1000, lens, np.eye(4), Shutter.GLOBAL)
+    covariance = np.diag([0.0, 0.0, 25 / 3])[None]
+    uv, spread, _ = unscented_projection(sensor, np.stack([np.eye(4)] * 2), np.array([[5.0, 0.0, 10.0]]), covariance)
+    assert uv[0] == pytest.approx([500 + 100 * 5 / 9, 500])
+    assert spread[0, 0, 0] == pytest.approx(1e4 * (2 / 324 + (4 / 324 + 4 / 81 + 16 / 81) / 6))
+
+
+def test_values_beyond_a_million_million_are_not_drawn():
+    made = gaussians([[5e11, 0, 0], [2e12, 0, 0], [5, 0, 0], [5, 0, 0]])
+    made.scale_m[2] = 2e12
+    made.rgb[3] = 5e11
+    assert drawable(made).tolist() == [True, False, False, True]
