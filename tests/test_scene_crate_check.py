@@ -2,11 +2,15 @@
 
 import io
 import struct
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from scene_worlds import full_scene
 
+from nurec_sim import decoding
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene import crate_arrays
 from nurec_sim.scene.crate_check import check_crate
 from nurec_sim.scene.npy import array_from_npy, npy_bytes
 from nurec_sim.scene.usd_layers import static_layer
@@ -62,7 +66,9 @@ def test_names_that_claim_too_many_bytes(crate):
     (start,) = struct.unpack_from("<Q", crate, entries["TOKENS"] + 16)
     refused(changed(crate, start + 8, 2**40), "its names claim 1,099,511,627,776 bytes")
     old = crate[:8] + bytes([0, 3, 0]) + crate[11:]
-    check_crate(io.BytesIO(changed(old, start + 16, 2**40)), "x")  # before 0.4.0 there is text in this place
+    with pytest.raises(ArchiveError) as caught:  # before 0.4.0 there is text in this place, and fields are not packed
+        check_crate(io.BytesIO(changed(old, start + 16, 2**40)), "x")
+    assert "names claim" not in str(caught.value)
 
 
 @pytest.mark.parametrize("header", [b"{'descr': '<f4', 'shape': (", b"(" * 4000, b"{'descr': '<f4'", b"\xff\xfe"])
@@ -71,3 +77,47 @@ def test_array_headers_that_are_no_python(header):
     bad = good[:8] + struct.pack("<H", len(header)) + header + good[-400:]
     with pytest.raises(ArchiveError, match="x is no array file"):
         array_from_npy(bad, "x")
+
+
+def layer_of(path, values, *, at_times=False):
+    """A layer with one attribute of numbers, that OpenUSD packs if all are whole or few differ."""
+    from pxr import Sdf, Usd, Vt
+
+    stage = Usd.Stage.CreateNew(str(path))
+    attribute = stage.DefinePrim("/a", "Scope").CreateAttribute("opacities", Sdf.ValueTypeNames.FloatArray)
+    for time in (1.0, 2.0) if at_times else (Usd.TimeCode.Default(),):
+        attribute.Set(Vt.FloatArray.FromNumpy(values), time)
+    stage.Save()
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("at_times", [False, True])
+def test_packed_arrays_are_counted_before_they_are_unpacked(tmp_path, monkeypatch, at_times):
+    """5 million zeros make a file of less than 20 kB."""
+    monkeypatch.setattr(decoding, "LIMITS", replace(decoding.LIMITS, free_bytes=1 << 20))
+    data = layer_of(tmp_path / "a.usdc", np.zeros(5_000_000, np.float32), at_times=at_times)
+    assert len(data) < 20_000
+    with pytest.raises(ArchiveError, match=r"x: its packed arrays may unpack to 40,000,000 bytes or more; at most"):
+        check_crate(io.BytesIO(data), "x")
+    sound = layer_of(tmp_path / "b.usdc", np.zeros(50_000, np.float32), at_times=at_times)
+    check_crate(io.BytesIO(sound), "x")
+
+
+def test_what_the_fields_say_is_what_openusd_reads(tmp_path):
+    """An array of 70,000 zeros, found by its word."""
+    data = layer_of(tmp_path / "a.usdc", np.zeros(70_000, np.float32))
+    _, entries = contents(data)
+    (start,) = struct.unpack_from("<Q", data, entries["FIELDS"] + 16)
+    words = crate_arrays._words(io.BytesIO(data), start, tuple(data[8:11]), "x")
+    packed = [word for word in words if word >> 61 == 0b101]
+    assert len(packed) == 1 and packed[0] >> 48 & 255 == 8  # of floats
+    assert crate_arrays._length(io.BytesIO(data), packed[0] & (1 << 48) - 1, tuple(data[8:11]), "x") == 70_000
+
+
+def test_fields_that_cannot_be_unpacked(crate):
+    _, entries = contents(crate)
+    start, length = struct.unpack_from("<QQ", crate, entries["FIELDS"] + 16)
+    (names,) = struct.unpack_from("<Q", crate, start + 8)
+    refused(changed(crate, start + 16 + names, 2**40), "fields claim 1,099,511,627,776 bytes")
+    at = start + 24 + names
+    refused(crate[:at] + b"\0\x0f\xff\xff" + crate[at + 4 :], "its fields cannot be unpacked")

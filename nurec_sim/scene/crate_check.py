@@ -2,15 +2,17 @@
 
 A crate begins with ``PXR-USDC``, 8 bytes of version and the place of its table of contents: a count, then entries of a
 16-byte name, a start and a size. Sections begin with the count of what they hold. All numbers are 64-bit little-endian.
+
+The arrays that its fields name are counted too (``scene.crate_arrays``).
 """
 
 from __future__ import annotations
 
 import os
-import struct
 from typing import BinaryIO
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.crate_arrays import check_arrays, numbers
 
 MAGIC = b"PXR-USDC"
 _MAX_SECTIONS = 64
@@ -31,46 +33,38 @@ def check_crate(file: BinaryIO, where: str) -> None:
     if file.read(len(MAGIC)) != MAGIC:
         return
     version = tuple(file.read(3))
-    (contents,) = _numbers(file, 16, 1, where)
-    (count,) = _numbers(file, contents, 1, where)
+    (contents,) = numbers(file, 16, 1, where)
+    (count,) = numbers(file, contents, 1, where)
     if count > _MAX_SECTIONS:
         raise ArchiveError(f"{where} is no readable USD layer: it claims {count:,} sections")
     for i in range(count):
         at = contents + 8 + 32 * i
         file.seek(at)
         name = file.read(16).rstrip(b"\0")
-        start, length = _numbers(file, at + 16, 2, where)
+        start, length = numbers(file, at + 16, 2, where)
         if start + length > size:
             raise ArchiveError(
                 f"{where} is no readable USD layer: section {name.decode(errors='replace')} ends beyond it"
             )
         if length >= 8:
             _check_section(file, name, start, length, where, packs=version >= _PACKED_SINCE)
+        if name == b"FIELDS" and length >= 8:
+            check_arrays(file, start, version, where)
 
 
 def _check_section(file: BinaryIO, name: bytes, start: int, length: int, where: str, *, packs: bool) -> None:
     """Whether a section can hold what its first numbers claim."""
-    (count,) = _numbers(file, start, 1, where)
+    (count,) = numbers(file, start, 1, where)
     most = count
     if name in _COUNTED:
         most = length * _MAX_RATIO * _INTEGERS_A_BYTE
     elif name == b"STRINGS":
         most = length // 4
     elif name == b"TOKENS" and length >= 24 and packs:
-        unpacked, packed = _numbers(file, start + 8, 2, where)
+        unpacked, packed = numbers(file, start + 8, 2, where)
         most = min(unpacked, (length + 8) * _MAX_RATIO)
         if packed > length or unpacked > (packed + 8) * _MAX_RATIO:
             raise ArchiveError(f"{where} is no readable USD layer: its names claim {unpacked:,} bytes")
     if count > most:
         what = f"section {name.decode(errors='replace')} claims {count:,} entries in {length:,} bytes"
         raise ArchiveError(f"{where} is no readable USD layer: {what}")
-
-
-def _numbers(file: BinaryIO, at: int, count: int, where: str) -> tuple[int, ...]:
-    if at >= 1 << 62:
-        raise ArchiveError(f"{where} is no readable USD layer: it refers to byte {at:,}")
-    file.seek(at)
-    data = file.read(8 * count)
-    if len(data) < 8 * count:
-        raise ArchiveError(f"{where} is no readable USD layer: it breaks off")
-    return struct.unpack(f"<{count}Q", data)
