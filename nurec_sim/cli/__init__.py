@@ -12,7 +12,7 @@ __all__ = ["main"]
 FIRST_STEPS = """\
 nurec-sim, an open closed-loop sensor simulator for driving. To begin with:
 
-  nurec-sim demo           the whole chain on the log that ships with the package
+  nurec-sim demo           the whole chain on the log that comes with it
   nurec-sim inspect CLIP   what a log of yours holds, and its faults
   nurec-sim run CLIP       reconstruct it, drive policies through it, report
 
