@@ -9,6 +9,8 @@ from metrics_worlds import flat_street
 from serving_world import camera_request, scene
 
 from nurec_sim.client import RemoteSensors
+from nurec_sim.report import ReportScene
+from nurec_sim.report.page import _reconstructions
 from nurec_sim.runs.scene_file import record_scene
 from nurec_sim.scene import read_scene, scene_hash, summary, write_scene
 from nurec_sim.scene_store import SceneStore
@@ -83,6 +85,8 @@ def test_the_report_names_what_nobody_labelled():
     (text,) = (text for text in movers.unknown if "unlabelled" in text)
     assert text.startswith("1 unlabelled movers, which no box of the log names, are in the picture but are no actors")
     assert text.endswith(": moving-1 (like automobile, 0.0 to 2.0 s)")
+    shown = _reconstructions([ReportScene("street", "dense", counts=movers.counts)])
+    assert "<dt>actors</dt><dd>1</dd>" in shown and "<dt>unlabelled movers</dt><dd>1</dd>" in shown
     (text,) = (text for text in found.unknown if "labelled" in text)
     assert text.startswith("1 actors were found by how they move and nobody has labelled them")
     assert found.counts["tracks"] == 1 and "unlabelled movers" not in found.counts and found.actors_known
