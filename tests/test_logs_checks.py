@@ -144,8 +144,9 @@ def test_the_ground_is_measured(height_m, slope):
 def test_walls_and_ceilings_are_no_ground():
     points = street(0.0, (0.0, 0.0))
     assert ground.find_ground(points[points[:, 1] == 5.5], BODY) is None
-    # A ceiling stands out, but the street lies below it.
-    ceiling = np.column_stack([points[:1000, :2], np.full(1000, 2.5)])
+    # A ceiling is larger, but the street lies below it.
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-10.0, 13.0, 0.25), np.arange(-5.9, 5.9, 0.25)))
+    ceiling = np.column_stack([x, y, np.full(len(x), 2.5)])
     found = ground.find_ground(np.concatenate([points, ceiling]), BODY)
     assert found is not None and abs(found.height_m) < 0.01
 
@@ -255,7 +256,7 @@ def test_inspect_says_what_fits_and_fails_on_what_does_not(tmp_path, capsys):
 
 
 @pytest.mark.realdata
-@pytest.mark.parametrize("name", ["kitti_raw_0002", "ddad_6cam", "ddad_3cam_static", "nuscenes_6cam_1frame"])
+@pytest.mark.parametrize("name", ["kitti_raw_0002", "ddad_6cam", "nuscenes_6cam_1frame"])
 def test_real_packs_fit_together_until_they_are_spoilt(realdata, spoil, name):
     clip = logs.open_clip(realdata / name)
     sampled = sample_sweeps(clip)
