@@ -113,7 +113,6 @@ def test_a_frame_may_place_so_many_actors(make):
 
 
 def test_many_actors_are_read_alike_and_an_error_names_the_one():
-    """Above a few, they are read in the client's turn."""
     pose = geometry.pose_from_xyyaw(9.0, 1.0, 0.3)
     message = camera_message()
     for k in range(500):

@@ -23,8 +23,6 @@ T = TypeVar("T")
 
 _LOADING_THREADS = 4
 _FETCHING_THREADS = 4  # of their own, so that a slow web does not hold up scenes that are here
-_FEW_ACTORS = 64
-"""A request with no more is read at once: that takes less than a millisecond."""
 
 
 class ServiceCore:
@@ -46,7 +44,7 @@ class ServiceCore:
         self._closing = False
         self._loading = ThreadPoolExecutor(_LOADING_THREADS, thread_name_prefix="scene")
         self._fetching = ThreadPoolExecutor(_FETCHING_THREADS, thread_name_prefix="fetch")
-        self._reading = ThreadPoolExecutor(1, thread_name_prefix="request")
+        self._reading = RenderQueue(1)  # one at a time, for what is read holds Python's lock, which all need
         self.renders = RenderQueue(options.render_workers)
         self._asked_rays: Counter[tuple[str, ...]] = Counter()
         """Pixels and beams of calls in progress, by client."""
@@ -56,8 +54,9 @@ class ServiceCore:
         self._closing = True
         for load in self._loads.values():
             load.cancel()
+        self._reading.close()
         self.renders.close()
-        for executor in (self._reading, self._loading, self._fetching):
+        for executor in (self._loading, self._fetching):
             executor.shutdown(wait=True, cancel_futures=True)
 
     async def prepare(self) -> None:
@@ -110,15 +109,12 @@ class ServiceCore:
             raise TooLargeError(f"a batch may have {self._options.max_batch_items} items, got {count}")
 
     async def _read(self, actors: int, function: Callable[..., T], *arguments) -> T:
-        """What reading a request gives; one with many actors waits for its client's turn."""
+        """What reading a request gives, when it is its client's turn."""
         if actors > self._options.max_actors:
             raise TooLargeError(
                 f"a frame may place {self._options.max_actors:,} actors (max_actors), got {actors:,} dynamic_objects"
             )
-        if actors > _FEW_ACTORS:
-            return await self.renders.run(actors, function, *arguments)
-        result: T = await self._run(self._reading, function, *arguments)
-        return result
+        return await self._reading.run(actors, function, *arguments)
 
     def _check_pixels(self, count: int, text: str) -> None:
         if count > self._options.max_pixels:
