@@ -174,7 +174,7 @@ def test_clients_may_stop_a_server_that_allows_it():
 
 
 def test_a_message_beyond_the_limit_is_refused():
-    with street_stub(max_message_bytes=1 << 20) as stub:
+    with street_stub(max_request_bytes=1 << 20, max_message_bytes=1 << 20) as stub:
         message = camera_message()
         message.camera_intrinsics.temporary_camera_spec = "x" * (2 << 20)
         assert refusal(stub.render_rgb, message)[0] == Code.RESOURCE_EXHAUSTED

@@ -90,7 +90,9 @@ def test_who_calls_too_often_is_told_and_health_is_not_counted():
         assert {health.Check(health_pb2.HealthCheckRequest(), timeout=10).status for _ in range(20)} == {1}
 
 
-@pytest.mark.parametrize("name", ["rate_per_s", "rate_burst", "max_calls", "max_message_bytes", "max_unread_bytes"])
+@pytest.mark.parametrize(
+    "name", ["rate_per_s", "rate_burst", "max_calls", "max_request_bytes", "max_message_bytes", "max_unread_bytes"]
+)
 def test_limits_must_let_something_through(name):
     with pytest.raises(ValueError, match=f"{name} must be above 0, got 0"):
         ServerOptions(**{name: 0})
