@@ -1,6 +1,7 @@
 """Named scenes for the tests of the archive: small, and with one of everything."""
 
 import numpy as np
+import shapely
 
 from nurec_sim import geometry
 from nurec_sim.sensors import lidar_model
@@ -114,9 +115,9 @@ def full_scene(sh_terms: int = 8) -> GaussianScene:
         Track("1/car", "automobile", (4.5, 1.9, 1.6), curved_path(9)),
         Track("1:car", "person", (0.6, 0.7, 1.8), still, controllable=False),
     ]
-    square = np.array([[0.0, -9.0], [60.0, -9.0], [60.0, 9.0], [0.0, 9.0]])
-    hole = np.array([[10.0, -1.0], [10.0, 1.0], [12.0, 0.0]])
-    lane = np.column_stack([np.linspace(0, 50, 26), np.sin(np.linspace(0, 3, 26)), np.linspace(0, 1, 26)])
+    lane = curved_path().position_m
+    street = np.array(shapely.LineString(lane[::8, :2]).buffer(4.0, cap_style="square").exterior.coords)[:-1]
+    hole = np.array([[18.0, 1.5], [19.0, 2.0], [19.0, 3.0]])
     lidars = {name: lidar_model(name, FRONT.copy(), id=name, columns=90) for name in ("VLP-16", "PANDAR128")}
     return GaussianScene(
         id="clip-é \"7\"",
@@ -127,10 +128,10 @@ def full_scene(sh_terms: int = 8) -> GaussianScene:
         rig=Rig(cameras(), lidars, Box((1.4, 0.01, 0.75), (4.9, 1.9, 1.5))),
         ego=curved_path(),
         tracks=tracks,
-        road_map=RoadMap(((square, hole), (square + 100,)), (lane,)),
+        road_map=RoadMap(((street, hole), (hole * 3 + 100,)), (lane,)),
         span_us=(START_US, END_US),
         camera_times_us={"front": START_US + np.array([[0, 30_000], [100_000, 130_000]]),
-                         "roof": START_US + np.array([[5, 5]])},
+                         "roof": START_US + np.array([[60_005, 60_005]])},
         provenance={"method": "lift", "settings": {"voxel_m": 0.1, "names": ["a", None, True, 3]}},
     )  # fmt: skip
 

@@ -107,6 +107,14 @@ def clipgt(drop=(), **tables):
     return spoil
 
 
+def xodr(shape, width, y=0.0):
+    """A straight lane along x, about y."""
+    return f"""<OpenDRIVE><header><geoReference>+lat_0=0 +lon_0=0</geoReference></header><road id="0" junction="-1">
+<planView><geometry s="0" x="-5" y="{y + width / 2}" hdg="0" length="60">{shape}</geometry></planView><lanes>
+<laneSection s="0"><right><lane id="-1" type="driving"><width sOffset="0" a="{width}" b="0" c="0" d="0"/></lane></right>
+</laneSection></lanes></road></OpenDRIVE>""".encode()
+
+
 def both(*rules):
     return {f"{consumer} {rule}" for rule in rules for consumer in ("alpasim", "carla")}
 
@@ -166,8 +174,9 @@ SIDECAR_BREAKS: dict[str, tuple[Spoil, set[str]]] = {
     "a frame twice": (frames([[START_US + 9, START_US + 10]] * 2), {"alpasim frame-times"}),
     "frames of floats": (frames([[START_US + 0.5, START_US + 10.5]]), {"alpasim frame-times"}),
     "all frames too late": (frames([[OUT_OF_PATH, OUT_OF_PATH + 9]]), {"alpasim first-frame"}),
-    "some frames too late": (frames([[START_US + 9, START_US + 10], [OUT_OF_PATH, OUT_OF_PATH + 9]]),
+    "some frames too late": (frames([[START_US + 60_009, START_US + 60_010], [OUT_OF_PATH, OUT_OF_PATH + 9]]),
                              {"alpasim frames-inside"}),
+    "a first frame at once": (frames([[START_US + 9, START_US + 49_999]]), {"alpasim shutter-room"}),
     "no box": (drive(lambda t: t.pop("rig_bbox")), {"alpasim rig-box"}),
     "the box is null": (drive(lambda t: t.update(rig_bbox=None)), {"alpasim rig-box"}),
     "a flat box": (drive(lambda t: t["rig_bbox"].update(dim=[4.0, 0.0, 1.0])), {"alpasim rig-box"}),
@@ -203,7 +212,12 @@ SIDECAR_BREAKS: dict[str, tuple[Spoil, set[str]]] = {
     "a map that is nowhere": (put("map.xodr", b"<OpenDRIVE><road/></OpenDRIVE>"), {"alpasim xodr", "carla map-origin"}),
     "a map without an origin": (
         put("map.xodr", b"<OpenDRIVE><header><geoReference>+proj=utm</geoReference></header><road/></OpenDRIVE>"),
-        {"carla map-origin"}),
+        {"alpasim xodr-lanes", "carla map-origin"}),
+    "a map of cubics": (put("map.xodr", xodr("<paramPoly3/>", 3.5)), {"alpasim xodr-lanes"}),
+    "a map elsewhere": (put("map.xodr", xodr("<line/>", 3.5, y=500)),
+                        {"alpasim lane-under-path", "alpasim offroad-agrees"}),
+    "a lane as wide as half a car": (put("map.xodr", xodr("<line/>", 1.0)),
+                                     {"alpasim lane-under-path", "alpasim offroad-on-path", "alpasim offroad-agrees"}),
     "a good clipgt": (clipgt(), set()),
     "a clipgt and no base frame": (lambda m: edit(RIG, lambda d: d.pop("T_world_base"))(clipgt()(m)),
                                    {"carla base-frame"}),

@@ -23,8 +23,9 @@ from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
 from nurec_sim.metrics import build_offroad_grid, judge_footprints, offroad_agreement, score_rollout
 from nurec_sim.metrics.ground import fit_ground
-from nurec_sim.metrics.offroad import Verdict, corners_outside_m, debounced, drivable_area
+from nurec_sim.metrics.offroad import Verdict, corners_outside_m, debounced
 from nurec_sim.metrics.offroad_grid import Cell, OffroadGrid, driven_path
+from nurec_sim.scene.road_area import drivable_area
 from nurec_sim.types import Label, RoadMap
 
 BODY = rig().body

@@ -28,6 +28,7 @@ def reconstruct(
     out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     method: Method = "lift",
     cameras: tuple[str, ...] = (),
+    map_from_gaussians: bool = False,
     overwrite: bool = False,
     network: NetworkFlags = NO_FLAGS,
 ) -> None:
@@ -42,6 +43,8 @@ def reconstruct(
         out_path: the archive to write; CLIP's name with .usdz in the current folder if not given.
         method: how to reconstruct.
         cameras: use only these cameras; all if not given, or as many as the network's profile takes.
+        map_from_gaussians: for a log without a map, give other simulators one (map.xodr) whose drivable area is that of
+            the road-class Gaussians; without it they get none.
         overwrite: replace an archive that is there.
         network: how the clip goes through the network.
     """
@@ -57,8 +60,15 @@ def reconstruct(
         world_scene = run_method(
             log, method, cameras=cameras or None, progress=advance, settings=network_settings(method, network)
         )
+    derived = None
+    if map_from_gaussians and world_scene.road_map is None:
+        from nurec_sim.metrics.offroad_grid import road_map_of_grid, scene_offroad_grid
+
+        derived = road_map_of_grid(scene_offroad_grid(world_scene))
+        told = {"map_xodr": "drivable area from the road-class Gaussians, lane along the recorded path; not surveyed"}
+        world_scene = dataclasses.replace(world_scene, provenance={**world_scene.provenance, **told})
     with progress(f"writing {target.name}"):
-        scene.write_scene(world_scene, target, overwrite=overwrite)
+        scene.write_scene(world_scene, target, overwrite=overwrite, derived_map=derived)
     print_table(f"scene {world_scene.id}", scene.summary(world_scene))
     for text in world_scene.provenance.get("unknown", ()):
         out.print(f"not known: {text}", markup=False)

@@ -17,6 +17,7 @@ from nurec_sim import geometry
 from nurec_sim.metrics.boxes import body_boxes
 from nurec_sim.metrics.offroad_grid import OffroadGrid
 from nurec_sim.metrics.series import make_series, times_of, unknown_series
+from nurec_sim.scene.road_area import drivable_area
 from nurec_sim.types import Box, RoadMap, Rollout, Series, Trajectory
 
 TOLERANCE_M = 0.3
@@ -114,14 +115,6 @@ def true_offroad_series(rollout: Rollout, road_map: RoadMap | None) -> Series:
             return unknown_series("offroad_true", t_us)
     values, valid = debounced(np.where(outside, Verdict.OFF, Verdict.ON))
     return make_series("offroad_true", t_us, values, valid)
-
-
-def drivable_area(road_map: RoadMap):
-    """The union of the map's drivable polygons as one shapely geometry."""
-    import shapely
-
-    polygons = [shapely.Polygon(rings[0], [ring for ring in rings[1:]]) for rings in road_map.drivable]
-    return shapely.union_all(shapely.make_valid(np.array(polygons, dtype=object)))
 
 
 def corners_outside_m(area, world_from_rig: Float64[np.ndarray, "n 4 4"], body: Box) -> Float64[np.ndarray, " n"]:

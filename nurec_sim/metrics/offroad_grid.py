@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
 from nurec_sim.metrics.ground import GroundHeights, fit_ground
-from nurec_sim.types import Box, Gaussians, GaussianScene, Label, Trajectory
+from nurec_sim.types import Box, Gaussians, GaussianScene, Label, RoadMap, Trajectory
 
 FAR_M = 1e6
 """Distance to something that is nowhere on the grid."""
@@ -165,6 +165,22 @@ def build_offroad_grid(
 def scene_offroad_grid(scene: GaussianScene, settings: GridSettings | None = None) -> OffroadGrid:
     """The grid of a reconstructed scene; see ``build_offroad_grid``."""
     return build_offroad_grid(scene.static, scene.ego, scene.rig.body, settings)
+
+
+def road_map_of_grid(grid: OffroadGrid, smooth_m: float = 0.2) -> RoadMap:
+    """The road cells as drivable polygons, their steps smoothed; no lanes. Unknown cells are not drivable."""
+    import shapely
+
+    road = np.pad((grid.state == Cell.ROAD).astype(np.int8), ((0, 0), (1, 1)))
+    row, start = np.nonzero(np.diff(road, axis=1) == 1)
+    _, stop = np.nonzero(np.diff(road, axis=1) == -1)
+    x0, y0 = grid.origin_m
+    cell = grid.cell_m
+    area = shapely.union_all(shapely.box(x0 + start * cell, y0 + row * cell, x0 + stop * cell, y0 + (row + 1) * cell))
+    area = shapely.buffer(shapely.buffer(area, -smooth_m), smooth_m).simplify(cell / 2)
+    polygons = [polygon for polygon in shapely.get_parts(area) if polygon.geom_type == "Polygon"]
+    rings = [(polygon.exterior, *polygon.interiors) for polygon in polygons]
+    return RoadMap(tuple(tuple(np.array(ring.coords)[:-1, :2] for ring in each) for each in rings))
 
 
 def driven_path(ego: Trajectory, body: Box, step_m: float = 0.05) -> Float64[np.ndarray, "k 3"]:

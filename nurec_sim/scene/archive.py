@@ -37,7 +37,7 @@ from nurec_sim.scene.usd_layers import (
     static_layer,
 )
 from nurec_sim.scene.zip_package import Package, write_package
-from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label
+from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, RoadMap
 
 FORMAT_VERSION = 1
 MANIFEST = "nurec_sim/manifest.json"
@@ -53,13 +53,16 @@ SCENE_SUFFIXES = (".usdz", *FOREIGN_SUFFIXES)
 """Names of files that ``read_scene`` opens end in one of these, in capitals or not."""
 
 
-def write_scene(scene: GaussianScene, path: Path | str, *, overwrite: bool = False) -> Path:
+def write_scene(
+    scene: GaussianScene, path: Path | str, *, overwrite: bool = False, derived_map: RoadMap | None = None
+) -> Path:
     """Writes a scene archive; the file appears complete or not at all.
 
     Args:
         scene: what to write; checked first.
         path: ends in ``.usdz``; its folder is made if need be.
         overwrite: whether an existing file may be replaced.
+        derived_map: a map for other simulators (``map.xodr``) that is no part of the scene, for one without a map.
 
     Returns:
         The path.
@@ -81,7 +84,7 @@ def write_scene(scene: GaussianScene, path: Path | str, *, overwrite: bool = Fal
         ACTORS_LAYER: actors_layer(scene),
         CAMERAS_LAYER: cameras_layer(scene, fits),
         SKY_TEXTURE: latlong_exr(scene.sky),
-        **sidecars(scene, digest, fits),
+        **sidecars(scene, digest, fits, derived_map),
         FACTS: codec.dump(scene_facts(scene), FACTS),
         ISP: codec.dump(scene.isp, ISP, indent=2),
         SKY: npy_bytes(scene.sky),

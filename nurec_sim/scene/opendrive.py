@@ -1,27 +1,32 @@
-"""An OpenDRIVE map (``map.xodr``): one single-lane road per lane centre line, or along the recorded path.
+"""An OpenDRIVE map (``map.xodr``) of a scene's drivable area and lanes, in ``<line>`` and ``<arc>`` only.
 
-Reference lines are chains of cubic pieces (``paramPoly3``, parameter 0..1) through points of the line, so positions
-and headings are continuous; heights are cubic pieces in arc length. Map coordinates equal world coordinates: the
-geo-reference names the same origin as ``T_world_base`` of ``rig_trajectories.json``. Logs carry no geodetic position,
-so that origin is latitude 0, longitude 0.
+``opendrive_layout`` says which roads there are; their widths are constant and heights are linear between knots. Map
+coordinates equal world coordinates: the geo-reference names the same origin as ``T_world_base`` of
+``rig_trajectories.json``. Logs carry no geodetic position, so that origin is latitude 0, longitude 0.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 from jaxtyping import Float64
 
-from nurec_sim.geometry import arc_length
-from nurec_sim.types import GaussianScene
+from nurec_sim.scene.opendrive_curves import resampled, sampled
+from nurec_sim.scene.opendrive_road import LANE_WIDTH_M, SEAL_M, LaidRoad
+from nurec_sim.scene.road_area import drivable_area
+from nurec_sim.types import RoadMap, Trajectory
 
-LANE_WIDTH_M = 3.5
-KNOT_SPACING_M = 2.0
-MIN_ROAD_M = 10.0
+HEIGHT_KNOT_M = 5.0
+HEIGHT_NEIGHBOURS = 4
+JOINT_M = 1e-6
+"""Pieces end this much before the next one starts: rounding must not make borders go backwards at a joint."""
 GEO_REFERENCE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +alt_0=0 +no_defs"
 _WGS84_RADIUS_M = 6378137.0
+Heights = Callable[[Float64[np.ndarray, "n 2"]], Float64[np.ndarray, " n"]]
 
 
 def world_to_ecef() -> Float64[np.ndarray, "4 4"]:
@@ -31,134 +36,111 @@ def world_to_ecef() -> Float64[np.ndarray, "4 4"]:
     )
 
 
-def opendrive_map(scene: GaussianScene) -> bytes:
-    """``map.xodr`` of a scene, in UTF-8."""
-    lanes = scene.road_map.lanes if scene.road_map is not None else ()
-    lines = [
-        line for line in (_clean_line(lane) for lane in lanes if len(lane)) if arc_length(line)[-1] >= KNOT_SPACING_M
-    ]
-    if not lines:
-        lines = [recorded_path(scene)]
-    root = ElementTree.Element("OpenDRIVE")
-    corners = np.concatenate(lines)
-    bounds = {
-        "north": corners[:, 1].max(), "south": corners[:, 1].min(),
-        "east": corners[:, 0].max(), "west": corners[:, 0].min(),
-    }  # fmt: skip
-    title = {"revMajor": "1", "revMinor": "6", "name": _plain(scene.id), "vendor": "nurec_sim"}
-    header = ElementTree.SubElement(root, "header", title | {name: _text(value) for name, value in bounds.items()})
-    ElementTree.SubElement(header, "geoReference").text = GEO_REFERENCE
-    for number, line in enumerate(lines):
-        _add_road(root, str(number), line)
+def opendrive_map(name: str, road_map: RoadMap, ego: Trajectory) -> bytes | None:
+    """``map.xodr`` in UTF-8, None if the map has neither an area nor a lane to drive on.
+
+    Args:
+        name: of the scene.
+        road_map: without drivable areas every lane counts as ``LANE_WIDTH_M`` wide; without lanes the recorded path
+            is one.
+        ego: the recorded path, whose origin lies on the ground.
+    """
+    from nurec_sim.scene.opendrive_layout import laid_out  # shapely takes a while
+
+    lanes = [lane for lane in road_map.lanes if len(lane) > 1 and np.ptp(lane[:, :2], axis=0).max() > 0]
+    area = drivable_area(road_map) if road_map.drivable else _area_of_lanes(lanes)
+    path = ego.position_m
+    if not lanes and np.ptp(path[:, :2], axis=0).max() > 0:
+        lanes = [path]
+    roads = laid_out(area, lanes, path) if area is not None and not area.is_empty else []
+    if not roads:
+        return None
+    heights = _heights([*lanes, path])
+    root = Element("OpenDRIVE")
+    west, south, east, north = area.bounds
+    header = SubElement(root, "header", revMajor="1", revMinor="6", name=_plain(name), vendor="nurec_sim",
+                        north=_text(north), south=_text(south), east=_text(east), west=_text(west))  # fmt: skip
+    SubElement(header, "geoReference").text = GEO_REFERENCE
+    for number, road in enumerate(roads):
+        _add_road(root, str(number), road, heights)
     ElementTree.indent(root)
     xml = ElementTree.tostring(root, encoding="unicode")
     xml = xml.replace(GEO_REFERENCE, f"<![CDATA[{GEO_REFERENCE}]]>")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{xml}\n'.encode()
 
 
-def recorded_path(scene: GaussianScene) -> Float64[np.ndarray, "k 3"]:
-    """The path of the rig; a car that hardly moved gets a straight road through where it stands."""
-    line = _clean_line(scene.ego.position_m)
-    length = arc_length(line)[-1]
-    if length >= MIN_ROAD_M:
-        return line
-    if length < KNOT_SPACING_M:
-        pose = scene.ego.world_from_body[0]
-        along = np.array([-MIN_ROAD_M / 2, 0.0, MIN_ROAD_M / 2])
-        return pose[:3, 3] + along[:, None] * pose[:3, 0]
-    step = line[-1] - line[-2]
-    ahead = line[-1] + step / np.linalg.norm(step) * (MIN_ROAD_M - length)
-    return np.concatenate([line, ahead[None]])
+def _area_of_lanes(lanes: list[Float64[np.ndarray, "k 3"]]):
+    """The area of lanes of the usual width."""
+    import shapely
+
+    bands = [shapely.LineString(lane[:, :2]).buffer(LANE_WIDTH_M / 2, cap_style="flat") for lane in lanes]
+    return shapely.union_all(bands) if bands else None
 
 
-def _clean_line(line: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "k 3"]:
-    """Points at least ``KNOT_SPACING_M`` apart: standing still and jitter leave no knots."""
-    points = np.asarray(line, np.float64)
-    kept = [0]
-    for index in range(1, len(points)):
-        if np.linalg.norm(points[index, :2] - points[kept[-1], :2]) >= KNOT_SPACING_M:
-            kept.append(index)
-    last = len(points) - 1
-    if len(kept) > 1 and kept[-1] != last:
-        kept[-1] = last  # end where the line ends
-    return points[kept]
+def _heights(lines: list[Float64[np.ndarray, "k 3"]]) -> Heights:
+    """Ground heights: the mean of the nearest known ones, nearer ones counting more."""
+    from scipy.spatial import cKDTree
+
+    known = np.concatenate([resampled(line, 1.0) if len(line) > 1 else line for line in lines])
+    tree = cKDTree(known[:, :2])
+
+    def heights(xy: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, " n"]:
+        distance, index = tree.query(xy, k=min(HEIGHT_NEIGHBOURS, len(known)))
+        weight = 1 / (distance.reshape(len(xy), -1) ** 2 + 1e-4)
+        return (known[index, 2].reshape(len(xy), -1) * weight).sum(axis=1) / weight.sum(axis=1)
+
+    return heights
 
 
-def _headings(line: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, " k"]:
-    """Heading at every point: that of the circle through it and its neighbours."""
-    step = np.diff(line[:, :2], axis=0)
-    chord = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    if len(chord) == 1:
-        return np.repeat(chord, 2)
-    length = np.linalg.norm(step, axis=1)
-    inner = (chord[:-1] * length[1:] + chord[1:] * length[:-1]) / (length[:-1] + length[1:])
-    return np.concatenate([[2 * chord[0] - inner[0]], inner, [2 * chord[-1] - inner[-1]]])
+def _add_road(root: Element, number: str, laid: LaidRoad, heights: Heights) -> None:
+    total = _text(laid.length_m)
+    road = SubElement(root, "road", name=f"{laid.lane} {number}", length=total, id=number, junction="-1")
+    SubElement(road, "type", s="0", type="town")
+    plan = SubElement(road, "planView")
+    s = 0.0
+    for piece in laid.reference:
+        (x, y), heading = piece.xy, piece.heading_rad
+        place = {"s": s, "x": x, "y": y, "hdg": heading, "length": piece.length_m - JOINT_M}
+        geometry = SubElement(plan, "geometry", {key: _text(value) for key, value in place.items()})
+        if piece.curvature_per_m == 0.0:
+            SubElement(geometry, "line")
+        else:
+            SubElement(geometry, "arc", curvature=_text(piece.curvature_per_m))
+        s += piece.length_m
+    _add_heights(SubElement(road, "elevationProfile"), laid, heights)
+    lanes = SubElement(SubElement(road, "lanes"), "laneSection", s="0")
+    sealed_left, sealed_right = laid.sealed
+    if sealed_left:
+        _add_lane(SubElement(lanes, "left"), 1, "none", SEAL_M)
+    SubElement(SubElement(lanes, "center"), "lane", id="0", type="none", level="false")
+    right = SubElement(lanes, "right")
+    _add_lane(right, -1, laid.lane, laid.width_m)
+    if sealed_right:
+        _add_lane(right, -2, "none", SEAL_M)
 
 
-def _add_road(root: ElementTree.Element, number: str, line: Float64[np.ndarray, "k 3"]) -> None:
-    headings = _headings(line)
-    pieces = [_cubic(line[i, :2], line[i + 1, :2], headings[i], headings[i + 1]) for i in range(len(line) - 1)]
-    lengths = np.array([length for _, _, length in pieces])
-    start_m = np.concatenate([[0.0], np.cumsum(lengths)])
-
-    total = _text(start_m[-1])
-    road = ElementTree.SubElement(root, "road", name=f"road {number}", length=total, id=number, junction="-1")
-    ElementTree.SubElement(road, "type", s="0", type="town")
-    plan = ElementTree.SubElement(road, "planView")
-    for (u, v, length), s, point, heading in zip(pieces, start_m, line, headings, strict=False):
-        place = {"s": s, "x": point[0], "y": point[1], "hdg": heading, "length": length}
-        geometry = ElementTree.SubElement(plan, "geometry", {key: _text(value) for key, value in place.items()})
-        coefficients = {f"{letter}U": value for letter, value in zip("abcd", u, strict=True)}
-        coefficients |= {f"{letter}V": value for letter, value in zip("abcd", v, strict=True)}
-        poly = {key: _text(value) for key, value in coefficients.items()}
-        ElementTree.SubElement(geometry, "paramPoly3", poly | {"pRange": "normalized"})
-
-    profile = ElementTree.SubElement(road, "elevationProfile")
-    slope = np.gradient(line[:, 2], start_m)
-    for i, length in enumerate(lengths):
-        rise, s0, s1 = line[i + 1, 2] - line[i, 2], slope[i], slope[i + 1]
-        c, d = (3 * rise / length - 2 * s0 - s1) / length, (s0 + s1 - 2 * rise / length) / length**2
-        values = {"s": start_m[i], "a": line[i, 2], "b": s0, "c": c, "d": d}
-        ElementTree.SubElement(profile, "elevation", {key: _text(value) for key, value in values.items()})
-    _add_lane(road)
+def _add_heights(profile: Element, laid: LaidRoad, heights: Heights) -> None:
+    """Of the middle of the lane, linear between knots."""
+    xy, yaw = sampled(laid.reference)
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    knots = np.linspace(0.0, laid.length_m, max(2, int(np.ceil(laid.length_m / HEIGHT_KNOT_M)) + 1))
+    right = laid.width_m / 2 * np.stack([np.sin(yaw), -np.cos(yaw)], axis=1)
+    middle = np.stack([np.interp(knots, s, (xy + right)[:, axis]) for axis in range(2)], axis=1)
+    z = heights(middle)
+    slope = np.append(np.diff(z) / np.diff(knots), 0.0)
+    for start, height, rise in zip(knots, z, slope, strict=True):
+        SubElement(profile, "elevation", s=_text(start), a=_text(height), b=_text(rise), c="0", d="0")
 
 
-def _add_lane(road: ElementTree.Element) -> None:
-    """One driving lane (-1) whose middle is the reference line: the lane offset moves its left border aside."""
-    lanes = ElementTree.SubElement(road, "lanes")
-    ElementTree.SubElement(lanes, "laneOffset", s="0", a=_text(LANE_WIDTH_M / 2), b="0", c="0", d="0")
-    section = ElementTree.SubElement(lanes, "laneSection", s="0")
-    for side, number, kind in (("center", "0", "none"), ("right", "-1", "driving")):
-        lane = ElementTree.SubElement(
-            ElementTree.SubElement(section, side), "lane", id=number, type=kind, level="false"
-        )
-        if kind == "driving":
-            ElementTree.SubElement(lane, "width", sOffset="0", a=_text(LANE_WIDTH_M), b="0", c="0", d="0")
-        ElementTree.SubElement(lane, "roadMark", sOffset="0", type="none", material="standard", color="white")
-
-
-def _cubic(
-    start: np.ndarray, end: np.ndarray, heading0: float, heading1: float
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Hermite cubic between two points: coefficients of u and v in the frame of the start, and its arc length."""
-    cos, sin = np.cos(heading0), np.sin(heading0)
-    du, dv = np.array([[cos, sin], [-sin, cos]]) @ (end - start)
-    chord = float(np.hypot(du, dv))
-    turn = heading1 - heading0
-    # The tangent length of a circular arc's cubic: its arc length to second order in the turn.
-    tangent = chord * (1 + turn**2 / 24)
-    end_u, end_v = tangent * np.cos(turn), tangent * np.sin(turn)
-    u = np.array([0.0, tangent, 3 * du - 2 * tangent - end_u, tangent + end_u - 2 * du])
-    v = np.array([0.0, 0.0, 3 * dv - end_v, end_v - 2 * dv])
-    nodes, weights = np.polynomial.legendre.leggauss(8)
-    p = (nodes + 1) / 2
-    speed = np.hypot(u[1] + 2 * u[2] * p + 3 * u[3] * p**2, v[1] + 2 * v[2] * p + 3 * v[3] * p**2)
-    return u, v, float(speed @ weights / 2)
+def _add_lane(side: Element, number: int, kind: str, width_m: float) -> None:
+    lane = SubElement(side, "lane", id=str(number), type=kind, level="false")
+    SubElement(lane, "width", sOffset="0", a=_text(width_m), b="0", c="0", d="0")
+    SubElement(lane, "roadMark", sOffset="0", type="none", material="standard", color="white")
 
 
 def _text(value: float) -> str:
-    """A number with nanometre resolution."""
-    return f"{float(value):.9f}"
+    """A number with nanometre resolution; curvatures need it over long arcs too."""
+    return f"{float(value):.12f}"
 
 
 def _plain(name: str) -> str:

@@ -3,9 +3,10 @@
 Conventions of those tools: ``T_a_b`` maps a to b; track quaternions are ``xyzw``; f-theta principal points count pixel
 centres as whole numbers (ours minus 0.5). ``world_to_nre`` is the identity, so poses mean the same in every reading.
 
-Those tools start a drive at a camera's first frame, which must lie on a path that takes time. So a rig with one pose
-stands there for the whole scene, frames that were exposed outside of the path are left out, and a camera without any
-frame gets one.
+Those tools start a drive at a camera's first frame, which must lie on a path that takes time. AlpaSim's first image
+takes the 30 ms before the end of that frame (its default shutter). So a rig with one pose stands there for the whole
+scene, frames that were exposed outside of the path or end within ``SHUTTER_ROOM_US`` of its start are left out, and a
+camera without any frame gets one.
 """
 
 from __future__ import annotations
@@ -24,10 +25,22 @@ from nurec_sim.geometry import quat_from_matrix
 from nurec_sim.scene import codec
 from nurec_sim.scene.ground_mesh import encode_ply, ground_mesh
 from nurec_sim.scene.opendrive import opendrive_map, world_to_ecef
-from nurec_sim.types import CameraModel, Fisheye, FTheta, GaussianScene, LidarModel, Pinhole, Shutter, Track, Trajectory
+from nurec_sim.types import (
+    CameraModel,
+    Fisheye,
+    FTheta,
+    GaussianScene,
+    LidarModel,
+    Pinhole,
+    RoadMap,
+    Shutter,
+    Track,
+    Trajectory,
+)
 
 CHUNK_ID = "dummy_chunk_id"  # CARLA's client looks for this very key
 FIRST_FRAME_US = 100_000
+SHUTTER_ROOM_US = 50_000
 _FTHETA_TERMS = 6
 _ROUNDING = 1e-9
 SHUTTER_NAMES = {
@@ -69,15 +82,18 @@ def fit_error_px(camera: CameraModel, fit: FTheta) -> dict[str, float]:
     return {"rms": float(np.sqrt(np.mean(off**2))), "max": float(off.max())}
 
 
-def sidecars(scene: GaussianScene, digest: str, fits: Mapping[str, FTheta]) -> dict[str, bytes]:
-    """All root files by name; ``digest`` is the scene's hash."""
+def sidecars(
+    scene: GaussianScene, digest: str, fits: Mapping[str, FTheta], derived_map: RoadMap | None = None
+) -> dict[str, bytes]:
+    """All root files by name; ``digest`` is the scene's hash, ``derived_map`` stands in where the scene has no map."""
     ground = encode_ply(ground_mesh(scene))
-    return {
+    road_map = scene.road_map if scene.road_map is not None else derived_map
+    xodr = None if road_map is None else opendrive_map(scene.id, road_map, scene.ego)
+    return ({} if xodr is None else {"map.xodr": xodr}) | {
         "metadata.yaml": _metadata(scene, digest),
         "data_info.json": codec.dump(_data_info(scene), "data_info.json", indent=2),
         "rig_trajectories.json": codec.dump(_rig_trajectories(scene, fits), "rig_trajectories.json"),
         "sequence_tracks.json": codec.dump(_sequence_tracks(scene), "sequence_tracks.json"),
-        "map.xodr": opendrive_map(scene),
         "mesh_ground.ply": ground,
         # Physics may ask for either name; walls and vehicles are not meshed.
         "mesh.ply": ground,
@@ -157,7 +173,7 @@ def drive_path(scene: GaussianScene) -> Trajectory:
 
 
 def camera_frames(scene: GaussianScene) -> dict[str, Int64[np.ndarray, "f 2"]]:
-    """Exposures of every camera within the path, strictly increasing and at least 1 us long; one at the least.
+    """Exposures of every camera that clients can render: strictly increasing, at least 1 us long; one at the least.
 
     A camera without any takes the first exposure of another, or the first tenth of a second.
     """
@@ -173,6 +189,7 @@ def _on_path(times_us: Int64[np.ndarray, "n 2"], path: Trajectory) -> Int64[np.n
     times_us = times_us[np.argsort(times_us[:, 0], kind="stable")]
     frames = np.column_stack([times_us[:, 0], np.maximum(times_us[:, 1], times_us[:, 0] + 1)])
     frames = frames[(frames[:, 0] >= path.start_us) & (frames[:, 1] <= path.end_us)]
+    frames = frames[frames[:, 1] >= path.start_us + SHUTTER_ROOM_US]
     latest = np.maximum.accumulate(frames, axis=0)
     return frames[np.concatenate([np.ones(len(frames[:1]), bool), (frames[1:] > latest[:-1]).all(axis=1)])]
 

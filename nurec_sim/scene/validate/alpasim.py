@@ -15,9 +15,11 @@ from nurec_sim.errors import ArchiveError
 from nurec_sim.scene.validate import maps, meshes, shared
 from nurec_sim.scene.validate.contents import Contents, entry_of, numbers_of, shown, text_of
 from nurec_sim.scene.validate.finding import Report, Rule
+from nurec_sim.scene.validate.map_agreement import LEAST_SHARE
 from nurec_sim.scene.validate.shared import RIG, TRACKS
 
 MIN_START_US = 1_000_000
+SHUTTER_ROOM_US = 50_000
 MOVED_M = 2.0
 METADATA_TEXTS = ("scene_id", "version_string", "training_date", "dataset_hash", "uuid")
 
@@ -57,6 +59,11 @@ RULES = {
     "first-frame": Rule(
         "error", "the end of a camera's first frame within the rig's path", "rendering starts where there is no pose"
     ),
+    "shutter-room": Rule(
+        "error",
+        f"a camera's first frame that ends {SHUTTER_ROOM_US // 1000} ms or more after the first pose",
+        "the first image (30 ms of shutter by default) begins where there is no pose",
+    ),
     "frames-inside": Rule("warning", "frames within the rig's path", "those frames have no recorded pose"),
     "rig-box": Rule(
         "error",
@@ -92,7 +99,26 @@ RULES = {
         f"the tables {', '.join(maps.CLIPGT_TABLES)} in clipgt/, and at least one lane with two equal rails",
         "there is no map (clipgt/ is read before map.xodr)",
     ),
-    "xodr": Rule("warning", "OpenDRIVE with roads and a geoReference in map.xodr", "there is no map"),
+    "xodr": Rule("error", "OpenDRIVE with roads and a geoReference in map.xodr", "the scene is refused"),
+    "xodr-lanes": Rule(
+        "error",
+        "roads of <line> and <arc> in map.xodr that give at least one lane",
+        "the scene is refused (failed to load vector map)",
+    ),
+    "lane-under-path": Rule(
+        "warning", "a lane of map.xodr under every recorded pose", "routes and off-road are wrong where the car drove"
+    ),
+    "offroad-on-path": Rule(
+        "warning",
+        "lanes without gaps between them around every recorded pose",
+        "the recorded drive counts as off-road",
+    ),
+    "offroad-agrees": Rule(
+        "warning",
+        f"lanes and road edges that give the drivable area's verdict on {LEAST_SHARE:.0%} of cars on and beside the "
+        "path",
+        "off-road and the scene score are wrong",
+    ),
     "base-frame": Rule("warning", "T_world_base, 4x4, to align map.xodr", "there is no map"),
     "mesh-ground": Rule(
         "error",
@@ -126,7 +152,7 @@ def check(report: Report, contents: Contents) -> None:
         _check_box(report, trajectory)
     _check_metadata(report, contents, path_us)
     _check_tracks(report, contents)
-    maps.check_alpasim_map(report, contents, None if rig is None else rig[0])
+    maps.check_alpasim_map(report, contents, None if rig is None else rig[0], world_from_rig)
     meshes.check_ground(report, contents, world_from_rig)
 
 
@@ -224,6 +250,9 @@ def _check_frames_inside(
             "first-frame", f"{where}: the first frame ends at {frames[0, 1]} us, {first_us} to {last_us} is driven"
         )
         return
+    if frames[0, 1] < first_us + SHUTTER_ROOM_US:
+        told = f"{where}: the first frame ends {(frames[0, 1] - first_us) / 1000:.2f} ms after the first pose"
+        report.add("shutter-room", told)
     outside = (frames[:, 0] < first_us) | (frames[:, 1] > last_us)
     if outside.any():
         told = f"{where}: {int(outside.sum())} of {len(frames)} frames are outside of {first_us} to {last_us} us"

@@ -7,9 +7,13 @@ import re
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
+from jaxtyping import Float64
+
 from nurec_sim.decoding import LIMITS
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene.opendrive_xml import opendrive_root
+from nurec_sim.scene.validate.alpasim_roads import check_roads
 from nurec_sim.scene.validate.contents import Contents, entry_of, numbers_of
 from nurec_sim.scene.validate.finding import Report
 
@@ -19,7 +23,9 @@ CLIPGT_TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign",
 MAX_TABLE_BYTES = 256 * 2**20
 
 
-def check_alpasim_map(report: Report, contents: Contents, rig: dict[str, Any] | None) -> None:
+def check_alpasim_map(
+    report: Report, contents: Contents, rig: dict[str, Any] | None, world_from_rig: Float64[np.ndarray, "t 4 4"] | None
+) -> None:
     """Adds what is wrong with the map that AlpaSim takes: the first folder that is there, else ``map.xodr``."""
     folder = next((name for name in MAP_FOLDERS if contents.folder(name)), None)
     if folder == "clipgt":
@@ -29,8 +35,11 @@ def check_alpasim_map(report: Report, contents: Contents, rig: dict[str, Any] | 
         report.add("map", f"the archive has neither {', '.join(f'{name}/' for name in MAP_FOLDERS)} nor {XODR}")
     elif folder is None:
         with report.rule("xodr"):
-            if georeference(road_root(contents)) is None:
+            root = road_root(contents)
+            if georeference(root) is None:
                 raise ArchiveError(f"{XODR} has no geoReference")
+            if rig is not None and world_from_rig is not None:
+                check_roads(report, contents, root, rig, world_from_rig)
         if rig is not None:
             with report.rule("base-frame"):
                 check_base_frame(rig)
