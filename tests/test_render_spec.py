@@ -63,6 +63,13 @@ def test_hits_fainter_than_one_step_of_a_pixel_do_not_count():
     assert alpha[0] == pytest.approx(1 / 255, rel=0.02) and alpha[1] == 0
 
 
+def test_a_disc_is_as_thin_as_it_says_down_to_a_hundredth_of_a_millimetre():
+    """Rays along it, one standard deviation above its middle; the thinnest counts as 0.01 mm."""
+    for thickness_m, sigma_m in ((2e-5, 2e-5), (1e-6, 1e-5)):
+        disc = gaussians([[10, 0, 0]], scale=(0.5, 0.5, thickness_m), opacity=0.9)
+        assert blend(disc, np.array([[0.0, 0.0, sigma_m]])).alpha[0] == pytest.approx(0.9 * np.exp(-0.5), rel=1e-4)
+
+
 def test_hits_nearer_than_near_do_not_count():
     slanted = geometry.quat_from_matrix(geometry.rotation_from_yaw(np.radians(80)))
     world = gaussians([[0.5, 0.4, 0]], scale=(0.5, 0.01, 0.5), quat=slanted)  # met at 0.43 m

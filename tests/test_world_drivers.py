@@ -97,6 +97,24 @@ def test_a_stop_sign_stops_even_who_is_alone():
     assert 44 < motion.middle_m[np.argmax(slow), 0, 0] + CAR[0] / 2 < 50
 
 
+@pytest.mark.parametrize(("before_m", "stops"), [(5.0, False), (25.0, True)])
+def test_a_red_light_stops_who_can_still_stop(before_m, stops):
+    """From 10 m/s the hardest braking, 6 m/s2, takes 8.3 m: who is nearer drives on as if it were green."""
+    way = route(line(0, 0, 150, 0), 10.0, [Leg("east", 50.0, 70.0, True)])
+    one = driver(way, 50.0 - before_m - CAR[0] / 2, 10.0, {"east": -1})
+    found = speeds(simulate([one], 200, {}, NOBODY, []))
+    assert found[-1] < 0.1 if stops else found.min() > 9.9
+
+
+def test_who_has_its_tail_in_the_crossing_has_not_passed():
+    """One stands half a metre beyond the crossing with its front, so the other waits where its junction begins."""
+    stands = driver(route(line(60, -60, 60, 90), 0.0, [Leg("north", 50.0, 70.0, True)]), 63.5 - CAR[0] / 2)
+    comes = driver(route(line(0, 0, 150, 0), 10.0, [Leg("east", 50.0, 70.0, True)]), 20.0, 8.0)
+    meet = Conflict((7.0, 13.0), (7.0, 13.0))
+    motion = simulate([comes, stands], 300, {("east", "north"): meet, ("north", "east"): meet}, NOBODY, [])
+    assert 46 < motion.middle_m[-1, 0, 0] + CAR[0] / 2 < 50 and speeds(motion)[-1] < 0.1
+
+
 def test_drivers_wait_for_people_who_cross():
     one = driver(route(line(0, 0, 200, 0)), 5.0, 10.0)
     assert simulate([one], 120, {}, NOBODY, []).middle_m[-1, 0, 0] > 60

@@ -225,7 +225,6 @@ class _Yields:
         meet = ~passed & (they_come < i_leave + 1.0) & (they_leave > i_come - 0.8)
         sooner = np.where(np.isclose(they_come, i_come), other < me, they_come < i_come)
         theirs = they_inside | (self.their_rank > self.my_rank) | ((self.their_rank == self.my_rank) & sooner)
-        theirs &= they_inside | (self.their_rank >= 0)
         held = ~inside & meet & theirs & _concerns(self.stop - front[me], speed[me])
         np.minimum.at(stops, me[held], self.stop[held])
         for table, closed in ((self.red, np.ones(len(self.red), bool)), (self.halt, ~self._halts(front, speed))):

@@ -1,0 +1,217 @@
+"""Surfels, views and matching costs one at a time, against values worked out by hand."""
+
+import numpy as np
+import pytest
+from reconstruct_street import Street
+
+from nurec_sim import geometry
+from nurec_sim.reconstruct.lift import colour, depth, lifting, splat, surfaces
+from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, seen_through
+from nurec_sim.reconstruct.lift.settings import PointSettings
+
+TOWARDS = np.array([[0.0, 0.0, -1.0]])
+"""The normal of a surface that faces the views of these tests, which look along z."""
+
+
+def looking_ahead(behind_m=0.0, width=9, height=9, focal_px=10.0):
+    """A packed view (``View.packed``) from as far behind the origin, without drift."""
+    pose = geometry.pose(np.eye(3), np.array([0.0, 0.0, behind_m]))
+    return np.concatenate(
+        [[focal_px, width / 2, height / 2, width, height], pose[:3, :3].ravel(), pose[:3, 3], np.zeros(6)]
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------- drawing
+
+
+@pytest.mark.parametrize(("behind", "shown"), [(0.097, (0.1 + 0.097) / 2), (0.095, 0.1)])
+def test_surfels_within_four_percent_of_the_front_are_averaged(behind, shown):
+    """Two at the middle of the same pixel, at inverse depths 0.1 and a little less."""
+    bodies = [
+        (looking_ahead(), np.array([[0.0, 0.0, 1 / w]]), TOWARDS, np.array([1.0]), offset)
+        for offset, w in ((5, 0.1), (8, behind))
+    ]
+    inverse_depth, index = splat.draw_surfels((9, 9), bodies)
+    assert inverse_depth[4, 4] == pytest.approx(shown, rel=1e-5) and index[4, 4] == 5
+    assert np.count_nonzero(inverse_depth) == 1 and (index >= 0).sum() == 1
+
+
+def seen_among(others, count):
+    """What is left of a pixel at 10 m, of whose 48 neighbours so many are at the other inverse depth."""
+    inverse_depth = np.full(49, 0.1, np.float32)
+    inverse_depth[[i for i in range(49) if i != 24][:count]] = others
+    inverse_depth, index = inverse_depth.reshape(7, 7), np.zeros((7, 7), np.int32)
+    splat.drop_shine_through(inverse_depth, index)
+    return inverse_depth[3, 3], index[3, 3]
+
+
+def test_what_shines_through_a_surface_is_dropped():
+    """Most of the surroundings lie clearly, more than 20 %, in front of it."""
+    assert seen_among(0.2, 40) == (0.0, -1)
+    assert seen_among(0.2, 20) == (np.float32(0.1), 0)
+    assert seen_among(0.115, 48) == (np.float32(0.1), 0)
+
+
+@pytest.mark.parametrize(("grey", "kept"), [(28, False), (92, True)])
+def test_a_rim_that_looks_like_what_lies_behind_it_is_trimmed(grey, kept):
+    """A near surface of grey 100 left of a far one of grey 20; the rim of the near one has another grey."""
+    inverse_depth = np.full((9, 10), 0.2, np.float32)
+    inverse_depth[:, 5:] = 0.1
+    index, image = np.zeros((9, 10), np.int32), np.full((9, 10), 100, np.uint8)
+    image[:, 5:], image[4, 4] = 20, grey
+    splat.trim_silhouettes(inverse_depth, index, image)
+    assert (inverse_depth[4, 4] > 0) == kept and (index[4, 4] == 0) == kept
+    inverse_depth[4, 4] = 0.2
+    assert (inverse_depth[:, :5] == np.float32(0.2)).all() and (inverse_depth[:, 5:] == np.float32(0.1)).all()
+
+
+# ------------------------------------------------------------------------------------------------------------- owning
+
+
+def owned(views, own_view=0, own_rgb=100.0):
+    """Whether a point 10 m ahead of its own view stays, and its colour; views are (metres behind, 1/m seen, grey)."""
+    packed = np.stack([looking_ahead(behind_m) for behind_m, _, _ in views])
+    inverse_depth = np.stack([np.full((9, 9), w, np.float32) for _, w, _ in views])
+    pictures = np.stack([np.full((9, 9, 3), grey, np.uint8) for _, _, grey in views])
+    rgb = np.full((1, 3), own_rgb, np.float32)
+    keep = lifting.owned(np.array([[0.0, 0.0, 10.0]]), np.array([10.0]), np.array([own_view], np.int32), rgb, packed,
+                         inverse_depth, pictures, np.ones(len(views), bool), 0.002, lifting.OWNER_RING,
+                         lifting.OWNER_BORDER)  # fmt: skip
+    return bool(keep[0]), rgb[0, 0]
+
+
+AGREES, THROUGH = (0.0, 0.1, 100), (0.0, 0.02, 100)
+
+
+@pytest.mark.parametrize(
+    ("others", "stays"),
+    [([THROUGH], False), ([AGREES, THROUGH], False), ([AGREES, AGREES, THROUGH], True), ([AGREES], True), ([], True)],
+)
+def test_points_go_if_more_than_half_as_many_views_look_through_them_as_agree(others, stays):
+    assert owned([AGREES, *others])[0] == stays
+
+
+def test_the_nearest_view_owns_a_surface_and_of_equally_near_ones_the_first():
+    """Rings grow by exp(0.1): 10 m lies in ring 23, as 10.4 m does, 8 m in ring 20."""
+    assert owned([AGREES, AGREES], own_view=0)[0] and not owned([AGREES, AGREES], own_view=1)[0]
+    assert not owned([AGREES, (-2.0, 1 / 8, 100)], own_view=0)[0]
+    assert owned([(2.0, 1 / 12, 100), AGREES], own_view=1)[0]
+    assert not owned([(0.4, 1 / 10.4, 100), AGREES], own_view=1)[0]
+
+
+def test_other_views_mix_into_a_colour_with_three_tenths_of_its_weight():
+    """Two as near, which show 200; then one 1.25 times as far away, which counts (1 / 1.25)^2 as much."""
+    same = (0.0, 0.1, 200)
+    assert owned([AGREES, same, same])[1] == pytest.approx((100 + 0.3 * 200 * 2) / 1.6)
+    share = 0.3 / 1.25**2
+    assert owned([AGREES, (2.5, 1 / 12.5, 200)])[1] == pytest.approx((100 + share * 200) / (1 + share))
+
+
+# ------------------------------------------------------------------------------------------------------------- colours
+
+
+def test_views_colour_a_point_by_the_inverse_square_of_their_distance():
+    """10 and 20 m away: four to one."""
+    packed = np.stack([looking_ahead(), looking_ahead(10.0)])
+    inverse_depth = np.stack([np.full((9, 9), w, np.float32) for w in (1 / 10, 1 / 20)])
+    pictures = np.stack([np.full((9, 9, 3), grey, np.uint8) for grey in (100, 200)])
+    rgb, pixel_m, through = colour.seen_colours(np.array([[0.0, 0.0, 10.0]]), TOWARDS, packed, inverse_depth, pictures,
+                                                np.ones(2, bool), 0.002)  # fmt: skip
+    assert rgb[0] == pytest.approx([(4 * 100 + 200) / 5] * 3)
+    assert pixel_m[0] == pytest.approx(10.0 / 10.0) and through[0] == 0
+
+
+def test_the_response_of_a_camera_is_not_that_of_the_glare_in_it():
+    """Four fifths of the light everywhere, but in 15 % of the points, which are white."""
+    random = np.random.default_rng(0)
+    true = random.uniform(0.1, 0.9, (2000, 3)).astype(np.float32)
+    shown = 0.8 * true
+    shown[:300] = 1.0
+    isp, _ = colour.solve_isp(["a", "b"], {"a": (true, np.ones(2000, bool)), "b": (shown, np.ones(2000, bool))})
+    assert isp["b"] @ [0.4, 0.4, 0.4, 1] == pytest.approx([0.32] * 3, abs=0.02)
+
+
+@pytest.mark.parametrize(("count", "compared"), [(299, False), (300, True)])
+def test_cameras_are_compared_from_300_shared_points_on(count, compared):
+    true = np.random.default_rng(0).uniform(0.1, 0.9, (1000, 3)).astype(np.float32)
+    isp, lonely = colour.solve_isp(
+        ["a", "b"], {"a": (true, np.ones(1000, bool)), "b": (0.8 * true, np.arange(1000) < count)}
+    )
+    assert (lonely == []) == compared and np.allclose(isp["b"], np.eye(3, 4)) != compared
+
+
+# ------------------------------------------------------------------------------------------------------------- depth
+
+
+def smoothed_middle(jump_to):
+    """Level in the middle of a picture of level 10, where level 16 costs nothing and level 10 costs 30."""
+    cost = np.full((9, 9, 24), 200.0, np.float32)
+    cost[:, :, 10] = 0
+    cost[4, 4, 10], cost[4, 4, 16] = 30, 0
+    image = np.full((9, 9), 0, np.uint8)
+    image[4, 4] = jump_to
+    return depth.smooth_depth(cost, image, 0.01)[4, 4] / 0.01
+
+
+def test_lone_matches_are_smoothed_away_unless_an_edge_surrounds_them():
+    """Staying alone costs 48 on each of 8 paths, 7 beside a change of 240 grey levels; the match counts 30 on each."""
+    assert smoothed_middle(jump_to=0) == pytest.approx(10, abs=0.5)
+    assert smoothed_middle(jump_to=240) == pytest.approx(16, abs=0.5)
+
+
+def test_inverse_depth_lies_at_the_vertex_between_levels():
+    cost = ((np.arange(24) - 10.3) ** 2).astype(np.float32)[None, None]
+    assert depth.smooth_depth(cost, np.zeros((1, 1), np.uint8), 0.01)[0, 0] == pytest.approx(0.103, rel=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------------------- points
+
+
+def cloud_of(xyz_m, sweeps):
+    n = len(xyz_m)
+    return Cloud(np.array(xyz_m, float), np.zeros((n, 3)), np.full(n, 0.1, np.float32), np.full(n, np.nan, np.float32),
+                 np.array(sweeps, np.int32))  # fmt: skip
+
+
+def test_a_scan_line_with_noise_of_its_ranges_faces_the_sensor():
+    """Its points spread least across the plane of its beams, which says nothing of the wall that they hit."""
+    noise_m = np.random.default_rng(0).normal(0, 0.01, 50)
+    line = np.column_stack([np.linspace(-1, 1, 50), 5 + noise_m, np.zeros(50)])
+    _, normal, _ = surfaces.surface_of(cloud_of(line, np.ones(50)))
+    assert (-normal[:, 1] > 0.95).all()
+
+
+def test_discs_reach_so_far_that_none_of_a_lattice_shows_gaps():
+    """Standard deviations: 0.45 of the spacing, and a twentieth of that in thickness but 3 mm at least."""
+    n = 2
+    made = surfaces.discs(np.zeros((n, 3)), np.repeat(-TOWARDS, n, axis=0), np.array([0.1, 0.4]), np.zeros((n, 3)),
+                          np.zeros(n), np.zeros(n, np.uint8), 0.9)  # fmt: skip
+    assert made.scale_m[0] == pytest.approx([0.045, 0.045, 0.003])
+    assert made.scale_m[1] == pytest.approx([0.18, 0.18, 0.009])
+
+
+def test_footprints_have_six_tenths_of_their_pixels():
+    made = surfaces.footprints(np.zeros((1, 3)), TOWARDS, -TOWARDS, np.array([0.1]), np.zeros((1, 3)), np.zeros(1),
+                               np.zeros(1, np.uint8), 0.9)  # fmt: skip
+    assert made.scale_m[0] == pytest.approx([0.06, 0.06, 0.006])
+
+
+def test_sweeps_look_through_what_lies_well_before_their_returns():
+    """1.05 times as far away and 0.7 m: 11.2 m for a point at 10 m."""
+    for wall_m, through in ((11.1, False), (11.3, True)):
+        image = (np.eye(4), np.full((160, 1440), wall_m, np.float32))
+        assert seen_through(cloud_of([[10.0, 0, 0]], [1]), [image] * 3, 3).tolist() == [through]
+
+
+def test_what_was_hit_more_than_half_as_often_as_looked_through_stays():
+    image = (np.eye(4), np.full((160, 1440), 20.0, np.float32))
+    clouds = cloud_of([[10.0, 0, 0]] * 3, [1, 2, 3])
+    assert seen_through(clouds, [image] * 4, 3).tolist() == [True, True, False]
+
+
+def test_the_lowest_30_cm_of_a_box_may_be_road():
+    clip = Street(frames=2, boxes={"a": ((4.0, 1.8, 1.5), np.array([12.0, -2.0]))})
+    found = gather(clip, actors_of(clip, PointSettings()), set(), PointSettings())
+    foot, _ = found.feet[0]
+    assert -0.75 + 0.2 < foot.xyz_m[:, 2].max() < -0.75 + 0.3 <= found.actors[0].xyz_m[:, 2].min()
+    assert geometry.points_in_box(foot.xyz_m, (4.0, 1.8, 1.5), 0.3).all()
