@@ -13,7 +13,7 @@ RUN apt-get update \
 
 ARG TORCH=torch
 WORKDIR /opt/nurec-sim
-COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY pyproject.toml setup.py constraints.txt README.md LICENSE ./
 COPY nurec_sim nurec_sim
 COPY policies policies
 COPY protos protos

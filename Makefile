@@ -4,9 +4,9 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs
 
-.PHONY: demo test check format bench bench-serving gpu-parity gpu-bench clean
+.PHONY: demo test check format docs dist bench bench-serving gpu-parity gpu-bench clean
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+$(VENV)/.installed: pyproject.toml setup.py constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(f"nurec_sim needs Python 3.11 or newer; $(PYTHON) is {sys.version.split()[0]}. Try: make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
@@ -27,6 +27,18 @@ check: $(VENV)/.installed ## format, lint, import arrows, types
 format: $(VENV)/.installed ## rewrite the code in house style
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+docs: $(VENV)/.installed-docs ## these pages and an API reference as a site with search, in build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	@echo "build/site: python3 -m http.server --directory build/site"
+
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	@touch $@
+
+dist: $(VENV)/.installed ## the wheel and the source distribution, in dist
+	rm -rf build/lib build/bdist.*
+	$(BIN)/python -m build --no-isolation --outdir dist
 
 bench: $(VENV)/.installed ## timings of the renderer and the network, written to build/bench.json and build/bench_network.json
 	$(BIN)/python benchmarks/render.py

@@ -34,7 +34,13 @@ def test_what_is_copied_is_here_and_is_all_that_the_package_needs(name):
     sources = copied(name)
     assert all((REPO / source).exists() for source in sources)
     folders = PROJECT["tool"]["setuptools"]["package-dir"].values()
-    needed = {*folders, "pyproject.toml", PROJECT["project"]["readme"], *PROJECT["project"]["license-files"]}
+    needed = {
+        *folders,
+        "pyproject.toml",
+        "setup.py",
+        PROJECT["project"]["readme"],
+        *PROJECT["project"]["license-files"],
+    }
     assert needed <= set(sources)
     let_through = {line[1:] for line in (REPO / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     assert let_through == set(sources)

@@ -113,7 +113,7 @@ def plan_view(entry: ReportRollout, view: View, image_key: str | None, road_map:
 
 def _outlines(
     name: str, rings: Sequence[np.ndarray], colour: str, width: float = 1.5, fill: str = "", dash: str = "solid"
-):
+) -> dict[str, Any]:
     """Many closed outlines as one trace."""
     broken = [np.vstack([ring, [[np.nan, np.nan]]]) for ring in rings]
     points = np.vstack(broken) if broken else np.zeros((0, 2))

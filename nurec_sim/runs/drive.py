@@ -12,6 +12,7 @@ from pathlib import Path
 
 import yaml
 
+import nurec_sim
 from nurec_sim.errors import NurecSimError, RunError, ScenarioError, WriteError
 from nurec_sim.new_files import writing
 from nurec_sim.runs import folder as layout
@@ -52,8 +53,8 @@ class _Job:
     @property
     def versions_text(self) -> str:
         """What the rollout depends on."""
-        packages = {}
-        for name in ("nurec-sim", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "av", "torch"):
+        packages = {"nurec-sim": nurec_sim.__version__}
+        for name in ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "av", "torch"):
             try:
                 packages[name] = version(name)
             except PackageNotFoundError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from nurec_sim.errors import RunError
@@ -16,6 +16,7 @@ from nurec_sim.report import ReportRollout, ReportScene, RunReport, render_repor
 from nurec_sim.runs import folder as layout
 from nurec_sim.runs.rollout_file import load_rollout
 from nurec_sim.runs.scene_file import SceneRecord, load_scene_record
+from nurec_sim.types import Rollout, Series
 
 PROFILE = "strict"
 
@@ -88,7 +89,7 @@ def headline(run: Path | str) -> list[tuple[str, ...]]:
     return rows
 
 
-def _report_entry(run: Path, place: Path, rollout, series) -> ReportRollout:
+def _report_entry(run: Path, place: Path, rollout: Rollout, series: Iterable[Series]) -> ReportRollout:
     video, video_error = place / layout.VIDEO, place / layout.VIDEO_ERROR
     return ReportRollout(
         rollout=rollout,

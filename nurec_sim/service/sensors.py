@@ -10,8 +10,6 @@ from nurec_sim.service.rendering import Rendering
 class SensorService(Rendering, Discovery, Editing):
     """The procedures, one coroutine each, by their names on the wire: message in, message out, errors raised.
 
-    Args:
-        store: the scenes.
-        options: limits and choices.
-        request_stop: called by ``shut_down``.
+    It is made of the ``store`` of scenes, ``options`` (limits and choices), and ``request_stop``, which
+    ``shut_down`` calls.
     """

@@ -121,7 +121,9 @@ class Stage:
         poses = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), fractions)
         return Moments(self.town, self.data, times, places, poses)
 
-    def look(self, patch: RayPatch, world_from_sensor: Float64[np.ndarray, "4 4"], seen: Seen, colours: bool = True):
+    def look(
+        self, patch: RayPatch, world_from_sensor: Float64[np.ndarray, "4 4"], seen: Seen, colours: bool = True
+    ) -> None:
         """Fills ``seen``, as large as the patch, with what its rays meet at the instant that was entered."""
         if self.painter is None:
             rays.look(self.town, self.data, patch.rays, patch.valid, world_from_sensor, seen)

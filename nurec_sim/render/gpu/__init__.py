@@ -6,6 +6,7 @@ Nothing outside of this folder imports it, and it imports torch and CUDA's packa
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 _HOME = {
     "GpuRenderer": "nurec_sim.render.gpu.renderer",
@@ -14,7 +15,7 @@ _HOME = {
 __all__ = list(_HOME)
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_HOME[name]), name)
