@@ -111,6 +111,6 @@ def test_only_valid_values_of_a_series_count(reduce, expected):
 
 def test_an_opened_clip_has_all_that_the_protocol_names():
     names = set(get_type_hints(Clip)) | {name for name in vars(Clip) if not name.startswith("_")}
-    attributes = {"id", "rig", "ego", "tracks", "road_map"}
+    attributes = {"id", "rig", "ego", "tracks", "road_map", "time_offset_us"}
     assert attributes < names
     assert names - attributes <= set(dir(logs.Clip))

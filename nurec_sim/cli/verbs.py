@@ -74,7 +74,7 @@ def run(words: list[str]) -> None:
 
 def _check_verb(words: list[str]) -> None:
     """Names the verb that was meant, and ends with 2, where the first word is none."""
-    known = list(getattr(app, "_subcommands", ()))  # tyro has no public name for them, and a help of its own without
+    known = sorted(getattr(app, "_subcommands", ()))  # tyro has no public name for them, and a help of its own without
     if not known or not words or words[0].startswith("-") or words[0] in known:
         return
     near = difflib.get_close_matches(words[0], known, n=1, cutoff=0.5)
