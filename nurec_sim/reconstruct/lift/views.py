@@ -51,7 +51,7 @@ class View:
     rgb: UInt8[np.ndarray, "h w 3"]
 
     @property
-    def packed(self) -> Float64[np.ndarray, " 24"]:
+    def packed(self) -> Float64[np.ndarray, " 23"]:
         """Everything a kernel needs to project: f, cx, cy, w, h, view_from_world (12), drift (3), fraction (3)."""
         matrix = geometry.inverse(self.world_from_view)
         return self.packed_from(matrix)
