@@ -29,7 +29,7 @@ format: $(VENV)/.installed ## rewrite the code in house style
 	$(BIN)/ruff check --fix .
 
 docs: $(VENV)/.installed-docs ## these pages and an API reference as a site with search, in build/site
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "build/site: python3 -m http.server --directory build/site"
 
 $(VENV)/.installed-docs: $(VENV)/.installed
