@@ -37,8 +37,9 @@ $(VENV)/.installed-docs: $(VENV)/.installed
 	@touch $@
 
 dist: $(VENV)/.installed ## the wheel and the source distribution, in dist
-	rm -rf build/lib build/bdist.*
+	rm -rf build/lib build/bdist.* nurec_sim.egg-info
 	$(BIN)/python -m build --no-isolation --outdir dist
+	rm -rf build/lib build/bdist.* nurec_sim.egg-info
 
 bench: $(VENV)/.installed ## timings of the renderer and the network, written to build/bench.json and build/bench_network.json
 	$(BIN)/python benchmarks/render.py
