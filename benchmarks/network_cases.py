@@ -125,7 +125,7 @@ class Drive:
     """A clip in memory: a straight drive with cameras of 1920x1080 at 10 Hz that see coloured clouds; no LiDAR."""
 
     def __init__(self, cameras: int, seconds: float) -> None:
-        self.id = "drive"
+        self.id, self.time_offset_us = "drive", 0
         count = round(seconds * 1e6 / FRAME_US)
         lens = Pinhole(960.0, 960.0, 960.0, 540.0)
         self.rig = Rig(

@@ -6,6 +6,8 @@ import pytest
 if "PYTEST_XDIST_WORKER" in os.environ:
     # As many workers as cores: more threads in each of them would only wait for one another.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # Workers are told a terminal's width, which they have not got.
+    os.environ.pop("COLUMNS", None)
 
 
 @pytest.fixture(scope="session")

@@ -213,13 +213,14 @@ def test_a_real_interrupt_ends_a_run_with_130(place):
     """)
     )
     words = ["run", "street.usdz", "--scenario", "brief.yaml", "--policies", "sleeps.py:Sleeps", "--no-video"]
+    # Where pytest itself runs in the background, its children ignore Ctrl-C.
+    listening = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); import runpy; "
     with subprocess.Popen(
-        [sys.executable, "-m", "nurec_sim.cli", *words],
+        [sys.executable, "-c", listening + "runpy.run_module('nurec_sim.cli', run_name='__main__')", *words],
         cwd=place,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # where pytest itself runs in the background
     ) as process:
         try:
             while "asleep" not in process.stdout.readline():

@@ -56,8 +56,9 @@ def test_our_own_sidecars_come_back(tmp_path):
     pixels = np.random.default_rng(0).uniform([0, 0], [1280, 720], (100, 2))
     (rays, seen), (others, also) = (sensors.unproject(s.rig.cameras["rear"], pixels) for s in (scene, foreign))
     assert np.array_equal(seen, also) and np.allclose(rays[seen], others[seen], atol=1e-9)
-    lanes = zip(scene.road_map.lanes, foreign.road_map.lanes, strict=True)
-    assert all(np.abs(ours[-1] - theirs[-1]).max() < 0.3 and off_line(ours, theirs) < 0.02 for ours, theirs in lanes)
+    # Lanes are written as lines and arcs within 3 cm, and 0.3 m longer at both ends.
+    for ours, theirs in zip(scene.road_map.lanes, foreign.road_map.lanes, strict=True):
+        assert np.abs(ours[-1] - theirs[-1]).max() < 0.31 and off_line(ours, theirs[1:-1]) < 0.03
     assert len(foreign.static) == len(scene.static) + len(scene.dynamic)
     assert archive.archive_faults(tmp_path / "foreign.usdz")
 

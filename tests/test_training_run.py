@@ -33,7 +33,8 @@ def test_a_run_that_was_cut_off_ends_with_the_same_bytes(tmp_path):
     assert all(torch.equal(state[0][name], state[1][name]) for name in state[0])
     metadata = [read_metadata(tmp_path / name / WEIGHTS) for name in ("whole", "cut")]
     assert metadata[0].pop("seconds") and metadata[1].pop("seconds") and metadata[0] == metadata[1]
-    assert len(whole) == len(cut)
+    # The header has the seconds, with as many digits as they have, and is padded to whole 8 bytes.
+    assert abs(len(whole) - len(cut)) <= 8
 
 
 def test_a_run_leaves_curves_weights_and_its_recipe(tmp_path):
