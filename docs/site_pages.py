@@ -1,4 +1,4 @@
-"""Pages of the site that do not lie in docs/: those of the repository's top, and an API reference.
+"""Pages of the site that do not lie in docs/: some of the repository's other pages, and an API reference.
 
 A hook of mkdocs. The reference has a page for each public part of ``nurec_sim``, the names of its ``__all__``, and for
 each package and module below it that has an ``__all__`` of its own. A page shows the names listed there, with their
@@ -7,6 +7,7 @@ docstrings.
 
 import ast
 import importlib
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -16,8 +17,13 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 REPO = Path(__file__).resolve().parents[1]
-TOP_PAGES = {"README.md": "index.md", "CHANGELOG.md": "CHANGELOG.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
-"""Pages of the repository's top, and what they are called on the site."""
+PAGES = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "CHANGELOG.md",
+    "CONTRIBUTING.md": "CONTRIBUTING.md",
+    "tests/README.md": "testing.md",
+}
+"""Pages of the repository outside docs/, and what they are called on the site."""
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -31,17 +37,22 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the pages that lie elsewhere and those of the reference."""
-    for source, target in TOP_PAGES.items():
-        text = (REPO / source).read_text(encoding="utf-8")
-        files.append(File.generated(config, target, content=from_docs(text)))
+    for source, target in PAGES.items():
+        files.append(File.generated(config, target, content=from_docs(REPO / source)))
     for name, path in public_modules().items():
         files.append(File.generated(config, _page(name), content=reference(name, path)))
     return files
 
 
-def from_docs(text: str) -> str:
-    """A page of the repository's top with its links as seen from docs/."""
-    return re.sub(r"\]\(docs/", "](", text).replace("](README.md", "](index.md")
+def from_docs(page: Path) -> str:
+    """The text of a page outside docs/, its links to other pages as they are on the site."""
+
+    def on_site(link: re.Match[str]) -> str:
+        target = Path(os.path.normpath(page.parent / link[1]))
+        source = target.relative_to(REPO).as_posix() if target.is_relative_to(REPO) else link[1]
+        return f"]({PAGES.get(source, source.removeprefix('docs/'))}"
+
+    return re.sub(r"\]\(([\w./-]+)(?=[)#])", on_site, page.read_text(encoding="utf-8"))
 
 
 def public_modules() -> dict[str, Path]:

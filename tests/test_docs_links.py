@@ -1,14 +1,18 @@
 """The pages: every one is in the site's navigation, and every link leads to a file and a heading that are there."""
 
+import ast
 import re
 from pathlib import Path
 
 import pytest
 import yaml
 
-REPO = Path(__file__).parent.parent
-TOP = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")
-PAGES = sorted([*(REPO / "docs").glob("*.md"), *(REPO / name for name in TOP)])
+REPO = Path(__file__).resolve().parent.parent
+SITE = ast.parse((REPO / "docs" / "site_pages.py").read_text()).body
+(OUTSIDE,) = [ast.literal_eval(node.value) for node in SITE if ast.unparse(node).startswith("PAGES =")]
+"""Pages outside docs/, and their names on the site."""
+IN_DOCS = sorted((REPO / "docs").glob("*.md"))
+PAGES = [*IN_DOCS, *(REPO / name for name in OUTSIDE)]
 
 
 def outside_code(text):
@@ -23,7 +27,7 @@ def anchors(page):
     return {re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower()) for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPO)))
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\(([^)\s]+)\)", outside_code(page.read_text()))
     for link in links:
@@ -32,6 +36,8 @@ def test_links_lead_somewhere(page):
             continue
         target = (page.parent / path) if path else page
         assert target.is_file(), f"{page.name}: {link}"
+        on_site = target.resolve() in PAGES or (REPO / "docs") in target.resolve().parents
+        assert on_site, f"{page.name}: {link} is not on the site; name it in docs/site_pages.py"
         assert not anchor or anchor in anchors(target), f"{page.name}: {link}"
 
 
@@ -44,10 +50,9 @@ def named_in(nav):
 
 def test_every_page_is_once_in_the_navigation():
     site = yaml.safe_load((REPO / "mkdocs.yml").read_text())
-    written = [page.name for page in PAGES if page.name != "README.md"]
-    assert sorted(named_in(site["nav"])) == sorted(["index.md", *written])
+    assert sorted(named_in(site["nav"])) == sorted([*OUTSIDE.values(), *(page.name for page in IN_DOCS)])
 
 
 def test_the_readme_leads_to_every_page():
     linked = set(re.findall(r"\]\(docs/([a-z0-9_]+\.md)\)", (REPO / "README.md").read_text()))
-    assert linked == {page.name for page in PAGES if page.parent.name == "docs"}
+    assert linked == {page.name for page in IN_DOCS}
