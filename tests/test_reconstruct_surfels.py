@@ -6,8 +6,9 @@ from reconstruct_street import Street
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lift import colour, depth, lifting, splat, surfaces
-from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, seen_through
+from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, seen_through, voxel_edge_m
 from nurec_sim.reconstruct.lift.settings import PointSettings
+from nurec_sim.reconstruct.lift.views import Tile, View
 
 TOWARDS = np.array([[0.0, 0.0, -1.0]])
 """The normal of a surface that faces the views of these tests, which look along z."""
@@ -68,13 +69,16 @@ def test_a_rim_that_looks_like_what_lies_behind_it_is_trimmed(grey, kept):
 # ------------------------------------------------------------------------------------------------------------- owning
 
 
-def owned(views, own_view=0, own_rgb=100.0):
-    """Whether a point 10 m ahead of its own view stays, and its colour; views are (metres behind, 1/m seen, grey)."""
+def owned(views, own_view=0, own_rgb=100.0, depth_m=10.0):
+    """Whether a point 10 m ahead, which its own view saw at ``depth_m``, stays, and its colour.
+
+    Views are (metres behind the origin, inverse depth seen, grey shown).
+    """
     packed = np.stack([looking_ahead(behind_m) for behind_m, _, _ in views])
     inverse_depth = np.stack([np.full((9, 9), w, np.float32) for _, w, _ in views])
     pictures = np.stack([np.full((9, 9, 3), grey, np.uint8) for _, _, grey in views])
     rgb = np.full((1, 3), own_rgb, np.float32)
-    keep = lifting.owned(np.array([[0.0, 0.0, 10.0]]), np.array([10.0]), np.array([own_view], np.int32), rgb, packed,
+    keep = lifting.owned(np.array([[0.0, 0.0, 10.0]]), np.array([depth_m]), np.array([own_view], np.int32), rgb, packed,
                          inverse_depth, pictures, np.ones(len(views), bool), 0.002, lifting.OWNER_RING,
                          lifting.OWNER_BORDER)  # fmt: skip
     return bool(keep[0]), rgb[0, 0]
@@ -107,6 +111,39 @@ def test_other_views_mix_into_a_colour_with_three_tenths_of_its_weight():
     assert owned([AGREES, (2.5, 1 / 12.5, 200)])[1] == pytest.approx((100 + share * 200) / (1 + share))
 
 
+def test_a_nearer_view_mixes_in_no_more_than_one_as_near():
+    assert owned([(0.9, 1 / 10.9, 100), (0.0, 0.1, 200)], depth_m=10.9)[1] == pytest.approx((100 + 0.3 * 200) / 1.3)
+
+
+def view_of(rgb):
+    """A level view along x with a focal length of 10 pixels."""
+    height, width = rgb.shape[:2]
+    tile = Tile(width, height, 10.0, (width / 2, height / 2), np.eye(3), 1, None, np.ones((height, width), bool),
+                np.zeros(3))  # fmt: skip
+    pose = geometry.pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
+    return View("front", 0, 1_000_000, True, tile, pose, np.zeros(3), rgb)
+
+
+def test_normals_face_the_camera_where_one_surface_ends_before_another():
+    """Walls across the view at 5 and 10 m: square to it, but for the two pixels on each side of the step."""
+    inverse_depth = np.full((9, 10), 0.2, np.float32)
+    inverse_depth[:, 5:] = 0.1
+    normal = lifting.normals_of(view_of(np.zeros((9, 10, 3), np.uint8)), inverse_depth)
+    assert normal[4, [0, 1, 2, 7, 8, 9]] == pytest.approx(np.tile([-1.0, 0, 0], (6, 1)), abs=1e-6)
+    for column in (3, 4, 5, 6):
+        ray = np.array([1.0, -(column + 0.5 - 5) / 10, 0.0])
+        assert normal[4, column] == pytest.approx(-ray / np.linalg.norm(ray))
+
+
+@pytest.mark.parametrize(
+    ("rgb", "sky"), [((200, 190, 195), True), ((100, 110, 140), True), ((60, 70, 100), False), ((120, 110, 115), False)]
+)
+def test_sky_is_bright_or_clearly_blue_and_above_the_horizon(rgb, sky):
+    """Beside a brightest grey of 240: from 192 on it is bright; what is blue counts from 108 on."""
+    found = lifting.sky_coloured(view_of(np.full((8, 8, 3), rgb, np.uint8)), np.zeros((8, 8), np.float32), 240.0)
+    assert (found[:4] == sky).all() and not found[4:].any()
+
+
 # ------------------------------------------------------------------------------------------------------------- colours
 
 
@@ -119,6 +156,22 @@ def test_views_colour_a_point_by_the_inverse_square_of_their_distance():
                                                 np.ones(2, bool), 0.002)  # fmt: skip
     assert rgb[0] == pytest.approx([(4 * 100 + 200) / 5] * 3)
     assert pixel_m[0] == pytest.approx(10.0 / 10.0) and through[0] == 0
+
+
+def test_unseen_points_take_the_colours_of_seen_ones_within_two_metres():
+    """0.45 and 0.95 m away weigh 1 / 0.5 and 1 / 1; the other unseen point has nobody nearer than 2.05 m."""
+    x = np.array([0.0, 0.45, -0.95, -3.0])
+    rgb = np.array([[0] * 3, [0.3] * 3, [0.9] * 3, [0] * 3], np.float32)
+    seen, none = np.array([False, True, True, False]), np.full(4, np.nan, np.float32)
+    filled = colour.fill_unseen(np.column_stack([x, np.zeros((4, 2))]), rgb, seen, none)
+    assert filled[:, 0] == pytest.approx([(2 * 0.3 + 0.9) / 3, 0.3, 0.9, 0.4])
+
+
+def test_unseen_points_far_from_seen_ones_are_grey_by_their_intensity():
+    """From 0.2 to 0.6, reached at the ninth decile of the known intensities; unknown ones count as half of that."""
+    intensity = np.array([*range(11), np.nan], np.float32)
+    filled = colour.fill_unseen(np.zeros((12, 3)), np.zeros((12, 3), np.float32), np.zeros(12, bool), intensity)
+    assert filled[[0, 3, 9, 10, 11], 1] == pytest.approx([0.2, 0.2 + 0.4 / 3, 0.6, 0.6, 0.4])
 
 
 def test_the_response_of_a_camera_is_not_that_of_the_glare_in_it():
@@ -194,6 +247,13 @@ def test_footprints_have_six_tenths_of_their_pixels():
     made = surfaces.footprints(np.zeros((1, 3)), TOWARDS, -TOWARDS, np.array([0.1]), np.zeros((1, 3)), np.zeros(1),
                                np.zeros(1, np.uint8), 0.9)  # fmt: skip
     assert made.scale_m[0] == pytest.approx([0.06, 0.06, 0.006])
+
+
+def test_voxels_grow_by_powers_of_two_with_the_distance_from_the_drive():
+    """A hundredth of it, between 6 and 48 cm."""
+    aside = np.array([2.0, 11.9, 12.1, 23.0, 25.0, 47.0, 100.0])
+    edge = voxel_edge_m(np.column_stack([np.zeros(7), aside, np.zeros(7)]), np.zeros((1, 3)), PointSettings())
+    assert edge == pytest.approx([0.06, 0.06, 0.12, 0.12, 0.24, 0.24, 0.48])
 
 
 def test_sweeps_look_through_what_lies_well_before_their_returns():

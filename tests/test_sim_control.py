@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nurec_sim.errors import PlanError
-from nurec_sim.sim.control import PlannedPath, pursuit_pi
+from nurec_sim.sim.control import PlannedPath, perfect, pursuit_pi
 from nurec_sim.sim.plans import check_plan
 from nurec_sim.sim.vehicle import Limits, VehicleState
 from nurec_sim.types import Plan
@@ -55,6 +55,21 @@ def test_the_brake_stays_on_at_a_standstill():
     assert after.accel_mps2 == pytest.approx(-2.0 * LAG)
     behind = pursuit_pi(along(0, 0, 0), VehicleState(-1.0, 0.0, 0.0, 0.1), 1_000_000, -1.0, LIMITS)
     assert behind.accel_mps2 == pytest.approx((2.0 * 1.0 - 2.5 * 0.1) * LAG)
+
+
+def test_the_perfect_car_has_the_place_speed_and_acceleration_of_its_plan():
+    """Speeds 2 and 4 m/s at the middles of the second and the third second, so 3 m/s and 2 m/s2 after two."""
+    after = perfect(along(1, 3, 7), VehicleState(2.98, 0.0, 0.0, 2.98), 1_990_000, 0.0, LIMITS)
+    assert (after.x_m, after.speed_mps, after.accel_mps2) == pytest.approx((3.0, 3.0, 2.0))
+    assert after.steering_rad == 0.0
+
+
+def test_the_perfect_car_steers_as_its_turn_needs():
+    """0.2 rad/s at 5 m/s: tan(steering) / wheelbase is the curvature 0.04 / m."""
+    turning = path([(5.0, 0.0, 0.2), (10.0, 0.0, 0.4), (15.0, 0.0, 0.6)])
+    after = perfect(turning, VehicleState(7.45, 0.0, 0.298, 5.0), 1_490_000, 0.0, LIMITS)
+    assert after.yaw_rad == pytest.approx(0.3)
+    assert after.steering_rad == pytest.approx(math.atan(0.04 * LIMITS.wheelbase_m))
 
 
 def test_stations_grow_by_steps_ahead_only():
