@@ -140,7 +140,8 @@ def test_finished_runs_are_not_trained_again(script, tmp_path):
     assert train("concatenation") == full == train("full")
     assert len(said) == 4 and full.stat().st_mtime_ns == written
     other = train("no_perceptual")
-    assert other != full and [line.split()[0] for line in said[2:]] == ["gaussians"]  # they share the first stage
+    # They share the first stage.
+    assert other != full and [line.split()[0] for line in said[4:]] == ["waiting", "gaussians"]
     full_state, other_state = load_state_dict(full), load_state_dict(other)
     assert any((full_state[name] != other_state[name]).any() for name in full_state)
     contender = script.contender("concatenation", full, options)
