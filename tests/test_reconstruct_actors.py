@@ -1,12 +1,9 @@
 import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.lift.actors import emit, tracks_of, windows_of
+from nurec_sim.reconstruct.lift.actors import in_box, standing_knots_us, tracks_of
 from nurec_sim.reconstruct.lift.points import actors_of
-from nurec_sim.reconstruct.lift.settings import LiftSettings, PointSettings
+from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.types import Gaussians, Track, Trajectory
 
 SPAN_US = (1_000_000, 6_000_000)
@@ -34,42 +31,14 @@ def drive(speed=8.0, accel=0.0, yaw_rate=0.0, seconds=4.0, step_s=0.1):
     return Trajectory(1_200_000 + np.round(t * 1e6).astype(np.int64), poses)
 
 
-def opacity(window_t, t):
-    t1, t2, t3 = window_t
-    x = (t - t2) / (t3 - t2) if t > t2 else (t2 - t) / (t2 - t1)
-    return np.exp(-(x**10))
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.floats(1, 15), st.floats(-2, 2), st.floats(-0.6, 0.6))
-def test_windows_cover_all_times_and_follow_the_path(speed, accel, yaw_rate):
-    path = drive(max(speed, 2 * abs(accel) * 4), accel, yaw_rate)
-    options = LiftSettings()
-    windows = windows_of(actor(path), SPAN_US, options)
-    for t in np.linspace(path.start_us, path.end_us, 60):
-        strength = [opacity(w.t_us, t) for w in windows]
-        assert 1 - np.prod(1 - 0.95 * np.array(strength)) > 0.75
-        window = windows[int(np.argmax(strength))]
-        position = [np.interp(t, window.t_us, window.position_m[:, axis]) for axis in range(3)]
-        assert np.linalg.norm(position - path.at(int(t))[:3, 3]) <= options.window_position_m + 0.01
-        turn = window.world_from_box[:3, :3].T @ path.at(int(t))[:3, :3]
-        angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
-        assert angle <= options.window_rotation_deg + 0.3
-
-
-def test_straight_driving_needs_one_window():
-    assert len(windows_of(actor(drive()), SPAN_US, LiftSettings())) == 1
-    assert len(windows_of(actor(drive(yaw_rate=0.4)), SPAN_US, LiftSettings())) > 5
-
-
-def test_standing_actors_stay_over_the_whole_clip():
+def test_what_stands_hardly_fades_within_the_clip():
     jitter = np.random.default_rng(0).normal(0, 0.03, (10, 2))
     poses = np.stack([geometry.pose_from_xyyaw(5 + x, 2 + y, 0.1, 0.8) for x, y in jitter])
-    standing = actor(Trajectory(2_000_000 + 100_000 * np.arange(10), poses))
-    assert standing.standing
-    (window,) = windows_of(standing, SPAN_US, LiftSettings())
-    assert all(opacity(window.t_us, t) > 0.8 for t in (*SPAN_US, 3_500_000))
-    assert np.ptp(window.position_m, axis=0) == pytest.approx([0, 0, 0])
+    assert actor(Trajectory(2_000_000 + 100_000 * np.arange(10), poses)).standing
+    early, middle, late = standing_knots_us(SPAN_US)
+    assert middle == 3_500_000 and early == middle - 3_000_001 and late == middle + 3_000_001
+    for t_us in (*SPAN_US, 3_500_000):
+        assert np.exp(-((abs(t_us - middle) / (late - middle)) ** 10)) > 0.8
 
 
 def test_a_far_label_that_jitters_stands_but_a_starting_car_does_not():
@@ -83,21 +52,21 @@ def test_things_that_cannot_move_are_no_actors():
     assert actor(drive(), label="traffic_sign") is None
 
 
-def test_emitted_gaussians_move_with_their_box():
+def test_gaussians_of_an_actor_are_stored_once_in_its_box():
     mover = actor(drive(yaw_rate=0.3))
     box = Gaussians.empty(3)
     box.mean_m[:] = [[2, 0, 0], [0, 1, 0], [0, 0, 0.7]]
-    box.normal[:] = [0, 1, 0]
-    windows = windows_of(mover, SPAN_US, LiftSettings())
-    layer = emit(mover, box, windows)
-    assert len(layer) == 3 * len(windows)
-    assert (layer.track == mover.index).all()
-    assert (np.diff(layer.knot_t_us, axis=1) > 0).all()
-    for k in range(len(layer)):
-        pose = mover.path.at(int(layer.knot_t_us[k, 1]))
-        assert layer.gaussians.mean_m[k] == pytest.approx(pose[:3, :3] @ box.mean_m[k % 3] + pose[:3, 3], abs=1e-3)
-        assert layer.gaussians.normal[k] == pytest.approx(pose[:3, :3] @ [0, 1, 0], abs=1e-3)
-        assert np.array_equal(layer.knot_m[k, 1], layer.gaussians.mean_m[k])
+    layer = in_box(mover, box)
+    assert len(layer) == 3 and layer.in_box.all() and (layer.track == mover.index).all()
+    assert np.array_equal(layer.gaussians.mean_m, box.mean_m)
+    alive, where, fade = layer.at(mover.path.end_us)
+    assert len(alive) == 3 and np.array_equal(where, box.mean_m) and (fade == 1).all()
+
+
+def test_a_track_that_is_labelled_once_is_there_for_a_tenth_of_a_second():
+    clip = Log(Track("car", "automobile", (4.0, 1.8, 1.5), Trajectory(np.array([2_000_000]), np.eye(4)[None])))
+    (shown,) = tracks_of(clip, actors_of(clip, PointSettings()))
+    assert shown.path.t_us.tolist() == [1_950_000, 2_050_000]
 
 
 def test_a_standing_actor_stays_to_be_hit_after_its_labels_end():

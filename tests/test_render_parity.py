@@ -153,3 +153,20 @@ def test_small_gaussians_are_found_while_the_shutter_rolls():
     got, expected = Renderer(world).render_camera(asked), spec.render_camera(world, asked)
     assert (expected.alpha > 0.3).sum() > 100
     assert (np.abs(got.alpha - expected.alpha) > 0.02).sum() == 0
+
+
+def test_a_frame_has_the_response_of_its_instant():
+    """Half way between a frame shown as it is and one shown at half its brightness: three quarters."""
+    times_us = np.array([[START_US, START_US], [START_US + 100_000, START_US + 100_000]])
+    plain = scene(cloud())
+    world = dataclasses.replace(
+        plain,
+        exposures={"front": np.stack([np.eye(3, 4), 0.5 * np.eye(3, 4)])},
+        camera_times_us={"front": times_us},
+    )
+    asked = request(camera(), start_us=START_US + 40_000, end_us=START_US + 60_000)
+    assert_same_image(world, asked)
+    shown, full = (Renderer(each).render_camera(asked).rgb.astype(float) for each in (world, plain))
+    assert np.abs(shown - 0.75 * full).max() <= 1
+    late = request(camera(), start_us=START_US + 900_000, end_us=START_US + 900_000)
+    assert np.array_equal(world.response("front", late.middle_us), 0.5 * np.eye(3, 4))

@@ -12,13 +12,13 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from nurec_sim.cli.console import app, err, out, print_table, progress
-from nurec_sim.cli.scenes import NO_FLAGS, Method, NetworkFlags, network_settings
+from nurec_sim.cli.scenes import NO_FLAGS, Method, NetworkFlags, network_settings, refinement
 from nurec_sim.errors import NurecSimError
 from nurec_sim.new_files import check_writable, write_file
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 
 ProtocolName = Literal["storm", "clip", "shift"]
-Compared = Literal["dense", "dense-lidar", "selective", "dense-concatenated", "lift", "copy"]
+Compared = Literal["dense", "dense-lidar", "selective", "dense-concatenated", "lift", "optimized", "copy"]
 USUAL_METHODS: dict[str, tuple[Compared, ...]] = {
     "storm": ("dense", "dense-lidar", "selective", "lift", "copy"),
     "clip": ("dense", "dense-lidar", "dense-concatenated", "lift", "copy"),
@@ -33,6 +33,8 @@ class LogFlags:
 
     method: Method = "lift"
     """CLIP: how to reconstruct."""
+    refine: float | None = None
+    """CLIP: seconds to spend on fitting the scene to its input images and sweeps."""
     input_cameras: tuple[str, ...] = ()
     """CLIP: cameras that the reconstruction may see; all if not given."""
     target_cameras: tuple[str, ...] = ()
@@ -147,6 +149,7 @@ def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> N
             images_dir=flags.images,
             progress=advance,
             settings=network_settings(flags.method, network),
+            refine=refinement(flags.refine),
         )
     if flags.json is not None:
         write_file(flags.json, json.dumps(figures, indent=1, sort_keys=True) + "\n")

@@ -12,11 +12,12 @@ from nurec_sim.cli.console import OnePath, app, out, print_table, progress
 from nurec_sim.errors import NurecSimError
 from nurec_sim.new_files import check_writable
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
+from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 
 if TYPE_CHECKING:
     from nurec_sim.types import GaussianScene
 
-Method = Literal["lift", "dense", "selective"]
+Method = Literal["lift", "dense", "selective", "optimized"]
 NetworkFlags = Annotated[FeedForwardSettings, tyro.conf.arg(name="")]
 NO_FLAGS = FeedForwardSettings()
 
@@ -29,6 +30,7 @@ def reconstruct(
     method: Method = "lift",
     cameras: tuple[str, ...] = (),
     map_from_gaussians: bool = False,
+    refine: float | None = None,
     overwrite: bool = False,
     network: NetworkFlags = NO_FLAGS,
 ) -> None:
@@ -36,7 +38,9 @@ def reconstruct(
 
     Methods: `lift` colours LiDAR points, without learning. `dense` and `selective` are the Instant NuRec network, with
     one Gaussian per pixel or with clusters around chosen points; the options of the second group are theirs.
-    `nurec-sim weights list` shows the profiles, and which weights are here.
+    `nurec-sim weights list` shows the profiles, and which weights are here. `optimized` fits the result of `lift` to
+    the log for five minutes, or as long as --refine says; --refine does so after any other method too. Ctrl-C while
+    it fits keeps what has been reached.
 
     Args:
         clip: a clip folder, or a .zip of one.
@@ -45,6 +49,7 @@ def reconstruct(
         cameras: use only these cameras; all if not given, or as many as the network's profile takes.
         map_from_gaussians: for a log without a map, give other simulators one (map.xodr) whose drivable area is that of
             the road-class Gaussians; without it they get none.
+        refine: seconds to spend on fitting the scene to the log's images and sweeps.
         overwrite: replace an archive that is there.
         network: how the clip goes through the network.
     """
@@ -58,7 +63,12 @@ def reconstruct(
     check_writable(target)
     with progress("reconstructing") as advance:
         world_scene = run_method(
-            log, method, cameras=cameras or None, progress=advance, settings=network_settings(method, network)
+            log,
+            method,
+            cameras=cameras or None,
+            progress=advance,
+            settings=network_settings(method, network),
+            refine=refinement(refine),
         )
     derived = None
     if map_from_gaussians and world_scene.road_map is None:
@@ -113,7 +123,7 @@ def network_settings(method: str, network: FeedForwardSettings) -> FeedForwardSe
     Raises:
         NurecSimError: flags were given to a method that has no use for them.
     """
-    if method != "lift":
+    if method in ("dense", "selective"):
         return network
     given = [
         "--" + each.name.replace("_", "-")
@@ -121,8 +131,22 @@ def network_settings(method: str, network: FeedForwardSettings) -> FeedForwardSe
         if getattr(network, each.name) != getattr(NO_FLAGS, each.name)
     ]
     if given:
-        raise NurecSimError(f"method 'lift' does not use {', '.join(given)}; choose --method dense or selective")
+        raise NurecSimError(f"method {method!r} does not use {', '.join(given)}; choose --method dense or selective")
     return None
+
+
+def refinement(seconds: float | None) -> OptimizeSettings | None:
+    """Settings of an optimisation of so many seconds.
+
+    Raises:
+        NurecSimError: no time at all.
+    """
+    if seconds is None:
+        return None
+    try:
+        return OptimizeSettings(seconds=seconds)
+    except ValueError as error:
+        raise NurecSimError(f"--refine: {error}") from None
 
 
 def load_scene(source: Path) -> GaussianScene:

@@ -10,7 +10,7 @@ from jaxtyping import Int64
 from nurec_sim import geometry
 from nurec_sim.evaluate.views import reduced, reduced_mask
 from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, Target
-from nurec_sim.types import CameraModel, Label, Pinhole, Rig, SensorRequest
+from nurec_sim.types import CameraModel, Label, Pinhole, Rig, SensorRequest, Trajectory
 from nurec_sim.world import LIDAR_ID, TrueWorld, street_rig, town_plan, true_sweep
 from nurec_sim.world.isp import CameraResponse, random_response
 from nurec_sim.world.plan import TownPlan

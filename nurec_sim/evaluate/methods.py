@@ -13,7 +13,7 @@ import numpy as np
 
 from nurec_sim.errors import ReconstructError, WeightsError
 from nurec_sim.evaluate.windows import Window
-from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings
+from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, OptimizeSettings
 from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, SensorRequest
 
 Show = Callable[[SensorRequest], CameraFrame]
@@ -25,11 +25,14 @@ CHOICES: Mapping[str, str] = {
     "dense-lidar": "dense, its depth fitted to the LiDAR that lift sees, from place to place",
     "dense-concatenated": "dense, all Gaussians of all chunks kept instead of merged by ownership",
     "lift": "coloured LiDAR and stereo, no learning",
+    "optimized": "lift, then fitted to the seen images and sweeps (400 steps)",
     "copy": "the input image nearest in time, as it is; knows no depth",
 }
 
 LIFT = LiftSettings(sky_px=256)
 """A finer sky would not be seen at the size at which views are compared."""
+OPTIMIZED = OptimizeSettings(seconds=None, steps=400)
+"""Steps, not seconds: figures must not depend on the machine."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Contender:
 
     name: str
     method: str
-    settings: FeedForwardSettings | LiftSettings | None = None
+    settings: FeedForwardSettings | LiftSettings | OptimizeSettings | None = None
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,8 @@ def _contender(name: str, network: FeedForwardSettings, selective: Path | None, 
         return Contender(name, "copy")
     if name == "lift":
         return Contender(name, "lift", lift)
+    if name == "optimized":
+        return Contender(name, "optimized", OPTIMIZED)
     method = "selective" if name == "selective" else "dense"
     if name == "dense-concatenated":
         network = dataclasses.replace(network, merge="concatenate")

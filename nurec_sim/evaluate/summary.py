@@ -21,6 +21,8 @@ PAIRS = (
     ("dense-lidar", "copy"),
     ("selective", "dense"),
     ("dense", "dense-concatenated"),
+    ("optimized", "lift"),
+    ("optimized", "dense"),
 )
 """Methods whose difference is told, where both took part."""
 DRAWS = 2000

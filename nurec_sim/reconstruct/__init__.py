@@ -9,17 +9,21 @@ from typing import TYPE_CHECKING
 from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.reconstruct.lift.settings import GroundSettings, LiftSettings, PointSettings, ViewSettings
+from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 
 if TYPE_CHECKING:
     from nurec_sim.types import Clip, GaussianScene
 
-METHODS = ("lift", "dense", "selective")
+METHODS = ("lift", "dense", "selective", "optimized")
+START_SHARE = 0.15
+"""Of the work of a reconstruction that is fitted to its log, about, is what it starts from."""
 
 __all__ = [
     "METHODS",
     "FeedForwardSettings",
     "GroundSettings",
     "LiftSettings",
+    "OptimizeSettings",
     "PointSettings",
     "ViewSettings",
     "reconstruct",
@@ -33,7 +37,8 @@ def reconstruct(
     cameras: Sequence[str] | None = None,
     hold_out_sweeps: Sequence[int] = (),
     progress: Callable[[str, float], None] | None = None,
-    settings: LiftSettings | FeedForwardSettings | None = None,
+    settings: LiftSettings | FeedForwardSettings | OptimizeSettings | None = None,
+    refine: OptimizeSettings | None = None,
 ) -> GaussianScene:
     """Build a Gaussian scene from a clip.
 
@@ -43,7 +48,9 @@ def reconstruct(
         cameras: ids of the cameras to use; if None all, or as many as the network's profile takes.
         hold_out_sweeps: indices of sweeps that must not be read, of every LiDAR.
         progress: called with the stage's name and the fraction of all work that is done, about.
-        settings: ``LiftSettings`` for ``lift``, ``FeedForwardSettings`` for the others; the defaults if None.
+        settings: ``LiftSettings`` for ``lift``, ``OptimizeSettings`` for ``optimized``, ``FeedForwardSettings`` for the
+            others; the defaults if None.
+        refine: fit the scene to the images and sweeps afterwards; ``optimized`` is ``lift`` with this step.
 
     Raises:
         ReconstructError: no such method, camera or sweep, settings of another method, or the clip lacks what the
@@ -63,6 +70,20 @@ def reconstruct(
 
     held = {int(index) for index in hold_out_sweeps}
     report = progress or (lambda stage, fraction: None)
+    if refine is not None or method == "optimized":
+        if isinstance(settings, OptimizeSettings) and refine is not None:
+            raise ReconstructError("the optimisation was given settings twice: as settings and as refine")
+        start = "lift" if method == "optimized" else method
+        plain = None if isinstance(settings, OptimizeSettings) else settings
+        fit = settings if isinstance(settings, OptimizeSettings) else refine or OptimizeSettings()
+        scene = reconstruct(
+            clip, start, cameras=cameras, hold_out_sweeps=hold_out_sweeps, settings=plain,
+            progress=lambda stage, share: report(stage, START_SHARE * share),
+        )  # fmt: skip
+        from nurec_sim.reconstruct.optimize.method import refine as fit_to_log
+
+        return fit_to_log(scene, clip, list(scene.provenance["cameras"]), held,
+                          lambda stage, share: report(stage, START_SHARE + (1 - START_SHARE) * share), fit)  # fmt: skip
     wanted = LiftSettings if method == "lift" else FeedForwardSettings
     if settings is None:
         settings = wanted()

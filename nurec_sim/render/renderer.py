@@ -96,7 +96,6 @@ class Renderer:
         self._static = Detail.of(scene.static, detail_px) if detail_px else pack(scene.static)
         self._moving = PackedMoving.of(scene.dynamic, scene.tracks)
         self._sky = np.ascontiguousarray(scene.sky, np.float32)
-        self._isp = {name: np.ascontiguousarray(matrix, np.float32) for name, matrix in scene.isp.items()}
         self._sensors: OrderedDict[tuple, _Sensor] = OrderedDict()
         self._sensors_lock = threading.Lock()
 
@@ -193,7 +192,8 @@ class Renderer:
         depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
         normal = np.empty((height, width, 3) if picture.kind == NORMALS else (0, 0, 3), np.float32)
         corrected = self.apply_isp and request.apply_isp
-        isp = self._isp.get(request.sensor.id, IDENTITY_ISP) if corrected else IDENTITY_ISP
+        response = self.scene.response(request.sensor.id, request.middle_us) if corrected else None
+        isp = IDENTITY_ISP if response is None else np.ascontiguousarray(response, np.float32)
         turn = view.world_from_line[:, :3, :3].astype(np.float32)
         linear = view.way in (AFFINE, ROLLING)
         ray_z = np.zeros((0, 0), np.float32) if linear else sensor.ray_z

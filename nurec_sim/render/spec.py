@@ -98,7 +98,8 @@ def render_camera(
             a.reshape(-1, *a.shape[2:])[pixels][None] for a in (origin, direction, ray, valid)
         )
     sums = blend_rays(gaussians, features, order, origin, direction, grid.near_m, valid)
-    isp = scene.isp.get(request.sensor.id) if apply_isp and request.apply_isp else None
+    corrected = apply_isp and request.apply_isp
+    isp = scene.response(request.sensor.id, request.middle_us) if corrected else None
     colour = finish_colour(sums.features[..., :3], sums.alpha, sky_colour(scene.sky, direction), isp)
     surface = sums.alpha >= SURFACE_ALPHA
     depth = np.maximum(sums.distance / np.maximum(sums.alpha, MIN_ALPHA) * ray[..., 2], 0)

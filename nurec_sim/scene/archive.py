@@ -42,11 +42,13 @@ from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, R
 FORMAT_VERSION = 1
 MANIFEST = "nurec_sim/manifest.json"
 FACTS, ISP, SKY = "nurec_sim/scene.json", "nurec_sim/isp.json", "nurec_sim/sky_cubemap.npy"
+EXPOSURES = "nurec_sim/exposures.json"
 KNOT_TIMES, KNOTS, OWNERS, IN_BOX = (
     f"nurec_sim/dynamic_{name}.npy" for name in ("knot_t_us", "knot_m", "track", "in_box")
 )
 TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY, KNOT_TIMES, KNOTS, OWNERS)
-"""The members that a scene is read from, with ``IN_BOX`` where it has such; all others are for other programs."""
+"""The members that a scene is read from, with ``IN_BOX`` and ``EXPOSURES`` where it has such; all others are for other
+programs."""
 
 FOREIGN_SUFFIXES = (".ply", ".spz", ".usd", ".usda", ".usdc", ".nurec", ".ckpt")
 SCENE_SUFFIXES = (".usdz", *FOREIGN_SUFFIXES)
@@ -92,6 +94,8 @@ def write_scene(
         KNOTS: npy_bytes(scene.dynamic.knot_m),
         OWNERS: npy_bytes(scene.dynamic.track),
     }
+    if scene.exposures:
+        members[EXPOSURES] = codec.dump(scene.exposures, EXPOSURES)
     if scene.dynamic.in_box is not None:
         members[IN_BOX] = npy_bytes(scene.dynamic.in_box)
     members[MANIFEST] = codec.dump(_manifest(scene, digest, members), MANIFEST, indent=2)
@@ -136,7 +140,14 @@ def read_scene(path: Path | str) -> GaussianScene:
         dynamic = DynamicGaussians(moving, knot_t_us, knot_m, owners, in_box)
         isp_json = codec.load(package.read(ISP, LIMITS.json_bytes), f"{path}: {ISP}")
         isp = codec.from_json(codec.mapping(codec.array(np.float64, 3, 4)), isp_json, f"{path}: {ISP}")
-        scene = GaussianScene(static=static, dynamic=dynamic, sky=_array(package, SKY), isp=isp, **facts)
+        scene = GaussianScene(
+            static=static,
+            dynamic=dynamic,
+            sky=_array(package, SKY),
+            isp=isp,
+            exposures=_exposures(package, manifest),
+            **facts,
+        )
     try:
         check_scene(scene)
     except ArchiveError as error:
@@ -242,6 +253,16 @@ def _read_fields(layer, paths: list[str], count: int, what: str) -> Gaussians:
         return gather([read_field(layer, path, what) for path in paths], count, what)
     except Tf.ErrorException as error:
         raise ArchiveError(f"{what}: the USD layer is damaged") from error
+
+
+def _exposures(package: Package, manifest: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Responses of single frames, where the archive has some."""
+    if EXPOSURES not in manifest["sha256"]:
+        return {}
+    _check_hashes(package, manifest, (EXPOSURES,))
+    where = f"{package.path}: {EXPOSURES}"
+    raw = codec.load(package.read(EXPOSURES, LIMITS.json_bytes), where)
+    return codec.from_json(codec.mapping(codec.array(np.float64, -1, 3, 4)), raw, where)
 
 
 def _array(package: Package, name: str) -> np.ndarray:

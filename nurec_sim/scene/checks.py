@@ -40,6 +40,12 @@ def check_scene(scene: GaussianScene) -> None:
         _check_array(matrix, f"isp[{camera_id!r}]", np.float64, (3, 4))
         if not np.isfinite(matrix).all():
             raise ArchiveError(f"isp[{camera_id!r}] is not finite: {matrix.tolist()}")
+    for camera_id, frames in scene.exposures.items():
+        if not len(scene.camera_times_us.get(camera_id, ())):
+            raise ArchiveError(f"exposures[{camera_id!r}]: camera_times_us has no frames of that camera")
+        _check_array(frames, f"exposures[{camera_id!r}]", np.float64, (len(scene.camera_times_us[camera_id]), 3, 4))
+        if not np.isfinite(frames).all():
+            raise ArchiveError(f"exposures[{camera_id!r}] are not finite")
     _check_facts(scene)
 
 

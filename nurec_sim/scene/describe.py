@@ -30,8 +30,11 @@ def _columns(gaussians: Gaussians) -> Mapping[str, np.ndarray]:
 
 def scene_hash(scene: GaussianScene) -> str:
     """SHA-256 of everything in a scene, hexadecimal; equal scenes have equal hashes."""
+    given = {"facts": scene_facts(scene), "isp": scene.isp}
+    if scene.exposures:
+        given["exposures"] = scene.exposures
     digest = hashlib.sha256()
-    digest.update(codec.dump({"facts": scene_facts(scene), "isp": scene.isp}, "the scene"))
+    digest.update(codec.dump(given, "the scene"))
     for name, array in scene_arrays(scene).items():
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
         canonical = array + array.dtype.type(0)  # -0 is 0: OpenUSD merges equal arrays, whatever their zeros' signs

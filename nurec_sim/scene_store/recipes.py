@@ -66,7 +66,7 @@ class Recipe:
 
     def _weights(self) -> str | None:
         """Hash of the file that the network's weights come from; None where none is read, or none is there."""
-        if self.method == "lift":
+        if self.method in ("lift", "optimized"):
             return None
         settings = self.settings if isinstance(self.settings, FeedForwardSettings) else FeedForwardSettings()
         if settings.random_weights is not None:

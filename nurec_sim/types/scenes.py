@@ -178,6 +178,8 @@ class GaussianScene:
 
     ``sky`` is a cubemap ``[6,h,h,3]`` of display-space colours, faces and axes as in ``geometry.cubemap_directions``.
     ``isp`` maps a camera id to ``[3,4]``: shown colour = ``isp[:, :3] @ colour + isp[:, 3]``, after sky compositing.
+    ``exposures`` maps a camera id to responses of its single frames, ``[frames,3,4]`` at the middles of
+    ``camera_times_us``; where a camera has them they stand in for ``isp``, between frames linearly in time.
     ``provenance`` is plain JSON: method, settings, what was not known (no map, no boxes, ...).
     """
 
@@ -193,6 +195,20 @@ class GaussianScene:
     span_us: tuple[int, int]
     camera_times_us: Mapping[str, Int64[np.ndarray, "frames 2"]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    exposures: Mapping[str, Float64[np.ndarray, "frames 3 4"]] = field(default_factory=dict)
+
+    def response(self, camera_id: str, t_us: int) -> Float64[np.ndarray, "3 4"] | None:
+        """The colour response of a camera at an instant; None for a camera that the scene doesn't know."""
+        frames = self.exposures.get(camera_id)
+        if frames is None:
+            return self.isp.get(camera_id)
+        middle = np.asarray(self.camera_times_us[camera_id], np.int64).sum(axis=1) // 2
+        after = int(np.clip(np.searchsorted(middle, t_us), 1, max(len(middle) - 1, 1)))
+        before = min(after - 1, len(middle) - 1)
+        after = min(after, len(middle) - 1)
+        span = max(int(middle[after] - middle[before]), 1)
+        share = float(np.clip((t_us - int(middle[before])) / span, 0, 1))
+        return frames[before] * (1 - share) + frames[after] * share
 
     def __repr__(self) -> str:
         start_us, end_us = self.span_us

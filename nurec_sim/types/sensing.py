@@ -31,6 +31,11 @@ class SensorRequest:
     hidden: Set[str] = frozenset()
     apply_isp: bool = True
 
+    @property
+    def middle_us(self) -> int:
+        """Middle of the exposure."""
+        return (self.start_us + self.end_us) // 2
+
 
 @dataclass(frozen=True)
 class CameraFrame:

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.lift.actors import windows_of
+from nurec_sim.reconstruct.lift.actors import standing_knots_us
 from nurec_sim.reconstruct.lift.points import Actor, actors_of
-from nurec_sim.reconstruct.lift.settings import LiftSettings, PointSettings
+from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.types import Clip, Trajectory
 
 PADDING_M = 0.5
@@ -129,8 +129,7 @@ def knots_along(
         Times and positions of the knots.
     """
     if actor.standing:
-        times = windows_of(actor, span_us, LiftSettings())[0].t_us
-        return np.tile(times, (len(xyz_m), 1)), np.repeat(xyz_m[:, None], 3, axis=1)
+        return np.tile(standing_knots_us(span_us), (len(xyz_m), 1)), np.repeat(xyz_m[:, None], 3, axis=1)
     before = max(target_t_us[0], actor.path.start_us)
     after = min(target_t_us[1], actor.path.end_us)
     box_from_world = geometry.inverse(poses_at(actor.path, t_us))

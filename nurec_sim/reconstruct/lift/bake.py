@@ -17,6 +17,8 @@ from nurec_sim.reconstruct.lift.settings import THREADS, LiftSettings
 from nurec_sim.reconstruct.lift.views import View
 from nurec_sim.types import Gaussians, Label
 
+GROUND_M = 0.12
+"""Points so near to the ground belong to it."""
 KEPT_SHARE = 0.4
 """Share of the pixels of all views that owns a surface, about; to meet the budget before ownership is known."""
 
@@ -156,7 +158,10 @@ def _lifted_gaussians(lifted: Lifted, body: Surfels, ground: Ground, settings: L
     if len(body.cloud):
         label = np.where(from_surfel, body.label[lifted.surfel], label)
         intensity = np.where(from_surfel, body.cloud.intensity[lifted.surfel], intensity)
+    stretch = np.full(n, surfaces.MOST_STRETCH)
     if body.actor is None:
+        flat = np.abs(ground.above(lifted.xyz_m)) < GROUND_M
+        stretch = np.where(flat, surfaces.MOST_STRETCH_OF_GROUND, stretch)
         label = np.where(~from_surfel & ground.is_road(lifted.xyz_m), Label.ROAD, label)
     return surfaces.footprints(lifted.xyz_m, lifted.normal, lifted.ray, lifted.pixel_m, lifted.rgb / 255, intensity,
-                               label, settings.opacity)  # fmt: skip
+                               label, settings.opacity, stretch)  # fmt: skip

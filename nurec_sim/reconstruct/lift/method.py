@@ -64,8 +64,7 @@ def lift(
         if body.actor is None:
             static = gaussians
         elif len(gaussians):
-            windows = actor_layer.windows_of(body.actor, clip.span_us, settings)
-            moving.append(actor_layer.emit(body.actor, gaussians, windows))
+            moving.append(actor_layer.in_box(body.actor, gaussians))
     stages.start("sky")
     sky = make_sky(views, canonical, [_sky_weight(p, v, settings) for p, v in zip(pictures, views, strict=True)],
                    settings.sky_px)  # fmt: skip

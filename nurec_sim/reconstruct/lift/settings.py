@@ -74,8 +74,4 @@ class LiftSettings:
     views: ViewSettings = field(default_factory=ViewSettings)
     sky_px: int = 512
     """Edge of a cubemap face."""
-    window_position_m: float = 0.05
-    """Largest error of the linear motion between the knots of an actor's window."""
-    window_rotation_deg: float = 2.5
-    """Largest turn of an actor within one window."""
     opacity: float = 0.95

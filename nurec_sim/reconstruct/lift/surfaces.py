@@ -20,6 +20,9 @@ DISC_SIGMA = 0.45
 """Standard deviation of a disc per metre of point spacing: discs on a square lattice then leave no visible gaps."""
 PIXEL_SIGMA = 0.6
 """The same for footprints of pixels, whose lattice shears where the surface is curved."""
+MOST_STRETCH, MOST_STRETCH_OF_GROUND = 5.0, 30.0
+"""Length over width of a footprint at most. The ground is known to be flat; from a camera at 1.65 m it is stretched by
+15 at 25 m."""
 THINNEST_M = 0.003
 """Thicker discs would catch grazing LiDAR beams far in front of the ground."""
 
@@ -101,9 +104,13 @@ def footprints(
     intensity: Float32[np.ndarray, " n"],
     label: UInt8[np.ndarray, " n"],
     opacity: float,
-    stretch_limit: float = 5.0,
+    stretch_limit: float | Float64[np.ndarray, " n"] = MOST_STRETCH,
 ) -> Gaussians:
-    """Gaussians as the shadows of pixels on the surface: ``pixel_m`` wide across ``ray``, stretched along its slope."""
+    """Gaussians as the shadows of pixels on the surface: ``pixel_m`` wide across ``ray``, stretched along its slope.
+
+    ``stretch_limit`` bounds the stretch, which is 1 / cosine of the incidence: a surface whose slope is not sure would
+    reach far into free space.
+    """
     facing = np.abs(np.sum(normal * ray, axis=1))
     # First axis: along the slope, where the footprint is stretched; second: across it.
     across = np.cross(normal, ray)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
 
 from nurec_sim.render.cpu.background import draw_sky, draw_sky_back
 from nurec_sim.render.cpu.backward import draw_tiles_back, number_slots
@@ -160,6 +160,13 @@ class Frame:
         self._picture = Picture(self.view, rays, kind, [(layer, np.arange(blocks))], self._array)
         self.planes = draw([self._picture], self._workers)[0]
         return self.planes
+
+    @property
+    def drawn_rows(self) -> Int32[np.ndarray, " k"]:
+        """Rows of the Gaussians that can be seen in the frame, rising; others have no gradient."""
+        # Every run takes its blocks in their order, and the runs follow each other.
+        picture = self._picture
+        return np.concatenate([picture.sources[first : first + many] for _, first, many in picture.runs])
 
     def draw_back(
         self,

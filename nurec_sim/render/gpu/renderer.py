@@ -173,7 +173,8 @@ class GpuRenderer:
 
     def _view(self, request: SensorRequest, number: int) -> SensorView:
         """The sensor of the request of that number."""
-        isp = self.scene.isp.get(request.sensor.id) if self.apply_isp and request.apply_isp else None
+        corrected = self.apply_isp and request.apply_isp
+        isp = self.scene.response(request.sensor.id, request.middle_us) if corrected else None
         blocks = len(self._moving)
         return SensorView(self._grid(request), request.world_from_sensor, isp, number * blocks, blocks)
 

@@ -1,0 +1,144 @@
+"""Kernel that takes one step of Adam (Kingma and Ba 2015) on the Gaussians that an image shows.
+
+A Gaussian's moments rest while it is out of view; its bias correction counts the images that showed it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nurec_sim.kernels import kernel
+
+VALUES = 14
+MEAN, QUAT, SCALE, OPACITY, RGB = 0, 3, 7, 10, 11
+"""First columns of a Gaussian's values: mean, quaternion, log scales, logit of opacity, colour."""
+BETA1, BETA2 = 0.9, 0.99
+EPSILON = 1e-15
+SMALLEST_M = 1e-3
+
+
+@kernel
+def adam_step(
+    rows, values, first, second, visits, turns, row_turn, by_mean, by_quat, by_scale, by_opacity, by_rgb, scale,
+    opacity, rates, largest_m,
+):  # fmt: skip
+    """One step on some Gaussians.
+
+    Args:
+        rows: [k] which ones.
+        values: [n,14] what is optimised, see ``MEAN`` and the others; changed.
+        first: [n,14] first moments; changed.
+        second: [n,14] second moments; changed.
+        visits: [n] steps so far; changed.
+        turns: [t,7] rotations world_from_frame, as a quaternion and padding: rows of ``row_turn``.
+        row_turn: [n] which of ``turns`` took a Gaussian to the world; -1 none.
+        by_mean: [n,3] gradient by the mean in the world, like the following ones.
+        by_quat: [n,4] by the quaternion in the world.
+        by_scale: [n,3] by standard deviations.
+        by_opacity: [n] by opacity.
+        by_rgb: [n,3] by colour.
+        scale: [n,3] standard deviations that were drawn.
+        opacity: [n] opacities that were drawn.
+        rates: [14] learning rates.
+        largest_m: standard deviations end here.
+    """
+    gradient = np.zeros(VALUES)
+    low, high = np.log(SMALLEST_M), np.log(largest_m)
+    for row in range(rows.shape[0]):
+        i = rows[row]
+        for k in range(3):
+            gradient[MEAN + k] = by_mean[i, k]
+            gradient[SCALE + k] = by_scale[i, k] * scale[i, k]
+            gradient[RGB + k] = by_rgb[i, k]
+        for k in range(4):
+            gradient[QUAT + k] = by_quat[i, k]
+        gradient[OPACITY] = by_opacity[i] * opacity[i] * (1 - opacity[i])
+        turn = row_turn[i]
+        if turn >= 0:
+            # mean_world = R mean + t and quat_world = r quat, so gradients go back by R^T and by conj(r).
+            w, x, y, z = turns[turn, 0], turns[turn, 1], turns[turn, 2], turns[turn, 3]
+            a, b, c = gradient[MEAN], gradient[MEAN + 1], gradient[MEAN + 2]
+            gradient[MEAN] = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c
+            gradient[MEAN + 1] = 2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c
+            gradient[MEAN + 2] = 2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c
+            p, q, r, s = gradient[QUAT], gradient[QUAT + 1], gradient[QUAT + 2], gradient[QUAT + 3]
+            gradient[QUAT] = w * p + x * q + y * r + z * s
+            gradient[QUAT + 1] = w * q - x * p - y * s + z * r
+            gradient[QUAT + 2] = w * r + x * s - y * p - z * q
+            gradient[QUAT + 3] = w * s - x * r + y * q - z * p
+        visits[i] += 1
+        correction1, correction2 = 1 - BETA1 ** visits[i], 1 - BETA2 ** visits[i]
+        for k in range(VALUES):
+            g = gradient[k]
+            first[i, k] = BETA1 * first[i, k] + (1 - BETA1) * g
+            second[i, k] = BETA2 * second[i, k] + (1 - BETA2) * g * g
+            step = first[i, k] / correction1 / (np.sqrt(second[i, k] / correction2) + EPSILON)
+            values[i, k] -= rates[k] * step
+        for k in range(SCALE, SCALE + 3):
+            values[i, k] = min(max(values[i, k], low), high)
+        norm = 0.0
+        for k in range(QUAT, QUAT + 4):
+            norm += values[i, k] * values[i, k]
+        norm = np.sqrt(max(norm, 1e-24))
+        for k in range(QUAT, QUAT + 4):
+            values[i, k] /= norm
+
+
+@kernel
+def activate(rows, values, mean, quat, scale, opacity, rgb):
+    """What is drawn, [n,...], of the values of some Gaussians, in their own frames."""
+    for row in range(rows.shape[0]):
+        i = rows[row]
+        for k in range(3):
+            mean[i, k] = values[i, MEAN + k]
+            scale[i, k] = np.exp(values[i, SCALE + k])
+            rgb[i, k] = values[i, RGB + k]
+        for k in range(4):
+            quat[i, k] = values[i, QUAT + k]
+        opacity[i] = 1 / (1 + np.exp(-values[i, OPACITY]))
+
+
+@kernel
+def adam_cells(values, first, second, visits, gradient, rate):
+    """One step on the cells [n,c] of a table that have a gradient, and those only; values stay within 0..1."""
+    for i in range(values.shape[0]):
+        touched = False
+        for k in range(values.shape[1]):
+            touched = touched or gradient[i, k] != 0
+        if not touched:
+            continue
+        visits[i] += 1
+        correction1, correction2 = 1 - BETA1 ** visits[i], 1 - BETA2 ** visits[i]
+        for k in range(values.shape[1]):
+            first[i, k] += (1 - BETA1) * (gradient[i, k] - first[i, k])
+            second[i, k] += (1 - BETA2) * (gradient[i, k] * gradient[i, k] - second[i, k])
+            step = first[i, k] / correction1 / (np.sqrt(second[i, k] / correction2) + EPSILON)
+            values[i, k] = min(max(values[i, k] - rate * step, 0.0), 1.0)
+
+
+class SkyAdam:
+    """Adam on the texels of a cubemap that an image shows."""
+
+    def __init__(self, sky: np.ndarray) -> None:
+        self._shape = (sky.size // sky.shape[-1], sky.shape[-1])
+        self.first, self.second = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.float32)
+        self.visits = np.zeros(self._shape[0], np.int32)
+
+    def step(self, sky: np.ndarray, gradient: np.ndarray, rate: float) -> None:
+        """Change ``sky`` in place."""
+        adam_cells(sky.reshape(self._shape), self.first, self.second, self.visits, gradient.reshape(self._shape), rate)
+
+
+class DenseAdam:
+    """Adam on a whole small array, with the same constants."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.first, self.second, self.steps = np.zeros(shape), np.zeros(shape), 0
+
+    def step(self, values: np.ndarray, gradient: np.ndarray, rate: float) -> None:
+        """Change ``values`` in place."""
+        self.steps += 1
+        self.first += (1 - BETA1) * (gradient - self.first)
+        self.second += (1 - BETA2) * (gradient * gradient - self.second)
+        corrected = np.sqrt(self.second / (1 - BETA2**self.steps)) + EPSILON
+        values -= (rate * self.first / (1 - BETA1**self.steps) / corrected).astype(values.dtype)

@@ -1,0 +1,96 @@
+"""How each frame of a camera shows colours: the camera's response with a gain and an offset of the frame's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from nurec_sim.reconstruct.optimize.adam import DenseAdam
+from nurec_sim.types import Rig
+
+GAINS = (0.5, 2.0)
+"""A frame's gains begin within these."""
+
+
+class FrameResponses:
+    """Logarithms of gains and offsets per channel of every frame, [2,3], and their moments.
+
+    Shown colour = ``exp(gain) * (isp[:, :3] @ colour + isp[:, 3]) + offset``. They are pulled towards 0, the response
+    of the camera, so that a scene keeps its colours.
+    """
+
+    def __init__(self, isp: Mapping[str, np.ndarray], frames: Mapping[str, int]) -> None:
+        self._isp = {name: np.asarray(isp.get(name, np.eye(3, 4)), np.float64) for name in frames}
+        self._values = {name: np.zeros((count, 2, 3)) for name, count in frames.items()}
+        self._adam = {(name, k): DenseAdam((2, 3)) for name, count in frames.items() for k in range(count)}
+
+    def of(self, camera: str, frame: int) -> Float64[np.ndarray, "3 4"]:
+        """Shown colour = ``[:, :3] @ colour + [:, 3]``."""
+        gain, offset = self._values[camera][frame]
+        shown = np.exp(gain)[:, None] * self._isp[camera]
+        shown[:, 3] += offset
+        return shown
+
+    def start(
+        self, camera: str, frame: int, shown: Float32[np.ndarray, "h w 3"], recorded: Float32[np.ndarray, "h w 3"]
+    ) -> None:
+        """Set the gains of a frame to the ratio of the images' mean colours."""
+        ratio = recorded.mean(axis=(0, 1), dtype=np.float64) / np.maximum(shown.mean(axis=(0, 1)), 1e-3)
+        self._values[camera][frame, 0] = np.log(np.clip(ratio, *GAINS))
+
+    def is_new(self, camera: str, frame: int) -> bool:
+        """Whether a frame has not been fitted yet."""
+        return self._adam[camera, frame].steps == 0
+
+    def step(
+        self,
+        camera: str,
+        frame: int,
+        shown: Float32[np.ndarray, "h w 3"],
+        by_shown: Float32[np.ndarray, "h w 3"],
+        rate: float,
+        weight: float,
+    ) -> None:
+        """One step of Adam on one frame, of an image and the gradient of the loss by its colours."""
+        values = self._values[camera][frame]
+        by_offset = by_shown.sum(axis=(0, 1), dtype=np.float64)
+        by_gain = np.einsum("hwc,hwc->c", by_shown, shown, dtype=np.float64) - by_offset * values[1]
+        self._adam[camera, frame].step(values, np.stack([by_gain, by_offset]) + 2 * weight * values, rate)
+
+    def all(self) -> dict[str, Float64[np.ndarray, "frames 3 4"]]:
+        """Responses of all frames by camera."""
+        return {name: np.array([self.of(name, k) for k in range(len(v))]) for name, v in self._values.items()}
+
+
+def borrowed_responses(
+    responses: Mapping[str, Float64[np.ndarray, "frames 3 4"]],
+    times_us: Mapping[str, np.ndarray],
+    rig: Rig,
+    cameras: Sequence[str],
+) -> dict[str, Float64[np.ndarray, "frames 3 4"]]:
+    """Responses of cameras that were not seen: those of the camera that is most like them, at the same instants.
+
+    A pair of cameras of one kind on one car is exposed alike. Alike are lenses and sizes; of several such cameras the
+    one that looks most nearly in the same direction counts. A camera like no other gets none.
+    """
+    borrowed = {}
+    for name in cameras:
+        model = rig.cameras[name]
+        like = [
+            other
+            for other in responses
+            if (rig.cameras[other].width_px, rig.cameras[other].height_px) == (model.width_px, model.height_px)
+            and type(rig.cameras[other].lens) is type(model.lens)
+        ]
+        if not like or not len(times_us[name]):
+            continue
+        nearest = max(like, key=lambda o: float(rig.cameras[o].rig_from_camera[:3, 2] @ model.rig_from_camera[:3, 2]))
+        if rig.cameras[nearest].rig_from_camera[:3, 2] @ model.rig_from_camera[:3, 2] < 0.7:
+            continue
+        own, theirs = (np.asarray(times_us[n], np.int64).sum(axis=1) // 2 for n in (name, nearest))
+        flat = responses[nearest].reshape(len(theirs), 12)
+        columns = [np.interp(own, theirs, flat[:, k]) for k in range(12)]
+        borrowed[name] = np.stack(columns, axis=1).reshape(len(own), 3, 4)
+    return borrowed

@@ -1,0 +1,71 @@
+"""Settings of the per-scene optimisation; learning rates are those of Adam at the start, per step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Step sizes at the start; all fall by ``OptimizeSettings.final_rate`` until the end of the budget."""
+
+    mean_m: float = 0.002
+    quat: float = 0.005
+    log_scale: float = 0.01
+    logit_opacity: float = 0.05
+    rgb: float = 0.02
+    sky: float = 0.01
+    response: float = 0.005
+    """Of the logarithm of a frame's gains, and of its offsets."""
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the terms of the loss; each term is a mean over the pixels or returns that it concerns."""
+
+    dssim: float = 0.2
+    """Share of 1 - SSIM in the loss of colour; the rest is the absolute difference (Kerbl et al. 2023, eq. 7)."""
+    depth: float = 0.1
+    """Relative error of the rendered inverse depth at LiDAR returns."""
+    solid: float = 0.02
+    """1 - alpha at LiDAR returns."""
+    sky: float = 0.02
+    """Alpha where the start of the optimisation shows the sky."""
+    response: float = 1e-3
+    """Squares of a frame's log gains and offsets: how far a frame may differ from its camera."""
+
+
+@dataclass(frozen=True)
+class OptimizeSettings:
+    """All settings of ``refine``.
+
+    Attributes:
+        seconds: wall time to spend, what comes before the first step left out; None: as ``steps`` says.
+        steps: images to fit, one a step; None: as ``seconds`` says. With both, what ends first ends it.
+        seed: of the order of images.
+        final_rate: learning rates at the end of the budget, relative to those at its start.
+        largest_m: no standard deviation may grow beyond this.
+        rates: learning rates.
+        weights: of the loss.
+    """
+
+    seconds: float | None = 300.0
+    steps: int | None = None
+    seed: int = 0
+    final_rate: float = 0.1
+    largest_m: float = 1.5
+    rates: LearningRates = field(default_factory=LearningRates)
+    weights: LossWeights = field(default_factory=LossWeights)
+
+    def __post_init__(self) -> None:
+        """Checks the budget.
+
+        Raises:
+            ValueError: no budget, or one that is not positive.
+        """
+        if self.seconds is None and self.steps is None:
+            raise ValueError("an optimisation needs a budget: seconds, steps or both")
+        for name in ("seconds", "steps"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < float("inf"):
+                raise ValueError(f"{name} must be positive and finite, got {value}")
