@@ -8,7 +8,7 @@ from reconstruct_street import Street, camera
 
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate import as_fired, evaluate, held_out
+from nurec_sim.evaluate import as_fired, evaluate, held_out, log
 from nurec_sim.metrics.lidar_scores import LidarScore, scanner_along, score_sweep
 from nurec_sim.reconstruct import LiftSettings, ViewSettings
 from nurec_sim.types import LidarFrame, RoadMap
@@ -142,3 +142,12 @@ def test_real_stereo_is_better_than_copying():
     assert right["psnr_db"] > right["floor"]["psnr_db"] + 1.0
     assert result["lidar"]["median_abs_range_error_m"] < 0.2
     assert result["lidar"]["return_recall"] > 0.85
+
+
+def test_time_is_added_up_by_stage_whatever_a_stage_tells_of_itself():
+    told = []
+    clock = log._StageClock(lambda stage, fraction: told.append(stage))
+    for text in ("images", "fitting, 1 images", "fitting, 2 images"):
+        clock(text, 0.5)
+    clock.stop()
+    assert list(clock.seconds) == ["start", "images", "fitting"] and told[-1] == "fitting, 2 images"

@@ -112,16 +112,17 @@ def _part(report: Progress, begin: float, end: float) -> Progress:
 
 
 class _StageClock:
-    """Passes progress on, and adds up the time between the calls by stage."""
+    """Passes progress on, and adds up the time between the calls by stage; what follows a comma is no part of it."""
 
     def __init__(self, report: Progress) -> None:
         self.report, self.stage, self.since = report, "start", time.perf_counter()
         self.seconds: dict[str, float] = {}
 
     def __call__(self, stage: str, fraction: float) -> None:
-        if stage != self.stage:
+        name = stage.partition(",")[0]
+        if name != self.stage:
             self.stop()
-            self.stage = stage
+            self.stage = name
         self.report(stage, fraction)
 
     def stop(self) -> None:
