@@ -117,7 +117,11 @@ def test_sixteen_clients_of_cameras_and_lidars_get_what_one_gets():
 
 def start_soak(*options):
     program = Path(__file__).parents[1] / "benchmarks" / "soak.py"
-    command = [sys.executable, str(program), "--width", "64", "--height", "36", *options]
+    # Where pytest itself runs in the background, its children ignore Ctrl-C.
+    listening = "import os, runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    listening += "sys.argv = sys.argv[1:]; sys.path.insert(0, os.path.dirname(sys.argv[0])); "
+    listening += "runpy.run_path(sys.argv[0], run_name='__main__')"
+    command = [sys.executable, "-c", listening, str(program), "--width", "64", "--height", "36", *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 

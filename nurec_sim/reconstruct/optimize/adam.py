@@ -30,7 +30,7 @@ def adam_step(
         first: [n,14] first moments; changed.
         second: [n,14] second moments; changed.
         visits: [n] steps so far; changed.
-        turns: [t,7] rotations world_from_frame, as a quaternion and padding: rows of ``row_turn``.
+        turns: [t,4] rotations world_from_frame as quaternions, what ``row_turn`` numbers.
         row_turn: [n] which of ``turns`` took a Gaussian to the world; -1 none.
         by_mean: [n,3] gradient by the mean in the world, like the following ones.
         by_quat: [n,4] by the quaternion in the world.

@@ -59,8 +59,8 @@ def refine(
     if not views:
         raise ReconstructError(f"clip {clip.id!r}: an optimisation needs images; cameras {list(cameras)} have none")
     run = Optimization(scene, views, settings)
-    spent = run.run(progress)
-    return run.scene(clip, spent)
+    run.run(progress)
+    return run.scene(clip)
 
 
 class Optimization:
@@ -68,7 +68,6 @@ class Optimization:
 
     def __init__(self, scene: GaussianScene, views: Sequence[TrainingView], settings: OptimizeSettings) -> None:
         self.settings, self.views = settings, views
-        self._scene = scene
         self.parameters = Parameters(scene)
         self.sky = scene.sky.astype(np.float32).copy()
         self._sky_adam = SkyAdam(self.sky)
@@ -78,20 +77,17 @@ class Optimization:
         self.responses = FrameResponses(scene.isp, frames)
         self._clear: dict[int, np.ndarray] = {}
         self.steps = 0
-        self.loss = float("nan")
 
-    def run(self, progress: Progress) -> float:
-        """Spend the budget; seconds spent."""
+    def run(self, progress: Progress) -> None:
+        """Spend the budget."""
         started, smooth, order = time.perf_counter(), float("nan"), self._order()
         try:
             while (spent := self._spent(time.perf_counter() - started)) < 1:
                 loss = self.step(next(order), self.settings.final_rate**spent)
                 smooth = loss if smooth != smooth else 0.95 * smooth + 0.05 * loss
-                self.loss = smooth
                 progress(f"fitting, {self.steps} images, loss {smooth:.4f}", spent)
         except KeyboardInterrupt:
             pass  # the caller gets what has been reached
-        return time.perf_counter() - started
 
     def step(self, number: int, rate: float) -> float:
         """Fit one view, with learning rates ``rate`` times those at the start; the loss before the step."""
@@ -134,7 +130,7 @@ class Optimization:
         shown = np.einsum("ij,jhw->hwi", response[:, :3], colour) + response[:, 3]
         return np.ascontiguousarray(shown * (frame.sensor.grid.valid > 0)[..., None])
 
-    def scene(self, clip: Clip, seconds: float) -> GaussianScene:
+    def scene(self, clip: Clip) -> GaussianScene:
         """The scene as it is now."""
         fitted = self.parameters.scene()
         times = {name: clip.camera_times_us(name) for name in clip.rig.cameras}
