@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -14,6 +16,8 @@ from nurec_sim.types import Needs, Observation, Plan, Policy, Rig
 T = TypeVar("T")
 
 PLAN_TIMEOUT_S = 60.0
+WAKE_S = 0.5
+"""Waiting is done in such pieces: a Ctrl-C that another thread receives is seen only when this one wakes up."""
 
 
 class PolicyHost:
@@ -99,14 +103,15 @@ class PolicyHost:
 
     def _ask(self, thread: PolicyThread, what: str, function: Callable[[], T]) -> T:
         future = thread.submit(function)
-        try:
-            return future.result(self._timeout_s)
-        except TimeoutError:
-            self._usable = False
-            thread.abandon()
-            raise PolicyError(
-                f"{what} did not end within {self._timeout_s:g} s; --plan-timeout (plan_timeout_s) allows more"
-            ) from None
+        until = time.monotonic() + self._timeout_s
+        while (left_s := until - time.monotonic()) > 0:
+            with contextlib.suppress(TimeoutError):
+                return future.result(min(left_s, WAKE_S))
+        self._usable = False
+        thread.abandon()
+        raise PolicyError(
+            f"{what} did not end within {self._timeout_s:g} s; --plan-timeout (plan_timeout_s) allows more"
+        )
 
 
 def described(error: BaseException) -> str:
