@@ -25,14 +25,14 @@ from nurec_sim.evaluate import Contender, Protocol, run_protocol
 from nurec_sim.evaluate.run import settings_of
 from nurec_sim.evaluate.summary import interval
 from nurec_sim.evaluate.tables import Table
-from nurec_sim.new_files import write_file
+from nurec_sim.files.new_files import write_file
 from nurec_sim.reconstruct import FeedForwardSettings
 from nurec_sim.training.ablations import ABLATIONS, ablated, scaled
 from nurec_sim.training.checkpoint import read_position
-from nurec_sim.training.clips import ready_clips
 from nurec_sim.training.config import TrainingConfig, read_config
-from nurec_sim.training.perceptual import perceptual_distance
-from nurec_sim.training.samples import Samples, TownSamples
+from nurec_sim.training.data.clips import ready_clips
+from nurec_sim.training.data.samples import Samples, TownSamples
+from nurec_sim.training.losses.perceptual import perceptual_distance
 from nurec_sim.training.trainer import WEIGHTS, Trainer
 
 VariantName = Literal[tuple(ABLATIONS)]  # type: ignore[valid-type]

@@ -16,7 +16,7 @@ from cases import SENSORS
 from plan import Options
 from scenes import BenchScene
 
-from nurec_sim.render import gradients
+from nurec_sim.render.cpu.backward import gradients
 from nurec_sim.render.cpu.pack import morton_order
 from nurec_sim.render.spec import to_uint8
 from nurec_sim.types import (

@@ -28,10 +28,10 @@ from grpc_health.v1 import health_pb2
 from serving import HEALTH, serving, with_unit_quaternions
 from soak import drive, drive_scene, sensor_mix
 
-from nurec_sim import wire
 from nurec_sim.scene import write_scene
+from nurec_sim.serving import wire
+from nurec_sim.serving.wire import ImageFormat, sensorsim
 from nurec_sim.types import CameraModel, Shutter
-from nurec_sim.wire import ImageFormat, sensorsim
 
 RESULT = Path("build/bench_fairness.json")
 SCENE = "soak"

@@ -62,7 +62,7 @@ def measure_served(archive: Path, request: SensorRequest, threads: int) -> dict[
         ``served_cpu_s``, the processor time that the server had taken by then, which other programs do not change;
         ``served_next_frame_s`` for the same frame again.
     """
-    from nurec_sim.client import RemoteSensors
+    from nurec_sim.serving.client import RemoteSensors
 
     began = time.perf_counter()
     command = [sys.executable, "-m", "nurec_sim.cli", "serve", str(archive), "--port", "0", "--threads", str(threads)]

@@ -26,10 +26,10 @@ from render import write
 from scenes import SCENES, BenchScene
 
 from nurec_sim.errors import GpuError
+from nurec_sim.render.cpu.backward.gradients import GaussianTensors
 from nurec_sim.render.gpu.gradients import DifferentiableRenderer
 from nurec_sim.render.gpu.launcher import CudaLauncher, Launcher
 from nurec_sim.render.gpu.renderer import GpuRenderer
-from nurec_sim.render.gradients import GaussianTensors
 
 EIGHT = SensorCase(
     (*(camera(1920, 1080, yaw_deg=360 / 7 * k, id=f"camera-{k}") for k in range(7)), lidar("PANDAR128")),

@@ -18,10 +18,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from nurec_sim.logs import open_clip
-from nurec_sim.scene.opendrive import opendrive_map
-from nurec_sim.scene.road_area import drivable_area
-from nurec_sim.scene.validate.alpasim_map import AlpasimMap
-from nurec_sim.scene.validate.map_agreement import LEAST_SHARE, PLACEMENTS, agreement
+from nurec_sim.scene.interop.validate.alpasim_map import AlpasimMap
+from nurec_sim.scene.interop.validate.map_agreement import LEAST_SHARE, PLACEMENTS, agreement
+from nurec_sim.scene.opendrive.road_area import drivable_area
+from nurec_sim.scene.opendrive.writer import opendrive_map
 from nurec_sim.types import Box, RoadMap, Trajectory
 from nurec_sim.world import TownNetwork, street_rig, town_plan
 

@@ -9,8 +9,8 @@ import numpy as np
 from nurec_sim import geometry
 from nurec_sim.logs import open_clip
 from nurec_sim.render import Renderer
-from nurec_sim.render.still import picture
-from nurec_sim.scene_store import SceneStore
+from nurec_sim.render.images.still import picture
+from nurec_sim.serving.store import SceneStore
 from nurec_sim.types import SensorRequest
 
 CAMERA, FRAME, LEFT_M = "camera_front", 22, 1.5

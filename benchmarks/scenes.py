@@ -131,7 +131,7 @@ def large(count: int) -> BenchScene:
 
 def real_log(progress: Progress | None = None) -> BenchScene:
     """A recorded log lifted to Gaussians: a real one where there is one, else the one that ships with the package."""
-    from nurec_sim.scene_store import SceneStore
+    from nurec_sim.serving.store import SceneStore
 
     folder = Path(os.environ.get("NUREC_SIM_REALDATA", ROOT.parent / "shared" / "realdata"))
     choices = [folder / "kitti_raw_0009", folder / "ddad_6cam", ROOT / "scenarios" / "demo_clip.zip"]

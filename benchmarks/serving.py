@@ -29,10 +29,10 @@ from bars import verdict
 from grpc_health.v1 import health_pb2
 from soak import drive, drive_scene, sensor_mix
 
-from nurec_sim import wire
 from nurec_sim.scene import write_scene
+from nurec_sim.serving import wire
+from nurec_sim.serving.wire import ImageFormat, common, sensorsim
 from nurec_sim.types import CameraModel, GaussianScene, SensorRequest
-from nurec_sim.wire import ImageFormat, common, sensorsim
 
 RESULT = Path("build/bench_serving.json")
 HEALTH = "grpc.health.v1.Health/Check"

@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 
 from nurec_sim import geometry, sensors
-from nurec_sim.client import RemoteSensors
 from nurec_sim.render import Renderer
-from nurec_sim.scene_store import SceneStore
-from nurec_sim.server import SensorServer
+from nurec_sim.serving.client import RemoteSensors
+from nurec_sim.serving.server import SensorServer
+from nurec_sim.serving.store import SceneStore
 from nurec_sim.types import (
     CameraModel,
     DynamicGaussians,

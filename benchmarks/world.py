@@ -28,11 +28,11 @@ from nurec_sim.types import (
     WindshieldReference,
 )
 from nurec_sim.world import LABEL_OF_CLASS, TrueWorld, street_rig, town_plan
-from nurec_sim.world.isp import random_response
-from nurec_sim.world.plan import TownPlan
-from nurec_sim.world.sense import TrueView
-from nurec_sim.world.stage import Quality
-from nurec_sim.world.truth import follow, scene_flow
+from nurec_sim.world.plan.town import TownPlan
+from nurec_sim.world.sense.isp import random_response
+from nurec_sim.world.sense.simulator import TrueView
+from nurec_sim.world.sense.stage import Quality
+from nurec_sim.world.sense.truth import follow, scene_flow
 
 LIDARS = ("PANDAR128", "HDL-64", "VLP-16")
 CLIP_LIMIT_S = 20.0

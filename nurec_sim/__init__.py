@@ -1,30 +1,45 @@
 """nurec_sim: an open closed-loop sensor simulator for driving. Its parts are loaded on first use."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-__version__: str
+import lazy_loader
 
-_PARTS = (
-    "client", "client_v1", "conformance", "driving", "errors", "evaluate", "geometry", "logs", "metrics", "network",
-    "plugins", "reconstruct", "render", "report", "runs", "scene", "scene_store", "sensors", "server", "service", "sim",
-    "training", "types", "wire", "world",
-)  # fmt: skip
-__all__ = ["__version__", *_PARTS]
+_parts, _names, __all__ = lazy_loader.attach(
+    __name__,
+    submodules=[
+        "errors",
+        "evaluate",
+        "files",
+        "geometry",
+        "logs",
+        "metrics",
+        "network",
+        "plugins",
+        "reconstruct",
+        "render",
+        "report",
+        "runs",
+        "scene",
+        "sensors",
+        "serving",
+        "sim",
+        "training",
+        "types",
+        "world",
+    ],  # fmt: skip
+)
+__all__.append("__version__")
 
-if not TYPE_CHECKING:  # to a type checker they are modules, as ever
 
-    def __getattr__(name: str) -> Any:
-        """Import a part of the package, or look up its version."""
-        if name == "__version__":
-            return globals().setdefault(name, _version())
-        if name not in _PARTS:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return import_module(f"{__name__}.{name}")
+def __getattr__(name: str) -> Any:
+    """Import a part of the package, or look up its version."""
+    if name == "__version__":
+        return globals().setdefault(name, _version())
+    return _parts(name)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return [*_names(), "__version__"]
 
 
 def _version() -> str:

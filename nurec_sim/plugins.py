@@ -32,7 +32,7 @@ def load_policy(reference: str) -> Policy:
         ScenarioError: nothing of that name, or what was found is no policy; the text says what is available.
     """
     if reference.startswith("grpc://"):
-        from nurec_sim.driving import RemotePolicy
+        from nurec_sim.serving.driver import RemotePolicy
 
         return _make(lambda: RemotePolicy.from_url(reference), reference)
     path, _, class_name = reference.partition(":")

@@ -36,7 +36,7 @@ def conformance(
         as_json: print one JSON document.
         rules: list the rules and stop.
     """
-    from nurec_sim.conformance import CHECKS, Target, run_checks
+    from nurec_sim.serving.conformance import CHECKS, Target, run_checks
 
     if rules:
         for one in CHECKS.values():

@@ -43,9 +43,9 @@ def drive_grpc(
         insecure: let anybody who can reach the port call.
         allow_shut_down: let clients stop the server with shut_down.
     """
-    from nurec_sim.driving import DriverOptions, DriverServer
     from nurec_sim.plugins import load_policy
-    from nurec_sim.server import check_exposure, run_until_signal
+    from nurec_sim.serving.driver import DriverOptions, DriverServer
+    from nurec_sim.serving.server import check_exposure, run_until_signal
 
     logging.getLogger("nurec_sim").setLevel(logging.WARNING)
     check_exposure(host, protected=False, insecure=insecure)

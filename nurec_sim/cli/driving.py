@@ -15,7 +15,7 @@ import tyro
 
 from nurec_sim.cli.console import OnePath, Paths, app, err, out, part_of, print_faults, print_table, progress
 from nurec_sim.errors import NurecSimError
-from nurec_sim.new_files import check_writable
+from nurec_sim.files.new_files import check_writable
 
 if TYPE_CHECKING:
     from nurec_sim.types import GaussianScene, Sense
@@ -125,9 +125,9 @@ def drive(
 ) -> None:
     """Policies, scenes, server, rollouts, report: what `run` and `demo` share."""
     from nurec_sim import runs, sim
-    from nurec_sim.client import RemoteSensors
-    from nurec_sim.scene_store import SceneStore
-    from nurec_sim.server import SensorServer
+    from nurec_sim.serving.client import RemoteSensors
+    from nurec_sim.serving.server import SensorServer
+    from nurec_sim.serving.store import SceneStore
 
     started = time.monotonic()
     scenario_path = sim.scenario_file(scenario_name)

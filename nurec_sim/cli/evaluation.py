@@ -14,7 +14,7 @@ import tyro
 from nurec_sim.cli.console import app, err, out, print_table, progress
 from nurec_sim.cli.scenes import NO_FLAGS, Method, NetworkFlags, network_settings, refinement
 from nurec_sim.errors import NurecSimError
-from nurec_sim.new_files import check_writable, write_file
+from nurec_sim.files.new_files import check_writable, write_file
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 
 ProtocolName = Literal["storm", "clip", "shift"]

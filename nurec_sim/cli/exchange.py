@@ -10,7 +10,7 @@ import tyro
 from nurec_sim.cli.console import OnePath, app, out, print_table, progress
 from nurec_sim.cli.scenes import load_scene
 from nurec_sim.errors import NurecSimError
-from nurec_sim.new_files import check_writable
+from nurec_sim.files.new_files import check_writable
 
 UpAxis = Literal["z", "-z", "y", "-y", "x", "-x"]
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from nurec_sim.channels import open_channel
 from nurec_sim.errors import NurecSimError, ServerError
+from nurec_sim.serving.channels import open_channel
 
 TIMEOUT_S = 4.0
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from nurec_sim.cli.console import OnePath, app, out, print_faults, print_table, progress
 from nurec_sim.cli.validation import inspect_scene
 from nurec_sim.errors import NurecSimError
-from nurec_sim.new_files import new_file
+from nurec_sim.files.new_files import new_file
 
 if TYPE_CHECKING:
     from nurec_sim.logs import Clip
@@ -30,7 +30,7 @@ def inspect(source: OnePath, *, overlay: Path | None = None, time_s: float | Non
     """
     from nurec_sim import logs
     from nurec_sim.logs.describe import SENSOR_COLUMNS
-    from nurec_sim.scene_store.sources import is_archive
+    from nurec_sim.serving.store.sources import is_archive
 
     if time_s is not None and overlay is None:
         raise NurecSimError("--time-s is the time of the picture that --overlay writes; give both")
@@ -58,7 +58,7 @@ def inspect(source: OnePath, *, overlay: Path | None = None, time_s: float | Non
 
 def _write_overlay(log: Clip, path: Path, time_s: float | None) -> None:
     from nurec_sim import logs
-    from nurec_sim.render.encode import encode_image
+    from nurec_sim.render.images.encode import encode_image
 
     start_us, end_us = log.span_us
     t_us = (start_us + end_us) // 2 if time_s is None else start_us + round(time_s * 1e6)

@@ -13,8 +13,8 @@ from nurec_sim.cli.console import err
 from nurec_sim.errors import NurecSimError
 
 if TYPE_CHECKING:
-    from nurec_sim.server import ServerOptions
-    from nurec_sim.service import ServiceOptions
+    from nurec_sim.serving.sensor_service import ServiceOptions
+    from nurec_sim.serving.server import ServerOptions
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def server_options(flags: OperationFlags) -> ServerOptions:
     Raises:
         NurecSimError: the flags contradict each other, or the token cannot be read.
     """
-    from nurec_sim.server import ServerOptions, Tls, read_token, set_up_logging
+    from nurec_sim.serving.server import ServerOptions, Tls, read_token, set_up_logging
 
     set_up_logging(flags.log_format, flags.log_level)
     if (flags.tls_cert is None) != (flags.tls_key is None) or (flags.tls_client_ca and flags.tls_cert is None):
@@ -119,7 +119,7 @@ def service_options(flags: OperationFlags, **more: Any) -> ServiceOptions:
     Raises:
         NurecSimError: a limit lets nothing through.
     """
-    from nurec_sim.service import ServiceOptions
+    from nurec_sim.serving.sensor_service import ServiceOptions
 
     given = {
         "render_workers": flags.workers,

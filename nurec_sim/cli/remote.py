@@ -32,8 +32,8 @@ def upload(
         client_cert: certificate (PEM) to show, for mutual TLS.
         client_key: its private key (PEM).
     """
-    from nurec_sim.client_v1 import SceneClient
-    from nurec_sim.server import read_token
+    from nurec_sim.serving.scene_client import SceneClient
+    from nurec_sim.serving.server import read_token
 
     if reconstruct and source.suffix != ".zip":
         raise NurecSimError(f"--reconstruct is for clips, {source.name} is none")

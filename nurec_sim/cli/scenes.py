@@ -10,7 +10,7 @@ import tyro
 
 from nurec_sim.cli.console import OnePath, app, out, print_table, progress
 from nurec_sim.errors import NurecSimError
-from nurec_sim.new_files import check_writable
+from nurec_sim.files.new_files import check_writable
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 
@@ -109,7 +109,7 @@ def render(
         layer: what to draw.
         width: image width in pixels; the camera's own if not given.
     """
-    from nurec_sim.render.still import render_still
+    from nurec_sim.render.images.still import render_still
 
     check_writable(out_path)
     scene_ = load_scene(source)
@@ -151,7 +151,7 @@ def refinement(seconds: float | None) -> OptimizeSettings | None:
 
 def load_scene(source: Path) -> GaussianScene:
     """A scene from an archive, or from a clip that is reconstructed now."""
-    from nurec_sim.scene_store import SceneStore
+    from nurec_sim.serving.store import SceneStore
 
     store = SceneStore([source])
     for fault in store.faults.values():

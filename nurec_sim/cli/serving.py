@@ -24,9 +24,9 @@ from nurec_sim.cli.operation import (
 from nurec_sim.errors import NurecSimError
 
 if TYPE_CHECKING:
-    from nurec_sim.scene_store import SceneStore
-    from nurec_sim.server import ServerOptions
-    from nurec_sim.service import ServiceOptions
+    from nurec_sim.serving.sensor_service import ServiceOptions
+    from nurec_sim.serving.server import ServerOptions
+    from nurec_sim.serving.store import SceneStore
 
 
 @app.command
@@ -58,7 +58,7 @@ def serve(
         ego_mask_dir: pictures of the ego car, FOLDER/<rig>/<camera>.png.
         operation: who may call, how much, and what the server tells of itself.
     """
-    from nurec_sim.server import check_exposure
+    from nurec_sim.serving.server import check_exposure
 
     options = server_options(operation)
     protected = options.tls is not None or options.token is not None
@@ -105,7 +105,7 @@ def serve_grpc(
         test_scenes_are_valid: load every scene first, and end with 1 if one of them is bad.
         operation: who may call, how much, and what the server tells of itself.
     """
-    from nurec_sim.server import is_loopback
+    from nurec_sim.serving.server import is_loopback
 
     options = server_options(operation)
     if not (is_loopback(host) or operation.insecure or options.tls or options.token):
@@ -169,8 +169,8 @@ def _store(
     Raises:
         NurecSimError: a bound leaves room for nothing, or the device cannot be used.
     """
-    from nurec_sim.render_queue import usable_cores
-    from nurec_sim.scene_store import SceneStore
+    from nurec_sim.serving.sensor_service.render_queue import usable_cores
+    from nurec_sim.serving.store import SceneStore
 
     if threads is not None and threads < 1:
         raise NurecSimError(f"--threads must be at least 1, got {threads}")
@@ -203,8 +203,8 @@ def _run(
     listening: ServerOptions,
     flags: OperationFlags,
 ) -> None:
-    from nurec_sim.server import serve as run_server
-    from nurec_sim.service_v1 import SceneOptions
+    from nurec_sim.serving.scene_service import SceneOptions
+    from nurec_sim.serving.server import serve as run_server
 
     scene_options = SceneOptions(upload_dir=flags.upload_dir, clip_dirs=flags.clip_dirs)
     try:

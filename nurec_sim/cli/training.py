@@ -9,7 +9,7 @@ import tyro
 
 from nurec_sim.cli.console import OnePath, app, err, out, progress
 from nurec_sim.errors import TrainingError
-from nurec_sim.new_files import check_writable
+from nurec_sim.files.new_files import check_writable
 
 AblationName = Literal["full", "single_stage", "sky_mlp", "no_perceptual", "no_depth_loss", "concatenation"]
 
@@ -45,10 +45,10 @@ def train(
 
     from nurec_sim.training.ablations import ablated
     from nurec_sim.training.config import read_config
-    from nurec_sim.training.lpips import load_lpips
-    from nurec_sim.training.perceptual import perceptual_distance
+    from nurec_sim.training.data.samples import TownSamples
+    from nurec_sim.training.losses.lpips import load_lpips
+    from nurec_sim.training.losses.perceptual import perceptual_distance
     from nurec_sim.training.processes import Processes
-    from nurec_sim.training.samples import TownSamples
     from nurec_sim.training.trainer import WEIGHTS, Trainer
 
     if min(drawers, loaders) < 0 or (threads is not None and threads < 1):

@@ -12,7 +12,7 @@ from nurec_sim.cli.console import Paths, app, out, print_table, progress
 from nurec_sim.errors import NurecSimError
 
 if TYPE_CHECKING:
-    from nurec_sim.scene.validate import Consumer, Finding
+    from nurec_sim.scene.interop.validate import Consumer, Finding
 
 USD_LIMIT_S = 300.0
 
@@ -35,7 +35,7 @@ def validate(
         for_: consumers, separated by commas: alpasim, carla, openusd, own.
         json_: print one JSON document instead of lines.
     """
-    from nurec_sim.scene.validate import same_scene_ids, validate_archive
+    from nurec_sim.scene.interop.validate import same_scene_ids, validate_archive
 
     consumers = _consumers(for_)
     if not scenes:
@@ -63,7 +63,7 @@ def validate(
 def inspect_scene(path: Path) -> None:
     """Prints what a scene holds, then what our reader finds wrong or unknown; exit status 1 if there are errors."""
     from nurec_sim.scene import summary
-    from nurec_sim.scene.validate import read_and_validate
+    from nurec_sim.scene.interop.validate import read_and_validate
 
     scene, findings = read_and_validate(path)
     if scene is not None:
@@ -75,7 +75,7 @@ def inspect_scene(path: Path) -> None:
 
 def _print_findings(path: Path, findings: list[Finding], consumers: list[Consumer]) -> None:
     """One line per finding, errors red; consumers without findings are named in one line."""
-    from nurec_sim.scene.validate import NAMES
+    from nurec_sim.scene.interop.validate import NAMES
 
     for finding in findings:
         _print_line(str(finding), "red" if finding.severity == "error" else "yellow")
@@ -89,7 +89,7 @@ def _print_line(text: str, style: str) -> None:
 
 
 def _consumers(text: str) -> list[Consumer]:
-    from nurec_sim.scene.validate import CONSUMERS
+    from nurec_sim.scene.interop.validate import CONSUMERS
 
     names = {name.strip() for name in text.split(",") if name.strip()}
     if not names or names - set(CONSUMERS):

@@ -27,11 +27,12 @@ def list_weights() -> None:
     `reconstruct` takes the first of: --checkpoint PATH, the file that $INSTANT_NUREC_FULL_PT names, weights that come
     with this package, released weights that were fetched.
     """
-    from nurec_sim.network import PROFILES, download
-    from nurec_sim.network.released import RELEASED
+    from nurec_sim.network import PROFILES
+    from nurec_sim.network.checkpoints import download
+    from nurec_sim.network.checkpoints.released import RELEASED
 
     with progress("counting parameters"):
-        from nurec_sim.network.weights_check import count_parameters
+        from nurec_sim.network.checkpoints.fit import count_parameters
 
         parameters = {name: f"{count_parameters(name) / 1e6:.1f} M" for name in PROFILES}
     rows = []
@@ -71,8 +72,8 @@ def fetch(
         revision: commit, tag or branch of the repository; its main branch if not given.
         to: put the file into this folder instead of the cache of Hugging Face ($HF_HOME); use it with --checkpoint.
     """
-    from nurec_sim.network import download
-    from nurec_sim.network.released import RELEASED
+    from nurec_sim.network.checkpoints import download
+    from nurec_sim.network.checkpoints.released import RELEASED
 
     released = RELEASED[profile]
     out.print(f"{released.repository}: {released.filename}, {released.size_bytes:,} bytes ({released.license})")
@@ -95,7 +96,7 @@ def check(path: OnePath, *, profile: Checkable | None = None) -> None:
         profile: what it should fit; whichever it does if not given.
     """
     with progress(f"reading {path.name}"):
-        from nurec_sim.network.weights_check import check_weights
+        from nurec_sim.network.checkpoints.fit import check_weights
 
         report = check_weights(path, profile)
     print_table(path.name, report.facts)
@@ -115,7 +116,7 @@ def share(path: OnePath, *, other: Path, to: Path) -> None:
         other: the file with which it shares tensors, .safetensors.
         to: the file to write, in the folder of the other one; one that is there is replaced.
     """
-    from nurec_sim.network.shared_weights import save_difference
+    from nurec_sim.network.checkpoints.shared import save_difference
 
     count = save_difference(path, other, to)
     out.print(f"{to}: {count} tensors are those of {other.name}; {to.stat().st_size:,} bytes", soft_wrap=True)

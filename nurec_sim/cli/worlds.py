@@ -9,7 +9,7 @@ import tyro
 
 from nurec_sim.cli.console import app, out, print_table, progress
 from nurec_sim.errors import ClipError, NurecSimError
-from nurec_sim.new_files import check_writable
+from nurec_sim.files.new_files import check_writable
 
 if TYPE_CHECKING:
     from nurec_sim.types import Rig

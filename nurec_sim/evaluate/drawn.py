@@ -12,10 +12,10 @@ from nurec_sim.evaluate.views import reduced, reduced_mask
 from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, Target
 from nurec_sim.types import CameraModel, Label, Pinhole, Rig, SensorRequest, Trajectory
 from nurec_sim.world import LIDAR_ID, TrueWorld, street_rig, town_plan, true_sweep
-from nurec_sim.world.isp import CameraResponse, random_response
-from nurec_sim.world.plan import TownPlan
-from nurec_sim.world.rig import CAMERA_FROM_RIG_AXES
-from nurec_sim.world.surface import LABEL_OF_CLASS, SurfaceClass
+from nurec_sim.world.plan.rig import CAMERA_FROM_RIG_AXES
+from nurec_sim.world.plan.surface import LABEL_OF_CLASS, SurfaceClass
+from nurec_sim.world.plan.town import TownPlan
+from nurec_sim.world.sense.isp import CameraResponse, random_response
 from nurec_sim.world.write import SPIN_US
 
 CAMERAS_DEG = {"camera_front": 0.0, "camera_front_left": 45.0, "camera_front_right": -45.0}
@@ -92,5 +92,5 @@ class Drawing:
 
 
 def held_out_plan(seed: int, seconds: float) -> TownPlan:
-    """The town of a seed from the split that training never sees (``world.splits``)."""
+    """The town of a seed from the split that training never sees (``world.plan.splits``)."""
     return town_plan(seed, "test", seconds=seconds)

@@ -18,11 +18,11 @@ from jaxtyping import Float64, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
-from nurec_sim.metrics.images import psnr, ssim
-from nurec_sim.metrics.lidar_scores import LidarScore, scanner_along, score_sweep
+from nurec_sim.evaluate.scores.images import psnr, ssim
+from nurec_sim.evaluate.scores.lidar import LidarScore, scanner_along, score_sweep
+from nurec_sim.files.new_files import write_file
 from nurec_sim.metrics.offroad import offroad_agreement
 from nurec_sim.metrics.offroad_grid import scene_offroad_grid
-from nurec_sim.new_files import write_file
 from nurec_sim.types import CameraFrame, Clip, GaussianScene, LidarFrame, Sense, SensorRequest, Sweep
 
 Progress = Callable[[str, float], None]
@@ -141,14 +141,14 @@ def held_out(clip: Clip, every: int, listed: Sequence[int]) -> list[int]:
 def sensing(scene: GaussianScene, via_grpc: bool) -> Iterator[Sense]:
     """A ``sense`` for a scene: through a server on a free port of this machine, or a renderer in this process."""
     if not via_grpc:
-        from nurec_sim.render.renderer import Renderer
+        from nurec_sim.render.cpu.renderer import Renderer
 
         local: Sense = Renderer(scene).sense
         yield local
         return
-    from nurec_sim.client import RemoteSensors
-    from nurec_sim.scene_store import SceneStore
-    from nurec_sim.server import SensorServer
+    from nurec_sim.serving.client import RemoteSensors
+    from nurec_sim.serving.server import SensorServer
+    from nurec_sim.serving.store import SceneStore
 
     with SensorServer(SceneStore([scene]), port=0) as address, RemoteSensors(address, scene.id) as remote:
         yield remote.sense

@@ -134,7 +134,7 @@ def describe(contender: Contender) -> dict[str, Any]:
         return said
     values = dataclasses.asdict(settings)
     if isinstance(settings, FeedForwardSettings):
-        from nurec_sim.network.download import find_weights, sha256
+        from nurec_sim.network.checkpoints.download import find_weights, sha256
         from nurec_sim.reconstruct.feedforward.method import profile_name
 
         profile = values["profile"] = profile_name(contender.method, settings.profile)
@@ -155,7 +155,7 @@ def build(contender: Contender, window: Window) -> Built:
     if contender.method == "copy":
         return Built(lambda request: _nearest(window.clip, request), None, 0.0)
     from nurec_sim.reconstruct import reconstruct
-    from nurec_sim.render.renderer import Renderer
+    from nurec_sim.render.cpu.renderer import Renderer
 
     _look(window, sweeps=_sees_lidar(contender))
     started = time.perf_counter()

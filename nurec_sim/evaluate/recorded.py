@@ -16,7 +16,7 @@ from nurec_sim import geometry, sensors
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.views import View, reduced, scored_size
 from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, Target, Window
-from nurec_sim.reconstruct.feedforward.frames import choose_cameras
+from nurec_sim.reconstruct.feedforward.inputs.frames import choose_cameras
 from nurec_sim.types import MOVABLE_LABELS, CameraModel, Clip, Rig, SensorRequest
 
 STEP_TOLERANCE = 0.25

@@ -25,7 +25,7 @@ from nurec_sim.evaluate.sheet import draw_sheet
 from nurec_sim.evaluate.summary import summarize
 from nurec_sim.evaluate.tables import tables
 from nurec_sim.evaluate.windows import Window
-from nurec_sim.new_files import write_file
+from nurec_sim.files.new_files import write_file
 
 Progress = Callable[[str, float], None]
 SETTINGS, RESULTS, TABLES, REPORT = "settings.json", "results.json", "tables.md", "report.html"

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Bool
 
 from nurec_sim.evaluate.methods import Built, Contender, build
+from nurec_sim.evaluate.scores.depth import depth_score, least_squares_scale
+from nurec_sim.evaluate.scores.images import masked_psnr, masked_ssim, psnr, ssim
 from nurec_sim.evaluate.views import View, reduced
 from nurec_sim.evaluate.windows import Target, Window
-from nurec_sim.metrics.depth_scores import depth_score, least_squares_scale
-from nurec_sim.metrics.images import masked_psnr, masked_ssim, psnr, ssim
 
 HIGHEST_PSNR_DB = 100.0
 """Of images that are equal."""

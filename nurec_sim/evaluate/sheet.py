@@ -13,7 +13,7 @@ from jaxtyping import Float32, UInt8
 from nurec_sim.evaluate.scoring import Scored
 from nurec_sim.evaluate.views import View
 from nurec_sim.evaluate.windows import Target, Window
-from nurec_sim.new_files import new_file
+from nurec_sim.files.new_files import new_file
 
 Picture = UInt8[np.ndarray, "h w 3"]
 NEAR_M, FAR_M = 2.0, 80.0

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from nurec_sim import geometry, sensors
-from nurec_sim.decoding import LIMITS
 from nurec_sim.errors import ClipError
+from nurec_sim.files.decoding import LIMITS
 from nurec_sim.logs import fields
 from nurec_sim.types import (
     Box,

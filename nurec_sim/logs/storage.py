@@ -1,6 +1,6 @@
 """Where the files of a clip lie: a folder, or a zip file read in place; every name and size is checked.
 
-Paths inside of a clip are relative, with forward slashes. Sizes are those of ``decoding.Limits``.
+Paths inside of a clip are relative, with forward slashes. Sizes are those of ``files.decoding.Limits``.
 """
 
 from __future__ import annotations
@@ -16,8 +16,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from nurec_sim.decoding import LIMITS, TooMuchError, check_directory, check_image, check_member, json_value, npz_arrays
 from nurec_sim.errors import ClipError
+from nurec_sim.files.decoding import (
+    LIMITS,
+    TooMuchError,
+    check_directory,
+    check_image,
+    check_member,
+    json_value,
+    npz_arrays,
+)
 
 META_FILE = "meta.json"
 # What the zip and numpy readers raise for broken bytes.

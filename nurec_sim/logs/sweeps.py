@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from nurec_sim import geometry, sensors
-from nurec_sim.decoding import LIMITS
 from nurec_sim.errors import ClipError
+from nurec_sim.files.decoding import LIMITS
 from nurec_sim.logs.storage import Storage
 from nurec_sim.types import Matrix4, Spin, Sweep, Trajectory
 

@@ -20,10 +20,10 @@ from jaxtyping import Float64, UInt8
 
 from nurec_sim import sensors
 from nurec_sim.errors import ClipError
+from nurec_sim.files.new_files import writing
 from nurec_sim.logs import calibration, sweeps, tables
 from nurec_sim.logs.consistency import EARLIEST_US
 from nurec_sim.logs.storage import META_FILE
-from nurec_sim.new_files import writing
 from nurec_sim.types import Rig, RoadMap, Sweep, Track, Trajectory
 
 SCHEMA = "nurec-sim-clip-1"

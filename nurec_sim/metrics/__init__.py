@@ -3,36 +3,17 @@
 Public names load on first use, so that importing the package costs nothing.
 """
 
-from importlib import import_module
-from typing import Any
+import lazy_loader
 
-_HOMES = {
-    "Agreement": "offroad",
-    "Contact": "collision",
-    "GridSettings": "offroad_grid",
-    "METRICS": "series",
-    "OffroadGrid": "offroad_grid",
-    "build_offroad_grid": "offroad_grid",
-    "find_contacts": "collision",
-    "judge_footprints": "offroad",
-    "metric_table": "table",
-    "read_table": "table",
-    "offroad_agreement": "offroad",
-    "rollout_values": "aggregate",
-    "scene_offroad_grid": "offroad_grid",
-    "score_rollout": "score",
-    "summarize": "aggregate",
-    "write_table": "table",
-}
-__all__ = sorted(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    """Import the module that holds a public name."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "aggregate": ["rollout_values", "summarize"],
+        "collision": ["Contact", "find_contacts"],
+        "offroad": ["Agreement", "judge_footprints", "offroad_agreement"],
+        "offroad_grid": ["GridSettings", "OffroadGrid", "build_offroad_grid", "scene_offroad_grid"],
+        "score": ["score_rollout"],
+        "series": ["METRICS"],
+        "table": ["metric_table", "read_table", "write_table"],
+    },
+)

@@ -17,7 +17,7 @@ from nurec_sim import geometry
 from nurec_sim.metrics.boxes import body_boxes
 from nurec_sim.metrics.offroad_grid import OffroadGrid
 from nurec_sim.metrics.series import make_series, times_of, unknown_series
-from nurec_sim.scene.road_area import drivable_area
+from nurec_sim.scene.opendrive.road_area import drivable_area
 from nurec_sim.types import Box, RoadMap, Rollout, Series, Trajectory
 
 TOLERANCE_M = 0.3

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nurec_sim.new_files import write_file
+from nurec_sim.files.new_files import write_file
 from nurec_sim.types import Rollout, Series
 
 if TYPE_CHECKING:

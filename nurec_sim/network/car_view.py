@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nurec_sim.network import plane_sweep as sweep
-from nurec_sim.network.flat_ground import flat_ground, rays_from_car
+from nurec_sim.network.stereo import plane_sweep as sweep
+from nurec_sim.network.stereo.flat_ground import flat_ground, rays_from_car
 from nurec_sim.network.tensors import SCENE_RESCALE, NetworkInputs
 
 CHANNELS = 8 + sweep.CHANNELS

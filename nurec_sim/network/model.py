@@ -9,19 +9,19 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from nurec_sim.network.background import stands
 from nurec_sim.network.car_view import car_view
 from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
-from nurec_sim.network.depth_refinement import depth_factor
 from nurec_sim.network.encoder import Encoder, Features
 from nurec_sim.network.image_colours import image_colours
 from nurec_sim.network.isp import IspDecoder
-from nurec_sim.network.learned_sky import SkyDecoder
-from nurec_sim.network.motion_search import searched_motion
-from nurec_sim.network.observed_sky import observed_sky
-from nurec_sim.network.plane_sweep import plane_sweep
 from nurec_sim.network.profiles import PATCH_PX, Profile, SkySize
-from nurec_sim.network.sky_mlp import SkyMlp
+from nurec_sim.network.sky.background import stands
+from nurec_sim.network.sky.learned import SkyDecoder
+from nurec_sim.network.sky.mlp import SkyMlp
+from nurec_sim.network.sky.observed import observed_sky
+from nurec_sim.network.stereo.depth_refinement import depth_factor
+from nurec_sim.network.stereo.motion_search import searched_motion
+from nurec_sim.network.stereo.plane_sweep import plane_sweep
 from nurec_sim.network.tensors import ContextMaps, NetworkInputs, NetworkOutputs, SemanticClass
 
 Precision = Literal["float32", "bfloat16", "float16"]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry
-from nurec_sim.scene.sky import sample_cubemap
+from nurec_sim.scene.usd.dome_texture import sample_cubemap
 
 SURE = 0.5
 """Texels that were seen as surely as this keep their colours."""

@@ -1,25 +1,16 @@
-"""Renders Gaussian scenes: cameras of any lens and shutter, spinning LiDARs; ``spec`` is the readable reference."""
+"""Renders Gaussian scenes: cameras of any lens and shutter, spinning LiDARs; ``spec`` is the readable reference.
 
-from __future__ import annotations
+Public names load on first use, so that importing the package costs nothing.
+"""
 
-import importlib
-from typing import Any
+import lazy_loader
 
-_HOME = {
-    "Renderer": "nurec_sim.render.renderer",
-    "encode_image": "nurec_sim.render.encode",
-    "check_request": "nurec_sim.render.requests",
-    "spec": "nurec_sim.render.spec",
-}
-__all__ = list(_HOME)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(_HOME[name])
-    return module if name == "spec" else getattr(module, name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submodules=["spec"],
+    submod_attrs={
+        "cpu.renderer": ["Renderer"],
+        "images.encode": ["encode_image"],
+        "requests": ["check_request"],
+    },
+)

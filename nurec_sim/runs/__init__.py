@@ -3,28 +3,16 @@
 Public names load on first use, so that importing the package costs nothing.
 """
 
-from importlib import import_module
-from typing import Any
+import lazy_loader
 
-_HOMES = {
-    "execute": "drive",
-    "headline": "results",
-    "load_policies": "policies",
-    "load_rollout": "rollout_file",
-    "record_video": "video",
-    "save_rollout": "rollout_file",
-    "true_world": "truth",
-    "write_report": "results",
-}
-__all__ = sorted(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    """Import the module that holds a public name."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "drive": ["execute"],
+        "policies": ["load_policies"],
+        "results": ["headline", "write_report"],
+        "rollout_file": ["load_rollout", "save_rollout"],
+        "truth": ["true_world"],
+        "video": ["record_video"],
+    },
+)

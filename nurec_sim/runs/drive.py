@@ -14,7 +14,7 @@ import yaml
 
 import nurec_sim
 from nurec_sim.errors import NurecSimError, RunError, ScenarioError, WriteError
-from nurec_sim.new_files import writing
+from nurec_sim.files.new_files import writing
 from nurec_sim.runs import folder as layout
 from nurec_sim.runs.policies import LoadedPolicy, load_policies
 from nurec_sim.runs.results import write_report
@@ -24,7 +24,7 @@ from nurec_sim.runs.video import record_video
 from nurec_sim.sim import Scenario, run_rollout
 from nurec_sim.sim.actors import Actors
 from nurec_sim.sim.policy_host import PLAN_TIMEOUT_S
-from nurec_sim.sim.sensing import find_camera
+from nurec_sim.sim.policy_sensors import find_camera
 from nurec_sim.types import GaussianScene, Policy, Rollout, Sense
 
 Progress = Callable[[str, float], None]

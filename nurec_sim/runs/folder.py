@@ -23,12 +23,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from nurec_sim.errors import RunError, WriteError
-from nurec_sim.new_files import writing
+from nurec_sim.files.new_files import writing
 
 ROLLOUT, SCENARIO, VERSIONS, VIDEO, ERROR = "rollout.npz", "scenario.yaml", "versions.json", "front.mp4", "error.txt"
 VIDEO_ERROR = "video_error.txt"
 _LEFTOVER = re.compile(r"\..+\.(part|part\.\d+|old\.\d+)")
-"""Names of ``new_files.new_file`` and of ``written_at_once``."""
+"""Names of ``files.new_files.new_file`` and of ``written_at_once``."""
 SCENE, ROAD, REPORT = "scene.json", "road.npz", "report.html"
 
 

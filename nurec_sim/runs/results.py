@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from nurec_sim.errors import RunError
+from nurec_sim.files.new_files import write_file
 from nurec_sim.metrics.aggregate import rollout_values, summarize
 from nurec_sim.metrics.collision import find_contacts
 from nurec_sim.metrics.score import score_rollout
 from nurec_sim.metrics.table import metric_table, read_table, write_table
-from nurec_sim.new_files import write_file
 from nurec_sim.report import ReportRollout, ReportScene, RunReport, render_report
 from nurec_sim.runs import folder as layout
 from nurec_sim.runs.rollout_file import load_rollout

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nurec_sim.errors import RunError
-from nurec_sim.new_files import new_file
+from nurec_sim.files.new_files import new_file
 from nurec_sim.scene import codec
 from nurec_sim.types import EgoState, Event, Plan, Rig, Rollout, Trajectory
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from nurec_sim.errors import ArchiveError, ReconstructError, RunError
+from nurec_sim.files.new_files import new_file, write_file
 from nurec_sim.metrics.offroad_grid import OffroadGrid, scene_offroad_grid
-from nurec_sim.new_files import new_file, write_file
 from nurec_sim.runs.folder import ROAD, SCENE
 from nurec_sim.scene import codec, scene_hash
 from nurec_sim.types import GaussianScene, Label, RoadMap, Track

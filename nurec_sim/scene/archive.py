@@ -14,18 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from nurec_sim.decoding import LIMITS
 from nurec_sim.errors import ArchiveError
+from nurec_sim.files.decoding import LIMITS
+from nurec_sim.files.npy import array_from_npy, npy_bytes
+from nurec_sim.files.zip_package import Package, write_package
 from nurec_sim.scene import codec
 from nurec_sim.scene.checks import check_scene
 from nurec_sim.scene.describe import scene_hash
 from nurec_sim.scene.facts import facts_from_json, scene_facts
-from nurec_sim.scene.npy import array_from_npy, npy_bytes
 from nurec_sim.scene.sidecars import ftheta_fits, sidecars
-from nurec_sim.scene.sky import latlong_exr
-from nurec_sim.scene.usd_actors import actors_layer, field_paths
-from nurec_sim.scene.usd_cameras import cameras_layer
-from nurec_sim.scene.usd_layers import (
+from nurec_sim.scene.usd.actors import actors_layer, field_paths
+from nurec_sim.scene.usd.cameras import cameras_layer
+from nurec_sim.scene.usd.dome_texture import latlong_exr
+from nurec_sim.scene.usd.layers import (
     ACTORS_LAYER,
     CAMERAS_LAYER,
     SKY_TEXTURE,
@@ -36,7 +37,6 @@ from nurec_sim.scene.usd_layers import (
     root_layer,
     static_layer,
 )
-from nurec_sim.scene.zip_package import Package, write_package
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, RoadMap
 
 FORMAT_VERSION = 1
@@ -49,10 +49,6 @@ KNOT_TIMES, KNOTS, OWNERS, IN_BOX = (
 TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY, KNOT_TIMES, KNOTS, OWNERS)
 """The members that a scene is read from, with ``IN_BOX`` and ``EXPOSURES`` where it has such; all others are for other
 programs."""
-
-FOREIGN_SUFFIXES = (".ply", ".spz", ".usd", ".usda", ".usdc", ".nurec", ".ckpt")
-SCENE_SUFFIXES = (".usdz", *FOREIGN_SUFFIXES)
-"""Names of files that ``read_scene`` opens end in one of these, in capitals or not."""
 
 
 def write_scene(
@@ -103,21 +99,15 @@ def write_scene(
     return path
 
 
-def read_scene(path: Path | str) -> GaussianScene:
-    """Reads a scene archive written by ``write_scene``, every value exactly; or what another program wrote.
+def read_archive(path: Path | str) -> GaussianScene:
+    """Reads a scene archive written by ``write_scene``, every value exactly.
 
-    Of an archive of ours nothing is extracted, unpickled or run, and no file outside of it is opened. For other
-    archives and for ``.ply``, ``.spz``, ``.usd``, ``.usda``, ``.usdc``, ``.nurec`` and ``.ckpt`` files see
-    ``foreign.read_foreign``.
+    Nothing is extracted, unpickled or run, and no file outside of the archive is opened.
 
     Raises:
         ArchiveError: not such an archive, damaged, changed since it was written, unsafe, or not a sound scene.
     """
     path = Path(path)
-    if is_foreign(path):
-        from nurec_sim.scene.foreign import read_foreign
-
-        return read_foreign(path)
     with Package(path) as package:
         manifest = _read_manifest(package)
         _check_hashes(package, manifest, TRUTH)
@@ -155,18 +145,6 @@ def read_scene(path: Path | str) -> GaussianScene:
     return scene
 
 
-def is_foreign(path: Path) -> bool:
-    """Whether another program wrote a file of a scene: it has no manifest of ours.
-
-    Raises:
-        ArchiveError: the file is no readable archive.
-    """
-    if path.suffix.lower() in FOREIGN_SUFFIXES:
-        return True
-    with Package(path) as package:
-        return MANIFEST not in package.names
-
-
 def archive_faults(path: Path | str) -> list[str]:
     """Everything wrong with an archive, as texts; empty if it reads well and no member was changed."""
     try:
@@ -179,7 +157,7 @@ def archive_faults(path: Path | str) -> list[str]:
                 except ArchiveError as error:
                     faults.append(str(error))
         if not faults:
-            read_scene(path)
+            read_archive(path)
         return faults
     except ArchiveError as error:
         return [str(error)]

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from nurec_sim.decoding import TooMuchError, check_json, json_value
 from nurec_sim.errors import ArchiveError
+from nurec_sim.files.decoding import TooMuchError, check_json, json_value
 from nurec_sim.types import (
     Box,
     CameraModel,

@@ -24,7 +24,7 @@ from nurec_sim.errors import ArchiveError
 from nurec_sim.geometry import quat_from_matrix
 from nurec_sim.scene import codec
 from nurec_sim.scene.ground_mesh import encode_ply, ground_mesh
-from nurec_sim.scene.opendrive import opendrive_map, world_to_ecef
+from nurec_sim.scene.opendrive.writer import opendrive_map, world_to_ecef
 from nurec_sim.types import (
     CameraModel,
     Fisheye,

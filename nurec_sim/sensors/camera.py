@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from nurec_sim import geometry
+from nurec_sim.compute.turns import rest
 from nurec_sim.sensors import windshield
 from nurec_sim.sensors.lens import check_lens, project_lens, unproject_lens
-from nurec_sim.turns import rest
 from nurec_sim.types import CameraModel, FTheta, Lens, Shutter, Windshield
 
 ROLLING_ITERATIONS = 10
@@ -78,7 +78,7 @@ def pixel_ray_strips(
     """``pixel_rays`` by strips of rows, each with its place, for images that are too large to hold in double precision.
 
     Raises:
-        GivenUpError, DeadlinePassedError: see ``turns.rest``.
+        GivenUpError, DeadlinePassedError: see ``compute.turns.rest``.
     """
     if _is_usual(camera):
         yield slice(0, camera.height_px), *pixel_rays(camera)

@@ -24,9 +24,9 @@ from nurec_sim.errors import PlanError, PolicyError, ScenarioError
 from nurec_sim.sim.actors import Actors
 from nurec_sim.sim.control import CONTROLLERS, PlannedPath
 from nurec_sim.sim.policy_host import PLAN_TIMEOUT_S, PolicyHost, described
+from nurec_sim.sim.policy_sensors import SceneFacts, SensorSuite
 from nurec_sim.sim.recorded import RecordedDrive
 from nurec_sim.sim.scenario import STATE_S, Perturbation, Scenario
-from nurec_sim.sim.sensing import SceneFacts, SensorSuite
 from nurec_sim.sim.vehicle import TICK_US, Limits, VehicleState
 from nurec_sim.types import EgoState, Event, Observation, Plan, Policy, Rollout, Sense, SensorFrame
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from nurec_sim.errors import TrainingError
-from nurec_sim.new_files import write_file
+from nurec_sim.files.new_files import write_file
 
 CHECKPOINT = "checkpoint.safetensors"
 _KEY = "nurec_sim_training"

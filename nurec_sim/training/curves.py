@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from nurec_sim.errors import TrainingError
-from nurec_sim.new_files import write_file
+from nurec_sim.files.new_files import write_file
 from nurec_sim.report.cells import escape
 from nurec_sim.report.figure import base_layout
 from nurec_sim.report.template import STYLE

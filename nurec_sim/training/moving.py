@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nurec_sim.network.tensors import NetworkInputs, QueryGaussians, SemanticClass
-from nurec_sim.render.gradients import GaussianTensors
+from nurec_sim.render.cpu.backward.gradients import GaussianTensors
 
 LEAST_OPACITY = 0.01
 LEAST_MOVING_OPACITY = 0.75

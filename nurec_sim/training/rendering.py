@@ -13,13 +13,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nurec_sim.network import cubemap
+from nurec_sim.network.sky import cubemap
 from nurec_sim.network.tensors import NetworkInputs, QueryGaussians, SemanticClass
-from nurec_sim.reconstruct.feedforward.rays import camera_rays, scene_rays
-from nurec_sim.render.gradients import render_camera
+from nurec_sim.reconstruct.feedforward.inputs.rays import camera_rays, scene_rays
+from nurec_sim.render.cpu.backward.gradients import render_camera
 from nurec_sim.training.config import LossWeights
+from nurec_sim.training.data.sample import TargetView
 from nurec_sim.training.moving import gaussians_at
-from nurec_sim.training.sample import TargetView
 
 PerceptualLoss = Callable[[Tensor, Tensor], Tensor]
 """Takes two images [h, w, 3] in 0..1."""

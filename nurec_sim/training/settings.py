@@ -7,9 +7,9 @@ import dataclasses
 from pydantic import BaseModel, ConfigDict, Field
 
 from nurec_sim.network.profiles import Profile
-from nurec_sim.training.augment import AugmentSettings
-from nurec_sim.training.generate import ClipSettings
-from nurec_sim.training.windows import WindowSettings
+from nurec_sim.training.data.augment import AugmentSettings
+from nurec_sim.training.data.generate import ClipSettings
+from nurec_sim.training.data.windows import WindowSettings
 
 
 class Strict(BaseModel):

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from nurec_sim.errors import TrainingError
 from nurec_sim.network.car_view import GROUND_DEPTH
-from nurec_sim.network.checkpoints import load_state_dict
+from nurec_sim.network.checkpoints.state_dicts import load_state_dict
 from nurec_sim.network.decoders import DenseDecoder, SelectiveDecoder
 from nurec_sim.network.dpt import DptHead
 from nurec_sim.network.model import InstantNuRec

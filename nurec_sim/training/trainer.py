@@ -23,17 +23,17 @@ from torch import Tensor, nn
 
 from nurec_sim import network
 from nurec_sim.errors import TrainingError
-from nurec_sim.network.checkpoints import save_weights
-from nurec_sim.new_files import write_file, writing
+from nurec_sim.files.new_files import write_file, writing
+from nurec_sim.network.checkpoints.state_dicts import save_weights
 from nurec_sim.training import checkpoint
 from nurec_sim.training.checkpoint import Position
 from nurec_sim.training.config import Stage, TrainingConfig
 from nurec_sim.training.curves import write_curves
-from nurec_sim.training.objective import Objective, StepOutputs
+from nurec_sim.training.data.sample import TrainingSample
+from nurec_sim.training.data.samples import Samples
+from nurec_sim.training.losses.objective import Objective, StepOutputs
 from nurec_sim.training.processes import Processes
 from nurec_sim.training.rendering import PerceptualLoss
-from nurec_sim.training.sample import TrainingSample
-from nurec_sim.training.samples import Samples
 from nurec_sim.training.start import load_shared, prepare
 
 WEIGHTS, RECIPE, CURVES, SAMPLES = "weights.safetensors", "recipe.json", "curves.csv", "samples"

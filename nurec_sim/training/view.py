@@ -10,7 +10,7 @@ from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 
 from nurec_sim.network.tensors import ContextMaps, SemanticClass
-from nurec_sim.training.sample import TrainingSample
+from nurec_sim.training.data.sample import TrainingSample
 
 TILE_WIDTH_PX = 208
 MARGIN_PX, CAPTION_PX = 4, 16

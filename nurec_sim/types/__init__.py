@@ -7,6 +7,7 @@ their origin at the image corner, centres at +0.5. Gaussian scales are standard 
 in 0..1. World: metres, z up.
 """
 
+from nurec_sim.types.frames import CameraFrame, LidarFilter, LidarFrame, Sense, SensorFrame, SensorRequest
 from nurec_sim.types.logs import (
     MOVABLE_LABELS,
     Clip,
@@ -33,14 +34,6 @@ from nurec_sim.types.scenes import (
     Gaussians,
     GaussianScene,
     Label,
-)
-from nurec_sim.types.sensing import (
-    CameraFrame,
-    LidarFilter,
-    LidarFrame,
-    Sense,
-    SensorFrame,
-    SensorRequest,
 )
 from nurec_sim.types.sensors import (
     Box,

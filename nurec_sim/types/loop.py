@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from nurec_sim.types.sensing import CameraFrame, LidarFrame
+from nurec_sim.types.frames import CameraFrame, LidarFrame
 from nurec_sim.types.sensors import Rig
 from nurec_sim.types.trajectories import Matrix4, Trajectory
 

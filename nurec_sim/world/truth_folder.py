@@ -19,13 +19,13 @@ import numpy as np
 from jaxtyping import Float32
 
 from nurec_sim.errors import ClipError
-from nurec_sim.new_files import writing
-from nurec_sim.world.isp import CameraResponse
-from nurec_sim.world.plan import TownPlan
-from nurec_sim.world.scan import LidarResponse
+from nurec_sim.files.new_files import writing
+from nurec_sim.world.plan.town import TownPlan
+from nurec_sim.world.sense.isp import CameraResponse
+from nurec_sim.world.sense.scan import LidarResponse
 
 if TYPE_CHECKING:
-    from nurec_sim.world.sense import TrueView
+    from nurec_sim.world.sense.simulator import TrueView
 
 PLAN_FILE, RESPONSES_FILE = "plan.json", "responses.json"
 

@@ -15,13 +15,13 @@ from jaxtyping import Int64, UInt8
 from nurec_sim import geometry, logs, sensors
 from nurec_sim.errors import ClipError
 from nurec_sim.types import CameraModel, LidarModel, Rig, SensorRequest, Shutter, Sweep, Trajectory
-from nurec_sim.world.isp import CameraResponse, random_response
-from nurec_sim.world.network import TownNetwork
-from nurec_sim.world.plan import TownPlan
-from nurec_sim.world.rig import street_rig
-from nurec_sim.world.scan import LidarResponse, measured_points
-from nurec_sim.world.sense import TrueWorld
-from nurec_sim.world.truth import scene_flow
+from nurec_sim.world.plan.network import TownNetwork
+from nurec_sim.world.plan.rig import street_rig
+from nurec_sim.world.plan.town import TownPlan
+from nurec_sim.world.sense.isp import CameraResponse, random_response
+from nurec_sim.world.sense.scan import LidarResponse, measured_points
+from nurec_sim.world.sense.simulator import TrueWorld
+from nurec_sim.world.sense.truth import scene_flow
 from nurec_sim.world.truth_folder import TruthFolder
 from nurec_sim.world.xodr import opendrive_town
 

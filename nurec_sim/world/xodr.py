@@ -12,11 +12,11 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from nurec_sim.scene.opendrive import GEO_REFERENCE
-from nurec_sim.world.network import TownNetwork
-from nurec_sim.world.plan import Arm, Connection, Crossing, Junction, TownPlan
-from nurec_sim.world.road import RoadLanes, RoadLine
-from nurec_sim.world.terrain import Terrain
+from nurec_sim.scene.opendrive.writer import GEO_REFERENCE
+from nurec_sim.world.plan.network import TownNetwork
+from nurec_sim.world.plan.road import RoadLanes, RoadLine
+from nurec_sim.world.plan.terrain import Terrain
+from nurec_sim.world.plan.town import Arm, Connection, Crossing, Junction, TownPlan
 
 PIECE_M = 8.0
 _MARK_OF_LINE = {"none": "none", "dashed": "broken", "solid": "solid", "double": "solid solid"}

@@ -19,10 +19,15 @@ from torch import Tensor
 
 from nurec_sim import geometry, sensors
 from nurec_sim.network.tensors import NetworkOutputs, QueryGaussians, SemanticClass
+from nurec_sim.reconstruct.feedforward.chunk_sky import observed_world_sky, world_background, world_sky
 from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ChunkLayers, ContextImage
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
-from nurec_sim.reconstruct.feedforward.sky import observed_world_sky, world_background, world_sky
-from nurec_sim.reconstruct.feedforward.tracks import knots_along, owners_of_points, owners_of_rays, scene_actors
+from nurec_sim.reconstruct.feedforward.tracks.labelled import (
+    knots_along,
+    owners_of_points,
+    owners_of_rays,
+    scene_actors,
+)
 from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Label
 
@@ -94,8 +99,8 @@ def _sky(
 ) -> tuple[Float32[np.ndarray, "6 s s 3"], Float32[np.ndarray, "6 s s"]]:
     """What lies behind everything, and how surely each texel was seen.
 
-    Sky where images show sky; standing surfaces where they show those (``network.background``); elsewhere the learned
-    sky, or what goes on from the sky that was seen.
+    Sky where images show sky; standing surfaces where they show those (``network.sky.background``); elsewhere the
+    learned sky, or what goes on from the sky that was seen.
     """
     context, size = outputs.context, settings.sky_px
     rays = chunk.tensors.rays.to(context.rgb.device)

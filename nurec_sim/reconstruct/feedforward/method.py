@@ -11,20 +11,20 @@ import torch
 
 from nurec_sim import network
 from nurec_sim.errors import ReconstructError
-from nurec_sim.network.background import stands
-from nurec_sim.network.checkpoints import load_weights
-from nurec_sim.network.consensus import find_consensus
-from nurec_sim.network.download import find_weights
+from nurec_sim.network.checkpoints.download import find_weights
+from nurec_sim.network.checkpoints.state_dicts import load_weights
 from nurec_sim.network.model import InstantNuRec, Precision
+from nurec_sim.network.sky.background import stands
 from nurec_sim.reconstruct.feedforward.chunks import ChunkLayers
-from nurec_sim.reconstruct.feedforward.clusters import group_into_tracks
-from nurec_sim.reconstruct.feedforward.frames import ChunkWindow, choose_cameras, chunk_windows
-from nurec_sim.reconstruct.feedforward.inputs import chunk_inputs
+from nurec_sim.reconstruct.feedforward.inputs.frames import ChunkWindow, choose_cameras, chunk_windows
+from nurec_sim.reconstruct.feedforward.inputs.window import chunk_inputs
 from nurec_sim.reconstruct.feedforward.layers import chunk_layers
-from nurec_sim.reconstruct.feedforward.lidar_depth import DepthFit, fit_depth
-from nurec_sim.reconstruct.feedforward.merge import merge_chunks
+from nurec_sim.reconstruct.feedforward.lidar.depth import DepthFit, fit_depth
+from nurec_sim.reconstruct.feedforward.merging.consensus import find_consensus
+from nurec_sim.reconstruct.feedforward.merging.merge import merge_chunks
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
-from nurec_sim.reconstruct.feedforward.tracks import scene_actors
+from nurec_sim.reconstruct.feedforward.tracks.clusters import group_into_tracks
+from nurec_sim.reconstruct.feedforward.tracks.labelled import scene_actors
 from nurec_sim.reconstruct.lift.actors import tracks_of
 from nurec_sim.types import Clip, DynamicGaussians, GaussianScene, Track
 

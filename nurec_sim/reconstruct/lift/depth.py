@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt64
 
-from nurec_sim.kernels import inner, kernel
+from nurec_sim.compute.kernels import inner, kernel
 
 PRIOR_COST, PRIOR_CAP = 40.0, 220.0
 SKY_COST, NOT_SKY_COST = 60.0, 40.0

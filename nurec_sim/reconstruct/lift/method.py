@@ -21,7 +21,7 @@ from nurec_sim.reconstruct.lift.bodies import surfels_of
 from nurec_sim.reconstruct.lift.pictures import DepthPicture, depth_pictures
 from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import LiftSettings
-from nurec_sim.reconstruct.lift.sky import make_sky
+from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
 from nurec_sim.reconstruct.lift.views import View, read_views
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from nurec_sim import geometry
-from nurec_sim.kernels import kernel
+from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.types import MOVABLE_LABELS, Clip, Track, Trajectory
 

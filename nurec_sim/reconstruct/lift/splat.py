@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from nurec_sim.kernels import inner, kernel
+from nurec_sim.compute.kernels import inner, kernel
 
 SPLAT_RADIUS = 0.5
 """Radius of a drawn surfel per metre of its spacing; what stays open is filled by matching."""

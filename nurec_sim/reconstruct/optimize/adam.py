@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nurec_sim.kernels import kernel
+from nurec_sim.compute.kernels import kernel
 
 VALUES = 14
 MEAN, QUAT, SCALE, OPACITY, RGB = 0, 3, 7, 10, 11

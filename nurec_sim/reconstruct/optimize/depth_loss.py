@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
-from nurec_sim.kernels import kernel
+from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.optimize.views import Returns
 
 OUTLIER = 0.2

@@ -21,7 +21,7 @@ from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
 from nurec_sim.reconstruct.optimize.responses import FrameResponses, borrowed_responses
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 from nurec_sim.reconstruct.optimize.views import TrainingView, training_views
-from nurec_sim.render.cpu.frame import Frame, sensor_tables
+from nurec_sim.render.cpu.backward.frame import Frame, sensor_tables
 from nurec_sim.types import Clip, GaussianScene
 
 Progress = Callable[[str, float], None]

@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64, Int32
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.optimize.adam import MEAN, OPACITY, QUAT, RGB, SCALE, VALUES, activate, adam_step
-from nurec_sim.render.cpu.frame import shared_workers
+from nurec_sim.render.cpu.backward.frame import shared_workers
 from nurec_sim.render.cpu.pack import morton_order
 from nurec_sim.types import Gaussians, GaussianScene
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from nurec_sim import sensors
-from nurec_sim.render.cpu.charts import PARAMETERS, Chart, lens_chart, lidar_chart
+from nurec_sim.render.cpu.project.charts import PARAMETERS, Chart, lens_chart, lidar_chart
 from nurec_sim.render.rays import NEAR_M, line_fractions, ray_grid, reference_fraction
 from nurec_sim.types import CameraModel, LidarModel, Pinhole, Shutter, Spin
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numba.core.options import DefaultOptions
 
-from nurec_sim.kernels import entry_point
+from nurec_sim.compute.kernels import entry_point
 from nurec_sim.render.cpu.simd import INSTRUCTION_SET
 
 f4 = np.float32

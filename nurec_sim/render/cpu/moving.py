@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
 from nurec_sim import geometry
-from nurec_sim.render.cpu.colours import harmonics_1, harmonics_2, harmonics_3
 from nurec_sim.render.cpu.kernel import f4, inner, kernel
 from nurec_sim.render.cpu.pack import (
     BLOCK,
@@ -33,6 +32,7 @@ from nurec_sim.render.cpu.pack import (
     morton_order,
     to_blocks,
 )
+from nurec_sim.render.cpu.project.colours import harmonics_1, harmonics_2, harmonics_3
 from nurec_sim.render.cpu.records import EYE_HIGH, EYE_LOW, FEATURES, LOG_255, SCRATCH, VIEW
 from nurec_sim.render.cpu.simd import LANES
 from nurec_sim.render.layers import LARGEST, drawable

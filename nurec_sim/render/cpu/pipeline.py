@@ -15,17 +15,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from nurec_sim.render.cpu.binning import count_tiles, depth_cuts, fill_tiles, sort_by_depth
-from nurec_sim.render.cpu.blend import LIDAR, NORMALS
-from nurec_sim.render.cpu.draw import draw_tiles, record_normals
+from nurec_sim.render.cpu.blend.binning import count_tiles, depth_cuts, fill_tiles, sort_by_depth
+from nurec_sim.render.cpu.blend.blocks import LIDAR, NORMALS
+from nurec_sim.render.cpu.blend.draw import draw_tiles, record_normals
+from nurec_sim.render.cpu.blend.rays import RayTiles
+from nurec_sim.render.cpu.blend.tiles import AFFINE, ROLLING
 from nurec_sim.render.cpu.grid import LIDAR as LIDAR_GRID
 from nurec_sim.render.cpu.pack import BLOCK, PackedGaussians
-from nurec_sim.render.cpu.project_general import project_general
-from nurec_sim.render.cpu.project_pinhole import project_pinhole
-from nurec_sim.render.cpu.rays import RayTiles
+from nurec_sim.render.cpu.project.general import project_general
+from nurec_sim.render.cpu.project.pinhole import project_pinhole
 from nurec_sim.render.cpu.records import MACRO, RECORD
 from nurec_sim.render.cpu.simd import LANES
-from nurec_sim.render.cpu.tiles import AFFINE, ROLLING
 from nurec_sim.render.cpu.view import View
 from nurec_sim.render.cpu.workers import SPLIT, Lend, Workers
 

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry
+from nurec_sim.render.cpu.blend.tiles import AFFINE, MOVING, ROLLING, TABLE
 from nurec_sim.render.cpu.grid import PINHOLE, Grid
-from nurec_sim.render.cpu.motion import motion_parameters
+from nurec_sim.render.cpu.project.motion import motion_parameters
 from nurec_sim.render.cpu.records import MACRO, view_parameters
-from nurec_sim.render.cpu.tiles import AFFINE, MOVING, ROLLING, TABLE
 
 GENTLE_TRAVEL_M = 0.03
 GENTLE_TURN_RAD = 2e-3

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 
 import numpy as np
 
-from nurec_sim.turns import current_turn
+from nurec_sim.compute.turns import current_turn
 
 SPLIT = 16
 """Ranges per thread: enough to even out tiles of very different cost."""
@@ -34,7 +34,7 @@ class Workers:
         Between calls, the work rests when its turn is over (``turns``); its helpers are then free for others.
 
         Raises:
-            GivenUpError, DeadlinePassedError: see ``turns.rest``.
+            GivenUpError, DeadlinePassedError: see ``compute.turns.rest``.
         """
         results: list = [None] * len(calls)
         numbers = itertools.count()  # next() of it is atomic

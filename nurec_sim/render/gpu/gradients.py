@@ -1,4 +1,4 @@
-"""Rendering that torch can differentiate, on a GPU: ``render.gradients`` for several sensors in one launch.
+"""Differentiable rendering for torch on a GPU: ``render.cpu.backward.gradients`` for several sensors in one launch.
 
 Gradients reach means, rotations, scales, opacities, colours and intensities, and poses of sensors. What switches a hit
 on or off has none: the cut at 1/255, the near plane, the end of a ray at 1e-4, the cap of the opacity at 0.99, and
@@ -18,14 +18,14 @@ from torch import Tensor
 from nurec_sim import geometry
 from nurec_sim.errors import RequestError
 from nurec_sim.render import torch_maths
+from nurec_sim.render.cpu.backward.gradients import CameraImages, GaussianTensors, LidarImages
 from nurec_sim.render.cpu.grid import make_grid
 from nurec_sim.render.cpu.pack import MAX_OPACITY, MIN_SCALE_M
 from nurec_sim.render.gpu.launcher import CudaLauncher, Launcher
 from nurec_sim.render.gpu.pipeline import ALPHA, DISTANCE, HALF, Blocks, draw, draw_backward
-from nurec_sim.render.gpu.sky import sky_colour
+from nurec_sim.render.gpu.sky_lookup import sky_colour
 from nurec_sim.render.gpu.tensors import blocks_of
 from nurec_sim.render.gpu.views import Batch, GridTensors, SensorView, make_batch, rotation_vector
-from nurec_sim.render.gradients import CameraImages, GaussianTensors, LidarImages
 from nurec_sim.render.spec import MIN_ALPHA, SURFACE_ALPHA
 from nurec_sim.types import CameraModel, LidarModel
 
@@ -60,7 +60,7 @@ class DifferentiableRenderer:
         world_from_sensor: Sequence[Float[Tensor, "4 4"] | Float[Tensor, "2 4 4"]],
         sky: Float[Tensor, "6 s s 3"] | Float[Tensor, " 3"] | None = None,
     ) -> list[CameraImages] | list[LidarImages]:
-        """What each sensor sees; the same as ``render.gradients``.
+        """What each sensor sees; the same as ``render.cpu.backward.gradients``.
 
         Args:
             gaussians: the world, on this device. Colours that depend on the view are evaluated for the first sensor's

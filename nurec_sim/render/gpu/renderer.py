@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nurec_sim.compute.turns import rest
 from nurec_sim.errors import TooLargeError
 from nurec_sim.render.cpu.grid import grid_key, make_grid
 from nurec_sim.render.cpu.pack import pack
@@ -25,7 +26,6 @@ from nurec_sim.render.requests import (
     check_request,
     ray_count,
 )
-from nurec_sim.turns import rest
 from nurec_sim.types import (
     CameraFrame,
     CameraModel,

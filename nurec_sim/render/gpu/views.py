@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry
-from nurec_sim.render.cpu.charts import (
+from nurec_sim.render.cpu.grid import LENS, LIDAR, Grid
+from nurec_sim.render.cpu.project.charts import (
     AZIMUTH,
     LEAST_AHEAD,
     MIDDLE,
@@ -24,7 +25,6 @@ from nurec_sim.render.cpu.charts import (
     PERIOD,
     TEXELS,
 )
-from nurec_sim.render.cpu.grid import LENS, LIDAR, Grid
 
 if TYPE_CHECKING:
     import torch

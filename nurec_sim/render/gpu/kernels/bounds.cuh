@@ -16,7 +16,7 @@ INLINE Box around(Box a, Box b) {
     return Box{fminf(a.u0, b.u0), fmaxf(a.u1, b.u1), fminf(a.v0, b.v0), fmaxf(a.v1, b.v1)};
 }
 
-// Parameters of a view (render/cpu/charts.py).
+// Parameters of a view (render/cpu/project/charts.py).
 enum Pinhole { FX, FY, CX, CY };
 enum Lens { TEXELS, MIDDLE, MISFIT };
 enum Lidar { PER_RADIAN, AZIMUTH, PERIOD, LEAST_AHEAD, MOST_AHEAD };

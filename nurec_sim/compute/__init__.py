@@ -1,0 +1,1 @@
+"""How kernels are compiled, and how long computations give way to others."""

@@ -1,0 +1,1 @@
+"""How right images, depth and LiDAR sweeps are."""

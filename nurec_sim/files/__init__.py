@@ -1,0 +1,1 @@
+"""Files of any origin: read within limits, written whole or not at all."""

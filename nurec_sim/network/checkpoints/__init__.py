@@ -1,0 +1,1 @@
+"""Weights of the network: files, downloads, and what a file fits."""

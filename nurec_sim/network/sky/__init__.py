@@ -1,0 +1,1 @@
+"""The sky: decoders, cubemaps, and what shows through between Gaussians."""

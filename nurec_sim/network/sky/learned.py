@@ -1,0 +1,88 @@
+"""The learned sky decoder: cubemap texels look at the features of the images that saw them (section 3.3)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nurec_sim.network.attention import KeyValueProjector, QueryBlock
+from nurec_sim.network.dpt import Fusion, Reassemble
+from nurec_sim.network.encoder import PatchEmbedding, normalized
+from nurec_sim.network.profiles import HeadSize, Profile, SkySize
+from nurec_sim.network.sky import cubemap
+
+RAY_OCTAVES = 8
+
+
+class RayEmbedding(nn.Module):
+    """Patches of ray directions as tokens: sines and cosines of eight octaves per axis."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.ray_embed = PatchEmbedding(width, 3 * 2 * RAY_OCTAVES, normed=True)
+
+    def forward(self, direction: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n y x c"]:
+        """Tokens by row and column."""
+        octave = math.pi * 2.0 ** torch.arange(RAY_OCTAVES, device=direction.device)
+        angle = direction[..., None] * octave
+        return self.ray_embed(torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2))
+
+
+class SkyUpsampling(nn.Module):
+    """One feature level, taken as four, fused to the cubemap's resolution."""
+
+    def __init__(self, size: SkySize, head: HeadSize) -> None:
+        super().__init__()
+        levels = HeadSize(size.levels, head.fused, head.last)
+        self.reassemble = Reassemble(size.width, levels)
+        self.decode_head = Fusion(levels, out=3)
+
+    def forward(self, feature: Float[Tensor, "n y x c"], edge_px: int) -> Float[Tensor, "n 3 e e"]:
+        """Faces of the cubemap, not yet in 0..1."""
+        return self.decode_head(self.reassemble([feature] * 4, 1.0), (edge_px, edge_px))
+
+
+class SkyDecoder(nn.Module):
+    """Colours of all directions, from the encoder's deepest features, the images and their rays."""
+
+    query_rays: Tensor
+
+    def __init__(self, profile: Profile, size: SkySize) -> None:
+        super().__init__()
+        self.size = size
+        self.token = nn.Parameter(torch.zeros(size.width))
+        self.register_buffer("query_rays", cubemap.directions(size.cubemap_px), persistent=profile.training_buffers)
+        self.feature_transform = nn.Sequential(
+            nn.Linear(2 * profile.encoder.width, size.width), nn.LayerNorm(size.width)
+        )
+        self.patch_embed_img = PatchEmbedding(size.width, normed=True)
+        self.patch_embed_ray = RayEmbedding(size.width)
+        self.blocks = nn.ModuleList(QueryBlock(size.width, size.heads, scale=1.0) for _ in range(size.depth))
+        self.kv_projector = KeyValueProjector(size.width, size.heads, normed=True)
+        self.upsample = SkyUpsampling(size, profile.head)
+
+    def set_constants(self) -> None:
+        """Compute the directions again, where the module was made without values."""
+        self.query_rays.copy_(cubemap.directions(self.size.cubemap_px, self.query_rays.device))
+
+    def forward(
+        self,
+        patches: Float[Tensor, "b v y x c"],
+        rgb: Float[Tensor, "b v h w 3"],
+        directions: Float[Tensor, "b v h w 3"],
+    ) -> Float[Tensor, "b 6 s s 3"]:
+        """The sky in the frame of the directions, 0..1."""
+        b, v = rgb.shape[:2]
+        seen = self.feature_transform(patches).flatten(0, 1)
+        seen = seen + self.patch_embed_img(normalized(rgb.flatten(0, 1)))
+        seen = seen + self.patch_embed_ray(directions.flatten(0, 1))
+        k, values = self.kv_projector(seen.reshape(b, -1, self.size.width))
+        query = self.patch_embed_ray(self.query_rays) + self.token
+        x = query.reshape(1, -1, self.size.width).expand(b, -1, -1)
+        for block in self.blocks:
+            x = block(x, k, values)
+        faces = self.upsample(x.reshape(b * 6, *query.shape[1:]), self.size.cubemap_px).float()
+        return (faces.clamp(-1, 1) * 0.5 + 0.5).permute(0, 2, 3, 1).unflatten(0, (b, 6))

@@ -1,0 +1,1 @@
+"""Classical matching between images: depth, its refinement, and motion."""

@@ -1,0 +1,124 @@
+"""The sky of a chunk as a cubemap over the world, complete in every direction (``reconstruct.sky_fill``).
+
+Chunks merge as means of their skies, weighted by ``seen`` plus a little (``alignment.merged_sky``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64
+from torch import Tensor
+from torch.nn import functional
+
+from nurec_sim import geometry
+from nurec_sim.network.sky import cubemap
+from nurec_sim.network.sky.background import background, stands
+from nurec_sim.network.sky.observed import texture
+from nurec_sim.network.tensors import ContextMaps, SemanticClass
+from nurec_sim.reconstruct.sky_fill import fill_unseen
+
+CUBE_FROM_WORLD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+"""Axes in which ``GaussianScene``'s sky (world z up) is a cubemap as in ``network.sky.cubemap``, whose y is down."""
+
+FEATHER_PX = 2.0
+"""How softly what was seen ends, in texels."""
+EDGE_PX = 3
+"""So near to something else, in pixels of an image, sky may show a little of it."""
+SEAM_PX = 6.0
+"""How softly the skies of chunks meet, in texels."""
+LEAST_SURE = 0.05
+"""What sky counts at its edge, where chunks meet."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedSky:
+    """Sky of one chunk from the pixels that the network calls sky.
+
+    Attributes:
+        rgb: complete in every direction.
+        shown: whether the texel was seen, 0..1.
+        sure: what it counts among chunks that saw it, less towards the edge of what was seen: there, things show that
+            stand before the sky, and chunks differ a little in their colours.
+    """
+
+    rgb: Float32[np.ndarray, "6 size size 3"]
+    shown: Float32[np.ndarray, "6 size size"]
+    sure: Float32[np.ndarray, "6 size size"]
+
+
+def observed_world_sky(
+    context: ContextMaps,
+    rays: Float[Tensor, "1 v h w 6"],
+    world_from_scene: Float64[np.ndarray, "4 4"],
+    size: int,
+    ego: Bool[np.ndarray, "v h w"] | None = None,
+) -> ObservedSky:
+    """Sky of one chunk over the world.
+
+    Takes the place of ``NetworkOutputs.sky`` where there is no learned sky: that one grows brighter or darker forwards
+    instead of upwards. ``rays`` are those of the inputs, in the scene frame; pixels where ``ego`` is True show the car
+    and no sky, whatever the network says.
+    """
+    shows_sky = context.logits[0].argmax(dim=-1) == SemanticClass.SKY
+    near_other = functional.max_pool2d((~shows_sky).float(), 2 * EDGE_PX + 1, stride=1, padding=EDGE_PX) > 0
+    (edge, edge_hits), (clear, clear_hits) = (
+        (each.cpu().numpy() for each in texture(*_pixels(chosen, context, rays, world_from_scene, ego), size))
+        for chosen in (shows_sky & near_other, shows_sky & ~near_other)
+    )
+    rgb = np.where((clear_hits > 0)[..., None], clear, edge)
+    seen = (clear_hits + edge_hits > 0).astype(np.float32)
+    # Images may be coarser than the cubemap and leave texels between their pixels: half of them is as good as all.
+    surely = np.minimum(2 * _blurred((clear_hits > 0).astype(np.float32), FEATHER_PX), 1)
+    sure = surely**2 * np.clip(2 * _blurred(surely, SEAM_PX) - 1, LEAST_SURE, 1)
+    return ObservedSky(fill_unseen(rgb, seen), np.minimum(2 * _blurred(seen, FEATHER_PX), 1), sure)
+
+
+def _blurred(faces: Float32[np.ndarray, "6 s s"], sigma_px: float) -> Float32[np.ndarray, "6 s s"]:
+    return np.stack([cv2.GaussianBlur(face, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE) for face in faces])
+
+
+def world_background(
+    context: ContextMaps,
+    rays: Float[Tensor, "1 v h w 6"],
+    world_from_scene: Float64[np.ndarray, "4 4"],
+    size: int,
+    ego: Bool[np.ndarray, "v h w"] | None = None,
+) -> tuple[Float32[np.ndarray, "6 size size 3"], Float32[np.ndarray, "6 size size"]]:
+    """``network.sky.background`` over the world, of what one chunk shows of all that stands."""
+    return background(*_pixels(stands(context.logits[0]), context, rays, world_from_scene, ego), size)
+
+
+def _pixels(
+    chosen: Bool[Tensor, "v h w"],
+    context: ContextMaps,
+    rays: Float[Tensor, "1 v h w 6"],
+    world_from_scene: Float64[np.ndarray, "4 4"],
+    ego: Bool[np.ndarray, "v h w"] | None,
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Colours of pixels and where they look, in the axes of the world's cubemap; none on the car."""
+    if ego is not None:
+        chosen = chosen & torch.from_numpy(~ego).to(chosen.device)
+    direction = rays[0][chosen][:, 3:]
+    turn = torch.as_tensor(CUBE_FROM_WORLD @ world_from_scene[:3, :3], dtype=direction.dtype, device=direction.device)
+    # Not a matrix product: those may round differently with another number of threads.
+    return context.rgb[0][chosen].detach(), (direction[:, None, :] * turn).sum(dim=-1)
+
+
+def world_sky(
+    sky: Float32[np.ndarray, "6 s s 3"],
+    seen: Float32[np.ndarray, "6 s s"],
+    world_from_scene: Float64[np.ndarray, "4 4"],
+    size: int,
+) -> tuple[Float32[np.ndarray, "6 size size 3"], Float32[np.ndarray, "6 size size"]]:
+    """A cubemap of the network (scene frame) as one of ``GaussianScene``: turned, the sky being far, and resampled."""
+    faces = torch.from_numpy(np.concatenate([sky, seen[..., None]], axis=-1, dtype=np.float32))
+    # Several rays per texel where the scene's sky is the coarser one: averaged, and not skipped through.
+    rays = max(1, round(sky.shape[1] / size))
+    direction = np.einsum("...i,ij->...j", geometry.cubemap_directions(rays * size), world_from_scene[:3, :3])
+    sampled = cubemap.sample_seamless(faces, torch.from_numpy(direction.astype(np.float32)))
+    values = sampled.reshape(6, size, rays, size, rays, 4).mean(dim=(2, 4)).numpy()
+    return np.ascontiguousarray(values[..., :3]), np.ascontiguousarray(values[..., 3])

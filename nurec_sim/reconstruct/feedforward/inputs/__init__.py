@@ -1,0 +1,1 @@
+"""From a window of a clip to what the network takes."""

@@ -1,0 +1,57 @@
+"""Masks of the recording car's own body, one PNG per camera, brought to the network's images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from nurec_sim.errors import ReconstructError
+from nurec_sim.files.decoding import check_image
+from nurec_sim.reconstruct.feedforward.inputs.crop import Crop
+from nurec_sim.types import Clip
+
+FAINTEST_COVER = 1e-3
+
+
+def ego_masks(folder: Path | None, clip: Clip, crops: Mapping[str, Crop]) -> dict[str, Bool[np.ndarray, "h w"]]:
+    """Where the car covers the view of each camera in ``crops``; nowhere for cameras without a file.
+
+    A mask ``<folder>/<camera>.png`` may have any size and is stretched over the whole image. One with an alpha channel
+    covers where alpha is not 0, one without where it is not black; a pixel is covered as soon as a part of it is.
+
+    Raises:
+        ReconstructError: the folder does not exist or has no mask for any camera of the clip, or a file is broken.
+    """
+    masks = {camera: np.zeros(crop.size[::-1], bool) for camera, crop in crops.items()}
+    if folder is None:
+        return masks
+    if not folder.is_dir():
+        raise ReconstructError(f"the folder of ego masks {folder} does not exist")
+    names = sorted(path.stem for path in folder.glob("*.png"))
+    if not set(names) & set(clip.rig.cameras):
+        raise ReconstructError(
+            f"no file in {folder} is named after a camera: need <camera>.png of {list(clip.rig.cameras)}, have {names}"
+        )
+    return {
+        camera: _scaled(folder / f"{camera}.png", crop) if camera in names else masks[camera]
+        for camera, crop in crops.items()
+    }
+
+
+def _scaled(path: Path, crop: Crop) -> Bool[np.ndarray, "h w"]:
+    try:
+        check_image(data := path.read_bytes())
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError, cv2.error):
+        pixels = None
+    if pixels is None:
+        raise ReconstructError(f"the ego mask {path} is not a readable PNG")
+    channels = np.atleast_3d(pixels)
+    cover = channels[..., 3] if channels.shape[2] == 4 else channels.max(axis=2)
+    resized = cv2.resize((cover > 0).astype(np.float32), crop.resized, interpolation=cv2.INTER_AREA)
+    (x, y), (width, height) = crop.offset, crop.size
+    return resized[y : y + height, x : x + width] > FAINTEST_COVER

@@ -1,0 +1,1 @@
+"""Predicted depth fitted to the LiDAR sweeps of a log."""

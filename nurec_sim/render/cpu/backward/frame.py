@@ -1,0 +1,230 @@
+"""One frame forwards and backwards: what ``gradients`` runs on the CPU, with NumPy arrays for tensors."""
+
+from __future__ import annotations
+
+import functools
+import os
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64
+
+from nurec_sim.render.cpu.backward.blend import IMAGE_PLANES, SUMS
+from nurec_sim.render.cpu.backward.project import project_back
+from nurec_sim.render.cpu.backward.repack import repack
+from nurec_sim.render.cpu.backward.tiles import draw_tiles_back, number_slots
+from nurec_sim.render.cpu.blend.background import draw_sky, draw_sky_back
+from nurec_sim.render.cpu.blend.blocks import CAMERA, LIDAR
+from nurec_sim.render.cpu.blend.rays import RayTiles, tile_rays
+from nurec_sim.render.cpu.blend.tiles import AFFINE, MOVING, ROLLING
+from nurec_sim.render.cpu.grid import Grid, grid_key, make_grid
+from nurec_sim.render.cpu.pack import BLOCK, FIELDS, PackedGaussians
+from nurec_sim.render.cpu.pipeline import NO_TABLE, Picture, draw, tile_ranges
+from nurec_sim.render.cpu.view import View
+from nurec_sim.render.cpu.workers import Buffers, Workers
+from nurec_sim.types import CameraModel, LidarModel
+
+KEPT_SENSORS = 16
+_BUFFERS = Buffers()
+_SENSORS: OrderedDict[tuple, Sensor] = OrderedDict()
+_SENSORS_LOCK = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """Tables of a sensor."""
+
+    grid: Grid
+
+    @cached_property
+    def rays(self) -> RayTiles:
+        """The rays as the kernels read them."""
+        return tile_rays(self.grid)
+
+    @cached_property
+    def all_valid(self) -> bool:
+        """Whether every pixel has a ray."""
+        return bool(np.all(self.grid.valid))
+
+    @cached_property
+    def cell_of_beam(self) -> Int64[np.ndarray, " n"]:
+        """Where in the grid each beam of a LiDAR is."""
+        assert self.grid.beam is not None
+        return np.argsort(self.grid.beam.reshape(-1))
+
+
+def sensor_tables(model: CameraModel | LidarModel) -> Sensor:
+    """Tables of a sensor, the latest ``KEPT_SENSORS`` kept."""
+    key = grid_key(model)
+    with _SENSORS_LOCK:
+        if key in _SENSORS:
+            _SENSORS.move_to_end(key)
+            return _SENSORS[key]
+    sensor = Sensor(make_grid(model))
+    with _SENSORS_LOCK:
+        _SENSORS[key] = sensor
+        while len(_SENSORS) > KEPT_SENSORS:
+            _SENSORS.popitem(last=False)
+    return sensor
+
+
+@functools.cache
+def shared_workers(threads: int | None) -> Workers:
+    """Threads shared by all frames that ask for as many; as many as the process may use if None."""
+    if threads is not None and threads < 1:
+        raise ValueError(f"rendering needs at least 1 thread, got {threads}")
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return Workers(threads or usable)
+
+
+class ExactView(View):
+    """A view whose rays start where they do; a rolling shutter is not drawn to first order."""
+
+    @cached_property
+    def way(self) -> int:
+        """AFFINE, TABLE or MOVING."""
+        return MOVING if super().way == ROLLING else super().way
+
+
+class Frame:
+    """A frame from its drawing until its gradients are no longer needed; it owns its scratch memory.
+
+    Args:
+        sensor: tables of the sensor.
+        pair: ``world_from_sensor`` at the start and the end of the exposure.
+        lidar: whether the features are those of a LiDAR: intensity, whether it is known, drop probability.
+        threads: as many as the process may use if None.
+    """
+
+    def __init__(
+        self, sensor: Sensor, pair: Float64[np.ndarray, "2 4 4"], lidar: bool, threads: int | None = None
+    ) -> None:
+        self.sensor, self.lidar = sensor, lidar
+        self.view = ExactView.of(sensor.grid, pair)
+        self._workers = shared_workers(threads)
+        loan = ExitStack()
+        weakref.finalize(self, loan.close)
+        self._array = loan.enter_context(_BUFFERS.lend())
+
+    @property
+    def ray_z(self) -> Float32[np.ndarray, "h w"] | None:
+        """Depth per distance along each ray; None where distances are depths already."""
+        return None if self.view.way == AFFINE else self.sensor.grid.direction[..., 2]
+
+    def draw_sky(self, sky: Float32[np.ndarray, "6 s s 3"]) -> Float32[np.ndarray, "3 h w"]:
+        """Colours of a cubemap behind every ray."""
+        return draw_sky(self._directions, self.view.world_from_reference[:3, :3], sky, self._workers)
+
+    def draw_sky_back(
+        self, sky: Float32[np.ndarray, "6 s s 3"], by_behind: Float32[np.ndarray, "3 h w"]
+    ) -> tuple[Float64[np.ndarray, "6 s s 3"], Float64[np.ndarray, "4 4"]]:
+        """Gradients by the sky and by the reference pose."""
+        pose = self.view.world_from_reference
+        by_sky, torque = draw_sky_back(self._directions, pose[:3, :3], sky, by_behind, self._workers)
+        return by_sky, pose_gradient(np.zeros(3), torque, pose)
+
+    @cached_property
+    def _directions(self) -> Float32[np.ndarray, "h w 3"]:
+        """Unit rays in the reference frame."""
+        grid, turns = self.sensor.grid, self.view.turns.reshape(-1, 3, 3)
+        if self.view.still:
+            return grid.direction
+        return np.einsum("hwij,hwj->hwi", turns[grid.line], grid.direction)
+
+    def draw(
+        self,
+        mean: Float32[np.ndarray, "n 3"],
+        quat: Float32[np.ndarray, "n 4"],
+        scale: Float32[np.ndarray, "n 3"],
+        opacity: Float32[np.ndarray, " n"],
+        features: Float32[np.ndarray, "n 3"],
+    ) -> Float32[np.ndarray, "6 h w"]:
+        """Blended planes: alpha, three features, distance, half distance; sides are rounded up to whole macro tiles."""
+        blocks = -(-len(mean) // BLOCK)
+        packed = self._array("fields", (blocks, FIELDS, BLOCK), np.float32)
+        self._workers.run(
+            repack,
+            [(first, last, mean, quat, scale, opacity, features, self.lidar, packed)
+             for first, last in self._workers.ranges(blocks, 8)],
+        )  # fmt: skip
+        nothing = np.zeros((0, 0, 0), np.float32)
+        layer = PackedGaussians(packed, nothing, np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros(0))
+        rays = NO_TABLE if self.view.way == AFFINE else self.sensor.rays
+        kind = LIDAR if self.lidar else CAMERA
+        self._picture = Picture(self.view, rays, kind, [(layer, np.arange(blocks))], self._array)
+        self.planes = draw([self._picture], self._workers)[0]
+        return self.planes
+
+    @property
+    def drawn_rows(self) -> Int32[np.ndarray, " k"]:
+        """Rows of the Gaussians that can be seen in the frame, rising; others have no gradient."""
+        # Every run takes its blocks in their order, and the runs follow each other.
+        picture = self._picture
+        return np.concatenate([picture.sources[first : first + many] for _, first, many in picture.runs])
+
+    def draw_back(
+        self,
+        mean: Float32[np.ndarray, "n 3"],
+        quat: Float32[np.ndarray, "n 4"],
+        scale: Float32[np.ndarray, "n 3"],
+        opacity: Float32[np.ndarray, " n"],
+        by_planes: Mapping[int, Float32[np.ndarray, "... h w"]],
+    ) -> tuple[Float32[np.ndarray, "n c"], ...]:
+        """Gradients by mean, quaternion, scale, opacity, features and ``world_from_sensor`` [4,4] at the reference.
+
+        Args:
+            mean: what has been drawn, like the following three.
+            quat: see mean.
+            scale: see mean.
+            opacity: see mean.
+            by_planes: gradients of the loss by the planes of ``draw``, by the number of the first plane.
+        """
+        picture, grid = self._picture, self.sensor.grid
+        height, width = grid.valid.shape
+        gradients = self._array("gradients", self.planes.shape, np.float32)
+        gradients[:] = 0
+        for plane, values in by_planes.items():
+            gradients[plane : plane + (len(values) if values.ndim == 3 else 1), :height, :width] = values
+        assert len(gradients) == IMAGE_PLANES
+        starts = np.array([first for _, first, _ in picture.runs], np.int64)
+        counts = np.array([count for _, _, count in picture.runs], np.int64)
+        first_slot = self._array("first slot", (len(picture.records),), np.int64)
+        pairs = number_slots(picture.spans, starts, counts, first_slot)
+        slots = self._array("slots", (pairs, SUMS), np.float32)
+        view, rays = self.view, picture.rays
+        self._workers.run(
+            draw_tiles_back,
+            [(view.way, picture.kind, tiles, picture.starts, picture.lists, picture.records, picture.spans, first_slot,
+              grid.intrinsics, rays.table, rays.line, rays.basis, view.turns, view.places, view.motion,
+              np.float32(grid.near_m), width, height, self.planes, gradients, slots)
+             for tiles in tile_ranges(picture, self._workers.threads)],
+        )  # fmt: skip
+        pose, count = view.world_from_reference, len(mean)
+        shares = [np.zeros((count, *width), np.float32) for width in ((3,), (4,), (3,), (), (3,))]
+        forces = np.zeros((-(-count // BLOCK), 6))
+        self._workers.run(
+            project_back,
+            [(first, many, picture.records, picture.spans, picture.sources, first_slot, slots, mean, quat, scale,
+              opacity, pose, *shares, forces) for _, first, many in picture.runs],
+        )  # fmt: skip
+        return *shares, pose_gradient(forces[:, :3].sum(axis=0), forces[:, 3:].sum(axis=0), pose)
+
+
+def pose_gradient(
+    force: Float64[np.ndarray, " 3"], torque: Float64[np.ndarray, " 3"], pose: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "4 4"]:
+    """The gradient by a pose's matrix, from those by a shift and by a small turn about its origin, both in the world.
+
+    Of all matrices with this torque it is the one along rotations; a change that is no rigid motion has no meaning.
+    """
+    x, y, z = torque
+    gradient = np.zeros((4, 4))
+    gradient[:3, :3] = 0.5 * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose[:3, :3]
+    gradient[:3, 3] = force
+    return gradient

@@ -1,0 +1,1 @@
+"""From projected Gaussians to images and sweeps: rays, tiles, blending, compositing."""

@@ -1,0 +1,1 @@
+"""From Gaussians to records with bounds on a sensor's grid, for any lens and motion."""

@@ -1,0 +1,200 @@
+"""Kernel that projects Gaussians for any lens and LiDAR, also in motion: conservative boxes, records, features."""
+
+from __future__ import annotations
+
+import numpy as np
+from llvmlite import ir
+
+from nurec_sim.render.cpu.kernel import keep_alive, kernel
+from nurec_sim.render.cpu.pack import BLOCK, FIELDS
+from nurec_sim.render.cpu.project.charts import PERIOD
+from nurec_sim.render.cpu.project.motion import (
+    APART,
+    join_ends,
+    lens_lines,
+    lidar_lines,
+    masks,
+    moving_lens_boxes,
+    moving_lidar_boxes,
+    other_ends,
+    to_lines,
+)
+from nurec_sim.render.cpu.project.outlines import Box, Lens, LensCone, Lidar, LidarCone, Outline
+from nurec_sim.render.cpu.project.parts import PARTS, add_lens_part, add_lidar_part, part_lines
+from nurec_sim.render.cpu.project.pinhole import take_features
+from nurec_sim.render.cpu.records import (
+    CELLS,
+    MACRO,
+    RECORD,
+    SCRATCH,
+    STEP,
+    build_records,
+    emit,
+    place,
+)
+from nurec_sim.render.cpu.simd import LANES, Lanes, Vector, vector_kernel
+
+
+@vector_kernel("iiiii")
+def lens_boxes(
+    v: Lanes, scratch: ir.Value, params: ir.Value, places: ir.Value, bends: ir.Value, box: ir.Value
+) -> ir.Value:
+    """Cells that a lens at one pose may see Gaussians in; the mask of those in its field."""
+    cone = LensCone(Lens(v, params, places, bends), Outline(v, scratch))
+    cone.box()[0].store(v, box)
+    return (~cone.outside()).integer()
+
+
+@vector_kernel("iiiii")
+def lidar_boxes(v: Lanes, scratch: ir.Value, params: ir.Value, rows: ir.Value, view: ir.Value, box: ir.Value) -> None:
+    """Cells that a LiDAR at one pose may see Gaussians in."""
+    cone = LidarCone(Lidar(v, params, rows), Outline(v, scratch), v.broadcast(view, 4 * CELLS) * 0.5)
+    Box(cone.columns, cone.rows(0.0)).store(v, box)
+
+
+def _cells(low: Vector, high: Vector, count: Vector) -> tuple[Vector, Vector]:
+    """First and last cell whose centre lies in an interval; the first is larger if there is none."""
+    return (low - 0.5).ceil().max(0), (high - 0.5).floor().min(count - 1)
+
+
+def _store_tiles(v: Lanes, ends: tuple[Vector, ...], tiles: ir.Value) -> None:
+    for k, end in enumerate(ends):
+        v.store(end, tiles, STEP * k)
+
+
+def _tile(cell: Vector) -> Vector:
+    return (cell.max(0) * (1 / MACRO)).floor()
+
+
+@vector_kernel("iii")
+def lens_tiles(v: Lanes, box: ir.Value, view: ir.Value, tiles: ir.Value) -> ir.Value:
+    """Macro tiles of boxes; the mask of those that hold the centre of a cell."""
+    ends = [v.load(box, STEP * k) for k in range(4)]
+    x0, x1 = _cells(ends[0], ends[1], v.broadcast(view, 4 * CELLS))
+    y0, y1 = _cells(ends[2], ends[3], v.broadcast(view, 4 * (CELLS + 1)))
+    _store_tiles(v, (_tile(x0), _tile(x1), _tile(y0), _tile(y1)), tiles)
+    return ((x0 <= x1) & (y0 <= y1)).integer()
+
+
+@vector_kernel("iiiii")
+def lidar_tiles(
+    v: Lanes, box: ir.Value, view: ir.Value, params: ir.Value, tiles: ir.Value, others: ir.Value
+) -> ir.Value:
+    """Macro tiles of boxes, and (``others``, mask ``APART`` bits on) of what a full turn brings back.
+
+    What leaves one side of the grid enters at the other. The two never share a tile.
+    """
+    left, right, top, bottom = (v.load(box, STEP * k) for k in range(4))
+    width, period = v.broadcast(view, 4 * CELLS), v.broadcast(params, 4 * PERIOD)
+    whole = ~(right - left < period)
+    y0, y1 = _cells(top, bottom, v.broadcast(view, 4 * (CELLS + 1)))
+    x0, x1 = _cells(whole.where(0, left), whole.where(width, right), width)
+    shift = (left < width - period).where(period, -period)
+    p0, p1 = _cells(left + shift, right + shift, width)
+    rows = y0 <= y1
+    first, second = (x0 <= x1) & rows, (p0 <= p1) & rows & ~whole
+    x0, x1, p0, p1 = _tile(x0), _tile(x1), _tile(p0), _tile(p1)
+    touch = first & second & (p0 <= x1) & (x0 <= p1)
+    _store_tiles(v, (touch.where(x0.min(p0), x0), touch.where(x1.max(p1), x1), _tile(y0), _tile(y1)), tiles)
+    _store_tiles(v, (p0, p1, _tile(y0), _tile(y1)), others)
+    return masks(v, first, second & ~touch)
+
+
+@kernel
+def project_general(
+    fields, sh_rest, blocks, first, last, view, is_lidar, params, places, bends, lines, motion,
+    records, keys, spans, sources, base,
+):  # fmt: skip
+    """Records of the Gaussians that a lens or a LiDAR may see, in the order of the blocks.
+
+    Args:
+        fields: [blocks,21,256] packed Gaussians.
+        sh_rest: [blocks,3k,256] or [0,0,0].
+        blocks: numbers of the blocks to look at.
+        first: first entry of ``blocks`` to take.
+        last: one behind the last.
+        view: see ``records.view_parameters``.
+        is_lidar: the chart is that of a LiDAR; the features are its own then.
+        params: of the chart (``charts.Chart``), as are places and bends.
+        places: see params.
+        bends: see params.
+        lines: [l,24] poses per line (``pipeline.View``); a single one where nothing moves.
+        motion: see ``motion.motion_parameters``.
+        records: [..,16] output, from row ``base`` on.
+        keys: [..] depths to sort by.
+        spans: [..,4] first and last macro tile column, first and last row.
+        sources: [..] packed rows (256 block + place) of the records.
+        base: first row to write; there must be room for 256 per block, for LiDARs 512.
+
+    Returns:
+        Number of records written; LiDARs write two of a Gaussian that their seam divides.
+    """
+    scratch, local = np.empty((SCRATCH, LANES), np.float32), np.empty((SCRATCH, LANES), np.float32)
+    rows = np.empty((LANES, RECORD), np.float32)
+    box, other_box = np.empty((4, LANES), np.float32), np.empty((4, LANES), np.float32)
+    tiles, other_tiles = np.empty((4, LANES), np.float32), np.empty((4, LANES), np.float32)
+    here, there, around = scratch.ctypes.data, local.ctypes.data, view.ctypes.data
+    chart, table, bend, path = params.ctypes.data, places.ctypes.data, bends.ctypes.data, motion.ctypes.data
+    cells, other_cells, poses = box.ctypes.data, other_box.ctypes.data, lines.ctypes.data
+    moving = lines.shape[0] > 1
+    n = base
+    for k in range(first, last):
+        number = np.int64(blocks[k])
+        for lane in range(0, BLOCK, LANES):
+            block = fields.ctypes.data + 4 * (number * (FIELDS * BLOCK) + lane)
+            mask = place(block, around, here)
+            if mask == 0:
+                continue
+            again = 0
+            if is_lidar:
+                if moving:
+                    lidar_lines(here, chart, around, path, there)
+                    to_lines(here, poses, path, there)
+                    found = moving_lidar_boxes(there, chart, table, around, path, cells)
+                    fast = mask & (found >> APART)
+                    seam = mask & found & ~fast
+                    if seam != 0:
+                        other_ends(path, there)
+                        to_lines(here, poses, path, there)
+                        found = moving_lidar_boxes(there, chart, table, around, path, other_cells)
+                        seam &= found >> (2 * APART)
+                        fast |= seam & (found >> APART)
+                        join_ends(seam, chart, cells, other_cells)
+                    if fast != 0:
+                        for part in range(PARTS):
+                            part_lines(part, path, there)
+                            to_lines(here, poses, path, there)
+                            add_lidar_part(part, fast, there, chart, table, path, around, cells)
+                else:
+                    lidar_boxes(here, chart, table, around, cells)
+                both = lidar_tiles(cells, around, chart, tiles.ctypes.data, other_tiles.ctypes.data)
+                again = mask & (both >> APART)
+                mask &= both
+            else:
+                if moving:
+                    lens_lines(here, chart, table, path, there)
+                    to_lines(here, poses, path, there)
+                    lens_lines(there, chart, table, path, there)
+                    to_lines(here, poses, path, there)
+                    found = moving_lens_boxes(there, chart, table, bend, path, cells)
+                    mask &= found
+                    fast = mask & (found >> APART)
+                    if fast != 0:
+                        for part in range(PARTS):
+                            part_lines(part, path, there)
+                            to_lines(here, poses, path, there)
+                            add_lens_part(part, fast, there, chart, table, bend, path, around, cells)
+                else:
+                    mask &= lens_boxes(here, chart, table, bend, cells)
+                mask &= lens_tiles(cells, around, tiles.ctypes.data)
+            if mask | again == 0:
+                continue
+            take_features(block, sh_rest, number, lane, around, here, is_lidar)
+            build_records(here, rows.ctypes.data, around)
+            source = number * BLOCK + lane
+            n = emit(mask, rows, scratch, tiles, source, n, records, keys, spans, sources)
+            n = emit(again, rows, scratch, other_tiles, source, n, records, keys, spans, sources)
+    keep_alive(local)
+    keep_alive(box)
+    keep_alive(other_box)
+    return n - base

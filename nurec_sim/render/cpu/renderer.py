@@ -1,0 +1,286 @@
+"""Renders requests for one Gaussian scene on the CPU; what it draws is defined in ``render.spec``."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+
+from nurec_sim import geometry
+from nurec_sim.compute.turns import rest
+from nurec_sim.render.cpu.blend.blocks import CAMERA, LIDAR, NORMALS
+from nurec_sim.render.cpu.blend.composite import composite
+from nurec_sim.render.cpu.blend.rays import RayTiles, tile_rays
+from nurec_sim.render.cpu.blend.sweep import sweep_returns
+from nurec_sim.render.cpu.blend.tiles import AFFINE, ROLLING
+from nurec_sim.render.cpu.grid import PINHOLE, Grid, grid_key, make_grid
+from nurec_sim.render.cpu.moving import PackedMoving
+from nurec_sim.render.cpu.pack import PackedGaussians, pack
+from nurec_sim.render.cpu.pipeline import NO_TABLE, FrameStats, Picture, blocks_in_view, draw
+from nurec_sim.render.cpu.view import View
+from nurec_sim.render.cpu.workers import Buffers, Lend, Workers
+from nurec_sim.render.lod import Detail, ray_spacing
+from nurec_sim.render.rays import actors_at, reference_pose
+from nurec_sim.render.requests import (
+    SENSED_OUTPUTS,
+    check_camera_call,
+    check_lidar_call,
+    check_outputs,
+    check_request,
+)
+from nurec_sim.types import CameraFrame, CameraModel, GaussianScene, LidarFilter, LidarFrame, SensorFrame, SensorRequest
+
+IDENTITY_ISP = np.eye(3, 4, dtype=np.float32)
+GROUP_BYTES = 256 << 20
+"""Scratch memory of the frames that go through the stages together, or of a single larger one."""
+SLICE_RAYS = 1 << 16
+"""Rays finished in one call of a kernel, about a millisecond of work."""
+KEPT_RAYS = 50_000_000
+"""Rays of the sensors whose tables are kept, in all; some 60 bytes each."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Sensor:
+    """Tables of a sensor; ``rays`` only where a pinhole's formula will not do.
+
+    ``ray_z`` holds the z of the unit rays, ``spacing_rad`` is the usual angle between neighbours.
+    """
+
+    grid: Grid
+    rays: RayTiles
+    ray_z: np.ndarray
+    spacing_rad: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """A frame on its way."""
+
+    request: SensorRequest
+    sensor: _Sensor
+    picture: Picture
+
+
+class Renderer:
+    """A scene made ready for rendering. Immutable but for caches; all methods can be called from many threads.
+
+    Args:
+        scene: the world.
+        threads: that work on a frame, the caller's own among them; as many as the process may use if None.
+        apply_isp: whether ``scene.isp`` of the request's sensor id is applied to requests that ask for it.
+        detail_px: level of detail: distant static Gaussians are drawn merged where that paints no more than about a
+            square of this side wrong, in pixels or beams; 0 draws all of them. 0.15 keeps 50 dB where surfaces have
+            several layers and 45 where they have one (``lod``). Merging takes seconds per million Gaussians.
+
+    Raises:
+        ValueError: less than one thread, or a negative or infinite ``detail_px``.
+    """
+
+    def __init__(
+        self, scene: GaussianScene, threads: int | None = None, apply_isp: bool = True, detail_px: float = 0.0
+    ) -> None:
+        if threads is not None and threads < 1:
+            raise ValueError(f"a renderer needs at least 1 thread, got {threads}")
+        if not 0 <= detail_px < np.inf:
+            raise ValueError(f"detail_px must be finite and not negative, got {detail_px}")
+        self.scene = scene
+        self.apply_isp = apply_isp
+        self._workers = Workers(threads or _usable_cores())
+        self._buffers = Buffers()
+        self._static = Detail.of(scene.static, detail_px) if detail_px else pack(scene.static)
+        self._moving = PackedMoving.of(scene.dynamic, scene.tracks)
+        self._sky = np.ascontiguousarray(scene.sky, np.float32)
+        self._sensors: OrderedDict[tuple, _Sensor] = OrderedDict()
+        self._sensors_lock = threading.Lock()
+
+    def sense(self, requests: Sequence[SensorRequest], outputs: Sequence[str] = SENSED_OUTPUTS) -> list[SensorFrame]:
+        """One frame per request, in order: ``types.Sense``; cameras with ``rgb`` and what else ``outputs`` names.
+
+        Frames go through the stages in groups that fit ``GROUP_BYTES``.
+
+        Raises:
+            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or an unknown output.
+        """
+        check_outputs(outputs)
+        return self.measure(requests, outputs)[0]
+
+    def render_camera(self, request: SensorRequest, outputs: Sequence[str] = SENSED_OUTPUTS) -> CameraFrame:
+        """A camera frame with ``rgb`` and those of depth, alpha, label and normal that ``outputs`` names.
+
+        Raises:
+            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or an unknown output.
+        """
+        check_camera_call(request, outputs)
+        frame = self.measure([request], outputs)[0][0]
+        assert isinstance(frame, CameraFrame)
+        return frame
+
+    def render_lidar(self, request: SensorRequest, filter: LidarFilter | None = None) -> LidarFrame:
+        """A sweep: the beams that return by ``filter`` (``LidarFilter()`` if None); see ``spec.sweep_frame``.
+
+        Raises:
+            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
+        """
+        check_lidar_call(request)
+        frame = self.measure([request], filter=filter)[0][0]
+        assert isinstance(frame, LidarFrame)
+        return frame
+
+    def measure(
+        self,
+        requests: Sequence[SensorRequest],
+        outputs: Sequence[str] = SENSED_OUTPUTS,
+        filter: LidarFilter | None = None,
+    ) -> tuple[list[SensorFrame], list[FrameStats]]:
+        """Frames as of ``sense``, and what each of them took.
+
+        Raises:
+            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
+        """
+        for request in requests:
+            check_request(request, self.scene)
+        frames: list[SensorFrame] = []
+        stats: list[FrameStats] = []
+        with ExitStack() as loans:
+            lends: list[Lend] = []
+            group: list[_Begun] = []
+            for number, request in enumerate(requests):
+                rest()
+                if len(group) == len(lends):
+                    lends.append(loans.enter_context(self._buffers.lend()))
+                group.append(self._begin(request, outputs, lends[len(group)]))
+                held = sum(begun.picture.scratch_bytes for begun in group)
+                if held >= GROUP_BYTES or number == len(requests) - 1:
+                    frames += self._finish(group, outputs, filter or LidarFilter())
+                    stats += [begun.picture.stats for begun in group]
+                    group = []
+        return frames, stats
+
+    def _begin(self, request: SensorRequest, outputs: Sequence[str], array: Lend) -> _Begun:
+        sensor = self._sensor(request)
+        view = View.of(sensor.grid, request.world_from_sensor)
+        kind = LIDAR if not isinstance(request.sensor, CameraModel) else NORMALS if "normal" in outputs else CAMERA
+        rays = NO_TABLE if view.way in (AFFINE, ROLLING) else self._ray_tables(sensor)
+        return _Begun(request, sensor, Picture(view, rays, kind, self._layers(request, sensor, view, array), array))
+
+    def _finish(self, group: Sequence[_Begun], outputs: Sequence[str], filter: LidarFilter) -> list[SensorFrame]:
+        planes = draw([begun.picture for begun in group], self._workers)
+        began = time.perf_counter()
+        frames: list[SensorFrame] = [
+            self._camera_frame(begun.request, begun.picture, begun.sensor, plane, outputs)
+            if isinstance(begun.request.sensor, CameraModel)
+            else self._lidar_frame(begun.request, begun.picture, plane, filter)
+            for begun, plane in zip(group, planes, strict=True)
+        ]
+        for begun in group:
+            begun.picture.stats.seconds["finish"] = time.perf_counter() - began
+        return frames
+
+    def _camera_frame(
+        self, request: SensorRequest, picture: Picture, sensor: _Sensor, planes: np.ndarray, outputs: Sequence[str]
+    ) -> CameraFrame:
+        assert isinstance(request.sensor, CameraModel)
+        grid, view = sensor.grid, picture.view
+        height, width = grid.valid.shape
+        rgb, label = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.uint8)
+        depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+        normal = np.empty((height, width, 3) if picture.kind == NORMALS else (0, 0, 3), np.float32)
+        corrected = self.apply_isp and request.apply_isp
+        response = self.scene.response(request.sensor.id, request.middle_us) if corrected else None
+        isp = IDENTITY_ISP if response is None else np.ascontiguousarray(response, np.float32)
+        turn = view.world_from_line[:, :3, :3].astype(np.float32)
+        linear = view.way in (AFFINE, ROLLING)
+        ray_z = np.zeros((0, 0), np.float32) if linear else sensor.ray_z
+        self._workers.run(
+            composite,
+            [(first, last, planes, ray_z, grid.direction, grid.valid, grid.line, turn, self._sky, isp, rgb, depth,
+              alpha, label, normal)
+             for first, last in self._workers.ranges(height, 16, SLICE_RAYS // width)],
+        )  # fmt: skip
+        return CameraFrame(
+            camera=request.sensor,
+            start_us=request.start_us,
+            end_us=request.end_us,
+            rgb=rgb,
+            depth_m=depth if "depth" in outputs else None,
+            alpha=alpha if "alpha" in outputs else None,
+            label=label if "label" in outputs else None,
+            normal=normal if "normal" in outputs else None,
+        )
+
+    def _lidar_frame(
+        self, request: SensorRequest, picture: Picture, planes: np.ndarray, filter: LidarFilter
+    ) -> LidarFrame:
+        assert not isinstance(request.sensor, CameraModel)
+        grid = picture.view.grid
+        assert grid.beam is not None
+        rows, columns = grid.beam.shape
+        end_from_line = (
+            geometry.inverse(np.asarray(request.world_from_sensor[1], np.float64)) @ picture.view.world_from_line
+        )
+        limit = np.inf if filter.distance_threshold_m is None else filter.distance_threshold_m
+        filters = (filter.raydrop_threshold, filter.opacity_threshold, limit)
+        ranges, intensities = np.empty(rows * columns, np.float32), np.empty(rows * columns, np.float32)
+        points, beams = np.empty((rows * columns, 3), np.float32), np.empty(rows * columns, np.int32)
+        parts = self._workers.ranges(rows, 4, SLICE_RAYS // columns)
+        counts = self._workers.run(
+            sweep_returns,
+            [(first, last, planes, grid.direction, grid.beam, grid.line, np.ascontiguousarray(end_from_line[:, :3]),
+              np.array(request.sensor.range_m, np.float64), np.array(filters, np.float64), ranges, intensities, points,
+              beams) for first, last in parts],
+        )  # fmt: skip
+        found = [
+            slice(first * columns, first * columns + count) for (first, _), count in zip(parts, counts, strict=True)
+        ]
+        xyz, range_m, intensity, beam = (
+            np.concatenate([values[part] for part in found]) for values in (points, ranges, intensities, beams)
+        )
+        return LidarFrame(request.sensor, request.start_us, request.end_us, xyz, range_m, intensity, beam)
+
+    def _layers(
+        self, request: SensorRequest, sensor: _Sensor, view: View, array: Lend
+    ) -> list[tuple[PackedGaussians, np.ndarray]]:
+        """The static layer, and the dynamic one as it is at the reference instant, with their blocks in view."""
+        eye = view.world_from_reference[:3, 3]
+        if isinstance(self._static, Detail):
+            layers = self._static.layers(eye, sensor.spacing_rad, lambda layer: blocks_in_view(view, layer))
+        else:
+            layers = [(self._static, blocks_in_view(view, self._static))]
+        if len(self.scene.dynamic):
+            _, t_us = reference_pose(request, view.grid.reference)
+            actors = actors_at(request, view.grid.reference, self._moving.track_of)
+            moving = self._moving.at(t_us, actors, request.hidden, eye, self._workers, array)
+            layers.append((moving, blocks_in_view(view, moving)))
+        return layers
+
+    def _sensor(self, request: SensorRequest) -> _Sensor:
+        """Tables of the request's sensor, the latest kept up to ``KEPT_RAYS``."""
+        key = grid_key(request.sensor)
+        with self._sensors_lock:
+            sensor = self._sensors.get(key)
+            if sensor is not None:
+                self._sensors.move_to_end(key)
+                return sensor
+        grid = make_grid(request.sensor)
+        rays = NO_TABLE if grid.kind == PINHOLE else tile_rays(grid)
+        heights = np.ascontiguousarray(grid.direction[..., 2])
+        sensor = _Sensor(grid, rays, heights, ray_spacing(grid.direction))
+        with self._sensors_lock:
+            self._sensors[key] = sensor
+            while len(self._sensors) > 1 and sum(kept.grid.valid.size for kept in self._sensors.values()) > KEPT_RAYS:
+                self._sensors.popitem(last=False)
+        return sensor
+
+    def _ray_tables(self, sensor: _Sensor) -> RayTiles:
+        """The sensor's rays as a table; a pinhole needs one only where it moves too fast for ``View.way`` to roll."""
+        return tile_rays(sensor.grid) if sensor.rays is NO_TABLE else sensor.rays
+
+
+def _usable_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,1 @@
+"""Rendered images as files and bytes."""

@@ -1,0 +1,89 @@
+"""One image of a scene as a PNG: recorded time, recorded or shifted pose, any layer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import UInt8
+
+from nurec_sim import geometry, sensors
+from nurec_sim.errors import RequestError
+from nurec_sim.files.new_files import write_file
+from nurec_sim.render.cpu.renderer import Renderer
+from nurec_sim.render.images.encode import encode_image
+from nurec_sim.types import CameraFrame, GaussianScene, Label, SensorRequest
+
+Layer = Literal["rgb", "depth", "alpha", "label", "normal"]
+FAR_M = 80.0
+LABEL_RGB = {
+    Label.OTHER: (120, 120, 120),
+    Label.ROAD: (128, 64, 128),
+    Label.MOVABLE: (30, 60, 200),
+    Label.SKY: (135, 190, 235),
+    Label.EGO: (0, 0, 0),
+}
+
+
+def render_still(
+    scene: GaussianScene,
+    path: Path,
+    camera_id: str | None = None,
+    frame: int = 0,
+    *,
+    left_m: float = 0.0,
+    yaw_deg: float = 0.0,
+    layer: Layer = "rgb",
+    width_px: int | None = None,
+) -> None:
+    """Write one image.
+
+    Args:
+        scene: the world.
+        path: the PNG to write.
+        camera_id: a camera of the scene's rig; the first if None.
+        frame: which of the camera's recorded times to take; the ego stands where it was then.
+        left_m: the car moved to its left.
+        yaw_deg: the car turned to its left.
+        layer: what to draw; depth is grey from near to ``FAR_M``, normals are coloured by x, y and z in the world.
+        width_px: image width, height follows; the camera's own size if None.
+
+    Raises:
+        RequestError: no such camera or frame.
+        WriteError: the file cannot be written; one that was there is as it was.
+    """
+    if not scene.rig.cameras:
+        raise RequestError(f"scene {scene.id!r} has no cameras")
+    camera_id = camera_id or next(iter(scene.rig.cameras))
+    if camera_id not in scene.rig.cameras:
+        raise RequestError(f"scene {scene.id!r} has no camera {camera_id!r}; have {list(scene.rig.cameras)}")
+    camera = scene.rig.cameras[camera_id]
+    times = scene.camera_times_us.get(camera_id, scene.ego.t_us[:, None].repeat(2, axis=1))
+    if not -len(times) <= frame < len(times):
+        raise RequestError(f"camera {camera_id!r} has frames 0 to {len(times) - 1}, got {frame}")
+    if width_px is not None:
+        camera = sensors.scaled_camera(camera, width_px, max(1, round(width_px * camera.height_px / camera.width_px)))
+    start_us, end_us = int(times[frame, 0]), int(times[frame, 1])
+    moved = geometry.pose_from_xyyaw(0.0, left_m, np.radians(yaw_deg))
+    poses = scene.ego.at(np.array([start_us, end_us])) @ moved @ camera.rig_from_camera
+    request = SensorRequest(scene.id, camera, start_us, max(end_us, start_us + 1), poses)
+    shown = picture(Renderer(scene).render_camera(request, ("rgb", layer)), layer)
+    write_file(path, encode_image(shown))
+
+
+def picture(frame: CameraFrame, layer: Layer) -> UInt8[np.ndarray, "h w 3"]:
+    """One layer of a frame as an image for people."""
+    if layer == "rgb":
+        return frame.rgb
+    plane = getattr(frame, {"depth": "depth_m"}.get(layer, layer))
+    if layer == "label":
+        table = np.zeros((256, 3), np.uint8)
+        for label, colour in LABEL_RGB.items():
+            table[label] = colour
+        return table[plane]
+    if layer == "normal":
+        known = np.any(plane != 0, axis=-1, keepdims=True)
+        return np.where(known, (plane + 1) * 127.5 + 0.5, 0).astype(np.uint8)
+    shade = np.clip(plane / FAR_M, 0, 1) ** 0.5 if layer == "depth" else np.clip(plane, 0, 1)
+    return np.repeat((255 * shade + 0.5).astype(np.uint8)[..., None], 3, axis=2)

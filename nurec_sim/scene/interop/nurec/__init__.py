@@ -1,0 +1,1 @@
+"""NuRec archives: state, layers, and the JSON files beside them."""

@@ -1,0 +1,1 @@
+"""OpenDRIVE maps: written from a scene's drivable area and lanes, and read."""

@@ -1,0 +1,68 @@
+"""A road of the map: a reference line and one lane of constant width to its right."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from nurec_sim.scene.opendrive.curves import Piece, sampled
+
+LANE_WIDTH_M = 3.5
+MAX_WIDTH_M = 4.0
+CLEAR_M = 0.3
+"""How far everything but the strips along the border keeps from it."""
+OVERLAP_M = 0.05
+SEAL_M = 0.02
+FIT_M = 0.03
+"""How far fitted curves may leave the area."""
+STATION_M = 1.0
+MIN_ROAD_M = 1.0
+SHARPEST = 0.8
+"""Largest product of curvature and the width on the inside of a bend."""
+
+
+@dataclass(frozen=True)
+class LaidRoad:
+    """A reference line and the lane on its right, with its type and width; seals are lanes of their own."""
+
+    reference: list[Piece]
+    lane: str
+    width_m: float
+    sealed: tuple[bool, bool]
+    """Whether it is closed on the left and on the right."""
+
+    @cached_property
+    def polygon(self) -> Any:
+        """What the lane covers, as a shapely polygon."""
+        import shapely
+
+        xy, yaw = sampled(self.reference)
+        normal = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+        return shapely.Polygon(np.concatenate([xy, (xy - self.width_m * normal)[::-1]]))
+
+    @property
+    def length_m(self) -> float:
+        """Of the reference line."""
+        return sum(piece.length_m for piece in self.reference)
+
+
+def gentle(chain: list[Piece], left_m: float, right_m: float) -> Iterator[list[Piece]]:
+    """A chain without the bends that are too sharp for what lies on their inside."""
+    fits = np.array([-SHARPEST <= piece.curvature_per_m * right_m and piece.curvature_per_m * left_m <= SHARPEST
+                     for piece in chain], bool)  # fmt: skip
+    for start, stop in runs(fits, 1):
+        if sum(piece.length_m for piece in chain[start:stop]) >= MIN_ROAD_M / 2:
+            yield chain[start:stop]
+
+
+def runs(mask: Bool[np.ndarray, " n"], shortest: int = 3) -> Iterator[tuple[int, int]]:
+    """Start and stop of the runs of True that have some entries."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        if stop - start >= shortest:
+            yield int(start), int(stop)

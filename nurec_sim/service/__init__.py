@@ -1,6 +1,0 @@
-"""What every procedure of the sensor interface does; ``server`` puts it on the network."""
-
-from nurec_sim.service.options import ServiceOptions, describe
-from nurec_sim.service.sensors import SensorService
-
-__all__ = ["SensorService", "ServiceOptions", "describe"]

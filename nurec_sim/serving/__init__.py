@@ -1,0 +1,1 @@
+"""Serving scenes over gRPC: the wire, the services, the server, the clients."""

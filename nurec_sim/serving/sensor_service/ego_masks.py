@@ -1,0 +1,77 @@
+"""Pictures of the recording car's own body, laid over rendered images: ``<folder>/<rig>/<camera>.png``."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from nurec_sim.errors import RequestError
+from nurec_sim.files.decoding import check_image
+
+
+class EgoMasks:
+    """The masks of one folder.
+
+    A picture with four channels is blended by its alpha; in one without, every pixel that is not black covers.
+
+    Args:
+        folder: where the masks lie, None for no masks.
+
+    Raises:
+        FileNotFoundError: the folder does not exist.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        if folder is not None and not folder.is_dir():
+            raise FileNotFoundError(f"the ego mask folder {folder} does not exist")
+        files = sorted(folder.glob("*/*.png")) if folder else []
+        self._paths = {(path.parent.name, path.stem): path for path in files}
+
+    @property
+    def ids(self) -> tuple[tuple[str, str], ...]:
+        """(rig, camera) of every mask."""
+        return tuple(self._paths)
+
+    def find(self, key: tuple[str, str]) -> tuple[str, str]:
+        """The (rig, camera) of the mask that is meant: ``key``, or with an empty rig the only one that has the camera.
+
+        Raises:
+            RequestError: there is none, or several; the text lists what there is.
+        """
+        rigs = [rig for rig, camera in self._paths if camera == key[1]]
+        if not key[0] and len(rigs) == 1:
+            return rigs[0], key[1]
+        if key not in self._paths:
+            raise RequestError(f"there is no ego mask for (rig, camera) {key}; have {list(self._paths)}")
+        return key
+
+    def lay_over(self, rgb: UInt8[np.ndarray, "h w 3"], key: tuple[str, str]) -> UInt8[np.ndarray, "h w 3"]:
+        """A copy of an image with the mask, scaled to its size, on top."""
+        picture, cover = _scaled_mask(self._paths[self.find(key)], rgb.shape[1], rgb.shape[0])
+        return np.rint(rgb + cover * (picture - rgb)).astype(np.uint8)
+
+
+@lru_cache(maxsize=32)
+def _scaled_mask(path: Path, width_px: int, height_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Colour [h,w,3] and cover [h,w,1] of a mask in float32."""
+    import cv2
+
+    try:
+        check_image(data := path.read_bytes())
+        bgra = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError, cv2.error):
+        bgra = None
+    if bgra is None:
+        raise RequestError(f"the ego mask {path.parent.name}/{path.name} is not a readable PNG")
+    scale = 65535 if bgra.dtype == np.uint16 else 255
+    bgra = np.atleast_3d(bgra.astype(np.float32) * (255 / scale))
+    rgb = np.repeat(bgra[..., :1], 3, axis=2) if bgra.shape[2] < 3 else bgra[..., 2::-1]
+    cover = bgra[..., 3:4] / 255 if bgra.shape[2] == 4 else (rgb.max(axis=2, keepdims=True) > 0).astype(np.float32)
+    # Colours are weighted by their cover while scaling, so that what lies under alpha 0 does not bleed in.
+    layers = np.concatenate([rgb * cover, cover], axis=2)
+    layers = cv2.resize(layers, (width_px, height_px), interpolation=cv2.INTER_AREA)
+    cover = layers[..., 3:4]
+    return layers[..., :3] / np.maximum(cover, 1e-6), cover

@@ -1,0 +1,22 @@
+"""The scenes that a server offers: named, loaded or reconstructed once on first use, and kept while there is room."""
+
+from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats, SceneRenderer
+from nurec_sim.serving.store.recipes import Recipe, content_key
+from nurec_sim.serving.store.sources import default_cache_dir, find_sources
+from nurec_sim.serving.store.store import SceneEntry, SceneStore
+from nurec_sim.serving.store.uploads import Upload, UploadFolder
+
+__all__ = [
+    "Lease",
+    "LoadedScene",
+    "MemoryStats",
+    "Recipe",
+    "SceneEntry",
+    "SceneRenderer",
+    "SceneStore",
+    "Upload",
+    "UploadFolder",
+    "content_key",
+    "default_cache_dir",
+    "find_sources",
+]

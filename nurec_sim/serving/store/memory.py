@@ -1,0 +1,231 @@
+"""Scenes in memory: loaded once however many ask, lent while they are used, dropped when others need the room."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from functools import partial
+from types import TracebackType
+from typing import Protocol
+
+from nurec_sim.errors import GivenUpError
+from nurec_sim.serving.store.sizes import array_bytes
+from nurec_sim.types import GaussianScene, LidarFilter, LidarFrame, SensorFrame, SensorRequest
+
+
+class SceneRenderer(Protocol):
+    """What a server needs of ``render.Renderer``."""
+
+    def sense(self, requests: Sequence[SensorRequest], outputs: Sequence[str] = ...) -> list[SensorFrame]:
+        """Images with ``rgb`` and what else ``outputs`` names, and sweeps; one frame per request, in order."""
+        ...
+
+    def render_lidar(self, request: SensorRequest, filter: LidarFilter | None = ...) -> LidarFrame:
+        """One sweep."""
+        ...
+
+
+@dataclass(frozen=True)
+class LoadedScene:
+    """A scene in memory with its renderer."""
+
+    scene: GaussianScene
+    renderer: SceneRenderer
+
+
+@dataclass(frozen=True)
+class MemoryStats:
+    """What happened so far, and what is in memory now."""
+
+    hits: int = 0
+    """Scenes asked for that were in memory."""
+    loads: int = 0
+    failed_loads: int = 0
+    evictions: int = 0
+    """Scenes dropped for others; not those that somebody unloaded."""
+    load_s: float = 0.0
+    """Time of all loads, reconstructions among them."""
+    loaded: int = 0
+    loaded_bytes: int = 0
+    in_use: int = 0
+    """Scenes that somebody holds a lease of."""
+
+
+@dataclass
+class _Entry:
+    """A scene that is in memory or on its way there."""
+
+    future: Future[LoadedScene] = field(default_factory=Future)
+    bytes: int = 0
+    users: int = 0
+    begun: bool = False
+
+    @property
+    def ready(self) -> bool:
+        return self.future.done() and self.future.exception() is None
+
+
+class Lease:
+    """The use of a scene; it stays in memory until ``release``, or the end of a ``with`` block, which gives it."""
+
+    def __init__(self, loaded: LoadedScene, release: Callable[[], None]) -> None:
+        self.loaded = loaded
+        self._release: Callable[[], None] | None = release
+
+    def release(self) -> None:
+        """Ends the use; harmless the second time."""
+        release, self._release = self._release, None
+        if release is not None:
+            release()
+
+    def __enter__(self) -> LoadedScene:
+        return self.loaded
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self.release()
+
+
+class SceneMemory:
+    """A cache of scenes, bounded by count and bytes: who was used least recently goes first.
+
+    Scenes in use never go, and the scene used last never does, whatever its size: for a while there may be more than
+    the bounds allow. Safe to use from many threads.
+
+    Args:
+        capacity: how many.
+        max_bytes: how much memory for all of them.
+    """
+
+    def __init__(self, capacity: int, max_bytes: int) -> None:
+        self.capacity, self.max_bytes = capacity, max_bytes
+        self._lock = threading.Lock()
+        self._entries: OrderedDict[str, _Entry] = OrderedDict()
+        self._stats = MemoryStats()
+
+    def lease(self, key: str, load: Callable[[], LoadedScene]) -> Lease:
+        """The use of a scene, which is loaded if it is not in memory; callers meanwhile wait for the same load.
+
+        Raises:
+            Exception: whatever ``load`` raises, in all who wait; but one that was given up is begun anew by the next.
+        """
+        while True:
+            with self._lock:
+                entry = self._entries.setdefault(key, _Entry())
+                first, entry.begun = not entry.begun, True
+                entry.users += 1
+                self._entries.move_to_end(key)
+                if entry.ready:
+                    self._count(hits=1)
+            if first:
+                self._load(key, entry, load)
+            try:
+                return Lease(entry.future.result(), partial(self._end_use, entry))
+            except BaseException as error:
+                self._end_use(entry)
+                if first or not isinstance(error, GivenUpError):
+                    raise
+
+    def lease_ready(self, key: str) -> Lease | None:
+        """The use of a scene that is in memory, else None; takes no waiting."""
+        with self._lock:
+            entry = self._entries.get(key)
+            if entry is None or not entry.ready:
+                return None
+            entry.users += 1
+            self._entries.move_to_end(key)
+            self._count(hits=1)
+        return Lease(entry.future.result(), partial(self._end_use, entry))
+
+    def put(self, key: str, loaded: LoadedScene | None) -> None:
+        """Puts a scene, or nothing, in the place of what is there; who uses that goes on with it."""
+        with self._lock:
+            self._entries.pop(key, None)
+            if loaded is None:
+                return
+            entry = self._entries[key] = _Entry(bytes=array_bytes(loaded), begun=True)
+            entry.future.set_result(loaded)
+        self._make_room()
+
+    def drop(self, key: str) -> int | None:
+        """Takes a scene out of memory if nobody uses or loads it: its bytes, 0 if it is not there, else None."""
+        with self._lock:
+            entry = self._entries.get(key)
+            if entry is None:
+                return 0
+            if entry.users or not entry.future.done():
+                return None
+            del self._entries[key]
+            return entry.bytes
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Scenes in memory, least recently used first."""
+        with self._lock:
+            return tuple(key for key, entry in self._entries.items() if entry.ready)
+
+    def state_of(self, key: str) -> tuple[int, int, bool]:
+        """Bytes of a scene (0 if it is not in memory), its users, and whether it is being loaded."""
+        with self._lock:
+            entry = self._entries.get(key)
+            return (0, 0, False) if entry is None else (entry.bytes, entry.users, not entry.future.done())
+
+    @property
+    def stats(self) -> MemoryStats:
+        """Counters since the start, and what is in memory now."""
+        with self._lock:
+            ready = [entry for entry in self._entries.values() if entry.ready]
+            return replace(
+                self._stats,
+                loaded=len(ready),
+                loaded_bytes=sum(entry.bytes for entry in ready),
+                in_use=sum(entry.users > 0 for entry in ready),
+            )
+
+    def _load(self, key: str, entry: _Entry, load: Callable[[], LoadedScene]) -> None:
+        began = time.perf_counter()
+        try:
+            loaded = load()
+        except BaseException as error:
+            with self._lock:
+                if self._entries.get(key) is entry:
+                    del self._entries[key]
+                    if isinstance(error, GivenUpError) and entry.users > 1:
+                        self._entries[key] = _Entry()  # keeps the place until one of those who wait begins anew
+                self._count(failed_loads=1)
+            entry.future.set_exception(error)
+            return
+        with self._lock:
+            self._count(loads=1, load_s=time.perf_counter() - began)
+        entry.future.set_result(loaded)
+        self._measure()
+        self._make_room()
+
+    def _measure(self) -> None:
+        """Sizes of all scenes: renderers grow with the sensors that they are asked for."""
+        with self._lock:
+            ready = [entry for entry in self._entries.values() if entry.ready]
+        for entry in ready:
+            entry.bytes = array_bytes(entry.future.result())
+
+    def _end_use(self, entry: _Entry) -> None:
+        with self._lock:
+            entry.users -= 1
+        if not entry.users:
+            self._make_room()
+
+    def _make_room(self) -> None:
+        with self._lock:
+            sizes = {key: entry.bytes for key, entry in self._entries.items()}
+            for key in list(sizes)[:-1]:
+                if len(sizes) <= self.capacity and sum(sizes.values()) <= self.max_bytes:
+                    break
+                if self._entries[key].future.done() and not self._entries[key].users:
+                    del self._entries[key], sizes[key]
+                    self._count(evictions=1)
+
+    def _count(self, **more: float) -> None:
+        self._stats = replace(self._stats, **{name: getattr(self._stats, name) + n for name, n in more.items()})

@@ -1,0 +1,142 @@
+"""Where scenes come from, and the names that they answer to."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from nurec_sim.errors import ArchiveError
+from nurec_sim.serving.store.recipes import Recipe
+from nurec_sim.types import GaussianScene
+
+_MAX_SIDECAR_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where one scene comes from.
+
+    ``origin`` is an object in memory, or the path of an archive or a clip; ``recipe`` how the clip becomes a scene,
+    None for the store's own way.
+    """
+
+    id: str
+    origin: GaussianScene | Path
+    aliases: tuple[str, ...] = ()
+    recipe: Recipe | None = None
+    edited: GaussianScene | None = None
+    """What is served instead, until it is restored."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Everything that it answers to."""
+        return (self.id, *self.aliases)
+
+    def is_from(self, path: Path) -> bool:
+        """Whether it comes from the file or folder ``path``, however that is spelt."""
+        return isinstance(self.origin, Path) and self.origin.resolve() == path.resolve()
+
+    @property
+    def kind(self) -> str:
+        """``memory``, ``archive`` or ``clip``."""
+        if isinstance(self.origin, GaussianScene):
+            return "memory"
+        return "archive" if is_archive(self.origin) else "clip"
+
+
+def default_cache_dir() -> Path:
+    """Where reconstructions of clips are kept: ``$NUREC_SIM_CACHE``, else ``nurec_sim`` in the user's cache folder."""
+    if chosen := os.environ.get("NUREC_SIM_CACHE"):
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "nurec_sim"
+
+
+def find_sources(path: Path) -> list[Path]:
+    """Archives and clips in a folder, at any depth; the path itself if it is one of them, or holds none.
+
+    Files and folders whose names begin with a dot are passed over: they may be half written.
+    """
+    from nurec_sim.logs.storage import META_FILE
+
+    if not path.is_dir() or (path / META_FILE).exists():
+        return [path]
+    found = [*path.rglob("*.usdz"), *path.rglob("*.zip"), *(meta.parent for meta in path.rglob(META_FILE))]
+    seen = [each for each in found if not any(part.startswith(".") for part in each.relative_to(path).parts)]
+    return sorted(seen) or [path]
+
+
+def identify(source: GaussianScene | str | Path, name: str = "", recipe: Recipe | None = None) -> Source:
+    """A source with its id and aliases, without loading it; ``name`` instead of its own id if it is given.
+
+    Raises:
+        ArchiveError, ClipError: it cannot be opened.
+    """
+    from nurec_sim.scene import alpasim_id
+
+    if isinstance(source, GaussianScene):
+        return Source(alpasim_id(source.id), source, (source.id,))
+    path = Path(source)
+    if not path.exists():
+        raise ArchiveError(f"{path} does not exist")
+    others: tuple[str, ...] = ()
+    if is_archive(path):
+        own_id, others = _archive_id(path), _metadata_id(path)
+    else:
+        from nurec_sim.logs import open_clip
+
+        own_id = open_clip(path).id
+    if name:
+        return Source(alpasim_id(name), path, (name,), recipe)
+    return Source(alpasim_id(own_id), path, (own_id, path.stem, alpasim_id(path.stem), *others), recipe)
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a path is to be read as a scene archive; everything else is a clip."""
+    from nurec_sim.scene import SCENE_SUFFIXES
+
+    return path.suffix.lower() in SCENE_SUFFIXES
+
+
+def stem_of(source: GaussianScene | str | Path) -> str:
+    """The name under which a fault of the source is kept."""
+    return source.id if isinstance(source, GaussianScene) else Path(source).stem
+
+
+def describe(source: GaussianScene | str | Path) -> str:
+    """The source in a text for people."""
+    return f"scene {source.id!r}" if isinstance(source, GaussianScene) else str(source)
+
+
+def _archive_id(path: Path) -> str:
+    """The id of the scene in an archive, from a sidecar; other programs' files may have none."""
+    from nurec_sim.files.zip_package import Package
+    from nurec_sim.scene.archive import MANIFEST
+
+    if path.suffix.lower() != ".usdz":
+        return path.stem
+    with Package(path) as package:
+        if not {MANIFEST, "data_info.json"} & set(package.names):
+            return path.stem
+        try:
+            own_id = json.loads(bytes(package.read("data_info.json", _MAX_SIDECAR_BYTES)))["sequence_id"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ArchiveError(f"{path}: data_info.json does not say a sequence_id ({error})") from error
+    if not isinstance(own_id, str) or not own_id:
+        raise ArchiveError(f"{path}: the sequence_id in data_info.json must be a text, got {own_id!r}")
+    return own_id
+
+
+def _metadata_id(path: Path) -> tuple[str, ...]:
+    """The id that AlpaSim reads from an archive's ``metadata.yaml``, which may be another in other programs' files."""
+    from nurec_sim.files.zip_package import Package
+
+    if path.suffix.lower() != ".usdz":
+        return ()
+    with Package(path) as package:
+        if "metadata.yaml" not in package.names:
+            return ()
+        text = package.read("metadata.yaml", _MAX_SIDECAR_BYTES).decode("utf-8", "replace")
+    return tuple(re.findall(r"""^scene_id:[ ]*["']?([^"'\s]+)["']?[ ]*$""", text, re.MULTILINE)[:1])

@@ -1,0 +1,324 @@
+"""Scenes by name, from whatever they come from."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from nurec_sim.errors import ArchiveError, NurecSimError, SceneInUseError, UnknownSceneError
+from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings
+from nurec_sim.serving.store.kept import KeptReconstructions
+from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats, SceneMemory, SceneRenderer
+from nurec_sim.serving.store.recipes import Progress, Recipe
+from nurec_sim.serving.store.sizes import half_of_memory
+from nurec_sim.serving.store.sources import Source, default_cache_dir, describe, find_sources, identify, stem_of
+from nurec_sim.types import GaussianScene
+
+log = logging.getLogger(__name__)
+
+MAX_NAMES_IN_TEXT = 20
+
+
+@dataclass(frozen=True)
+class SceneEntry:
+    """One scene on offer, as it is now."""
+
+    id: str
+    kind: str
+    """``memory``, ``archive`` or ``clip``."""
+    file_bytes: int
+    """Size of its file; 0 for folders and objects in memory."""
+    loaded_bytes: int
+    """Memory that it takes; 0 if it is not loaded."""
+    users: int
+    """Leases of it."""
+    loading: bool
+
+
+class SceneStore:
+    """Scenes by id, from ``GaussianScene`` objects, ``.usdz`` archives and clips; safe to use from many threads.
+
+    Ids are spelt ``clipgt-<id>``, as AlpaSim knows them from the archive; a scene also answers to its plain id, its
+    file stem and ``clipgt-<file stem>``. A source that cannot be opened is kept as a fault, under its stem, and does
+    not disturb the others.
+
+    Whoever renders a scene holds a ``lease`` of it meanwhile: scenes in use stay in memory. Of the others the least
+    recently used go when there are more than ``capacity`` of them, or they take more than ``max_bytes``; the one used
+    last stays, whatever its size.
+
+    Args:
+        sources: objects, or paths of archives (``.usdz``), clips, and folders of them.
+        capacity: scenes kept in memory.
+        max_bytes: memory for them: arrays of the scenes and of their renderers; None for half of the machine's.
+        cache_dir: where reconstructed clips are kept, by content; None for ``default_cache_dir()``.
+        method: reconstruction method of clips.
+        settings: of the method; None for its defaults.
+        threads: render threads, None for all cores.
+        make_renderer: makes the renderer of a scene; None for ``render.Renderer``.
+        on_progress: called with a line of text when something slow begins.
+    """
+
+    def __init__(
+        self,
+        sources: Iterable[GaussianScene | str | Path] = (),
+        *,
+        capacity: int = 10,
+        max_bytes: int | None = None,
+        cache_dir: Path | None = None,
+        method: str = "lift",
+        settings: LiftSettings | FeedForwardSettings | None = None,
+        threads: int | None = None,
+        make_renderer: Callable[[GaussianScene], SceneRenderer] | None = None,
+        on_progress: Callable[[str], None] | None = None,
+    ) -> None:
+        if capacity < 1:
+            raise ValueError(f"a scene store needs room for at least 1 scene, got capacity {capacity}")
+        if max_bytes is not None and max_bytes < 1:
+            raise ValueError(f"a scene store needs room for at least 1 byte, got max_bytes {max_bytes}")
+        self._memory = SceneMemory(capacity, half_of_memory() if max_bytes is None else max_bytes)
+        self._kept = KeptReconstructions(cache_dir or default_cache_dir(), on_progress or (lambda text: None))
+        self._recipe = Recipe(method, settings)
+        self._threads = threads
+        self._make_renderer = make_renderer
+        self._lock = threading.Lock()
+        self._sources: dict[str, Source] = {}
+        self._faults: dict[str, str] = {}
+        for source in sources:
+            self.add(source)
+
+    # ---------------------------------------------------------------------------------------------------- what there is
+
+    def add(self, source: GaussianScene | str | Path) -> tuple[str, ...]:
+        """Offers the scene, or all scenes of a folder, and gives their ids; what cannot be opened becomes a fault."""
+        added = []
+        for one in [source] if isinstance(source, GaussianScene) else find_sources(Path(source)):
+            try:
+                added.append(self.offer(one))
+            except (NurecSimError, OSError) as error:
+                text = f"{describe(one)}: {error}" if isinstance(error, OSError) else str(error)
+                log.warning("not served: %s", text)
+                with self._lock:
+                    self._faults[stem_of(one)] = text
+        return tuple(added)
+
+    def offer(self, source: GaussianScene | Path, name: str = "", recipe: Recipe | None = None) -> str:
+        """Offers one scene and gives its id; raises what ``add`` makes a fault of.
+
+        Args:
+            source: an object, or the path of an archive or a clip.
+            name: its id, if it is not to be its own.
+            recipe: how it becomes a scene if it is a clip; None for the store's way.
+
+        Raises:
+            ArchiveError, ClipError: it cannot be opened, or its id is taken.
+        """
+        entry = identify(source, name, recipe)
+        with self._lock:
+            if entry.id in self._sources:
+                raise ArchiveError(f"{describe(source)}: a scene of id {entry.id!r} is already served")
+            self._sources[entry.id] = entry
+        return entry.id
+
+    def remove(self, name: str) -> int:
+        """Offers a scene no longer; its file stays. Gives the bytes of memory that it took.
+
+        Raises:
+            UnknownSceneError, ArchiveError: see ``resolve``.
+            SceneInUseError: it is in use.
+        """
+        source = self.source(name)
+        with self._lock:
+            self._sources.pop(source.id, None)
+        try:
+            return self._unload(source.id)
+        except SceneInUseError:
+            with self._lock:
+                self._sources.setdefault(source.id, source)
+            raise
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Ids of the scenes on offer, in the order they were added."""
+        with self._lock:
+            return tuple(self._sources)
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """Where the scenes on offer come from, in the order they were added."""
+        with self._lock:
+            return tuple(self._sources.values())
+
+    @property
+    def faults(self) -> Mapping[str, str]:
+        """Why a source is not on offer, by file stem."""
+        with self._lock:
+            return dict(self._faults)
+
+    @property
+    def entries(self) -> tuple[SceneEntry, ...]:
+        """The scenes on offer, in the order they were added."""
+        return tuple(
+            SceneEntry(source.id, source.kind, _file_bytes(source), *self._memory.state_of(source.id))
+            for source in self.sources
+        )
+
+    def resolve(self, name: str) -> str:
+        """The id of the scene that answers to ``name``.
+
+        Raises:
+            UnknownSceneError: there is none; the text lists what there is.
+            ArchiveError: its source was refused; the text says why.
+        """
+        return self.source(name).id
+
+    def source(self, name: str) -> Source:
+        """Where the scene that answers to ``name`` comes from.
+
+        Raises:
+            UnknownSceneError, ArchiveError: see ``resolve``.
+        """
+        with self._lock:
+            if name in self._sources:
+                return self._sources[name]
+            for entry in self._sources.values():
+                if name in entry.aliases:
+                    return entry
+            fault = self._faults.get(name) or self._faults.get(name.removeprefix("clipgt-"))
+            have = list(self._sources)
+        if fault:
+            raise ArchiveError(f"scene {name!r} cannot be served: {fault}")
+        more = f" and {len(have) - MAX_NAMES_IN_TEXT} more" if len(have) > MAX_NAMES_IN_TEXT else ""
+        raise UnknownSceneError(f"scene {name!r} is not served; have {have[:MAX_NAMES_IN_TEXT]}{more}")
+
+    # ------------------------------------------------------------------------------------------------ what is in memory
+
+    @property
+    def cache_dir(self) -> Path:
+        """Where reconstructed clips are kept, and what else takes time to get again."""
+        return self._kept.folder
+
+    @property
+    def capacity(self) -> int:
+        """How many scenes are kept in memory."""
+        return self._memory.capacity
+
+    @property
+    def max_bytes(self) -> int:
+        """How much memory they may take."""
+        return self._memory.max_bytes
+
+    @property
+    def loaded_ids(self) -> tuple[str, ...]:
+        """Ids of the scenes in memory, least recently used first."""
+        return self._memory.keys
+
+    @property
+    def stats(self) -> MemoryStats:
+        """Counters since the start, and what is in memory now."""
+        return self._memory.stats
+
+    def lease(self, name: str, progress: Progress | None = None) -> Lease:
+        """The use of the scene that answers to ``name``; loads or reconstructs it if it is not in memory.
+
+        ::
+
+            with store.lease("street") as loaded:
+                (frame,) = loaded.renderer.sense([request])
+
+        Callers that come while it loads wait for the same load. ``progress`` hears of a reconstruction: what is being
+        done, and the fraction of it that is. It may raise ``GivenUpError`` to end it.
+
+        Raises:
+            UnknownSceneError: there is no such scene.
+            ArchiveError, ClipError, ReconstructError, WeightsError: it cannot be loaded.
+        """
+        source = self.source(name)
+        return self._memory.lease(source.id, lambda: self._load(source, progress))
+
+    def lease_in_memory(self, name: str) -> Lease | None:
+        """The use of the scene that answers to ``name`` if that takes no waiting, else None.
+
+        Raises:
+            UnknownSceneError, ArchiveError: see ``resolve``.
+        """
+        return self._memory.lease_ready(self.resolve(name))
+
+    def get(self, name: str, progress: Progress | None = None) -> LoadedScene:
+        """As ``lease``, for those who hold the scene but not its place in memory."""
+        with self.lease(name, progress) as loaded:
+            return loaded
+
+    def unload(self, name: str) -> int:
+        """Takes a scene out of memory; it is loaded again when somebody asks. Gives the bytes that it took.
+
+        Raises:
+            UnknownSceneError, ArchiveError: see ``resolve``.
+            SceneInUseError: it is in use.
+        """
+        return self._unload(self.resolve(name))
+
+    def _unload(self, scene_id: str) -> int:
+        freed = self._memory.drop(scene_id)
+        if freed is None:
+            _, users, _ = self._memory.state_of(scene_id)
+            raise SceneInUseError(f"scene {scene_id!r} is in use ({users} calls); unload it when they have ended")
+        return freed
+
+    def replace(self, name: str, scene: GaussianScene) -> None:
+        """Serves an edited copy in the place of a scene until ``restore``; frames in progress are not affected.
+
+        Raises:
+            UnknownSceneError, ArchiveError: see ``resolve``.
+        """
+        source = replace(self.source(name), edited=scene)
+        loaded = self._load(source, None)
+        with self._lock:
+            self._sources[source.id] = source
+        self._memory.put(source.id, loaded)
+
+    def restore(self, name: str) -> None:
+        """Serves the original of a scene again; without effect on one that was not replaced.
+
+        Raises:
+            UnknownSceneError, ArchiveError: see ``resolve``.
+        """
+        source = self.source(name)
+        if source.edited is not None:
+            with self._lock:
+                self._sources[source.id] = replace(source, edited=None)
+            self._memory.put(source.id, None)
+
+    @property
+    def edited_ids(self) -> tuple[str, ...]:
+        """Ids of the scenes of which an edited copy is served."""
+        with self._lock:
+            return tuple(source.id for source in self._sources.values() if source.edited is not None)
+
+    def _load(self, source: Source, progress: Progress | None) -> LoadedScene:
+        scene = self._scene(source, progress)
+        if self._make_renderer is not None:
+            return LoadedScene(scene, self._make_renderer(scene))
+        from nurec_sim.render.cpu.renderer import Renderer
+
+        return LoadedScene(scene, Renderer(scene, threads=self._threads))
+
+    def _scene(self, source: Source, progress: Progress | None) -> GaussianScene:
+        if source.edited is not None:
+            return source.edited
+        if isinstance(source.origin, GaussianScene):
+            return source.origin
+        if source.kind == "archive":
+            from nurec_sim.scene import read_scene
+
+            return read_scene(source.origin)
+        recipe = source.recipe or self._recipe
+        return self._kept.scene(source.origin, recipe, progress or (lambda stage, fraction: None))
+
+
+def _file_bytes(source: Source) -> int:
+    if isinstance(source.origin, GaussianScene) or not source.origin.is_file():
+        return 0
+    return source.origin.stat().st_size

@@ -1,0 +1,1 @@
+"""Training data: logs, windows, samples, augmentation, caches."""

@@ -1,0 +1,81 @@
+"""Where a training run's samples come from: clips drawn in the background, and a stream of samples for each stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack
+from pathlib import Path
+from typing import Protocol
+
+from nurec_sim.network.profiles import PROFILES
+from nurec_sim.training.config import Stage, TrainingConfig
+from nurec_sim.training.data.cache import ClipCache
+from nurec_sim.training.data.sample import TrainingSample
+from nurec_sim.training.data.stream import SampleStream
+from nurec_sim.training.processes import Processes
+
+
+class Samples(Protocol):
+    """Samples for a trainer: sample k of a run is the same whoever asks, and whenever."""
+
+    def stream(self, stage: Stage, step: int, processes: Processes) -> AbstractContextManager[Iterator[TrainingSample]]:
+        """Samples of a stage, from a step (counted over all stages) on."""
+
+    def data_hash(self) -> str:
+        """What stands for the data in the facts about the weights."""
+
+
+class TownSamples:
+    """Samples of towns; use it as a context manager, which draws clips meanwhile.
+
+    Args:
+        config: the recipe.
+        folder: for clips; runs of the same data settings share them.
+        drawers: processes that draw clips, in the first process of a run.
+        loaders: processes that prepare samples; 0 is a thread.
+        processes: this process among those of the run.
+        report: is told what goes wrong in the background.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        folder: Path,
+        drawers: int = 1,
+        loaders: int = 0,
+        processes: Processes | None = None,
+        report: Callable[[str], None] | None = None,
+    ) -> None:
+        self.config, self.drawers, self.loaders = config, drawers, loaders
+        self.first = processes is None or processes.first
+        data = config.data
+        self.cache = ClipCache(folder, data.clip_settings(), data.clips, data.first_town, report)
+        self._open = ExitStack()
+
+    def __enter__(self) -> TownSamples:
+        if self.first and self.drawers:
+            self.cache.start(self.drawers, refresh=self.config.data.refresh)
+        self._open.callback(self.cache.close)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def stream(self, stage: Stage, step: int, processes: Processes) -> SampleStream:
+        """Samples of a stage, from a step on."""
+        profile = PROFILES[self.config.profile]
+        settings = self.config.data.window_settings(profile, stage.pixels, stage.targets)
+        return SampleStream(
+            self.cache.clips,
+            settings,
+            self.config.seed,
+            step,
+            self.loaders,
+            processes.rank,
+            processes.count,
+            check=self.cache.check,
+        )
+
+    def data_hash(self) -> str:
+        """SHA-256 of the clips that are there."""
+        return self.cache.data_hash()

@@ -1,0 +1,1 @@
+"""Training losses (paper section 4)."""

@@ -1,0 +1,1 @@
+"""Meshes and textures of what stands and moves in a town."""

@@ -1,0 +1,119 @@
+"""A thin layer over MjSpec: named materials, meshes and visual geoms that know their class, instance and reflectivity.
+
+There are no colliders: collisions are measured between boxes by ``metrics``, and ``mj_multiRay`` silently loses visual
+geoms of bodies that also carry a collider (MuJoCo 4.0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from nurec_sim.world.assets.meshes import Corners, MeshBuilder
+from nurec_sim.world.plan.surface import REFLECTIVITY, SurfaceClass
+
+DECAL_GROUP = 3
+"""Geoms that are drawn in colour images only: no depth, no label, no laser return."""
+DECAL_ALPHA = 0.99
+"""The classic renderer blends only what is not quite opaque."""
+STATIC = 0
+"""Instance id of everything that is no actor; actor i of the plan is instance i + 1."""
+
+
+class SpecBuilder:
+    """Collects a world in ``spec``; remembers each material's mean colour for images without OpenGL."""
+
+    def __init__(self) -> None:
+        self.spec = mujoco.MjSpec()
+        self.spec.nuser_geom = 6  # class, instance, reflectivity, and the colour [3] that stands for its texture
+        self._colour: dict[str, np.ndarray] = {}
+        self._mean_colour: dict[str, np.ndarray] = {}
+        self._meshes = 0
+
+    @property
+    def world(self) -> Any:
+        """The body that holds everything static."""
+        return self.spec.worldbody
+
+    def material(
+        self,
+        name: str,
+        image: np.ndarray | None = None,
+        colour: Sequence[float] = (1, 1, 1),
+        shine: float = 0.05,
+        glow: float = 0.0,
+    ) -> None:
+        """A material; with an ``image [h,w,3]`` its texture is tinted by ``colour``."""
+        material = self.spec.add_material(name=name, rgba=[*colour, 1], specular=shine, shininess=0.1 + 0.7 * shine,
+                                          reflectance=0.0, emission=glow)  # fmt: skip
+        self._colour[name] = mean = np.asarray(colour, np.float64)
+        if image is not None:
+            self.texture(f"{name}_texture", image, mujoco.mjtTexture.mjTEXTURE_2D)
+            material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = f"{name}_texture"
+            mean = mean * image[..., :3].reshape(-1, 3).mean(axis=0) / 255
+        self._mean_colour[name] = mean
+
+    def texture(self, name: str, image: np.ndarray, kind: Any) -> None:
+        """A texture; linear, because the classic renderer knows no gamma and would turn sRGB dark."""
+        height, width, channels = image.shape
+        texture = self.spec.add_texture(name=name, type=kind, width=width, height=height, nchannel=channels)
+        texture.data = np.ascontiguousarray(image).tobytes()
+        texture.colorspace = mujoco.mjtColorSpace.mjCOLORSPACE_LINEAR
+
+    def mesh(self, builder: MeshBuilder, crease_deg: float = 38.0) -> str:
+        """Registers a mesh and gives its name."""
+        return self.shared_mesh(builder.corners(crease_deg))
+
+    def shared_mesh(self, corners: Corners, scale: Sequence[float] = (1.0, 1.0, 1.0)) -> str:
+        """Registers what ``MeshBuilder.corners`` gave, stretched along the axes, and gives its name."""
+        points, normals, uv = corners
+        if len(points) == 3:  # MuJoCo wants at least four vertices
+            points, normals, uv = (np.concatenate([values, values]) for values in (points, normals, uv))
+        self._meshes += 1
+        mesh = self.spec.add_mesh(name=f"mesh{self._meshes}")
+        mesh.uservert = (points * np.asarray(scale)).ravel().tolist()
+        mesh.usernormal = normals.ravel().tolist()
+        mesh.usertexcoord = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).ravel().tolist()
+        mesh.userface = list(range(len(points)))
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # flat and open meshes have no volume
+        return mesh.name
+
+    def place(
+        self,
+        body: Any,
+        mesh: str | MeshBuilder,
+        surface: SurfaceClass,
+        material: str,
+        *,
+        instance: int = STATIC,
+        xyz: Sequence[float] = (0, 0, 0),
+        yaw: float = 0.0,
+        tint: Sequence[float] = (1, 1, 1),
+        reflectivity: float | None = None,
+        shadow: bool = True,
+        crease_deg: float = 38.0,
+        decal: bool = False,
+    ) -> None:
+        """A mesh on a body. A ``decal`` is blended over what lies below it and exists in colour images only."""
+        name = mesh if isinstance(mesh, str) else self.mesh(mesh, crease_deg)
+        geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=xyz, quat=_yaw_quat(yaw))
+        self._dress(geom, surface, material, instance, tint, reflectivity, shadow and not decal)
+        if decal:
+            geom.group, geom.rgba = DECAL_GROUP, [*geom.rgba[:3], DECAL_ALPHA]
+
+    def _dress(self, geom: Any, surface: SurfaceClass, material: str, instance: int, tint: Sequence[float],
+               reflectivity: float | None, shadow: bool) -> None:  # fmt: skip
+        # A geom's own colour replaces its material's, so the tint has to hold both.
+        geom.material, geom.rgba, geom.castshadow = material, [*(self._colour[material] * np.asarray(tint)), 1], shadow
+        geom.contype = geom.conaffinity = 0
+        geom.group, geom.mass = 1, 0
+        colour = self._mean_colour[material] * np.asarray(tint)
+        laser = REFLECTIVITY[surface] if reflectivity is None else reflectivity
+        geom.userdata = [int(surface), instance, laser, *colour]
+
+
+def _yaw_quat(yaw: float) -> list[float]:
+    return [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]

@@ -1,0 +1,1 @@
+"""A town as pure data: roads, buildings, traffic, weather, rigs."""

@@ -1,0 +1,174 @@
+"""The traffic of a town: the recorded ego, who drives around it, who stands at the kerb and who walks.
+
+Everybody drives with everybody else from ``WARM_UP_S`` before the log begins, so that its first instant is as likely
+as any other. Whoever would touch somebody is left out, and the rest drives again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float64, Int64
+
+from nurec_sim.world.plan import departures, drivers, fleet, pedestrians
+from nurec_sim.world.plan import swept_boxes as boxes
+from nurec_sim.world.plan.departures import Vehicle
+from nurec_sim.world.plan.drivers import STEP_S
+from nurec_sim.world.plan.network import TownNetwork
+from nurec_sim.world.plan.pedestrians import Walker
+from nurec_sim.world.plan.rules import Rules
+from nurec_sim.world.plan.splits import STREAM_OF_SPLIT, Split
+from nurec_sim.world.plan.swept_boxes import Boxes
+from nurec_sim.world.plan.town import EGO_MIDDLE_M, Actor, ActorKind
+
+WARM_UP_S = 3.0
+AHEAD_M = 130.0
+"""So far along the ego's route others are worth drawing."""
+KEPT_EVERY = 2
+"""Every so-manieth step of an actor is kept; the ego's are all kept."""
+ATTEMPTS, AGAIN = 3, 5
+APART_M = 0.08
+LIVELY_SHARE, LIVELY_COUNT, LIVELY_M = 0.6, 2, 40.0
+"""A drive is lively if in this share of it so many actors move within so many metres in front of the ego."""
+
+EgoPath = tuple[tuple[int, float, float, float], ...]
+
+
+def drive(network: TownNetwork, seed: int, split: Split, span_us: tuple[int, int]) -> tuple[EgoPath, tuple[Actor, ...]]:
+    """Who drives where in a town, always the same for the same seed and split.
+
+    Returns:
+        The ego as (t_us, x, y, yaw) every 50 ms over the whole span, and all other actors; no two boxes ever touch.
+    """
+    rules = Rules(network)
+    best: tuple[float, _Scene] | None = None
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([STREAM_OF_SPLIT[split], seed, 0x7A, attempt])
+        scene = _scene(rng, rules, split, span_us)
+        lively = liveliness(scene.boxes, scene.movers)
+        if best is None or lively > best[0]:
+            best = lively, scene
+        if lively >= LIVELY_SHARE:
+            break
+    assert best is not None
+    return best[1].ego_path(), best[1].actors()
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """Everybody's boxes (the ego, vehicles, walkers, parked cars) at ``t_us``, and who of them stays."""
+
+    t_us: Int64[np.ndarray, " t"]
+    boxes: Boxes
+    vehicles: Sequence[Vehicle]
+    walkers: Sequence[Walker]
+    parked: Sequence[Actor]
+    stays: Bool[np.ndarray, " n"]
+
+    @property
+    def movers(self) -> Bool[np.ndarray, " n"]:
+        """Who is neither the ego nor parked, and stays."""
+        index = np.arange(len(self.stays))
+        return self.stays & (index > 0) & (index <= len(self.vehicles) + len(self.walkers))
+
+    def ego_path(self) -> EgoPath:
+        """The rear axle of the ego."""
+        yaw = self.boxes.yaw_rad[:, 0]
+        xy = self.boxes.middle_m[:, 0] - EGO_MIDDLE_M * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+        rows = np.column_stack([xy, yaw]).round(6).tolist()
+        return tuple((int(t), *row) for t, row in zip(self.t_us, rows, strict=True))
+
+    def actors(self) -> tuple[Actor, ...]:
+        """All others, named."""
+        found = []
+        for index, vehicle in enumerate(self.vehicles, start=1):
+            if self.stays[index]:
+                size = vehicle.driver.size_m
+                above = np.full(len(self.t_us), size[2] / 2)
+                found.append(self._moving(index, vehicle.name, vehicle.kind, size, vehicle.colour, above))
+        for index, walker in enumerate(self.walkers, start=1 + len(self.vehicles)):
+            if self.stays[index]:
+                above = walker.foot_m[-len(self.t_us) :] + walker.size_m[2] / 2
+                name = f"pedestrian_{index - 1 - len(self.vehicles)}"
+                found.append(self._moving(index, name, "pedestrian", walker.size_m, walker.colour, above))
+        stays = self.stays[1 + len(self.vehicles) + len(self.walkers) :]
+        return (*found, *(actor for actor, keep in zip(self.parked, stays, strict=True) if keep))
+
+    def _moving(
+        self,
+        index: int,
+        name: str,
+        kind: ActorKind,
+        size_m: tuple[float, float, float],
+        colour: tuple[float, float, float],
+        above_m: Float64[np.ndarray, " t"],
+    ) -> Actor:
+        rows = np.column_stack([self.boxes.middle_m[:, index], above_m, self.boxes.yaw_rad[:, index]]).round(4)
+        last = len(rows) - 1
+        moves = bool(np.ptp(rows[:, :2], axis=0).max() > 0.02)
+        steps = sorted({*range(0, last, KEPT_EVERY), last}) if moves else [0, last]
+        path = tuple((int(self.t_us[i]), *rows[i if moves else 0].tolist()) for i in steps)
+        return Actor(name, kind, size_m, colour, moves, path)
+
+
+def _scene(rng: np.random.Generator, rules: Rules, split: Split, span_us: tuple[int, int]) -> _Scene:
+    """One attempt: everybody drives; who touches somebody is left out, until nobody does."""
+    seconds = (span_us[1] - span_us[0]) * 1e-6
+    steps, warm = round(seconds / STEP_S), round(WARM_UP_S / STEP_S)
+    t_s = (np.arange(warm + steps + 1) - warm) * STEP_S
+    ego = departures.ego_driver(rng, rules, seconds + WARM_UP_S)
+    ahead = ego.route.at(np.linspace(ego.station_m, min(ego.station_m + AHEAD_M, ego.route.length_m), 27))
+    way = shapely.LineString(ahead)
+    parked = fleet.parked_cars(rng, rules.network, split, span_us, way)
+    walkers = pedestrians.people(rng, rules.network, ahead, t_s)
+    vehicles = departures.other_vehicles(rng, rules, split, ego, way)
+    for again in range(AGAIN):
+        everyone = [ego, *(vehicle.driver for vehicle in vehicles)]
+        crossers = [walker for walker in walkers if walker.crossing is not None]
+        passes = rules.passes(everyone, crossers, WARM_UP_S)
+        motion = drivers.simulate(everyone, warm + steps, rules.meetings, pedestrians.boxes_of(crossers, t_s), passes)
+        places = [(actor.path[0][1], actor.path[0][2], actor.path[0][4]) for actor in parked]
+        half = np.array([actor.size_m[:2] for actor in parked]).reshape(-1, 2) / 2
+        groups = [motion, pedestrians.boxes_of(walkers, t_s), boxes.standing(places, half, len(t_s))]
+        everything = boxes.together(groups).since(warm)
+        driving, walking = len(everyone), len(everyone) + len(walkers)
+        stays = ~_superfluous(everything, driving, walking)
+        if stays.all() or again == AGAIN - 1:
+            break
+        vehicles = [each for each, stay in zip(vehicles, stays[1:driving], strict=True) if stay]
+        walkers = [each for each, stay in zip(walkers, stays[driving:walking], strict=True) if stay]
+        parked = [each for each, stay in zip(parked, stays[walking:], strict=True) if stay]
+    t_us = span_us[0] + np.rint(np.arange(steps + 1) * STEP_S * 1e6).astype(np.int64)
+    return _Scene(t_us, everything, vehicles, walkers, parked, stays)
+
+
+def _superfluous(everything: Boxes, driving: int, walking: int) -> Bool[np.ndarray, " n"]:
+    """Whom to leave out so that nobody touches anybody: people first, then parked cars, then who was placed last.
+
+    Args:
+        everything: vehicles [0, driving), the ego first, people [driving, walking), parked cars.
+        driving: see ``everything``.
+        walking: see ``everything``.
+    """
+    order = np.arange(len(everything.half_m))
+    order[driving:walking] += len(order)
+    out = np.zeros(len(order), bool)
+    for i, j in boxes.touching(everything, APART_M):
+        if not out[i] and not out[j]:
+            out[i if order[i] > order[j] else j] = True
+    return out
+
+
+def liveliness(everything: Boxes, who: Bool[np.ndarray, " n"]) -> float:
+    """The share of the time in which ``LIVELY_COUNT`` of ``who`` move near in front of box 0, the ego."""
+    each = round(0.5 / STEP_S)
+    middle, yaw = everything.middle_m[::each], everything.yaw_rad[::each, :1]
+    away = middle[:-1, who] - middle[:-1, :1]
+    c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
+    ahead, aside = away[..., 0] * c + away[..., 1] * s, np.abs(away[..., 1] * c - away[..., 0] * s)
+    moves = np.linalg.norm(np.diff(middle[:, who], axis=0), axis=2) > 0.15
+    seen = (ahead > 0) & (ahead < LIVELY_M) & (aside < 1.2 * ahead) & moves
+    return float((seen.sum(axis=1) >= LIVELY_COUNT).mean())

@@ -1,0 +1,1 @@
+"""True sensors in a town: cameras, LiDARs, depth, boxes."""

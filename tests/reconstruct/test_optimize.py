@@ -1,0 +1,253 @@
+"""Per-scene optimisation: its losses against skimage and finite differences, and what it makes of a street."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from reconstruct_street import Street, camera
+from skimage.metrics import structural_similarity
+
+from nurec_sim import geometry
+from nurec_sim.errors import ReconstructError
+from nurec_sim.evaluate.scores.images import psnr
+from nurec_sim.reconstruct import LiftSettings, OptimizeSettings, ViewSettings, reconstruct
+from nurec_sim.reconstruct.optimize import method
+from nurec_sim.reconstruct.optimize.adam import MEAN, QUAT
+from nurec_sim.reconstruct.optimize.depth_loss import depth_loss
+from nurec_sim.reconstruct.optimize.image_loss import colour_loss
+from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
+from nurec_sim.reconstruct.optimize.responses import borrowed_responses
+from nurec_sim.reconstruct.optimize.views import Returns, returns_in, training_views
+from nurec_sim.render import Renderer
+from nurec_sim.scene import read_scene, scene_hash, write_scene
+from nurec_sim.types import DynamicGaussians, SensorRequest
+
+SMALL = LiftSettings(sky_px=32, views=ViewSettings(levels=32))
+CROSSING = {"moving": ((4.0, 1.8, 1.5), np.column_stack([np.linspace(12, 16, 4), np.full(4, 2.2)]))}
+
+
+class Flicker(Street):
+    """A street whose second image is taken 20 % too bright."""
+
+    def image(self, camera_id, index):
+        image = super().image(camera_id, index)
+        return np.clip(image * (1.2 if index == 1 else 1.0), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def street():
+    return Flicker(frames=4, boxes=CROSSING, cameras=(camera(width=128, height=64), camera("beside", 0.5, 128, 64)))
+
+
+@pytest.fixture(scope="module")
+def lifted(street):
+    return reconstruct(street, settings=SMALL, cameras=["front"])
+
+
+@pytest.fixture(scope="module")
+def fitted(street, lifted):
+    return method.refine(lifted, street, ["front"], set(), lambda *_: None, OptimizeSettings(seconds=None, steps=60))
+
+
+def image_of(scene, clip, name, index):
+    t_us = int(clip.t_us[index])
+    request = SensorRequest(scene.id, clip.rig.cameras[name], t_us, t_us + 1, clip.world_from_camera(name, index))
+    return Renderer(scene, threads=1).render_camera(request, ("rgb",)).rgb
+
+
+def mean_psnr(scene, clip, name):
+    return np.mean([psnr(image_of(scene, clip, name, k), clip.image(name, k)) for k in range(clip.frames)])
+
+
+def test_seen_and_unseen_images_gain(street, lifted, fitted):
+    assert mean_psnr(fitted, street, "front") > mean_psnr(lifted, street, "front") + 3
+    assert mean_psnr(fitted, street, "beside") > mean_psnr(lifted, street, "beside") + 2
+
+
+def test_a_frame_taken_brighter_has_a_response_of_its_own(fitted):
+    bright, usual = fitted.exposures["front"][1], fitted.exposures["front"][2]
+    assert np.diag(bright[:, :3]).mean() / np.diag(usual[:, :3]).mean() == pytest.approx(1.2, abs=0.06)
+    assert fitted.exposures["beside"] == pytest.approx(fitted.exposures["front"]), "a camera of the same kind"
+    assert fitted.provenance["refined"]["borrowed_responses"] == ["beside"]
+
+
+def test_the_same_steps_give_the_same_bytes_and_an_archive_keeps_them(street, lifted, fitted, tmp_path):
+    few = OptimizeSettings(seconds=None, steps=3)
+    one, two = (method.refine(lifted, street, ["front"], set(), lambda *_: None, few) for _ in range(2))
+    assert scene_hash(one) == scene_hash(two) != scene_hash(dataclasses.replace(one, exposures={}))
+    write_scene(fitted, tmp_path / "a.usdz")
+    back = read_scene(tmp_path / "a.usdz")
+    assert scene_hash(back) == scene_hash(fitted) and back.exposures.keys() == {"front", "beside"}
+    assert np.array_equal(image_of(back, street, "front", 1), image_of(fitted, street, "front", 1))
+
+
+def test_an_interruption_keeps_what_has_been_reached(street, lifted):
+    def interrupt(stage, fraction):
+        if stage.startswith("fitting, 5 images"):
+            raise KeyboardInterrupt
+
+    scene = method.refine(lifted, street, ["front"], set(), interrupt, OptimizeSettings(seconds=None, steps=1000))
+    assert scene.provenance["refined"]["steps"] == 5
+    assert mean_psnr(scene, street, "front") > mean_psnr(lifted, street, "front")
+
+
+def test_the_method_is_lift_and_a_fit_and_needs_images(street):
+    scene = reconstruct(street, "optimized", cameras=["front"], settings=OptimizeSettings(seconds=None, steps=1))
+    assert scene.provenance["method"] == "lift" and scene.provenance["refined"]["steps"] == 1
+    with pytest.raises(ReconstructError, match="needs images; have no cameras"):
+        reconstruct(street, "lift", cameras=[], settings=SMALL, refine=OptimizeSettings(steps=1))
+    with pytest.raises(ValueError, match="needs a budget"):
+        OptimizeSettings(seconds=None)
+    with pytest.raises(ValueError, match="seconds must be positive and finite, got -1"):
+        OptimizeSettings(seconds=-1)
+
+
+def test_view_dependent_colours_are_refused(lifted):
+    sh = dataclasses.replace(lifted.static, sh_rest=np.zeros((len(lifted.static), 3, 3), np.float32))
+    with pytest.raises(ReconstructError, match="view-dependent colours"):
+        Parameters(dataclasses.replace(lifted, static=sh))
+
+
+# ------------------------------------------------------------------------------------------------------------ losses
+
+
+def test_the_loss_of_colour_is_that_of_skimage_and_its_gradient_that_of_differences():
+    random = np.random.default_rng(0)
+    shown, recorded = random.random((2, 24, 30, 3), dtype=np.float32)
+    recorded = 0.6 * shown + 0.4 * recorded
+    loss, gradient = colour_loss(shown, recorded, 0.2)
+    _, similarity = structural_similarity(shown, recorded, channel_axis=2, data_range=1.0, gaussian_weights=True,
+                                          sigma=1.5, use_sample_covariance=False, full=True)  # fmt: skip
+    inner = (slice(5, -5), slice(5, -5))  # borders differ: zeros here, reflection there
+    only_dssim = colour_loss(shown, recorded, 1.0)[0]
+    assert np.abs(shown - recorded).mean() * 0.8 + 0.2 * only_dssim == pytest.approx(loss, rel=1e-5)
+    assert 1 - similarity[inner].mean() == pytest.approx(only_dssim, abs=0.05)
+    for v, u, c in ((0, 0, 0), (12, 15, 1), (23, 7, 2), (6, 29, 0)):
+        step = np.zeros_like(shown)
+        step[v, u, c] = 2e-3
+        difference = (colour_loss(shown + step, recorded, 0.2)[0] - colour_loss(shown - step, recorded, 0.2)[0]) / 4e-3
+        assert gradient[v, u, c] == pytest.approx(difference, rel=0.02, abs=2e-6)
+
+
+def plane_image(height=20, width=30):
+    """Depth of a slanted plane 1 / (0.1 + 0.004 u + 0.002 v) at pixel centres, half opaque somewhere."""
+    v, u = np.mgrid[:height, :width] + 0.5
+    depth = 1 / (0.1 + 0.004 * u + 0.002 * v)
+    alpha = np.where(u < 15, 0.7, 0.95)
+    return alpha.astype(np.float32), (alpha * depth).astype(np.float32)
+
+
+def test_returns_on_a_plane_have_no_error_between_pixels():
+    alpha, distance = plane_image()
+    uv = np.array([[7.3, 4.9], [20.81, 13.02], [12.5, 9.5]])
+    depth = 1 / (0.1 + 0.004 * uv[:, 0] + 0.002 * uv[:, 1])
+    by_alpha, by_distance = np.zeros_like(alpha), np.zeros_like(alpha)
+    assert depth_loss(Returns(uv, depth), alpha, distance, None, 1.0, 0.0, by_alpha, by_distance) < 1e-6
+    # Twice as far along rays of z = 0.5 is the same plane.
+    half = np.full_like(alpha, 0.5)
+    assert depth_loss(Returns(uv, depth), alpha, 2 * distance, half, 1.0, 0.0, by_alpha, by_distance) < 1e-6
+    nearer = depth_loss(Returns(uv, depth * 0.9), alpha, distance, None, 1.0, 0.0, by_alpha, by_distance)
+    assert nearer == pytest.approx(0.1, rel=1e-4)
+
+
+def test_gradients_of_the_loss_of_depth_are_those_of_differences():
+    alpha, distance = plane_image()
+    uv = np.array([[7.3, 4.9], [20.81, 13.02], [3.0, 15.2]])
+    returns = Returns(uv, np.array([7.9, 4.4, 7.2]))
+    by_alpha, by_distance = np.zeros_like(alpha), np.zeros_like(alpha)
+
+    def loss(a, d):
+        return depth_loss(returns, a, d, None, 0.7, 0.3, np.zeros_like(alpha), np.zeros_like(alpha))
+
+    depth_loss(returns, alpha, distance, None, 0.7, 0.3, by_alpha, by_distance)
+    for row, column in ((4, 6), (5, 7), (12, 20), (13, 21), (14, 2)):
+        for image, gradient in ((0, by_alpha), (1, by_distance)):
+            step = np.zeros((2, *alpha.shape), np.float32)
+            step[image, row, column] = 1e-3
+            difference = (loss(alpha + step[0], distance + step[1]) - loss(alpha - step[0], distance - step[1])) / 2e-3
+            assert gradient[row, column] == pytest.approx(difference, rel=0.02, abs=1e-5)
+
+
+def test_returns_behind_others_are_left_out():
+    seen = camera(width=192, height=96)
+    pose = np.stack([seen.rig_from_camera] * 2)
+    ahead = np.array([[11.5, 0.0, 1.5], [11.5, 0.05, 1.5], [21.5, 0.02, 1.5], [21.5, 5.0, 1.5], [-5.0, 0, 1.5]])
+    found = returns_in(seen, pose, ahead)
+    assert found.depth_m.tolist() == pytest.approx([10.0, 10.0, 20.0])
+    assert found.uv_px[0].tolist() == pytest.approx([96.0, 48.0])
+
+
+def test_returns_of_labelled_boxes_are_left_out(street, lifted):
+    """The moving box is 2 m to the left; without its label its returns would count as static."""
+    views = training_views(street, lifted, ["front"], set())
+    unlabelled = training_views(street, dataclasses.replace(lifted, tracks=()), ["front"], set())
+    assert all(len(a.returns) < len(b.returns) for a, b in zip(views, unlabelled, strict=True))
+    assert all(len(view.returns) == 0 for view in training_views(street, lifted, ["front"], {0, 1, 2, 3}))
+
+
+# -------------------------------------------------------------------------------------------------------- parameters
+
+
+def boxed(scene):
+    """The scene with its actor's Gaussians as rigid parts of its box."""
+    dynamic, track = scene.dynamic, scene.tracks[0]
+    t_us = track.path.start_us
+    box_from_world = geometry.inverse(track.path.at(t_us))
+    alive, mean, _ = dynamic.at(t_us)
+    gaussians = dataclasses.replace(
+        dynamic.gaussians[alive], mean_m=geometry.transform_points(box_from_world, mean).astype(np.float32)
+    )
+    return dataclasses.replace(scene, dynamic=DynamicGaussians.rigid(gaussians, np.zeros(len(alive), np.int32), t_us))
+
+
+def test_values_give_the_scene_back(lifted):
+    for scene in (lifted, boxed(lifted)):
+        back = Parameters(scene).scene()
+        assert len(back.static) == len(scene.static) and len(back.dynamic) == len(scene.dynamic)
+        order = np.lexsort(scene.static.mean_m.T)
+        mine = np.lexsort(back.static.mean_m.T)
+        assert np.array_equal(back.static.mean_m[mine], scene.static.mean_m[order])
+        assert np.allclose(back.static.scale_m[mine], scene.static.scale_m[order], rtol=1e-5)
+        assert np.allclose(back.static.normal[mine], scene.static.normal[order], atol=1e-5)
+        assert np.allclose(back.dynamic.knot_m, scene.dynamic.knot_m)
+
+
+def test_gaussians_of_an_actor_are_where_its_box_is_and_gone_when_it_is(lifted):
+    scene = boxed(lifted)
+    parameters = Parameters(scene)
+    t_us = int(scene.tracks[0].path.t_us[2])
+    drawn, first = parameters.at(t_us), parameters.static_count
+    world = geometry.transform_points(scene.tracks[0].path.at(t_us), scene.dynamic.gaussians.mean_m)
+    assert np.allclose(drawn.mean_m[first:], world, atol=1e-5) and (drawn.opacity[first:] > 0).all()
+    assert (parameters.at(scene.tracks[0].path.end_us + 1).opacity[first:] == 0).all()
+
+
+def test_gradients_in_the_world_go_back_to_the_box(lifted):
+    """A box turned by 90 degrees: what pulls along the world's y pulls along the box's x."""
+    scene = boxed(lifted)
+    turned = geometry.pose_from_xyyaw(5.0, 1.0, np.pi / 2)
+    path = dataclasses.replace(scene.tracks[0].path, world_from_body=np.stack([turned] * 4))
+    scene = dataclasses.replace(scene, tracks=(dataclasses.replace(scene.tracks[0], path=path),))
+    parameters = Parameters(scene)
+    drawn, row = parameters.at(path.start_us), parameters.static_count
+    n = len(parameters)
+    by_mean, by_quat = np.zeros((n, 3), np.float32), np.zeros((n, 4), np.float32)
+    by_mean[row] = (0, 1, 0)
+    parameters.values[row, QUAT : QUAT + 4] = (1, 0, 0, 0)
+    by_quat[row] = (0, 0, 0, 1)  # by the world's quaternion (c, 0, 0, s) of 90 degrees, c = s = 0.7071
+    zeros = np.zeros((n, 3), np.float32), np.zeros(n, np.float32), np.zeros((n, 3), np.float32)
+    parameters.step(drawn, np.array([row], np.int32), (by_mean, by_quat, *zeros), rate_columns(0, 0, 0, 0, 0), 1.0)
+    assert parameters.first[row, MEAN : MEAN + 3] == pytest.approx([0.1, 0, 0], abs=1e-6)
+    # q_world = (c w - s z, .., .., c z + s w), so its last component's gradient is s by w and c by z.
+    assert parameters.first[row, QUAT : QUAT + 4] == pytest.approx([0.07071, 0, 0, 0.07071], abs=1e-5)
+
+
+def test_responses_are_borrowed_at_the_same_instant_from_a_camera_of_the_same_kind():
+    front, beside, other = camera(), camera("beside", 0.5), camera("other", width=96)
+    back = dataclasses.replace(front, id="back", rig_from_camera=front.rig_from_camera @ np.diag([-1.0, 1, -1, 1]))
+    rig = Street(cameras=(front, beside, other, back)).rig
+    times = {"front": np.array([[0, 0], [100, 100]]), "beside": np.array([[50, 50]])}
+    times |= {"other": times["front"], "back": times["front"]}
+    known = {"front": np.stack([np.eye(3, 4), 2 * np.eye(3, 4)])}
+    found = borrowed_responses(known, times, rig, ["beside", "other", "back"])
+    assert found.keys() == {"beside"} and found["beside"][0] == pytest.approx(1.5 * np.eye(3, 4))

@@ -1,0 +1,232 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reconstruct_street import KERB_M, STEP_M, Street, camera
+
+from nurec_sim import geometry, sensors
+from nurec_sim.reconstruct.lift import colour, depth, lifting, splat
+from nurec_sim.reconstruct.lift.ground import find_ground
+from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, seen_through, spherical_ranges
+from nurec_sim.reconstruct.lift.settings import GroundSettings, PointSettings, ViewSettings
+from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
+from nurec_sim.reconstruct.lift.surfaces import footprints, surface_of
+from nurec_sim.reconstruct.lift.views import choose_frames, read_views, tiles_of
+from nurec_sim.types import CameraModel, Fisheye, Pinhole, Shutter
+
+
+def cloud_of(xyz, eye=(0.0, 0.0, 5.0), spacing=0.1):
+    n = len(xyz)
+    return Cloud(np.asarray(xyz, float), np.broadcast_to(np.asarray(eye, float), (n, 3)).copy(),
+                 np.full(n, spacing, np.float32), np.full(n, np.nan, np.float32), np.ones(n, np.int32))  # fmt: skip
+
+
+def ground_points(kerb_m, seed=0, noise_m=0.01):
+    random = np.random.default_rng(seed)
+    xy = random.uniform([-5, -9], [25, 9], (60_000, 2))
+    z = np.where(np.abs(xy[:, 1]) < KERB_M, 0.0, kerb_m) + random.normal(0, noise_m, len(xy))
+    return np.column_stack([xy, z])
+
+
+def drive():
+    return np.stack([geometry.pose_from_xyyaw(x, 0, 0) for x in np.arange(0, 20, 1.0)])
+
+
+@pytest.mark.parametrize(("slope", "kerb_m"), [(0.0, 0.15), (0.04, 0.12), (-0.03, 0.10)])
+def test_road_grows_to_the_kerb_on_any_slope(slope, kerb_m):
+    points, poses = ground_points(kerb_m), drive()
+    points[:, 2] += slope * points[:, 0]
+    poses[:, 2, 3] = slope * poses[:, 0, 3]
+    ground = find_ground(points, poses, GroundSettings())
+    x, y = np.meshgrid(np.arange(0, 20, 0.2), np.arange(-7, 7.01, 0.1))
+    at = np.column_stack([x.ravel(), y.ravel(), slope * x.ravel() + np.where(np.abs(y.ravel()) < KERB_M, 0, kerb_m)])
+    road = ground.is_road(at)
+    side = np.abs(at[:, 1])
+    assert road[side < KERB_M - 0.25].mean() > 0.99
+    assert road[side > KERB_M + 0.25].mean() < 0.01
+
+
+def test_pavement_level_with_the_road_cannot_be_told_apart():
+    ground = find_ground(ground_points(0.0), drive(), GroundSettings())
+    assert ground.is_road(np.array([[10.0, 6.0, 0.0]]))[0]
+
+
+def test_ground_holes_are_filled_flat():
+    points = ground_points(STEP_M)
+    hole = np.linalg.norm(points[:, :2] - [8, 0], axis=1) < 2.0
+    ground = find_ground(points[~hole], drive(), GroundSettings())
+    sheet = ground.sheet(cloud_of(points[~hole]))
+    inside = np.linalg.norm(sheet.xyz_m[:, :2] - [8, 0], axis=1) < 2.0
+    assert inside.sum() > 1000
+    assert np.abs(sheet.xyz_m[inside, 2]).max() < 0.05
+
+
+def test_tops_of_things_are_not_ground():
+    points = ground_points(STEP_M)
+    top = np.column_stack([np.random.default_rng(1).uniform([10, 1], [14, 3], (4000, 2)), np.full(4000, 1.4)])
+    under = (points[:, 0] > 10) & (points[:, 0] < 14) & (points[:, 1] > 1) & (points[:, 1] < 3)
+    ground = find_ground(np.concatenate([points[~under], top]), drive(), GroundSettings())
+    row, column, _ = ground.cells(np.array([[12.0, 2.0, 0]]))
+    assert abs(ground.height_m[row, column][0]) < 0.1
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20, deadline=None)
+def test_normals_of_a_plane_face_the_sensor(seed):
+    random = np.random.default_rng(seed)
+    normal = random.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    basis = np.linalg.svd(normal[None])[2][1:]
+    xyz = random.uniform(-2, 2, (400, 2)) @ basis + random.normal(0, 0.02, (400, 1)) * normal
+    moved, found, spacing = surface_of(cloud_of(xyz, eye=5 * normal))
+    assert np.median(found @ normal) > 0.98
+    assert (found @ normal > 0).all()
+    assert np.std(moved.xyz_m @ normal) < 0.7 * np.std(xyz @ normal)
+    assert (spacing >= 0.1 - 1e-6).all() and (spacing <= 0.3 + 1e-6).all()
+
+
+def test_one_scan_line_faces_the_sensor():
+    xyz = np.column_stack([np.linspace(-1, 1, 50), np.full(50, 5.0), np.zeros(50)])
+    _, normal, _ = surface_of(cloud_of(xyz, eye=(0, 0, 0)))
+    assert np.median(-normal[:, 1]) > 0.99
+
+
+def test_footprints_cover_their_pixels_on_the_surface():
+    ray = np.array([[0.8, 0.0, -0.6], [1.0, 0, 0]])
+    normal = np.array([[0.0, 0, 1], [-1.0, 0, 0]])
+    gaussians = footprints(np.zeros((2, 3)), normal, ray, np.array([0.1, 0.1]), np.zeros((2, 3)), np.zeros(2),
+                           np.zeros(2, np.uint8), 0.9)  # fmt: skip
+    axes = geometry.matrix_from_quat(gaussians.quat_wxyz)
+    stretched = axes[0][:, 0]
+    assert abs(stretched[0]) == pytest.approx(1, abs=1e-6)
+    assert gaussians.scale_m[0, 0] / gaussians.scale_m[0, 1] == pytest.approx(1 / 0.6, rel=1e-5)
+    assert gaussians.scale_m[1, 0] == pytest.approx(gaussians.scale_m[1, 1], rel=1e-5)
+    assert (gaussians.scale_m[:, 2] < 0.2 * gaussians.scale_m[:, 1]).all()
+
+
+def test_every_point_goes_to_one_body():
+    clip = Street(boxes={"a": ((4.0, 1.8, 1.5), np.array([12.0, -2.0]))})
+    actors = actors_of(clip, PointSettings())
+    fine = PointSettings(min_voxel_m=0.001, max_voxel_m=0.001)
+    gathered = gather(clip, actors, set(), fine)
+    feet = sum(len(box) for box, _ in gathered.feet.values())
+    total = len(gathered.static) + sum(map(len, gathered.actors.values())) + feet
+    assert 0.97 * gathered.point_count <= total <= gathered.point_count
+    box = clip.tracks[0].path.world_from_body[0]
+    local = geometry.transform_points(geometry.inverse(box), gathered.static.xyz_m)
+    assert not geometry.points_in_box(local, (4.0, 1.8, 1.5), 0.14).any()
+
+
+def test_ghosts_are_seen_through_and_walls_are_not():
+    directions = np.column_stack([np.cos(a := np.linspace(0, 2 * np.pi, 5000)), np.sin(a), np.zeros(5000)])
+    image = (np.eye(4), spherical_ranges(directions * 20))
+    points = cloud_of([[10.0, 0, 0], [19.9, 0, 0], [25, 0, 0]])
+    assert seen_through(points, [image] * 4, 3).tolist() == [True, False, False]
+    assert not seen_through(points, [image] * 2, 3).any()
+
+
+@pytest.mark.parametrize("lens", ["plain", "distorted", "fisheye"])
+def test_views_project_like_their_camera(lens):
+    front = camera(width=320, height=160)
+    if lens == "distorted":
+        front = CameraModel("front", 320, 160, Pinhole(150, 150, 160, 80, radial=(-0.1, 0.02, 0, 0, 0, 0)),
+                            front.rig_from_camera)  # fmt: skip
+    if lens == "fisheye":
+        front = CameraModel("front", 320, 160, Fisheye(100, 100, 160, 80, max_angle_rad=1.6), front.rig_from_camera)
+    clip = Street(frames=1, cameras=(front,))
+    options = ViewSettings()
+    views = read_views(clip, ["front"], options)
+    assert len(views) == len(tiles_of(front, options)) and (lens != "fisheye" or len(views) >= 2)
+    world_from_camera = clip.world_from_camera("front", 0)[0]
+    errors = []
+    for view in views:
+        tile = view.tile
+        assert tile.valid.mean() > 0.5
+        v, u = np.nonzero(tile.valid)
+        some = slice(None, None, 997)
+        points = lifting.points_of(view, np.full(tile.valid.shape, 0.1, np.float32))[v[some], u[some]]
+        uv, seen = sensors.project(front, geometry.transform_points(geometry.inverse(world_from_camera), points))
+        for x, pixel, ok, row, column in zip(points, uv, seen, v[some], u[some], strict=True):
+            a, b, z = splat.project_point(view.packed, *x)
+            assert (a, b) == pytest.approx((column + 0.5, row + 0.5), abs=1e-3) and z == pytest.approx(10, rel=1e-5)
+            recorded = clip.image("front", 0)
+            if ok and 1 < pixel[0] < 319 and 1 < pixel[1] < 159:
+                near = recorded[int(pixel[1]) - 1 : int(pixel[1]) + 2, int(pixel[0]) - 1 : int(pixel[0]) + 2]
+                errors.append(np.abs(near.astype(int) - view.rgb[row, column]).min(axis=(0, 1)).max())
+    assert len(errors) > 10 and np.mean(np.array(errors) < 12) > 0.85
+
+
+def test_rolling_shutter_points_project_back():
+    base = camera()
+    rolling = CameraModel("front", 192, 96, base.lens, base.rig_from_camera, Shutter.TOP_TO_BOTTOM)
+
+    class Rolling(Street):
+        def world_from_camera(self, camera_id, index):
+            pair = super().world_from_camera(camera_id, index)
+            pair[1, 0, 3] += 0.3
+            return pair
+
+    clip = Rolling(frames=1, cameras=(rolling,))
+    (view,) = read_views(clip, ["front"], ViewSettings())
+    assert np.linalg.norm(view.drift_m) == pytest.approx(0.3)
+    points = lifting.points_of(view, np.full((96, 192), 0.2, np.float32))
+    uv, seen, _ = sensors.project_rolling(rolling, clip.world_from_camera("front", 0), points[::9, ::17].reshape(-1, 3))
+    v, u = np.mgrid[0:96:9, 0:192:17] + 0.5
+    assert seen.all()
+    assert np.abs(uv - np.column_stack([u.ravel(), v.ravel()])).max() < 0.15
+
+
+def test_frames_are_thinned_evenly():
+    frames = choose_frames(Street(frames=50), ["front"], 1, ViewSettings(max_views=10, max_frames=25))
+    assert [frame for _, frame, _ in frames] == list(range(0, 50, 2))
+    assert [frame for _, frame, key in frames if key] == list(range(0, 50, 6))
+
+
+def test_depth_is_found_by_matching_where_nothing_was_measured():
+    clip = Street(frames=3)
+    views = read_views(clip, ["front"], ViewSettings())
+    step, levels = 1 / 3.5 / 47, 48
+    empty = np.zeros((96, 192), np.float32)
+    around = [(v.packed, v.rgb, depth.census(v.rgb.mean(axis=-1).astype(np.uint8))) for v in views[1:]]
+    found = depth.dense_inverse_depth(views[0].packed, views[0].world_from_view, views[0].rgb, empty, empty > 1, around,
+                                      levels, step)  # fmt: skip
+    pose = views[0].world_from_view
+    rays = lifting.rays_of(views[0]).reshape(-1, 3)
+    distance, what = clip.cast(pose[:3, 3], rays @ pose[:3, :3].T, 0)
+    true = (1 / distance).reshape(96, 192)
+    walls = (what.reshape(96, 192) == 4) & (true > 1 / 25)
+    walls[:, :20], walls[:, -20:] = False, False
+    assert np.median(np.abs(found - true)[walls]) < step
+
+
+def test_measured_depth_stays():
+    prior = np.full((20, 30), 0.123, np.float32)
+    view = read_views(Street(frames=1, cameras=(camera(width=30, height=20),)), ["front"], ViewSettings())[0]
+    found = depth.dense_inverse_depth(view.packed, view.world_from_view, view.rgb, prior, prior > 1, [], 32, 0.01)
+    assert np.array_equal(found, prior)
+
+
+@pytest.mark.parametrize("thinning", [1, 2, 4, 8, 16])
+def test_lattice_keeps_its_share(thinning):
+    assert lifting.lattice((64, 64), thinning).mean() == pytest.approx(1 / thinning)
+
+
+def test_isp_of_cameras_that_share_points():
+    random = np.random.default_rng(0)
+    true = random.uniform(0.1, 0.9, (2000, 3)).astype(np.float32)
+    gain = np.array([[0.9, 0.05, 0, 0.02], [0, 0.8, 0, 0.03], [0, 0, 1.1, -0.02]])
+    other = (np.column_stack([true, np.ones(2000)]) @ gain.T).astype(np.float32)
+    everything = np.ones(2000, bool)
+    nothing = np.zeros(2000, bool)
+    isp, lonely = colour.solve_isp(
+        ["a", "b", "c"], {"a": (true, everything), "b": (other, everything), "c": (true, nothing)}
+    )
+    assert np.allclose(isp["a"], np.eye(3, 4)) and np.allclose(isp["c"], np.eye(3, 4))
+    assert np.abs(isp["b"] - gain).max() < 0.06
+    assert lonely == ["c"]
+    assert np.abs(colour.to_canonical(other * 255, isp["b"]) - true * 255).mean() < 4
+
+
+def test_sky_without_any_view_is_grey():
+    sky = make_sky([], [], [], 8)
+    assert sky.shape == (6, 8, 8, 3) and (sky == sky[0, 0, 0]).all()

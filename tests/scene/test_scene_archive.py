@@ -1,0 +1,275 @@
+"""A scene archive gives back exactly what went in, in the same bytes every time, and replaces nothing unasked."""
+
+import dataclasses
+import hashlib
+import io
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from scene_worlds import END_US, START_US, empty_scene, full_scene, gaussians, hilly_road
+
+from nurec_sim.errors import ArchiveError
+from nurec_sim.scene import archive_faults, read_scene, scene_hash, summary, write_scene
+from nurec_sim.scene.describe import scene_arrays
+from nurec_sim.sensors import lidar_model
+from nurec_sim.types import DynamicGaussians, Gaussians, Label, Rig, Trajectory
+
+KNOT_FIELDS = ("knot_t_us", "knot_m", "track")
+
+
+def assert_same(a, b, where="scene"):
+    """Equality of nested dataclasses, mappings, sequences and arrays; NaN equals NaN, and -0 equals 0."""
+    if dataclasses.is_dataclass(a):
+        assert type(a) is type(b), where
+        for field in dataclasses.fields(a):
+            assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
+    elif isinstance(a, np.ndarray):
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), where
+        assert np.array_equal(a, b, equal_nan=a.dtype.kind == "f"), where
+    elif isinstance(a, dict):
+        assert list(a) == list(b), where
+        for key in a:
+            assert_same(a[key], b[key], f"{where}[{key!r}]")
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b), where
+        for index, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_same(x, y, f"{where}[{index}]")
+    else:
+        assert a == b, where
+
+
+@pytest.mark.parametrize("sh_terms", [0, 3, 8, 15])
+def test_round_trip_loses_nothing(tmp_path, sh_terms):
+    scene = full_scene(sh_terms)
+    assert write_scene(scene, tmp_path / "a.usdz") == tmp_path / "a.usdz"
+    back = read_scene(tmp_path / "a.usdz")
+    assert_same(scene, back)
+    assert scene_hash(scene) == scene_hash(back)
+    assert archive_faults(tmp_path / "a.usdz") == []
+
+
+@pytest.mark.parametrize("make", [empty_scene, hilly_road])
+def test_round_trip_of_unusual_scenes(tmp_path, make):
+    write_scene(make(), tmp_path / "new folder" / "a [1].usdz")
+    assert_same(make(), read_scene(tmp_path / "new folder" / "a [1].usdz"))
+
+
+def test_no_moving_gaussians_keep_their_degree(tmp_path):
+    """Otherwise they could not be joined with the static ones."""
+    scene = full_scene(15)
+    none = DynamicGaussians(scene.dynamic.gaussians[:0], *(getattr(scene.dynamic, name)[:0] for name in KNOT_FIELDS))
+    write_scene(dataclasses.replace(scene, dynamic=none), tmp_path / "a.usdz")
+    back = read_scene(tmp_path / "a.usdz")
+    assert_same(none, back.dynamic)
+    assert len(Gaussians.concatenate([back.static, back.dynamic.gaussians])) == 400
+
+
+def with_ray_drop(scene):
+    """The scene with a drop probability for every Gaussian."""
+
+    def dropping(part):
+        return dataclasses.replace(part, ray_drop=np.random.default_rng(len(part)).random(len(part), np.float32))
+
+    moving = dataclasses.replace(scene.dynamic, gaussians=dropping(scene.dynamic.gaussians))
+    return dataclasses.replace(scene, static=dropping(scene.static), dynamic=moving)
+
+
+@pytest.mark.parametrize("make", [full_scene, empty_scene])
+def test_ray_drop_is_kept_where_there_is_one(tmp_path, make):
+    scene = with_ray_drop(make())
+    write_scene(scene, tmp_path / "a.usdz")
+    back = read_scene(tmp_path / "a.usdz")
+    assert_same(scene, back)
+    assert scene_hash(scene) == scene_hash(back) != scene_hash(make())
+    assert archive_faults(tmp_path / "a.usdz") == []
+
+
+finite32 = st.floats(allow_nan=False, allow_infinity=False, width=32)
+finite64 = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@settings(max_examples=25, deadline=None, phases=[Phase.explicit, Phase.generate])
+@given(data=st.data(), count=st.integers(0, 6), scene_id=st.text("aé/@ \"\\'{}", min_size=1))
+def test_round_trip_of_any_numbers(tmp_path_factory, data, count, scene_id):
+    def floats(*shape):
+        values = data.draw(st.lists(finite32, min_size=int(np.prod(shape)), max_size=int(np.prod(shape))))
+        return np.array(values, np.float32).reshape(shape)
+
+    def unit(values):
+        return np.clip(np.abs(values), 0, 1)
+
+    quat = np.zeros((count, 4), np.float32)
+    quat[np.arange(count), data.draw(st.lists(st.integers(0, 3), min_size=count, max_size=count))] = 1
+    static = Gaussians(
+        floats(count, 3), quat, np.abs(floats(count, 3)), unit(floats(count)), floats(count, 3), floats(count, 3),
+        np.full(count, data.draw(st.sampled_from(Label)), np.uint8), unit(floats(count)),
+    )  # fmt: skip
+    times = data.draw(st.lists(st.integers(-(2**50), 2**50), min_size=3 * count, max_size=3 * count))
+    knot_t_us = np.sort(np.array(times, np.int64).reshape(count, 3), axis=1)
+    base = full_scene(0)
+    dynamic = DynamicGaussians(static, knot_t_us, floats(count, 3, 3), np.full(count, -1, np.int32))
+    isp = np.array(data.draw(st.lists(finite64, min_size=12, max_size=12))).reshape(3, 4)
+    scene = dataclasses.replace(base, id=scene_id, static=static, dynamic=dynamic, isp={scene_id: isp})
+    path = tmp_path_factory.mktemp("any") / "a.usdz"
+    write_scene(scene, path)
+    back = read_scene(path)
+    assert_same(scene, back)
+    assert scene_hash(scene) == scene_hash(back)
+
+
+def test_same_scene_gives_the_same_bytes_in_every_process(tmp_path):
+    first = write_scene(full_scene(), tmp_path / "a.usdz").read_bytes()
+    assert write_scene(full_scene(), tmp_path / "b.usdz").read_bytes() == first
+    code = (
+        "import sys; from scene_worlds import full_scene; from nurec_sim.scene import write_scene;"
+        "write_scene(full_scene(), sys.argv[1])"
+    )
+    environment = os.environ | {
+        "PYTHONPATH": str(Path(__file__).parents[1] / "helpers"),
+        "PYTHONHASHSEED": "7",
+        "TZ": "Asia/Tokyo",
+    }
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "c.usdz")], env=environment, check=True, timeout=60)
+    assert hashlib.sha256((tmp_path / "c.usdz").read_bytes()).digest() == hashlib.sha256(first).digest()
+
+
+def test_many_windows_are_binned_for_usd_but_stay_exact(tmp_path, monkeypatch):
+    monkeypatch.setattr("nurec_sim.scene.usd.actors.MAX_WINDOWS", 10)
+    scene = full_scene()
+    rng = np.random.default_rng(0)
+    times = np.sort(rng.integers(START_US, END_US, (len(scene.dynamic), 3)), axis=1)
+    scene = dataclasses.replace(scene, dynamic=dataclasses.replace(scene.dynamic, knot_t_us=times))
+    write_scene(scene, tmp_path / "a.usdz")
+    assert_same(scene, read_scene(tmp_path / "a.usdz"))
+
+
+def test_an_existing_file_is_kept_unless_asked(tmp_path):
+    path = tmp_path / "a.usdz"
+    path.write_bytes(b"precious")
+    with pytest.raises(ArchiveError, match="exists; pass overwrite=True"):
+        write_scene(full_scene(), path)
+    assert path.read_bytes() == b"precious"
+    write_scene(full_scene(), path, overwrite=True)
+    assert archive_faults(path) == []
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
+    path = write_scene(empty_scene(), tmp_path / "a.usdz")
+    before = path.read_bytes()
+
+    def no_space(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", no_space)
+    with pytest.raises(OSError, match="No space left"):
+        write_scene(full_scene(), path, overwrite=True)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["a.usdz"]
+
+
+def test_name_must_end_in_usdz(tmp_path):
+    with pytest.raises(ArchiveError, match=r"must end in \.usdz, got 'a\.zip'"):
+        write_scene(empty_scene(), tmp_path / "a.zip")
+
+
+def broken(**changes):
+    """A scene with some of its static Gaussians' columns replaced."""
+    static = gaussians(5, 0)
+    return dataclasses.replace(empty_scene(), static=dataclasses.replace(static, **changes))
+
+
+NAN = np.full((5, 3), np.nan, np.float32)
+NEARSIGHTED = dataclasses.replace(lidar_model("VLP-16", np.eye(4), id="x"), range_m=(2.0, 1.0))
+FAULTS = {
+    "NaN mean": (lambda: broken(mean_m=NAN), r"static\.mean_m: 5 of 5 are not finite; the first is number 0"),
+    "doubles": (lambda: broken(mean_m=NAN.astype(float)), r"mean_m must be float32 \(5, 3\), got float64 \(5, 3\)"),
+    "lengths": (lambda: broken(opacity=np.ones(4, np.float32)), r"opacity must be float32 \(5,\), got float32 \(4,\)"),
+    "opacity": (lambda: broken(opacity=np.full(5, 1.5, np.float32)), r"opacity: 5 of 5 are outside 0\.\.1"),
+    "intensity": (lambda: broken(intensity=np.full(5, -1, np.float32)), r"intensity: 5 of 5 are outside 0\.\.1"),
+    "ray drop": (lambda: broken(ray_drop=np.full(5, 1.5, np.float32)), r"ray_drop: 5 of 5 are outside 0\.\.1"),
+    "no ray drop": (lambda: broken(ray_drop=NAN[:, 0]), r"ray_drop: 5 of 5 are not finite"),
+    "scale": (lambda: broken(scale_m=np.full((5, 3), -1, np.float32)), r"scale_m: 5 of 5 are negative"),
+    "quaternion": (lambda: broken(quat_wxyz=np.ones((5, 4), np.float32)), r"quat_wxyz: 5 of 5 are not of unit length"),
+    "label": (lambda: broken(label=np.full(5, 99, np.uint8)), r"label: 5 of 5 are not a Label"),
+    "harmonics": (lambda: broken(sh_rest=np.zeros((5, 4, 3), np.float32)), r"sh_rest has 4 coefficients"),
+    "start": (lambda: dataclasses.replace(empty_scene(), span_us=(0, 10)), r"start >= 1000000, got \(0, 10\)"),
+    "id": (lambda: dataclasses.replace(empty_scene(), id="a\n"), r"needs a printable id, got 'a\\n'"),
+    "sky": (lambda: dataclasses.replace(empty_scene(), sky=np.zeros((6, 2, 3, 3), np.float32)), r"sky must be float32"),
+    "isp": (lambda: dataclasses.replace(full_scene(), isp={"a": np.eye(4)}), r"isp\['a'\] must be float64 \(3,"),
+    "twins": (lambda: dataclasses.replace(full_scene(), tracks=full_scene().tracks[:1] * 2), "track ids must differ"),
+    "owner": (lambda: dataclasses.replace(full_scene(), tracks=[]), r"dynamic\.track: 46 of 53 are outside -1\.\.-1"),
+    "skew path": (
+        lambda: dataclasses.replace(empty_scene(), ego=Trajectory(np.array([1]), 2 * np.eye(4)[None])),
+        r"ego\.poses: 1 of 1 are not rotations",
+    ),
+    "names": (
+        lambda: dataclasses.replace(empty_scene(), rig=Rig({"a": full_scene().rig.cameras["roof"]}, {})),
+        "the rig lists the sensor 'roof' as 'a'",
+    ),
+    "LiDAR": (
+        lambda: dataclasses.replace(empty_scene(), rig=Rig({}, {"x": NEARSIGHTED})),
+        r"LiDAR 'x': range_m must be \(near, far\)",
+    ),
+    "provenance": (
+        lambda: dataclasses.replace(empty_scene(), provenance={"x": float("nan")}),
+        "cannot be written as JSON: Out of range float",
+    ),
+    "provenance kind": (
+        lambda: dataclasses.replace(empty_scene(), provenance={"path": Path("x")}),
+        "cannot be written as JSON: Object of type .*Path",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("make, text", FAULTS.values(), ids=FAULTS)
+def test_unsound_scenes_are_refused_before_anything_is_written(tmp_path, make, text):
+    with pytest.raises(ArchiveError, match=text):
+        write_scene(make(), tmp_path / "a.usdz")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_hash_sees_every_array_and_fact():
+    scene = full_scene()
+    hashes = {scene_hash(scene)}
+    for name, array in scene_arrays(scene).items():
+        array.reshape(-1).view(np.uint8)[0] ^= 1
+        hashes.add(scene_hash(scene))
+        assert len(hashes) > 1, name
+    hashes.add(scene_hash(dataclasses.replace(scene, id="other")))
+    assert len(hashes) == len(scene_arrays(scene)) + 2
+
+
+def test_whole_numbers_hash_like_floats():
+    scene = full_scene()
+    car = dataclasses.replace(scene.tracks[0], size_m=(5, 2, 1))
+    same = dataclasses.replace(scene.tracks[0], size_m=(5.0, 2.0, 1.0))
+    rest = scene.tracks[1]
+    assert scene_hash(dataclasses.replace(scene, tracks=[car, rest])) == scene_hash(
+        dataclasses.replace(scene, tracks=[same, rest])
+    )
+
+
+def test_summary_counts_what_is_there():
+    rows = dict(summary(full_scene()))
+    assert rows["static Gaussians"].startswith("400 (other 126, road 131, movable 143), harmonics degree 2")
+    assert rows["moving Gaussians"] == "53 of 2 tracks"
+    assert rows["time"] == "4.00 s from 1700000000123457 us"
+    assert rows["road map"] == "2 drivable areas, 1 lanes"
+    assert dict(summary(empty_scene()))["cameras"] == "none"
+
+
+def test_the_faces_of_the_sky_are_archived_in_their_order(tmp_path):
+    """Read without our reader: a cubemap whose face n has the colour n."""
+    sky = np.broadcast_to(np.arange(6, dtype=np.float32)[:, None, None, None] / 8, (6, 4, 4, 3)).copy()
+    write_scene(dataclasses.replace(full_scene(0), sky=sky), tmp_path / "a.usdz")
+    with zipfile.ZipFile(tmp_path / "a.usdz") as package:
+        kept = np.load(io.BytesIO(package.read("nurec_sim/sky_cubemap.npy")))
+    assert kept[:, 0, 0, 0].tolist() == [0, 0.125, 0.25, 0.375, 0.5, 0.625]
+    assert np.array_equal(read_scene(tmp_path / "a.usdz").sky, sky)

@@ -1,0 +1,147 @@
+import csv
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+from training_samples import GroundSamples, mean_difference, small_config
+
+from nurec_sim import network
+from nurec_sim.errors import TrainingError, WeightsError
+from nurec_sim.network.checkpoints.state_dicts import load_weights, read_metadata
+from nurec_sim.training.checkpoint import CHECKPOINT, read_position
+from nurec_sim.training.config import Stage, read_config
+from nurec_sim.training.trainer import CURVES, WEIGHTS, Trainer, learning_rate
+
+
+def trainer(folder, config=None):
+    return Trainer(config or small_config(), folder, GroundSamples(), mean_difference, threads=1)
+
+
+def test_a_run_that_was_cut_off_ends_with_the_same_bytes(tmp_path):
+    trainer(tmp_path / "whole").run()
+    for until in (2, 4, 7, None):
+        trainer(tmp_path / "cut").run(until=until)
+    whole, cut = ((tmp_path / name / WEIGHTS).read_bytes() for name in ("whole", "cut"))
+    state = [safetensors.torch.load_file(tmp_path / name / CHECKPOINT) for name in ("whole", "cut")]
+    assert state[0].keys() == state[1].keys()
+    assert all(torch.equal(state[0][name], state[1][name]) for name in state[0])
+    metadata = [read_metadata(tmp_path / name / WEIGHTS) for name in ("whole", "cut")]
+    assert metadata[0].pop("seconds") and metadata[1].pop("seconds") and metadata[0] == metadata[1]
+    # The header has the seconds, with as many digits as they have, and is padded to whole 8 bytes.
+    assert abs(len(whole) - len(cut)) <= 8
+
+
+def test_a_run_leaves_curves_weights_and_its_recipe(tmp_path):
+    trainer(tmp_path).run()
+    with (tmp_path / CURVES).open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["step"]) for row in rows] == list(range(1, 9))
+    assert [row["stage"] for row in rows] == ["context"] * 3 + ["motion"] * 2 + ["gaussians"] * 3
+    assert all(float(row["loss"]) > 0 for row in rows) and float(rows[-1]["psnr"]) > 5
+    assert json.loads((tmp_path / "recipe.json").read_text())["profile"] == "tiny"
+    assert (tmp_path / "samples" / "000008.png").is_file()
+    model = network.build("tiny", seed=None)
+    load_weights(model, tmp_path / WEIGHTS, "tiny")
+    assert (tmp_path / WEIGHTS).stat().st_size < 16 * 2**20
+    facts = read_metadata(tmp_path / WEIGHTS)
+    assert facts["steps"] == "8" and facts["data"] == "ground" and json.loads(facts["recipe"])["seed"] == 0
+
+
+def test_training_lowers_the_loss(tmp_path):
+    stage = {"name": "context", "steps": 30, "trains": ["encoder", "context"], "learning_rate": 2e-3, "warm_up": 3}
+    trainer(tmp_path, small_config(stages=[stage])).run()
+    with (tmp_path / CURVES).open() as file:
+        depth = [float(row["depth"]) for row in csv.DictReader(file)]
+    assert sum(depth[-5:]) < 0.75 * sum(depth[:5])
+
+
+def test_another_recipe_does_not_go_on_in_a_run_folder(tmp_path):
+    trainer(tmp_path).run(until=1)
+    with pytest.raises(TrainingError, match="another recipe"):
+        trainer(tmp_path, small_config(seed=1))
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path):
+    trainer(tmp_path).run(until=1)
+    path = tmp_path / CHECKPOINT
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(TrainingError, match="damaged"):
+        read_position(tmp_path)
+
+
+def test_training_begins_with_given_weights_and_says_what_does_not_fit(tmp_path):
+    trainer(tmp_path / "dense").run(until=1)
+    config = small_config(profile="tiny-selective", start=tmp_path / "dense" / WEIGHTS)
+    begun = trainer(tmp_path / "selective", config)
+    given = safetensors.torch.load_file(tmp_path / "dense" / WEIGHTS)["encoder.vit.blocks.0.attn.qkv.weight"]
+    assert torch.equal(begun.model.encoder.vit.blocks[0].attn.qkv.weight.half(), given)
+    with pytest.raises(WeightsError, match="no weights at"):
+        trainer(tmp_path / "none", small_config(start=tmp_path / "missing.safetensors"))
+
+
+def test_the_learning_rate_rises_and_falls():
+    stage = Stage(name="a", steps=100, trains=("encoder",), learning_rate=1.0, warm_up=10, final_rate=0.1)
+    rates = [learning_rate(stage, step) for step in range(100)]
+    assert rates[0] == pytest.approx(0.1) and max(rates) == pytest.approx(1.0) and rates.index(max(rates)) in (9, 10)
+    assert rates[-1] == pytest.approx(0.1, abs=0.01) and rates[10:] == sorted(rates[10:], reverse=True)
+
+
+def test_recipes_are_checked_key_by_key(tmp_path):
+    path = tmp_path / "recipe.yaml"
+    path.write_text("profile: tiny\nstages:\n  - {name: a, steps: 1, trains: [encoder], learning_rat: 1}\n")
+    with pytest.raises(TrainingError, match=r"stages\.0\.learning_rat: Extra inputs"):
+        read_config(path)
+    path.write_text("profile: huge\nstages: [{name: a, steps: 1, trains: [encoder]}]\n")
+    with pytest.raises(TrainingError, match="no network profile 'huge'; have"):
+        read_config(path)
+    path.write_text("- 1\n")
+    with pytest.raises(TrainingError, match="must hold keys and values"):
+        read_config(path)
+    with pytest.raises(TrainingError, match="cannot be read"):
+        read_config(tmp_path / "none.yaml")
+    path.write_text("start: w.safetensors\nstages: [{name: a, steps: 1, trains: [encoder]}]\n")
+    assert read_config(path).start == tmp_path / "w.safetensors"
+
+
+RANK_PROGRAM = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import torch
+torch.set_num_threads(1)
+from training_samples import GroundSamples, mean_difference, small_config
+from nurec_sim.training.processes import Processes
+from nurec_sim.training.trainer import Trainer
+processes = Processes.from_torchrun()
+run = Trainer(small_config(), Path({folder!r}), GroundSamples(), mean_difference, processes, threads=1)
+run.run(until=6)
+total = sum(float(p.double().sum()) for p in run.model.parameters())
+print(f"rank {{processes.rank}} of {{processes.count}}: {{total:.12f}}")
+processes.leave()
+"""
+
+
+def test_two_processes_keep_the_same_weights_and_one_of_them_writes(tmp_path):
+    program = RANK_PROGRAM.format(tests=str(Path(__file__).parents[1] / "helpers"), folder=str(tmp_path / "run"))
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    common = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1"}
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, "-c", program], env=os.environ | common | {"RANK": str(rank)}, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )
+        for rank in range(2)
+    ]  # fmt: skip
+    said = [process.communicate(timeout=300) for process in ranks]
+    assert [process.returncode for process in ranks] == [0, 0], said
+    totals = [out.split(": ")[1].strip() for out, _ in said]
+    assert totals[0] == totals[1]
+    assert read_position(tmp_path / "run").step == 6
