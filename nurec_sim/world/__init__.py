@@ -10,7 +10,7 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "build.model": ["Town", "build_town"],
+        "model.assemble": ["Town", "build_town"],
         "plan.layout": ["town_plan"],
         "plan.network": ["TownNetwork"],
         "plan.random_rigs": ["random_readout_us", "random_rig"],

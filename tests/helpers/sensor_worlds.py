@@ -9,7 +9,7 @@ import pytest
 
 from nurec_sim.types import LidarModel, SensorRequest
 from nurec_sim.world import TrueWorld, pick_backend, town_plan
-from nurec_sim.world.build.model import build_town
+from nurec_sim.world.model.assemble import build_town
 from nurec_sim.world.sense import simulator as sense
 
 NEAR_THE_DRIVE_M = 60.0

@@ -8,8 +8,8 @@ import shapely
 from nurec_sim import geometry, sensors
 from nurec_sim.types import Label, SensorRequest
 from nurec_sim.world import TrueWorld, pick_backend, street_rig
-from nurec_sim.world.build.builder import DECAL_ALPHA, DECAL_GROUP
-from nurec_sim.world.build.model import FAR_M, build_town
+from nurec_sim.world.model.assemble import FAR_M, build_town
+from nurec_sim.world.model.builder import DECAL_ALPHA, DECAL_GROUP
 from nurec_sim.world.plan.layout import town_plan
 from nurec_sim.world.plan.surface import LABEL_OF_CLASS, SurfaceClass
 

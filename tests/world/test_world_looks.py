@@ -16,8 +16,8 @@ from nurec_sim.world.assets.fixtures import fixture_parts
 from nurec_sim.world.assets.meshes import MeshBuilder, icosphere
 from nurec_sim.world.assets.vehicle_families import FAMILIES
 from nurec_sim.world.assets.vehicle_meshes import vehicle_parts
-from nurec_sim.world.build.sky import Sky
-from nurec_sim.world.build.weather import add_fog, illumination
+from nurec_sim.world.model.sky import Sky
+from nurec_sim.world.model.weather import add_fog, illumination
 from nurec_sim.world.plan import splits
 from nurec_sim.world.plan.town import PROP_KINDS, SIGNS, Prop, Weather
 

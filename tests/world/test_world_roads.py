@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from nurec_sim import geometry
 from nurec_sim.world import Road, RoadLine, RoadPiece, TownNetwork
-from nurec_sim.world.build.triangles import ground_triangles, on_ground
+from nurec_sim.world.model.triangles import ground_triangles, on_ground
 from nurec_sim.world.plan import splits
 from nurec_sim.world.plan.junctions import join, reaches
 from nurec_sim.world.plan.layout import still_town

@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from nurec_sim.world import SurfaceClass, TownNetwork
-from nurec_sim.world.build.model import build_town
+from nurec_sim.world.model.assemble import build_town
 from nurec_sim.world.plan.layout import still_town
 
 

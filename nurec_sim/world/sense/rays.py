@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
-from nurec_sim.world.build.model import Town
+from nurec_sim.world.model.assemble import Town
 from nurec_sim.world.sense.faces import Seen
 
 REACH_M = 1400.0

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, UInt8
 
 from nurec_sim.types import Pinhole
-from nurec_sim.world.build.builder import DECAL_GROUP
-from nurec_sim.world.build.model import Town
+from nurec_sim.world.model.assemble import Town
+from nurec_sim.world.model.builder import DECAL_GROUP
 from nurec_sim.world.sense.backend import gl_context
 from nurec_sim.world.sense.faces import Drawn, Face
 

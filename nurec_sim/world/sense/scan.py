@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, Int32, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.types import LidarModel, SensorRequest
-from nurec_sim.world.build.model import Town
+from nurec_sim.world.model.assemble import Town
 from nurec_sim.world.sense import rays
 from nurec_sim.world.sense.faces import Seen
 from nurec_sim.world.sense.shutter import lidar_patches

@@ -15,7 +15,7 @@ from jaxtyping import Float32, Float64, Int32, UInt8
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError, TooLargeError
 from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, LidarModel, SensorFrame, SensorRequest, Shutter
-from nurec_sim.world.build.model import Town, build_town
+from nurec_sim.world.model.assemble import Town, build_town
 from nurec_sim.world.plan.surface import LABEL_OF_CLASS
 from nurec_sim.world.plan.town import TownPlan
 from nurec_sim.world.sense import scan

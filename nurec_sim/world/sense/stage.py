@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int32, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.types import CameraModel, SensorRequest, Shutter, Trajectory
-from nurec_sim.world.build.model import ActorPlaces, Town
+from nurec_sim.world.model.assemble import ActorPlaces, Town
 from nurec_sim.world.plan.surface import SurfaceClass
 from nurec_sim.world.sense import rays
 from nurec_sim.world.sense.faces import Seen

@@ -9,8 +9,8 @@ from jaxtyping import Float64
 from nurec_sim.world.assets.meshes import MeshBuilder
 from nurec_sim.world.assets.textures import noise
 from nurec_sim.world.assets.textures_ground import ASPHALT_TILE_M, GRASS_TILE_M, PAVING_TILE_M
-from nurec_sim.world.build.chunks import Chunks
-from nurec_sim.world.build.triangles import STEP_M, ground_triangles, on_ground
+from nurec_sim.world.model.chunks import Chunks
+from nurec_sim.world.model.triangles import STEP_M, ground_triangles, on_ground
 from nurec_sim.world.plan.network import TownNetwork
 from nurec_sim.world.plan.surface import SurfaceClass
 

@@ -10,7 +10,7 @@ import numpy as np
 from nurec_sim.geometry import box_corners_xy, pose_from_xyyaw
 from nurec_sim.world.assets.meshes import MeshBuilder
 from nurec_sim.world.assets.textures_facades import BAYS, FLOORS
-from nurec_sim.world.build.chunks import Chunks
+from nurec_sim.world.model.chunks import Chunks
 from nurec_sim.world.plan.surface import SurfaceClass
 from nurec_sim.world.plan.terrain import Terrain
 from nurec_sim.world.plan.town import Building

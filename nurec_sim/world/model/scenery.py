@@ -7,11 +7,11 @@ import numpy as np
 from nurec_sim.geometry import pose_from_xyyaw
 from nurec_sim.world.assets import trees
 from nurec_sim.world.assets.fixtures import Part, fixture_parts
-from nurec_sim.world.build.builder import SpecBuilder
-from nurec_sim.world.build.chunks import Chunks
-from nurec_sim.world.build.ground_meshes import add_ground, add_light_pools
-from nurec_sim.world.build.houses import add_house
-from nurec_sim.world.build.materials import LAMPS_ON
+from nurec_sim.world.model.builder import SpecBuilder
+from nurec_sim.world.model.chunks import Chunks
+from nurec_sim.world.model.ground_meshes import add_ground, add_light_pools
+from nurec_sim.world.model.houses import add_house
+from nurec_sim.world.model.materials import LAMPS_ON
 from nurec_sim.world.plan.network import TownNetwork
 from nurec_sim.world.plan.surface import SurfaceClass
 from nurec_sim.world.plan.town import Prop

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from nurec_sim.world.build.sky import Colour, Sky, sun_direction
+from nurec_sim.world.model.sky import Colour, Sky, sun_direction
 from nurec_sim.world.plan.town import Weather
 
 

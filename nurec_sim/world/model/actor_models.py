@@ -13,7 +13,7 @@ from nurec_sim.world.assets import people, textures_ground, textures_people, tex
 from nurec_sim.world.assets.meshes import Corners, MeshBuilder
 from nurec_sim.world.assets.vehicle_families import FAMILIES
 from nurec_sim.world.assets.vehicle_meshes import vehicle_parts
-from nurec_sim.world.build.builder import SpecBuilder
+from nurec_sim.world.model.builder import SpecBuilder
 from nurec_sim.world.plan.surface import SurfaceClass
 from nurec_sim.world.plan.town import Actor, TownPlan
 

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
 from nurec_sim import geometry
-from nurec_sim.world.build.actor_models import ActorBuilder, Gait
-from nurec_sim.world.build.builder import SpecBuilder
-from nurec_sim.world.build.materials import add_materials
-from nurec_sim.world.build.scenery import add_scenery
-from nurec_sim.world.build.sky import Sky
-from nurec_sim.world.build.weather import add_fog, add_lights
+from nurec_sim.world.model.actor_models import ActorBuilder, Gait
+from nurec_sim.world.model.builder import SpecBuilder
+from nurec_sim.world.model.materials import add_materials
+from nurec_sim.world.model.scenery import add_scenery
+from nurec_sim.world.model.sky import Sky
+from nurec_sim.world.model.weather import add_fog, add_lights
 from nurec_sim.world.plan.network import TownNetwork
 from nurec_sim.world.plan.town import TownPlan
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from nurec_sim.world.assets import textures_facades, textures_ground, textures_plants, textures_signs, textures_vehicles
-from nurec_sim.world.build.builder import SpecBuilder
-from nurec_sim.world.build.sky import Sky
-from nurec_sim.world.build.weather import illumination
+from nurec_sim.world.model.builder import SpecBuilder
+from nurec_sim.world.model.sky import Sky
+from nurec_sim.world.model.weather import illumination
 from nurec_sim.world.plan.town import SIGNS, TownPlan
 
 WET_DARKER = 0.45

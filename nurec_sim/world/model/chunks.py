@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nurec_sim.world.assets.meshes import MeshBuilder
-from nurec_sim.world.build.builder import SpecBuilder
+from nurec_sim.world.model.builder import SpecBuilder
 from nurec_sim.world.plan.surface import SurfaceClass
 
 CHUNK_M = 40.0
