@@ -3,6 +3,9 @@ from pathlib import Path
 
 import pytest
 
+# Asserts in helpers show the values that they compared, as those in tests do.
+pytest.register_assert_rewrite(*(path.stem for path in (Path(__file__).parent / "helpers").glob("*.py")))
+
 if "PYTEST_XDIST_WORKER" in os.environ:
     # As many workers as cores: more threads in each of them would only wait for one another.
     os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -256,8 +256,8 @@ def test_parts_of_the_package_load_on_first_use() -> None:
 
 
 def test_scenes_and_rollouts_show_themselves_in_three_lines() -> None:
+    from metrics_worlds import full_rollout
     from serving_world import scene
-    from test_runs import full_rollout
 
     lines = repr(scene()).splitlines()
     assert lines == [

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from nurec_sim import geometry
+from nurec_sim.sensors import lidar_model
 from nurec_sim.types import (
     CameraModel,
     DynamicGaussians,
@@ -93,6 +96,16 @@ def failed_rollout(**changes) -> Rollout:
 
 def standing(count: int, x: float, y: float, yaw: float = 0.0, z: float = 0.75) -> np.ndarray:
     return np.repeat(geometry.pose_from_xyyaw(x, y, yaw, z)[None], count, axis=0)
+
+
+def full_rollout() -> Rollout:
+    """Every field of a rollout in use: a LiDAR, an actor that appears late, a plan that ends the session, an event."""
+    sensors = Rig(rig().cameras, {"top": lidar_model("VLP-16", np.eye(4), id="top", columns=90)})
+    poses = standing(20, 15.0, 3.0)
+    poses[:4] = np.nan
+    run = rollout(straight_poses(20), {"a": poses, "b": standing(20, 40, 0)}, rig=sensors)
+    stop = (run.plans[-1][0], Plan(run.plans[-1][1].t_us[:3], run.plans[-1][1].pose[:3], stop_session=True))
+    return dataclasses.replace(run, plans=(*run.plans[:-1], stop), events=(Event(2_000_000, "clipped", "ä \n 'x'"),))
 
 
 # ------------------------------------------------------------------------------------------------- Gaussian S-curve

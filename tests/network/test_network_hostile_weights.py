@@ -9,7 +9,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from network_weights import part
-from test_network_checkpoints import Contract, Runs, assert_same, repacked, training_file
+from training_files import Contract, Runs, assert_same, repacked, training_file
 
 from nurec_sim.errors import WeightsError
 from nurec_sim.files.torch_pickle import OTHER, StoredTensor, read_tensor_pickle

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from metrics_worlds import failed_rollout, flat_street, rig, rollout, standing, straight_poses
+from metrics_worlds import failed_rollout, flat_street, full_rollout, rollout, standing, straight_poses
 
 from nurec_sim import runs, sim
 from nurec_sim.errors import RequestError, RunError, ScenarioError
@@ -20,8 +20,7 @@ from nurec_sim.runs import folder as layout
 from nurec_sim.runs.rollout_file import load_rollout, save_rollout
 from nurec_sim.runs.scene_file import load_scene_record, record_scene, save_scene_record
 from nurec_sim.scene import codec
-from nurec_sim.sensors import lidar_model
-from nurec_sim.types import CameraFrame, Event, Needs, Plan, Rig
+from nurec_sim.types import CameraFrame, Needs, Plan
 
 
 def striped(requests):
@@ -55,15 +54,6 @@ def assert_same(a, b):
     for (made_a, plan_a), (made_b, plan_b) in zip(a.plans, b.plans, strict=True):
         assert made_a == made_b and plan_a.stop_session == plan_b.stop_session
         assert np.array_equal(plan_a.t_us, plan_b.t_us) and np.array_equal(plan_a.pose, plan_b.pose)
-
-
-def full_rollout():
-    sensors = Rig(rig().cameras, {"top": lidar_model("VLP-16", np.eye(4), id="top", columns=90)})
-    poses = standing(20, 15.0, 3.0)
-    poses[:4] = np.nan
-    run = rollout(straight_poses(20), {"a": poses, "b": standing(20, 40, 0)}, rig=sensors)
-    stop = (run.plans[-1][0], Plan(run.plans[-1][1].t_us[:3], run.plans[-1][1].pose[:3], stop_session=True))
-    return dataclasses.replace(run, plans=(*run.plans[:-1], stop), events=(Event(2_000_000, "clipped", "ä \n 'x'"),))
 
 
 @pytest.mark.parametrize(

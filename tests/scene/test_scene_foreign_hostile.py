@@ -14,23 +14,14 @@ from pathlib import Path
 import foreign_files as made
 import numpy as np
 import pytest
+from nurec_archives import ONE_ACTOR, small_arrays
 from ply_files import standard, values
 
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene import read_scene
-from nurec_sim.types import Label
 
 MUTATIONS = 36
 """Of each kind; ``NUREC_SIM_MUTATIONS`` sets another number."""
-
-
-def small_arrays():
-    parts = {"background": made.gaussians(6, 1, [4, -8, 0], [30, 8, 5]),
-             "dynamic_rigids": (made.gaussians(4, 2, [-1, -1, -1], [1, 1, 1], Label.MOVABLE), np.zeros(4))}  # fmt: skip
-    return made.nurec_arrays(parts, sky=np.full((6, 2, 2, 3), 0.5))
-
-
-IDS = {"dynamic_rigids": ["car-7"]}
 
 
 def refused(path, text):
@@ -54,7 +45,7 @@ def array(key, values, shape=None):
 
 @pytest.mark.parametrize("part", [0.05, 0.5, 0.99])
 def test_cut_volumes(tmp_path, part):
-    data = made.volume(small_arrays(), IDS)
+    data = made.volume(small_arrays(), ONE_ACTOR)
     (tmp_path / "a.nurec").write_bytes(data[: int(len(data) * part)])
     refused(tmp_path / "a.nurec", "cut short|not a gzip file")
 
@@ -107,7 +98,7 @@ def test_arrays_that_are_not_what_they_say(tmp_path, state, text):
 )
 def test_layers_whose_arrays_do_not_fit(tmp_path, name, values, text):
     content = small_arrays() | {f"gaussians_nodes.background.{name}": values}
-    (tmp_path / "a.nurec").write_bytes(made.volume(content, IDS))
+    (tmp_path / "a.nurec").write_bytes(made.volume(content, ONE_ACTOR))
     refused(tmp_path / "a.nurec", text)
 
 
@@ -123,7 +114,7 @@ class Trap:
 
 def test_checkpoints_are_never_unpickled(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    good = made.checkpoint(small_arrays(), IDS)
+    good = made.checkpoint(small_arrays(), ONE_ACTOR)
     (tmp_path / "good.ckpt").write_bytes(good)
     with zipfile.ZipFile(tmp_path / "good.ckpt") as source, zipfile.ZipFile(tmp_path / "a.ckpt", "w") as writer:
         for name in source.namelist():
@@ -159,7 +150,7 @@ def test_a_checkpoint_that_shows_the_same_values_many_times(tmp_path):
     ],
 )
 def test_sidecars_without_what_they_are_for(tmp_path, name, content, text):
-    members = {"volume.nurec": made.volume(small_arrays(), IDS)} | made.json_sidecars(**{name: content})
+    members = {"volume.nurec": made.volume(small_arrays(), ONE_ACTOR)} | made.json_sidecars(**{name: content})
     refused(made.usdz(tmp_path / "a.usdz", members), text)
 
 
@@ -184,17 +175,17 @@ def mutated(data, rng):
 
 
 def mutated_volume(rng):
-    return {"volume.nurec": gzip.compress(mutated(zlib.decompress(made.volume(small_arrays(), IDS), 31), rng), 1)}
+    return {"volume.nurec": gzip.compress(mutated(zlib.decompress(made.volume(small_arrays(), ONE_ACTOR), 31), rng), 1)}
 
 
 def mutated_checkpoint(rng):
-    return {"checkpoint.ckpt": mutated(made.checkpoint(small_arrays(), IDS), rng)}
+    return {"checkpoint.ckpt": mutated(made.checkpoint(small_arrays(), ONE_ACTOR), rng)}
 
 
 def mutated_pickle(rng):
     """The instructions alone are changed, behind a fitting checksum."""
     result = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(made.checkpoint(small_arrays(), IDS))) as source:
+    with zipfile.ZipFile(io.BytesIO(made.checkpoint(small_arrays(), ONE_ACTOR))) as source:
         with zipfile.ZipFile(result, "w") as writer:
             for name in source.namelist():
                 data = source.read(name)
@@ -219,7 +210,7 @@ MAKERS = [mutated_volume, mutated_checkpoint, mutated_pickle, mutated_sidecars, 
 @pytest.mark.parametrize("make", MAKERS)
 @pytest.mark.filterwarnings("error")
 def test_mutated_archives_give_only_archive_errors(tmp_path, make):
-    good = {"volume.nurec": made.volume(small_arrays(), IDS), **made.json_sidecars([made.curved_track()])}
+    good = {"volume.nurec": made.volume(small_arrays(), ONE_ACTOR), **made.json_sidecars([made.curved_track()])}
     if make not in (mutated_volume, mutated_sidecars):
         del good["volume.nurec"]
     opened = 0

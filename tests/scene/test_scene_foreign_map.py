@@ -3,7 +3,7 @@
 import foreign_files as made
 import numpy as np
 import pytest
-from test_scene_foreign_hostile import small_arrays
+from nurec_archives import small_arrays
 
 from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError

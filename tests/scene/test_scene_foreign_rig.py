@@ -6,9 +6,9 @@ import json
 import foreign_files as made
 import numpy as np
 import pytest
+from nurec_archives import ONE_ACTOR, small_arrays
 from ply_files import standard, values
 from scene_worlds import full_scene
-from test_scene_foreign_hostile import IDS, small_arrays
 
 from nurec_sim import geometry, sensors
 from nurec_sim.files.zip_package import Package
@@ -22,7 +22,7 @@ def off_line(line, points):
 
 
 def opened(tmp_path, **kwargs):
-    members = {"volume.nurec": made.volume(small_arrays(), IDS)} | made.json_sidecars(**kwargs)
+    members = {"volume.nurec": made.volume(small_arrays(), ONE_ACTOR)} | made.json_sidecars(**kwargs)
     return read_scene(made.usdz(tmp_path / "a.usdz", members))
 
 
@@ -127,7 +127,7 @@ def test_tracks_with_faults_are_repaired_or_named(tmp_path):
 
 
 def test_missing_pieces_get_defaults_that_are_named(tmp_path):
-    scene = read_scene(made.usdz(tmp_path / "plain.usdz", {"volume.nurec": made.volume(small_arrays(), IDS)}))
+    scene = read_scene(made.usdz(tmp_path / "plain.usdz", {"volume.nurec": made.volume(small_arrays(), ONE_ACTOR)}))
     assert scene.id == "plain" and scene.span_us == (1_000_000, 2_000_000) and list(scene.rig.cameras) == ["camera"]
     unknown = "\n".join(scene.provenance["unknown"])
     for text in ("no rig_trajectories.json", "no sequence_tracks.json", "one camera looks along x", "no road map",

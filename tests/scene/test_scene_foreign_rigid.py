@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 from gpu_on_cpu.places import PLACES, launcher_at
+from moving_layers import TRACKS, assert_packed_is_readable, layer
 from render_scenes import START_US, camera, cloud, moved, moving_cloud, psnr_db, request, scene
-from test_render_moving import TRACKS, check, layer
 
 from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
@@ -33,7 +33,7 @@ def mixed(sh=3):
 @pytest.mark.parametrize("t_us", [START_US, START_US + 50_000, LATE_US])
 @pytest.mark.parametrize("asked", [(), ("near",), ("near", "far")])
 def test_the_packed_layer_is_the_readable_one(t_us, asked):
-    count = check(mixed(), t_us, {name: moved(0.4, 5, -3) for name in asked})
+    count = assert_packed_is_readable(mixed(), t_us, {name: moved(0.4, 5, -3) for name in asked})
     assert (count > 100 * len(asked)) if asked else (count > 0) == (t_us != LATE_US)
 
 

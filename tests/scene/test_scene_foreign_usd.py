@@ -5,7 +5,7 @@ import dataclasses
 import foreign_files as made
 import numpy as np
 import pytest
-from test_scene_foreign import background, psnr, road
+from nurec_archives import background, psnr, road
 
 from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError

@@ -4,7 +4,7 @@ import foreign_files as made
 import numpy as np
 import pytest
 import scene_worlds
-from test_scene_foreign import AT_US, IDS, archive, arrays, picture, psnr, truth
+from nurec_archives import AT_US, IDS, archive, arrays, picture, psnr, truth
 
 from nurec_sim import cli
 from nurec_sim.scene import import_scene, read_scene

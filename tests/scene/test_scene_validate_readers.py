@@ -10,10 +10,10 @@ import numpy as np
 import ply_files
 import pytest
 import tiny_clip
+from nurec_archives import IDS, archive, arrays
 from scene_readers import InvalidSceneError, carla_project, read_artifact, read_carla, read_json
 from scene_worlds import START_US, cameras, empty_scene, full_scene
 from spoilt_archives import SIDECAR_BREAKS, complete_scene, members_of
-from test_scene_foreign import IDS, archive, arrays
 
 from nurec_sim import geometry, logs, sensors
 from nurec_sim.files.zip_package import write_package
