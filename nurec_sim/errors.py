@@ -14,7 +14,7 @@
     │   ├── UnsupportedError   a procedure that this server lacks      (gRPC UNIMPLEMENTED)
     │   └── NotAllowedError    what this server was told not to do     (gRPC PERMISSION_DENIED)
     ├── SceneInUseError  a scene cannot be taken away now             (gRPC FAILED_PRECONDITION)
-    ├── GivenUpError     work ended because nobody waits for it       (gRPC CANCELLED)
+    ├── CancelledError   work was cancelled: nobody waits for it      (gRPC CANCELLED)
     ├── DeadlinePassedError  the client's deadline passed before the answer  (gRPC DEADLINE_EXCEEDED)
     ├── PlanError        a policy failed, or answered what cannot be driven  (gRPC ABORTED)
     │   └── PolicyError        it raised, tried to end the process, or did not answer in time
@@ -76,8 +76,8 @@ class SceneInUseError(NurecSimError):
     """A scene cannot be taken away while somebody uses it."""
 
 
-class GivenUpError(NurecSimError):
-    """Work ended because nobody waits for its result any more."""
+class CancelledError(NurecSimError):
+    """Work was cancelled: nobody waits for its result any more."""
 
 
 class DeadlinePassedError(NurecSimError):

@@ -7,42 +7,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import grpc
-from grpc_health.v1 import health_pb2, health_pb2_grpc
-
-from nurec_sim.errors import NurecSimError, ServerError
-from nurec_sim.serving.channels import open_channel
+from nurec_sim.errors import NurecSimError
+from nurec_sim.serving.health import check_health
 
 TIMEOUT_S = 4.0
-
-
-def health(address: str, *, root_ca: Path | None = None, timeout: float = TIMEOUT_S) -> str:
-    """Ask a gRPC server whether it serves; exit status 1 if it does not, or not yet.
-
-    Args:
-        address: host:port, of the server or of its --health-port.
-        root_ca: certificates (PEM) that vouch for a server with TLS.
-        timeout: seconds to wait for an answer.
-
-    Raises:
-        ServerError: no answer, or another than SERVING.
-    """
-    with open_channel(address, root_ca) as channel:
-        try:
-            reply = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=timeout)
-        except grpc.RpcError as error:
-            raise ServerError(f"{address}: {error.code().name}: {error.details()}") from None
-    status = health_pb2.HealthCheckResponse.ServingStatus.Name(reply.status)
-    if status != "SERVING":
-        raise ServerError(f"{address}: {status}")
-    return status
 
 
 def run(words: Sequence[str]) -> None:
     """The verb, from the words that follow it; prints the status, or one line on stderr and exits with 1."""
     given = _parser().parse_args(words)
     try:
-        print(f"{given.address}: {health(given.address, root_ca=given.root_ca, timeout=given.timeout)}")
+        print(f"{given.address}: {check_health(given.address, root_ca=given.root_ca, timeout_s=given.timeout)}")
     except NurecSimError as error:
         print(f"nurec-sim: {error}", file=sys.stderr)
         raise SystemExit(1) from None

@@ -133,9 +133,9 @@ def serve_grpc(
 def health(address: str, *, root_ca: Path | None = None, timeout: float = 4.0) -> None:
     """Ask a gRPC server whether it serves; exit status 1 if it does not, or not yet."""
     # Here for the list of verbs: `cli.main` goes to the other module at once, which starts quicker.
-    from nurec_sim.cli import health as probe
+    from nurec_sim.serving.health import check_health
 
-    probe.health(address, root_ca=root_ca, timeout=timeout)
+    check_health(address, root_ca=root_ca, timeout_s=timeout)
 
 
 def sort_serve_grpc(arguments: Sequence[str]) -> list[str]:

@@ -25,7 +25,7 @@ class Turn(Protocol):
         """Returns when it may go on; from the thread that the work was begun in.
 
         Raises:
-            GivenUpError: nobody waits for the result any more.
+            CancelledError: nobody waits for the result any more.
             DeadlinePassedError: the client has stopped waiting.
         """
         ...
@@ -57,7 +57,7 @@ def rest() -> None:
     """Lets others have their turn if this one is over.
 
     Raises:
-        GivenUpError, DeadlinePassedError: see ``Turn.rest``.
+        CancelledError, DeadlinePassedError: see ``Turn.rest``.
     """
     turn = _current.get()
     if turn is not None and turn.is_over:

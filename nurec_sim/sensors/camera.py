@@ -78,7 +78,7 @@ def pixel_ray_strips(
     """``pixel_rays`` by strips of rows, each with its place, for images that are too large to hold in double precision.
 
     Raises:
-        GivenUpError, DeadlinePassedError: see ``compute.turns.rest``.
+        CancelledError, DeadlinePassedError: see ``compute.turns.rest``.
     """
     if _is_usual(camera):
         yield slice(0, camera.height_px), *pixel_rays(camera)

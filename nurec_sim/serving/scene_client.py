@@ -101,7 +101,7 @@ class SceneClient(Connection):
             method: ``lift``, ``dense`` or ``selective``; empty for the server's choice.
             profile: size of the network.
             cameras: ids of the cameras to use.
-            progress: hears what is being done and the fraction of it that is; if it raises, the server gives up too.
+            progress: called with the stage and the fraction done; if it raises, the server cancels the work.
             timeout_s: for all of it.
         """
         clip = {"path": path} if path else {"scene_id": scene_id}

@@ -137,7 +137,7 @@ def test_a_slow_policy_misses_its_deadline_holds_up_nobody_and_goes_on(slow):
         assert status(stub.drive, drive_message(), timeout=0.3)[0] is Code.DEADLINE_EXCEEDED
         assert time.monotonic() - began < 5
         stub.submit_egomotion_observation(ego_message(), timeout=5)
-        # One call that has been given up before its turn is never planned; the thread of the session is still busy.
+        # One call that was cancelled before its turn is never planned; the thread of the session is still busy.
         assert status(stub.drive, drive_message(), timeout=0.3)[0] is Code.DEADLINE_EXCEEDED
         assert status(stub.drive, drive_message(session="other"), timeout=0.3)[0] is Code.DEADLINE_EXCEEDED
         assert slow.planning == 2

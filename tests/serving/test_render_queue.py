@@ -7,7 +7,7 @@ import time
 import pytest
 
 from nurec_sim.compute.turns import aside, current_turn, rest
-from nurec_sim.errors import DeadlinePassedError, GivenUpError
+from nurec_sim.errors import CancelledError, DeadlinePassedError
 from nurec_sim.render.cpu.workers import Workers
 from nurec_sim.serving.calls import Call, enter_call
 from nurec_sim.serving.sensor_service.render_queue import LARGE_RAYS, MOST_RAYS, TURN_S, RenderQueue
@@ -69,7 +69,7 @@ def test_kernels_stop_soon_after_their_client_has_left(rests):
     def frame():
         try:
             Workers(2).run_calls([(lambda: (count.append(1), time.sleep(0.005)),)] * 100_000)
-        except GivenUpError:
+        except CancelledError:
             ended.append(time.monotonic())
             raise
 
@@ -78,8 +78,8 @@ def test_kernels_stop_soon_after_their_client_has_left(rests):
         task = start(queue, "a", 1, frame)
         await until(lambda: len(count) > 3)
         left = time.monotonic()
-        for given_up in (task, *others):
-            given_up.cancel()
+        for cancelled in (task, *others):
+            cancelled.cancel()
         await until(lambda: ended)
         return ended[0] - left
 
@@ -99,7 +99,7 @@ def test_a_deadline_ends_work_that_rests():
     run(1, main)
 
 
-def test_what_was_given_up_before_its_turn_is_not_begun():
+def test_what_was_cancelled_before_its_turn_is_not_begun():
     gate, begun = threading.Event(), []
 
     async def main(queue):

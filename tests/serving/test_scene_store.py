@@ -8,7 +8,7 @@ import pytest
 from serving_calls import wait_until
 from serving_world import scene
 
-from nurec_sim.errors import ArchiveError, GivenUpError, SceneInUseError, UnknownSceneError
+from nurec_sim.errors import ArchiveError, CancelledError, SceneInUseError, UnknownSceneError
 from nurec_sim.render import Renderer
 from nurec_sim.scene import write_scene
 from nurec_sim.scene.describe import scene_arrays
@@ -144,7 +144,7 @@ def test_a_load_that_one_gives_up_is_begun_anew_for_who_waits(monkeypatch, tmp_p
 
     def progress(stage, fraction):
         if left.is_set():
-            raise GivenUpError("the client left")
+            raise CancelledError("the client left")
 
     with ThreadPoolExecutor(2) as pool:
         impatient = pool.submit(store.get, "drive", progress)
@@ -153,7 +153,7 @@ def test_a_load_that_one_gives_up_is_begun_anew_for_who_waits(monkeypatch, tmp_p
         wait_until(lambda: store.entries[0].users == 2)
         assert store.entries[0].loading and store.loaded_ids == ()
         left.set()
-        assert isinstance(impatient.exception(20), GivenUpError)
+        assert isinstance(impatient.exception(20), CancelledError)
         wait_until(lambda: len(clips.begun) == 2)
         clips.gate.set()
         assert patient.result(20).scene.id == "drive"

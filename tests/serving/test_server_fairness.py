@@ -136,7 +136,7 @@ def test_a_request_that_is_too_large_is_not_received():
 
 
 class Resting:
-    """A renderer whose large images take until they are let go, or given up, and rest meanwhile."""
+    """A renderer whose large images take until they are let go, or cancelled, and rest meanwhile."""
 
     def __init__(self, world):
         self.inner, self.go, self.begun, self.ended = street_renderer(), threading.Event(), threading.Event(), 0

@@ -160,11 +160,11 @@ def test_what_a_client_gave_up_is_not_rendered():
     with SensorServer(store, port=0, options=one) as address, Stub(address) as stub:
         first = stub.render_rgb.future(camera_message(camera_request(t_us=5_100_000)))
         wait_until(lambda: gated.begun)
-        given_up = stub.render_rgb.future(camera_message(camera_request(t_us=5_200_000)))
+        cancelled = stub.render_rgb.future(camera_message(camera_request(t_us=5_200_000)))
         too_late = stub.render_rgb.future(camera_message(camera_request(t_us=5_300_000)), timeout=0.3)
         assert health_pb2_grpc.HealthStub(stub.channel).Check(health_pb2.HealthCheckRequest(), timeout=1).status == 1
         assert too_late.exception().code() == Code.DEADLINE_EXCEEDED
-        given_up.cancel()
+        cancelled.cancel()
         time.sleep(0.2)
         gated.gate.set()
         assert first.result().image_bytes

@@ -208,13 +208,13 @@ def test_who_waits_for_the_scene_gets_it_though_the_other_leaves(client, address
 def test_of_two_clients_the_second_gets_the_scene_though_the_first_leaves(client, address, clip, method, store):
     leave = threading.Event()
 
-    def give_up(stage, fraction):
+    def cancel(stage, fraction):
         if leave.is_set():
             raise InterruptedError
 
     def first():
         with SceneClient(address) as other, pytest.raises(InterruptedError):
-            other.reconstruct(path=str(clip), progress=give_up)
+            other.reconstruct(path=str(clip), progress=cancel)
 
     with ThreadPoolExecutor(2) as pool:
         leaving = pool.submit(first)

@@ -34,7 +34,7 @@ class Workers:
         Between calls, the work rests when its turn is over (``turns``); its helpers are then free for others.
 
         Raises:
-            GivenUpError, DeadlinePassedError: see ``compute.turns.rest``.
+            CancelledError, DeadlinePassedError: see ``compute.turns.rest``.
         """
         results: list = [None] * len(calls)
         numbers = itertools.count()  # next() of it is atomic

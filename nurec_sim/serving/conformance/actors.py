@@ -9,8 +9,8 @@ import numpy as np
 
 from nurec_sim import geometry
 from nurec_sim.serving import wire
-from nurec_sim.serving.conformance.kit import Skipped, check, expect
-from nurec_sim.serving.conformance.target import Target, difference, place, unit_error
+from nurec_sim.serving.conformance.kit import check
+from nurec_sim.serving.conformance.target import Skipped, Target, difference, expect, place, unit_error
 from nurec_sim.types import Matrix4, Track
 
 _BELOW_M = 100.0  # where AlpaSim hides actors

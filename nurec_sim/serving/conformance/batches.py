@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import grpc
 
-from nurec_sim.serving.conformance.kit import check, expect
-from nurec_sim.serving.conformance.target import Target
+from nurec_sim.serving.conformance.kit import check
+from nurec_sim.serving.conformance.target import Target, expect
 from nurec_sim.serving.wire import sensorsim
 
 

@@ -6,8 +6,8 @@ import math
 
 import grpc
 
-from nurec_sim.serving.conformance.kit import Failed, check, expect
-from nurec_sim.serving.conformance.target import HEIGHT_PX, Target, difference
+from nurec_sim.serving.conformance.kit import check
+from nurec_sim.serving.conformance.target import HEIGHT_PX, Failed, Target, difference, expect
 from nurec_sim.serving.wire import sensorsim
 
 WIDTH_PX = 160

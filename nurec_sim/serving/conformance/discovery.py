@@ -5,8 +5,8 @@ from __future__ import annotations
 import grpc
 
 from nurec_sim.serving import wire
-from nurec_sim.serving.conformance.kit import Skipped, check, expect
-from nurec_sim.serving.conformance.target import Target, unit_error
+from nurec_sim.serving.conformance.kit import check
+from nurec_sim.serving.conformance.target import Skipped, Target, expect, unit_error
 from nurec_sim.serving.wire import sensorsim
 
 _NRE, _NUREC, _SHORT = wire.SERVICE_PATHS

@@ -5,8 +5,8 @@ from __future__ import annotations
 import grpc
 import numpy as np
 
-from nurec_sim.serving.conformance.kit import Skipped, check, expect
-from nurec_sim.serving.conformance.target import Target
+from nurec_sim.serving.conformance.kit import check
+from nurec_sim.serving.conformance.target import Skipped, Target, expect
 from nurec_sim.serving.wire import sensorsim
 from nurec_sim.serving.wire.poses import write_poses
 

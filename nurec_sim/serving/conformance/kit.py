@@ -6,12 +6,10 @@ import enum
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import grpc
 
-if TYPE_CHECKING:
-    from nurec_sim.serving.conformance.target import Target
+from nurec_sim.serving.conformance.target import Failed, Skipped, Target
 
 
 class Verdict(enum.StrEnum):
@@ -20,14 +18,6 @@ class Verdict(enum.StrEnum):
     PASS = "PASS"
     FAIL = "FAIL"
     SKIP = "SKIP"
-
-
-class Failed(Exception):
-    """A rule is broken; the text says how."""
-
-
-class Skipped(Exception):
-    """A rule does not apply, or cannot be seen; the text says why."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +58,6 @@ def check(name: str, *, optional: bool = False) -> Callable[[Callable[[Target], 
         return test
 
     return add
-
-
-def expect(condition: object, text: str) -> None:
-    """Ends a check as failed unless ``condition`` holds; ``text`` says what was seen and what was expected."""
-    if not condition:
-        raise Failed(text)
 
 
 def run_checks(target: Target, names: Sequence[str] = ()) -> Iterator[Outcome]:

@@ -6,8 +6,8 @@ import grpc
 import numpy as np
 
 from nurec_sim import geometry
-from nurec_sim.serving.conformance.kit import Skipped, check, expect
-from nurec_sim.serving.conformance.target import Target, place
+from nurec_sim.serving.conformance.kit import check
+from nurec_sim.serving.conformance.target import Skipped, Target, expect, place
 from nurec_sim.serving.wire import sensorsim
 
 _MOUNTING = geometry.pose(np.eye(3), np.array([1.0, 0.0, 1.9]))

@@ -6,8 +6,8 @@ import time
 
 import grpc
 
-from nurec_sim.serving.conformance.kit import Failed, Skipped, check, expect
-from nurec_sim.serving.conformance.target import Target, difference
+from nurec_sim.serving.conformance.kit import check
+from nurec_sim.serving.conformance.target import Failed, Skipped, Target, difference, expect
 from nurec_sim.serving.wire import ImageFormat
 
 Code = grpc.StatusCode

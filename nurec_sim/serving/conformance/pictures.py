@@ -5,8 +5,8 @@ from __future__ import annotations
 import grpc
 import numpy as np
 
-from nurec_sim.serving.conformance.kit import Failed, Skipped, check, expect
-from nurec_sim.serving.conformance.target import HEIGHT_PX, Target, decode, difference
+from nurec_sim.serving.conformance.kit import check
+from nurec_sim.serving.conformance.target import HEIGHT_PX, Failed, Skipped, Target, decode, difference, expect
 from nurec_sim.serving.wire import ImageFormat
 
 Code = grpc.StatusCode

@@ -6,8 +6,8 @@ import grpc
 import numpy as np
 
 from nurec_sim import geometry
-from nurec_sim.serving.conformance.kit import Skipped, check, expect
-from nurec_sim.serving.conformance.target import Target, difference, place
+from nurec_sim.serving.conformance.kit import check
+from nurec_sim.serving.conformance.target import Skipped, Target, difference, expect, place
 
 Code = grpc.StatusCode
 _TURN_RAD = 0.12

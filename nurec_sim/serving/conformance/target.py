@@ -12,7 +12,6 @@ from jaxtyping import Float64, UInt8
 from nurec_sim.errors import ServerError
 from nurec_sim.files.decoding import TooMuchError, check_image
 from nurec_sim.serving import wire
-from nurec_sim.serving.conformance.kit import Failed, Skipped, expect
 from nurec_sim.serving.wire import ImageFormat, sensorsim
 from nurec_sim.serving.wire.poses import write_poses
 from nurec_sim.types import Matrix4, Trajectory
@@ -20,6 +19,20 @@ from nurec_sim.types import Matrix4, Trajectory
 HEIGHT_PX = 90
 CONNECT_S = 5.0
 """For the connection; a server that listens takes a moment, whatever it has to load."""
+
+
+class Failed(Exception):
+    """A rule is broken; the text says how."""
+
+
+class Skipped(Exception):
+    """A rule does not apply, or cannot be seen; the text says why."""
+
+
+def expect(condition: object, text: str) -> None:
+    """Ends a check as failed unless ``condition`` holds; ``text`` says what was seen and what was expected."""
+    if not condition:
+        raise Failed(text)
 
 
 class Target:

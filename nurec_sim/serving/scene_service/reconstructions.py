@@ -9,7 +9,7 @@ from collections.abc import AsyncGenerator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from nurec_sim.errors import GivenUpError, NurecSimError, RequestError
+from nurec_sim.errors import CancelledError, NurecSimError, RequestError
 from nurec_sim.reconstruct import FeedForwardSettings
 from nurec_sim.serving.store import LoadedScene, Recipe, SceneStore
 from nurec_sim.serving.store.sources import is_archive
@@ -55,7 +55,7 @@ class Reconstructions:
         def progress(stage: str, fraction: float) -> None:
             nonlocal said
             if left.is_set() or self._closing.is_set():
-                raise GivenUpError(f"the reconstruction of {scene_id!r} was given up at {fraction:.0%} ({stage})")
+                raise CancelledError(f"the reconstruction of {scene_id!r} was cancelled at {fraction:.0%} ({stage})")
             if stage != said[0] or abs(fraction - said[1]) >= _LEAST_STEP:
                 said = (stage, fraction)
                 loop.call_soon_threadsafe(events.put_nowait, said)

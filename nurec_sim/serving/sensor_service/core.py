@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TypeVar
 
-from nurec_sim.errors import GivenUpError, TooLargeError
+from nurec_sim.errors import CancelledError, TooLargeError
 from nurec_sim.serving.calls import current_call
 from nurec_sim.serving.sensor_service.ego_masks import EgoMasks
 from nurec_sim.serving.sensor_service.options import ServiceOptions
@@ -92,7 +92,7 @@ class ServiceCore:
 
     def _go_on(self, stage: str, fraction: float) -> None:
         if self._closing:
-            raise GivenUpError(f"the server stops; a scene was given up at {fraction:.0%} ({stage})")
+            raise CancelledError(f"the server is stopping; loading a scene was cancelled at {fraction:.0%} ({stage})")
 
     async def _scene(self, name: str) -> GaussianScene:
         """What a scene holds, for those who only read it."""
@@ -101,7 +101,7 @@ class ServiceCore:
 
     @staticmethod
     async def _run(executor: ThreadPoolExecutor, function: Callable, *arguments):
-        # If the client gives up, the await is cancelled, and with it a job that has not begun.
+        # A client that cancels its call cancels the await, and with it a job that has not begun.
         return await asyncio.get_running_loop().run_in_executor(executor, function, *arguments)
 
     def _check_batch(self, count: int) -> None:

@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from nurec_sim.compute.turns import taking
-from nurec_sim.errors import GivenUpError
+from nurec_sim.errors import CancelledError
 from nurec_sim.serving.calls import Call, current_call
 from nurec_sim.serving.sensor_service.fair_shares import FairShares, Job
 
@@ -39,7 +39,7 @@ class RenderQueue:
     """Runs functions in threads, a few at a time, and shares out the time between clients.
 
     A function that calls ``compute.turns.rest`` stops there while others have their turn. Jobs that have begun hold
-    memory, so there are bounds: of large ones, a client has one at a time. What its client gave up, or has stopped
+    memory, so there are bounds: of large ones, a client has one at a time. What its client cancelled, or has stopped
     waiting for, is not begun, and ends at its next rest.
 
     Args:
@@ -94,13 +94,13 @@ class RenderQueue:
             result: T = await asyncio.wrap_future(work.future)
             return result
         except asyncio.CancelledError:
-            self.give_up(work)
+            self.cancel(work)
             raise
 
-    def give_up(self, work: _Work) -> None:
+    def cancel(self, work: _Work) -> None:
         """Ends a job at its next rest, or before it begins."""
         with self.lock:
-            work.given_up = True
+            work.cancelled = True
             if work.waits:
                 self.stop_waiting(work)
                 if not work.begun:
@@ -114,7 +114,7 @@ class RenderQueue:
             self._closed = True
             unbegun = [work for work in self._works.values() if not work.begun]
         for work in unbegun:
-            self.give_up(work)
+            self.cancel(work)
         self._threads.shutdown(wait=True)
 
     # ---------------------------------------------------------------------- called by the work, which holds the lock
@@ -206,7 +206,7 @@ class _Work:
         self._queue, self.job, self._call = queue, job, call
         self._function, self._arguments = function, arguments
         self.future: Future = Future()
-        self.begun = self.has_place = self.given_up = False
+        self.begun = self.has_place = self.cancelled = False
         self.waits = True
         self.since_s = 0.0
         """When its turn began."""
@@ -236,7 +236,7 @@ class _Work:
         """Whether it is somebody else's turn, or nobody wants the result any more."""
         now = time.monotonic()
         over = self._queue.offered > 0 and now - self.since_s >= TURN_S
-        return self.given_up or over or now >= self._call.deadline_s
+        return self.cancelled or over or now >= self._call.deadline_s
 
     def rest(self) -> None:
         """Waits for its next turn; see ``compute.turns.Turn``."""
@@ -261,10 +261,10 @@ class _Work:
 
     def _take_place(self) -> None:
         with self._queue.lock:
-            if not self.given_up:
+            if not self.cancelled:
                 self._queue.wait_for_place(self)
             self._queue.share_out()
-        while not self.given_up and not self.go_on.wait(self._left_s()):
+        while not self.cancelled and not self.go_on.wait(self._left_s()):
             with self._queue.lock:
                 if self.waits and self._left_s() == 0:
                     self._queue.stop_waiting(self)
@@ -277,6 +277,6 @@ class _Work:
         return None if deadline_s == math.inf else max(deadline_s - time.monotonic(), 0.0)
 
     def _check(self) -> None:
-        if self.given_up:
-            raise GivenUpError("nobody waits for this frame any more")
+        if self.cancelled:
+            raise CancelledError("the request for this frame was cancelled")
         self._call.check_deadline()

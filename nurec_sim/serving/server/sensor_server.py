@@ -1,7 +1,7 @@
 """The sensor server: the NuRec sensor interface over a ``SceneStore``.
 
 One asyncio loop takes the calls; scenes load and frames render in threads of their own, so that health and discovery
-answer while something renders. A call that its client gave up is not rendered.
+answer while something renders. A cancelled call is not rendered.
 """
 
 from __future__ import annotations

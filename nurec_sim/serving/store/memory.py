@@ -12,7 +12,7 @@ from functools import partial
 from types import TracebackType
 from typing import Protocol
 
-from nurec_sim.errors import GivenUpError
+from nurec_sim.errors import CancelledError
 from nurec_sim.serving.store.sizes import array_bytes
 from nurec_sim.types import GaussianScene, LidarFilter, LidarFrame, SensorFrame, SensorRequest
 
@@ -110,7 +110,7 @@ class SceneMemory:
         """The use of a scene, which is loaded if it is not in memory; callers meanwhile wait for the same load.
 
         Raises:
-            Exception: whatever ``load`` raises, in all who wait; but one that was given up is begun anew by the next.
+            Exception: whatever ``load`` raises, in all who wait; but a cancelled load is started again by the next.
         """
         while True:
             with self._lock:
@@ -126,7 +126,7 @@ class SceneMemory:
                 return Lease(entry.future.result(), partial(self._end_use, entry))
             except BaseException as error:
                 self._end_use(entry)
-                if first or not isinstance(error, GivenUpError):
+                if first or not isinstance(error, CancelledError):
                     raise
 
     def lease_ready(self, key: str) -> Lease | None:
@@ -193,7 +193,7 @@ class SceneMemory:
             with self._lock:
                 if self._entries.get(key) is entry:
                     del self._entries[key]
-                    if isinstance(error, GivenUpError) and entry.users > 1:
+                    if isinstance(error, CancelledError) and entry.users > 1:
                         self._entries[key] = _Entry()  # keeps the place until one of those who wait begins anew
                 self._count(failed_loads=1)
             entry.future.set_exception(error)

@@ -229,7 +229,7 @@ class SceneStore:
                 (frame,) = loaded.renderer.sense([request])
 
         Callers that come while it loads wait for the same load. ``progress`` hears of a reconstruction: what is being
-        done, and the fraction of it that is. It may raise ``GivenUpError`` to end it.
+        done, and the fraction of it that is. It may raise ``CancelledError`` to end it.
 
         Raises:
             UnknownSceneError: there is no such scene.

@@ -64,7 +64,7 @@ class UploadFolder:
         """Size of all files; of those that are arriving the size that was promised."""
         total = 0
         for path in self.folder.iterdir():
-            with contextlib.suppress(FileNotFoundError):  # it arrived, or was given up, at this moment
+            with contextlib.suppress(FileNotFoundError):  # it arrived, or was cancelled, at this moment
                 total += path.stat().st_size
         return total
 

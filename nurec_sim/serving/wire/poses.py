@@ -39,7 +39,7 @@ def read_poses(messages: Sequence, names: Sequence[str]) -> Float64[np.ndarray, 
 
     Raises:
         RequestError: a value is not finite, a quaternion is not a unit one, or ``exact`` is not a rigid transform.
-        GivenUpError, DeadlinePassedError: see ``compute.turns.rest``.
+        CancelledError, DeadlinePassedError: see ``compute.turns.rest``.
     """
     parts = []
     for first in range(0, len(messages), _AT_ONCE):

@@ -18,7 +18,7 @@ _CODES: tuple[tuple[type[errors.NurecSimError], grpc.StatusCode], ...] = (
     (errors.ReconstructError, grpc.StatusCode.FAILED_PRECONDITION),
     (errors.WeightsError, grpc.StatusCode.FAILED_PRECONDITION),
     (errors.SceneInUseError, grpc.StatusCode.FAILED_PRECONDITION),
-    (errors.GivenUpError, grpc.StatusCode.CANCELLED),
+    (errors.CancelledError, grpc.StatusCode.CANCELLED),
     (errors.DeadlinePassedError, grpc.StatusCode.DEADLINE_EXCEEDED),
     (errors.UnknownSessionError, grpc.StatusCode.NOT_FOUND),
     (errors.SessionExistsError, grpc.StatusCode.ALREADY_EXISTS),
