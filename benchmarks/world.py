@@ -30,9 +30,8 @@ from nurec_sim.types import (
 from nurec_sim.world import LABEL_OF_CLASS, TrueWorld, street_rig, town_plan
 from nurec_sim.world.plan.town import TownPlan
 from nurec_sim.world.sense.isp import random_response
-from nurec_sim.world.sense.simulator import TrueView
 from nurec_sim.world.sense.stage import Quality
-from nurec_sim.world.sense.truth import follow, scene_flow
+from nurec_sim.world.sense.truth import TrueView, follow, scene_flow
 
 LIDARS = ("PANDAR128", "HDL-64", "VLP-16")
 CLIP_LIMIT_S = 20.0

@@ -169,7 +169,7 @@ def _store(
     Raises:
         NurecSimError: a bound leaves room for nothing, or the device cannot be used.
     """
-    from nurec_sim.serving.sensor_service.render_queue import usable_cores
+    from nurec_sim.compute.cores import usable_cores
     from nurec_sim.serving.store import SceneStore
 
     if threads is not None and threads < 1:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate.views import View, reduced, scored_size
+from nurec_sim.evaluate.views import ScoredView, reduced, scored_size
 from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, Target, Window
 from nurec_sim.reconstruct.feedforward.inputs.frames import choose_cameras
 from nurec_sim.types import MOVABLE_LABELS, CameraModel, Clip, Rig, SensorRequest
@@ -160,7 +160,7 @@ def _target(clip: Clip, camera_id: str, index: int, sweep: tuple[str, int] | Non
         depth_m = projected_depth(request, camera, clip.sweep(*sweep).xyz_world_m)
     movable = movable_pixels(clip, request, camera) if clip.tracks else None
     name = f"{camera_id}-{index:04d}"
-    return Target(name, request, View(true.rgb, depth_m), movable, beyond=beyond)
+    return Target(name, request, ScoredView(true.rgb, depth_m), movable, beyond=beyond)
 
 
 def projected_depth(

@@ -13,7 +13,7 @@ from jaxtyping import Bool
 from nurec_sim.evaluate.methods import Built, Contender, build
 from nurec_sim.evaluate.scores.depth import depth_score, least_squares_scale
 from nurec_sim.evaluate.scores.images import masked_psnr, masked_ssim, psnr, ssim
-from nurec_sim.evaluate.views import View, reduced
+from nurec_sim.evaluate.views import ScoredView, reduced
 from nurec_sim.evaluate.windows import Target, Window
 
 HIGHEST_PSNR_DB = 100.0
@@ -27,7 +27,7 @@ class Scored:
     """A method's record of a window, plain JSON, and its views by the names of the targets."""
 
     record: dict[str, Any]
-    views: dict[str, View]
+    views: dict[str, ScoredView]
 
 
 def score_window(contender: Contender, window: Window, progress: Callable[[str, float], None] | None = None) -> Scored:
@@ -57,7 +57,7 @@ def score_window(contender: Contender, window: Window, progress: Callable[[str, 
     return Scored(record, views)
 
 
-def score_view(view: View, target: Target) -> dict[str, Figures | None]:
+def score_view(view: ScoredView, target: Target) -> dict[str, Figures | None]:
     """Figures of one view: ``full``; where the truth knows what can move, ``dynamic`` (its pixels) and ``static``.
 
     ``static`` are all other pixels; each of the two is None where it has none. Each has ``psnr_db``, ``ssim``, and
@@ -77,7 +77,9 @@ def score_view(view: View, target: Target) -> dict[str, Figures | None]:
     return {"full": full} | {name: _figures_inside(view, true, scale, part) for name, part in parts.items()}
 
 
-def _figures_inside(view: View, true: View, scale: float, mask: Bool[np.ndarray, "h w"] | None) -> Figures | None:
+def _figures_inside(
+    view: ScoredView, true: ScoredView, scale: float, mask: Bool[np.ndarray, "h w"] | None
+) -> Figures | None:
     if mask is None or not mask.any():
         return None
     return {
@@ -87,7 +89,7 @@ def _figures_inside(view: View, true: View, scale: float, mask: Bool[np.ndarray,
     }
 
 
-def _depth_figures(view: View, true: View, scale: float, mask: Bool[np.ndarray, "h w"] | None) -> Figures:
+def _depth_figures(view: ScoredView, true: ScoredView, scale: float, mask: Bool[np.ndarray, "h w"] | None) -> Figures:
     figures: Figures = dict.fromkeys(("abs_rel", "delta1", "abs_rel_metric", "delta1_metric"))
     if view.depth_m is not None and true.depth_m is not None:
         for factor, suffix in ((scale, ""), (1.0, "_metric")):

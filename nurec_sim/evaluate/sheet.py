@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from nurec_sim.evaluate.scoring import Scored
-from nurec_sim.evaluate.views import View
+from nurec_sim.evaluate.views import ScoredView
 from nurec_sim.evaluate.windows import Target, Window
 from nurec_sim.files.new_files import new_file
 
@@ -70,11 +70,11 @@ def _figures(scored: Scored, target: Target) -> dict[str, Any]:
     return next(row for row in scored.record["targets"] if row["name"] == target.name)
 
 
-def _rgb(view: View) -> Picture:
+def _rgb(view: ScoredView) -> Picture:
     return np.rint(view.rgb * 255).astype(np.uint8)
 
 
-def _depth(view: View) -> Picture:
+def _depth(view: ScoredView) -> Picture:
     """Depth as colours, near things bright; grey where there is none."""
     if view.depth_m is None:
         return np.full(view.rgb.shape, UNKNOWN, np.uint8)

@@ -17,7 +17,7 @@ SCORED_PIXELS = 240 * 160
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ScoredView:
     """A view at the size at which it is scored: colours 0..1, depth 0 where there is none or None where not known."""
 
     rgb: Float32[np.ndarray, "h w 3"]
@@ -30,11 +30,11 @@ def scored_size(width_px: int, height_px: int) -> tuple[int, int]:
     return max(8, round(width_px * factor)), max(8, round(height_px * factor))
 
 
-def reduced(rgb: UInt8[np.ndarray, "h w 3"], depth_m: Float32[np.ndarray, "h w"] | None) -> View:
+def reduced(rgb: UInt8[np.ndarray, "h w 3"], depth_m: Float32[np.ndarray, "h w"] | None) -> ScoredView:
     """A view at the size at which it is scored."""
     width, height = scored_size(rgb.shape[1], rgb.shape[0])
     small = cv2.resize(rgb.astype(np.float32) / 255, (width, height), interpolation=cv2.INTER_AREA)
-    return View(np.clip(small, 0, 1), None if depth_m is None else _picked(depth_m, width, height))
+    return ScoredView(np.clip(small, 0, 1), None if depth_m is None else _picked(depth_m, width, height))
 
 
 def reduced_mask(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

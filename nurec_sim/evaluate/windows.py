@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from nurec_sim.evaluate.views import View
+from nurec_sim.evaluate.views import ScoredView
 from nurec_sim.types import Clip, Rig, RoadMap, SensorRequest, Sweep, Track, Trajectory
 
 Image = UInt8[np.ndarray, "h w 3"]
@@ -100,7 +100,7 @@ class Target:
 
     name: str
     request: SensorRequest
-    true: View
+    true: ScoredView
     movable: Bool[np.ndarray, "h w"] | None
     left_m: float = 0.0
     beyond: bool = False

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 from nurec_sim import geometry, sensors
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.clip import Clip
 from nurec_sim.logs.consistency import table_faults
@@ -35,7 +35,7 @@ def check_clip(clip: Clip | str | Path) -> list[str]:
     sweeps = [(clip, name, index) for name in clip.rig.lidars for index in range(clip.sweep_count(name))]
     faults = table_faults(clip)
     # Decoding and unpacking let other threads run.
-    with ThreadPoolExecutor(max_workers=min(MOST_THREADS, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(max_workers=min(MOST_THREADS, usable_cores())) as pool:
         for fault, jobs in ((_image_fault, images), (_sweep_fault, sweeps)):
             faults += [text for text in pool.map(fault, *zip(*jobs, strict=True)) if text is not None] if jobs else []
     return faults

@@ -13,7 +13,7 @@ from nurec_sim.metrics.series import METRICS
 from nurec_sim.report.cells import by_policy, count_of, escape, fact_list, full_name, list_items, meaning, summary_cell
 from nurec_sim.report.charts import collision_bars, time_view
 from nurec_sim.report.data import ReportScene, RunReport
-from nurec_sim.report.plan import View, plan_view
+from nurec_sim.report.plan import PlanAxes, plan_view
 from nurec_sim.report.rollout_card import rollout_card
 from nurec_sim.report.template import SCRIPT, STYLE
 
@@ -39,13 +39,13 @@ def render_report(report: RunReport) -> str:
     images: dict[str, object] = {}
     embed = sum(e.video.stat().st_size for e in report.rollouts if e.video is not None) < MAX_EMBEDDED_BYTES
     scenes = {(scene.id, scene.reconstruction): scene for scene in report.scenes}
-    views: dict[tuple[str, str], View] = {}
+    views: dict[tuple[str, str], PlanAxes] = {}
     cards = []
     for index, entry in enumerate(report.rollouts):
         key = (entry.rollout.scene_id, entry.rollout.reconstruction)
         scene = scenes.get(key, ReportScene(*key))
         if entry.rollout.states:
-            view = views.setdefault(key, View(entry.rollout.recorded))
+            view = views.setdefault(key, PlanAxes(entry.rollout.recorded))
             image_key = "/".join(key) if scene.grid is not None else None
             if scene.grid is not None and image_key not in images:
                 images["/".join(key)] = view.grid_image(scene.grid)

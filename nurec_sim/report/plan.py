@@ -24,7 +24,7 @@ MARGIN_M = 25.0
 EVERY_STATES = 10
 
 
-class View:
+class PlanAxes:
     """Turns the world so that a recorded drive goes to the right."""
 
     def __init__(self, recorded: Trajectory) -> None:
@@ -62,7 +62,7 @@ class View:
         }  # fmt: skip
 
 
-def plan_view(entry: ReportRollout, view: View, image_key: str | None, road_map: RoadMap | None) -> dict[str, Any]:
+def plan_view(entry: ReportRollout, view: PlanAxes, image_key: str | None, road_map: RoadMap | None) -> dict[str, Any]:
     """Road grid, recorded and driven path, ego and actor boxes every second, events."""
     rollout = entry.rollout
     ego, boxes = ego_boxes(rollout), actor_boxes(rollout)
@@ -121,7 +121,7 @@ def _outlines(
     return trace | ({"fill": "toself", "fillcolor": fill} if fill else {})
 
 
-def _outline(view: View, box: BoxPath, index: int | np.integer) -> np.ndarray:
+def _outline(view: PlanAxes, box: BoxPath, index: int | np.integer) -> np.ndarray:
     corners = geometry.box_corners_xy(box.world_from_box[index], *box.size_m[:2])
     return view.points(corners[[0, 1, 2, 3, 0]])
 
@@ -141,7 +141,7 @@ def _first_event(entry: ReportRollout) -> int | None:
     return min(found) if found else None
 
 
-def _event_marks(entry: ReportRollout, view: View) -> list[dict[str, Any]]:
+def _event_marks(entry: ReportRollout, view: PlanAxes) -> list[dict[str, Any]]:
     rollout = entry.rollout
     marks: list[tuple[int, str, str, str]] = [
         (contact.t_us, f"{contact.side} contact with {contact.actor}", ALARM, "x") for contact in entry.contacts

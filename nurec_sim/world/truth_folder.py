@@ -25,7 +25,7 @@ from nurec_sim.world.sense.isp import CameraResponse
 from nurec_sim.world.sense.scan import LidarResponse
 
 if TYPE_CHECKING:
-    from nurec_sim.world.sense.simulator import TrueView
+    from nurec_sim.world.sense.truth import TrueView
 
 PLAN_FILE, RESPONSES_FILE = "plan.json", "responses.json"
 

@@ -10,7 +10,7 @@ from nurec_sim.evaluate.scores.images import masked_psnr, masked_ssim, psnr, ssi
 from nurec_sim.evaluate.scoring import score_view, score_window
 from nurec_sim.evaluate.summary import doubling_offset, interval, summarize
 from nurec_sim.evaluate.tables import tables
-from nurec_sim.evaluate.views import View, reduced, reduced_mask, scored_size
+from nurec_sim.evaluate.views import ScoredView, reduced, reduced_mask, scored_size
 
 
 def test_depth_scores_are_the_formulas():
@@ -82,18 +82,18 @@ def test_the_truth_scores_best_and_a_wrong_scale_is_seen():
     assert right["full"]["psnr_db"] == 100 and right["full"]["ssim"] == pytest.approx(1)
     assert right["full"]["abs_rel"] == 0 and right["full"]["depth_coverage"] == 1
     assert right["dynamic"]["psnr_db"] == 100 and right["dynamic"]["delta1"] == 1
-    far = score_view(View(target.true.rgb, target.true.depth_m * 2), target)["full"]
+    far = score_view(ScoredView(target.true.rgb, target.true.depth_m * 2), target)["full"]
     assert far["depth_scale"] == pytest.approx(0.5) and far["abs_rel"] == pytest.approx(0, abs=1e-6)
     assert far["abs_rel_metric"] == pytest.approx(1) and far["delta1_metric"] == 0
-    flat = score_view(View(target.true.rgb, None), target)
+    flat = score_view(ScoredView(target.true.rgb, None), target)
     assert flat["full"]["abs_rel"] is None and flat["dynamic"]["delta1_metric"] is None
 
 
 def test_what_cannot_move_is_scored_apart():
     target = street_window(boxes=True).targets[0]
     error = np.where(target.movable[..., None], 0.1, 0.01).astype(np.float32)  # 20 dB where things can move, else 40
-    flat = View(np.full_like(target.true.rgb, 0.5), None)
-    found = score_view(View(flat.rgb + error, None), replace(target, true=flat))
+    flat = ScoredView(np.full_like(target.true.rgb, 0.5), None)
+    found = score_view(ScoredView(flat.rgb + error, None), replace(target, true=flat))
     assert found["dynamic"]["psnr_db"] == pytest.approx(20, abs=1e-3)
     assert found["static"]["psnr_db"] == pytest.approx(40, abs=1e-3)
     nothing = replace(target, movable=np.zeros_like(target.movable))
@@ -196,6 +196,6 @@ def test_intervals_leave_out_a_fortieth_on_each_side():
 
 def test_depth_of_what_moves_is_scaled_by_its_whole_frame():
     target = street_window(boxes=True).targets[0]
-    figures = score_view(View(target.true.rgb, target.true.depth_m * 2), target)["dynamic"]
+    figures = score_view(ScoredView(target.true.rgb, target.true.depth_m * 2), target)["dynamic"]
     assert figures["abs_rel"] == pytest.approx(0, abs=1e-6) and figures["delta1"] == 1
     assert figures["abs_rel_metric"] == pytest.approx(1) and figures["delta1_metric"] == 0

@@ -4,16 +4,36 @@ import numpy as np
 import pytest
 import torch
 
-from nurec_sim.network.stereo.semi_global import _summed, _summed_by_torch, semi_global
+from nurec_sim.network.stereo.paths import add_path
+from nurec_sim.network.stereo.semi_global import _summed_by_torch, semi_global
 
 
-@pytest.mark.parametrize("shape", [(1, 3, 4), (2, 1, 5), (17, 2, 3), (40, 48, 33)])
+@pytest.mark.parametrize("shape", [(3, 1, 4), (1, 2, 5), (2, 17, 3), (48, 40, 33)])
 def test_the_compiled_sums_are_those_of_torch_to_the_bit(shape):
-    rng = np.random.default_rng(0)
-    cost = rng.random(shape, np.float32)
-    jump = (0.05 + rng.random((shape[0] - 1, shape[2]))).astype(np.float32)
-    expected = _summed_by_torch(torch.from_numpy(cost), torch.from_numpy(jump), 0.05)
-    assert _summed(cost, jump, np.float32(0.05)).tobytes() == expected.numpy().tobytes()
+    generator = torch.Generator().manual_seed(0)
+    cost, guide = torch.rand(shape, generator=generator), torch.rand(shape[1:], generator=generator)
+    across = _summed_by_torch(cost.permute(2, 0, 1), guide.T, 0.05, 2.0).permute(1, 2, 0)
+    down = _summed_by_torch(cost.permute(1, 0, 2), guide, 0.05, 2.0).permute(1, 0, 2)
+    assert torch.equal(semi_global(cost, guide, 0.05, 2.0), (across + down) / 4)
+
+
+@pytest.mark.parametrize(("dy", "dx"), [(0, 1), (-1, 0), (1, -1), (-1, 1), (1, 1)])
+def test_a_path_costs_what_the_published_recursion_says(dy, dx):
+    """Equation 13 of Hirschmueller (2008), pixel by pixel; paths begin where they enter the image."""
+    rng = np.random.default_rng(3)
+    cost, jump, small = rng.random((5, 6, 4), np.float32), 0.3 + rng.random((5, 6)), 0.2
+    expected = np.zeros((5, 6, 4))
+    for row in range(5)[:: dy or 1]:
+        for column in range(6)[:: dx or 1]:
+            expected[row, column] = cost[row, column]
+            if 0 <= row - dy < 5 and 0 <= column - dx < 6:
+                before = expected[row - dy, column - dx]
+                for d in range(4):
+                    near = [before[k] + small for k in (d - 1, d + 1) if 0 <= k < 4]
+                    expected[row, column, d] += min(before[d], before.min() + jump[row, column], *near) - before.min()
+    total = np.ones_like(cost)
+    add_path(cost, jump, small, dy, dx, total)
+    np.testing.assert_allclose(total - 1, expected, atol=1e-6)
 
 
 def test_a_pixel_that_fits_any_depth_takes_that_of_its_neighbours_up_to_an_edge():

@@ -8,14 +8,14 @@ from nurec_sim import geometry
 from nurec_sim.reconstruct.lift import colour, depth, lifting, splat, surfaces
 from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, seen_through, voxel_edge_m
 from nurec_sim.reconstruct.lift.settings import PointSettings
-from nurec_sim.reconstruct.lift.views import Tile, View
+from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 
 TOWARDS = np.array([[0.0, 0.0, -1.0]])
 """The normal of a surface that faces the views of these tests, which look along z."""
 
 
 def looking_ahead(behind_m=0.0, width=9, height=9, focal_px=10.0):
-    """A packed view (``View.packed``) from as far behind the origin, without drift."""
+    """A packed view (``WorkingView.packed``) from as far behind the origin, without drift."""
     pose = geometry.pose(np.eye(3), np.array([0.0, 0.0, behind_m]))
     return np.concatenate(
         [[focal_px, width / 2, height / 2, width, height], pose[:3, :3].ravel(), pose[:3, 3], np.zeros(6)]
@@ -121,7 +121,7 @@ def view_of(rgb):
     tile = Tile(width, height, 10.0, (width / 2, height / 2), np.eye(3), 1, None, np.ones((height, width), bool),
                 np.zeros(3))  # fmt: skip
     pose = geometry.pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
-    return View("front", 0, 1_000_000, True, tile, pose, np.zeros(3), rgb)
+    return WorkingView("front", 0, 1_000_000, True, tile, pose, np.zeros(3), rgb)
 
 
 def test_normals_face_the_camera_where_one_surface_ends_before_another():

@@ -17,7 +17,7 @@ from nurec_sim.render.cpu.pack import BLOCK, pack
 from nurec_sim.render.cpu.project.general import lens_boxes, project_general
 from nurec_sim.render.cpu.records import MACRO, RECORD, SCRATCH, place
 from nurec_sim.render.cpu.simd import LANES
-from nurec_sim.render.cpu.view import View
+from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.rays import ray_grid, reference_pose, world_rays
 from nurec_sim.types import Fisheye, FTheta, FThetaReference, LidarModel, Pinhole, Shutter, Spin, Windshield
 from nurec_sim.types import WindshieldReference as Exact
@@ -121,7 +121,7 @@ def hits(grid, sensor, request, gaussians):
 def check(sensor, grid, first, last, gaussians):
     """Every seen cell lies in exactly one of the tiles; returns the numbers of tiles spanned and needed."""
     request = scenes.request(sensor, first, last)
-    view = View.of(grid, request.world_from_sensor)
+    view = ExposureView.of(grid, request.world_from_sensor)
     rows, spans = project(grid, view, pack(gaussians))
     height, width = grid.valid.shape
     covered = np.zeros((len(gaussians.mean_m), -(-height // MACRO), -(-width // MACRO)), np.int64)
@@ -221,7 +221,7 @@ def test_cells_of_lenses_are_bounded(name):
         )
         request = scenes.request(sensor)
         packed, box = pack(gaussians, sort=False), np.empty((4, LANES), np.float32)
-        mask = boxes(packed.fields[0], View.of(grid, request.world_from_sensor).parameters, grid.chart.params,
+        mask = boxes(packed.fields[0], ExposureView.of(grid, request.world_from_sensor).parameters, grid.chart.params,
                      grid.chart.places, grid.chart.bends, box)  # fmt: skip
         for lane, seen in enumerate(hits(grid, sensor, request, gaussians)):
             rows, columns = np.nonzero(seen)
@@ -241,7 +241,7 @@ def test_a_lidar_splits_at_its_seam():
     sensor, grid = LIDARS["clockwise"], GRIDS["clockwise"]
     azimuth = sensor.azimuth_rad[0] + 0.5 * (sensor.azimuth_rad[0] - sensor.azimuth_rad[1])
     gaussians = scenes.gaussians([[10 * np.cos(azimuth), 10 * np.sin(azimuth), 0]], scale=0.3)
-    view = View.of(grid, scenes.request(sensor).world_from_sensor)
+    view = ExposureView.of(grid, scenes.request(sensor).world_from_sensor)
     _, spans = project(grid, view, pack(gaussians))
     assert sorted(spans[:, 0].tolist()) == [0, (grid.valid.shape[1] - 1) // MACRO]
     assert (spans[:, 0] == spans[:, 1]).all()
@@ -250,7 +250,7 @@ def test_a_lidar_splits_at_its_seam():
 def test_a_gaussian_around_the_sensor_covers_everything():
     for name in ("fisheye", "clockwise"):
         sensor, grid = {**CAMERAS, **LIDARS}[name], GRIDS[name]
-        view = View.of(grid, scenes.request(sensor).world_from_sensor)
+        view = ExposureView.of(grid, scenes.request(sensor).world_from_sensor)
         _, spans = project(grid, view, pack(scenes.gaussians([[1.0, 0.2, 0.1]], scale=5.0)))
         height, width = grid.valid.shape
         assert spans.tolist() == [[0, (width - 1) // MACRO, 0, (height - 1) // MACRO]]
@@ -258,7 +258,7 @@ def test_a_gaussian_around_the_sensor_covers_everything():
 
 def test_what_lies_behind_a_lens_is_left_out():
     sensor, grid = CAMERAS["ftheta"], GRIDS["ftheta"]
-    view = View.of(grid, scenes.request(sensor).world_from_sensor)
+    view = ExposureView.of(grid, scenes.request(sensor).world_from_sensor)
     _, spans = project(grid, view, pack(scenes.gaussians([[-5.0, 0.5, 0.2], [5.0, 0.5, 0.2]], scale=0.1)))
     assert len(spans) == 1
 

@@ -21,7 +21,7 @@ from nurec_sim import geometry
 from nurec_sim.metrics import build_offroad_grid, find_contacts, metric_table, rollout_values, score_rollout, summarize
 from nurec_sim.metrics.series import METRICS
 from nurec_sim.report import ReportRollout, ReportScene, RunReport, render_report
-from nurec_sim.report.plan import View, plan_view
+from nurec_sim.report.plan import PlanAxes, plan_view
 from nurec_sim.types import Trajectory
 
 EGO = s_curve_path()
@@ -139,13 +139,13 @@ def test_plans_show_road_boxes_path_and_events(text):
 
 def test_the_drive_goes_to_the_right_whatever_its_heading(report):
     north = geometry.pose_from_xyyaw(100.0, -50.0, 2.0)
-    turned = View(Trajectory(EGO.t_us, north @ EGO.world_from_body))
+    turned = PlanAxes(Trajectory(EGO.t_us, north @ EGO.world_from_body))
     ends = turned.points((north @ EGO.world_from_body)[[0, -1], :2, 3])
     assert ends[0] == pytest.approx([0, 0]) and ends[1][1] == pytest.approx(0, abs=1e-9) and ends[1][0] > 90
     grid = report.scenes[0].grid
-    image = View(EGO).grid_image(grid)
-    assert image["x"] == pytest.approx(View(EGO).low[0] - 25) and image["sizex"] > 100
-    figure = plan_view(report.rollouts[0], View(EGO), None, None)
+    image = PlanAxes(EGO).grid_image(grid)
+    assert image["x"] == pytest.approx(PlanAxes(EGO).low[0] - 25) and image["sizex"] > 100
+    figure = plan_view(report.rollouts[0], PlanAxes(EGO), None, None)
     assert "images" not in figure["layout"]
 
 
@@ -154,7 +154,7 @@ def test_grid_image_lies_where_the_path_is(report):
 
     import cv2
 
-    view = View(EGO)
+    view = PlanAxes(EGO)
     image = view.grid_image(report.scenes[0].grid)
     pixels = cv2.imdecode(np.frombuffer(base64.b64decode(image["source"].split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
     place = view.points(EGO.position_m)

@@ -29,7 +29,7 @@ FEWEST_SHIFTS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CalibrationView:
     """An image and the points measured about when it was taken."""
 
     camera: CameraModel
@@ -66,7 +66,7 @@ def comparable_image(rgb: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h 
     return lab
 
 
-def fit(views: Sequence[View], rig_from_camera: Matrix4) -> Fit:
+def fit(views: Sequence[CalibrationView], rig_from_camera: Matrix4) -> Fit:
     """How well the views fit if the camera sits at a pose.
 
     The colour of the image changes where the LiDAR finds a border and stays where it finds none. The figure is the log
@@ -93,7 +93,7 @@ def fit(views: Sequence[View], rig_from_camera: Matrix4) -> Fit:
 
 
 def _gains(
-    view: View, rig_from_camera: Matrix4, most: int
+    view: CalibrationView, rig_from_camera: Matrix4, most: int
 ) -> tuple[Float64[np.ndarray, " n"], np.ndarray, np.ndarray] | None:
     """Per pair: its colour difference less that around it, whether it is a border, and its patch."""
     height, width = view.lab.shape[:2]

@@ -8,7 +8,7 @@ import numpy as np
 
 from nurec_sim import geometry
 from nurec_sim.errors import ClipError
-from nurec_sim.logs.checks.alignment import Fit, View, comparable_image, fit
+from nurec_sim.logs.checks.alignment import CalibrationView, Fit, comparable_image, fit
 from nurec_sim.logs.checks.borders import Pairs, find_pairs
 from nurec_sim.logs.checks.measure import Measure
 from nurec_sim.logs.checks.sampling import SampledSweep, point_of_view
@@ -44,7 +44,7 @@ def check_calibration(clip: Clip, sweeps: Sequence[SampledSweep]) -> list[Measur
     return rows
 
 
-def _verdict(name: str, what: str, given: Matrix4, rig_from_log: Matrix4, views: Sequence[View]) -> Measure:
+def _verdict(name: str, what: str, given: Matrix4, rig_from_log: Matrix4, views: Sequence[CalibrationView]) -> Measure:
     """Compares the pose as given with every other reading; figures are gains in standard errors."""
     as_given = fit(views, given)
     errors = as_given.errors - (0.0 if is_upright(given) else LYING_ERRORS)
@@ -68,7 +68,9 @@ def _figure(given: Fit, other: Fit) -> str:
     return f"fits at {given.errors:.1f} standard errors, turned or inverted at most {other.errors:.1f}"
 
 
-def _views(clip: Clip, camera_id: str, sweeps: Sequence[SampledSweep], known: dict[int, Pairs]) -> list[View]:
+def _views(
+    clip: Clip, camera_id: str, sweeps: Sequence[SampledSweep], known: dict[int, Pairs]
+) -> list[CalibrationView]:
     """The camera's image nearest in time to each sweep, with the sweep's points around the car at that time."""
     camera = clip.rig.cameras[camera_id]
     times = clip.camera_times_us(camera_id).mean(axis=1)
@@ -88,7 +90,7 @@ def _views(clip: Clip, camera_id: str, sweeps: Sequence[SampledSweep], known: di
         # The rig where the frame's own pose puts it: that pose may know better than the ego's.
         rig_from_world = camera.rig_from_camera @ geometry.inverse(middle)
         points = geometry.transform_points(rig_from_world @ each.sweep.world_from_lidar, each.sweep.xyz_m)
-        views.append(View(camera, comparable_image(image), points, known[number]))
+        views.append(CalibrationView(camera, comparable_image(image), points, known[number]))
     return views
 
 

@@ -1,16 +1,16 @@
-"""Semi-global matching: costs of depths summed along lines, so that neighbours agree unless there is an edge.
+"""Semi-global matching of tensors: neighbours agree on their depth unless there is an edge (``paths``).
 
-Hirschmueller, Stereo Processing by Semiglobal Matching and Mutual Information (2008), with four directions.
+Four directions, along the rows and the columns.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from torch import Tensor
 
-from nurec_sim.compute.kernels import kernel
+from nurec_sim.network.stereo.paths import add_path, brightness_steps
 
 SMALL_STEP, LARGE_STEP = 0.05, 2.0
 """What it costs to go to the next depth, and to any other, from a pixel to its neighbour; if nothing else is said."""
@@ -29,26 +29,30 @@ def semi_global(
         small: what it costs to go to the next depth, from a pixel to its neighbour.
         large: what it costs to go to any other.
     """
-    across = _along(cost.permute(2, 0, 1), guide.T, small, large)
-    down = _along(cost.permute(1, 0, 2), guide, small, large)
+    if cost.device.type == "cpu" and cost.dtype == torch.float32:
+        return _on_cpu(cost, guide, small, large)
+    across = _summed_by_torch(cost.permute(2, 0, 1), guide.T, small, large)
+    down = _summed_by_torch(cost.permute(1, 0, 2), guide, small, large)
     return (across.permute(1, 2, 0) + down.permute(1, 0, 2)) / 4
 
 
-def _along(
-    cost: Float[Tensor, "length d m"], guide: Float[Tensor, "length m"], small: float, large: float
-) -> Float[Tensor, "length d m"]:
-    """The sum of both directions along the first axis."""
-    cost = cost.contiguous()
-    jump = small + large / (1 + EDGE * (guide[1:] - guide[:-1]).abs())
-    if cost.device.type == "cpu" and cost.dtype == torch.float32:
-        return torch.from_numpy(_summed(cost.numpy(), jump.contiguous().numpy(), np.float32(small)))
-    return _summed_by_torch(cost, jump, small)
+def _on_cpu(
+    cost: Float[Tensor, "d h w"], guide: Float[Tensor, "h w"], small: float, large: float
+) -> Float[Tensor, "d h w"]:
+    """The sums by a compiled kernel; to the bit those of ``_summed_by_torch``."""
+    volume, brightness = cost.permute(1, 2, 0).contiguous().numpy(), guide.float().numpy()
+    across, down = np.zeros_like(volume), np.zeros_like(volume)
+    for total, dy, dx in ((across, 0, 1), (across, 0, -1), (down, 1, 0), (down, -1, 0)):
+        jump = small + large / (1 + EDGE * brightness_steps(brightness, dy, dx))
+        add_path(volume, jump, np.float32(small), dy, dx, total)
+    return torch.from_numpy((across + down) / 4).permute(2, 0, 1)
 
 
 def _summed_by_torch(
-    cost: Float[Tensor, "length d m"], jump: Float[Tensor, "length-1 m"], small: float
+    cost: Float[Tensor, "length d m"], guide: Float[Tensor, "length m"], small: float, large: float
 ) -> Float[Tensor, "length d m"]:
-    """``_summed`` on any device."""
+    """The sums of ``paths.add_path`` in both directions along the first axis, on any device."""
+    jump = small + large / (1 + EDGE * (guide[1:] - guide[:-1]).abs())
     total = torch.zeros_like(cost)
     for order, jumps in ((range(len(cost)), jump), (range(len(cost) - 1, -1, -1), jump.flip(0))):
         before: Tensor | None = None
@@ -68,35 +72,3 @@ def _carried(before: Float[Tensor, "d m"], jump: Float[Tensor, " m"], small: flo
     carried[1:] = torch.minimum(carried[1:], before[:-1] + small)
     carried[:-1] = torch.minimum(carried[:-1], before[1:] + small)
     return carried - least
-
-
-@kernel
-def _summed(
-    cost: Float32[np.ndarray, "length d m"], jump: Float32[np.ndarray, "length-1 m"], small: np.float32
-) -> Float32[np.ndarray, "length d m"]:
-    """Costs summed along the first axis in both directions; to the bit as ``_summed_by_torch``."""
-    length, depths, width = cost.shape
-    total = np.zeros_like(cost)
-    before, now, least = np.empty_like(cost[0]), np.empty_like(cost[0]), np.empty(width, np.float32)
-    for backwards in (False, True):
-        for number in range(length):
-            place = length - 1 - number if backwards else number
-            now[:] = cost[place]
-            if number:
-                jumps = jump[place] if backwards else jump[place - 1]
-                least[:] = before[0]
-                for d in range(1, depths):
-                    for m in range(width):
-                        least[m] = min(least[m], before[d, m])
-                for d in range(depths):
-                    nearer, farther = before[max(d - 1, 0)], before[min(d + 1, depths - 1)]
-                    for m in range(width):
-                        carried = min(before[d, m], least[m] + jumps[m])
-                        if d > 0:
-                            carried = min(carried, nearer[m] + small)
-                        if d < depths - 1:
-                            carried = min(carried, farther[m] + small)
-                        now[d, m] += carried - least[m]
-            total[place] += now
-            before, now = now, before
-    return total

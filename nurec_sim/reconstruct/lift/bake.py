@@ -14,7 +14,7 @@ from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
 from nurec_sim.reconstruct.lift.settings import THREADS, LiftSettings
-from nurec_sim.reconstruct.lift.views import View
+from nurec_sim.reconstruct.lift.views import WorkingView
 from nurec_sim.types import Gaussians, Label
 
 GROUND_M = 0.12
@@ -24,7 +24,7 @@ KEPT_SHARE = 0.4
 
 
 def camera_isp(
-    views: Sequence[View], pictures: Sequence[DepthPicture], bodies: Sequence[Surfels], cameras: Sequence[str]
+    views: Sequence[WorkingView], pictures: Sequence[DepthPicture], bodies: Sequence[Surfels], cameras: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Affine response of each camera, from the static surfels that several cameras see."""
     cameras = [camera for camera in cameras if any(view.camera_id == camera for view in views)]
@@ -55,7 +55,7 @@ def _look_up(xyz, normal, views, pictures, rgb, body: Surfels | None) -> tuple[n
     return tuple(np.concatenate(items) for items in zip(*results, strict=True))
 
 
-def _packed(views: Sequence[View], body: Surfels | None) -> tuple[np.ndarray, np.ndarray]:
+def _packed(views: Sequence[WorkingView], body: Surfels | None) -> tuple[np.ndarray, np.ndarray]:
     if body is None or body.actor is None:
         return colour.packed_views(views), np.ones(len(views), bool)
     poses = [body.world_from_body(view.t_us) for view in views]
@@ -66,7 +66,7 @@ def body_gaussians(
     number: int,
     body: Surfels,
     ground: Ground,
-    views: Sequence[View],
+    views: Sequence[WorkingView],
     pictures: Sequence[DepthPicture],
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,
@@ -90,7 +90,7 @@ def body_gaussians(
 def _lifted(
     number: int,
     body: Surfels,
-    views: Sequence[View],
+    views: Sequence[WorkingView],
     pictures: Sequence[DepthPicture],
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,

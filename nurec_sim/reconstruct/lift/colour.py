@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.splat import project_point
-from nurec_sim.reconstruct.lift.views import View
+from nurec_sim.reconstruct.lift.views import WorkingView
 
 ENOUGH_SHARED = 300
 """Points that two cameras must share before their colours are compared."""
@@ -152,7 +152,9 @@ def to_canonical(rgb: np.ndarray, isp: Float64[np.ndarray, "3 4"]) -> np.ndarray
     return np.clip(shown @ np.linalg.inv(isp[:, :3]).T * 255, 0, 255)
 
 
-def packed_views(views: Sequence[View], body_poses: Sequence[np.ndarray] | None = None) -> Float64[np.ndarray, "k 23"]:
+def packed_views(
+    views: Sequence[WorkingView], body_poses: Sequence[np.ndarray] | None = None
+) -> Float64[np.ndarray, "k 23"]:
     """Packed projections of views from the world, or from a body with the given ``world_from_body`` at each view."""
     from nurec_sim import geometry
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt64
 
 from nurec_sim.compute.kernels import inner, kernel
+from nurec_sim.network.stereo.paths import add_path, brightness_steps
 
 PRIOR_COST, PRIOR_CAP = 40.0, 220.0
 SKY_COST, NOT_SKY_COST = 60.0, 40.0
@@ -124,45 +125,22 @@ def add_prior(cost, prior, sky, step):
                 cost[row, column, 0] += NOT_SKY_COST
 
 
-@inner
-def _sweep_path(cost, gray, dy, dx, total, line, fresh):
-    height, width, levels = cost.shape
-    rows = range(height) if dy > 0 or (dy == 0 and dx > 0) else range(height - 1, -1, -1)
-    for row in rows:
-        for step in range(width):
-            column = step if dx >= 0 else width - 1 - step
-            r, c = row - dy, column - dx
-            here = fresh[column]
-            if r < 0 or r >= height or c < 0 or c >= width:
-                for k in range(levels):
-                    here[k] = cost[row, column, k]
-            else:
-                before = line[c] if dy != 0 else fresh[c]
-                jump = abs(float(gray[row, column]) - float(gray[r, c]))
-                many = max(SMOOTH_MANY / (1.0 + jump / 8.0), SMOOTH_ONE + 1)
-                low = before[0]
-                for k in range(1, levels):
-                    low = min(low, before[k])
-                for k in range(levels):
-                    best = min(before[k], low + many)
-                    if k > 0:
-                        best = min(best, before[k - 1] + SMOOTH_ONE)
-                    if k < levels - 1:
-                        best = min(best, before[k + 1] + SMOOTH_ONE)
-                    here[k] = cost[row, column, k] + best - low
-            for k in range(levels):
-                total[row, column, k] += here[k]
-        line, fresh = fresh, line
+def smooth_depth(
+    cost: Float32[np.ndarray, "h w levels"], gray: UInt8[np.ndarray, "h w"], step: float
+) -> Float32[np.ndarray, "h w"]:
+    """Inverse depth of least cost after semi-global matching along eight paths (``stereo.paths``)."""
+    total, brightness = np.zeros_like(cost), gray.astype(np.float64)
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+        # Depth is likely to jump where the brightness does, so a jump costs less there.
+        jump = np.maximum(SMOOTH_MANY / (1.0 + brightness_steps(brightness, dy, dx) / 8.0), SMOOTH_ONE + 1)
+        add_path(cost, jump, SMOOTH_ONE, dy, dx, total)
+    return _least(total, step)
 
 
 @kernel
-def smooth_depth(cost, gray, step):
-    """Semi-global minimum over 8 paths; inverse depth with a parabola between levels [h, w] float32."""
-    height, width, levels = cost.shape
-    total = np.zeros((height, width, levels), np.float32)
-    line, fresh = np.zeros((width, levels), np.float32), np.zeros((width, levels), np.float32)
-    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
-        _sweep_path(cost, gray, dy, dx, total, line, fresh)
+def _least(total, step):
+    """The level of least cost [h,w,levels], with a parabola between levels, as inverse depth [h,w]."""
+    height, width, levels = total.shape
     result = np.zeros((height, width), np.float32)
     for row in range(height):
         for column in range(width):

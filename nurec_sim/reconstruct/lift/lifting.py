@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Float64, Int32
 
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.splat import project_point
-from nurec_sim.reconstruct.lift.views import View
+from nurec_sim.reconstruct.lift.views import WorkingView
 
 STATIC, NOBODY = -1, -2
 OWNER_RING = 0.1
@@ -49,7 +49,7 @@ class Lifted:
         return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in cls.__dataclass_fields__))
 
 
-def rays_of(view: View) -> Float64[np.ndarray, "h w 3"]:
+def rays_of(view: WorkingView) -> Float64[np.ndarray, "h w 3"]:
     """Rays through the pixel centres with depth 1, in the view's frame."""
     tile = view.tile
     u, v = np.meshgrid(np.arange(tile.width) + 0.5, np.arange(tile.height) + 0.5)
@@ -58,7 +58,7 @@ def rays_of(view: View) -> Float64[np.ndarray, "h w 3"]:
     )
 
 
-def points_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
+def points_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
     """World points of all pixels; pixels at infinity lie at 1000 m."""
     depth = 1.0 / np.maximum(inverse_depth.astype(np.float64), 1e-3)
     local = rays_of(view) * depth[..., None]
@@ -70,7 +70,7 @@ def points_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64[
     return local @ pose[:3, :3].T + pose[:3, 3]
 
 
-def normals_of(view: View, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
+def normals_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
     """World normals from the depth of neighbouring pixels; where these lie on other surfaces, facing the camera.
 
     In inverse depth a plane is linear in the pixel: w = n.ray / d, so its gradient gives the normal without noise
@@ -160,7 +160,7 @@ def stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
     return result
 
 
-def sky_coloured(view: View, prior: Float32[np.ndarray, "h w"], bright: float) -> Bool[np.ndarray, "h w"]:
+def sky_coloured(view: WorkingView, prior: Float32[np.ndarray, "h w"], bright: float) -> Bool[np.ndarray, "h w"]:
     """Pixels that look like sky: above the horizon, no surface measured, and bright or clearly blue."""
     rgb = view.rgb.astype(np.float32)
     up = rays_of(view) @ view.world_from_view[2, :3]

@@ -22,7 +22,7 @@ from nurec_sim.reconstruct.lift.pictures import DepthPicture, depth_pictures
 from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
-from nurec_sim.reconstruct.lift.views import View, read_views
+from nurec_sim.reconstruct.lift.views import WorkingView, read_views
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene
 
 Progress = Callable[[str, float], None]
@@ -102,7 +102,7 @@ def lift(
     )
 
 
-def _sky_weight(picture: DepthPicture, view: View, settings: LiftSettings) -> np.ndarray:
+def _sky_weight(picture: DepthPicture, view: WorkingView, settings: LiftSettings) -> np.ndarray:
     """How much each pixel tells of the sky: 1 if it is far and looks like sky, little if it is merely far."""
     far = (picture.inverse_depth < 1 / settings.views.max_depth_m) & view.tile.valid
     return np.where(far, np.where(picture.sky, 1.0, 0.02), 0.0)

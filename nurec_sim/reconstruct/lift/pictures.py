@@ -15,7 +15,7 @@ from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
 from nurec_sim.reconstruct.lift.settings import THREADS, LiftSettings
 from nurec_sim.reconstruct.lift.splat import draw_surfels, trim_silhouettes
-from nurec_sim.reconstruct.lift.views import View
+from nurec_sim.reconstruct.lift.views import WorkingView
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class DepthPicture:
 
 
 def depth_pictures(
-    views: Sequence[View], bodies: Sequence[Surfels], settings: LiftSettings, progress: Callable[[float], None]
+    views: Sequence[WorkingView], bodies: Sequence[Surfels], settings: LiftSettings, progress: Callable[[float], None]
 ) -> list[DepthPicture]:
     """Dense depth of the key views, matched against all views."""
     keys = [k for k, view in enumerate(views) if view.key]
@@ -66,7 +66,7 @@ def depth_pictures(
     return pictures
 
 
-def _draw(view: View, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _draw(view: WorkingView, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Splat all bodies: inverse depth, surfel row within its body, and body number per pixel."""
     offset, starts, jobs = 0, [], []
     for surfels in bodies:
@@ -84,7 +84,7 @@ def _draw(view: View, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.ndarray
     return inverse_depth, index, body
 
 
-def _bodies_of_pixels(view: View, bodies: Sequence[Surfels], dense: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+def _bodies_of_pixels(view: WorkingView, bodies: Sequence[Surfels], dense: np.ndarray, drawn: np.ndarray) -> np.ndarray:
     """Body number per pixel: that of the actor's surfel, else of the box that the pixel lies in, else the world (0)."""
     body = np.where(drawn >= 0, drawn, 0).astype(np.int32)
     open_pixels = (drawn <= 0) & (dense > 0)
@@ -105,7 +105,7 @@ def _bodies_of_pixels(view: View, bodies: Sequence[Surfels], dense: np.ndarray, 
     return body
 
 
-def neighbours_of(views: Sequence[View], k: int, count: int) -> list[int]:
+def neighbours_of(views: Sequence[WorkingView], k: int, count: int) -> list[int]:
     """Views to match view k against: alike in direction and time, 0.25 to 8 m away and best about 1.5 m."""
     mine = views[k]
     scored = []

@@ -9,12 +9,12 @@ from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lift.lifting import rays_of
-from nurec_sim.reconstruct.lift.views import View
+from nurec_sim.reconstruct.lift.views import WorkingView
 from nurec_sim.reconstruct.sky_fill import fill_unseen
 
 
 def make_sky(
-    views: Sequence[View],
+    views: Sequence[WorkingView],
     colours: Sequence[Float64[np.ndarray, "h w 3"]],
     weights: Sequence[Float64[np.ndarray, "h w"]],
     size: int,

@@ -38,7 +38,7 @@ class Tile:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class WorkingView:
     """One frame through one tile. ``rgb`` is display colour; pixels of ``key`` views are lifted."""
 
     camera_id: str
@@ -186,7 +186,7 @@ def read_views(
     cameras: Sequence[str],
     settings: ViewSettings,
     progress: Callable[[float], None] = lambda fraction: None,
-) -> list[View]:
+) -> list[WorkingView]:
     """Read and resample the chosen frames of the cameras."""
     tiles = {}
     for camera in cameras:
@@ -205,7 +205,7 @@ def read_views(
             pose = world_from_camera @ geometry.pose(tile.camera_from_tile, np.zeros(3))
             rgb = _resample(image, tile)
             drift = tile.camera_from_tile.T @ travel if tile.fraction.any() else np.zeros(3)
-            views.append(View(camera, frame, (start_us + end_us) // 2, key, tile, pose, drift, rgb))
+            views.append(WorkingView(camera, frame, (start_us + end_us) // 2, key, tile, pose, drift, rgb))
     return views
 
 

@@ -21,7 +21,7 @@ from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
 from nurec_sim.reconstruct.optimize.responses import FrameResponses, borrowed_responses
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 from nurec_sim.reconstruct.optimize.views import TrainingView, training_views
-from nurec_sim.render.cpu.backward.frame import Frame, sensor_tables
+from nurec_sim.render.cpu.backward.frame import SENSORS, Frame
 from nurec_sim.types import Clip, GaussianScene
 
 Progress = Callable[[str, float], None]
@@ -93,7 +93,7 @@ class Optimization:
         """Fit one view, with learning rates ``rate`` times those at the start; the loss before the step."""
         view, weights, rates = self.views[number], self.settings.weights, self.settings.rates
         height, width = view.image.shape[:2]
-        frame = Frame(sensor_tables(view.camera), view.world_from_camera, False)
+        frame = Frame(SENSORS.tables(view.camera), view.world_from_camera, False)
         drawn = self.parameters.at(view.t_us)
         planes = frame.draw(*drawn.arrays)[:, :height, :width]
         alpha, behind = planes[0], frame.draw_sky(self.sky)

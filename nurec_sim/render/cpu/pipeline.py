@@ -26,7 +26,7 @@ from nurec_sim.render.cpu.project.general import project_general
 from nurec_sim.render.cpu.project.pinhole import project_pinhole
 from nurec_sim.render.cpu.records import MACRO, RECORD
 from nurec_sim.render.cpu.simd import LANES
-from nurec_sim.render.cpu.view import View
+from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.cpu.workers import SPLIT, Lend, Workers
 
 SLICE_PAIRS, SLICE_BLOCKS, SLICE_RECORDS = 8192, 512, 200_000
@@ -58,7 +58,7 @@ class Picture:
     ``runs`` are the first row and the number of records that each layer has written, by range.
     """
 
-    view: View
+    view: ExposureView
     rays: RayTiles
     kind: int
     layers: Sequence[tuple[PackedGaussians, Int64[np.ndarray, " b"]]]
@@ -248,7 +248,7 @@ def _timed(stage: str, pictures: Sequence[Picture]) -> Iterator[None]:
         picture.stats.seconds[stage] = time.perf_counter() - began
 
 
-def blocks_in_view(view: View, layer: PackedGaussians) -> Int64[np.ndarray, " b"]:
+def blocks_in_view(view: ExposureView, layer: PackedGaussians) -> Int64[np.ndarray, " b"]:
     """Blocks whose sphere meets the cone of the grid's rays, widened by the sensor's own motion."""
     if view.grid.field_cos <= -1.0 or len(layer) == 0:
         return np.arange(len(layer))

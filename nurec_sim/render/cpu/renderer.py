@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import threading
 import time
-from collections import OrderedDict
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -13,19 +10,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from nurec_sim import geometry
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.compute.turns import rest
 from nurec_sim.render.cpu.blend.blocks import CAMERA, LIDAR, NORMALS
 from nurec_sim.render.cpu.blend.composite import composite
-from nurec_sim.render.cpu.blend.rays import RayTiles, tile_rays
 from nurec_sim.render.cpu.blend.sweep import sweep_returns
 from nurec_sim.render.cpu.blend.tiles import AFFINE, ROLLING
-from nurec_sim.render.cpu.grid import PINHOLE, Grid, grid_key, make_grid
 from nurec_sim.render.cpu.moving import PackedMoving
 from nurec_sim.render.cpu.pack import PackedGaussians, pack
 from nurec_sim.render.cpu.pipeline import NO_TABLE, FrameStats, Picture, blocks_in_view, draw
-from nurec_sim.render.cpu.view import View
+from nurec_sim.render.cpu.sensor_tables import SensorCache, SensorTables
+from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.cpu.workers import Buffers, Lend, Workers
-from nurec_sim.render.lod import Detail, ray_spacing
+from nurec_sim.render.lod import Detail
 from nurec_sim.render.rays import actors_at, reference_pose
 from nurec_sim.render.requests import (
     SENSED_OUTPUTS,
@@ -41,21 +38,6 @@ GROUP_BYTES = 256 << 20
 """Scratch memory of the frames that go through the stages together, or of a single larger one."""
 SLICE_RAYS = 1 << 16
 """Rays finished in one call of a kernel, about a millisecond of work."""
-KEPT_RAYS = 50_000_000
-"""Rays of the sensors whose tables are kept, in all; some 60 bytes each."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Sensor:
-    """Tables of a sensor; ``rays`` only where a pinhole's formula will not do.
-
-    ``ray_z`` holds the z of the unit rays, ``spacing_rad`` is the usual angle between neighbours.
-    """
-
-    grid: Grid
-    rays: RayTiles
-    ray_z: np.ndarray
-    spacing_rad: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +45,7 @@ class _Begun:
     """A frame on its way."""
 
     request: SensorRequest
-    sensor: _Sensor
+    sensor: SensorTables
     picture: Picture
 
 
@@ -91,13 +73,12 @@ class Renderer:
             raise ValueError(f"detail_px must be finite and not negative, got {detail_px}")
         self.scene = scene
         self.apply_isp = apply_isp
-        self._workers = Workers(threads or _usable_cores())
+        self._workers = Workers(threads or usable_cores())
         self._buffers = Buffers()
         self._static = Detail.of(scene.static, detail_px) if detail_px else pack(scene.static)
         self._moving = PackedMoving.of(scene.dynamic, scene.tracks)
         self._sky = np.ascontiguousarray(scene.sky, np.float32)
-        self._sensors: OrderedDict[tuple, _Sensor] = OrderedDict()
-        self._sensors_lock = threading.Lock()
+        self._sensors = SensorCache(SensorTables)
 
     def sense(self, requests: Sequence[SensorRequest], outputs: Sequence[str] = SENSED_OUTPUTS) -> list[SensorFrame]:
         """One frame per request, in order: ``types.Sense``; cameras with ``rgb`` and what else ``outputs`` names.
@@ -163,10 +144,10 @@ class Renderer:
         return frames, stats
 
     def _begin(self, request: SensorRequest, outputs: Sequence[str], array: Lend) -> _Begun:
-        sensor = self._sensor(request)
-        view = View.of(sensor.grid, request.world_from_sensor)
+        sensor = self._sensors.tables(request.sensor)
+        view = ExposureView.of(sensor.grid, request.world_from_sensor)
         kind = LIDAR if not isinstance(request.sensor, CameraModel) else NORMALS if "normal" in outputs else CAMERA
-        rays = NO_TABLE if view.way in (AFFINE, ROLLING) else self._ray_tables(sensor)
+        rays = NO_TABLE if view.way in (AFFINE, ROLLING) else sensor.rays
         return _Begun(request, sensor, Picture(view, rays, kind, self._layers(request, sensor, view, array), array))
 
     def _finish(self, group: Sequence[_Begun], outputs: Sequence[str], filter: LidarFilter) -> list[SensorFrame]:
@@ -183,7 +164,7 @@ class Renderer:
         return frames
 
     def _camera_frame(
-        self, request: SensorRequest, picture: Picture, sensor: _Sensor, planes: np.ndarray, outputs: Sequence[str]
+        self, request: SensorRequest, picture: Picture, sensor: SensorTables, planes: np.ndarray, outputs: Sequence[str]
     ) -> CameraFrame:
         assert isinstance(request.sensor, CameraModel)
         grid, view = sensor.grid, picture.view
@@ -244,7 +225,7 @@ class Renderer:
         return LidarFrame(request.sensor, request.start_us, request.end_us, xyz, range_m, intensity, beam)
 
     def _layers(
-        self, request: SensorRequest, sensor: _Sensor, view: View, array: Lend
+        self, request: SensorRequest, sensor: SensorTables, view: ExposureView, array: Lend
     ) -> list[tuple[PackedGaussians, np.ndarray]]:
         """The static layer, and the dynamic one as it is at the reference instant, with their blocks in view."""
         eye = view.world_from_reference[:3, 3]
@@ -258,29 +239,3 @@ class Renderer:
             moving = self._moving.at(t_us, actors, request.hidden, eye, self._workers, array)
             layers.append((moving, blocks_in_view(view, moving)))
         return layers
-
-    def _sensor(self, request: SensorRequest) -> _Sensor:
-        """Tables of the request's sensor, the latest kept up to ``KEPT_RAYS``."""
-        key = grid_key(request.sensor)
-        with self._sensors_lock:
-            sensor = self._sensors.get(key)
-            if sensor is not None:
-                self._sensors.move_to_end(key)
-                return sensor
-        grid = make_grid(request.sensor)
-        rays = NO_TABLE if grid.kind == PINHOLE else tile_rays(grid)
-        heights = np.ascontiguousarray(grid.direction[..., 2])
-        sensor = _Sensor(grid, rays, heights, ray_spacing(grid.direction))
-        with self._sensors_lock:
-            self._sensors[key] = sensor
-            while len(self._sensors) > 1 and sum(kept.grid.valid.size for kept in self._sensors.values()) > KEPT_RAYS:
-                self._sensors.popitem(last=False)
-        return sensor
-
-    def _ray_tables(self, sensor: _Sensor) -> RayTiles:
-        """The sensor's rays as a table; a pinhole needs one only where it moves too fast for ``View.way`` to roll."""
-        return tile_rays(sensor.grid) if sensor.rays is NO_TABLE else sensor.rays
-
-
-def _usable_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -20,7 +20,7 @@ GENTLE_TURN_RAD = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ExposureView:
     """A grid at its poses. The reference is the pose at ``grid.reference`` of the exposure.
 
     ``lines`` holds per line the rotation and translation of reference_from_line, then those of line_from_reference; a
@@ -38,7 +38,7 @@ class View:
     ends_from_reference: Float64[np.ndarray, "2 4 4"]
 
     @classmethod
-    def of(cls, grid: Grid, pair: Float64[np.ndarray, "2 4 4"]) -> View:
+    def of(cls, grid: Grid, pair: Float64[np.ndarray, "2 4 4"]) -> ExposureView:
         """The view of a grid whose sensor moves from the first to the second pose."""
         pair = np.asarray(pair, np.float64)
         reference = geometry.interpolate_pose_pair(pair, np.array(grid.reference))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -12,8 +10,8 @@ import numpy as np
 
 from nurec_sim.compute.turns import rest
 from nurec_sim.errors import TooLargeError
-from nurec_sim.render.cpu.grid import grid_key, make_grid
 from nurec_sim.render.cpu.pack import pack
+from nurec_sim.render.cpu.sensor_tables import SensorCache
 from nurec_sim.render.gpu.launcher import THREADS, CudaLauncher, Launcher
 from nurec_sim.render.gpu.moving import MovingLayer
 from nurec_sim.render.gpu.pipeline import ALPHA, Blocks, draw
@@ -40,7 +38,6 @@ from nurec_sim.types import (
 if TYPE_CHECKING:
     import torch
 
-KEPT_GRIDS = 24
 GROUP_RAYS = 1 << 24
 """Pixels and beams that are drawn together, or of a single larger frame; some hundred bytes each."""
 
@@ -88,8 +85,7 @@ class GpuRenderer:
         self._static = Blocks.of(pack(scene.static), self.device)
         self._moving = MovingLayer.of(scene.dynamic, scene.tracks, self.device)
         self._sky = torch.from_numpy(np.ascontiguousarray(scene.sky, np.float32)).to(self.device)
-        self._grids: OrderedDict[tuple, GridTensors] = OrderedDict()
-        self._lock = threading.Lock()
+        self._grids = SensorCache(lambda grid: GridTensors.of(grid, self.device))
 
     def sense(self, requests: Sequence[SensorRequest], outputs: Sequence[str] = SENSED_OUTPUTS) -> list[SensorFrame]:
         """One frame per request, in order: ``types.Sense``; cameras with ``rgb`` and what else ``outputs`` names.
@@ -176,7 +172,7 @@ class GpuRenderer:
         corrected = self.apply_isp and request.apply_isp
         isp = self.scene.response(request.sensor.id, request.middle_us) if corrected else None
         blocks = len(self._moving)
-        return SensorView(self._grid(request), request.world_from_sensor, isp, number * blocks, blocks)
+        return SensorView(self._grids.tables(request.sensor), request.world_from_sensor, isp, number * blocks, blocks)
 
     def _finish(
         self, batch: Batch, planes: torch.Tensor, requests: Sequence[SensorRequest], filter: LidarFilter
@@ -210,21 +206,6 @@ class GpuRenderer:
             thresholds = (float(filter.opacity_threshold), float(filter.raydrop_threshold), farthest)
             self._launcher.launch("finish_beams", grid, *common, range_m, *thresholds, images.returns)
         return images
-
-    def _grid(self, request: SensorRequest) -> GridTensors:
-        """Tables of the request's sensor, the latest ``KEPT_GRIDS`` kept."""
-        key = grid_key(request.sensor)
-        with self._lock:
-            tensors = self._grids.get(key)
-            if tensors is not None:
-                self._grids.move_to_end(key)
-                return tensors
-        tensors = GridTensors.of(make_grid(request.sensor), self.device)
-        with self._lock:
-            self._grids[key] = tensors
-            while len(self._grids) > KEPT_GRIDS:
-                self._grids.popitem(last=False)
-        return tensors
 
 
 def _camera_frame(request: SensorRequest, camera: CameraModel, planes: dict[str, np.ndarray]) -> CameraFrame:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.errors import NurecSimError
 from nurec_sim.render.requests import MAX_RAYS
 from nurec_sim.serving import wire
-from nurec_sim.serving.sensor_service.render_queue import usable_cores
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import os
 import threading
 import time
 from collections import Counter
@@ -28,11 +27,6 @@ MOST_RAYS = 1 << 25
 """Of the small jobs that have begun; large ones get twice as many, and a single one always."""
 MOST_BEGUN = 64
 """Jobs, a thread each."""
-
-
-def usable_cores() -> int:
-    """Processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class RenderQueue:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import TypeVar
 from zlib import crc32
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, UInt8
+from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError, TooLargeError
@@ -23,31 +22,10 @@ from nurec_sim.world.sense.backend import pick_backend
 from nurec_sim.world.sense.isp import CameraResponse, apply_response
 from nurec_sim.world.sense.scan import LidarResponse, TrueScan, measured_points
 from nurec_sim.world.sense.stage import Quality, Stage, named
+from nurec_sim.world.sense.truth import TrueView
 
 MAX_SIDE_PX = 4096
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class TrueView:
-    """An image with its ground truth. Pixels outside of the lens are black sky, and everything else is zero there.
-
-    Args:
-        rgb: colours, as the camera's ``CameraResponse`` makes them.
-        depth_m: distance of the surface along the optical axis, 0 for the sky and for what lies behind the camera
-            (lenses of more than 180 degrees).
-        surface: ``SurfaceClass``.
-        instance: 0 for static surfaces, i + 1 for actor i of the plan.
-        normal: unit normal of the surface in the camera frame, towards the camera; zero where none is known.
-        range_m: distance of the surface from the camera, 0 for the sky.
-    """
-
-    rgb: UInt8[np.ndarray, "h w 3"]
-    depth_m: Float32[np.ndarray, "h w"]
-    surface: UInt8[np.ndarray, "h w"]
-    instance: Int32[np.ndarray, "h w"]
-    normal: Float32[np.ndarray, "h w 3"]
-    range_m: Float32[np.ndarray, "h w"]
 
 
 class TrueWorld:

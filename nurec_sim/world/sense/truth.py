@@ -6,20 +6,39 @@ pixel coordinates, so that differences of neighbours are exact on planes, at any
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.types import CameraModel, Pinhole
 
-if TYPE_CHECKING:
-    from nurec_sim.world.sense.simulator import TrueView
-
 _NO_NEIGHBOUR = np.float32(1e9)
 
 Plane = Float32[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class TrueView:
+    """An image with its ground truth. Pixels outside of the lens are black sky, and everything else is zero there.
+
+    Args:
+        rgb: colours, as the camera's ``CameraResponse`` makes them.
+        depth_m: distance of the surface along the optical axis, 0 for the sky and for what lies behind the camera
+            (lenses of more than 180 degrees).
+        surface: ``SurfaceClass``.
+        instance: 0 for static surfaces, i + 1 for actor i of the plan.
+        normal: unit normal of the surface in the camera frame, towards the camera; zero where none is known.
+        range_m: distance of the surface from the camera, 0 for the sky.
+    """
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    depth_m: Float32[np.ndarray, "h w"]
+    surface: UInt8[np.ndarray, "h w"]
+    instance: Int32[np.ndarray, "h w"]
+    normal: Float32[np.ndarray, "h w 3"]
+    range_m: Float32[np.ndarray, "h w"]
 
 
 def slopes(nearness: Plane, geom: Int32[np.ndarray, "h w"]) -> tuple[Plane, Plane, Bool[np.ndarray, "h w"]]:

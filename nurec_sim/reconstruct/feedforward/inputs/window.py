@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from nurec_sim import geometry
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.network.profiles import Profile
 from nurec_sim.network.tensors import SCENE_RESCALE, NetworkInputs
 from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ContextImage
@@ -34,7 +34,7 @@ from nurec_sim.types import CameraModel, Clip
 
 LONE_FRAME_GAP_US = 500_000
 """How far the motion decoder looks from the only frame of a camera."""
-READING_THREADS = min(8, os.cpu_count() or 1)
+READING_THREADS = min(8, usable_cores())
 
 
 @dataclass(frozen=True, eq=False)

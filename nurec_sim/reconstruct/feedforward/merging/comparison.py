@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.compute.kernels import inner, kernel
 from nurec_sim.network.stereo.matching import ImageView
 from nurec_sim.network.tensors import NetworkInputs
@@ -103,7 +103,7 @@ def views_of(inputs: NetworkInputs) -> Views:
 def compare(pictures: Pictures, views: Views) -> Compared:
     """Compare every image with the others, on all cores; the result does not depend on their number."""
     count = len(pictures.depth_m)
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         said = pool.map(lambda image: _compare(image, _others(image, count), pictures, views), range(count))
         return Compared(*(np.stack(maps) for maps in zip(*said, strict=True)))
 

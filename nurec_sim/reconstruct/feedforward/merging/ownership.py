@@ -14,7 +14,6 @@ chunk sees stays in its own, and what only others see goes.
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from nurec_sim import geometry, sensors
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.reconstruct.feedforward.chunks import ChunkLayers, ContextImage
 from nurec_sim.render.cpu.pack import morton_order
 from nurec_sim.types import CameraModel, Fisheye, FTheta, Lens, Shutter, Windshield
@@ -93,7 +93,7 @@ def nearest_view_m(
     def search(rows: np.ndarray) -> None:
         result[rows] = _nearest_of_block(images, cones, np.asarray(points[rows], np.float64), limit[rows])
 
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         list(pool.map(search, blocks))
     return result
 

@@ -10,7 +10,6 @@ frame hide each other. Labels never mix. What is alone in its voxel stays as it 
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -19,6 +18,7 @@ from jaxtyping import Float64, Int64
 from scipy.special import spence
 
 from nurec_sim import geometry
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.types import Gaussians
 
 FIRST_VOXEL_M = 0.1
@@ -129,7 +129,7 @@ def merge_voxels(gaussians: Gaussians, voxel_m: float) -> Gaussians:
         for name, values in _merged(gaussians[members], inside, begins).items():
             getattr(result, name)[groups] = values
 
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         list(pool.map(merge_groups, [crowded[k : k + GROUPS_AT_ONCE] for k in range(0, len(crowded), GROUPS_AT_ONCE)]))
     return result
 

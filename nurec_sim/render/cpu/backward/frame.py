@@ -3,75 +3,31 @@
 from __future__ import annotations
 
 import functools
-import os
-import threading
 import weakref
-from collections import OrderedDict
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64
+from jaxtyping import Float32, Float64, Int32
 
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.render.cpu.backward.blend import IMAGE_PLANES, SUMS
 from nurec_sim.render.cpu.backward.project import project_back
 from nurec_sim.render.cpu.backward.repack import repack
 from nurec_sim.render.cpu.backward.tiles import draw_tiles_back, number_slots
 from nurec_sim.render.cpu.blend.background import draw_sky, draw_sky_back
 from nurec_sim.render.cpu.blend.blocks import CAMERA, LIDAR
-from nurec_sim.render.cpu.blend.rays import RayTiles, tile_rays
 from nurec_sim.render.cpu.blend.tiles import AFFINE, MOVING, ROLLING
-from nurec_sim.render.cpu.grid import Grid, grid_key, make_grid
 from nurec_sim.render.cpu.pack import BLOCK, FIELDS, PackedGaussians
 from nurec_sim.render.cpu.pipeline import NO_TABLE, Picture, draw, tile_ranges
-from nurec_sim.render.cpu.view import View
+from nurec_sim.render.cpu.sensor_tables import SensorCache, SensorTables
+from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.cpu.workers import Buffers, Workers
-from nurec_sim.types import CameraModel, LidarModel
 
-KEPT_SENSORS = 16
+SENSORS = SensorCache(SensorTables)
+"""Shared by all frames of the process: an optimisation draws the same few cameras again and again."""
 _BUFFERS = Buffers()
-_SENSORS: OrderedDict[tuple, Sensor] = OrderedDict()
-_SENSORS_LOCK = threading.Lock()
-
-
-@dataclass(frozen=True, eq=False)
-class Sensor:
-    """Tables of a sensor."""
-
-    grid: Grid
-
-    @cached_property
-    def rays(self) -> RayTiles:
-        """The rays as the kernels read them."""
-        return tile_rays(self.grid)
-
-    @cached_property
-    def all_valid(self) -> bool:
-        """Whether every pixel has a ray."""
-        return bool(np.all(self.grid.valid))
-
-    @cached_property
-    def cell_of_beam(self) -> Int64[np.ndarray, " n"]:
-        """Where in the grid each beam of a LiDAR is."""
-        assert self.grid.beam is not None
-        return np.argsort(self.grid.beam.reshape(-1))
-
-
-def sensor_tables(model: CameraModel | LidarModel) -> Sensor:
-    """Tables of a sensor, the latest ``KEPT_SENSORS`` kept."""
-    key = grid_key(model)
-    with _SENSORS_LOCK:
-        if key in _SENSORS:
-            _SENSORS.move_to_end(key)
-            return _SENSORS[key]
-    sensor = Sensor(make_grid(model))
-    with _SENSORS_LOCK:
-        _SENSORS[key] = sensor
-        while len(_SENSORS) > KEPT_SENSORS:
-            _SENSORS.popitem(last=False)
-    return sensor
 
 
 @functools.cache
@@ -79,11 +35,10 @@ def shared_workers(threads: int | None) -> Workers:
     """Threads shared by all frames that ask for as many; as many as the process may use if None."""
     if threads is not None and threads < 1:
         raise ValueError(f"rendering needs at least 1 thread, got {threads}")
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return Workers(threads or usable)
+    return Workers(threads or usable_cores())
 
 
-class ExactView(View):
+class ExactView(ExposureView):
     """A view whose rays start where they do; a rolling shutter is not drawn to first order."""
 
     @cached_property
@@ -103,7 +58,7 @@ class Frame:
     """
 
     def __init__(
-        self, sensor: Sensor, pair: Float64[np.ndarray, "2 4 4"], lidar: bool, threads: int | None = None
+        self, sensor: SensorTables, pair: Float64[np.ndarray, "2 4 4"], lidar: bool, threads: int | None = None
     ) -> None:
         self.sensor, self.lidar = sensor, lidar
         self.view = ExactView.of(sensor.grid, pair)

@@ -17,7 +17,8 @@ from torch.autograd.function import once_differentiable
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
 from nurec_sim.render import torch_maths
-from nurec_sim.render.cpu.backward.frame import Frame, Sensor, sensor_tables
+from nurec_sim.render.cpu.backward.frame import SENSORS, Frame
+from nurec_sim.render.cpu.sensor_tables import SensorTables
 from nurec_sim.render.spec import MIN_ALPHA, SURFACE_ALPHA
 from nurec_sim.types import CameraModel, Gaussians, LidarModel
 
@@ -242,15 +243,15 @@ def _draw(
     return tuple(torch.where(valid, plane, 0) for plane in planes)
 
 
-def _sensor(model: CameraModel | LidarModel, check: Callable[..., None]) -> Sensor:
+def _sensor(model: CameraModel | LidarModel, check: Callable[..., None]) -> SensorTables:
     try:
         check(model)
     except ValueError as error:
         raise RequestError(str(error)) from None
-    return sensor_tables(model)
+    return SENSORS.tables(model)
 
 
-def _poses(poses: Tensor, sensor: Sensor) -> tuple[Float[Tensor, "4 4"], Float[np.ndarray, "2 4 4"]]:
+def _poses(poses: Tensor, sensor: SensorTables) -> tuple[Float[Tensor, "4 4"], Float[np.ndarray, "2 4 4"]]:
     """The reference pose, which carries gradients, and the plain pair of poses."""
     if poses.shape not in ((4, 4), (2, 4, 4)):
         raise RequestError(f"a sensor needs one pose [4,4] or two [2,4,4], got {list(poses.shape)}")

@@ -19,7 +19,7 @@ from nurec_sim.render.cpu.project.motion import (
     other_ends,
     to_lines,
 )
-from nurec_sim.render.cpu.project.outlines import Box, Lens, LensCone, Lidar, LidarCone, Outline
+from nurec_sim.render.cpu.project.outlines import CellBox, LensChart, LensCone, LidarChart, LidarCone, Outline
 from nurec_sim.render.cpu.project.parts import PARTS, add_lens_part, add_lidar_part, part_lines
 from nurec_sim.render.cpu.project.pinhole import take_features
 from nurec_sim.render.cpu.records import (
@@ -40,7 +40,7 @@ def lens_boxes(
     v: Lanes, scratch: ir.Value, params: ir.Value, places: ir.Value, bends: ir.Value, box: ir.Value
 ) -> ir.Value:
     """Cells that a lens at one pose may see Gaussians in; the mask of those in its field."""
-    cone = LensCone(Lens(v, params, places, bends), Outline(v, scratch))
+    cone = LensCone(LensChart(v, params, places, bends), Outline(v, scratch))
     cone.box()[0].store(v, box)
     return (~cone.outside()).integer()
 
@@ -48,8 +48,8 @@ def lens_boxes(
 @vector_kernel("iiiii")
 def lidar_boxes(v: Lanes, scratch: ir.Value, params: ir.Value, rows: ir.Value, view: ir.Value, box: ir.Value) -> None:
     """Cells that a LiDAR at one pose may see Gaussians in."""
-    cone = LidarCone(Lidar(v, params, rows), Outline(v, scratch), v.broadcast(view, 4 * CELLS) * 0.5)
-    Box(cone.columns, cone.rows(0.0)).store(v, box)
+    cone = LidarCone(LidarChart(v, params, rows), Outline(v, scratch), v.broadcast(view, 4 * CELLS) * 0.5)
+    CellBox(cone.columns, cone.rows(0.0)).store(v, box)
 
 
 def _cells(low: Vector, high: Vector, count: Vector) -> tuple[Vector, Vector]:
@@ -118,7 +118,7 @@ def project_general(
         params: of the chart (``charts.Chart``), as are places and bends.
         places: see params.
         bends: see params.
-        lines: [l,24] poses per line (``pipeline.View``); a single one where nothing moves.
+        lines: [l,24] poses per line (``view.ExposureView``); a single one where nothing moves.
         motion: see ``motion.motion_parameters``.
         records: [..,16] output, from row ``base`` on.
         keys: [..] depths to sort by.

@@ -15,7 +15,7 @@ from jaxtyping import Float32
 from llvmlite import ir
 
 from nurec_sim.render.cpu.project.charts import PER_RADIAN, PERIOD, SHIFTED
-from nurec_sim.render.cpu.project.outlines import Box, Lens, LensCone, Lidar, LidarCone, Outline, Texels
+from nurec_sim.render.cpu.project.outlines import CellBox, LensChart, LensCone, LidarChart, LidarCone, Outline, Texels
 from nurec_sim.render.cpu.records import CELLS, CENTRE, LOG_P, ROTATION, SIGMA, STEP, dot
 from nurec_sim.render.cpu.simd import BITS, I64, LANES, Lanes, Mask, Vector, vector_kernel
 
@@ -27,7 +27,7 @@ LINES, BY_COLUMN, TURN_RATE, TRAVEL_RATE, SPEED = 0, 1, 2, 3, 6
 MOTION = 7
 
 TO_LINE = 12
-"""Column of ``View.lines`` from which on line_from_reference stands: rotation, translation."""
+"""Column of ``ExposureView.lines`` from which on line_from_reference stands: rotation, translation."""
 LINE_COLUMNS = 24
 MOST = 1e3
 """Radians that stand for any turn."""
@@ -36,7 +36,7 @@ APART = 16
 
 
 def motion_parameters(lines: Float32[np.ndarray, "l 24"], line_axis: int) -> Float32[np.ndarray, " 7"]:
-    """What the kernels need to know of the poses of ``View.lines``, which follow each other evenly."""
+    """What the kernels need to know of the poses of ``ExposureView.lines``, which follow each other evenly."""
     first, last = lines[0].astype(np.float64), lines[-1].astype(np.float64)
     steps = max(len(lines) - 1, 1)
     turn = first[:9].reshape(3, 3).T @ last[:9].reshape(3, 3)
@@ -53,7 +53,7 @@ def lens_lines(
     """The image row (or column) that the centres in ``scratch`` are seen in, to ``local``."""
     centre = [v.load(scratch, STEP * (CENTRE + k)) for k in range(3)]
     away = 1 / dot(centre, centre).max(1e-20).sqrt()
-    texels = Texels(Lens(v, params, places, places), [component * away for component in centre])
+    texels = Texels(LensChart(v, params, places, places), [component * away for component in centre])
     axis = 1 - v.broadcast(motion, 4 * BY_COLUMN)
     place = texels.entry(axis) + texels.entry(axis * 2 + 2) * texels.ds + texels.entry(axis * 2 + 3) * texels.dt
     v.store(place.floor().max(0).min(v.broadcast(motion, 4 * LINES) - 1), local, STEP * LINE)
@@ -65,7 +65,7 @@ def lidar_lines(
 ) -> None:
     """The column that the centres in ``scratch`` are seen in, to ``local``."""
     centre = [v.load(scratch, STEP * (CENTRE + k)) for k in range(3)]
-    place = Lidar(v, params, params).column(centre, v.broadcast(view, 4 * CELLS) * 0.5)
+    place = LidarChart(v, params, params).column(centre, v.broadcast(view, 4 * CELLS) * 0.5)
     v.store(place.floor().max(0).min(v.broadcast(motion, 4 * LINES) - 1), local, STEP * LINE)
 
 
@@ -159,7 +159,7 @@ def moving_lens_boxes(
 ) -> ir.Value:
     """Cells that any line of a lens may see Gaussians in; masks of those in its field and of the too fast."""
     outline = Outline(v, local)
-    cone = LensCone(Lens(v, params, places, bends), outline)
+    cone = LensCone(LensChart(v, params, places, bends), outline)
     motions = Motion(v, motion, local, outline, 1.0)
     by_column = v.broadcast(motion, 4 * BY_COLUMN) > 0.5
 
@@ -171,7 +171,7 @@ def moving_lens_boxes(
     box, (column_rate, row_rate) = cone.box(motions.turned(lines))
     lines, fast = motions.lines_away(*along(box.column, box.row), by_column.where(column_rate, row_rate), lines)
     turned = motions.turned(lines)
-    Box(widened(box.column, column_rate * turned), widened(box.row, row_rate * turned)).store(v, target)
+    CellBox(widened(box.column, column_rate * turned), widened(box.row, row_rate * turned)).store(v, target)
     return masks(v, ~cone.outside(motions.turned(motions.all_lines)), fast)
 
 
@@ -186,7 +186,7 @@ def moving_lidar_boxes(
     Returns:
         Masks of those that may cross the seam, of those that are too fast, and of those whose box holds columns.
     """
-    lidar, outline = Lidar(v, params, rows), Outline(v, local)
+    lidar, outline = LidarChart(v, params, rows), Outline(v, local)
     shifted, period, width = lidar.param(SHIFTED), lidar.param(PERIOD), v.broadcast(view, 4 * CELLS)
     motions = Motion(v, motion, local, outline, shifted)
     cone = LidarCone(lidar, outline, motions.line)
@@ -194,7 +194,7 @@ def moving_lidar_boxes(
     rate = cone.rate(motions.turned(lines))
     lines, fast = motions.lines_away(*cone.columns, rate, lines)
     turned = motions.turned(lines)
-    box = Box(widened(cone.columns, rate * turned), cone.rows(turned))
+    box = CellBox(widened(cone.columns, rate * turned), cone.rows(turned))
     box.store(v, target)
     # Over the whole sweep azimuths turn at most as much as directions do that are level.
     level = (cone.flat - outline.f[2].abs() * outline.reach).max(1e-3)

@@ -79,7 +79,7 @@ class Outline:
 
 
 @dataclass
-class Box:
+class CellBox:
     """Cells (fractional, centres at +0.5) that a group of Gaussians may be seen in: lowest and highest."""
 
     column: tuple[Vector, Vector]
@@ -91,7 +91,7 @@ class Box:
             v.store(end, target, STEP * k)
 
 
-class Lens:
+class LensChart:
     """A lens chart in memory."""
 
     def __init__(self, v: Lanes, params: ir.Value, places: ir.Value, bends: ir.Value) -> None:
@@ -105,7 +105,7 @@ class Lens:
 class Texels:
     """The texels of a lens chart nearest to unit directions ``f``, and the way (``ds``, ``dt``) from them to these."""
 
-    def __init__(self, lens: Lens, f: list[Vector]) -> None:
+    def __init__(self, lens: LensChart, f: list[Vector]) -> None:
         self.lens, self.f = lens, f
         self.inverse = 1 / (1 + f[2]).max(1e-6)
         self.s, self.t = f[0] * self.inverse, f[1] * self.inverse
@@ -148,7 +148,7 @@ class Texels:
 class LensCone:
     """Where a lens sees the cones of a group of Gaussians."""
 
-    def __init__(self, lens: Lens, outline: Outline) -> None:
+    def __init__(self, lens: LensChart, outline: Outline) -> None:
         self.lens, self.outline, self.texels = lens, outline, Texels(lens, outline.f)
         self.offset = self.texels.offset()
         self.places, self.slopes, self.intervals = [], [], []
@@ -158,7 +158,7 @@ class LensCone:
             self.slopes.append(dot(gradient, gradient).sqrt())
             self.intervals.append(outline.interval(gradient))
 
-    def box(self, turned: Vector | None = None) -> tuple[Box, list[Vector]]:
+    def box(self, turned: Vector | None = None) -> tuple[CellBox, list[Vector]]:
         """The box, and the most columns and rows per radian for directions up to the angle ``turned`` away.
 
         The place of the centre, its gradient times the tangents of the cone, and a pad for what bends: half the
@@ -175,7 +175,7 @@ class LensCone:
             pad = bend * away * away * 0.5 + cube + self.lens.param(MISFIT)
             ends.append((known.where(place + low - pad, -EVERYWHERE), known.where(place + high + pad, EVERYWHERE)))
             rates.append(slope + bend * (angle + self.offset))
-        return Box(*ends), rates
+        return CellBox(*ends), rates
 
     def outside(self, turned: Vector | None = None) -> Mask:
         """Which cones lie wholly outside of the lens's field, even turned by an angle."""
@@ -190,7 +190,7 @@ class LensCone:
         return beyond & (sin_field * cosine + cos_field * sine > 0) & (reach < WIDE)
 
 
-class Lidar:
+class LidarChart:
     """A LiDAR chart in memory."""
 
     def __init__(self, v: Lanes, params: ir.Value, rows: ir.Value) -> None:
@@ -216,7 +216,7 @@ class Lidar:
 class LidarCone:
     """Where a LiDAR sees the cones of a group of Gaussians: columns within half a turn of ``near``."""
 
-    def __init__(self, lidar: Lidar, outline: Outline, near: Vector) -> None:
+    def __init__(self, lidar: LidarChart, outline: Outline, near: Vector) -> None:
         self.lidar, self.outline = lidar, outline
         x, y, z = outline.f
         reach = outline.reach

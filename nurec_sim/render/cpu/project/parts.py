@@ -10,7 +10,15 @@ from llvmlite import ir
 
 from nurec_sim.render.cpu.project.charts import SHIFTED
 from nurec_sim.render.cpu.project.motion import BY_COLUMN, LINE, LINES, Motion, mask_of, widened
-from nurec_sim.render.cpu.project.outlines import EVERYWHERE, Box, Lens, LensCone, Lidar, LidarCone, Outline
+from nurec_sim.render.cpu.project.outlines import (
+    EVERYWHERE,
+    CellBox,
+    LensChart,
+    LensCone,
+    LidarChart,
+    LidarCone,
+    Outline,
+)
 from nurec_sim.render.cpu.records import CELLS, STEP
 from nurec_sim.render.cpu.simd import I32, INTS, Lanes, Mask, Vector, spread, vector_kernel
 
@@ -33,7 +41,9 @@ def _half(v: Lanes, motion: ir.Value) -> Vector:
     return v.broadcast(motion, 4 * LINES) * (0.5 / PARTS) + 1
 
 
-def _add(v: Lanes, part: ir.Value, chosen: ir.Value, box: Box, view: ir.Value, seen: Mask, target: ir.Value) -> None:
+def _add(
+    v: Lanes, part: ir.Value, chosen: ir.Value, box: CellBox, view: ir.Value, seen: Mask, target: ir.Value
+) -> None:
     """Enlarge the boxes of the mask ``chosen`` by those of a part; the first part starts anew."""
     width, height = (v.broadcast(view, 4 * (CELLS + k)) for k in range(2))
     (left, right), (top, bottom) = box.column, box.row
@@ -56,7 +66,7 @@ def add_lens_part(
 ) -> None:  # fmt: skip
     """Add the cells that the lines of one part of a lens's exposure may see to the boxes in the mask ``chosen``."""
     outline = Outline(v, local)
-    cone = LensCone(Lens(v, params, places, bends), outline)
+    cone = LensCone(LensChart(v, params, places, bends), outline)
     motions, half = Motion(v, motion, local, outline, 0.0), _half(v, motion)
     turned = motions.turned(half)
     box, (column_rate, row_rate) = cone.box(turned)
@@ -65,7 +75,7 @@ def add_lens_part(
     low, high = motions.line - half, motions.line + half
     columns = by_column.where(columns[0].max(low), columns[0]), by_column.where(columns[1].min(high), columns[1])
     rows = by_column.where(rows[0], rows[0].max(low)), by_column.where(rows[1], rows[1].min(high))
-    _add(v, part, chosen, Box(columns, rows), view, ~cone.outside(turned), target)
+    _add(v, part, chosen, CellBox(columns, rows), view, ~cone.outside(turned), target)
 
 
 @vector_kernel("iiiiiiii")
@@ -74,10 +84,10 @@ def add_lidar_part(
     view: ir.Value, target: ir.Value,
 ) -> None:  # fmt: skip
     """Add the cells that one part of a LiDAR's sweep may see to the boxes in the mask ``chosen``."""
-    lidar, outline = Lidar(v, params, rows), Outline(v, local)
+    lidar, outline = LidarChart(v, params, rows), Outline(v, local)
     shifted = lidar.param(SHIFTED)
     motions, half = Motion(v, motion, local, outline, shifted), _half(v, motion) + shifted
     cone, turned = LidarCone(lidar, outline, motions.line), motions.turned(half)
     left, right = widened(cone.columns, cone.rate(turned) * turned)
     columns = left.max(motions.line - half), right.min(motions.line + half)
-    _add(v, part, chosen, Box(columns, cone.rows(turned)), view, turned > -1, target)
+    _add(v, part, chosen, CellBox(columns, cone.rows(turned)), view, turned > -1, target)

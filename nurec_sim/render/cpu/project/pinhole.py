@@ -40,7 +40,7 @@ LINE_POSE = 13
 
 
 @dataclass(frozen=True)
-class Box:
+class PixelBox:
     """Pixels between which Gaussians are seen; ``gone`` where they are not seen at all."""
 
     u0: Vector
@@ -50,7 +50,7 @@ class Box:
     gone: Mask
 
 
-def pinhole_box(v: Lanes, centre: list[Vector], axes: list[list[Vector]], k2: Vector, view: ir.Value) -> Box:
+def pinhole_box(v: Lanes, centre: list[Vector], axes: list[list[Vector]], k2: Vector, view: ir.Value) -> PixelBox:
     """The exact box around the image of ellipsoids: tangents of the dual conic k2 Sigma - m m^T.
 
     Args:
@@ -89,10 +89,10 @@ def pinhole_box(v: Lanes, centre: list[Vector], axes: list[list[Vector]], k2: Ve
     gone = gone | beyond(-cy / fy, 1.0, y, yy, yz) | beyond((height - cy) / fy, -1.0, y, yy, yz)
     u0, u1 = interval(x, xx, xz, fx, cx)
     v0, v1 = interval(y, yy, yz, fy, cy)
-    return Box(u0, u1, v0, v1, crosses & gone)
+    return PixelBox(u0, u1, v0, v1, crosses & gone)
 
 
-def macro_tiles(v: Lanes, box: Box, view: ir.Value, target: ir.Value) -> ir.Value:
+def macro_tiles(v: Lanes, box: PixelBox, view: ir.Value, target: ir.Value) -> ir.Value:
     """Store the macro tiles of boxes; the mask of those that hold the centre of a cell."""
 
     def cells(low: Vector, high: Vector, size: Vector) -> tuple[Vector, Vector]:
@@ -151,7 +151,7 @@ def rolling_boxes(
         part = between[0].max(between[1]) + slack if larger else between[0].min(between[1]) - slack
         return wild.where(whole, part)
 
-    union = Box(
+    union = PixelBox(
         moved(start.u0, stop.u0, False),
         moved(start.u1, stop.u1, True),
         moved(start.v0, stop.v0, False),
