@@ -34,6 +34,7 @@ def command(output: Path, *more: str) -> list[str]:
     return [sys.executable, str(BENCHMARKS / "render.py"), *TINY, "--output", str(output), *more]
 
 
+@pytest.mark.slow
 def test_the_script_writes_a_row_per_sensor_that_agrees_with_the_reference(tmp_path):
     output = tmp_path / "bench.json"
     options = ["--sensors", "pinhole-640", "lidar-64", "--repeats", "3", "--paths", "turn"]
@@ -52,6 +53,7 @@ def test_the_script_writes_a_row_per_sensor_that_agrees_with_the_reference(tmp_p
     assert rows[1]["lidar_range_error_m_median"] <= 1e-3 and rows[1]["return_agreement"] >= 0.98
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_keeps_what_it_has_measured(tmp_path):
     output = tmp_path / "bench.json"
     running = subprocess.Popen(

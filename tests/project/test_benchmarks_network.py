@@ -31,6 +31,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
 
 
+@pytest.mark.slow
 def test_the_quick_run_writes_a_row_of_every_kind(tmp_path):
     output = tmp_path / "bench.json"
     done = run("--quick", "--repeats", "1", "--threads", "1", "--precisions", "float32", "--output", str(output))

@@ -12,20 +12,16 @@ from spoilt_archives import SIDECAR_BREAKS, Members, complete_scene, hashed, mem
 
 from nurec_sim.files.zip_package import write_package
 from nurec_sim.scene import archive, write_scene
-from nurec_sim.scene.interop.validate import RULES, alpasim_roads, openusd, validate_archive
+from nurec_sim.scene.interop.validate import RULES, openusd, validate_archive
 from nurec_sim.scene.usd.layers import static_layer
 from nurec_sim.types import Gaussians, GaussianScene, Label, Rig, Trajectory
+
+pytestmark = pytest.mark.usefixtures("few_placements")
 
 
 @pytest.fixture(scope="module")
 def members(tmp_path_factory) -> Members:
     return members_of(complete_scene(), tmp_path_factory.mktemp("validate"))
-
-
-@pytest.fixture(autouse=True)
-def few_placements(monkeypatch):
-    """The verdicts of a map are looked at elsewhere."""
-    monkeypatch.setattr(alpasim_roads, "PLACEMENTS", 30)
 
 
 def rules_of(path: Path) -> set[str]:

@@ -18,6 +18,7 @@ from nurec_sim.files.zip_package import write_package
 from nurec_sim.scene import write_scene
 from nurec_sim.scene.interop.validate import CONSUMERS, RULES, contents, openusd, same_scene_ids, validate_archive
 
+pytestmark = pytest.mark.usefixtures("few_placements")
 DOCS = Path(__file__).parents[2] / "docs" / "scene_format.md"
 
 

@@ -23,6 +23,8 @@ from nurec_sim.scene import alpasim_id, import_scene, write_scene
 from nurec_sim.scene.interop.validate import RULES, validate_archive
 from nurec_sim.types import CameraModel, FTheta, FThetaReference, GaussianScene, Rig, Track, Trajectory
 
+pytestmark = pytest.mark.usefixtures("few_placements")
+
 
 def with_cameras(*chosen: CameraModel, **changes) -> GaussianScene:
     """A scene with these cameras only, each with two frames."""
@@ -170,7 +172,6 @@ def test_an_import_closes_the_gaps_of_a_nurec_archive(tmp_path):
     assert_complete(write_scene(scene, tmp_path / "ours.usdz"), scene)
 
 
-@pytest.mark.slow
 def test_a_lifted_clip(tmp_path):
     scene = reconstruct(logs.open_clip(tiny_clip.write(tmp_path / "clip")), "lift")
     assert_complete(write_scene(scene, tmp_path / "a.usdz"), scene)

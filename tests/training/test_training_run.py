@@ -23,33 +23,48 @@ def trainer(folder, config=None):
     return Trainer(config or small_config(), folder, GroundSamples(), mean_difference, threads=1)
 
 
-def test_a_run_that_was_cut_off_ends_with_the_same_bytes(tmp_path):
-    trainer(tmp_path / "whole").run()
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder of a run of all three stages."""
+    folder = tmp_path_factory.mktemp("training") / "whole"
+    trainer(folder).run()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def first_step(tmp_path_factory):
+    """The folder of a run that ended after one step; tests copy what they change."""
+    folder = tmp_path_factory.mktemp("training") / "first"
+    trainer(folder).run(until=1)
+    return folder
+
+
+def test_a_run_that_was_cut_off_ends_with_the_same_bytes(whole, tmp_path):
     for until in (2, 4, 7, None):
         trainer(tmp_path / "cut").run(until=until)
-    whole, cut = ((tmp_path / name / WEIGHTS).read_bytes() for name in ("whole", "cut"))
-    state = [safetensors.torch.load_file(tmp_path / name / CHECKPOINT) for name in ("whole", "cut")]
+    folders = (whole, tmp_path / "cut")
+    state = [safetensors.torch.load_file(folder / CHECKPOINT) for folder in folders]
     assert state[0].keys() == state[1].keys()
     assert all(torch.equal(state[0][name], state[1][name]) for name in state[0])
-    metadata = [read_metadata(tmp_path / name / WEIGHTS) for name in ("whole", "cut")]
+    metadata = [read_metadata(folder / WEIGHTS) for folder in folders]
     assert metadata[0].pop("seconds") and metadata[1].pop("seconds") and metadata[0] == metadata[1]
     # The header has the seconds, with as many digits as they have, and is padded to whole 8 bytes.
-    assert abs(len(whole) - len(cut)) <= 8
+    sizes = [(folder / WEIGHTS).stat().st_size for folder in folders]
+    assert abs(sizes[0] - sizes[1]) <= 8
 
 
-def test_a_run_leaves_curves_weights_and_its_recipe(tmp_path):
-    trainer(tmp_path).run()
-    with (tmp_path / CURVES).open() as file:
+def test_a_run_leaves_curves_weights_and_its_recipe(whole):
+    with (whole / CURVES).open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["step"]) for row in rows] == list(range(1, 9))
     assert [row["stage"] for row in rows] == ["context"] * 3 + ["motion"] * 2 + ["gaussians"] * 3
     assert all(float(row["loss"]) > 0 for row in rows) and float(rows[-1]["psnr"]) > 5
-    assert json.loads((tmp_path / "recipe.json").read_text())["profile"] == "tiny"
-    assert (tmp_path / "samples" / "000008.png").is_file()
+    assert json.loads((whole / "recipe.json").read_text())["profile"] == "tiny"
+    assert (whole / "samples" / "000008.png").is_file()
     model = network.build("tiny", seed=None)
-    load_weights(model, tmp_path / WEIGHTS, "tiny")
-    assert (tmp_path / WEIGHTS).stat().st_size < 16 * 2**20
-    facts = read_metadata(tmp_path / WEIGHTS)
+    load_weights(model, whole / WEIGHTS, "tiny")
+    assert (whole / WEIGHTS).stat().st_size < 16 * 2**20
+    facts = read_metadata(whole / WEIGHTS)
     assert facts["steps"] == "8" and facts["data"] == "ground" and json.loads(facts["recipe"])["seed"] == 0
 
 
@@ -61,25 +76,21 @@ def test_training_lowers_the_loss(tmp_path):
     assert sum(depth[-5:]) < 0.75 * sum(depth[:5])
 
 
-def test_another_recipe_does_not_go_on_in_a_run_folder(tmp_path):
-    trainer(tmp_path).run(until=1)
+def test_another_recipe_does_not_go_on_in_a_run_folder(first_step):
     with pytest.raises(TrainingError, match="another recipe"):
-        trainer(tmp_path, small_config(seed=1))
+        trainer(first_step, small_config(seed=1))
 
 
-def test_a_damaged_checkpoint_is_refused(tmp_path):
-    trainer(tmp_path).run(until=1)
-    path = tmp_path / CHECKPOINT
-    path.write_bytes(path.read_bytes()[:1000])
+def test_a_damaged_checkpoint_is_refused(first_step, tmp_path):
+    (tmp_path / CHECKPOINT).write_bytes((first_step / CHECKPOINT).read_bytes()[:1000])
     with pytest.raises(TrainingError, match="damaged"):
         read_position(tmp_path)
 
 
-def test_training_begins_with_given_weights_and_says_what_does_not_fit(tmp_path):
-    trainer(tmp_path / "dense").run(until=1)
-    config = small_config(profile="tiny-selective", start=tmp_path / "dense" / WEIGHTS)
+def test_training_begins_with_given_weights_and_says_what_does_not_fit(first_step, tmp_path):
+    config = small_config(profile="tiny-selective", start=first_step / WEIGHTS)
     begun = trainer(tmp_path / "selective", config)
-    given = safetensors.torch.load_file(tmp_path / "dense" / WEIGHTS)["encoder.vit.blocks.0.attn.qkv.weight"]
+    given = safetensors.torch.load_file(first_step / WEIGHTS)["encoder.vit.blocks.0.attn.qkv.weight"]
     assert torch.equal(begun.model.encoder.vit.blocks[0].attn.qkv.weight.half(), given)
     with pytest.raises(WeightsError, match="no weights at"):
         trainer(tmp_path / "none", small_config(start=tmp_path / "missing.safetensors"))
@@ -127,6 +138,7 @@ processes.leave()
 """
 
 
+@pytest.mark.slow
 def test_two_processes_keep_the_same_weights_and_one_of_them_writes(tmp_path):
     program = RANK_PROGRAM.format(tests=str(Path(__file__).parents[1] / "helpers"), folder=str(tmp_path / "run"))
     with socket.socket() as probe:
