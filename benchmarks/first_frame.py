@@ -95,7 +95,7 @@ def main(archive: str, asked: str) -> None:
     """Draw one frame and print how long it took, apart from reading the archive."""
     import numpy as np
 
-    from nurec_sim.render import Renderer
+    from nurec_sim.render import CpuRenderer
     from nurec_sim.types import CameraModel, Pinhole, SensorRequest
 
     imported = time.perf_counter() - BEGAN
@@ -108,7 +108,7 @@ def main(archive: str, asked: str) -> None:
     scene = read_scene(archive)
     request = SensorRequest(scene.id, camera, start_us, start_us + 1, np.array(wanted["poses"]))
     began = time.perf_counter()
-    Renderer(scene, threads=wanted["threads"]).sense([request])
+    CpuRenderer(scene, threads=wanted["threads"]).sense([request])
     print(json.dumps({"first_frame_s": imported + time.perf_counter() - began}))
 
 

@@ -15,7 +15,7 @@ from cases import SENSORS
 from scenes import PATHS, ROOT, SCENES, BenchScene
 from timing import Draw, Entry
 
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.types import CameraModel, GaussianScene, SensorFrame, SensorRequest
 
 BUILD = ROOT / "build"
@@ -109,7 +109,7 @@ def count(scene: GaussianScene) -> int:
     return len(scene.static) + len(scene.dynamic)
 
 
-def entries(name: str, built: BenchScene, renderer: Renderer, options: Options) -> tuple[list[Entry], list[str]]:
+def entries(name: str, built: BenchScene, renderer: CpuRenderer, options: Options) -> tuple[list[Entry], list[str]]:
     """Everything to be timed on a scene, and remarks on what cannot be."""
     chosen = options.sensors or SCENE_SENSORS.get(name, OTHER_SCENES)
     frames = max(2, round(options.repeats * FEWER_FRAMES.get(name, 1.0)))
@@ -117,7 +117,7 @@ def entries(name: str, built: BenchScene, renderer: Renderer, options: Options) 
     first = paths[0]
     result: list[Entry] = []
 
-    def add(sensor: str, path: str, backend: str, draw: Draw, measured: Renderer | None = None, **more: Any) -> None:
+    def add(sensor: str, path: str, backend: str, draw: Draw, measured: CpuRenderer | None = None, **more: Any) -> None:
         case, outputs = SENSORS[sensor], SENSORS[sensor].outputs
         ticks = cases.tick_requests(built, case, path, more.pop("frames", frames))
         width, height = case.size
@@ -138,7 +138,7 @@ def entries(name: str, built: BenchScene, renderer: Renderer, options: Options) 
             add(sensor, path, "ours", each(renderer, SENSORS[sensor].outputs), renderer)
     detailed = [sensor for sensor in chosen if sensor in DETAIL_SENSORS]
     if detailed and options.detail_px > 0 and name in DETAIL_SCENES:
-        coarse = Renderer(built.scene, threads=options.thread_count, detail_px=options.detail_px)
+        coarse = CpuRenderer(built.scene, threads=options.thread_count, detail_px=options.detail_px)
         for sensor in detailed:
             full = row_name(name, sensor, first, "ours")
             add(sensor, first, "ours lod", each(coarse, SENSORS[sensor].outputs), coarse, full=full)
@@ -160,7 +160,7 @@ def row_name(scene: str, sensor: str, path: str, backend: str) -> str:
     return f"{scene} {sensor} {path}" + ("" if backend == "ours" else f" {backend.removeprefix('ours ')}")
 
 
-def each(renderer: Renderer, outputs: tuple[str, ...]) -> Draw:
+def each(renderer: CpuRenderer, outputs: tuple[str, ...]) -> Draw:
     """Draws requests one after the other, cameras with the given outputs."""
 
     def draw(requests: Sequence[SensorRequest]) -> list[SensorFrame]:
@@ -174,11 +174,11 @@ def each(renderer: Renderer, outputs: tuple[str, ...]) -> Draw:
     return draw
 
 
-def own_account(renderer: Renderer, outputs: tuple[str, ...]) -> Callable[[Sequence[SensorRequest]], list[Any]]:
+def own_account(renderer: CpuRenderer, outputs: tuple[str, ...]) -> Callable[[Sequence[SensorRequest]], list[Any]]:
     """What the renderer itself counts of a tick."""
     return lambda requests: renderer.measure(requests, outputs)[1]
 
 
-def one_by_one(renderer: Renderer) -> Draw:
+def one_by_one(renderer: CpuRenderer) -> Draw:
     """Draws requests as ``sense`` calls of one request."""
     return lambda requests: [frame for asked in requests for frame in renderer.sense([asked])]

@@ -8,7 +8,7 @@ import numpy as np
 
 from nurec_sim import geometry
 from nurec_sim.logs import open_clip
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.render.images.still import picture
 from nurec_sim.serving.store import SceneStore
 from nurec_sim.types import SensorRequest
@@ -21,7 +21,7 @@ def main() -> None:
     path = Path(str(resources.files("nurec_sim.scenarios") / "demo_clip.zip"))
     clip = open_clip(path)
     store = SceneStore([path])
-    renderer = Renderer(store.get(store.ids[0]).scene)
+    renderer = CpuRenderer(store.get(store.ids[0]).scene)
     pose = clip.world_from_camera(CAMERA, FRAME)
     t_us = int(clip.camera_times_us(CAMERA)[FRAME, 0])
     camera = clip.rig.cameras[CAMERA]

@@ -27,7 +27,7 @@ from scenes import BenchScene
 
 from nurec_sim.cli import console
 from nurec_sim.cli.console import err, out
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 
 PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
 HEADING = (
@@ -65,7 +65,7 @@ def scene_rows(name: str, options: Options) -> Iterator[dict[str, Any]]:
         advance("making the scene", 0.0)
         built = plan.build(name, options, advance)
         advance("packing the scene", 0.9)
-        renderer = Renderer(built.scene, threads=options.thread_count)
+        renderer = CpuRenderer(built.scene, threads=options.thread_count)
         entries, notes = plan.entries(name, built, renderer, options)
     out.print(f"\n{name}: {plan.count(built.scene):,} Gaussians. {built.about}", **PLAIN)
     for note in notes:

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from nurec_sim import geometry, sensors
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.serving.client import RemoteSensors
 from nurec_sim.serving.server import SensorServer
 from nurec_sim.serving.store import SceneStore
@@ -127,7 +127,7 @@ def drive(scene: GaussianScene, mix: list[CameraModel | LidarModel]) -> Iterator
 def sensing(scene: GaussianScene, direct: bool, threads: int) -> Iterator[Sense]:
     """What renders: the renderer, or a client of a server in this process."""
     if direct:
-        yield Renderer(scene, threads=threads).sense
+        yield CpuRenderer(scene, threads=threads).sense
         return
     with SensorServer(SceneStore([scene], threads=threads), port=0) as address:
         with RemoteSensors(address, scene.id) as remote:

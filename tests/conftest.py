@@ -3,6 +3,9 @@ from pathlib import Path
 
 import pytest
 
+# Tests compare bytes of frames: "auto" is the CPU, on a machine with a GPU too.
+os.environ.setdefault("NUREC_SIM_DEVICE", "cpu")
+
 # Asserts in helpers show the values that they compared, as those in tests do.
 pytest.register_assert_rewrite(*(path.stem for path in (Path(__file__).parent / "helpers").glob("*.py")))
 

@@ -41,6 +41,20 @@ def print_table(title: str, rows: Sequence[Sequence[object]], heading: Sequence[
     draw_table(out, title, rows, heading)
 
 
+def chosen_device(device: str, quiet: bool = False) -> str:
+    """The device to render on; says which one ``auto`` is, and why it is no GPU, unless ``quiet``.
+
+    Raises:
+        GpuError: see ``render.choose_device``.
+    """
+    from nurec_sim.render.device import choose_device
+
+    name, reason = choose_device(device)
+    if device == "auto" and reason and not quiet:
+        err.print(f"rendering on {name}: {reason}", style="dim", markup=False, highlight=False, soft_wrap=True)
+    return name
+
+
 def print_faults(faults: Sequence[str]) -> None:
     """One red line per fault, and exit status 1 if there are any."""
     for fault in faults:

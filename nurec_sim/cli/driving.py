@@ -13,7 +13,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from nurec_sim.cli.console import OnePath, Paths, app, err, out, part_of, print_faults, print_table, progress
+from nurec_sim.cli.console import (
+    OnePath,
+    Paths,
+    app,
+    chosen_device,
+    err,
+    out,
+    part_of,
+    print_faults,
+    print_table,
+    progress,
+)
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable
 
@@ -35,6 +46,7 @@ def run(
     cache: Path | None = None,
     video: bool = True,
     plan_timeout: float = 60.0,
+    device: str = "auto",
 ) -> None:
     """Drive policies closed-loop through scenes, measure, and write a report; exit status 1 if a rollout failed.
 
@@ -54,8 +66,9 @@ def run(
         cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
         video: also record the front camera of every rollout.
         plan_timeout: seconds for making a policy and for each of its answers; one that takes longer has failed.
+        device: that renders, without --address: auto (a GPU if one can be used), cpu, cuda or cuda:N.
     """
-    drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video, true_world, plan_timeout)
+    drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video, true_world, plan_timeout, device)
 
 
 @app.command
@@ -64,6 +77,7 @@ def demo(
     out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs"),
     resume: Path | None = None,
     cache: Path | None = None,
+    device: str = "auto",
 ) -> None:
     """Run the whole chain on the log that ships with the package: about five minutes on two cores.
 
@@ -71,8 +85,9 @@ def demo(
         out_path: folder that collects run folders.
         resume: go on with this run folder; finished rollouts are kept.
         cache: where the reconstructed scene is kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
+        device: that renders: auto (a GPU if one can be used), cpu, cuda or cuda:N.
     """
-    drive((), "demo", (), (), out_path, resume, None, cache, True)
+    drive((), "demo", (), (), out_path, resume, None, cache, True, device=device)
 
 
 @app.command
@@ -122,6 +137,7 @@ def drive(
     video: bool,
     true_world: Path | None = None,
     plan_timeout_s: float = 60.0,
+    device: str = "auto",
 ) -> None:
     """Policies, scenes, server, rollouts, report: what `run` and `demo` share."""
     from nurec_sim import runs, sim
@@ -138,7 +154,8 @@ def drive(
     if address is not None:
         with RemoteSensors(address) as sensors:
             sensors.version()  # a server that is not there ends this here
-    store = SceneStore(sources or [scenario_path.parent / str(scenario.clip)], cache_dir=cache)
+    device = "cpu" if address is not None else chosen_device(device)
+    store = SceneStore(sources or [scenario_path.parent / str(scenario.clip)], cache_dir=cache, device=device)
     for fault in store.faults.values():
         raise NurecSimError(fault)
     check_writable(resume or out_dir, folder=True)

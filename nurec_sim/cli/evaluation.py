@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from nurec_sim.cli.console import app, err, out, print_table, progress
+from nurec_sim.cli.console import app, chosen_device, err, out, print_table, progress
 from nurec_sim.cli.scenes import NO_FLAGS, Method, NetworkFlags, network_settings, refinement
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable, write_file
@@ -103,7 +103,7 @@ def evaluate(
         protocol: how to compare methods.
         log: how to measure one log.
         side_by_side: what to compare on what.
-        network: how logs go through the network (`nurec-sim reconstruct --help` says more).
+        network: how logs go through the network (`nurec-sim reconstruct --help` says more); --device also renders.
     """
     if protocol is None:
         _refuse(given(side_by_side, NO_PROTOCOL_FLAGS), "without --protocol")
@@ -138,6 +138,9 @@ def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> N
         check_writable(flags.json)
     if flags.images is not None:
         check_writable(flags.images, folder=True)
+    device = chosen_device(network.device)
+    if flags.method not in ("dense", "selective"):
+        network = dataclasses.replace(network, device=NO_FLAGS.device)  # its renderer alone uses it
     with progress("evaluating") as advance:
         figures = run_evaluation(
             log,
@@ -146,6 +149,7 @@ def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> N
             target_cameras=flags.target_cameras or None,
             hold_out_every=flags.hold_out_sweeps,
             via_grpc=not flags.local,
+            device=device,
             images_dir=flags.images,
             progress=advance,
             settings=network_settings(flags.method, network),
@@ -186,8 +190,9 @@ def evaluate_protocol(name: ProtocolName, flags: ProtocolFlags, network: FeedFor
     settings_of(protocol, methods)  # what is missing is said before a folder is made
     stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
     folder = new_run_folder(flags.out, stamp) if flags.resume is None else existing_run_folder(flags.resume)
+    device = chosen_device(network.device)
     with progress("evaluating") as advance:
-        results = run_protocol(protocol, methods, folder, advance)
+        results = run_protocol(protocol, methods, folder, advance, device)
     for table in tables(results):
         print_table(table.title, table.rows, table.heading)
         if table.note:

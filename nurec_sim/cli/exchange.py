@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from nurec_sim.cli.console import OnePath, app, out, print_table, progress
-from nurec_sim.cli.scenes import load_scene
+from nurec_sim.cli.scenes import loaded
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable
 
@@ -44,7 +44,7 @@ def export(
     from nurec_sim.types import Label
 
     check_writable(out_path)
-    world = load_scene(scene)
+    world = loaded(scene, "cpu").scene
     with progress("exporting") as advance:
         exported = export_scene(
             world, out_path, layout=layout, up=up, at_us=at_us, overwrite=overwrite, progress=advance

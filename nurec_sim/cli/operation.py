@@ -49,8 +49,8 @@ class OperationFlags:
     """Megabytes (2^20 bytes) of a request, or of a part of an upload; 16 if not given."""
     max_message_mb: int | None = None
     """Megabytes (2^20 bytes) of a reply; 64 if not given."""
-    device: str = "cpu"
-    """What renders: cpu, or a CUDA device such as cuda or cuda:1."""
+    device: str = "auto"
+    """Device that renders: auto (a GPU if one can be used), cpu, cuda or cuda:N."""
     workers: int | None = None
     """Frames rendered at the same time; as many as there are cores if not given."""
     health_port: int | None = None

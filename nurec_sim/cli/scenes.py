@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from nurec_sim.cli.console import OnePath, app, out, print_table, progress
+from nurec_sim.cli.console import OnePath, app, chosen_device, out, print_table, progress
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 
 if TYPE_CHECKING:
-    from nurec_sim.types import GaussianScene
+    from nurec_sim.serving.store import LoadedScene
 
 Method = Literal["lift", "dense", "selective", "optimized"]
 NetworkFlags = Annotated[FeedForwardSettings, tyro.conf.arg(name="")]
@@ -96,6 +96,7 @@ def render(
     yaw_deg: float = 0.0,
     layer: Literal["rgb", "depth", "alpha", "label", "normal"] = "rgb",
     width: int | None = None,
+    device: str = "auto",
 ) -> None:
     """Render one camera image of a scene to a PNG, from where it was recorded or beside it.
 
@@ -108,12 +109,13 @@ def render(
         yaw_deg: turn the car to the left by so many degrees.
         layer: what to draw.
         width: image width in pixels; the camera's own if not given.
+        device: that renders: auto (a GPU if one can be used), cpu, cuda or cuda:N.
     """
     from nurec_sim.render.images.still import render_still
 
     check_writable(out_path)
-    scene_ = load_scene(source)
-    render_still(scene_, out_path, camera, frame, left_m=left_m, yaw_deg=yaw_deg, layer=layer, width_px=width)
+    renderer = loaded(source, chosen_device(device)).renderer
+    render_still(renderer, out_path, camera, frame, left_m=left_m, yaw_deg=yaw_deg, layer=layer, width_px=width)
     out.print(f"wrote {out_path}", soft_wrap=True)
 
 
@@ -149,12 +151,12 @@ def refinement(seconds: float | None) -> OptimizeSettings | None:
         raise NurecSimError(f"--refine: {error}") from None
 
 
-def load_scene(source: Path) -> GaussianScene:
-    """A scene from an archive, or from a clip that is reconstructed now."""
+def loaded(source: Path, device: str) -> LoadedScene:
+    """A scene from an archive, or from a clip that is reconstructed now, and its renderer."""
     from nurec_sim.serving.store import SceneStore
 
-    store = SceneStore([source])
+    store = SceneStore([source], device=device)
     for fault in store.faults.values():
         raise NurecSimError(fault)
     with progress("loading") as advance:
-        return store.get(store.ids[0], progress=advance).scene
+        return store.get(store.ids[0], progress=advance)

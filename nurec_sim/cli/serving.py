@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import glob
 import inspect
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nurec_sim.cli.console import Paths, app, err, progress
+from nurec_sim.cli.console import Paths, app, chosen_device, err, progress
 from nurec_sim.cli.nre_flags import sort_flags
 from nurec_sim.cli.operation import (
     NO_FLAGS,
@@ -51,7 +50,7 @@ def serve(
         sources: scene archives, clips, or folders of them.
         host: address to listen on; only this machine unless said otherwise.
         port: 0 takes a free one.
-        threads: that work on one frame; half of the cores if not given, so that many clients get the most.
+        threads: CPU threads that work on one frame; half of the cores if not given, so that many clients get the most.
         cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
         cache_size: scenes kept in memory.
         cache_gb: gigabytes of memory for them; half of the machine's if not given.
@@ -63,7 +62,7 @@ def serve(
     options = server_options(operation)
     protected = options.tls is not None or options.token is not None
     check_exposure(host, protected=protected, insecure=operation.insecure)
-    store = _store(sources, cache_size, cache_dir=cache, threads=threads, gigabytes=cache_gb, device=operation.device)
+    store = _store(sources, cache_size, cache_dir=cache, threads=threads, gigabytes=cache_gb, device=_device(operation))
     if not store.ids and operation.upload_dir is None:
         raise NurecSimError("nothing to serve: " + ("; ".join(store.faults.values()) or "give archives or clips"))
     chosen = service_options(operation, ego_mask_dir=ego_mask_dir, scene_dirs=scene_dirs(operation, sources))
@@ -113,7 +112,7 @@ def serve_grpc(
     if max_workers is not None and operation.workers is None:
         operation = dataclasses.replace(operation, workers=max_workers)
     matches = _matches(artifact_glob)
-    store = _store(matches, cache_size, device=operation.device)
+    store = _store(matches, cache_size, device=_device(operation))
     if artifact_glob is not None and not store.ids:
         raise NurecSimError("nothing to serve: " + "; ".join(store.faults.values()))
     if test_scenes_are_valid:
@@ -162,7 +161,7 @@ def _store(
     cache_dir: Path | None = None,
     threads: int | None = None,
     gigabytes: float | None = None,
-    device: str = "cpu",
+    device: str = "auto",
 ) -> SceneStore:
     """The scenes of the sources.
 
@@ -174,12 +173,6 @@ def _store(
 
     if threads is not None and threads < 1:
         raise NurecSimError(f"--threads must be at least 1, got {threads}")
-    make_renderer = None
-    if device != "cpu":
-        from nurec_sim.render.gpu.launcher import CudaLauncher
-        from nurec_sim.render.gpu.renderer import GpuRenderer
-
-        make_renderer = functools.partial(GpuRenderer, device=CudaLauncher(device))
     max_bytes = None if gigabytes is None else int(gigabytes * 1e9)
     try:
         return SceneStore(
@@ -187,12 +180,17 @@ def _store(
             capacity=capacity,
             max_bytes=max_bytes,
             cache_dir=cache_dir,
+            device=device,
             threads=threads or max(1, usable_cores() // 2),
-            make_renderer=make_renderer,
             on_progress=err.print,
         )
     except ValueError as error:
         raise NurecSimError(str(error)) from None
+
+
+def _device(flags: OperationFlags) -> str:
+    """The device to render on; lines that are not JSON have no place in a log of JSON."""
+    return chosen_device(flags.device, quiet=flags.log_format == "json")
 
 
 def _run(

@@ -23,6 +23,7 @@ from nurec_sim.evaluate.scores.lidar import LidarScore, scanner_along, score_swe
 from nurec_sim.files.new_files import write_file
 from nurec_sim.metrics.offroad import offroad_agreement
 from nurec_sim.metrics.offroad_grid import scene_offroad_grid
+from nurec_sim.render import make_renderer
 from nurec_sim.types import CameraFrame, Clip, GaussianScene, LidarFrame, Sense, SensorRequest, Sweep
 
 Progress = Callable[[str, float], None]
@@ -37,6 +38,7 @@ def evaluate(
     hold_out_every: int = 0,
     hold_out_sweeps: Sequence[int] = (),
     via_grpc: bool = True,
+    device: str = "auto",
     images_dir: Path | None = None,
     progress: Progress | None = None,
     **options: Any,
@@ -51,6 +53,7 @@ def evaluate(
         hold_out_every: hold out sweeps K, 2K, 3K, ...; 0 holds out none.
         hold_out_sweeps: further sweeps to hold out, by index.
         via_grpc: whether frames come from a sensor server in this process over gRPC, or from a renderer directly.
+        device: that renders; see ``render.choose_device``.
         images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
         progress: called with a stage and the fraction of all work that is done, about.
         options: passed on to ``reconstruct``.
@@ -82,7 +85,7 @@ def evaluate(
     targets = inputs if target_cameras is None else list(target_cameras)
     seconds = {f"reconstruct: {stage}": round(spent, 3) for stage, spent in stages.seconds.items()}
     seconds["reconstruct"] = round(sum(stages.seconds.values()), 3)
-    with sensing(scene, via_grpc) as sense:
+    with sensing(scene, via_grpc, device) as sense:
         started = time.perf_counter()
         image = _score_images(clip, inputs, targets, sense, images_dir, _part(report, 0.6, 0.9))
         seconds["images"] = round(time.perf_counter() - started, 3)
@@ -138,19 +141,19 @@ def held_out(clip: Clip, every: int, listed: Sequence[int]) -> list[int]:
 
 
 @contextlib.contextmanager
-def sensing(scene: GaussianScene, via_grpc: bool) -> Iterator[Sense]:
+def sensing(scene: GaussianScene, via_grpc: bool, device: str) -> Iterator[Sense]:
     """A ``sense`` for a scene: through a server on a free port of this machine, or a renderer in this process."""
     if not via_grpc:
-        from nurec_sim.render.cpu.renderer import Renderer
-
-        local: Sense = Renderer(scene).sense
-        yield local
+        yield make_renderer(scene, device).sense
         return
     from nurec_sim.serving.client import RemoteSensors
     from nurec_sim.serving.server import SensorServer
     from nurec_sim.serving.store import SceneStore
 
-    with SensorServer(SceneStore([scene]), port=0) as address, RemoteSensors(address, scene.id) as remote:
+    with (
+        SensorServer(SceneStore([scene], device=device), port=0) as address,
+        RemoteSensors(address, scene.id) as remote,
+    ):
         yield remote.sense
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from nurec_sim.errors import ReconstructError, WeightsError
 from nurec_sim.evaluate.windows import Window
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, OptimizeSettings
+from nurec_sim.render import make_renderer
 from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, SensorRequest
 
 Show = Callable[[SensorRequest], CameraFrame]
@@ -145,8 +146,8 @@ def describe(contender: Contender) -> dict[str, Any]:
     return said | {"settings": values}
 
 
-def build(contender: Contender, window: Window) -> Built:
-    """Let a method see a window's log.
+def build(contender: Contender, window: Window, device: str = "auto") -> Built:
+    """Let a method see a window's log; ``device`` renders what it made of it (``render.choose_device``).
 
     Raises:
         ReconstructError: the log lacks what the method needs.
@@ -155,12 +156,11 @@ def build(contender: Contender, window: Window) -> Built:
     if contender.method == "copy":
         return Built(lambda request: _nearest(window.clip, request), None, 0.0)
     from nurec_sim.reconstruct import reconstruct
-    from nurec_sim.render.cpu.renderer import Renderer
 
     _look(window, sweeps=_sees_lidar(contender))
     started = time.perf_counter()
     scene = reconstruct(window.clip, contender.method, cameras=window.cameras, settings=contender.settings)
-    renderer, spent = Renderer(scene), time.perf_counter() - started
+    renderer, spent = make_renderer(scene, device), time.perf_counter() - started
     return Built(lambda request: renderer.render_camera(request, ("rgb", "depth")), scene, spent)
 
 

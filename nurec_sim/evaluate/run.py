@@ -34,7 +34,11 @@ DRAWING_SHARE = 0.3
 
 
 def run_protocol(
-    protocol: Protocol, methods: Sequence[Contender], folder: Path | None = None, progress: Progress | None = None
+    protocol: Protocol,
+    methods: Sequence[Contender],
+    folder: Path | None = None,
+    progress: Progress | None = None,
+    device: str = "auto",
 ) -> dict[str, Any]:
     """Compare methods side by side.
 
@@ -44,6 +48,7 @@ def run_protocol(
         folder: where windows, tables, sheets and the report go, and where finished windows are found again; None writes
             nothing.
         progress: called with what is done and the fraction of all that is.
+        device: that renders; see ``render.choose_device``.
 
     Returns:
         ``protocol``, ``methods`` (all settings), ``windows`` (every view's figures) and ``summary``
@@ -60,7 +65,7 @@ def run_protocol(
     for index, name in enumerate(protocol.ids):
         record = None if folder is None else _finished(folder, name, methods)
         if record is None:
-            record = _window(protocol, index, methods, folder, progress or (lambda stage, fraction: None))
+            record = _window(protocol, index, methods, folder, progress or (lambda stage, fraction: None), device)
         records.append(record)
     results = settings | {"windows": records, "summary": summarize(records, [method.name for method in methods])}
     if folder is not None:
@@ -80,7 +85,7 @@ def settings_of(protocol: Protocol, methods: Sequence[Contender]) -> dict[str, A
 
 
 def _window(
-    protocol: Protocol, index: int, methods: Sequence[Contender], folder: Path | None, progress: Progress
+    protocol: Protocol, index: int, methods: Sequence[Contender], folder: Path | None, progress: Progress, device: str
 ) -> dict[str, Any]:
     name, count = protocol.ids[index], len(protocol.ids)
 
@@ -92,7 +97,7 @@ def _window(
         share = (1 - DRAWING_SHARE) / len(methods)
         for number, method in enumerate(methods):
             first = DRAWING_SHARE + share * number
-            scored[method.name] = _scored(method, window, _part(tell, first, share))
+            scored[method.name] = _scored(method, window, _part(tell, first, share), device)
         record = {
             "id": window.id,
             "about": dict(window.about),
@@ -110,10 +115,10 @@ def _part(progress: Progress, first: float, share: float) -> Progress:
     return lambda stage, fraction: progress(stage, first + share * fraction)
 
 
-def _scored(method: Contender, window: Window, progress: Progress) -> Scored | str:
+def _scored(method: Contender, window: Window, progress: Progress, device: str) -> Scored | str:
     """A method's scores, or why it could not make anything of this window."""
     try:
-        return score_window(method, window, progress)
+        return score_window(method, window, progress, device)
     except ReconstructError as error:
         return str(error)
 

@@ -30,8 +30,19 @@ class Scored:
     views: dict[str, ScoredView]
 
 
-def score_window(contender: Contender, window: Window, progress: Callable[[str, float], None] | None = None) -> Scored:
+def score_window(
+    contender: Contender,
+    window: Window,
+    progress: Callable[[str, float], None] | None = None,
+    device: str = "auto",
+) -> Scored:
     """Let a method see a window and compare all that it shows with the truth.
+
+    Args:
+        contender: the method.
+        window: what it sees, and the truth.
+        progress: called with what is done and the fraction of it that is.
+        device: that renders; see ``render.choose_device``.
 
     Returns:
         The record: ``gaussians``, ``seconds`` (``reconstruct``; ``render`` per view), ``unknown``, and per target
@@ -42,7 +53,7 @@ def score_window(contender: Contender, window: Window, progress: Callable[[str, 
     """
     report = progress or (lambda stage, fraction: None)
     report(f"{contender.name} reconstructs", 0.0)
-    built: Built = build(contender, window)
+    built: Built = build(contender, window, device)
     rows, views, rendering = [], {}, 0.0
     for index, target in enumerate(window.targets):
         report(f"{contender.name} shows", 0.3 + 0.7 * index / len(window.targets))

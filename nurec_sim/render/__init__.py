@@ -9,7 +9,8 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submodules=["spec"],
     submod_attrs={
-        "cpu.renderer": ["Renderer"],
+        "cpu.renderer": ["CpuRenderer"],
+        "device": ["Renderer", "choose_device", "make_renderer"],
         "images.encode": ["encode_image"],
         "requests": ["check_request"],
     },

@@ -131,7 +131,7 @@ class SceneClient(Connection):
     def render_camera(
         self, request: SensorRequest, outputs: Sequence[str] = ("depth", "alpha", "label", "normal")
     ) -> CameraFrame:
-        """A camera frame, bit for bit as ``render.Renderer`` gives it: ``rgb`` always, and the ``outputs``."""
+        """A camera frame, bit for bit as the server's renderer gives it: ``rgb`` always, and the ``outputs``."""
         message = v1.RenderCameraRequest(outputs=[wire.CameraOutput[name.upper()] for name in {"rgb", *outputs}])
         wire.write_camera_request(request, message.request, scene_id=request.scene_id)
         reply = self._call("RenderCamera", message)
@@ -140,7 +140,7 @@ class SceneClient(Connection):
             return CameraFrame(frame.camera, frame.start_us, frame.end_us, frame.rgb, **wire.read_outputs(reply))
 
     def render_lidar(self, request: SensorRequest) -> LidarFrame:
-        """A sweep as points, bit for bit as ``render.Renderer`` gives it."""
+        """A sweep as points, bit for bit as the server's renderer gives it."""
         message = v1.RenderLidarRequest(form=wire.SweepForm.POINTS)
         wire.write_lidar_request(request, message.request, scene_id=request.scene_id)
         reply = self._call("RenderLidar", message)

@@ -6,7 +6,7 @@ import foreign_files as made
 import numpy as np
 
 from nurec_sim import geometry
-from nurec_sim.render.cpu.renderer import Renderer
+from nurec_sim.render.cpu.renderer import CpuRenderer
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, SensorRequest
 
 AT_US = made.START_US + 310_000
@@ -57,7 +57,7 @@ def camera_pose(t_us):
 def picture(scene, actors=None, at_us=AT_US):
     camera = made.rig().cameras["front"]
     request = SensorRequest("s", camera, at_us, at_us + 1, np.repeat(camera_pose(AT_US)[None], 2, axis=0), actors or {})
-    return Renderer(scene, threads=2).render_camera(request, ("rgb",)).rgb.astype(float)
+    return CpuRenderer(scene, threads=2).render_camera(request, ("rgb",)).rgb.astype(float)
 
 
 def psnr(a, b):

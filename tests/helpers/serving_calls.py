@@ -11,7 +11,7 @@ import pytest
 from serving_world import camera_request, lidar_request, scene
 
 from nurec_sim.compute.turns import rest
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.serving import wire
 from nurec_sim.serving.sensor_service import ServiceOptions
 from nurec_sim.serving.server import SensorServer
@@ -55,7 +55,7 @@ def street_stub(*more, **options):
 
 
 def street_renderer():
-    return Renderer(scene(), threads=2)
+    return CpuRenderer(scene(), threads=2)
 
 
 def camera_message(request=None, image_format=ImageFormat.RGB_UINT8_PLANAR, scene_id="street"):
@@ -118,7 +118,7 @@ class Gated:
     """A renderer that waits to be let through, and counts."""
 
     def __init__(self, scene):
-        self.inner, self.gate, self.begun = Renderer(scene, threads=2), threading.Event(), []
+        self.inner, self.gate, self.begun = CpuRenderer(scene, threads=2), threading.Event(), []
 
     def sense(self, requests, outputs=()):
         frames = []

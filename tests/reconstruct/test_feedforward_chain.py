@@ -12,7 +12,7 @@ from nurec_sim.evaluate import evaluate
 from nurec_sim.logs import open_clip
 from nurec_sim.plugins import load_policy
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, reconstruct
-from nurec_sim.render.cpu.renderer import Renderer
+from nurec_sim.render.cpu.renderer import CpuRenderer
 from nurec_sim.sim import Scenario, run_rollout
 from nurec_sim.types import Label, SensorRequest
 
@@ -99,7 +99,7 @@ def test_archive_keeps_and_renderer_draws_it(world, clip, tmp_path):
     start_us, end_us = (int(t) for t in clip.camera_times_us("front")[0])
     request = SensorRequest(again.id, clip.rig.cameras["front"], start_us, max(end_us, start_us + 1),
                             clip.world_from_camera("front", 0))  # fmt: skip
-    frame = Renderer(again).render_camera(request, ("rgb", "alpha"))
+    frame = CpuRenderer(again).render_camera(request, ("rgb", "alpha"))
     assert frame.alpha.mean() > 0.1
     assert frame.rgb.std() > 1
 

@@ -10,7 +10,7 @@ import render_scenes
 from nurec_sim import geometry
 from nurec_sim.reconstruct.feedforward.tracks.boxes import LEAST_M, Sighting, lengthened, track_of
 from nurec_sim.reconstruct.feedforward.tracks.clusters import group_into_tracks
-from nurec_sim.render.cpu.renderer import Renderer
+from nurec_sim.render.cpu.renderer import CpuRenderer
 from nurec_sim.types import MOVABLE_LABELS, DynamicGaussians
 
 
@@ -76,7 +76,7 @@ def test_a_request_moves_one_thing_and_nothing_else(street):
     def picture(scene_layer, actors):
         scene = render_scenes.scene(dynamic=scene_layer, tracks=tracks, span_us=span)
         request = render_scenes.request(sensor, rig, start_us=t_us, end_us=t_us + 1, actors=actors)
-        return Renderer(scene, threads=1).render_camera(request, outputs=("rgb", "alpha"))
+        return CpuRenderer(scene, threads=1).render_camera(request, outputs=("rgb", "alpha"))
 
     def without(number):
         rest = layer.track != number

@@ -13,7 +13,7 @@ from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.feedforward.merging.alignment import LARGEST_GAIN, UNSEEN_WEIGHT, colour_map
 from nurec_sim.reconstruct.feedforward.merging.merge import merge_chunks
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.types import Gaussians
 
 SMALL = settings(max_examples=25, deadline=None)
@@ -64,10 +64,10 @@ def test_no_seam_is_shown_where_chunks_meet():
         chunks.append(chunk(wall, [image(camera())], {"front": row}, sky=canonical))
     merged = merge_chunks(chunks, KEEP_ALL)
     world = scene(merged.static, sky=merged.sky, isp=merged.isp)
-    rgb = Renderer(world).render_camera(request(camera()), ("rgb",)).rgb
+    rgb = CpuRenderer(world).render_camera(request(camera()), ("rgb",)).rgb
     assert np.abs(rgb.astype(int) - np.round(display * 255).astype(int)).max() <= 1
     unaligned = scene(Gaussians.concatenate([c.static for c in chunks]), sky=merged.sky, isp=merged.isp)
-    seam = Renderer(unaligned).render_camera(request(camera()), ("rgb",)).rgb.astype(int)
+    seam = CpuRenderer(unaligned).render_camera(request(camera()), ("rgb",)).rgb.astype(int)
     assert np.abs(seam[24, 10] - seam[24, 60]).max() > 30
 
 

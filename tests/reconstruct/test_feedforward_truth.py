@@ -14,7 +14,7 @@ from nurec_sim.reconstruct.feedforward.inputs.window import chunk_inputs
 from nurec_sim.reconstruct.feedforward.layers import chunk_layers
 from nurec_sim.reconstruct.feedforward.method import _tracks
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
-from nurec_sim.render.cpu.renderer import Renderer
+from nurec_sim.render.cpu.renderer import CpuRenderer
 from nurec_sim.types import GaussianScene, SensorRequest
 
 FRAMES = 7
@@ -91,7 +91,7 @@ def world(request):
     tracks, dynamic = _tracks(log, layers.dynamic)
     scene = GaussianScene("street", layers.static, dynamic, layers.sky, layers.isp, log.rig, log.ego, tracks, None,
                           log.span_us)  # fmt: skip
-    return log, scene, Renderer(scene, threads=1)
+    return log, scene, CpuRenderer(scene, threads=1)
 
 
 def picture(log, renderer, frame, actors=None):

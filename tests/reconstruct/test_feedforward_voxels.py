@@ -16,7 +16,7 @@ from nurec_sim.reconstruct.feedforward.merging.voxels import (
     reduce_to_budget,
     voxel_keys,
 )
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.types import GAUSSIAN_FIELDS, OPTIONAL_GAUSSIAN_FIELDS, Gaussians
 
 SMALL = settings(max_examples=25, deadline=None)
@@ -129,7 +129,7 @@ def test_a_wall_of_tiles_stays_as_opaque_as_it_was():
     merged = merge_voxels(wall, 0.1)
     assert len(merged) < len(wall) / 3
     view = request(camera())
-    before, after = (Renderer(scene(g, sky=1.0)).render_camera(view, ("rgb", "alpha")) for g in (wall, merged))
+    before, after = (CpuRenderer(scene(g, sky=1.0)).render_camera(view, ("rgb", "alpha")) for g in (wall, merged))
     middle = np.s_[14:34, 26:46]
     assert before.alpha[middle].min() > 0.9
     assert np.abs(after.alpha[middle] - before.alpha[middle]).mean() < 0.05

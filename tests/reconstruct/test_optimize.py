@@ -18,7 +18,7 @@ from nurec_sim.reconstruct.optimize.image_loss import colour_loss
 from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
 from nurec_sim.reconstruct.optimize.responses import borrowed_responses
 from nurec_sim.reconstruct.optimize.views import Returns, returns_in, training_views
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.scene import read_scene, scene_hash, write_scene
 from nurec_sim.types import DynamicGaussians, SensorRequest
 
@@ -52,7 +52,7 @@ def fitted(street, lifted):
 def image_of(scene, clip, name, index):
     t_us = int(clip.t_us[index])
     request = SensorRequest(scene.id, clip.rig.cameras[name], t_us, t_us + 1, clip.world_from_camera(name, index))
-    return Renderer(scene, threads=1).render_camera(request, ("rgb",)).rgb
+    return CpuRenderer(scene, threads=1).render_camera(request, ("rgb",)).rgb
 
 
 def mean_psnr(scene, clip, name):

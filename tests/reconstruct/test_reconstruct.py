@@ -27,11 +27,11 @@ def scene(street):
 
 
 def image_of(scene, clip, name, index):
-    from nurec_sim.render import Renderer
+    from nurec_sim.render import CpuRenderer
 
     t_us = int(clip.t_us[index])
     request = SensorRequest("street", clip.rig.cameras[name], t_us, t_us + 1, clip.world_from_camera(name, index))
-    return Renderer(scene, threads=1).render_camera(request)
+    return CpuRenderer(scene, threads=1).render_camera(request)
 
 
 def test_scene_looks_like_the_log(street, scene):

@@ -10,7 +10,7 @@ from render_scenes import START_US, camera, cloud, gaussians, moved, psnr_db, re
 
 from nurec_sim import sensors
 from nurec_sim.errors import TooLargeError
-from nurec_sim.render import Renderer, spec
+from nurec_sim.render import CpuRenderer, spec
 from nurec_sim.render.requests import CAMERA_OUTPUTS
 from nurec_sim.types import (
     CameraFrame,
@@ -65,7 +65,7 @@ def assert_sound(frame, world):
 
 
 def all_frames(world, threads=2):
-    renderer = Renderer(world, threads=threads)
+    renderer = CpuRenderer(world, threads=threads)
     return [everything(renderer, asked) for asked in ASKED]
 
 
@@ -136,7 +136,7 @@ def test_any_mixture_of_broken_gaussians(asked, rows, motions):
         np.array([owner for _, _, _, owner in motions], np.int32),
     )
     world = scene(Gaussians.concatenate([GOOD, spoilt(rows)]), dynamic, [track()])
-    assert_sound(everything(Renderer(world, threads=1), asked), world)
+    assert_sound(everything(CpuRenderer(world, threads=1), asked), world)
 
 
 BROKEN = [
@@ -175,8 +175,8 @@ def test_gaussians_out_of_sight_change_nothing(where):
     unseen = gaussians(**OUT_OF_SIGHT[where])
     good = dataclasses.replace(GOOD, sh_rest=None)
     for asked in ASKED[:2]:
-        without = Renderer(scene(good)).render_camera(asked)
-        got = Renderer(scene(Gaussians.concatenate([unseen, good]))).render_camera(asked)
+        without = CpuRenderer(scene(good)).render_camera(asked)
+        got = CpuRenderer(scene(Gaussians.concatenate([unseen, good]))).render_camera(asked)
         assert np.abs(got.rgb.astype(int) - without.rgb).max() <= 1
         assert np.abs(got.alpha - without.alpha).max() <= 2e-4
         assert (got.label == without.label).all()
@@ -187,7 +187,7 @@ def test_gaussians_out_of_sight_change_nothing(where):
 
 def assert_close_to_spec(static, asked, least_db=60.0):
     world = scene(static)
-    frame = everything(Renderer(world, threads=2), asked)
+    frame = everything(CpuRenderer(world, threads=2), asked)
     assert_sound(frame, world)
     assert psnr_db(frame.rgb, spec.render_camera(world, asked).rgb) >= least_db
     return frame
@@ -206,7 +206,7 @@ def test_a_gaussian_at_the_eye_or_at_the_near_plane(x):
         static = gaussians([[x, 0.0, 0.0]], scale=scale, opacity=0.9)
         if abs(x - 0.2) > 1e-6:
             assert_close_to_spec(static, ASKED[0])
-        renderer = Renderer(scene(static), threads=2)
+        renderer = CpuRenderer(scene(static), threads=2)
         for asked in (ASKED[0], ASKED[1], ASKED[4]):
             assert_sound(everything(renderer, asked), scene(static))
 
@@ -245,7 +245,8 @@ def test_plates_and_needles_of_extreme_aspect(scale):
 
 def test_opacity_of_one_and_more_is_opaque_to_the_limit():
     for opacity in (0.99, 1.0, 5.0):
-        frame = Renderer(scene(gaussians([[5.0, 0, 0]], scale=5.0, opacity=opacity), sky=0.0)).render_camera(ASKED[0])
+        opaque = scene(gaussians([[5.0, 0, 0]], scale=5.0, opacity=opacity), sky=0.0)
+        frame = CpuRenderer(opaque).render_camera(ASKED[0])
         assert frame.alpha[12, 18] == pytest.approx(0.99, abs=1e-3)
 
 
@@ -261,7 +262,7 @@ def test_images_of_any_size(width, height):
             dataclasses.replace(WIDE_FISHEYE, fx_px=size * 0.3, fy_px=size * 0.3, cx_px=width / 2, cy_px=height / 2),
         ):
             asked = request(camera(width, height, lens, shutter), end_from_rig=moved())
-            assert_sound(everything(Renderer(scene(GOOD), threads=2), asked), scene(GOOD))
+            assert_sound(everything(CpuRenderer(scene(GOOD), threads=2), asked), scene(GOOD))
 
 
 @pytest.mark.parametrize("width, height", [(1, 1), (1, 40), (40, 1), (7, 3)])
@@ -296,7 +297,7 @@ def test_lidars_of_few_beams(rows, columns):
     )  # fmt: skip
     wall = gaussians([[8.0, 0, 0]], scale=[0.01, 3.0, 3.0], opacity=0.95)
     for asked in (request(few), request(few, end_from_rig=moved(0.0, 0.2, 0.0))):
-        got, expected = Renderer(scene(wall)).render_lidar(asked), spec.render_lidar(scene(wall), asked)
+        got, expected = CpuRenderer(scene(wall)).render_lidar(asked), spec.render_lidar(scene(wall), asked)
         assert_sound(got, scene(wall))
         assert len(got.beam) > 0 and np.array_equal(got.beam, expected.beam)
         assert np.abs(got.range_m - expected.range_m).max() < 2e-3
@@ -305,7 +306,7 @@ def test_lidars_of_few_beams(rows, columns):
 @pytest.mark.slow
 def test_an_8k_image():
     ultra = camera(7680, 4320)
-    renderer = Renderer(scene(GOOD), threads=2)
+    renderer = CpuRenderer(scene(GOOD), threads=2)
     frame = everything(renderer, request(ultra))
     assert_sound(frame, scene(GOOD))
     small = renderer.render_camera(request(camera(480, 270)))
@@ -314,7 +315,7 @@ def test_an_8k_image():
 
 
 def test_no_image_is_larger_than_8k():
-    renderer = Renderer(scene(GOOD), threads=2)
+    renderer = CpuRenderer(scene(GOOD), threads=2)
     with pytest.raises(TooLargeError, match="10000 x 10000 pixels are too many"):
         renderer.render_camera(request(camera(10_000, 10_000)))
     with pytest.raises(TooLargeError, match="8192 x 8192 pixels are too many"):

@@ -8,14 +8,14 @@ import pytest
 from render_scenes import START_US, camera, cloud, gaussians, moved, moving_cloud, request, scene, track
 
 from nurec_sim import geometry, sensors
-from nurec_sim.render import Renderer, encode_image, spec
+from nurec_sim.render import CpuRenderer, encode_image, spec
 from nurec_sim.render.layers import moving_gaussians, sh_basis
 from nurec_sim.types import DynamicGaussians, Gaussians, Label, LidarFilter, Shutter
 
 
 def test_one_gaussian_is_where_it_should_be():
     world = scene(gaussians([[10.0, 1.0, 0.5]], scale=0.15, opacity=0.95, rgb=(1, 0, 0), label=2), sky=0.0)
-    frame = Renderer(world).render_camera(request(camera(101, 61)))
+    frame = CpuRenderer(world).render_camera(request(camera(101, 61)))
     weight = frame.rgb[..., 0].astype(float)
     rows, columns = np.mgrid[0:61, 0:101] + 0.5
     focal = 101 * 0.65
@@ -32,7 +32,7 @@ def test_the_nearer_one_is_in_front(swap):
     both = gaussians([[5.0, 0, 0], [8.0, 0, 0]], scale=0.5, opacity=0.8)
     both = dataclasses.replace(both, rgb=np.float32([[1, 0, 0], [0, 1, 0]]))
     world = scene(both[np.array([1, 0])] if swap else both, sky=0.0)
-    frame = Renderer(world).render_camera(request(camera(33, 33)))
+    frame = CpuRenderer(world).render_camera(request(camera(33, 33)))
     assert tuple(frame.rgb[16, 16]) == (204, 41, 0)  # 0.8 red, then 0.8 of the rest green
 
 
@@ -44,7 +44,7 @@ def wall(distance=12.0, step=0.2):
 
 
 def test_a_flat_wall_has_flat_depth():
-    frame = Renderer(scene(wall())).render_camera(request(camera()))
+    frame = CpuRenderer(scene(wall())).render_camera(request(camera()))
     assert frame.alpha.min() > 0.98
     assert np.abs(frame.depth_m - 12.0).max() < 0.01
     assert (frame.label == Label.ROAD).all()
@@ -53,7 +53,7 @@ def test_a_flat_wall_has_flat_depth():
 def test_lidar_measures_a_wall_while_driving():
     lidar = sensors.lidar_model("VLP-16", geometry.pose(np.eye(3), np.array([0, 0, 0.0])), columns=720)
     asked = request(lidar, np.eye(4), moved(0.1, 1.0, 0.2), end_us=START_US + 100_000)
-    frame = Renderer(scene(wall())).render_lidar(asked)
+    frame = CpuRenderer(scene(wall())).render_lidar(asked)
     assert len(frame.beam) > 500
     world = geometry.transform_points(asked.world_from_sensor[1], frame.xyz_m)
     assert np.abs(world[:, 0] - 12.0).max() < 0.02
@@ -68,19 +68,19 @@ def test_lidar_threshold_range_and_unknown_intensity():
     lidar = sensors.lidar_model("VLP-16", np.eye(4), columns=360)
     thin = dataclasses.replace(wall(), opacity=np.full(len(wall()), 0.12, np.float32))
     thin = dataclasses.replace(thin, intensity=np.full(len(thin), np.nan, np.float32))
-    renderer = Renderer(scene(thin))
+    renderer = CpuRenderer(scene(thin))
     assert len(renderer.render_lidar(request(lidar), LidarFilter(opacity_threshold=0.9)).beam) == 0
     some = renderer.render_lidar(request(lidar), LidarFilter(opacity_threshold=0.05))
     assert len(some.beam) > 0 and (some.intensity == 0).all()
     short = dataclasses.replace(lidar, range_m=(0.5, 5.0))
-    assert len(Renderer(scene(wall())).render_lidar(request(short)).beam) == 0
+    assert len(CpuRenderer(scene(wall())).render_lidar(request(short)).beam) == 0
 
 
 def test_lidar_reports_the_surface_and_no_mean_of_two():
     lidar = sensors.lidar_model("VLP-16", np.eye(4), columns=360)
     veil = dataclasses.replace(wall(6.0), opacity=np.full(len(wall()), 0.12, np.float32))
     both = scene(Gaussians.concatenate([veil, wall(12.0)]))
-    for frame in (Renderer(both).render_lidar(request(lidar)), spec.render_lidar(both, request(lidar))):
+    for frame in (CpuRenderer(both).render_lidar(request(lidar)), spec.render_lidar(both, request(lidar))):
         ahead = frame.xyz_m[np.abs(frame.xyz_m[:, 1]) < 2.0]
         assert len(ahead) > 20
         assert np.abs(ahead[:, 0] - 12.0).max() < 0.05
@@ -139,7 +139,7 @@ def test_harmonics_are_orthonormal():
 def test_the_sky_is_looked_up_in_the_world():
     sky = geometry.cubemap_directions(64) * 0.5 + 0.5
     asked = request(camera(), geometry.pose_from_xyyaw(3, 4, 0.7))
-    frame = Renderer(scene(sky=sky)).render_camera(asked)
+    frame = CpuRenderer(scene(sky=sky)).render_camera(asked)
     rays, _ = sensors.pixel_rays(asked.sensor)
     world = rays @ asked.world_from_sensor[0, :3, :3].T
     assert np.abs(frame.rgb / 255 - (world * 0.5 + 0.5)).max() < 0.02
@@ -152,7 +152,7 @@ def test_same_bytes_at_any_thread_count():
         request(camera(150, 90)),
         request(sensors.lidar_model("VLP-16", np.eye(4), columns=300), end_from_rig=moved()),
     ]
-    one, many = Renderer(world, threads=1).sense(asked), Renderer(world, threads=5).sense(asked)
+    one, many = CpuRenderer(world, threads=1).sense(asked), CpuRenderer(world, threads=5).sense(asked)
     for a, b in zip(one, many, strict=True):
         for field in dataclasses.fields(a):
             if isinstance(getattr(a, field.name), np.ndarray):
@@ -161,9 +161,9 @@ def test_same_bytes_at_any_thread_count():
 
 def test_many_threads_share_a_renderer():
     world = scene(cloud(1000), moving_cloud(), [track()])
-    renderer = Renderer(world, threads=2)
+    renderer = CpuRenderer(world, threads=2)
     asked = [request(camera(60 + 8 * k, 40), moved(0.1 * k)) for k in range(6)]
-    alone = [Renderer(world, threads=1).render_camera(each).rgb for each in asked]
+    alone = [CpuRenderer(world, threads=1).render_camera(each).rgb for each in asked]
     with ThreadPoolExecutor(6) as pool:
         together = list(pool.map(lambda each: renderer.render_camera(each).rgb, asked * 4))
     for k, rgb in enumerate(together):
@@ -172,7 +172,7 @@ def test_many_threads_share_a_renderer():
 
 def test_empty_and_broken_gaussians():
     asked = [request(camera()), request(sensors.lidar_model("VLP-16", np.eye(4), columns=90))]
-    image, sweep = Renderer(scene(sky=0.25)).sense(asked)
+    image, sweep = CpuRenderer(scene(sky=0.25)).sense(asked)
     assert (image.rgb == 64).all() and (image.label == Label.SKY).all() and len(sweep.beam) == 0
     broken = gaussians(np.tile([[5.0, 0, 0]], (6, 1)))
     broken.mean_m[0] = np.nan
@@ -180,13 +180,13 @@ def test_empty_and_broken_gaussians():
     broken.scale_m[2] = np.inf
     broken.opacity[3:5] = (0.0, 0.003)
     broken.rgb[5] = np.nan
-    image, sweep = Renderer(scene(broken, sky=0.25)).sense(asked)
+    image, sweep = CpuRenderer(scene(broken, sky=0.25)).sense(asked)
     assert (image.rgb == 64).all() and len(sweep.beam) == 0
     assert len(Gaussians.empty()) == 0
 
 
 def test_planes_are_optional_and_colours_round_half_up():
-    frame = Renderer(scene(sky=0.5)).render_camera(request(camera()), outputs=("rgb",))
+    frame = CpuRenderer(scene(sky=0.5)).render_camera(request(camera()), outputs=("rgb",))
     assert frame.depth_m is None and frame.alpha is None and frame.label is None
     assert (frame.rgb == 128).all()
     assert spec.to_uint8(np.array([-1.0, 0.49 / 255, 0.5 / 255, 2.0])).tolist() == [0, 0, 1, 255]
@@ -196,7 +196,7 @@ def test_planes_are_optional_and_colours_round_half_up():
 def test_encoding(image_format):
     import cv2
 
-    rgb = Renderer(scene(cloud())).render_camera(request(camera())).rgb
+    rgb = CpuRenderer(scene(cloud())).render_camera(request(camera())).rgb
     data = encode_image(rgb, image_format)
     if image_format == "rgb_planar":
         assert np.array_equal(np.frombuffer(data, np.uint8).reshape(3, 48, 72)[0], rgb[..., 0])

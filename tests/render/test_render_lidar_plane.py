@@ -8,7 +8,7 @@ from render_scenes import START_US, request, scene
 
 from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.lift import surfaces
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.types import Label
 
 HEIGHT_M = 1.9
@@ -61,7 +61,7 @@ def test_ranges_on_flat_ground(plane, thick_m, device):
     mount = geometry.pose(np.eye(3), np.array([0.0, 0.0, HEIGHT_M]))
     lidar = sensors.lidar_model(device, mount)
     world = scene(dataclasses.replace(plane, scale_m=scale))
-    frame = Renderer(world, threads=2).render_lidar(request(lidar, end_us=START_US + 100_000))
+    frame = CpuRenderer(world, threads=2).render_lidar(request(lidar, end_us=START_US + 100_000))
 
     direction = sensors.beam_directions(lidar).reshape(-1, 3)
     with np.errstate(divide="ignore"):

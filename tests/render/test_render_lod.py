@@ -7,7 +7,7 @@ import pytest
 from render_scenes import camera, gaussians, psnr_db, request, scene
 
 from nurec_sim import geometry
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.render.cpu.grid import make_grid
 from nurec_sim.render.cpu.pack import BLOCK
 from nurec_sim.render.lod import Detail, choose_blocks, merge_levels, ray_spacing
@@ -159,7 +159,7 @@ def test_blocks_out_of_view_are_left_out_and_nearer_ones_are_finer():
 
 def drawn(full, asked, detail_px, threads=2):
     """A picture at a level of detail, and how many Gaussians it took."""
-    (picture,), (stats,) = Renderer(scene(full), threads=threads, detail_px=detail_px).measure([asked])
+    (picture,), (stats,) = CpuRenderer(scene(full), threads=threads, detail_px=detail_px).measure([asked])
     return picture, stats.visible
 
 
@@ -182,14 +182,14 @@ def test_no_tolerance_draws_everything():
     detail = Detail.of(full, 0.0)
     layers = detail.layers(np.zeros(3), 0.01, lambda packed: np.arange(len(packed)))
     assert len(layers) == 1 and (layers[0][0].index >= 0).sum() == len(full)
-    default = Renderer(scene(full)).render_camera(asked)
+    default = CpuRenderer(scene(full)).render_camera(asked)
     assert np.array_equal(drawn(full, asked, 0.0)[0].rgb, default.rgb)
 
 
 def test_a_sweep_at_a_level_of_detail_finds_the_same_wall():
     world, asked = scene(wall(60_000, far=35.0, sigma_m=0.1)), request(lidar_model("VLP-16", np.eye(4), columns=360))
-    full = Renderer(world).render_lidar(asked)
-    (some,), (stats,) = Renderer(world, detail_px=0.3).measure([asked])
+    full = CpuRenderer(world).render_lidar(asked)
+    (some,), (stats,) = CpuRenderer(world, detail_px=0.3).measure([asked])
     assert stats.visible < 50_000
     _, mine, theirs = np.intersect1d(some.beam, full.beam, return_indices=True)
     assert len(mine) > 0.98 * len(full.beam)
@@ -199,7 +199,7 @@ def test_a_sweep_at_a_level_of_detail_finds_the_same_wall():
 @pytest.mark.parametrize("detail_px", [-1.0, np.nan, np.inf])
 def test_nonsense_tolerances_are_refused(detail_px):
     with pytest.raises(ValueError, match="detail_px must be finite and not negative, got"):
-        Renderer(scene(wall(10)), detail_px=detail_px)
+        CpuRenderer(scene(wall(10)), detail_px=detail_px)
 
 
 def test_layers_hold_the_chosen_blocks_in_view():

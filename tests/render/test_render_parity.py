@@ -19,13 +19,13 @@ from render_scenes import (
 )
 
 from nurec_sim import geometry
-from nurec_sim.render import Renderer, spec
+from nurec_sim.render import CpuRenderer, spec
 from nurec_sim.render.requests import CAMERA_OUTPUTS
 from nurec_sim.types import LidarFilter, Shutter, Windshield, WindshieldReference
 
 
 def assert_same_image(world, asked, least_db=60.0):
-    renderer, expected = Renderer(world, threads=2), spec.render_camera(world, asked)
+    renderer, expected = CpuRenderer(world, threads=2), spec.render_camera(world, asked)
     got = renderer.render_camera(asked, CAMERA_OUTPUTS)
     assert psnr_db(got.rgb, expected.rgb) >= least_db
     assert psnr_db(renderer.render_camera(asked).rgb, expected.rgb) >= least_db
@@ -83,11 +83,11 @@ def test_isp_and_its_switch():
     isp = {"front": np.array([[0.8, 0.1, 0, 0.05], [0, 0.7, 0.1, 0], [0.1, 0, 0.9, -0.1]])}
     world, asked = scene(cloud(), isp=isp), request(camera())
     assert_same_image(world, asked)
-    plain = Renderer(world, apply_isp=False).render_camera(asked)
+    plain = CpuRenderer(world, apply_isp=False).render_camera(asked)
     assert psnr_db(plain.rgb, spec.render_camera(world, asked, apply_isp=False).rgb) >= 60
-    assert np.array_equal(plain.rgb, Renderer(world).render_camera(dataclasses.replace(asked, apply_isp=False)).rgb)
-    assert psnr_db(plain.rgb, Renderer(world).render_camera(asked).rgb) < 30
-    other = Renderer(world).render_camera(request(camera(id="rear")))
+    assert np.array_equal(plain.rgb, CpuRenderer(world).render_camera(dataclasses.replace(asked, apply_isp=False)).rgb)
+    assert psnr_db(plain.rgb, CpuRenderer(world).render_camera(asked).rgb) < 30
+    other = CpuRenderer(world).render_camera(request(camera(id="rear")))
     assert np.array_equal(other.rgb, plain.rgb)
 
 
@@ -97,13 +97,13 @@ def test_moving_actors(actors):
     pairs = {name: np.stack([pose, moved() @ pose]) for name, pose in actors.items()}
     asked = request(camera(shutter=Shutter.TOP_TO_BOTTOM), end_from_rig=moved(), actors=pairs)
     assert_same_image(world, asked)
-    without = Renderer(scene(cloud())).render_camera(asked)
-    assert psnr_db(without.rgb, Renderer(world).render_camera(asked).rgb) < 40
+    without = CpuRenderer(scene(cloud())).render_camera(asked)
+    assert psnr_db(without.rgb, CpuRenderer(world).render_camera(asked).rgb) < 40
 
 
 def same_sweeps(world, asked, filter=None):
     """Both sweeps at the beams that return from both; all but 1 in 500 must."""
-    got, expected = Renderer(world, threads=2).render_lidar(asked, filter), spec.render_lidar(world, asked, filter)
+    got, expected = CpuRenderer(world, threads=2).render_lidar(asked, filter), spec.render_lidar(world, asked, filter)
     _, mine, theirs = np.intersect1d(got.beam, expected.beam, return_indices=True)
     assert len(mine) > 300
     assert len(mine) >= 0.998 * max(len(got.beam), len(expected.beam))
@@ -142,7 +142,7 @@ def test_lidar_filters(filter):
     _, distance, _, beam = same_sweeps(world, asked, filter)
     assert np.median(np.abs(distance[0] - distance[1])) < 1e-3
     everything = LidarFilter(raydrop_threshold=1.0, opacity_threshold=0.01)
-    assert len(beam[0]) < 0.9 * len(Renderer(world).render_lidar(asked, everything).beam)
+    assert len(beam[0]) < 0.9 * len(CpuRenderer(world).render_lidar(asked, everything).beam)
 
 
 def test_small_gaussians_are_found_while_the_shutter_rolls():
@@ -150,7 +150,7 @@ def test_small_gaussians_are_found_while_the_shutter_rolls():
     world = cloud(300, 5, low=(4, -3, -2), high=(8, 3, 2))
     world = scene(dataclasses.replace(world, scale_m=np.full_like(world.scale_m, 0.04)))
     asked = request(camera(shutter=Shutter.TOP_TO_BOTTOM), moved(0.0, 0.0, 0.0), moved(0.002, 0.05, 0.0))
-    got, expected = Renderer(world).render_camera(asked), spec.render_camera(world, asked)
+    got, expected = CpuRenderer(world).render_camera(asked), spec.render_camera(world, asked)
     assert (expected.alpha > 0.3).sum() > 100
     assert (np.abs(got.alpha - expected.alpha) > 0.02).sum() == 0
 
@@ -166,7 +166,7 @@ def test_a_frame_has_the_response_of_its_instant():
     )
     asked = request(camera(), start_us=START_US + 40_000, end_us=START_US + 60_000)
     assert_same_image(world, asked)
-    shown, full = (Renderer(each).render_camera(asked).rgb.astype(float) for each in (world, plain))
+    shown, full = (CpuRenderer(each).render_camera(asked).rgb.astype(float) for each in (world, plain))
     assert np.abs(shown - 0.75 * full).max() <= 1
     late = request(camera(), start_us=START_US + 900_000, end_us=START_US + 900_000)
     assert np.array_equal(world.response("front", late.middle_us), 0.5 * np.eye(3, 4))

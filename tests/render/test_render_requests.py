@@ -8,9 +8,9 @@ from render_scenes import START_US, camera, cloud, request, scene
 
 from nurec_sim import sensors
 from nurec_sim.errors import OutOfRangeError, RequestError, TooLargeError
-from nurec_sim.render import Renderer, encode_image
+from nurec_sim.render import CpuRenderer, encode_image
 
-RENDERER = Renderer(scene(cloud(5)), threads=1)
+RENDERER = CpuRenderer(scene(cloud(5)), threads=1)
 GOOD = request(camera())
 
 
@@ -64,7 +64,7 @@ def test_sensors():
 
 def test_threads_and_encoding():
     with pytest.raises(ValueError, match="at least 1 thread"):
-        Renderer(scene(), threads=0)
+        CpuRenderer(scene(), threads=0)
     image = np.zeros((4, 4, 3), np.uint8)
     with pytest.raises(RequestError, match="unknown image format 'gif'"):
         encode_image(image, "gif")

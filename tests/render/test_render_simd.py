@@ -67,13 +67,13 @@ def test_every_instruction_set_draws_what_the_reference_draws(machine):
 def draw_and_compare():
     """Kernels of cameras and LiDARs, still and moving, against the reference, as JSON on standard output."""
     from nurec_sim import sensors
-    from nurec_sim.render import Renderer, spec
+    from nurec_sim.render import CpuRenderer, spec
     from nurec_sim.render.cpu import simd
     from nurec_sim.types import Fisheye, Shutter
 
     began = time.perf_counter()
     world = scene(cloud(300, sh=3), sky=np.random.default_rng(1).random((6, 4, 4, 3)))
-    renderer = Renderer(world, threads=2)
+    renderer = CpuRenderer(world, threads=2)
     cameras = {
         "pinhole": camera(),
         "fisheye": camera(lens=Fisheye(24.0, 24.0, 36.0, 24.0, (0.02, -0.005, 0, 0), max_angle_rad=1.7)),

@@ -12,7 +12,7 @@ import pytest
 from render_scenes import START_US, camera, cloud, moved, moving_cloud, request, scene, track
 
 from nurec_sim import geometry, sensors
-from nurec_sim.render import Renderer, spec
+from nurec_sim.render import CpuRenderer, spec
 from nurec_sim.render.cpu import pipeline
 from nurec_sim.render.cpu import renderer as renderer_module
 from nurec_sim.sensors import camera as camera_rays
@@ -65,7 +65,7 @@ def world():
 @pytest.fixture(scope="module")
 def alone(world):
     """Frames of the mixture from one thread, each by itself."""
-    renderer = Renderer(world, threads=1)
+    renderer = CpuRenderer(world, threads=1)
     return [renderer.sense([asked])[0] for asked in mixture()]
 
 
@@ -80,11 +80,11 @@ def test_the_mixture_has_something_to_see(alone):
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 7])
 def test_same_bytes_at_any_thread_count(world, alone, threads):
-    assert_same_bytes(Renderer(world, threads=threads).sense(list(mixture())), alone)
+    assert_same_bytes(CpuRenderer(world, threads=threads).sense(list(mixture())), alone)
 
 
 def test_a_batch_gives_what_one_by_one_gives_in_any_order(world, alone):
-    renderer, asked = Renderer(world, threads=2), list(mixture())
+    renderer, asked = CpuRenderer(world, threads=2), list(mixture())
     order = np.random.default_rng(3).permutation(2 * len(asked)) % len(asked)
     frames = renderer.sense([asked[k] for k in order])
     assert_same_bytes(frames, [alone[k] for k in order])
@@ -104,14 +104,14 @@ def test_groups_slices_and_strips_do_not_change_a_byte(world, alone, monkeypatch
     monkeypatch.setattr(
         renderer_module, "draw", lambda group, workers: drawn.append(len(group)) or draw(group, workers)
     )
-    assert_same_bytes(Renderer(world, threads=1).sense(list(mixture())), alone)
+    assert_same_bytes(CpuRenderer(world, threads=1).sense(list(mixture())), alone)
     assert len(drawn) > 3 and sum(drawn) == len(alone)
 
 
 def test_memory_of_many_frames_does_not_grow_with_their_number(world, monkeypatch):
     """Scratch memory is that of a group, and reused by the next one."""
     monkeypatch.setattr(renderer_module, "GROUP_BYTES", 1)
-    renderer = Renderer(world, threads=1)
+    renderer = CpuRenderer(world, threads=1)
     lent = []
     lend = renderer._buffers.lend
     monkeypatch.setattr(renderer._buffers, "lend", lambda: lent.append(1) or lend())
@@ -129,15 +129,15 @@ def test_hidden_tracks_are_not_drawn(world, boxed):
     )  # fmt: skip
     asked = request(camera(141, 90), actors=ACTORS)
     hidden = dataclasses.replace(asked, hidden=frozenset({"car", "unknown"}))
-    expected = Renderer(without).render_camera(request(camera(141, 90))).rgb
-    assert np.array_equal(Renderer(world).render_camera(hidden).rgb, expected)
-    assert not np.array_equal(Renderer(world).render_camera(asked).rgb, expected)
+    expected = CpuRenderer(without).render_camera(request(camera(141, 90))).rgb
+    assert np.array_equal(CpuRenderer(world).render_camera(hidden).rgb, expected)
+    assert not np.array_equal(CpuRenderer(world).render_camera(asked).rgb, expected)
     assert np.abs(spec.render_camera(world, hidden).rgb.astype(int) - expected).max() <= 2
 
 
 def test_sixteen_threads_share_a_renderer(world, alone):
     """Also on its first frames, when tables and buffers are made."""
-    renderer, asked = Renderer(world, threads=2), list(mixture())
+    renderer, asked = CpuRenderer(world, threads=2), list(mixture())
     begin = threading.Barrier(16)
 
     def client(seed):
@@ -151,7 +151,7 @@ def test_sixteen_threads_share_a_renderer(world, alone):
 
 
 def test_frames_are_not_overwritten_by_later_ones(world, alone):
-    renderer = Renderer(world, threads=2)
+    renderer = CpuRenderer(world, threads=2)
     first = renderer.sense(list(mixture()))
     renderer.sense([request(camera(141, 90), moved(2.0)), request(LIDAR, moved(2.0))])
     assert_same_bytes(first, alone)
@@ -160,7 +160,7 @@ def test_frames_are_not_overwritten_by_later_ones(world, alone):
 def test_renderers_that_are_dropped_leave_no_threads(world):
     before = set(threading.enumerate())
     for _ in range(5):
-        renderer = Renderer(world, threads=4)
+        renderer = CpuRenderer(world, threads=4)
         renderer.sense(list(mixture())[:2])
         assert len(threading.enumerate()) < len(before) + 8
         del renderer
@@ -178,7 +178,7 @@ def test_renderers_that_are_dropped_leave_no_memory(world):
 
     def resident_mb(times):
         for _ in range(times):
-            Renderer(scene(static), threads=2).sense(asked)
+            CpuRenderer(scene(static), threads=2).sense(asked)
         gc.collect()
         return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
 

@@ -11,7 +11,7 @@ from ply_files import standard, textured_sky, values
 
 from nurec_sim import cli, geometry
 from nurec_sim.errors import ArchiveError
-from nurec_sim.render.cpu.renderer import Renderer
+from nurec_sim.render.cpu.renderer import CpuRenderer
 from nurec_sim.render.layers import view_colour
 from nurec_sim.scene import export_scene, import_scene, read_ply, read_scene, scene_hash, write_scene
 from nurec_sim.scene.harmonics import rotate_harmonics
@@ -37,7 +37,7 @@ def street(sh=8):
 def view(scene, t_us=worlds.START_US, yaw=0.0):
     pose = geometry.pose_from_xyyaw(0, 0, yaw)
     request = worlds.request(scene.rig.cameras["front"], pose, pose, t_us, t_us + 1)
-    return Renderer(scene, threads=1).render_camera(request).rgb
+    return CpuRenderer(scene, threads=1).render_camera(request).rgb
 
 
 @pytest.mark.parametrize(

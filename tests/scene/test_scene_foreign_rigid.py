@@ -10,7 +10,7 @@ from render_scenes import START_US, camera, cloud, moved, moving_cloud, psnr_db,
 
 from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
-from nurec_sim.render.cpu.renderer import Renderer
+from nurec_sim.render.cpu.renderer import CpuRenderer
 from nurec_sim.render.layers import moving_gaussians
 from nurec_sim.scene import check_scene, export_scene, read_ply, read_scene, write_scene
 from nurec_sim.types import DynamicGaussians, Gaussians
@@ -66,7 +66,7 @@ def test_the_gpu_draws_the_same(place, asked):
     world = dataclasses.replace(scene(cloud(40), moving_cloud(40), TRACKS[:1]), dynamic=dynamic)
     wanted = request(camera())
     wanted = dataclasses.replace(wanted, actors={name: np.stack([moved(0.2, 2, 1)] * 2) for name in asked})
-    ours = Renderer(world, threads=2).render_camera(wanted, ("rgb",)).rgb
+    ours = CpuRenderer(world, threads=2).render_camera(wanted, ("rgb",)).rgb
     theirs = GpuRenderer(world, launcher).render_camera(wanted, ("rgb",)).rgb
     assert psnr_db(ours, theirs) > 50
 

@@ -9,7 +9,7 @@ from nurec_archives import background, psnr, road
 
 from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
-from nurec_sim.render.cpu.renderer import Renderer
+from nurec_sim.render.cpu.renderer import CpuRenderer
 from nurec_sim.scene import read_scene
 from nurec_sim.types import Gaussians, Label, SensorRequest
 
@@ -22,7 +22,7 @@ def picture(scene, static=None):
     lens = dataclasses.replace(camera.lens, fx_px=160, fy_px=160, cx_px=160, cy_px=90)
     small = dataclasses.replace(camera, width_px=320, height_px=180, lens=lens)
     request = SensorRequest("s", small, 1_000_000, 1_000_001, pose)
-    return Renderer(scene, threads=2).render_camera(request, ("rgb",)).rgb.astype(float)
+    return CpuRenderer(scene, threads=2).render_camera(request, ("rgb",)).rgb.astype(float)
 
 
 def opened(path, data):
@@ -97,9 +97,9 @@ def test_turned_fields_take_their_colours_along(tmp_path):
     camera = scene.rig.cameras["camera"]
     half_turn = geometry.pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ camera.rig_from_camera
     request = SensorRequest("s", camera, 1_000_000, 1_000_001, np.stack([half_turn, half_turn]))
-    seen = Renderer(scene, threads=2).render_camera(request, ("rgb",)).rgb.astype(float)
+    seen = CpuRenderer(scene, threads=2).render_camera(request, ("rgb",)).rgb.astype(float)
     first = dataclasses.replace(request, world_from_sensor=np.stack([camera.rig_from_camera] * 2))
-    assert psnr(seen, Renderer(original, threads=2).render_camera(first, ("rgb",)).rgb.astype(float)) > 50
+    assert psnr(seen, CpuRenderer(original, threads=2).render_camera(first, ("rgb",)).rgb.astype(float)) > 50
 
 
 def test_packages_with_references_and_sidecars(tmp_path):

@@ -16,7 +16,7 @@ from nurec_sim.errors import (
     TooLargeError,
     UnknownSceneError,
 )
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.serving import client
 from nurec_sim.serving.client import RemoteSensors
 from nurec_sim.serving.sensor_service import ServiceOptions
@@ -32,7 +32,7 @@ def world():
 
 @pytest.fixture(scope="module")
 def renderer(world):
-    return Renderer(world, threads=2)
+    return CpuRenderer(world, threads=2)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_remote_frames_are_the_local_ones_bit_for_bit(remote, renderer):
 def test_the_colour_correction_follows_the_client(address, world):
     with RemoteSensors(address, "street", timeout_s=30, apply_isp=False) as remote:
         (far,) = remote.sense([camera_request()])
-    (near,) = Renderer(world, threads=2, apply_isp=False).sense([camera_request()])
+    (near,) = CpuRenderer(world, threads=2, apply_isp=False).sense([camera_request()])
     assert np.array_equal(far.rgb, near.rgb)
 
 

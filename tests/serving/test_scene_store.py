@@ -9,7 +9,7 @@ from serving_calls import wait_until
 from serving_world import scene
 
 from nurec_sim.errors import ArchiveError, CancelledError, SceneInUseError, UnknownSceneError
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.scene import write_scene
 from nurec_sim.scene.describe import scene_arrays
 from nurec_sim.serving.store import SceneStore
@@ -17,7 +17,7 @@ from nurec_sim.serving.store.sizes import array_bytes, half_of_memory
 
 
 def one_thread(world):
-    return Renderer(world, threads=1)
+    return CpuRenderer(world, threads=1)
 
 
 def store_of(names, **options):

@@ -20,7 +20,7 @@ import nurec_sim.logs
 import nurec_sim.reconstruct
 from nurec_sim.errors import ReconstructError, WeightsError
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, ViewSettings
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.serving.store import Recipe, SceneStore, content_key
 
 HERE = Path(__file__).parents[1] / "helpers"
@@ -46,7 +46,7 @@ def made(monkeypatch):
 
 
 def store_of(clip, cache, **options):
-    return SceneStore([clip], cache_dir=cache, make_renderer=lambda world: Renderer(world, threads=1), **options)
+    return SceneStore([clip], cache_dir=cache, make_renderer=lambda world: CpuRenderer(world, threads=1), **options)
 
 
 def test_a_clip_is_lifted_with_the_settings_of_the_store_and_kept(clip, tmp_path):

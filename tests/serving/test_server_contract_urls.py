@@ -15,7 +15,7 @@ from serving_calls import Stub, camera_message, pixels
 from serving_world import camera_request, scene
 
 from nurec_sim.errors import RequestError
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.scene import read_scene, write_scene
 from nurec_sim.serving.sensor_service import ServiceOptions
 from nurec_sim.serving.sensor_service.downloads import DownloadCache
@@ -93,7 +93,7 @@ def test_a_file_is_served_under_the_name_that_is_asked_for(archive, tmp_path):
         assert scenes(stub, url, "mine_1-a") == scenes(stub), "the second time nothing happens"
         assert scenes(stub, url) == ["clipgt-street", "clipgt-mine_1-a", "clipgt-brought"], "or under its own name"
         again = pixels(stub.render_rgb(camera_message(scene_id="brought")))
-    expected = Renderer(read_scene(archive), threads=2).render_camera(camera_request()).rgb
+    expected = CpuRenderer(read_scene(archive), threads=2).render_camera(camera_request()).rgb
     assert np.array_equal(image, expected) and np.array_equal(again, expected)
 
 

@@ -18,7 +18,7 @@ import pytest
 from serving_world import camera_request, scene
 
 from nurec_sim.errors import ArchiveError, ClipError, UnknownSceneError
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.scene import write_scene
 from nurec_sim.serving import store as scene_store
 from nurec_sim.serving.client import RemoteSensors
@@ -36,7 +36,7 @@ def archive(tmp_path_factory):
 
 
 def one_thread(world):
-    return Renderer(world, threads=1)
+    return CpuRenderer(world, threads=1)
 
 
 # -------------------------------------------------------------------------------------------------------------- server

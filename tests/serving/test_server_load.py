@@ -28,7 +28,7 @@ from serving_calls import (
 )
 from serving_world import LAST_US, START_US, camera_request, lidar_request, scene
 
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.serving.sensor_service import ServiceOptions
 from nurec_sim.serving.server import SensorServer
 from nurec_sim.serving.store import SceneStore
@@ -178,7 +178,7 @@ def test_a_scene_that_loads_does_not_hold_up_the_others():
     def make_renderer(loading):
         begun.append(loading.id)
         assert loading.id == "street" or gate.wait(30)
-        return Renderer(loading, threads=2)
+        return CpuRenderer(loading, threads=2)
 
     store = SceneStore([scene(), scene("slow")], make_renderer=make_renderer)
     with SensorServer(store, port=0) as address, Stub(address) as stub:

@@ -18,7 +18,7 @@ from serving_calls import (
 from serving_world import LAST_US, START_US, camera_request, lidar_request, scene
 
 from nurec_sim import geometry
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.serving.wire import ImageFormat
 from nurec_sim.serving.wire.poses import write_poses
 
@@ -97,7 +97,7 @@ def test_a_requested_size_scales_the_intrinsics(stub, renderer):
 def test_the_colour_correction_can_be_left_out(stub):
     message = camera_message()
     message.apply_isp = False
-    plain = Renderer(scene(), threads=2, apply_isp=False).render_camera(camera_request()).rgb
+    plain = CpuRenderer(scene(), threads=2, apply_isp=False).render_camera(camera_request()).rgb
     assert np.array_equal(pixels(stub.render_rgb(message)), plain)
     message.apply_isp = True
     assert not np.array_equal(pixels(stub.render_rgb(message)), plain)

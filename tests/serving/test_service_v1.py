@@ -15,7 +15,7 @@ from nurec_sim.errors import (
     TooLargeError,
     UnknownSceneError,
 )
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.scene import write_scene
 from nurec_sim.serving import wire
 from nurec_sim.serving.connection import open_channel
@@ -50,7 +50,7 @@ def client(address):
 
 @pytest.fixture(scope="module")
 def renderer():
-    return Renderer(scene(), threads=2)
+    return CpuRenderer(scene(), threads=2)
 
 
 def test_scenes_are_listed_with_their_state_and_faults(client, archive):

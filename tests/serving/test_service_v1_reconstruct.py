@@ -12,7 +12,7 @@ from serving_world import camera_request, scene
 import nurec_sim.reconstruct
 from nurec_sim.errors import ArchiveError, ClipError, ReconstructError, RequestError, WeightsError
 from nurec_sim.reconstruct import LiftSettings, ViewSettings
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.scene import write_scene
 from nurec_sim.serving.scene_client import SceneClient
 from nurec_sim.serving.scene_service import SceneOptions
@@ -189,7 +189,7 @@ def test_who_waits_for_the_scene_gets_it_though_the_other_leaves(client, address
 
     def waiter():
         with store.lease("tiny") as loaded:
-            frames.append(Renderer(loaded.scene, threads=1).render_camera(camera_request()))
+            frames.append(CpuRenderer(loaded.scene, threads=1).render_camera(camera_request()))
 
     threads = [threading.Thread(target=leaver)]
     threads[0].start()

@@ -10,7 +10,7 @@ from nurec_sim import logs, runs
 from nurec_sim.errors import RunError
 from nurec_sim.plugins import load_policy
 from nurec_sim.reconstruct import reconstruct
-from nurec_sim.render import Renderer
+from nurec_sim.render import CpuRenderer
 from nurec_sim.sim import Scenario, run_rollout
 from nurec_sim.types import Trajectory
 from nurec_sim.world import TrueWorld, street_rig, town_plan, write_town_clip
@@ -53,7 +53,7 @@ def test_policies_drive_in_the_true_world(plan):
 def test_truth_and_reconstruction_stand_side_by_side_in_one_run(log, tmp_path):
     clip, plan_file = log
     scene = reconstruct(clip, "lift")
-    renderer = Renderer(scene)
+    renderer = CpuRenderer(scene)
     folder = runs.execute([scene], SCENARIO, SCENARIO.policies, lambda _: renderer.sense, tmp_path, video=False)
     with runs.true_world(plan_file, scene, "rays") as (truth, sense):
         again = runs.execute(

@@ -49,7 +49,7 @@ class _Begun:
     picture: Picture
 
 
-class Renderer:
+class CpuRenderer:
     """A scene made ready for rendering. Immutable but for caches; all methods can be called from many threads.
 
     Args:

@@ -6,11 +6,13 @@ machine without a GPU (``tests/gpu_on_cpu``).
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from nurec_sim.errors import GpuError
+from nurec_sim.render.device import check_driver
 from nurec_sim.render.gpu.compiler import cached_cubin, import_cuda_core, kernel_names
 
 if TYPE_CHECKING:
@@ -44,6 +46,7 @@ class CudaLauncher:
     """
 
     def __init__(self, device: str = "cuda") -> None:
+        check_driver()
         core = import_cuda_core()
         self.device = cuda_device(device)
         self._core = core
@@ -64,6 +67,16 @@ class CudaLauncher:
         config = self._core.LaunchConfig(grid=grid, block=THREADS)
         values = [as_scalar(argument, self.device) for argument in arguments]
         self._core.launch(_TorchStream(self.device), config, self._kernels[kernel], *values)
+
+
+@functools.lru_cache
+def shared_launcher(device: str) -> CudaLauncher:
+    """The one launcher of a device that all renderers of this process share, so that kernels are loaded once.
+
+    Raises:
+        GpuError: see ``CudaLauncher``.
+    """
+    return CudaLauncher(device)
 
 
 class _TorchStream:

@@ -62,7 +62,7 @@ class Images:
 
 
 class GpuRenderer:
-    """A scene made ready for rendering on a GPU, with the methods of ``render.Renderer``.
+    """A scene made ready for rendering on a GPU, a ``render.Renderer``.
 
     Immutable but for caches; all methods can be called from many threads. Work is queued on torch's current stream.
 

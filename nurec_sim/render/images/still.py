@@ -11,9 +11,9 @@ from jaxtyping import UInt8
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
 from nurec_sim.files.new_files import write_file
-from nurec_sim.render.cpu.renderer import Renderer
+from nurec_sim.render.device import Renderer
 from nurec_sim.render.images.encode import encode_image
-from nurec_sim.types import CameraFrame, GaussianScene, Label, SensorRequest
+from nurec_sim.types import CameraFrame, Label, SensorRequest
 
 Layer = Literal["rgb", "depth", "alpha", "label", "normal"]
 FAR_M = 80.0
@@ -27,7 +27,7 @@ LABEL_RGB = {
 
 
 def render_still(
-    scene: GaussianScene,
+    renderer: Renderer,
     path: Path,
     camera_id: str | None = None,
     frame: int = 0,
@@ -40,7 +40,7 @@ def render_still(
     """Write one image.
 
     Args:
-        scene: the world.
+        renderer: of the world.
         path: the PNG to write.
         camera_id: a camera of the scene's rig; the first if None.
         frame: which of the camera's recorded times to take; the ego stands where it was then.
@@ -53,6 +53,7 @@ def render_still(
         RequestError: no such camera or frame.
         WriteError: the file cannot be written; one that was there is as it was.
     """
+    scene = renderer.scene
     if not scene.rig.cameras:
         raise RequestError(f"scene {scene.id!r} has no cameras")
     camera_id = camera_id or next(iter(scene.rig.cameras))
@@ -68,7 +69,7 @@ def render_still(
     moved = geometry.pose_from_xyyaw(0.0, left_m, np.radians(yaw_deg))
     poses = scene.ego.at(np.array([start_us, end_us])) @ moved @ camera.rig_from_camera
     request = SensorRequest(scene.id, camera, start_us, max(end_us, start_us + 1), poses)
-    shown = picture(Renderer(scene).render_camera(request, ("rgb", layer)), layer)
+    shown = picture(renderer.render_camera(request, ("rgb", layer)), layer)
     write_file(path, encode_image(shown))
 
 

@@ -1,6 +1,6 @@
 """The scenes that a server offers: named, loaded or reconstructed once on first use, and kept while there is room."""
 
-from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats, SceneRenderer
+from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats
 from nurec_sim.serving.store.recipes import Recipe, content_key
 from nurec_sim.serving.store.sources import default_cache_dir, find_sources
 from nurec_sim.serving.store.store import SceneEntry, SceneStore
@@ -12,7 +12,6 @@ __all__ = [
     "MemoryStats",
     "Recipe",
     "SceneEntry",
-    "SceneRenderer",
     "SceneStore",
     "Upload",
     "UploadFolder",

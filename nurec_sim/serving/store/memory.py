@@ -5,28 +5,16 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import TracebackType
-from typing import Protocol
 
 from nurec_sim.errors import CancelledError
+from nurec_sim.render.device import Renderer
 from nurec_sim.serving.store.sizes import array_bytes
-from nurec_sim.types import GaussianScene, LidarFilter, LidarFrame, SensorFrame, SensorRequest
-
-
-class SceneRenderer(Protocol):
-    """What a server needs of ``render.Renderer``."""
-
-    def sense(self, requests: Sequence[SensorRequest], outputs: Sequence[str] = ...) -> list[SensorFrame]:
-        """Images with ``rgb`` and what else ``outputs`` names, and sweeps; one frame per request, in order."""
-        ...
-
-    def render_lidar(self, request: SensorRequest, filter: LidarFilter | None = ...) -> LidarFrame:
-        """One sweep."""
-        ...
+from nurec_sim.types import GaussianScene
 
 
 @dataclass(frozen=True)
@@ -34,7 +22,7 @@ class LoadedScene:
     """A scene in memory with its renderer."""
 
     scene: GaussianScene
-    renderer: SceneRenderer
+    renderer: Renderer
 
 
 @dataclass(frozen=True)

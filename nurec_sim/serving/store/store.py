@@ -6,12 +6,15 @@ import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from nurec_sim.errors import ArchiveError, NurecSimError, SceneInUseError, UnknownSceneError
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings
+from nurec_sim.render.device import Renderer
+from nurec_sim.render.device import make_renderer as renderer_on
 from nurec_sim.serving.store.kept import KeptReconstructions
-from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats, SceneMemory, SceneRenderer
+from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats, SceneMemory
 from nurec_sim.serving.store.recipes import Progress, Recipe
 from nurec_sim.serving.store.sizes import half_of_memory
 from nurec_sim.serving.store.sources import Source, default_cache_dir, describe, find_sources, identify, stem_of
@@ -56,8 +59,9 @@ class SceneStore:
         cache_dir: where reconstructed clips are kept, by content; None for ``default_cache_dir()``.
         method: reconstruction method of clips.
         settings: of the method; None for its defaults.
-        threads: render threads, None for all cores.
-        make_renderer: makes the renderer of a scene; None for ``render.Renderer``.
+        device: that renders; see ``render.choose_device``.
+        threads: render threads on a CPU, None for all cores.
+        make_renderer: makes the renderer of a scene; None for ``render.make_renderer`` with these two.
         on_progress: called with a line of text when something slow begins.
     """
 
@@ -70,8 +74,9 @@ class SceneStore:
         cache_dir: Path | None = None,
         method: str = "lift",
         settings: LiftSettings | FeedForwardSettings | None = None,
+        device: str = "auto",
         threads: int | None = None,
-        make_renderer: Callable[[GaussianScene], SceneRenderer] | None = None,
+        make_renderer: Callable[[GaussianScene], Renderer] | None = None,
         on_progress: Callable[[str], None] | None = None,
     ) -> None:
         if capacity < 1:
@@ -81,8 +86,7 @@ class SceneStore:
         self._memory = SceneMemory(capacity, half_of_memory() if max_bytes is None else max_bytes)
         self._kept = KeptReconstructions(cache_dir or default_cache_dir(), on_progress or (lambda text: None))
         self._recipe = Recipe(method, settings)
-        self._threads = threads
-        self._make_renderer = make_renderer
+        self._make_renderer = make_renderer or partial(renderer_on, device=device, threads=threads)
         self._lock = threading.Lock()
         self._sources: dict[str, Source] = {}
         self._faults: dict[str, str] = {}
@@ -299,11 +303,7 @@ class SceneStore:
 
     def _load(self, source: Source, progress: Progress | None) -> LoadedScene:
         scene = self._scene(source, progress)
-        if self._make_renderer is not None:
-            return LoadedScene(scene, self._make_renderer(scene))
-        from nurec_sim.render.cpu.renderer import Renderer
-
-        return LoadedScene(scene, Renderer(scene, threads=self._threads))
+        return LoadedScene(scene, self._make_renderer(scene))
 
     def _scene(self, source: Source, progress: Progress | None) -> GaussianScene:
         if source.edited is not None:
