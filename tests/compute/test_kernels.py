@@ -134,6 +134,7 @@ print(nurec_sim.__file__)
 """
 
 
+@pytest.mark.slow
 def test_a_read_only_install_without_a_home_runs(tmp_path):
     """``__pycache__`` is a file and the home lies in one: nothing can be written, not even by root."""
     skip = shutil.ignore_patterns("__pycache__", "weights", "*.cu", "*.cuh")

@@ -39,6 +39,7 @@ def test_one_command_prints_the_tables_and_keeps_them(streets, capsys):
     assert len([p for p in (streets / "evaluations").iterdir() if not p.is_symlink()]) == 1
 
 
+@pytest.mark.slow
 def test_random_weights_are_named_as_such(streets, capsys):
     run_cli("--protocol", "storm", "--worlds", 1, "--methods", "selective", "--random-weights", 2, "--sky-px", 16)
     page = (streets / "evaluations" / "latest" / "report.html").read_text()

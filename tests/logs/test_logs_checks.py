@@ -255,6 +255,7 @@ def test_inspect_says_what_fits_and_fails_on_what_does_not(tmp_path, capsys):
     assert "do they fit together" in text and "cannot tell" in text and text.endswith("no faults\n")
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", ["kitti_raw_0002", "ddad_6cam", "nuscenes_6cam_1frame"])
 def test_real_packs_fit_together_until_they_are_spoilt(realdata, spoil, name):

@@ -88,6 +88,7 @@ def learnt(kind: str, truth: torch.Tensor, steps: int) -> float:
     return min(losses[-10:])
 
 
+@pytest.mark.slow
 def test_it_learns_a_smooth_sky_quickly_and_clouds_later_than_the_decoder():
     """What the paper finds: an MLP over directions is slow to learn what changes quickly between them."""
     down = cubemap.directions(28)[..., 1:2]

@@ -92,6 +92,7 @@ def test_inputs_are_the_same_every_time_and_their_rays_are_those_of_their_poses(
     assert torch.allclose(first.rays[0, :, 0, 0, :3] * 0.15, first.c2w[0, :, :3, 3])
 
 
+@pytest.mark.slow
 def test_without_a_gpu_the_reason_is_printed(tmp_path):
     if torch.cuda.is_available():
         pytest.skip("there is a GPU, so its cases would run")

@@ -104,6 +104,7 @@ def test_archive_keeps_and_renderer_draws_it(world, clip, tmp_path):
     assert frame.rgb.std() > 1
 
 
+@pytest.mark.slow
 def test_same_clip_same_bytes(clip, tmp_path):
     for name in ("a", "b"):
         result = reconstruct(clip, "selective", cameras=["wide"], settings=quick(chunking="non-overlapping"))

@@ -16,7 +16,7 @@ from nurec_sim.scene.interop.validate import RULES, openusd, validate_archive
 from nurec_sim.scene.usd.layers import static_layer
 from nurec_sim.types import Gaussians, GaussianScene, Label, Rig, Trajectory
 
-pytestmark = pytest.mark.usefixtures("few_placements")
+pytestmark = pytest.mark.usefixtures("quick_maps")
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from repetition import slow_after
 from scene_worlds import full_scene
 from spoilt_archives import INFO, RIG, TRACKS, Members, clipgt, complete_scene, edit, members_of
 
@@ -18,7 +19,7 @@ from nurec_sim.files.zip_package import write_package
 from nurec_sim.scene import write_scene
 from nurec_sim.scene.interop.validate import CONSUMERS, RULES, contents, openusd, same_scene_ids, validate_archive
 
-pytestmark = pytest.mark.usefixtures("few_placements")
+pytestmark = pytest.mark.usefixtures("quick_maps")
 DOCS = Path(__file__).parents[2] / "docs" / "scene_format.md"
 
 
@@ -147,15 +148,16 @@ def test_names_that_leave_the_package(members, tmp_path):
     assert any(text.startswith("error: nurec-sim") and "must stay inside" in text for text in texts)
 
 
-def test_damaged_bytes(members, tmp_path):
+@pytest.mark.parametrize("seed", slow_after(1, range(4)))
+def test_damaged_bytes(members, tmp_path, seed):
     """Whatever byte is changed, whoever is asked: lines and nothing else."""
     good = tmp_path / "good.usdz"
     write_package(good, members)
-    data, rng = good.read_bytes(), random.Random(5)
+    data, rng = good.read_bytes(), random.Random(seed)
     directory = data.rfind(b"PK\x05\x06")
     start = struct.unpack_from("<I", data, directory + 16)[0]
     path = tmp_path / "a.usdz"
-    for number in range(80):
+    for number in range(20):
         spoilt = bytearray(data)
         low = 0 if number % 2 else start  # every other time in the directory
         for _ in range(rng.choice((1, 3, 20))):
@@ -192,12 +194,13 @@ def places(value, here=()):
         yield from places(part, (*here, key))
 
 
-def test_odd_values_in_odd_places(members, tmp_path):
-    rng = random.Random(3)
+@pytest.mark.parametrize("seed", slow_after(1, range(4)))
+def test_odd_values_in_odd_places(members, tmp_path, seed):
+    rng = random.Random(seed)
     light = {name: data for name, data in members.items() if not name.endswith((".usdc", ".npy"))}
     for name in (RIG, TRACKS, INFO):
         paths = [path for path in places(json.loads(members[name])) if path]
-        for path in rng.sample(paths, min(25, len(paths))):
+        for path in rng.sample(paths, min(8, len(paths))):
             document = json.loads(members[name])
             part = document
             for key in path[:-1]:

@@ -23,7 +23,7 @@ from nurec_sim.scene import alpasim_id, import_scene, write_scene
 from nurec_sim.scene.interop.validate import RULES, validate_archive
 from nurec_sim.types import CameraModel, FTheta, FThetaReference, GaussianScene, Rig, Track, Trajectory
 
-pytestmark = pytest.mark.usefixtures("few_placements")
+pytestmark = pytest.mark.usefixtures("quick_maps")
 
 
 def with_cameras(*chosen: CameraModel, **changes) -> GaussianScene:
@@ -172,18 +172,18 @@ def test_an_import_closes_the_gaps_of_a_nurec_archive(tmp_path):
     assert_complete(write_scene(scene, tmp_path / "ours.usdz"), scene)
 
 
+QUICK = LiftSettings(views=ViewSettings(width_px=96, max_views=2, max_frames=4, budget=20_000, levels=16), sky_px=16)
+
+
 def test_a_lifted_clip(tmp_path):
-    scene = reconstruct(logs.open_clip(tiny_clip.write(tmp_path / "clip")), "lift")
+    scene = reconstruct(logs.open_clip(tiny_clip.write(tmp_path / "clip")), "lift", settings=QUICK)
     assert_complete(write_scene(scene, tmp_path / "a.usdz"), scene)
 
 
 @pytest.mark.slow
 def test_the_demo_clip_lifted(tmp_path):
     clip = logs.open_clip(Path(str(resources.files("nurec_sim.scenarios"))) / "demo_clip.zip")
-    quick = LiftSettings(
-        views=ViewSettings(width_px=96, max_views=2, max_frames=4, budget=20_000, levels=16), sky_px=16
-    )
-    scene = reconstruct(clip, "lift", cameras=("camera_front",), settings=quick)
+    scene = reconstruct(clip, "lift", cameras=("camera_front",), settings=QUICK)
     path = write_scene(scene, tmp_path / "demo.usdz")
     assert_complete(path, scene)
     assert validate_archive(path) == []
