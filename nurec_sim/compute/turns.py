@@ -35,22 +35,13 @@ class Turn(Protocol):
         ...
 
 
-_current: ContextVar[Turn | None] = ContextVar("turn", default=None)
+turn_of_thread: ContextVar[Turn | None] = ContextVar("turn", default=None)
+"""The turn of the work that runs in this thread, set by whoever shares out the machine; None if nobody does."""
 
 
 def current_turn() -> Turn | None:
     """The turn of the work that runs in this thread; None if nobody shares out the machine."""
-    return _current.get()
-
-
-@contextlib.contextmanager
-def taking(turn: Turn | None) -> Iterator[None]:
-    """Makes ``turn`` the current one of this thread."""
-    token = _current.set(turn)
-    try:
-        yield
-    finally:
-        _current.reset(token)
+    return turn_of_thread.get()
 
 
 def rest() -> None:
@@ -59,7 +50,7 @@ def rest() -> None:
     Raises:
         CancelledError, DeadlinePassedError: see ``Turn.rest``.
     """
-    turn = _current.get()
+    turn = turn_of_thread.get()
     if turn is not None and turn.is_over:
         turn.rest()
 
@@ -67,9 +58,13 @@ def rest() -> None:
 @contextlib.contextmanager
 def aside() -> Iterator[None]:
     """See ``Turn.aside``; without effect where nobody shares out the machine. Inside, ``rest`` does nothing."""
-    turn = _current.get()
+    turn = turn_of_thread.get()
     if turn is None:
         yield
         return
-    with turn.aside(), taking(None):
-        yield
+    with turn.aside():
+        token = turn_of_thread.set(None)
+        try:
+            yield
+        finally:
+            turn_of_thread.reset(token)

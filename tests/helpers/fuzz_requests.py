@@ -16,13 +16,13 @@ from serving_world import LAST_US, START_US, camera_request, lidar_request, rig,
 
 from nurec_sim import geometry
 from nurec_sim.serving import wire
-from nurec_sim.serving.calls import Call, enter_call
+from nurec_sim.serving.calls import Call, Service, enter_call, register
 from nurec_sim.serving.sensor_service import SensorService, ServiceOptions
-from nurec_sim.serving.server import SensorServer, Service
-from nurec_sim.serving.server.registration import register
+from nurec_sim.serving.sensor_service.scene_urls import URL_KEY
+from nurec_sim.serving.server import SensorServer
 from nurec_sim.serving.store import SceneStore
 from nurec_sim.serving.wire import ImageFormat, sensorsim
-from nurec_sim.serving.wire.poses import write_poses
+from nurec_sim.serving.wire.requests import write_poses
 
 Code = grpc.StatusCode
 STATUS_MAP = frozenset({
@@ -154,7 +154,7 @@ def fuzz_handlers(
 async def _fuzz_handlers(count: int, seed: int, report, options: ServiceOptions) -> Tally:
     tally, handlers = Tally(), _Handlers()
     service = SensorService(store(), options, lambda: None)
-    register(handlers, Service(wire.SERVICE, service, (), service.prepare))
+    register(handlers, Service(wire.SERVICE, service, (), {URL_KEY: service.offer_scene}))
     try:
         for number, name, data, metadata in requests(count, seed):
             context, begin = _Context(), time.perf_counter()

@@ -17,7 +17,7 @@ from nurec_sim.serving.sensor_service import ServiceOptions
 from nurec_sim.serving.server import SensorServer
 from nurec_sim.serving.store import SceneStore
 from nurec_sim.serving.wire import ImageFormat, sensorsim
-from nurec_sim.serving.wire.poses import write_poses
+from nurec_sim.serving.wire.requests import write_poses
 
 
 class Stub:

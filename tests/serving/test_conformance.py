@@ -108,7 +108,7 @@ def drop_polynomial(_, reply):
 
 def in_start_frame(request, reply):
     pair = request.sensor_pose
-    start, end = wire.poses.read_poses([pair.start_pose, pair.end_pose], ["start", "end"])
+    start, end = wire.read_poses([pair.start_pose, pair.end_pose], ["start", "end"])
     points = np.frombuffer(reply.point_xyzs_buffer, "<f4").reshape(-1, 3)
     reply.point_xyzs_buffer = geometry.transform_points(geometry.inverse(start) @ end, points).astype("<f4").tobytes()
 

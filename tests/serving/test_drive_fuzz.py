@@ -22,6 +22,7 @@ from driving_calls import (
 from nurec_sim import geometry
 from nurec_sim.errors import NurecSimError
 from nurec_sim.serving import wire
+from nurec_sim.serving.calls import parse
 from nurec_sim.serving.driver import DriverOptions, DriverService
 from nurec_sim.serving.wire import driving, driving_paths, egodriver
 from nurec_sim.sim.flat_world import demo_rig
@@ -125,7 +126,7 @@ def mutated(message, random):
 async def say(service, name, data):
     """The status of a call, as the server would answer it."""
     try:
-        await getattr(service, name)(wire.parse(driving.DRIVER_METHODS[name].request, data))
+        await getattr(service, name)(parse(driving.DRIVER_METHODS[name].request, data))
     except NurecSimError as error:
         assert str(error)
         return wire.code_of(error)

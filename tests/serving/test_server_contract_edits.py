@@ -23,7 +23,7 @@ from nurec_sim import geometry
 from nurec_sim.serving.server import SensorServer
 from nurec_sim.serving.store import SceneStore
 from nurec_sim.serving.wire import sensorsim
-from nurec_sim.serving.wire.poses import write_poses
+from nurec_sim.serving.wire.requests import write_poses
 
 
 @pytest.fixture(scope="module")

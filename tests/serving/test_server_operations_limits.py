@@ -17,7 +17,7 @@ from nurec_sim.serving import wire
 from nurec_sim.serving.calls import address_of
 from nurec_sim.serving.sensor_service import ServiceOptions
 from nurec_sim.serving.server import SensorServer, ServerOptions
-from nurec_sim.serving.server.limits import RateLimit, UnreadReplies
+from nurec_sim.serving.server.gate import RateLimit, UnreadReplies
 from nurec_sim.serving.store import SceneStore
 from nurec_sim.serving.wire import common, sensorsim
 

@@ -20,7 +20,7 @@ from serving_world import LAST_US, START_US, camera_request, lidar_request, scen
 from nurec_sim import geometry
 from nurec_sim.render import CpuRenderer
 from nurec_sim.serving.wire import ImageFormat
-from nurec_sim.serving.wire.poses import write_poses
+from nurec_sim.serving.wire.requests import write_poses
 
 
 @pytest.fixture(scope="module")

@@ -175,3 +175,14 @@ def test_a_bug_becomes_an_internal_error_in_the_log_and_the_server_goes_on(caplo
         assert (item.success, item.error_code) == (False, Code.INTERNAL.value[0])
         assert stub.get_version(common.Empty()).version_id
     assert sum("ZeroDivisionError" in (record.exc_text or "") for record in caplog.records) == 2
+
+
+def test_what_only_the_renderer_refuses_fails_its_item_alone(stub):
+    batch = sensorsim.BatchRGBRenderRequest()
+    for name, width in (("good", 320), ("wide", 8200)):
+        item = batch.items.add(camera_name=name, request=camera_message())
+        item.request.resolution_w, item.request.resolution_h = width, 4
+    good, wide = stub.batch_render_rgb(batch, timeout=20).items
+    assert good.success and len(good.result.image_bytes) == 3 * 320 * 4
+    assert not wide.success and "8200 x 4 pixels are too many; at most 8192 a side" in wide.error_message
+    assert wide.error_code == Code.RESOURCE_EXHAUSTED.value[0]

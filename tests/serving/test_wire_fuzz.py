@@ -11,6 +11,7 @@ from serving_world import camera_request, lidar_request, rig
 from nurec_sim.errors import RequestError
 from nurec_sim.sensors import check_camera, check_lidar
 from nurec_sim.serving import wire
+from nurec_sim.serving.calls import parse
 from nurec_sim.serving.wire import sensorsim
 from nurec_sim.types import CameraModel
 
@@ -114,4 +115,4 @@ def test_strange_lidar_requests(data, count):
 @given(st.binary(max_size=64), st.sampled_from(list(wire.METHODS.values())))
 def test_strange_bytes(noise, method):
     with contextlib.suppress(RequestError):
-        assert isinstance(wire.parse(method.request, noise), method.request)
+        assert isinstance(parse(method.request, noise), method.request)

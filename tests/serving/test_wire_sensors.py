@@ -13,7 +13,7 @@ from nurec_sim.errors import RequestError
 from nurec_sim.sensors import lidar_model
 from nurec_sim.serving import wire
 from nurec_sim.serving.wire import common, sensorsim
-from nurec_sim.serving.wire.poses import read_poses, write_poses
+from nurec_sim.serving.wire.requests import read_poses, write_poses
 from nurec_sim.types import (
     CameraModel,
     Fisheye,

@@ -8,7 +8,7 @@ import numpy as np
 from nurec_sim.serving.conformance.kit import check
 from nurec_sim.serving.conformance.target import Skipped, Target, expect
 from nurec_sim.serving.wire import sensorsim
-from nurec_sim.serving.wire.poses import write_poses
+from nurec_sim.serving.wire.requests import write_poses
 
 Code = grpc.StatusCode
 _NEW = "conformance-actor"

@@ -13,7 +13,7 @@ from nurec_sim.errors import ServerError
 from nurec_sim.files.decoding import TooMuchError, check_image
 from nurec_sim.serving import wire
 from nurec_sim.serving.wire import ImageFormat, sensorsim
-from nurec_sim.serving.wire.poses import write_poses
+from nurec_sim.serving.wire.requests import write_poses
 from nurec_sim.types import Matrix4, Trajectory
 
 HEIGHT_PX = 90

@@ -42,7 +42,7 @@ class Frames:
                 reply = v1.RenderCameraReply()
                 wire.write_outputs(frame, reply)
                 if "rgb" in outputs:
-                    (image,) = self._sensors.finish_images([frame], [job.options])
+                    (image,) = self._sensors.images.of([frame], [job.options])
                     if isinstance(image, Exception):
                         raise image
                     reply.rgb = image.image_bytes

@@ -1,6 +1,16 @@
 """What every procedure of the sensor interface does; ``server`` puts it on the network."""
 
-from nurec_sim.serving.sensor_service.options import ServiceOptions, describe
-from nurec_sim.serving.sensor_service.sensors import SensorService
+from nurec_sim.serving.sensor_service.discovery import Discovery
+from nurec_sim.serving.sensor_service.editing import Editing
+from nurec_sim.serving.sensor_service.options import ServiceOptions
+from nurec_sim.serving.sensor_service.rendering import Rendering
 
-__all__ = ["SensorService", "ServiceOptions", "describe"]
+__all__ = ["SensorService", "ServiceOptions"]
+
+
+class SensorService(Rendering, Discovery, Editing):
+    """The procedures, one coroutine each, by their names on the wire: message in, message out, errors raised.
+
+    It is made of the ``store`` of scenes, ``options`` (limits and choices), and ``request_stop``, which
+    ``shut_down`` calls.
+    """

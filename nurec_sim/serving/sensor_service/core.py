@@ -1,25 +1,25 @@
-"""What all procedures share: scenes on loan, threads to work in, limits."""
+"""What all procedures share: scenes, loaded once for all who ask, and threads to work in."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-from collections import Counter
-from collections.abc import Callable, Iterator
+import logging
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TypeVar
 
-from nurec_sim.errors import CancelledError, TooLargeError
+import numpy as np
+
+from nurec_sim.errors import CancelledError
 from nurec_sim.serving.calls import current_call
-from nurec_sim.serving.sensor_service.ego_masks import EgoMasks
+from nurec_sim.serving.sensor_service.images import EgoMasks
 from nurec_sim.serving.sensor_service.options import ServiceOptions
 from nurec_sim.serving.sensor_service.render_queue import RenderQueue
 from nurec_sim.serving.sensor_service.scene_urls import SceneUrls
 from nurec_sim.serving.store import Lease, LoadedScene, SceneStore
-from nurec_sim.types import GaussianScene
+from nurec_sim.types import CameraModel, GaussianScene, LidarModel, SensorRequest
 
-T = TypeVar("T")
+log = logging.getLogger(__name__)
 
 _LOADING_THREADS = 4
 _FETCHING_THREADS = 4  # of their own, so that a slow web does not hold up scenes that are here
@@ -46,8 +46,6 @@ class ServiceCore:
         self._fetching = ThreadPoolExecutor(_FETCHING_THREADS, thread_name_prefix="fetch")
         self._reading = RenderQueue(1)  # one at a time, for what is read holds Python's lock, which all need
         self.renders = RenderQueue(options.render_workers)
-        self._asked_rays: Counter[tuple[str, ...]] = Counter()
-        """Pixels and beams of calls in progress, by client."""
 
     def close(self) -> None:
         """Drops what has not begun and waits for the rest; reconstructions end at their next step."""
@@ -59,8 +57,25 @@ class ServiceCore:
         for executor in (self._loading, self._fetching):
             executor.shutdown(wait=True, cancel_futures=True)
 
-    async def prepare(self) -> None:
-        """What comes before every procedure: offers the scene whose address came beside the request.
+    async def warm_up(self) -> None:
+        """Loads the first scene and draws one image and one sweep of it; what fails is logged only."""
+        try:
+            with await self.lease(self._store.ids[0]) as loaded:
+                rig, ego = loaded.scene.rig, loaded.scene.ego
+                start_us = max(loaded.scene.span_us[0], ego.start_us)
+
+                def look(sensor: CameraModel | LidarModel, rig_from_sensor: np.ndarray) -> SensorRequest:
+                    pose = ego.at(start_us) @ rig_from_sensor
+                    return SensorRequest(loaded.scene.id, sensor, start_us, start_us + 1, np.stack([pose, pose]))
+
+                first = [look(camera, camera.rig_from_camera) for camera in list(rig.cameras.values())[:1]]
+                first += [look(lidar, lidar.rig_from_lidar) for lidar in list(rig.lidars.values())[:1]]
+                await self.renders.run(0, loaded.renderer.sense, first, ("rgb",))
+        except Exception as error:
+            log.warning("the server could not warm up: %s", error)
+
+    async def offer_scene(self) -> None:
+        """Offers the scene whose address came as metadata of the current call.
 
         Raises:
             RequestError, NotAllowedError, TooLargeError, ArchiveError: see ``SceneUrls.offer``.
@@ -103,74 +118,6 @@ class ServiceCore:
     async def _run(executor: ThreadPoolExecutor, function: Callable, *arguments):
         # A client that cancels its call cancels the await, and with it a job that has not begun.
         return await asyncio.get_running_loop().run_in_executor(executor, function, *arguments)
-
-    def _check_batch(self, count: int) -> None:
-        if count > self._options.max_batch_items:
-            raise TooLargeError(f"a batch may have {self._options.max_batch_items} items, got {count}")
-
-    async def _read(self, actors: int, function: Callable[..., T], *arguments) -> T:
-        """What reading a request gives, when it is its client's turn."""
-        if actors > self._options.max_actors:
-            raise TooLargeError(
-                f"a frame may place {self._options.max_actors:,} actors (max_actors), got {actors:,} dynamic_objects"
-            )
-        return await self._reading.run(actors, function, *arguments)
-
-    def _check_pixels(self, count: int, text: str) -> None:
-        if count > self._options.max_pixels:
-            raise TooLargeError(
-                f"a frame may have {self._options.max_pixels:,} pixels or beams, got {text} = {count:,}"
-            )
-
-    def check_rays(self, rays: int) -> None:
-        """Refuses a call that asks for too many pixels and beams.
-
-        Raises:
-            TooLargeError: how many it may ask for.
-        """
-        if rays > self._options.max_call_rays:
-            raise TooLargeError(
-                f"a call may ask for {self._options.max_call_rays:,} pixels and beams in all (max_call_rays), "
-                f"got {rays:,}; ask for fewer or smaller frames"
-            )
-
-    @contextlib.contextmanager
-    def spending(self, rays: int) -> Iterator[None]:
-        """Counts what the current call costs while it is in progress.
-
-        Args:
-            rays: pixels and beams of all its frames.
-
-        Raises:
-            TooLargeError: more than a call may ask for, or than its client may together with its other calls.
-        """
-        self.check_rays(rays)
-        options, client = self._options, current_call().client
-        others = self._asked_rays[client]
-        if others and others + rays > options.max_client_rays:
-            raise TooLargeError(
-                f"the calls of a connection may ask for {options.max_client_rays:,} pixels and beams at a time "
-                f"(max_client_rays); {others:,} are in progress, and this call asks for {rays:,}; try again later"
-            )
-        self._asked_rays[client] += rays
-        try:
-            yield
-        finally:
-            self._asked_rays[client] -= rays
-            if not self._asked_rays[client]:
-                del self._asked_rays[client]
-
-    def check_reply(self, size: int, what: str, fewer: str) -> None:
-        """Refuses a reply that would not fit a message, before it is made.
-
-        Raises:
-            TooLargeError: what is too large, and what to ask for instead.
-        """
-        if size > self._options.max_message_bytes:
-            raise TooLargeError(
-                f"the raw {what} of this reply may take {size:,} bytes of {self._options.max_message_bytes:,}; "
-                f"ask for fewer {fewer}"
-            )
 
 
 async def run_to_end(executor: ThreadPoolExecutor, function: Callable, *arguments):

@@ -1,4 +1,4 @@
-"""What a service allows, and how its errors read."""
+"""What a sensor service allows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from nurec_sim.compute.cores import usable_cores
-from nurec_sim.errors import NurecSimError
 from nurec_sim.render.requests import MAX_RAYS
 from nurec_sim.serving import wire
 
@@ -63,8 +62,3 @@ class ServiceOptions:
         for name in ("max_edited_scenes", "download_timeout_s"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-
-
-def describe(error: Exception) -> str:
-    """The text of an error that is fit for a client."""
-    return str(error) if isinstance(error, NurecSimError) else f"internal error: {type(error).__name__}: {error}"

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
-from nurec_sim.compute.turns import taking
+from nurec_sim.compute.turns import turn_of_thread
 from nurec_sim.errors import CancelledError
 from nurec_sim.serving.calls import Call, current_call
 from nurec_sim.serving.sensor_service.fair_shares import FairShares, Job
@@ -209,12 +209,14 @@ class _Work:
     def perform(self) -> None:
         """Does the work."""
         error, result = None, None
+        token = turn_of_thread.set(self)
         try:
-            with taking(self):
-                self._check()
-                result = self._function(*self._arguments)
+            self._check()
+            result = self._function(*self._arguments)
         except BaseException as raised:
             error = raised
+        finally:
+            turn_of_thread.reset(token)
         del self._function, self._arguments  # with all that they hold
         with self._queue.lock:
             self._queue.end(self)

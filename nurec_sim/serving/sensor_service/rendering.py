@@ -9,33 +9,21 @@ ignored, and all others, static ones always, are drawn as recorded.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Awaitable, Iterable, Sequence
-from contextlib import ExitStack
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-import numpy as np
-
-from nurec_sim.compute.turns import aside, rest
-from nurec_sim.errors import NurecSimError, OutOfRangeError
-from nurec_sim.render.cpu.workers import Workers
-from nurec_sim.render.requests import check_request, ray_count
+from nurec_sim.errors import NurecSimError, OutOfRangeError, RequestError, TooLargeError
 from nurec_sim.serving import wire
+from nurec_sim.serving.calls import current_call
 from nurec_sim.serving.sensor_service.core import ServiceCore
-from nurec_sim.serving.sensor_service.options import describe
-from nurec_sim.serving.sensor_service.render_queue import LARGE_RAYS
+from nurec_sim.serving.sensor_service.images import ImageReplies
 from nurec_sim.serving.store import LoadedScene
 from nurec_sim.serving.wire import sensorsim
-from nurec_sim.types import (
-    CameraFrame,
-    CameraModel,
-    GaussianScene,
-    LidarFilter,
-    LidarFrame,
-    LidarModel,
-    SensorRequest,
-)
+from nurec_sim.types import CameraModel, LidarFilter, LidarFrame, LidarModel, SensorRequest
 
 log = logging.getLogger(__name__)
 
@@ -78,44 +66,31 @@ class Rendering(ServiceCore):
 
     def __init__(self, *arguments) -> None:
         super().__init__(*arguments)
-        self._encoders = Workers(self._options.render_workers)
-
-    async def warm_up(self) -> None:
-        """Loads the first scene and draws one image and one sweep of it; what fails is logged only."""
-        try:
-            with await self.lease(self._store.ids[0]) as loaded:
-                rig, ego = loaded.scene.rig, loaded.scene.ego
-                start_us = max(loaded.scene.span_us[0], ego.start_us)
-
-                def look(sensor: CameraModel | LidarModel, rig_from_sensor: np.ndarray) -> SensorRequest:
-                    pose = ego.at(start_us) @ rig_from_sensor
-                    return SensorRequest(loaded.scene.id, sensor, start_us, start_us + 1, np.stack([pose, pose]))
-
-                first = [look(camera, camera.rig_from_camera) for camera in list(rig.cameras.values())[:1]]
-                first += [look(lidar, lidar.rig_from_lidar) for lidar in list(rig.lidars.values())[:1]]
-                await self.renders.run(0, loaded.renderer.sense, first, ("rgb",))
-        except Exception as error:
-            log.warning("the server could not warm up: %s", error)
+        self.images = ImageReplies(self._masks, self._options.render_workers)
+        self._asked_rays: Counter[tuple[str, ...]] = Counter()
+        """Pixels and beams of calls in progress, by client."""
 
     async def render_rgb(self, request):
         """One image."""
-        with ExitStack() as held:
+        with contextlib.ExitStack() as held:
             job = await self.admit_camera(request, held)
             self._check_images([job])
-            (reply,) = _raise_first(await self._render_cameras([job]))
+            with self.spending(job.pixels):
+                (reply,) = _raise_first(await self._render_all([job]))
             return reply
 
     async def batch_render_rgb(self, batch):
         """Several images; what is wrong with one item is said in that item."""
         self._check_batch(len(batch.items))
         self._check_sizes(item.request for item in batch.items)
-        with ExitStack() as held:
+        with contextlib.ExitStack() as held:
             admitted = await asyncio.gather(
                 *(self.admit_camera(item.request, held) for item in batch.items), return_exceptions=True
             )
             jobs = [job for job in admitted if isinstance(job, CameraJob)]
             self._check_images(jobs)
-            rendered = iter(await self._render_cameras(jobs))
+            with self.spending(sum(job.pixels for job in jobs)):
+                rendered = iter(await self._render_all(jobs))
             results = [next(rendered) if isinstance(job, CameraJob) else job for job in admitted]
         reply = sensorsim.BatchRGBRenderReturn()
         for item, result in zip(batch.items, results, strict=True):
@@ -123,7 +98,7 @@ class Rendering(ServiceCore):
             if isinstance(result, Exception):
                 if not isinstance(result, NurecSimError):
                     log.error("batch item %r failed", item.camera_name, exc_info=result)
-                entry.error_message, entry.error_code = describe(result), wire.number_of(result)
+                entry.error_message, entry.error_code = wire.text_of(result), wire.number_of(result)
             else:
                 entry.success = True
                 entry.result.CopyFrom(result)
@@ -131,7 +106,7 @@ class Rendering(ServiceCore):
 
     async def render_lidar(self, request):
         """One sweep."""
-        with ExitStack() as held:
+        with contextlib.ExitStack() as held:
             job = await self.admit_lidar(request, held)
             self.check_reply(BYTES_A_POINT * job.beams, "points", "beams")
             with self.spending(job.beams):
@@ -141,7 +116,7 @@ class Rendering(ServiceCore):
         """Images and sweeps together; one that fails fails all, there is no place for its error in the reply."""
         self._check_batch(len(request.rgb_requests) + len(request.lidar_requests))
         self._check_sizes(request.rgb_requests)
-        with ExitStack() as held:
+        with contextlib.ExitStack() as held:
             jobs = await _all(self.admit_camera(item, held) for item in request.rgb_requests)
             sweeps = await _all(self.admit_lidar(item, held) for item in request.lidar_requests)
             self._check_images(jobs)
@@ -151,15 +126,19 @@ class Rendering(ServiceCore):
                 lidar_returns = await _all(self._render_lidar(sweep) for sweep in sweeps)
         return sensorsim.AggregatedRenderReturn(rgb_returns=rgb_returns, lidar_returns=lidar_returns)
 
-    async def admit_camera(self, message, held: ExitStack) -> CameraJob:
+    async def admit_camera(self, message, held: contextlib.ExitStack) -> CameraJob:
         """Checks a request and borrows its scene until ``held`` ends."""
-        loaded = held.enter_context(await self.lease(message.scene_id))
+        loaded = await self._borrow(message.scene_id, held)
         return await self._read(len(message.dynamic_objects), self._read_camera, message, loaded)
 
-    async def admit_lidar(self, message, held: ExitStack) -> LidarJob:
+    async def admit_lidar(self, message, held: contextlib.ExitStack) -> LidarJob:
         """Checks a request and borrows its scene until ``held`` ends."""
-        loaded = held.enter_context(await self.lease(message.scene_id))
+        loaded = await self._borrow(message.scene_id, held)
         return await self._read(len(message.dynamic_objects), self._read_lidar, message, loaded)
+
+    async def _borrow(self, name: str, held: contextlib.ExitStack) -> LoadedScene:
+        # A scene in memory is found by its id at once; other names and loading are the store's.
+        return held.enter_context(self._store.memory.lease_ready(name) or await self.lease(name))
 
     def _read_camera(self, message, loaded: LoadedScene) -> CameraJob:
         request, options = wire.read_camera_request(message, loaded.scene.rig.cameras)
@@ -167,24 +146,20 @@ class Rendering(ServiceCore):
             options = replace(options, ego_mask=self._masks.find(options.ego_mask))
         camera = request.sensor
         assert isinstance(camera, CameraModel)
-        self._check_pixels(ray_count(request), f"{camera.width_px}x{camera.height_px} pixels")
-        return CameraJob(loaded, self._admit(request, loaded.scene), options, ray_count(request))
+        pixels = camera.width_px * camera.height_px
+        self._check_pixels(pixels, f"{camera.width_px}x{camera.height_px} pixels")
+        return CameraJob(loaded, self._admit(request, loaded), options, pixels)
 
     def _read_lidar(self, message, loaded: LoadedScene) -> LidarJob:
         request, filter = wire.read_lidar_request(message)
         lidar = request.sensor
         assert isinstance(lidar, LidarModel)
         rows, columns = len(lidar.elevation_rad), len(lidar.azimuth_rad)
-        self._check_pixels(ray_count(request), f"{rows}x{columns} beams")
-        return LidarJob(loaded, self._admit(request, loaded.scene), filter, ray_count(request))
-
-    async def _render_cameras(self, jobs: Sequence[CameraJob]) -> list[Any]:
-        """An ``RGBRenderReturn``, or an error, for each job; all of them are one call."""
-        with self.spending(sum(job.pixels for job in jobs)):
-            return await self._render_all(jobs)
+        self._check_pixels(rows * columns, f"{rows}x{columns} beams")
+        return LidarJob(loaded, self._admit(request, loaded), filter, rows * columns)
 
     async def _render_all(self, jobs: Sequence[CameraJob]) -> list[Any]:
-        """As ``_render_cameras``; those of one scene are rendered together."""
+        """An ``RGBRenderReturn``, or an error, for each job; those of one scene are rendered together."""
         groups: dict[int, list[int]] = {}
         for number, job in enumerate(jobs):
             groups.setdefault(id(job.loaded), []).append(number)
@@ -197,9 +172,12 @@ class Rendering(ServiceCore):
         return results
 
     def _draw(self, jobs: Sequence[CameraJob]) -> list[Any]:
-        """Replies, or errors, to jobs of one scene."""
-        frames = jobs[0].loaded.renderer.sense([job.request for job in jobs], ("rgb",))
-        return self.finish_images(frames, [job.options for job in jobs])
+        """Replies, or errors, to jobs of one scene; the renderer checks a request before it renders any."""
+        try:
+            frames = jobs[0].loaded.renderer.sense([job.request for job in jobs], ("rgb",))
+        except RequestError as error:
+            return [error] if len(jobs) == 1 else [reply for job in jobs for reply in self._draw([job])]
+        return self.images.of(frames, [job.options for job in jobs])
 
     async def _render_lidar(self, job: LidarJob):
         def render():
@@ -209,55 +187,93 @@ class Rendering(ServiceCore):
 
         return await self.renders.run(job.beams, render)
 
-    def finish_images(self, frames: Sequence[Any], options: Sequence[wire.ImageOptions]) -> list[Any]:
-        """An ``RGBRenderReturn``, or an error, for each frame: its colours in the format asked for."""
-        calls = [(self._finished, *pair) for pair in zip(frames, options, strict=True)]
-        if all(frame.rgb.size <= 3 * LARGE_RAYS for frame in frames):
-            return self._encoders.run_calls(calls)
-        results = []
-        for first in range(0, len(calls), self._encoders.threads):
-            rest()
-            with aside():  # an encoder cannot be interrupted
-                results += self._encoders.run_calls(calls[first : first + self._encoders.threads])
-        return results
-
-    def _finished(self, frame: CameraFrame, options: wire.ImageOptions):
-        """An ``RGBRenderReturn``, with the ego mask over the image, or what went wrong."""
-        try:
-            rgb = self._masks.lay_over(frame.rgb, options.ego_mask) if options.ego_mask else frame.rgb
-            reply = sensorsim.RGBRenderReturn()
-            wire.write_image(rgb, options, reply)
-            return reply
-        except Exception as error:
-            return error
-
-    def _admit(self, request: SensorRequest, scene: GaussianScene) -> SensorRequest:
+    def _admit(self, request: SensorRequest, loaded: LoadedScene) -> SensorRequest:
         """The request as the renderer takes it: in the scene's time, with actors that the scene knows."""
-        span_start, span_end = scene.span_us  # the renderer takes the last instant [end, end + 1) too
-        # Clients take their times from the trajectory, which may reach a little farther than the sensors' data.
-        first, last = min(span_start, scene.ego.start_us), max(span_end, scene.ego.end_us)
+        scene, (first, last) = loaded.scene, loaded.times_us
         if request.start_us > last or request.end_us <= first:
             raise OutOfRangeError(
                 f"the frame [{request.start_us}, {request.end_us}) us lies outside of scene {scene.id!r}, "
                 f"which covers [{first}, {last}]"
             )
+        span_start, span_end = scene.span_us  # the renderer takes the last instant [end, end + 1) too
         start_us = min(max(request.start_us, span_start), span_end)
         end_us = max(min(request.end_us, span_end + 1), start_us + 1)
-        actors = self._actors(request, scene)
+        actors = request.actors
+        if unknown := sorted(actors.keys() - loaded.tracks.keys()):
+            log.info("scene %s has no %d of the actors listed, as %r", scene.id, len(unknown), unknown[0])
+            actors = {track_id: pair for track_id, pair in actors.items() if track_id in loaded.tracks}
         hidden: frozenset[str] = frozenset()
         if self._options.only_listed_actors and request.actors:
-            hidden = frozenset(track.id for track in scene.tracks if track.controllable and track.id not in actors)
-        admitted = replace(request, start_us=start_us, end_us=end_us, actors=actors, hidden=hidden)
-        check_request(admitted, scene)
-        return admitted
+            hidden = frozenset(key for key, track in loaded.tracks.items() if track.controllable and key not in actors)
+        return replace(request, start_us=start_us, end_us=end_us, actors=actors, hidden=hidden)
 
-    def _actors(self, request: SensorRequest, scene: GaussianScene) -> dict[str, np.ndarray]:
-        known = {track.id for track in scene.tracks}
-        actors = {track_id: pair for track_id, pair in request.actors.items() if track_id in known}
-        if len(actors) < len(request.actors):
-            unknown = sorted(request.actors.keys() - known)
-            log.info("scene %s has no %d of the actors listed, as %r", scene.id, len(unknown), unknown[0])
-        return actors
+    def _check_batch(self, count: int) -> None:
+        if count > self._options.max_batch_items:
+            raise TooLargeError(f"a batch may have {self._options.max_batch_items} items, got {count}")
+
+    async def _read(self, actors: int, function: Callable[..., T], *arguments) -> T:
+        """What reading a request gives, when it is its client's turn."""
+        if actors > self._options.max_actors:
+            raise TooLargeError(
+                f"a frame may place {self._options.max_actors:,} actors (max_actors), got {actors:,} dynamic_objects"
+            )
+        return await self._reading.run(actors, function, *arguments)
+
+    def _check_pixels(self, count: int, text: str) -> None:
+        if count > self._options.max_pixels:
+            raise TooLargeError(
+                f"a frame may have {self._options.max_pixels:,} pixels or beams, got {text} = {count:,}"
+            )
+
+    def check_rays(self, rays: int) -> None:
+        """Refuses a call that asks for too many pixels and beams.
+
+        Raises:
+            TooLargeError: how many it may ask for.
+        """
+        if rays > self._options.max_call_rays:
+            raise TooLargeError(
+                f"a call may ask for {self._options.max_call_rays:,} pixels and beams in all (max_call_rays), "
+                f"got {rays:,}; ask for fewer or smaller frames"
+            )
+
+    @contextlib.contextmanager
+    def spending(self, rays: int) -> Iterator[None]:
+        """Counts what the current call costs while it is in progress.
+
+        Args:
+            rays: pixels and beams of all its frames.
+
+        Raises:
+            TooLargeError: more than a call may ask for, or than its client may together with its other calls.
+        """
+        self.check_rays(rays)
+        options, client = self._options, current_call().client
+        others = self._asked_rays[client]
+        if others and others + rays > options.max_client_rays:
+            raise TooLargeError(
+                f"the calls of a connection may ask for {options.max_client_rays:,} pixels and beams at a time "
+                f"(max_client_rays); {others:,} are in progress, and this call asks for {rays:,}; try again later"
+            )
+        self._asked_rays[client] += rays
+        try:
+            yield
+        finally:
+            self._asked_rays[client] -= rays
+            if not self._asked_rays[client]:
+                del self._asked_rays[client]
+
+    def check_reply(self, size: int, what: str, fewer: str) -> None:
+        """Refuses a reply that would not fit a message, before it is made.
+
+        Raises:
+            TooLargeError: what is too large, and what to ask for instead.
+        """
+        if size > self._options.max_message_bytes:
+            raise TooLargeError(
+                f"the raw {what} of this reply may take {size:,} bytes of {self._options.max_message_bytes:,}; "
+                f"ask for fewer {fewer}"
+            )
 
     def _check_sizes(self, messages: Iterable[Any]) -> None:
         """Refuses a call that names more pixels than it may have, before anything of it is read."""

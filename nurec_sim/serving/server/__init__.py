@@ -1,8 +1,8 @@
 """gRPC servers: the sensor server, and what any server of ours listens with."""
 
+from nurec_sim.serving.calls import Service
 from nurec_sim.serving.server.grpc_server import Application, GrpcServer, run_until_signal
 from nurec_sim.serving.server.options import ServerOptions
-from nurec_sim.serving.server.registration import Service
 from nurec_sim.serving.server.request_log import LogFormat, LogLevel, set_up_logging
 from nurec_sim.serving.server.security import Tls, check_exposure, is_loopback, read_token
 from nurec_sim.serving.server.sensor_server import SensorServer, serve

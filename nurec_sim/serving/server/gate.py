@@ -7,14 +7,13 @@ import contextlib
 import inspect
 import math
 import time
+from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
 import grpc
 
-from nurec_sim.serving.calls import Call, address_of, enter_call
-from nurec_sim.serving.server.limits import RateLimit, UnreadReplies
+from nurec_sim.serving.calls import HANDLER_KINDS, Call, address_of, enter_call
 from nurec_sim.serving.server.options import ServerOptions
-from nurec_sim.serving.server.registration import HANDLER_KINDS
 from nurec_sim.serving.server.request_log import log_call
 from nurec_sim.serving.server.security import shows_token
 from nurec_sim.serving.server.telemetry import Telemetry
@@ -26,6 +25,69 @@ _QUIET_S = 0.1
 """A client that has read its last reply asks again within this time, and is to hear that the server is stopping."""
 _LONGEST_WAIT_FOR_QUIET_S = 1.0
 _SECRETS = ("authorization", "cookie")
+_MOST_PEERS = 10_000
+"""Addresses whose rates are remembered."""
+
+
+class RateLimit:
+    """A bucket of tokens for each client address: a call takes one, and they come back at a steady rate.
+
+    Args:
+        per_s: tokens that come back in a second.
+        burst: tokens that fit.
+        clock: seconds, never going back.
+    """
+
+    def __init__(self, per_s: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._per_s, self._burst, self._clock = per_s, float(burst), clock
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()  # address: tokens, when they were counted
+
+    def allows(self, address: str) -> bool:
+        """Whether a call may begin now; takes its token if so."""
+        now = self._clock()
+        tokens, then = self._buckets.pop(address, (self._burst, now))
+        tokens = min(self._burst, tokens + self._per_s * (now - then))
+        allowed = tokens >= 1
+        self._buckets[address] = (tokens - 1 if allowed else tokens, now)
+        if len(self._buckets) > _MOST_PEERS:
+            self._buckets.popitem(last=False)  # asked longest ago
+        return allowed
+
+
+class UnreadReplies:
+    """Bytes of replies that were handed to the network and not taken by their clients yet.
+
+    Args:
+        most: in all; one connection may leave a quarter of it, or a single reply of any size.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._by_peer: Counter[str] = Counter()
+
+    @property
+    def total(self) -> int:
+        """Bytes in all."""
+        return self._by_peer.total()
+
+    def refusal(self, peer: str, size: int = 0) -> str | None:
+        """Why a reply of ``size`` bytes cannot be held for a connection; None if it can."""
+        unread = self._by_peer[peer] if peer in self._by_peer else 0
+        if unread and unread + size > self._most // 4:
+            return f"{unread:,} bytes of replies wait to be read by this connection; read them first"
+        if (total := self.total) and total + size > self._most:
+            return f"{total:,} bytes of replies wait to be read by clients of this server; try again later"
+        return None
+
+    def add(self, peer: str, size: int) -> None:
+        """Counts a reply that goes out."""
+        self._by_peer[peer] += size
+
+    def remove(self, peer: str, size: int) -> None:
+        """Counts a reply that was taken, or whose client left."""
+        self._by_peer[peer] -= size
+        if self._by_peer[peer] <= 0:
+            del self._by_peer[peer]
 
 
 class Gate(grpc.aio.ServerInterceptor):

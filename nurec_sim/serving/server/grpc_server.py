@@ -19,9 +19,9 @@ from grpc_health.v1.health import aio as health
 from grpc_reflection.v1alpha import reflection
 
 from nurec_sim.serving import wire
+from nurec_sim.serving.calls import Service, register
 from nurec_sim.serving.server.gate import Gate
 from nurec_sim.serving.server.options import ServerOptions
-from nurec_sim.serving.server.registration import Service, register
 from nurec_sim.serving.server.telemetry import Telemetry
 
 log = logging.getLogger(__name__)

@@ -10,11 +10,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from nurec_sim.serving import wire
+from nurec_sim.serving.calls import Service
 from nurec_sim.serving.scene_service import SceneOptions, SceneService
 from nurec_sim.serving.sensor_service import SensorService, ServiceOptions
+from nurec_sim.serving.sensor_service.scene_urls import URL_KEY
 from nurec_sim.serving.server.grpc_server import GrpcServer, run_until_signal
 from nurec_sim.serving.server.options import ServerOptions
-from nurec_sim.serving.server.registration import Service
 from nurec_sim.serving.store import SceneStore
 
 
@@ -68,9 +69,10 @@ class _Sensors:
         self._store, self._options = store, options
         self._service = SensorService(store, options, request_stop)
         self._scenes = SceneService(store, self._service, scene_options)
+        on_metadata = {URL_KEY: self._service.offer_scene}
         self.services: Sequence[Service] = (
-            Service(wire.SERVICE, self._service, wire.SERVICE_PATHS, self._service.prepare),
-            Service(wire.SCENE_SERVICE, self._scenes, prepare=self._service.prepare),
+            Service(wire.SERVICE, self._service, wire.SERVICE_PATHS, on_metadata),
+            Service(wire.SCENE_SERVICE, self._scenes, on_metadata=on_metadata),
         )
 
     async def warm_up(self) -> None:

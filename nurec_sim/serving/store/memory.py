@@ -8,13 +8,13 @@ from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from types import TracebackType
 
 from nurec_sim.errors import CancelledError
 from nurec_sim.render.device import Renderer
 from nurec_sim.serving.store.sizes import array_bytes
-from nurec_sim.types import GaussianScene
+from nurec_sim.types import GaussianScene, Track
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,20 @@ class LoadedScene:
 
     scene: GaussianScene
     renderer: Renderer
+
+    @cached_property
+    def times_us(self) -> tuple[int, int]:
+        """First and last time that a frame may be asked for.
+
+        Clients take their times from the recorded path, which may reach a little farther than the sensors' data.
+        """
+        (first, last), ego = self.scene.span_us, self.scene.ego
+        return min(first, ego.start_us), max(last, ego.end_us)
+
+    @cached_property
+    def tracks(self) -> dict[str, Track]:
+        """The scene's tracks by id."""
+        return {track.id: track for track in self.scene.tracks}
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class SceneStore:
             raise ValueError(f"a scene store needs room for at least 1 scene, got capacity {capacity}")
         if max_bytes is not None and max_bytes < 1:
             raise ValueError(f"a scene store needs room for at least 1 byte, got max_bytes {max_bytes}")
-        self._memory = SceneMemory(capacity, half_of_memory() if max_bytes is None else max_bytes)
+        self.memory = SceneMemory(capacity, half_of_memory() if max_bytes is None else max_bytes)
         self._kept = KeptReconstructions(cache_dir or default_cache_dir(), on_progress or (lambda text: None))
         self._recipe = Recipe(method, settings)
         self._make_renderer = make_renderer or partial(renderer_on, device=device, threads=threads)
@@ -165,7 +165,7 @@ class SceneStore:
     def entries(self) -> tuple[SceneEntry, ...]:
         """The scenes on offer, in the order they were added."""
         return tuple(
-            SceneEntry(source.id, source.kind, _file_bytes(source), *self._memory.state_of(source.id))
+            SceneEntry(source.id, source.kind, _file_bytes(source), *self.memory.state_of(source.id))
             for source in self.sources
         )
 
@@ -207,22 +207,22 @@ class SceneStore:
     @property
     def capacity(self) -> int:
         """How many scenes are kept in memory."""
-        return self._memory.capacity
+        return self.memory.capacity
 
     @property
     def max_bytes(self) -> int:
         """How much memory they may take."""
-        return self._memory.max_bytes
+        return self.memory.max_bytes
 
     @property
     def loaded_ids(self) -> tuple[str, ...]:
         """Ids of the scenes in memory, least recently used first."""
-        return self._memory.keys
+        return self.memory.keys
 
     @property
     def stats(self) -> MemoryStats:
         """Counters since the start, and what is in memory now."""
-        return self._memory.stats
+        return self.memory.stats
 
     def lease(self, name: str, progress: Progress | None = None) -> Lease:
         """The use of the scene that answers to ``name``; loads or reconstructs it if it is not in memory.
@@ -240,7 +240,7 @@ class SceneStore:
             ArchiveError, ClipError, ReconstructError, WeightsError: it cannot be loaded.
         """
         source = self.source(name)
-        return self._memory.lease(source.id, lambda: self._load(source, progress))
+        return self.memory.lease(source.id, lambda: self._load(source, progress))
 
     def lease_in_memory(self, name: str) -> Lease | None:
         """The use of the scene that answers to ``name`` if that takes no waiting, else None.
@@ -248,7 +248,7 @@ class SceneStore:
         Raises:
             UnknownSceneError, ArchiveError: see ``resolve``.
         """
-        return self._memory.lease_ready(self.resolve(name))
+        return self.memory.lease_ready(self.resolve(name))
 
     def get(self, name: str, progress: Progress | None = None) -> LoadedScene:
         """As ``lease``, for those who hold the scene but not its place in memory."""
@@ -265,9 +265,9 @@ class SceneStore:
         return self._unload(self.resolve(name))
 
     def _unload(self, scene_id: str) -> int:
-        freed = self._memory.drop(scene_id)
+        freed = self.memory.drop(scene_id)
         if freed is None:
-            _, users, _ = self._memory.state_of(scene_id)
+            _, users, _ = self.memory.state_of(scene_id)
             raise SceneInUseError(f"scene {scene_id!r} is in use ({users} calls); unload it when they have ended")
         return freed
 
@@ -281,7 +281,7 @@ class SceneStore:
         loaded = self._load(source, None)
         with self._lock:
             self._sources[source.id] = source
-        self._memory.put(source.id, loaded)
+        self.memory.put(source.id, loaded)
 
     def restore(self, name: str) -> None:
         """Serves the original of a scene again; without effect on one that was not replaced.
@@ -293,7 +293,7 @@ class SceneStore:
         if source.edited is not None:
             with self._lock:
                 self._sources[source.id] = replace(source, edited=None)
-            self._memory.put(source.id, None)
+            self.memory.put(source.id, None)
 
     @property
     def edited_ids(self) -> tuple[str, ...]:

@@ -17,40 +17,36 @@ from nurec_sim.serving.wire.messages import (
     common,
     egodriver,
     nurec_sim_v1,
-    parse,
     pool,
     sensorsim,
 )
-from nurec_sim.serving.wire.outputs import (
+from nurec_sim.serving.wire.replies import (
+    ImageOptions,
     bytes_a_pixel,
+    offered_formats,
     outputs_of,
+    read_camera_frame,
+    read_lidar_frame,
     read_outputs,
     read_range_map,
+    write_image,
+    write_lidar_frame,
     write_outputs,
     write_range_map,
 )
-from nurec_sim.serving.wire.poses import read_track, read_trajectory, write_track, write_trajectory
 from nurec_sim.serving.wire.requests import (
-    ImageOptions,
-    offered_formats,
-    read_camera_frame,
     read_camera_request,
-    read_lidar_frame,
     read_lidar_request,
-    write_camera_request,
-    write_image,
-    write_lidar_frame,
-    write_lidar_request,
-)
-from nurec_sim.serving.wire.sensor_specs import (
-    read_camera,
-    read_lidar,
     read_mounting,
-    write_camera,
-    write_lidar,
+    read_poses,
+    write_camera_request,
+    write_lidar_request,
     write_mounting,
+    write_poses,
 )
-from nurec_sim.serving.wire.status import code_of, error_of, number_of
+from nurec_sim.serving.wire.sensor_specs import read_camera, read_lidar, write_camera, write_lidar
+from nurec_sim.serving.wire.status import code_of, error_of, number_of, text_of
+from nurec_sim.serving.wire.trajectories import read_track, read_trajectory, write_track, write_trajectory
 
 __all__ = [
     "MAX_MESSAGE_BYTES",
@@ -73,7 +69,6 @@ __all__ = [
     "nurec_sim_v1",
     "offered_formats",
     "outputs_of",
-    "parse",
     "pool",
     "read_camera",
     "read_camera_frame",
@@ -83,10 +78,12 @@ __all__ = [
     "read_lidar_request",
     "read_mounting",
     "read_outputs",
+    "read_poses",
     "read_range_map",
     "read_track",
     "read_trajectory",
     "sensorsim",
+    "text_of",
     "write_camera",
     "write_camera_request",
     "write_image",
@@ -95,6 +92,7 @@ __all__ = [
     "write_lidar_request",
     "write_mounting",
     "write_outputs",
+    "write_poses",
     "write_range_map",
     "write_track",
     "write_trajectory",

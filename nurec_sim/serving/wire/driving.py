@@ -10,15 +10,13 @@ from google.protobuf import message_factory
 
 from nurec_sim.errors import RequestError
 from nurec_sim.serving.wire.messages import Method, pool
-from nurec_sim.serving.wire.poses import MAX_TIME_US, read_poses, write_poses
-from nurec_sim.serving.wire.requests import read_lidar_frame, write_lidar_frame
+from nurec_sim.serving.wire.replies import read_lidar_frame, write_lidar_frame
+from nurec_sim.serving.wire.requests import MAX_TIME_US, read_mounting, read_poses, write_mounting, write_poses
 from nurec_sim.serving.wire.sensor_specs import (
     read_camera,
     read_lidar,
-    read_mounting,
     write_camera,
     write_lidar,
-    write_mounting,
 )
 from nurec_sim.types import (
     ActorState,

@@ -16,7 +16,7 @@ from jaxtyping import Float64, Int64
 from nurec_sim import geometry
 from nurec_sim.errors import RequestError
 from nurec_sim.serving.wire.driving import MAX_POSES, check_time
-from nurec_sim.serving.wire.poses import read_poses, write_poses
+from nurec_sim.serving.wire.requests import read_poses, write_poses
 from nurec_sim.types import EgoState, Matrix4, Plan
 
 LEAST_UPRIGHT = 0.2

@@ -14,7 +14,7 @@ import numpy as np
 
 from nurec_sim.errors import RequestError
 from nurec_sim.serving.wire.driving import MAX_POSES, bounded, check_time
-from nurec_sim.serving.wire.poses import read_poses, write_poses
+from nurec_sim.serving.wire.requests import read_poses, write_poses
 from nurec_sim.types import EgoState, Matrix4
 
 

@@ -14,9 +14,6 @@ from typing import Any, NamedTuple
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.descriptor import Descriptor
-from google.protobuf.message import DecodeError
-
-from nurec_sim.errors import RequestError
 
 SENSORSIM = "nre.grpc.protos.sensorsim"
 SERVICE = f"{SENSORSIM}.SensorsimService"
@@ -88,15 +85,3 @@ METHODS = {
     for method in pool.FindServiceByName(SERVICE).methods
 }
 """Every procedure of the sensor service by name."""
-
-
-def parse(kind: Any, data: bytes) -> Any:
-    """The message of class ``kind`` in ``data``.
-
-    Raises:
-        RequestError: the bytes are no such message.
-    """
-    try:
-        return kind.FromString(data)
-    except DecodeError as error:
-        raise RequestError(f"the {len(data)} bytes received are no {kind.DESCRIPTOR.name} message") from error

@@ -1,52 +1,40 @@
-"""Render requests, images and sweeps <-> messages."""
+"""Requests for frames, and the poses in them <-> messages.
+
+The wire's poses are float32 position and ``wxyz`` quaternion; ours travel beside them in double precision
+(``Pose.exact``), so that a remote rollout equals a local one bit for bit.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import enum
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Int64
 
+from nurec_sim import geometry
+from nurec_sim.compute.turns import rest
 from nurec_sim.errors import RequestError
-from nurec_sim.render.images.encode import available_formats, encode_image
+from nurec_sim.render.images.encode import available_formats
 from nurec_sim.render.requests import check_pose_pair
 from nurec_sim.serving.wire.messages import ImageFormat
-from nurec_sim.serving.wire.poses import check_interval, read_poses, write_poses
+from nurec_sim.serving.wire.replies import DEFAULT_QUALITY, ENCODER, ImageOptions, offered_formats, sensor_of
 from nurec_sim.serving.wire.sensor_specs import read_camera, read_lidar, write_camera, write_lidar
-from nurec_sim.types import CameraFrame, CameraModel, LidarFilter, LidarFrame, LidarModel, SensorRequest
+from nurec_sim.types import CameraModel, LidarFilter, LidarModel, Matrix4, SensorRequest
 
-_ENCODER = {
-    ImageFormat.PNG: "png",
-    ImageFormat.JPEG: "jpeg",
-    ImageFormat.JPEG2000: "jpeg2000",
-    ImageFormat.RGB_UINT8_PLANAR: "rgb_planar",
-    ImageFormat.AVC: "avc",
-    ImageFormat.AV1: "av1",
-}
 _LOSSLESS = (ImageFormat.PNG, ImageFormat.RGB_UINT8_PLANAR)
-DEFAULT_QUALITY = 95
 DEFAULT_DISTANCE_THRESHOLD_M = 1.0
 """Of a request that enables the distance filter without saying how far is too far."""
+_AT_ONCE = 1024
+"""Poses read in a few milliseconds."""
+QUAT_TOLERANCE = 1e-3
+"""How far a quaternion's squared norm may be from 1; clients round to float32, AlpaSim itself allows 1e-4."""
 
-Sensor = TypeVar("Sensor", CameraModel, LidarModel)
-
-
-@dataclass(frozen=True)
-class ImageOptions:
-    """How a camera image is finished: file format, quality, and the ego mask laid over it."""
-
-    format: int = ImageFormat.PNG
-    quality: int = DEFAULT_QUALITY
-    """1..100; without effect on PNG and raw planes."""
-    ego_mask: tuple[str, str] | None = None
-    """(rig, camera) of the mask, or None. The rig may be empty: the one that has a mask of this camera."""
+MAX_TIME_US = 2**62
+"""Times beyond this are rejected, so that sums of two still fit int64."""
 
 
-# ------------------------------------------------------------------------------------------------------------ requests
+# ------------------------------------------------------------------------------------------------------------- requests
 
 
 def write_camera_request(request: SensorRequest, message, *, scene_id: str) -> None:
@@ -55,7 +43,7 @@ def write_camera_request(request: SensorRequest, message, *, scene_id: str) -> N
     Raises:
         RequestError: the frame is empty, a pose is not finite or not rigid, or tracks are hidden.
     """
-    camera = _sensor_of(request, CameraModel)
+    camera = sensor_of(request, CameraModel)
     message.resolution_w, message.resolution_h = camera.width_px, camera.height_px
     write_camera(camera, message.camera_intrinsics)
     message.image_format = ImageFormat.RGB_UINT8_PLANAR
@@ -70,14 +58,8 @@ def write_lidar_request(request: SensorRequest, message, *, scene_id: str) -> No
     Raises:
         RequestError: the frame is empty, a pose is not finite or not rigid, or tracks are hidden.
     """
-    write_lidar(_sensor_of(request, LidarModel), message.lidar_config)
+    write_lidar(sensor_of(request, LidarModel), message.lidar_config)
     _write_frame(request, message, scene_id)
-
-
-def _sensor_of(request: SensorRequest, kind: type[Sensor]) -> Sensor:
-    if not isinstance(request.sensor, kind):
-        raise RequestError(f"the sensor must be a {kind.__name__}, got {type(request.sensor).__name__}")
-    return request.sensor
 
 
 def _write_frame(request: SensorRequest, message, scene_id: str) -> None:
@@ -152,7 +134,7 @@ def _read_frame(message, sensor) -> SensorRequest:
 
 
 def _read_image_options(message) -> ImageOptions:
-    if _ENCODER.get(message.image_format) not in available_formats():
+    if ENCODER.get(message.image_format) not in available_formats():
         allowed = ", ".join(f"{number.name} ({number.value})" for number in offered_formats())
         given = ImageFormat(message.image_format).name if message.image_format in list(ImageFormat) else "unknown"
         raise RequestError(f"image_format must be one of {allowed}; got {given} ({message.image_format})")
@@ -172,80 +154,109 @@ def _read_image_options(message) -> ImageOptions:
     )
 
 
-def offered_formats() -> tuple[enum.IntEnum, ...]:
-    """Image formats for which this installation has an encoder."""
-    return tuple(number for number, name in _ENCODER.items() if name in available_formats())
-
-
-# -------------------------------------------------------------------------------------------------------------- frames
-
-
-def write_image(rgb: UInt8[np.ndarray, "h w 3"], options: ImageOptions, message) -> None:
-    """Fills an ``RGBRenderReturn``."""
-    message.image_bytes = encode_image(rgb, _ENCODER[options.format], options.quality)
-
-
-def read_camera_frame(message, request: SensorRequest, field: str = "image_bytes") -> CameraFrame:
-    """The frame of an ``RGBRenderReturn`` to a request made by ``write_camera_request``.
-
-    ``field`` is what errors call the picture.
+def check_interval(start_us: int, end_us: int) -> None:
+    """Whether [start, end) is a valid frame.
 
     Raises:
-        RequestError: the reply has another size than asked for.
+        RequestError: it is empty or reversed, or a time is beyond any clock.
     """
-    camera = _sensor_of(request, CameraModel)
-    shape = (3, camera.height_px, camera.width_px)
-    if len(message.image_bytes) != int(np.prod(shape)):
+    if end_us > MAX_TIME_US or start_us > MAX_TIME_US:
+        raise RequestError(f"frame_start_us {start_us} and frame_end_us {end_us} must be microseconds below 2**62")
+    if start_us >= end_us:
         raise RequestError(
-            f"camera {camera.id!r}: {field} must hold {camera.width_px}x{camera.height_px} planar RGB, "
-            f"{int(np.prod(shape)):,} bytes, got {len(message.image_bytes):,}"
+            f"a frame is the half-open interval [frame_start_us, frame_end_us) and needs start < end, "
+            f"got [{start_us}, {end_us}); an instant t is [t, t + 1)"
         )
-    import cv2
-
-    rgb = cv2.merge(list(np.frombuffer(message.image_bytes, np.uint8).reshape(shape)))  # far quicker than NumPy's copy
-    return CameraFrame(camera, request.start_us, request.end_us, rgb)
 
 
-def write_lidar_frame(frame: LidarFrame, message) -> None:
-    """Fills a ``LidarRenderReturn``; only the buffers, not the repeated fields."""
-    message.num_points = len(frame.xyz_m)
-    message.point_xyzs_buffer = np.ascontiguousarray(frame.xyz_m, "<f4").tobytes()
-    message.point_intensities_buffer = np.ascontiguousarray(frame.intensity, "<f4").tobytes()
-    message.point_ranges_buffer = np.ascontiguousarray(frame.range_m, "<f4").tobytes()
-    message.point_beams_buffer = np.ascontiguousarray(frame.beam, "<i4").tobytes()
+# ---------------------------------------------------------------------------------------------------------------- poses
 
 
-def read_lidar_frame(message, request: SensorRequest) -> LidarFrame:
-    """The sweep of a ``LidarRenderReturn``.
+def write_poses(poses: Float64[np.ndarray, "n 4 4"], messages: Sequence) -> None:
+    """Fills one ``common.Pose`` message per pose."""
+    quats = geometry.quat_from_matrix(poses[:, :3, :3]).tolist()
+    for pose, (w, x, y, z), message in zip(poses, quats, messages, strict=True):
+        message.vec.x, message.vec.y, message.vec.z = pose[:3, 3].tolist()
+        message.quat.w, message.quat.x, message.quat.y, message.quat.z = w, x, y, z
+        message.exact.extend(pose.ravel().tolist())
 
-    From servers without our additions, ranges are the points' norms and beams are -1.
+
+def read_poses(messages: Sequence, names: Sequence[str]) -> Float64[np.ndarray, "n 4 4"]:
+    """Poses of ``common.Pose`` messages; ``names`` say in an error which one was wrong.
 
     Raises:
-        RequestError: the buffers have different lengths.
+        RequestError: a value is not finite, a quaternion is not a unit one, or ``exact`` is not a rigid transform.
+        CancelledError, DeadlinePassedError: see ``compute.turns.rest``.
     """
-    lidar = _sensor_of(request, LidarModel)
-    xyz = _read_buffer(message, "point_xyzs_buffer", "<f4")
-    intensity = _read_buffer(message, "point_intensities_buffer", "<f4")
-    if not len(xyz):
-        xyz, intensity = np.array(message.point_xyzs, "<f4"), np.array(message.point_intensities, "<f4")
-    n = message.num_points
-    ranges, beam = (
-        _read_buffer(message, "point_ranges_buffer", "<f4"),
-        _read_buffer(message, "point_beams_buffer", "<i4"),
-    )
-    if len(xyz) != 3 * n or len(intensity) != n or len(ranges) not in (0, n) or len(beam) not in (0, n):
+    parts = []
+    for first in range(0, len(messages), _AT_ONCE):
+        if first:  # few poses take no time
+            rest()
+        parts.append(_read_some(messages[first : first + _AT_ONCE], names[first : first + _AT_ONCE]))
+    return np.concatenate([np.zeros((0, 4, 4)), *parts])
+
+
+def _read_some(messages: Sequence, names: Sequence[str]) -> Float64[np.ndarray, "n 4 4"]:
+    position = np.array([(m.vec.x, m.vec.y, m.vec.z) for m in messages], np.float64).reshape(-1, 3)
+    quat = np.array([(m.quat.w, m.quat.x, m.quat.y, m.quat.z) for m in messages], np.float64).reshape(-1, 4)
+    norm2 = np.sum(quat * quat, axis=1)
+    finite = np.isfinite(norm2 + np.sum(position * position, axis=1))  # squares of float32 do not overflow
+    bad = np.flatnonzero(~(finite & (np.abs(norm2 - 1) <= QUAT_TOLERANCE)))
+    if len(bad):
+        i = int(bad[0])
+        values = f"vec (x, y, z) = {_text(position[i])}, quat (w, x, y, z) = {_text(quat[i])}"
+        if not finite[i]:
+            raise RequestError(f"{names[i]} must be finite, got {values}")
         raise RequestError(
-            f"lidar {lidar.id!r}: num_points says {n}, but there are {len(xyz)} point_xyzs, {len(intensity)} "
-            f"point_intensities, {len(ranges)} point_ranges and {len(beam)} point_beams"
+            f"{names[i]} must have a unit quaternion (squared norm 1 within {QUAT_TOLERANCE}), "
+            f"got squared norm {norm2[i]:.6g}: {values}"
         )
-    xyz = xyz.reshape(n, 3).astype(np.float32)
-    ranges = ranges.astype(np.float32) if len(ranges) else np.linalg.norm(xyz, axis=1)
-    beam = beam.astype(np.int32) if len(beam) else np.full(n, -1, np.int32)
-    return LidarFrame(lidar, request.start_us, request.end_us, xyz, ranges, intensity.astype(np.float32), beam)
+    result = np.tile(np.eye(4), (len(messages), 1, 1))
+    result[:, :3, 3] = position
+    result[:, :3, :3] = geometry.matrix_from_quat(quat)
+    given, exact = _read_exact(messages, names)
+    # A client that copied a message of ours and edited `vec` or `quat` leaves a stale `exact` behind.
+    turned = np.abs(exact[:, :3, :3] - result[given, :3, :3]).max(axis=(1, 2), initial=0)
+    moved = np.abs(exact[:, :3, 3] - position[given]).max(axis=1, initial=0)
+    fresh = (turned <= 1e-6) & (moved <= 1e-6 * np.maximum(1.0, np.abs(position[given]).max(axis=1, initial=0)))
+    result[given[fresh]] = exact[fresh]
+    return result
 
 
-def _read_buffer(message, name: str, kind: str) -> np.ndarray:
-    data = getattr(message, name)
-    if len(data) % 4:
-        raise RequestError(f"{name} must hold 4 bytes a value, got {len(data)} bytes")
-    return np.frombuffer(data, kind)
+def _read_exact(
+    messages: Sequence, names: Sequence[str]
+) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 4 4"]]:
+    """Which messages have ``exact``, and it."""
+    given: list[int] = []
+    values: list[float] = []
+    for i, message in enumerate(messages):
+        count = len(message.exact)
+        if count == 0:
+            continue
+        if count != 16:
+            raise RequestError(f"{names[i]}.exact must have 16 values (a row-major 4x4) or none, got {count}")
+        given.append(i)
+        values.extend(message.exact)
+    exact = np.array(values, np.float64).reshape(-1, 4, 4)
+    sound = geometry.are_rotations(exact[:, :3, :3]) & np.isfinite(exact).all(axis=(1, 2))
+    bad = np.flatnonzero(~(sound & (exact[:, 3] == (0, 0, 0, 1)).all(axis=1)))
+    if len(bad):
+        raise RequestError(
+            f"{names[given[bad[0]]]}.exact must be a rigid transform with last row 0 0 0 1, "
+            f"got {_text(exact[bad[0]].ravel())}"
+        )
+    return np.array(given, np.int64), exact
+
+
+def _text(values: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.6g}" for value in values) + ")"
+
+
+def write_mounting(rig_from_sensor: Matrix4, message) -> None:
+    """Fills the ``common.Pose`` of a sensor in its rig (``rig_to_camera``: the name says the inverse of what it is)."""
+    write_poses(rig_from_sensor[None], [message])
+
+
+def read_mounting(message, name: str) -> Matrix4:
+    """The pose of a sensor in its rig."""
+    return read_poses([message], [name])[0]

@@ -22,7 +22,6 @@ from nurec_sim.serving.wire.messages import (
     ShutterType,
     WindshieldPolynomial,
 )
-from nurec_sim.serving.wire.poses import read_poses, write_poses
 from nurec_sim.types import (
     CameraModel,
     Fisheye,
@@ -30,7 +29,6 @@ from nurec_sim.types import (
     FThetaReference,
     Lens,
     LidarModel,
-    Matrix4,
     Pinhole,
     Shutter,
     Spin,
@@ -244,16 +242,3 @@ def _member(kind: Any, number: int, name: str) -> enum.IntEnum:
     if number not in list(kind):
         raise RequestError(f"{name} must be one of {[member.name for member in kind]}, got {number}")
     return kind(number)
-
-
-# ----------------------------------------------------------------------------------------------------------- discovery
-
-
-def write_mounting(rig_from_sensor: Matrix4, message) -> None:
-    """Fills the ``common.Pose`` of a sensor in its rig (``rig_to_camera``: the name says the inverse of what it is)."""
-    write_poses(rig_from_sensor[None], [message])
-
-
-def read_mounting(message, name: str) -> Matrix4:
-    """The pose of a sensor in its rig."""
-    return read_poses([message], [name])[0]

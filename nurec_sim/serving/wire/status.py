@@ -40,6 +40,11 @@ def number_of(error: Exception) -> int:
     return code_of(error).value[0]
 
 
+def text_of(error: Exception) -> str:
+    """The text of an error that is fit for a client."""
+    return str(error) if isinstance(error, errors.NurecSimError) else f"internal error: {type(error).__name__}: {error}"
+
+
 def error_of(code: grpc.StatusCode | int, text: str) -> errors.NurecSimError:
     """The error that a status stands for; ``ServerError`` where it stands for none of ours."""
     if isinstance(code, int):

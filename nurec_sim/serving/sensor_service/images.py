@@ -1,19 +1,27 @@
-"""Pictures of the recording car's own body, laid over rendered images: ``<folder>/<rig>/<camera>.png``."""
+"""Rendered images as replies: encoded, with pictures of the recording car's own body (ego masks) laid over them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
+from nurec_sim.compute.turns import aside, rest
 from nurec_sim.errors import RequestError
 from nurec_sim.files.decoding import check_image
+from nurec_sim.render.cpu.workers import Workers
+from nurec_sim.serving import wire
+from nurec_sim.serving.sensor_service.render_queue import LARGE_RAYS
+from nurec_sim.serving.wire import sensorsim
+from nurec_sim.types import CameraFrame
 
 
 class EgoMasks:
-    """The masks of one folder.
+    """The masks of one folder, ``<folder>/<rig>/<camera>.png``.
 
     A picture with four channels is blended by its alpha; in one without, every pixel that is not black covers.
 
@@ -75,3 +83,37 @@ def _scaled_mask(path: Path, width_px: int, height_px: int) -> tuple[np.ndarray,
     layers = cv2.resize(layers, (width_px, height_px), interpolation=cv2.INTER_AREA)
     cover = layers[..., 3:4]
     return layers[..., :3] / np.maximum(cover, 1e-6), cover
+
+
+class ImageReplies:
+    """Encodes images in threads of its own.
+
+    Args:
+        masks: what may be laid over images.
+        threads: images encoded at the same time.
+    """
+
+    def __init__(self, masks: EgoMasks, threads: int) -> None:
+        self._masks = masks
+        self._encoders = Workers(threads)
+
+    def of(self, frames: Sequence[Any], options: Sequence[wire.ImageOptions]) -> list[Any]:
+        """An ``RGBRenderReturn``, or an error, for each frame: its colours in the format asked for."""
+        calls = [(self._reply, *pair) for pair in zip(frames, options, strict=True)]
+        if all(frame.rgb.size <= 3 * LARGE_RAYS for frame in frames):
+            return self._encoders.run_calls(calls)
+        results = []
+        for first in range(0, len(calls), self._encoders.threads):
+            rest()
+            with aside():  # an encoder cannot be interrupted
+                results += self._encoders.run_calls(calls[first : first + self._encoders.threads])
+        return results
+
+    def _reply(self, frame: CameraFrame, options: wire.ImageOptions):
+        try:
+            rgb = self._masks.lay_over(frame.rgb, options.ego_mask) if options.ego_mask else frame.rgb
+            reply = sensorsim.RGBRenderReturn()
+            wire.write_image(rgb, options, reply)
+            return reply
+        except Exception as error:
+            return error
