@@ -37,9 +37,9 @@ def torch_frame(scene: GaussianScene, request: SensorRequest, threads: int = 2) 
         ValueError: the camera is of another kind.
     """
     camera = request.sensor
-    if not isinstance(camera.lens, Pinhole) or camera.lens.distorted or camera.shutter is not Shutter.GLOBAL:
+    if camera.ideal_pinhole is None or camera.shutter is not Shutter.GLOBAL:
         raise ValueError("torch_frame draws ideal pinhole cameras with a global shutter")
-    lens, width, height = camera.lens, camera.width_px, camera.height_px
+    lens, width, height = camera.ideal_pinhole, camera.width_px, camera.height_px
     pose = np.asarray(request.world_from_sensor[0])
     grid = ray_grid(camera)
     gaussians, order = spec.visible_gaussians(scene, request, grid)
@@ -153,10 +153,10 @@ def gsplat_frame(scene: GaussianScene, request: SensorRequest) -> CameraFrame:
     gsplat = importlib.import_module("gsplat")
     device = "cuda" if torch.cuda.is_available() else "cpu"
     camera = request.sensor
-    assert isinstance(camera.lens, Pinhole)
+    lens = camera.ideal_pinhole
+    assert lens is not None
     gaussians, order = spec.visible_gaussians(scene, request, ray_grid(camera))
     ordered = gaussians[order]
-    lens = camera.lens
     intrinsics = [[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1]]
 
     def tensor(values) -> torch.Tensor:

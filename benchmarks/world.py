@@ -20,7 +20,6 @@ from nurec_sim.types import (
     FTheta,
     FThetaReference,
     LidarModel,
-    Pinhole,
     Rig,
     SensorRequest,
     Shutter,
@@ -187,8 +186,8 @@ def agreement(name: str, drawn: TrueWorld, cast: TrueWorld, camera: CameraModel,
 
 def lenses(front: CameraModel) -> dict[str, CameraModel]:
     """The camera with lenses of all kinds."""
-    flat, (width, height) = front.lens, (front.width_px, front.height_px)
-    assert isinstance(flat, Pinhole)
+    flat, (width, height) = front.ideal_pinhole, (front.width_px, front.height_px)
+    assert flat is not None
     centre = {"cx_px": width / 2, "cy_px": height / 2}
     wide = width / np.deg2rad(120.0)
     glass = Windshield(WindshieldReference.FORWARD, (0.002, 1.01, 0.003, 0.004, 0.002, -0.01),

@@ -11,6 +11,7 @@ _parts, _names, __all__ = lazy_loader.attach(
         "evaluate",
         "files",
         "geometry",
+        "lenses",
         "logs",
         "metrics",
         "network",

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from nurec_sim import geometry
-from nurec_sim.types import CameraFrame, CameraModel, Pinhole
+from nurec_sim.types import CameraFrame, CameraModel
 
 CELL_M, AHEAD_M, SIDE_M = 0.25, 32.0, 10.0
 TINT_TOLERANCE, DARKER, BRIGHTER = 0.09, -0.9, 0.28
@@ -74,8 +74,8 @@ def ground_pixels(camera: CameraModel) -> np.ndarray:
     ground = np.stack(np.broadcast_arrays(x[:, None], y[None, :], 0.0), axis=-1)
     inside_camera = geometry.transform_points(geometry.inverse(camera.rig_from_camera), ground)
     depth = np.maximum(inside_camera[..., 2], 0.1)
-    lens = camera.lens
-    assert isinstance(lens, Pinhole), "the loop hands ideal pinholes to policies"
+    lens = camera.ideal_pinhole
+    assert lens is not None, "the loop hands ideal pinholes to policies"
     u = np.floor(lens.fx_px * inside_camera[..., 0] / depth + lens.cx_px)
     v = np.floor(lens.fy_px * inside_camera[..., 1] / depth + lens.cy_px)
     good = (inside_camera[..., 2] > 0.5) & (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)

@@ -14,34 +14,29 @@ import numpy as np
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import LIMITS
+from nurec_sim.lenses import decode_parameters, encode_parameters, lens_class
 from nurec_sim.logs import fields
 from nurec_sim.types import (
     Box,
     CameraModel,
-    Fisheye,
-    FTheta,
-    FThetaReference,
     LidarModel,
-    Pinhole,
     Rig,
     Shutter,
     Spin,
     Windshield,
-    WindshieldReference,
 )
 
 CALIBRATION_FILE = "calib.json"
 MAX_COLUMNS = 1 << 14
 """Of a LiDAR; those in use have up to 4,000 in a turn."""
-LENS_KINDS: dict[str, type[Pinhole] | type[Fisheye] | type[FTheta]] = {
-    "pinhole": Pinhole,
-    "fisheye": Fisheye,
-    "ftheta": FTheta,
-}
 
 
 def rig_to_json(rig: Rig, intensity_scale: int) -> dict[str, Any]:
-    """calib.json of a rig."""
+    """calib.json of a rig.
+
+    Raises:
+        ClipError: the lens of a camera is of no registered kind.
+    """
     return {
         "ego_frame": "x forward, y left, z up, origin at the rear axle on the ground",
         "ground_z_in_ego_m": 0.0,
@@ -54,16 +49,19 @@ def rig_to_json(rig: Rig, intensity_scale: int) -> dict[str, Any]:
 
 
 def _camera_to_json(camera: CameraModel) -> dict[str, Any]:
-    kind = next(name for name, lens in LENS_KINDS.items() if isinstance(camera.lens, lens))
+    try:
+        lens_class(camera.lens.kind)
+    except ValueError as error:
+        raise ClipError(f"{CALIBRATION_FILE}: camera {camera.id!r}: {error}") from None
     row = {
         "width": camera.width_px,
         "height": camera.height_px,
-        "lens": {"model": kind, **_plain(camera.lens)},
+        "lens": {"model": camera.lens.kind, **encode_parameters(camera.lens)},
         "shutter": camera.shutter.value,
         "T_ego_cam": np.asarray(camera.rig_from_camera, np.float64).tolist(),
     }
     if camera.windshield is not None:
-        row["windshield"] = _plain(camera.windshield)
+        row["windshield"] = encode_parameters(camera.windshield)
     return row
 
 
@@ -133,19 +131,19 @@ def camera_from_json(name: str, row: Any, rig_from_ego: np.ndarray) -> CameraMod
     where = f"{CALIBRATION_FILE}: camera {name!r}"
     lens_row = fields.of_kind(where, row, "lens", dict)
     kind = fields.of_kind(f"{where}: lens", lens_row, "model", str)
-    if kind not in LENS_KINDS:
-        raise ClipError(f"{where}: unknown lens model {kind!r}; known are {list(LENS_KINDS)}")
-    glass = None
-    if row.get("windshield") is not None:
-        glass = _from_plain(f"{where}: windshield", Windshield, row["windshield"])
+    glass_row = row.get("windshield")
+    try:
+        lens = lens_class(kind)
+    except ValueError as error:
+        raise ClipError(f"{where}: {error}") from None
     camera = CameraModel(
         id=name,
         width_px=fields.integer(where, row, "width"),
         height_px=fields.integer(where, row, "height"),
-        lens=_from_plain(f"{where}: lens", LENS_KINDS[kind], {k: v for k, v in lens_row.items() if k != "model"}),
+        lens=_decoded(f"{where}: lens", lens, {k: v for k, v in lens_row.items() if k != "model"}),
         rig_from_camera=rig_from_ego @ fields.transform(where, row, "T_ego_cam"),
         shutter=_member(where, Shutter, row.get("shutter", Shutter.GLOBAL.value)),
-        windshield=glass,
+        windshield=None if glass_row is None else _decoded(f"{where}: windshield", Windshield, glass_row),
     )
     return checked_camera(camera)
 
@@ -166,27 +164,11 @@ def checked_camera(camera: CameraModel) -> CameraModel:
     return camera
 
 
-_ENUMS: dict[str, type[enum.Enum]] = {"FThetaReference": FThetaReference, "WindshieldReference": WindshieldReference}
-
-
-def _from_plain(where: str, cls: type, row: Any) -> Any:
-    """A flat dataclass of numbers, tuples of numbers and enums from JSON; unknown keys are errors."""
-    known = {field.name: field for field in dataclasses.fields(cls)}
-    if not isinstance(row, dict):
-        raise ClipError(f"{where}: must be a JSON object, got {type(row).__name__}")
-    if unknown := sorted(set(row) - set(known)):
-        raise ClipError(f"{where}: unknown field {unknown[0]!r}; known are {list(known)}")
-    values: dict[str, Any] = {}
-    for name, field in known.items():
-        if name not in row and field.default is not dataclasses.MISSING:
-            continue
-        if field.type in _ENUMS:
-            values[name] = _member(where, _ENUMS[str(field.type)], fields.required(where, row, name))
-        elif str(field.type).startswith("tuple"):
-            values[name] = tuple(fields.array(where, row, name, (None,)).tolist())
-        else:
-            values[name] = fields.number(where, row, name)
-    return cls(**values)
+def _decoded(where: str, cls: type[Any], row: Any) -> Any:
+    try:
+        return decode_parameters(cls, row)
+    except ValueError as error:
+        raise ClipError(f"{where}: {error}") from None
 
 
 def _member(where: str, kind: type[enum.Enum], value: Any) -> Any:

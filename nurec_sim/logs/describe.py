@@ -10,7 +10,7 @@ from jaxtyping import Int64
 
 from nurec_sim import sensors
 from nurec_sim.logs.clip import Clip
-from nurec_sim.types import CameraModel, Pinhole, Spin
+from nurec_sim.types import CameraModel, Spin
 
 SENSOR_COLUMNS = ("sensor", "model", "size", "frames", "rate Hz", "span s", "shutter")
 
@@ -69,8 +69,8 @@ def _span(times_us: Int64[np.ndarray, "t 2"]) -> str:
 
 
 def _lens_name(camera: CameraModel) -> str:
-    name = type(camera.lens).__name__.lower()
-    if isinstance(camera.lens, Pinhole) and camera.lens.distorted:
+    name = camera.lens.kind
+    if camera.lens.perspective and camera.lens.ideal_pinhole is None:
         name += ", distorted"
     return name + (", windshield" if camera.windshield is not None else "")
 

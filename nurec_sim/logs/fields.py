@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from nurec_sim.errors import ClipError
+from nurec_sim.lenses.parameters import LARGEST
 from nurec_sim.types import Matrix4
 
-# Larger numbers mean nothing here, and their squares would overflow.
-LARGEST = 1e60
 LARGEST_INTEGER = 1 << 62
 
 

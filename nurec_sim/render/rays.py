@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from nurec_sim import geometry, sensors
-from nurec_sim.types import CameraModel, LidarModel, Pinhole, SensorRequest, Shutter
+from nurec_sim.types import CameraModel, LidarModel, SensorRequest, Shutter
 
 NEAR_M = 0.2
 """Gaussians whose centre, and hits that, lie closer than this are not drawn (LiDARs: their own minimal range)."""
@@ -26,7 +26,7 @@ class RayGrid:
     ``fraction`` is the place of each ray's instant in the exposure, 0 at its start and 1 at its end; ``reference``
     the fraction at which Gaussians are sorted, culled and, where they move, placed: the middle, or the one instant of
     all rays (a global shutter, a LiDAR of one column). ``by_range`` says whether Gaussians are ordered by the distance
-    of their centre (LiDAR, fisheye and F-theta lenses, which see sideways) or by its z (pinhole).
+    of their centre (LiDARs, and lenses that see sideways) or by its z (``Lens.perspective``).
     """
 
     direction: Float64[np.ndarray, "h w 3"]
@@ -48,7 +48,7 @@ def ray_grid(sensor: CameraModel | LidarModel) -> RayGrid:
     shared, by_column = line_fractions(sensor)
     fraction = np.broadcast_to(shared if by_column else shared[:, None], valid.shape)
     direction = np.where(valid[..., None], direction, (0.0, 0.0, 1.0))
-    by_range = not isinstance(sensor.lens, Pinhole)
+    by_range = not sensor.lens.perspective
     return RayGrid(direction, valid, fraction, reference_fraction(shared), by_range, NEAR_M)
 
 

@@ -16,14 +16,12 @@ import numpy as np
 
 from nurec_sim.errors import ArchiveError
 from nurec_sim.files.decoding import TooMuchError, check_json, json_value
+from nurec_sim.lenses import decode_parameters, lens_class
 from nurec_sim.types import (
     Box,
     CameraModel,
-    Fisheye,
-    FTheta,
-    FThetaReference,
+    Lens,
     LidarModel,
-    Pinhole,
     Rig,
     RoadMap,
     Shutter,
@@ -208,6 +206,15 @@ def record(*kinds: type) -> Decoder:
     return decode
 
 
+def lens(value: Any) -> Lens:
+    """A lens of any registered kind, named by its class in ``"type"``; all its parameters must be there."""
+    if not isinstance(value, dict) or not isinstance(value.get("type"), str):
+        raise ValueError(f"expected an object with the 'type' of a lens, got {value!r:.60}")
+    kind = lens_class(value["type"])
+    parameters = {name: item for name, item in value.items() if name != "type"}
+    return _within(kind.__name__, lambda row: decode_parameters(kind, row, complete=True), parameters)
+
+
 def _within(name: str, decoder: Decoder, value: Any) -> Any:
     """Decodes a part and puts its name before the text of an error."""
     try:
@@ -218,25 +225,12 @@ def _within(name: str, decoder: Decoder, value: Any) -> Any:
 
 _FIELDS: dict[type, dict[str, Decoder]] = {
     Trajectory: {"t_us": array(np.int64, -1), "world_from_body": array(np.float64, -1, 4, 4)},
-    Pinhole: {
-        "fx_px": number, "fy_px": number, "cx_px": number, "cy_px": number,
-        "radial": numbers(), "tangential": numbers(), "thin_prism": numbers(),
-    },
-    Fisheye: {
-        "fx_px": number, "fy_px": number, "cx_px": number, "cy_px": number,
-        "radial": numbers(), "max_angle_rad": number,
-    },
-    FTheta: {
-        "cx_px": number, "cy_px": number, "reference": choice(FThetaReference),
-        "pixeldist_to_angle": numbers(), "angle_to_pixeldist": numbers(),
-        "max_angle_rad": number, "linear_cde": numbers(3),
-    },
     Windshield: {
         "reference": choice(WindshieldReference), "horizontal": numbers(), "vertical": numbers(),
         "horizontal_inverse": numbers(), "vertical_inverse": numbers(),
     },
     CameraModel: {
-        "id": text, "width_px": integer, "height_px": integer, "lens": record(Pinhole, Fisheye, FTheta),
+        "id": text, "width_px": integer, "height_px": integer, "lens": lens,
         "rig_from_camera": array(np.float64, 4, 4), "shutter": choice(Shutter),
         "windshield": optional(record(Windshield)),
     },

@@ -27,11 +27,9 @@ from nurec_sim.scene.ground_mesh import encode_ply, ground_mesh
 from nurec_sim.scene.opendrive.writer import opendrive_map, world_to_ecef
 from nurec_sim.types import (
     CameraModel,
-    Fisheye,
     FTheta,
     GaussianScene,
     LidarModel,
-    Pinhole,
     RoadMap,
     Shutter,
     Track,
@@ -42,6 +40,13 @@ CHUNK_ID = "dummy_chunk_id"  # CARLA's client looks for this very key
 FIRST_FRAME_US = 100_000
 SHUTTER_ROOM_US = 50_000
 _FTHETA_TERMS = 6
+_NCORE_NAMES = {
+    "pinhole": (
+        "opencv-pinhole",
+        {"radial_coeffs": "radial", "tangential_coeffs": "tangential", "thin_prism_coeffs": "thin_prism"},
+    ),
+    "fisheye": ("opencv-fisheye", {"radial_coeffs": "radial", "max_angle": "max_angle_rad"}),
+}
 _ROUNDING = 1e-9
 SHUTTER_NAMES = {
     Shutter.GLOBAL: "GLOBAL",
@@ -202,7 +207,7 @@ def _camera_calibration(scene: GaussianScene, index: int, camera: CameraModel, f
         "T_sensor_rig": camera.rig_from_camera,
         "camera_model": {"type": "ftheta", "parameters": _common_parameters(camera) | _ftheta_parameters(fit)},
     }
-    if not isinstance(camera.lens, FTheta):
+    if camera.lens.kind != fit.kind:
         calibration["exact_camera_model"] = _exact_model(camera)
         calibration["ftheta_fit_error_px"] = fit_error_px(camera, fit)
     return calibration
@@ -240,18 +245,16 @@ def _ftheta_parameters(fit: FTheta) -> dict[str, Any]:
 
 
 def _exact_model(camera: CameraModel) -> dict[str, Any]:
-    """The lens itself, in NCore's names."""
-    lens = camera.lens
-    assert isinstance(lens, (Pinhole, Fisheye))
-    parameters = _common_parameters(camera) | {
-        "principal_point": [lens.cx_px, lens.cy_px],
-        "focal_length": [lens.fx_px, lens.fy_px],
-        "radial_coeffs": lens.radial,
+    """The lens itself: in NCore's names those that NCore knows, any other as ``nurec_sim/scene.json`` has it."""
+    lens, common = camera.lens, _common_parameters(camera)
+    if lens.kind not in _NCORE_NAMES:
+        return {"type": lens.kind, "parameters": common | {"lens": lens}}
+    kind, names = _NCORE_NAMES[lens.kind]
+    pairs = {"principal_point": [lens.cx_px, lens.cy_px], "focal_length": [lens.fx_px, lens.fy_px]}
+    return {
+        "type": kind,
+        "parameters": common | pairs | {theirs: getattr(lens, ours) for theirs, ours in names.items()},
     }
-    if isinstance(lens, Fisheye):
-        return {"type": "opencv-fisheye", "parameters": parameters | {"max_angle": lens.max_angle_rad}}
-    parameters |= {"tangential_coeffs": lens.tangential, "thin_prism_coeffs": lens.thin_prism}
-    return {"type": "opencv-pinhole", "parameters": parameters}
 
 
 def _lidar_calibration(scene: GaussianScene, index: int, lidar: LidarModel) -> dict[str, Any]:

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float64
 
 from nurec_sim import geometry
 from nurec_sim.compute.turns import rest
+from nurec_sim.lenses.base import missing_members
 from nurec_sim.sensors import windshield
-from nurec_sim.sensors.lens import check_lens, project_lens, unproject_lens
-from nurec_sim.types import CameraModel, FTheta, Lens, Shutter, Windshield
+from nurec_sim.types import CameraModel, Lens, Shutter, Windshield
 
 ROLLING_ITERATIONS = 10
 KEPT_PIXELS = 1 << 22
@@ -43,7 +43,7 @@ def project(camera: CameraModel, xyz_camera: Points3) -> tuple[Points2, Mask]:
     if camera.windshield is not None:
         xyz, passed = windshield.into_car(camera.windshield, xyz)
         valid = valid & passed
-    uv, seen = project_lens(camera.lens, xyz)
+    uv, seen = camera.lens.project(xyz)
     valid = valid & seen
     uv[~valid] = np.nan
     return uv, valid
@@ -57,7 +57,7 @@ def unproject(camera: CameraModel, uv_px: Points2) -> tuple[Points3, Mask]:
     """
     uv = np.asarray(uv_px, np.float64).reshape(-1, 2)
     finite: Mask = np.asarray(np.isfinite(uv).all(axis=1))
-    rays, valid = unproject_lens(camera.lens, np.where(finite[:, None], uv, 0.0))
+    rays, valid = camera.lens.unproject(np.where(finite[:, None], uv, 0.0))
     valid = valid & finite
     if camera.windshield is not None:
         rays, passed = windshield.out_of_car(camera.windshield, rays)
@@ -189,36 +189,25 @@ def scaled_camera(camera: CameraModel, width_px: int, height_px: int) -> CameraM
     if (width_px, height_px) == (camera.width_px, camera.height_px):
         return camera
     sx, sy = width_px / camera.width_px, height_px / camera.height_px
-    lens = camera.lens
-    cx_px, cy_px = lens.cx_px * sx, lens.cy_px * sy
-    scaled: Lens
-    if isinstance(lens, FTheta):
-        c, d, e = lens.linear_cde
-        # The corner of the matrix is fixed at 1, so the distance scales with the rows and c, d take up the rest.
-        scaled = dataclasses.replace(
-            lens,
-            cx_px=cx_px,
-            cy_px=cy_px,
-            pixeldist_to_angle=tuple(k / sy**power for power, k in enumerate(lens.pixeldist_to_angle)),
-            angle_to_pixeldist=tuple(k * sy for k in lens.angle_to_pixeldist),
-            linear_cde=(c * sx / sy, d * sx / sy, e),
-        )
-    else:
-        scaled = dataclasses.replace(lens, cx_px=cx_px, cy_px=cy_px, fx_px=lens.fx_px * sx, fy_px=lens.fy_px * sy)
-    return dataclasses.replace(camera, width_px=width_px, height_px=height_px, lens=scaled)
+    return dataclasses.replace(camera, width_px=width_px, height_px=height_px, lens=camera.lens.scaled(sx, sy))
 
 
 def check_camera(camera: CameraModel) -> None:
     """Check that a camera can be used.
 
     Raises:
-        ValueError: what is wrong with it: size, number of coefficients, not finite, focal length, angle or pose.
+        ValueError: what is wrong with it: size, pose, or what the lens's ``check`` refuses.
     """
     name = f"camera {camera.id!r}"
     if camera.width_px < 1 or camera.height_px < 1:
         raise ValueError(f"{name}: an image needs at least 1 x 1 pixels, got {camera.width_px} x {camera.height_px}")
     check_pose(f"{name}: rig_from_camera", camera.rig_from_camera)
-    check_lens(name, camera.lens)
+    if missing := missing_members(type(camera.lens)):
+        raise ValueError(f"{name}: the lens, a {type(camera.lens).__name__}, lacks {', '.join(missing)}")
+    try:
+        camera.lens.check()
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
     if camera.windshield is not None:
         windshield.check_windshield(name, camera.windshield)
 

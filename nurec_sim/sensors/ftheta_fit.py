@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TypeVar
 
 import numpy as np
 
-from nurec_sim.sensors import ftheta, radial
-from nurec_sim.sensors.lens import unproject_lens
-from nurec_sim.types import CameraModel, FTheta, FThetaReference
+from nurec_sim.lenses import ftheta, radial
+from nurec_sim.types import CameraModel, FTheta, FThetaReference, Lens
+
+AnyLens = TypeVar("AnyLens", bound=Lens)
 
 TERMS = 6
 FIT_SAMPLES = 2000
@@ -22,14 +24,16 @@ def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, ...]:
     return (0.0, *(float(value) for value in solution / scale**powers))
 
 
-def fill_ftheta(lens: FTheta, max_radius_px: float) -> FTheta:
-    """The same lens with both polynomials present: a missing one is fitted up to ``max_radius_px``.
+def fill_ftheta(lens: AnyLens, max_radius_px: float) -> AnyLens:
+    """The same lens, if it is F-theta with both polynomials: a missing one is fitted up to ``max_radius_px``.
 
     Raises:
         ValueError: the lens has no polynomial, or ``max_radius_px`` is not positive.
     """
     if not max_radius_px > 0:
         raise ValueError(f"max_radius_px must be positive, got {max_radius_px}")
+    if not isinstance(lens, FTheta):
+        return lens
     reference, _ = ftheta.exact_polynomial(lens)
     if lens.pixeldist_to_angle and lens.angle_to_pixeldist:
         return lens
@@ -54,7 +58,7 @@ def fit_ftheta(camera: CameraModel) -> FTheta:
     columns = np.linspace(0.0, camera.width_px, 65)
     rows = np.linspace(0.0, camera.height_px, 49)
     uv = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    rays, valid = unproject_lens(lens, uv)
+    rays, valid = lens.unproject(uv)
     if not valid.any():
         raise ValueError(f"camera {camera.id!r}: no pixel of the image lies in the field of its lens")
     stretch = lens.fx_px / lens.fy_px

@@ -178,8 +178,7 @@ def policy_camera(camera: CameraModel, width_px: int) -> CameraModel:
     from nurec_sim.sensors import scaled_camera
 
     height_px = max(8, round(width_px * camera.height_px / camera.width_px))
-    ideal = isinstance(camera.lens, Pinhole) and not camera.lens.distorted and camera.windshield is None
-    if ideal:
+    if camera.ideal_pinhole is not None:
         return scaled_camera(camera, width_px, height_px)
     half = min(horizontal_fov_rad(camera), MAX_VIRTUAL_FOV_RAD) / 2
     focal = width_px / 2 / math.tan(half)

@@ -7,6 +7,7 @@ their origin at the image corner, centres at +0.5. Gaussian scales are standard 
 in 0..1. World: metres, z up.
 """
 
+from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Lens, Pinhole
 from nurec_sim.types.frames import CameraFrame, LidarFilter, LidarFrame, Sense, SensorFrame, SensorRequest
 from nurec_sim.types.logs import (
     MOVABLE_LABELS,
@@ -38,12 +39,7 @@ from nurec_sim.types.scenes import (
 from nurec_sim.types.sensors import (
     Box,
     CameraModel,
-    Fisheye,
-    FTheta,
-    FThetaReference,
-    Lens,
     LidarModel,
-    Pinhole,
     Rig,
     Shutter,
     Spin,

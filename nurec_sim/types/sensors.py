@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from nurec_sim.lenses import Lens, Pinhole
 from nurec_sim.types.trajectories import Matrix4
 
 
@@ -20,61 +21,6 @@ class Shutter(enum.Enum):
     LEFT_TO_RIGHT = "left_to_right"
     BOTTOM_TO_TOP = "bottom_to_top"
     RIGHT_TO_LEFT = "right_to_left"
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """OpenCV pinhole: rational radial k1..k6, tangential p1 p2, thin prism s1..s4; corner-origin principal point."""
-
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    radial: tuple[float, ...] = (0.0,) * 6
-    tangential: tuple[float, ...] = (0.0,) * 2
-    thin_prism: tuple[float, ...] = (0.0,) * 4
-
-    @property
-    def distorted(self) -> bool:
-        """Whether any distortion coefficient differs from zero."""
-        return any(self.radial) or any(self.tangential) or any(self.thin_prism)
-
-
-@dataclass(frozen=True)
-class Fisheye:
-    """OpenCV fisheye: r = theta (1 + k1 theta^2 + .. + k4 theta^8); valid up to ``max_angle_rad`` off the axis."""
-
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    radial: tuple[float, ...] = (0.0,) * 4
-    max_angle_rad: float = np.pi / 2
-
-
-class FThetaReference(enum.Enum):
-    """Which of the two F-theta polynomials is exact; the other one is only a first guess."""
-
-    PIXELDIST_TO_ANGLE = "pixeldist_to_angle"
-    ANGLE_TO_PIXELDIST = "angle_to_pixeldist"
-
-
-@dataclass(frozen=True)
-class FTheta:
-    """F-theta: pixel distance and angle are polynomials of each other, coefficients from power 0 up.
-
-    ``pixel = [[c, d], [e, 1]] @ (r(theta) * direction) + (cx, cy)``. The principal point here is corner-origin like
-    every pixel of ours; formats that count pixel centres as whole numbers add 0.5 when they read
-    (docs/scene_format.md). An empty polynomial is filled in by numeric inversion of the other one.
-    """
-
-    cx_px: float
-    cy_px: float
-    reference: FThetaReference
-    pixeldist_to_angle: tuple[float, ...] = ()
-    angle_to_pixeldist: tuple[float, ...] = ()
-    max_angle_rad: float = np.pi / 2
-    linear_cde: tuple[float, float, float] = (1.0, 0.0, 0.0)
 
 
 class WindshieldReference(enum.Enum):
@@ -99,9 +45,6 @@ class Windshield:
     vertical_inverse: tuple[float, ...] = ()
 
 
-Lens = Pinhole | Fisheye | FTheta
-
-
 @dataclass(frozen=True, eq=False)
 class CameraModel:
     """One camera of a rig: size, lens, shutter and where it sits."""
@@ -113,6 +56,11 @@ class CameraModel:
     rig_from_camera: Matrix4
     shutter: Shutter = Shutter.GLOBAL
     windshield: Windshield | None = None
+
+    @property
+    def ideal_pinhole(self) -> Pinhole | None:
+        """The lens as a pinhole without distortion; None where it is none, or behind a windshield."""
+        return None if self.windshield is not None else self.lens.ideal_pinhole
 
 
 class Spin(enum.Enum):

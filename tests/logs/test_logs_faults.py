@@ -170,7 +170,7 @@ FRONT = ("cameras", "front")
         (
             "calib.json",
             set_path(*FRONT, "lens", "model", value="orb"),
-            "unknown lens model 'orb'; known are .'pinhole'",
+            "unknown lens model 'orb'; known are .'fisheye', 'ftheta', 'pinhole'",
         ),
         ("calib.json", set_path(*FRONT, "lens", "k1", value=1), "camera 'front': lens: unknown field 'k1'; known are"),
         ("calib.json", set_path(*FRONT, "lens", "fx_px", value=-3), "camera 'front': focal lengths must be positive"),

@@ -283,8 +283,12 @@ def test_references_to_other_files_are_not_followed(good):
 
 FACT_FAULTS = {
     "camera size": (("rig", "cameras", "front", "width_px"), "many", "front: width_px: expected a 64-bit integer"),
-    "lens": (("rig", "cameras", "front", "lens", "type"), "Box", "lens: expected an object of type"),
-    "lens field": (("rig", "cameras", "roof", "lens", "k7"), 1.0, "Pinhole needs the fields"),
+    "lens": (
+        ("rig", "cameras", "front", "lens", "type"),
+        "Box",
+        "lens: unknown lens model 'Box'; known are .'fisheye'",
+    ),
+    "lens field": (("rig", "cameras", "roof", "lens", "k7"), 1.0, "Pinhole: unknown field 'k7'; known are"),
     "shutter": (("rig", "cameras", "roof", "shutter"), "slow", "shutter: 'slow' is not a valid Shutter"),
     "pose": (("rig", "cameras", "roof", "rig_from_camera"), [[1.0]], r"expected an array 4x4, got shape \(1, 1\)"),
     "path": (("ego", "t_us"), [5, 4, 3], "a trajectory needs times"),

@@ -332,7 +332,7 @@ def test_fit_ftheta_stands_in_for_any_lens(lens, error_px):
         ({"lens": FTheta(480, 270, FThetaReference.ANGLE_TO_PIXELDIST)}, "needs pixeldist_to_angle or angle_to"),
         ({"lens": FTheta(1, 1, FThetaReference.ANGLE_TO_PIXELDIST, (), (0, -1))}, "must rise from the axis outwards"),
         ({"lens": FTheta(1, 1, FThetaReference.ANGLE_TO_PIXELDIST, (), (0, 9), 1, (1, 1, 1))}, "without an inverse"),
-        ({"lens": "pinhole"}, "the lens must be a Pinhole, Fisheye or FTheta, got str"),
+        ({"lens": "pinhole"}, "the lens, a str, lacks kind, perspective, cx_px"),
         ({"rig_from_camera": np.diag([1.0, 1, -1, 1])}, "rig_from_camera has a 3 x 3 part that is not a rotation"),
         ({"rig_from_camera": np.full((4, 4), np.nan)}, "rig_from_camera must be finite"),
         ({"rig_from_camera": np.eye(3)}, "rig_from_camera must be 4 x 4, got 3 x 3"),

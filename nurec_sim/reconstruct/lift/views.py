@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.lift.settings import ViewSettings
-from nurec_sim.types import Box, CameraModel, Clip, Pinhole, Shutter
+from nurec_sim.types import Box, CameraModel, Clip, Shutter
 
 EGO_HEIGHT_M = 0.75
 """Bonnet and boot of a car lie at about this height: what is lower within its outline is the car itself."""
@@ -73,14 +73,13 @@ class WorkingView:
 def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
     """Cut a camera into pinhole tiles of at most ``max_field_deg``; one exact reduction if it is a plain pinhole."""
     reduction = max(1, int(np.ceil(camera.width_px / settings.width_px)))
-    if isinstance(camera.lens, Pinhole) and not camera.lens.distorted and camera.windshield is None:
-        lens = camera.lens
-        if abs(lens.fx_px - lens.fy_px) < 1e-3 * lens.fx_px:
-            width, height = camera.width_px // reduction, camera.height_px // reduction
-            center = (lens.cx_px / reduction, lens.cy_px / reduction)
-            valid = np.ones((height, width), bool)
-            tile = Tile(width, height, lens.fx_px / reduction, center, np.eye(3), reduction, None, valid, np.zeros(3))
-            return [_with_fraction(tile, camera)]
+    lens = camera.ideal_pinhole
+    if lens is not None and abs(lens.fx_px - lens.fy_px) < 1e-3 * lens.fx_px:
+        width, height = camera.width_px // reduction, camera.height_px // reduction
+        center = (lens.cx_px / reduction, lens.cy_px / reduction)
+        valid = np.ones((height, width), bool)
+        tile = Tile(width, height, lens.fx_px / reduction, center, np.eye(3), reduction, None, valid, np.zeros(3))
+        return [_with_fraction(tile, camera)]
     rays, seen = sensors.pixel_rays(sensors.scaled_camera(camera, camera.width_px // 8, camera.height_px // 8))
     azimuth, elevation = np.arctan2(rays[..., 0], rays[..., 2])[seen], np.arcsin(np.clip(rays[..., 1], -1, 1))[seen]
     left, right = np.percentile(azimuth, [0.5, 99.5])

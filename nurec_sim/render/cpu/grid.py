@@ -14,7 +14,7 @@ from jaxtyping import Float32, Int32
 from nurec_sim import sensors
 from nurec_sim.render.cpu.project.charts import PARAMETERS, Chart, lens_chart, lidar_chart
 from nurec_sim.render.rays import NEAR_M, line_fractions, ray_grid, reference_fraction
-from nurec_sim.types import CameraModel, LidarModel, Pinhole, Shutter, Spin
+from nurec_sim.types import CameraModel, LidarModel, Shutter, Spin
 
 PINHOLE, LENS, LIDAR = 0, 1, 2
 NO_CHART = Chart(np.zeros(PARAMETERS, np.float32), np.zeros((0, 0, 0), np.float32), np.zeros((0, 0, 0), np.float32))
@@ -72,14 +72,13 @@ def _camera_grid(camera: CameraModel) -> Grid:
     else:
         number = np.arange(len(fraction), dtype=np.int32)
         line = np.ascontiguousarray(np.broadcast_to(number if by_column else number[:, None], (height, width)))
-    lens = camera.lens
-    ideal = lens if isinstance(lens, Pinhole) and not lens.distorted and camera.windshield is None else None
+    ideal = camera.ideal_pinhole
     chart = NO_CHART if ideal and len(fraction) == 1 else lens_chart(camera, field_cos, direction, valid > 0)
     kind, intrinsics = LENS, np.zeros(4, np.float32)
     if ideal:
         kind, intrinsics = PINHOLE, np.array([ideal.fx_px, ideal.fy_px, ideal.cx_px, ideal.cy_px], np.float32)
     return Grid(kind, direction, valid, line, fraction, None, intrinsics, reference_fraction(fraction),
-                not isinstance(lens, Pinhole), NEAR_M, field_cos, int(by_column), chart)  # fmt: skip
+                not camera.lens.perspective, NEAR_M, field_cos, int(by_column), chart)  # fmt: skip
 
 
 def _lidar_grid(lidar: LidarModel) -> Grid:

@@ -13,7 +13,7 @@ import numpy as np
 
 from nurec_sim.scene.usd.actors import author_path
 from nurec_sim.scene.usd.layers import NAMESPACE, crate_bytes, new_stage
-from nurec_sim.types import CameraModel, FTheta, GaussianScene, Pinhole
+from nurec_sim.types import CameraModel, FTheta, GaussianScene
 
 _APERTURE_MM = 20.955  # USD's own default width; only its ratio to the focal length has a meaning
 
@@ -65,7 +65,7 @@ def _author_camera(stage, path: str, camera: CameraModel, fit: FTheta) -> None:
 def _pinhole_view(camera: CameraModel, fit: FTheta) -> tuple[float, float, float, float]:
     """(fx, fy, cx, cy) of the pinhole that agrees with the lens at its centre."""
     lens = camera.lens
-    if isinstance(lens, Pinhole):
+    if lens.perspective:
         return lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px
     focal_px = fit.angle_to_pixeldist[1]
     return focal_px, focal_px, fit.cx_px, fit.cy_px

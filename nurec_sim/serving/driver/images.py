@@ -14,7 +14,7 @@ from nurec_sim.errors import RequestError, TooLargeError
 from nurec_sim.files import decoding
 from nurec_sim.serving.wire.driving import EncodedImage
 from nurec_sim.sim.policy_sensors import policy_camera
-from nurec_sim.types import CameraFrame, CameraModel, Pinhole
+from nurec_sim.types import CameraFrame, CameraModel
 
 MAX_IMAGE_PIXELS = 4096 * 4096
 MAX_SEEN_PIXELS = 2048 * 2048
@@ -85,7 +85,7 @@ def see_image(image: EncodedImage, camera: CameraModel, width_px: int) -> Camera
             rgb, taken = _rectified(rgb, taken, wanted), wanted
     except (ValueError, ArithmeticError, cv2.error) as error:
         raise RequestError(f"camera {camera.id!r} cannot be rectified: {error}") from error
-    if not isinstance(taken.lens, Pinhole) or taken.lens.distorted or taken.windshield is not None:
+    if taken.ideal_pinhole is None:
         raise RequestError(f"an image as_is must be an ideal pinhole's; camera {camera.id!r} has another lens")
     return CameraFrame(taken, image.start_us, image.end_us, rgb)
 

@@ -12,7 +12,7 @@ from nurec_sim.sensors import fill_ftheta
 from nurec_sim.serving import wire
 from nurec_sim.serving.sensor_service.core import ServiceCore
 from nurec_sim.serving.wire import common, sensorsim
-from nurec_sim.types import CameraModel, FTheta
+from nurec_sim.types import CameraModel
 
 API_VERSION = (0, 54, 0)
 """The version of AlpaSim's interface whose messages ``protos/`` holds."""
@@ -88,8 +88,6 @@ class Discovery(ServiceCore):
 
 
 def _with_both_polynomials(camera: CameraModel) -> CameraModel:
-    if not isinstance(camera.lens, FTheta):
-        return camera
     far_x = max(camera.lens.cx_px, camera.width_px - camera.lens.cx_px)
     far_y = max(camera.lens.cy_px, camera.height_px - camera.lens.cy_px)
     return replace(camera, lens=fill_ftheta(camera.lens, float(np.hypot(far_x, far_y))))

@@ -8,13 +8,16 @@ both sides.
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from nurec_sim.errors import RequestError
-from nurec_sim.sensors import check_camera, check_lidar, lidar_model, scaled_camera
+from nurec_sim.files.decoding import json_value
+from nurec_sim.lenses import decode_parameters, encode_parameters, lens_class
+from nurec_sim.sensors import check_camera, check_lidar, fit_ftheta, lidar_model, scaled_camera
 from nurec_sim.serving.wire.messages import (
     CustomSpin,
     FthetaPolynomial,
@@ -39,6 +42,9 @@ from nurec_sim.types import (
 MAX_COEFFICIENTS = 64
 """Of one polynomial; cameras in use have 6, windshields up to 21, and the time to solve one grows with its cube."""
 
+MAX_PARAMETERS = 1 << 16
+"""Characters of the parameters of a custom lens."""
+
 _SHUTTER_TYPE = {
     Shutter.GLOBAL: ShutterType.GLOBAL,
     Shutter.TOP_TO_BOTTOM: ShutterType.ROLLING_TOP_TO_BOTTOM,
@@ -53,29 +59,20 @@ _SHUTTER = {number: shutter for shutter, number in _SHUTTER_TYPE.items()} | {Shu
 
 
 def write_camera(camera: CameraModel, message) -> None:
-    """Fills a ``CameraSpec`` message."""
+    """Fills a ``CameraSpec`` message.
+
+    Raises:
+        ValueError: a lens for which the message has no fields of its own sees nothing in the image.
+    """
     message.logical_id = camera.id
     message.resolution_w, message.resolution_h = camera.width_px, camera.height_px
     message.shutter_type = _SHUTTER_TYPE[camera.shutter]
-    lens = camera.lens
-    if isinstance(lens, FTheta):
-        param = message.ftheta_param
-        param.principal_point_x, param.principal_point_y = lens.cx_px - 0.5, lens.cy_px - 0.5
-        param.reference_poly = FthetaPolynomial[lens.reference.name]
-        param.pixeldist_to_angle_poly.extend(lens.pixeldist_to_angle)
-        param.angle_to_pixeldist_poly.extend(lens.angle_to_pixeldist)
-        param.max_angle = lens.max_angle_rad
-        param.linear_cde.linear_c, param.linear_cde.linear_d, param.linear_cde.linear_e = lens.linear_cde
+    if camera.lens.kind in _LENS_WRITERS:
+        _LENS_WRITERS[camera.lens.kind](camera.lens, message)
     else:
-        param = message.opencv_pinhole_param if isinstance(lens, Pinhole) else message.opencv_fisheye_param
-        param.principal_point_x, param.principal_point_y = lens.cx_px, lens.cy_px
-        param.focal_length_x, param.focal_length_y = lens.fx_px, lens.fy_px
-        param.radial_coeffs.extend(lens.radial)
-        if isinstance(lens, Pinhole):
-            param.tangential_coeffs.extend(lens.tangential)
-            param.thin_prism_coeffs.extend(lens.thin_prism)
-        else:
-            param.max_angle = lens.max_angle_rad
+        _write_ftheta(fit_ftheta(camera), message)  # for programs that do not know the lens
+        message.custom_lens.kind = camera.lens.kind
+        message.custom_lens.parameters = json.dumps(encode_parameters(camera.lens))
     if camera.windshield is not None:
         glass = message.bivariate_windshield_model_param
         glass.SetInParent()
@@ -84,6 +81,40 @@ def write_camera(camera: CameraModel, message) -> None:
         glass.vertical_poly.extend(camera.windshield.vertical)
         glass.horizontal_poly_inverse.extend(camera.windshield.horizontal_inverse)
         glass.vertical_poly_inverse.extend(camera.windshield.vertical_inverse)
+
+
+def _write_ftheta(lens: FTheta, message) -> None:
+    param = message.ftheta_param
+    param.principal_point_x, param.principal_point_y = lens.cx_px - 0.5, lens.cy_px - 0.5
+    param.reference_poly = FthetaPolynomial[lens.reference.name]
+    param.pixeldist_to_angle_poly.extend(lens.pixeldist_to_angle)
+    param.angle_to_pixeldist_poly.extend(lens.angle_to_pixeldist)
+    param.max_angle = lens.max_angle_rad
+    param.linear_cde.linear_c, param.linear_cde.linear_d, param.linear_cde.linear_e = lens.linear_cde
+
+
+def _write_pinhole(lens: Pinhole, message) -> None:
+    _write_opencv(lens, message.opencv_pinhole_param)
+    message.opencv_pinhole_param.tangential_coeffs.extend(lens.tangential)
+    message.opencv_pinhole_param.thin_prism_coeffs.extend(lens.thin_prism)
+
+
+def _write_fisheye(lens: Fisheye, message) -> None:
+    _write_opencv(lens, message.opencv_fisheye_param)
+    message.opencv_fisheye_param.max_angle = lens.max_angle_rad
+
+
+def _write_opencv(lens: Pinhole | Fisheye, param) -> None:
+    param.principal_point_x, param.principal_point_y = lens.cx_px, lens.cy_px
+    param.focal_length_x, param.focal_length_y = lens.fx_px, lens.fy_px
+    param.radial_coeffs.extend(lens.radial)
+
+
+_LENS_WRITERS: dict[str, Callable[[Any, Any], None]] = {
+    Pinhole.kind: _write_pinhole,
+    Fisheye.kind: _write_fisheye,
+    FTheta.kind: _write_ftheta,
+}
 
 
 def read_camera(message, width_px: int, height_px: int, known: Mapping[str, CameraModel]) -> CameraModel:
@@ -95,7 +126,7 @@ def read_camera(message, width_px: int, height_px: int, known: Mapping[str, Came
     Raises:
         RequestError: no lens and no known camera of that id, or the parameters make no camera.
     """
-    kind = message.WhichOneof("camera_param")
+    kind = "custom_lens" if message.HasField("custom_lens") else message.WhichOneof("camera_param")
     if kind is None:
         native = known.get(message.logical_id)
         if native is None:
@@ -143,6 +174,8 @@ def _image_size(native: CameraModel, width_px: int, height_px: int) -> tuple[int
 
 def _read_lens(message, kind: str) -> Lens:
     param = getattr(message, kind)
+    if kind == "custom_lens":
+        return _read_custom_lens(param)
     if kind == "ftheta_param":
         forward = _bounded(param.angle_to_pixeldist_poly, "angle_to_pixeldist_poly")
         backward = _bounded(param.pixeldist_to_angle_poly, "pixeldist_to_angle_poly")
@@ -168,6 +201,15 @@ def _read_lens(message, kind: str) -> Lens:
         _padded(param.tangential_coeffs, 2, "tangential_coeffs"),
         _padded(param.thin_prism_coeffs, 4, "thin_prism_coeffs"),
     )
+
+
+def _read_custom_lens(param) -> Lens:
+    try:
+        if len(param.parameters) > MAX_PARAMETERS:
+            raise ValueError(f"parameters may have {MAX_PARAMETERS} characters, got {len(param.parameters)}")
+        return decode_parameters(lens_class(param.kind), json_value(param.parameters.encode()))
+    except (ValueError, RecursionError) as error:
+        raise RequestError(f"camera_intrinsics: custom_lens: {error}") from error
 
 
 def _bounded(values, name: str) -> tuple[float, ...]:

@@ -17,9 +17,6 @@ from nurec_sim.training.data.clips import FrameTruth, TrueClip
 from nurec_sim.types import (
     Box,
     CameraModel,
-    FTheta,
-    Lens,
-    Pinhole,
     Rig,
     RoadMap,
     Shutter,
@@ -145,19 +142,7 @@ def mirrored_camera(camera: CameraModel) -> CameraModel:
         raise ValueError(f"camera {camera.id!r} is behind a windshield and cannot be mirrored")
     return dataclasses.replace(
         camera,
-        lens=_mirrored_lens(camera.lens, camera.width_px),
+        lens=camera.lens.mirrored(camera.width_px),
         shutter=_MIRRORED_SHUTTER.get(camera.shutter, camera.shutter),
         rig_from_camera=_WORLD_MIRROR @ camera.rig_from_camera @ _CAMERA_MIRROR,
     )
-
-
-def _mirrored_lens(lens: Lens, width_px: int) -> Lens:
-    """Terms that are odd in x change their signs."""
-    lens = dataclasses.replace(lens, cx_px=width_px - lens.cx_px)
-    if isinstance(lens, Pinhole):
-        (p1, p2), (s1, s2, s3, s4) = lens.tangential, lens.thin_prism
-        return dataclasses.replace(lens, tangential=(p1, -p2), thin_prism=(-s1, -s2, s3, s4))
-    if isinstance(lens, FTheta):
-        c, d, e = lens.linear_cde
-        return dataclasses.replace(lens, linear_cde=(c, -d, -e))
-    return lens

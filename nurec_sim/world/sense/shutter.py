@@ -77,9 +77,7 @@ def _camera_patches(
         lines = np.array([low, high - 1]) + 0.5
         fraction = float(sensors.shutter_fraction(camera, np.stack([lines, lines], axis=1)).mean())
         part, seen = rays[rows, columns], valid[rows, columns]
-        flat = None
-        if isinstance(lens, Pinhole) and not lens.distorted and glass is None:
-            flat = Pinhole(lens.fx_px, lens.fy_px, lens.cx_px - columns.start, lens.cy_px - rows.start)
+        flat = None if camera.ideal_pinhole is None else camera.ideal_pinhole.cropped(columns.start, rows.start)
         patches.append(RayPatch(rows, columns, fraction, part, seen, IMAGE_DOWN, FINENESS, flat))
     return tuple(patches)
 

@@ -90,9 +90,7 @@ def crop_image(image: UInt8[np.ndarray, "h0 w0 3"], crop: Crop) -> Float[Tensor,
 def crop_camera(camera: CameraModel, crop: Crop) -> CameraModel:
     """The camera of the cropped image, for every lens; windshield, shutter and mounting stay."""
     scaled = sensors.scaled_camera(camera, *crop.resized)
-    lens = dataclasses.replace(
-        scaled.lens, cx_px=scaled.lens.cx_px - crop.offset[0], cy_px=scaled.lens.cy_px - crop.offset[1]
-    )
+    lens = scaled.lens.cropped(*crop.offset)
     return dataclasses.replace(scaled, width_px=crop.size[0], height_px=crop.size[1], lens=lens)
 
 

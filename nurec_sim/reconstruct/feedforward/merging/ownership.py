@@ -25,7 +25,7 @@ from nurec_sim import geometry, sensors
 from nurec_sim.compute.cores import usable_cores
 from nurec_sim.reconstruct.feedforward.chunks import ChunkLayers, ContextImage
 from nurec_sim.render.cpu.pack import morton_order
-from nurec_sim.types import CameraModel, Fisheye, FTheta, Lens, Shutter, Windshield
+from nurec_sim.types import CameraModel, Lens, Shutter, Windshield
 
 BLOCK = 8192
 """Neighbouring points that are handled together; a block passes over most images as a whole."""
@@ -157,9 +157,7 @@ def _half_field_rad(lens: Lens, glass: Windshield | None, width: int, height: in
     if valid.all():
         return float(np.arccos(np.clip(rays[:, 2].min(), -1, 1))) + FIELD_MARGIN_RAD
     # The lens ends inside the image: between two pixels of the grid.
-    if glass is None and isinstance(lens, (Fisheye, FTheta)):
-        return lens.max_angle_rad + FIELD_MARGIN_RAD
-    return np.pi
+    return lens.max_angle_rad + FIELD_MARGIN_RAD if glass is None else np.pi
 
 
 def _nearest_of_block(

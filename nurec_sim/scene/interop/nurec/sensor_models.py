@@ -39,8 +39,7 @@ def camera_from(calibration: Mapping[str, Any], name: str) -> CameraModel:
     """
     model = calibration.get("exact_camera_model") or calibration.get("camera_model")
     kind, parameters = _model(model)
-    if kind not in _LENSES:
-        raise ValueError(f"camera model {kind!r:.60} is not known; known are {sorted(_LENSES)}")
+    lens = _lens(kind, parameters)
     size = codec.sequence(codec.integer)(_get(parameters, "resolution"))
     if len(size) != 2:
         raise ValueError(f"resolution must be [width, height], got {size}")
@@ -48,7 +47,7 @@ def camera_from(calibration: Mapping[str, Any], name: str) -> CameraModel:
     if shutter not in _SHUTTERS:
         raise ValueError(f"shutter_type {shutter!r:.60} is not known; known are {sorted(_SHUTTERS)}")
     camera = CameraModel(
-        name, size[0], size[1], _LENSES[kind](parameters), _MATRIX(_get(calibration, "T_sensor_rig")),
+        name, size[0], size[1], lens, _MATRIX(_get(calibration, "T_sensor_rig")),
         _SHUTTERS[shutter], _windshield(parameters.get("external_distortion_parameters")),
     )  # fmt: skip
     sensors.check_camera(camera)
@@ -89,6 +88,15 @@ def _get(parameters: Mapping[str, Any], name: str) -> Any:
     if name not in parameters:
         raise ValueError(f"{name!r} is missing; have {sorted(map(str, parameters))[:20]}")
     return parameters[name]
+
+
+def _lens(kind: str, parameters: Mapping[str, Any]) -> Lens:
+    """Lenses that NCore does not know have their parameters as ``nurec_sim/scene.json`` has them."""
+    if kind in _LENSES:
+        return _LENSES[kind](parameters)
+    if "lens" not in parameters:
+        raise ValueError(f"camera model {kind!r:.60} is not known; known are {sorted(_LENSES)}")
+    return codec.lens(parameters["lens"])
 
 
 def _pair(parameters: Mapping[str, Any], name: str) -> tuple[float, float]:

@@ -9,13 +9,16 @@ With a = x/z, b = y/z, r2 = a*a + b*b and g = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / 
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy.polynomial import polynomial
 
-from nurec_sim.sensors import radial
-from nurec_sim.types import Pinhole
+from nurec_sim.lenses import radial
+from nurec_sim.lenses.base import BaseLens, Mask, Points2, Points3, check_values
+from nurec_sim.lenses.registry import register_lens
 
 # A distorted lens is not trusted beyond this tangent of the angle off the axis (87 degrees).
 WIDEST_TANGENT = 20.0
@@ -23,30 +26,74 @@ NEAREST_Z_M = 1e-6
 # Where the denominator of g falls below this, a pole is near and the model means nothing any more.
 FAR_FROM_POLE = 0.1
 
-Points2 = Float64[np.ndarray, "n 2"]
 
+@register_lens
+@dataclass(frozen=True)
+class Pinhole(BaseLens):
+    """OpenCV pinhole: rational radial k1..k6, tangential p1 p2, thin prism s1..s4; corner-origin principal point."""
 
-def project(lens: Pinhole, xyz: Float64[np.ndarray, "n 3"]) -> tuple[Points2, Bool[np.ndarray, " n"]]:
-    """Pixels of points, and whether each is in front and inside the field where the lens is one-to-one."""
-    z = xyz[:, 2]
-    valid = z > NEAREST_Z_M
-    flat = xyz[:, :2] / np.where(valid, z, 1.0)[:, None]
-    if lens.distorted:
-        inside = np.hypot(flat[:, 0], flat[:, 1]) <= _field(lens)
-        flat = np.where((valid & inside)[:, None], flat, 0.0)
-        flat, jacobian = _distort(lens, flat)
-        valid = valid & inside & _one_to_one(jacobian)
-    return flat * (lens.fx_px, lens.fy_px) + (lens.cx_px, lens.cy_px), valid
+    kind: ClassVar[str] = "pinhole"
+    perspective: ClassVar[bool] = True
 
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    radial: tuple[float, ...] = (0.0,) * 6
+    tangential: tuple[float, ...] = (0.0,) * 2
+    thin_prism: tuple[float, ...] = (0.0,) * 4
 
-def unproject(lens: Pinhole, uv: Points2) -> tuple[Float64[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Unit rays of pixels, and whether the lens sees anything there."""
-    flat = (uv - (lens.cx_px, lens.cy_px)) / (lens.fx_px, lens.fy_px)
-    valid = np.ones(len(uv), bool)
-    if lens.distorted:
-        flat, valid = _undistort(lens, flat)
-    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True), valid
+    @property
+    def distorted(self) -> bool:
+        """Whether any distortion coefficient differs from zero."""
+        return any(self.radial) or any(self.tangential) or any(self.thin_prism)
+
+    @property
+    def ideal_pinhole(self) -> Pinhole | None:
+        """The lens itself, if it is not distorted."""
+        return None if self.distorted else self
+
+    @property
+    def max_angle_rad(self) -> float:
+        """A right angle: everything in front of the camera; a distorted lens may end before."""
+        return np.pi / 2
+
+    def check(self) -> None:
+        """Check the parameters.
+
+        Raises:
+            ValueError: a number is not finite, a focal length not positive, or a tuple not of its length.
+        """
+        super().check()
+        for what, count in (("radial", 6), ("tangential", 2), ("thin_prism", 4)):
+            check_values(what, getattr(self, what), count)
+
+    def mirrored(self, width_px: float) -> Pinhole:
+        """Terms that are odd in x change their signs."""
+        (p1, p2), (s1, s2, s3, s4) = self.tangential, self.thin_prism
+        other_side = super().mirrored(width_px)
+        return replace(other_side, tangential=(p1, -p2), thin_prism=(-s1, -s2, s3, s4))
+
+    def project(self, xyz: Points3) -> tuple[Points2, Mask]:
+        """Pixels of points, and whether each is in front and inside the field where the lens is one-to-one."""
+        z = xyz[:, 2]
+        valid = z > NEAREST_Z_M
+        flat = xyz[:, :2] / np.where(valid, z, 1.0)[:, None]
+        if self.distorted:
+            inside = np.hypot(flat[:, 0], flat[:, 1]) <= _field(self)
+            flat = np.where((valid & inside)[:, None], flat, 0.0)
+            flat, jacobian = _distort(self, flat)
+            valid = valid & inside & _one_to_one(jacobian)
+        return flat * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px), valid
+
+    def unproject(self, uv: Points2) -> tuple[Points3, Mask]:
+        """Unit rays of pixels, and whether the lens sees anything there."""
+        flat = (uv - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px)
+        valid = np.ones(len(uv), bool)
+        if self.distorted:
+            flat, valid = _undistort(self, flat)
+        rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True), valid
 
 
 def _radial_parts(lens: Pinhole) -> tuple[np.ndarray, np.ndarray]:
