@@ -202,11 +202,13 @@ def _run(
     flags: OperationFlags,
 ) -> None:
     from nurec_sim.serving.scene_service import SceneOptions
-    from nurec_sim.serving.server import serve as run_server
+    from nurec_sim.serving.server import SensorServer, run_until_signal
 
     scene_options = SceneOptions(upload_dir=flags.upload_dir, clip_dirs=flags.clip_dirs)
     try:
-        run_server(store, host=host, port=port, options=options, scene_options=scene_options, server_options=listening)
+        run_until_signal(
+            SensorServer(store, host, port, options=options, scene_options=scene_options, server_options=listening)
+        )
     except OSError as error:
         raise NurecSimError(str(error)) from None
 

@@ -13,7 +13,7 @@ from nurec_sim.render import CpuRenderer
 from nurec_sim.scene import write_scene
 from nurec_sim.scene.describe import scene_arrays
 from nurec_sim.serving.store import SceneStore
-from nurec_sim.serving.store.sizes import array_bytes, half_of_memory
+from nurec_sim.serving.store.memory import array_bytes, half_of_memory
 
 
 def one_thread(world):

@@ -44,8 +44,9 @@ def one_thread(world):
 
 def serve_in_a_process(archive: Path) -> subprocess.Popen:
     program = (
-        "import sys; from nurec_sim.serving.store import SceneStore; from nurec_sim.serving.server import serve; "
-        "serve(SceneStore([sys.argv[1]], threads=1), port=0)"
+        "import sys; from nurec_sim.serving.store import SceneStore; "
+        "from nurec_sim.serving.server import SensorServer, run_until_signal; "
+        "run_until_signal(SensorServer(SceneStore([sys.argv[1]], threads=1), port=0))"
     )
     return subprocess.Popen(
         [sys.executable, "-W", "error", "-c", program, str(archive)],

@@ -13,7 +13,7 @@ from serving_world import camera_request, scene
 from nurec_sim.errors import ServerError
 from nurec_sim.serving.client import RemoteSensors
 from nurec_sim.serving.server import SensorServer, ServerOptions, Tls, check_exposure, is_loopback, read_token
-from nurec_sim.serving.server.security import shows_token
+from nurec_sim.serving.server.options import shows_token
 from nurec_sim.serving.store import SceneStore
 from nurec_sim.serving.wire import common
 

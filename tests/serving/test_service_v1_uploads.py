@@ -248,9 +248,10 @@ SERVER = """
 import sys
 from pathlib import Path
 from nurec_sim.serving.store import SceneStore, UploadFolder
-from nurec_sim.serving.server import serve
+from nurec_sim.serving.server import SensorServer, run_until_signal
 from nurec_sim.serving.scene_service import SceneOptions
-serve(SceneStore([sys.argv[1]], threads=1), port=0, scene_options=SceneOptions(upload_dir=Path(sys.argv[2])))
+options = SceneOptions(upload_dir=Path(sys.argv[2]))
+run_until_signal(SensorServer(SceneStore([sys.argv[1]], threads=1), port=0, scene_options=options))
 """
 
 

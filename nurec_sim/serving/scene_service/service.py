@@ -6,16 +6,35 @@ import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, aclosing
+from dataclasses import dataclass
+from pathlib import Path
 
 from nurec_sim.errors import RequestError, TooLargeError, UnsupportedError
 from nurec_sim.serving import wire
 from nurec_sim.serving.scene_service.frames import Frames
-from nurec_sim.serving.scene_service.options import SceneOptions
 from nurec_sim.serving.scene_service.reconstructions import Reconstructions
 from nurec_sim.serving.sensor_service import SensorService
 from nurec_sim.serving.sensor_service.core import run_to_end
 from nurec_sim.serving.store import SceneStore, Upload, UploadFolder
 from nurec_sim.serving.wire import nurec_sim_v1 as v1
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """What the scene service allows; limits of frames and messages are those of ``ServiceOptions``."""
+
+    upload_dir: Path | None = None
+    """Where uploaded scenes and clips are kept, and offered again when a server starts; None: nobody may upload."""
+    max_upload_bytes: int = 4 << 30
+    """Of one file; a scene archive cannot be larger."""
+    max_uploaded_bytes: int = 64 << 30
+    """Of all files in the folder."""
+    max_uploads: int = 4
+    """Uploads in progress."""
+    upload_idle_s: float = 60.0
+    """How long a client may say nothing in the middle of an upload."""
+    clip_dirs: tuple[Path, ...] = ()
+    """Folders whose clips clients may have reconstructed by naming their path."""
 
 
 class SceneService:

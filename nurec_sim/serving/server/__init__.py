@@ -2,10 +2,9 @@
 
 from nurec_sim.serving.calls import Service
 from nurec_sim.serving.server.grpc_server import Application, GrpcServer, run_until_signal
-from nurec_sim.serving.server.options import ServerOptions
-from nurec_sim.serving.server.request_log import LogFormat, LogLevel, set_up_logging
-from nurec_sim.serving.server.security import Tls, check_exposure, is_loopback, read_token
-from nurec_sim.serving.server.sensor_server import SensorServer, serve
+from nurec_sim.serving.server.options import ServerOptions, Tls, check_exposure, is_loopback, read_token
+from nurec_sim.serving.server.sensor_server import SensorServer
+from nurec_sim.serving.server.telemetry import LogFormat, LogLevel, set_up_logging
 
 __all__ = [
     "Application",
@@ -20,6 +19,5 @@ __all__ = [
     "is_loopback",
     "read_token",
     "run_until_signal",
-    "serve",
     "set_up_logging",
 ]

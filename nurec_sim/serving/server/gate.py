@@ -13,10 +13,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 import grpc
 
 from nurec_sim.serving.calls import HANDLER_KINDS, Call, address_of, enter_call
-from nurec_sim.serving.server.options import ServerOptions
-from nurec_sim.serving.server.request_log import log_call
-from nurec_sim.serving.server.security import shows_token
-from nurec_sim.serving.server.telemetry import Telemetry
+from nurec_sim.serving.server.options import ServerOptions, shows_token
+from nurec_sim.serving.server.telemetry import Telemetry, log_call
 
 Code = grpc.StatusCode
 _HEALTH = "Health/"

@@ -1,11 +1,56 @@
-"""How a server listens, whom it lets in, and what it tells of itself."""
+"""How a server listens and whom it lets in: TLS, a bearer token, limits, exposure to other machines."""
 
 from __future__ import annotations
 
+import hmac
+import ipaddress
+import os
+import ssl
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
+import grpc
+
+from nurec_sim.errors import ServerError
 from nurec_sim.serving import wire
-from nurec_sim.serving.server.security import Tls
+
+TOKEN_VARIABLE = "NUREC_SIM_TOKEN"
+_SCHEME = "bearer "
+
+
+@dataclass(frozen=True)
+class Tls:
+    """PEM files of a server's TLS.
+
+    Attributes:
+        cert: the server's certificate, and those between it and the root.
+        key: its private key, without a password.
+        client_ca: clients must show a certificate that one of these signed (mutual TLS); None asks for none.
+    """
+
+    cert: Path
+    key: Path
+    client_ca: Path | None = None
+
+    def credentials(self) -> grpc.ServerCredentials:
+        """What gRPC needs.
+
+        Raises:
+            ServerError: a file cannot be read, is no PEM, or key and certificate do not belong together.
+        """
+        try:
+            # gRPC would accept anything here and fail at every handshake.
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(self.cert, self.key, password=lambda: "")
+            if self.client_ca is not None:
+                context.load_verify_locations(self.client_ca)
+            roots = None if self.client_ca is None else self.client_ca.read_bytes()
+            pair = (self.key.read_bytes(), self.cert.read_bytes())
+        except (OSError, ValueError) as error:  # an SSLError is an OSError
+            files = [str(path) for path in (self.cert, self.key, self.client_ca) if path is not None]
+            raise ServerError(f"TLS cannot be set up from {files}: {error}") from None
+        return grpc.ssl_server_credentials([pair], roots, require_client_auth=roots is not None)
 
 
 @dataclass(frozen=True)
@@ -38,16 +83,62 @@ class ServerOptions:
     """Time that calls in progress get to finish when the server stops."""
 
     def __post_init__(self) -> None:
-        for name in (
-            "rate_per_s",
-            "rate_burst",
-            "max_calls",
-            "max_request_bytes",
-            "max_message_bytes",
-            "max_unread_bytes",
-        ):
+        sizes = ("max_request_bytes", "max_message_bytes", "max_unread_bytes")
+        for name in ("rate_per_s", "rate_burst", "max_calls", *sizes):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name} must be above 0, got {value}")
         if not 0 <= self.stop_grace_s < float("inf"):
             raise ValueError(f"stop_grace_s must be finite and not negative, got {self.stop_grace_s}")
+
+
+def read_token(path: Path | None) -> str | None:
+    """The token that clients must show: from a file, else from ``$NUREC_SIM_TOKEN``; None if there is neither.
+
+    Raises:
+        ServerError: the file cannot be read, or holds no token: visible ASCII without spaces, at least 8 characters.
+    """
+    if path is None and TOKEN_VARIABLE not in os.environ:
+        return None
+    source = f"${TOKEN_VARIABLE}" if path is None else str(path)
+    try:
+        token = os.environ[TOKEN_VARIABLE] if path is None else path.read_text("ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ServerError(f"the token cannot be read from {source}: {error}") from None
+    token = token.strip()
+    if len(token) < 8 or not all("!" <= letter <= "~" for letter in token):
+        raise ServerError(
+            f"{source} must hold a token of at least 8 visible ASCII characters without spaces, got {len(token)} in all"
+        )
+    return token
+
+
+def shows_token(metadata: Mapping[str, str | bytes], token: str) -> bool:
+    """Whether the ``authorization`` of a call is ``Bearer <token>``; takes as long for every wrong token."""
+    given = metadata.get("authorization", "")
+    if not isinstance(given, str) or given[: len(_SCHEME)].lower() != _SCHEME:
+        return False
+    return hmac.compare_digest(given[len(_SCHEME) :].strip().encode(), token.encode())
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only programs of this machine can reach ``host``."""
+    if host.startswith("unix:") or host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+def check_exposure(host: str, *, protected: bool, insecure: bool) -> None:
+    """Refuses to open a server to other machines unless it is protected, or that was asked for.
+
+    Raises:
+        ServerError: other machines can reach ``host``, and neither was said.
+    """
+    if not (is_loopback(host) or protected or insecure):
+        raise ServerError(
+            f"refused to listen at {host!r}, which other machines can reach, for anybody to call; "
+            "give --tls-cert and --tls-key, or --token-file, or --insecure if the network is trusted"
+        )

@@ -14,7 +14,7 @@ from nurec_sim.serving.calls import Service
 from nurec_sim.serving.scene_service import SceneOptions, SceneService
 from nurec_sim.serving.sensor_service import SensorService, ServiceOptions
 from nurec_sim.serving.sensor_service.scene_urls import URL_KEY
-from nurec_sim.serving.server.grpc_server import GrpcServer, run_until_signal
+from nurec_sim.serving.server.grpc_server import GrpcServer
 from nurec_sim.serving.server.options import ServerOptions
 from nurec_sim.serving.store import SceneStore
 
@@ -105,34 +105,3 @@ def _load_shared_libraries() -> None:
     """
     import cv2  # noqa: F401
     from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdSemantics, UsdVol, Vt  # noqa: F401
-
-
-def serve(
-    store: SceneStore,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    *,
-    options: ServiceOptions | None = None,
-    scene_options: SceneOptions | None = None,
-    server_options: ServerOptions | None = None,
-    announce: Callable[[str], None] | None = None,
-) -> None:
-    """Serves until SIGINT or SIGTERM; for the main thread.
-
-    Args:
-        store: the scenes.
-        host: name or address to listen at; ``0.0.0.0`` for all.
-        port: 0 picks a free one.
-        options: what the service allows.
-        scene_options: what the scene service allows.
-        server_options: how it listens, and to whom.
-        announce: called with ``Serving on <host>:<port>`` once calls are taken; prints it if None.
-
-    Raises:
-        OSError: an address cannot be listened at.
-        ServerError: TLS cannot be set up.
-    """
-    run_until_signal(
-        SensorServer(store, host, port, options=options, scene_options=scene_options, server_options=server_options),
-        announce,
-    )

@@ -1,14 +1,28 @@
-"""What a server counts, for Prometheus."""
+"""What a server reports of its calls: metrics for Prometheus, and log lines as text or JSON.
+
+Nothing that a request holds is logged, beyond the name of its scene.
+"""
 
 from __future__ import annotations
 
+import json
+import logging
+import sys
 from collections.abc import Callable, Iterable, Mapping
+from datetime import UTC, datetime
+from typing import Literal, TextIO
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, start_http_server
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+LogFormat = Literal["text", "json"]
+LogLevel = Literal["debug", "info", "warning", "error"]
+
+log = logging.getLogger(__name__)
+
 PREFIX = "nurec_sim_"
+_LONGEST_NAME = 200
 _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 300)
 
 Gauges = Callable[[], Mapping[str, tuple[str, float]]]
@@ -65,3 +79,49 @@ class _Gauges(Collector):
 
     def describe(self) -> Iterable[Metric]:
         return ()
+
+
+def log_call(method: str, code: str, seconds: float, scene: str, peer: str) -> None:
+    """Writes the line of a call that ended; at level info."""
+    if log.isEnabledFor(logging.INFO):
+        fields = {
+            "method": method,
+            "code": code,
+            "ms": round(1e3 * seconds, 1),
+            "scene": scene[:_LONGEST_NAME],
+            "peer": peer,
+        }
+        text = "%(method)s %(code)s %(ms).1f ms scene=%(scene)r peer=%(peer)s"
+        log.info(text, fields, extra={"call": fields})
+
+
+class JsonLines(logging.Formatter):
+    """One JSON object a line: ``time`` (UTC), ``level``, ``logger``, ``message``; a call's fields; ``error``."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line of a record."""
+        entry = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            **getattr(record, "call", {}),
+        }
+        if record.exc_info:
+            entry["error"] = self.formatException(record.exc_info)
+        return json.dumps(entry)
+
+
+def set_up_logging(form: LogFormat = "text", level: LogLevel = "warning", stream: TextIO | None = None) -> None:
+    """Sends the log of this process to a stream, stderr if None; for programs, not for libraries."""
+    handler = logging.StreamHandler(stream or sys.stderr)
+    plain = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
+    handler.setFormatter(JsonLines() if form == "json" else plain)
+    logging.basicConfig(handlers=[handler], level=logging.WARNING, force=True)
+    logging.getLogger("nurec_sim").setLevel(level.upper())
+    # gRPC logs a traceback whenever a client leaves before it has read its reply; the call's own line says it too.
+    logging.getLogger("grpc._cython.cygrpc").addFilter(_is_not_about_a_client_that_left)
+
+
+def _is_not_about_a_client_that_left(record: logging.LogRecord) -> bool:
+    return "ExecuteBatchError raised in core" not in record.getMessage()

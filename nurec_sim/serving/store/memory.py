@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from nurec_sim.errors import CancelledError
 from nurec_sim.render.device import Renderer
-from nurec_sim.serving.store.sizes import array_bytes
 from nurec_sim.types import GaussianScene, Track
+
+_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
 @dataclass(frozen=True)
@@ -231,3 +235,34 @@ class SceneMemory:
 
     def _count(self, **more: float) -> None:
         self._stats = replace(self._stats, **{name: getattr(self._stats, name) + n for name, n in more.items()})
+
+
+def array_bytes(*things: Any) -> int:
+    """Bytes of the arrays and tensors that objects of ours hold, at any depth; each buffer counts once."""
+    total, seen, stack = 0, set(), list(things)
+    while stack:
+        thing = stack.pop()
+        while getattr(thing, "base", None) is not None and hasattr(thing.base, "nbytes"):
+            thing = thing.base  # a view keeps all of what it looks at
+        if id(thing) in seen:
+            continue
+        seen.add(id(thing))
+        if isinstance(getattr(thing, "nbytes", None), int):
+            total += thing.nbytes
+        elif isinstance(thing, Mapping):
+            stack += list(thing.values())
+        elif isinstance(thing, (list, tuple)):
+            stack += thing
+        elif type(thing).__module__.startswith("nurec_sim.") and hasattr(thing, "__dict__"):
+            stack += list(vars(thing).values())
+    return total
+
+
+def half_of_memory() -> int:
+    """Half of the memory that this process may use, in bytes: of the machine, or of its container if that is less."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        total = min(total, int(_CGROUP_LIMIT.read_text()))
+    except (OSError, ValueError):  # no container, or one without a limit ("max")
+        pass
+    return total // 2

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
+import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from nurec_sim.errors import ArchiveError
+from nurec_sim.errors import ArchiveError, NurecSimError, UnknownSceneError
 from nurec_sim.serving.store.recipes import Recipe
 from nurec_sim.types import GaussianScene
 
+log = logging.getLogger(__name__)
+
+MAX_NAMES_IN_TEXT = 20
 _MAX_SIDECAR_BYTES = 1 << 20
 
 
@@ -140,3 +146,89 @@ def _metadata_id(path: Path) -> tuple[str, ...]:
             return ()
         text = package.read("metadata.yaml", _MAX_SIDECAR_BYTES).decode("utf-8", "replace")
     return tuple(re.findall(r"""^scene_id:[ ]*["']?([^"'\s]+)["']?[ ]*$""", text, re.MULTILINE)[:1])
+
+
+class SceneCatalog:
+    """The scenes on offer, by name; safe to use from many threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sources: dict[str, Source] = {}
+        self._faults: dict[str, str] = {}
+
+    def add(self, source: GaussianScene | str | Path) -> tuple[str, ...]:
+        """Offers the scene, or all scenes of a folder, and gives their ids; what cannot be opened becomes a fault."""
+        added = []
+        for one in [source] if isinstance(source, GaussianScene) else find_sources(Path(source)):
+            try:
+                added.append(self.offer(one))
+            except (NurecSimError, OSError) as error:
+                text = f"{describe(one)}: {error}" if isinstance(error, OSError) else str(error)
+                log.warning("not served: %s", text)
+                with self._lock:
+                    self._faults[stem_of(one)] = text
+        return tuple(added)
+
+    def offer(self, source: GaussianScene | Path, name: str = "", recipe: Recipe | None = None) -> str:
+        """Offers one scene and gives its id; raises what ``add`` makes a fault of.
+
+        Args:
+            source: an object, or the path of an archive or a clip.
+            name: its id, if it is not to be its own.
+            recipe: how it becomes a scene if it is a clip; None for the store's way.
+
+        Raises:
+            ArchiveError, ClipError: it cannot be opened, or its id is taken.
+        """
+        entry = identify(source, name, recipe)
+        with self._lock:
+            if entry.id in self._sources:
+                raise ArchiveError(f"{describe(source)}: a scene of id {entry.id!r} is already served")
+            self._sources[entry.id] = entry
+        return entry.id
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Ids of the scenes on offer, in the order they were added."""
+        with self._lock:
+            return tuple(self._sources)
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """Where the scenes on offer come from, in the order they were added."""
+        with self._lock:
+            return tuple(self._sources.values())
+
+    @property
+    def faults(self) -> Mapping[str, str]:
+        """Why a source is not on offer, by file stem."""
+        with self._lock:
+            return dict(self._faults)
+
+    def resolve(self, name: str) -> str:
+        """The id of the scene that answers to ``name``.
+
+        Raises:
+            UnknownSceneError: there is none; the text lists what there is.
+            ArchiveError: its source was refused; the text says why.
+        """
+        return self.source(name).id
+
+    def source(self, name: str) -> Source:
+        """Where the scene that answers to ``name`` comes from.
+
+        Raises:
+            UnknownSceneError, ArchiveError: see ``resolve``.
+        """
+        with self._lock:
+            if name in self._sources:
+                return self._sources[name]
+            for entry in self._sources.values():
+                if name in entry.aliases:
+                    return entry
+            fault = self._faults.get(name) or self._faults.get(name.removeprefix("clipgt-"))
+            have = list(self._sources)
+        if fault:
+            raise ArchiveError(f"scene {name!r} cannot be served: {fault}")
+        more = f" and {len(have) - MAX_NAMES_IN_TEXT} more" if len(have) > MAX_NAMES_IN_TEXT else ""
+        raise UnknownSceneError(f"scene {name!r} is not served; have {have[:MAX_NAMES_IN_TEXT]}{more}")

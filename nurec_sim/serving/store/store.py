@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import logging
-import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from nurec_sim.errors import ArchiveError, NurecSimError, SceneInUseError, UnknownSceneError
+from nurec_sim.errors import SceneInUseError
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings
 from nurec_sim.render.device import Renderer
 from nurec_sim.render.device import make_renderer as renderer_on
 from nurec_sim.serving.store.kept import KeptReconstructions
-from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats, SceneMemory
+from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats, SceneMemory, half_of_memory
 from nurec_sim.serving.store.recipes import Progress, Recipe
-from nurec_sim.serving.store.sizes import half_of_memory
-from nurec_sim.serving.store.sources import Source, default_cache_dir, describe, find_sources, identify, stem_of
+from nurec_sim.serving.store.sources import SceneCatalog, Source, default_cache_dir
 from nurec_sim.types import GaussianScene
-
-log = logging.getLogger(__name__)
-
-MAX_NAMES_IN_TEXT = 20
 
 
 @dataclass(frozen=True)
@@ -41,7 +34,7 @@ class SceneEntry:
     loading: bool
 
 
-class SceneStore:
+class SceneStore(SceneCatalog):
     """Scenes by id, from ``GaussianScene`` objects, ``.usdz`` archives and clips; safe to use from many threads.
 
     Ids are spelt ``clipgt-<id>``, as AlpaSim knows them from the archive; a scene also answers to its plain id, its
@@ -83,48 +76,13 @@ class SceneStore:
             raise ValueError(f"a scene store needs room for at least 1 scene, got capacity {capacity}")
         if max_bytes is not None and max_bytes < 1:
             raise ValueError(f"a scene store needs room for at least 1 byte, got max_bytes {max_bytes}")
+        super().__init__()
         self.memory = SceneMemory(capacity, half_of_memory() if max_bytes is None else max_bytes)
         self._kept = KeptReconstructions(cache_dir or default_cache_dir(), on_progress or (lambda text: None))
         self._recipe = Recipe(method, settings)
         self._make_renderer = make_renderer or partial(renderer_on, device=device, threads=threads)
-        self._lock = threading.Lock()
-        self._sources: dict[str, Source] = {}
-        self._faults: dict[str, str] = {}
         for source in sources:
             self.add(source)
-
-    # ---------------------------------------------------------------------------------------------------- what there is
-
-    def add(self, source: GaussianScene | str | Path) -> tuple[str, ...]:
-        """Offers the scene, or all scenes of a folder, and gives their ids; what cannot be opened becomes a fault."""
-        added = []
-        for one in [source] if isinstance(source, GaussianScene) else find_sources(Path(source)):
-            try:
-                added.append(self.offer(one))
-            except (NurecSimError, OSError) as error:
-                text = f"{describe(one)}: {error}" if isinstance(error, OSError) else str(error)
-                log.warning("not served: %s", text)
-                with self._lock:
-                    self._faults[stem_of(one)] = text
-        return tuple(added)
-
-    def offer(self, source: GaussianScene | Path, name: str = "", recipe: Recipe | None = None) -> str:
-        """Offers one scene and gives its id; raises what ``add`` makes a fault of.
-
-        Args:
-            source: an object, or the path of an archive or a clip.
-            name: its id, if it is not to be its own.
-            recipe: how it becomes a scene if it is a clip; None for the store's way.
-
-        Raises:
-            ArchiveError, ClipError: it cannot be opened, or its id is taken.
-        """
-        entry = identify(source, name, recipe)
-        with self._lock:
-            if entry.id in self._sources:
-                raise ArchiveError(f"{describe(source)}: a scene of id {entry.id!r} is already served")
-            self._sources[entry.id] = entry
-        return entry.id
 
     def remove(self, name: str) -> int:
         """Offers a scene no longer; its file stays. Gives the bytes of memory that it took.
@@ -144,60 +102,12 @@ class SceneStore:
             raise
 
     @property
-    def ids(self) -> tuple[str, ...]:
-        """Ids of the scenes on offer, in the order they were added."""
-        with self._lock:
-            return tuple(self._sources)
-
-    @property
-    def sources(self) -> tuple[Source, ...]:
-        """Where the scenes on offer come from, in the order they were added."""
-        with self._lock:
-            return tuple(self._sources.values())
-
-    @property
-    def faults(self) -> Mapping[str, str]:
-        """Why a source is not on offer, by file stem."""
-        with self._lock:
-            return dict(self._faults)
-
-    @property
     def entries(self) -> tuple[SceneEntry, ...]:
         """The scenes on offer, in the order they were added."""
         return tuple(
             SceneEntry(source.id, source.kind, _file_bytes(source), *self.memory.state_of(source.id))
             for source in self.sources
         )
-
-    def resolve(self, name: str) -> str:
-        """The id of the scene that answers to ``name``.
-
-        Raises:
-            UnknownSceneError: there is none; the text lists what there is.
-            ArchiveError: its source was refused; the text says why.
-        """
-        return self.source(name).id
-
-    def source(self, name: str) -> Source:
-        """Where the scene that answers to ``name`` comes from.
-
-        Raises:
-            UnknownSceneError, ArchiveError: see ``resolve``.
-        """
-        with self._lock:
-            if name in self._sources:
-                return self._sources[name]
-            for entry in self._sources.values():
-                if name in entry.aliases:
-                    return entry
-            fault = self._faults.get(name) or self._faults.get(name.removeprefix("clipgt-"))
-            have = list(self._sources)
-        if fault:
-            raise ArchiveError(f"scene {name!r} cannot be served: {fault}")
-        more = f" and {len(have) - MAX_NAMES_IN_TEXT} more" if len(have) > MAX_NAMES_IN_TEXT else ""
-        raise UnknownSceneError(f"scene {name!r} is not served; have {have[:MAX_NAMES_IN_TEXT]}{more}")
-
-    # ------------------------------------------------------------------------------------------------ what is in memory
 
     @property
     def cache_dir(self) -> Path:
