@@ -9,6 +9,7 @@ import pytest
 import tiny_clip
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from repetition import slow_after
 
 from nurec_sim import geometry, logs
 from nurec_sim.errors import ClipError
@@ -322,9 +323,12 @@ def packed_clip(tmp_path_factory) -> bytes:
     return tiny_clip.write(tmp_path_factory.mktemp("packed") / "clip.zip", jpeg_quality=95).read_bytes()
 
 
-@settings(max_examples=150, deadline=None)
+@pytest.mark.parametrize("repetition", slow_after(1, range(3)))
+@settings(max_examples=50, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), noise=st.binary(min_size=1, max_size=8))
-def test_whatever_byte_of_a_zip_is_broken_the_error_is_a_clip_error(tmp_path_factory, packed_clip, place, noise):
+def test_whatever_byte_of_a_zip_is_broken_the_error_is_a_clip_error(
+    tmp_path_factory, packed_clip, repetition, place, noise
+):
     data = bytearray(packed_clip)
     start = int(place * len(data))
     data[start : start + len(noise)] = noise
@@ -333,10 +337,11 @@ def test_whatever_byte_of_a_zip_is_broken_the_error_is_a_clip_error(tmp_path_fac
     assert all(fault.strip() for fault in logs.check_clip(path))
 
 
-@settings(max_examples=150, deadline=None)
+@pytest.mark.parametrize("repetition", slow_after(1, range(3)))
+@settings(max_examples=50, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), noise=st.binary(min_size=1, max_size=8), name=st.sampled_from(
     ["lidar/top/0000.npz", "images/front/0000.jpg"]))  # fmt: skip
-def test_whatever_byte_of_a_file_is_broken_the_error_is_a_clip_error(spoiled_clip, place, noise, name):
+def test_whatever_byte_of_a_file_is_broken_the_error_is_a_clip_error(spoiled_clip, repetition, place, noise, name):
     file = spoiled_clip / name.replace("jpg", "png")
     good = file.read_bytes()
     data = bytearray(good)

@@ -113,7 +113,7 @@ def test_round_trip_of_any_numbers(tmp_path_factory, data, count, scene_id):
     )  # fmt: skip
     times = data.draw(st.lists(st.integers(-(2**50), 2**50), min_size=3 * count, max_size=3 * count))
     knot_t_us = np.sort(np.array(times, np.int64).reshape(count, 3), axis=1)
-    base = full_scene(0)
+    base = empty_scene()
     dynamic = DynamicGaussians(static, knot_t_us, floats(count, 3, 3), np.full(count, -1, np.int32))
     isp = np.array(data.draw(st.lists(finite64, min_size=12, max_size=12))).reshape(3, 4)
     scene = dataclasses.replace(base, id=scene_id, static=static, dynamic=dynamic, isp={scene_id: isp})

@@ -19,10 +19,18 @@ from nurec_sim.scene import archive, archive_faults, read_scene, scene_hash, wri
 from nurec_sim.scene.usd.layers import static_layer
 
 
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    """The bytes of a sound archive."""
+    return write_scene(full_scene(0), tmp_path_factory.mktemp("hostile") / "a.usdz").read_bytes()
+
+
 @pytest.fixture
-def good(tmp_path):
+def good(sound, tmp_path):
     """A sound archive in a folder of its own."""
-    return write_scene(full_scene(0), tmp_path / "good" / "a.usdz")
+    (tmp_path / "good").mkdir()
+    (tmp_path / "good" / "a.usdz").write_bytes(sound)
+    return tmp_path / "good" / "a.usdz"
 
 
 def members_of(path):

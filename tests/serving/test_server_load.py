@@ -125,6 +125,7 @@ def start_soak(*options):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the memory of a process is read from /proc")
 def test_memory_does_not_grow_with_frames():
     """A short form of ``benchmarks/soak.py``."""
@@ -133,6 +134,7 @@ def test_memory_does_not_grow_with_frames():
     assert soak.returncode == 0 and "300 frames" in text and "memory grew by" in text, text
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the memory of a process is read from /proc")
 def test_an_interrupted_soak_says_what_it_has_seen():
     with start_soak("--frames", "1000000", "--direct") as soak:
