@@ -100,6 +100,26 @@ def test_a_place_that_enough_images_call_movable_is_movable_for_all():
     assert np.array_equal(find_consensus(chunk.tensors, true_m, none, grey(true_m)).semantic, none)
 
 
+def test_movable_things_that_stand_are_agreed_on_like_walls_and_stay_movable_where_images_disagree():
+    inputs, true_m, semantic = two_images_ten_metres_apart()
+    cars = np.where(semantic == SemanticClass.OTHERS, int(SemanticClass.MOVABLE), semantic)
+    stands = cars == SemanticClass.MOVABLE
+    wall = find_consensus(inputs, true_m, semantic, grey(true_m))
+    car = find_consensus(inputs, true_m, cars, grey(true_m), None, stands)
+    agreed = car.semantic == semantic
+    assert agreed.mean() > 0.98 and np.array_equal(car.shown[agreed], wall.shown[agreed])
+    assert find_consensus(inputs, true_m, cars, grey(true_m)).shown.all()
+    chunk, true_m, semantic = street()
+    cars = np.where(semantic == SemanticClass.OTHERS, int(SemanticClass.MOVABLE), semantic)
+    depth_m = true_m.copy()
+    patch = (1, slice(32, 43), slice(64, 86))
+    depth_m[patch] *= 0.5
+    found = find_consensus(chunk.tensors, depth_m, cars, grey(depth_m), None, cars == SemanticClass.MOVABLE)
+    assert (found.semantic[patch] == SemanticClass.MOVABLE).mean() > 0.95
+    moves = found.semantic == SemanticClass.MOVABLE
+    assert found.shown[moves].all() and (found.factor[moves] == 1).all()
+
+
 def test_one_of_many_images_cannot_make_a_place_movable():
     chunk, true_m, semantic = street(frames=8)
     wrong = semantic.copy()

@@ -11,6 +11,7 @@ from nurec_sim.network.tensors import ContextMaps, NetworkInputs, NetworkOutputs
 from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ContextImage
 from nurec_sim.reconstruct.feedforward.layers import COVERED_WEIGHT, MIN_DYNAMIC_OPACITY, chunk_layers
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
+from nurec_sim.reconstruct.feedforward.tracks.standing import standing_pixels
 from nurec_sim.types import CameraModel, Label, Pinhole, Shutter, Track, Trajectory
 
 EPOCH_US = 1_550_000_000_000_000
@@ -350,15 +351,43 @@ def test_movable_points_with_a_wrong_depth_find_their_box_by_ray():
     )
 
 
-def test_points_of_a_standing_car_stay_over_the_whole_clip():
+@pytest.mark.parametrize("semantic", [SemanticClass.OTHERS, SemanticClass.MOVABLE])
+def test_points_of_a_standing_car_stay_over_the_whole_clip_unless_images_disagree_on_them(semantic):
+    """Those that the consensus left movable are shown for the moment of their image only."""
     drive = Drive()
     drive.tracks = (vehicle(drive),)
-    dynamic = chunk_layers(drive, drive.chunk(), outputs(drive, 10.0, SemanticClass.MOVABLE), SETTINGS).dynamic
+    dynamic = chunk_layers(drive, drive.chunk(), outputs(drive, 10.0, semantic), SETTINGS).dynamic
     mine = dynamic.track == 0
     assert mine.any() and np.ptp(dynamic.knot_m[mine], axis=1).max() == 0
-    assert (dynamic.knot_t_us[mine, 0] < drive.span_us[0]).all() and (
-        dynamic.knot_t_us[mine, 2] > drive.span_us[1]
-    ).all()
+    first_us, last_us = dynamic.knot_t_us[mine, 0], dynamic.knot_t_us[mine, 2]
+    if semantic == SemanticClass.OTHERS:
+        assert (first_us < drive.span_us[0]).all() and (last_us > drive.span_us[1]).all()
+    else:
+        assert (last_us - first_us <= 2 * GAP_US + EXPOSURE_US).all()
+
+
+def test_pixels_that_show_what_stands():
+    """In or behind a box that stands; and, if a log has boxes, what lies in none and moves less than 0.5 m/s."""
+    drive = Drive()
+    standing, moving = vehicle(drive), vehicle(drive, velocity=(8.0, 3.0), size=(3.0, 2.0, 2.0))
+    semantic = np.full((4, HEIGHT, WIDTH), int(SemanticClass.MOVABLE))
+    semantic[:, -2:] = SemanticClass.ROAD
+    depth_m, still = np.full((4, HEIGHT, WIDTH), 10.0, np.float32), torch.zeros(1, 4, HEIGHT, WIDTH, 2, 3)
+
+    def found(tracks, speed_mps, depth_m=depth_m, motion=True):
+        drive.tracks = tracks
+        moves = still.clone()
+        moves[..., 1, 0] = speed_mps * 2 * GAP_US / 1e6
+        return standing_pixels(drive, drive.chunk(), depth_m, semantic, moves if motion else None)
+
+    movable = semantic == SemanticClass.MOVABLE
+    assert not found((), 0.0).any()
+    assert (found((standing,), 0.49) == movable).all()
+    boxed = found((standing,), 0.51)
+    assert 20 < boxed.sum() < movable.sum() and (boxed == found((standing,), 0, motion=False)).all()
+    assert (found((standing,), 1.0, np.full_like(depth_m, 40.0)) >= boxed).all(), "by the ray"
+    free = found((moving,), 0.0)
+    assert 20 < (movable & ~free).sum() < movable.sum() and not found((moving,), 1.0).any()
 
 
 def test_the_order_of_the_queries_does_not_matter():

@@ -260,6 +260,11 @@ def _moving_points(
         mine = np.flatnonzero(owner == number)
         actor = actors[number]
         track[mine] = actor.index
+        if actor.standing:
+            # Movable ones are those that the images disagree on (``tracks.standing``): over the whole clip they would
+            # hide each other, so each stays for the moment of its image.
+            knots[mine] = points.position_m[mine, None]
+            mine = mine[points.gaussians.label[mine] != Label.MOVABLE]
         times[mine], knots[mine] = knots_along(actor, points.position_m[mine], t_us[mine], image.target_t_us, span_us)
     gaussians = dataclasses.replace(
         points.gaussians,

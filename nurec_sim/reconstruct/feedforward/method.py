@@ -25,6 +25,7 @@ from nurec_sim.reconstruct.feedforward.merging.merge import merge_chunks
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.reconstruct.feedforward.tracks.clusters import group_into_tracks
 from nurec_sim.reconstruct.feedforward.tracks.labelled import scene_actors
+from nurec_sim.reconstruct.feedforward.tracks.standing import standing_pixels
 from nurec_sim.reconstruct.lift.actors import tracks_of
 from nurec_sim.types import Clip, DynamicGaussians, GaussianScene, Track
 
@@ -176,7 +177,8 @@ def _chunk(
     if settings.consensus:
         progress("consensus", 0.8)
         semantic, rgb = outputs.context.logits[0].argmax(-1).cpu().numpy(), outputs.context.rgb[0].float().cpu().numpy()
-        consensus = find_consensus(chunk.tensors, depth_m, semantic, rgb, chunk.ego)
+        standing = standing_pixels(clip, chunk, depth_m, semantic, outputs.context.motion_m)
+        consensus = find_consensus(chunk.tensors, depth_m, semantic, rgb, chunk.ego, standing)
         outputs = consensus.coloured(
             dataclasses.replace(outputs, gaussians=consensus.apply(gaussians, chunk.tensors)), chunk.tensors
         )

@@ -90,6 +90,7 @@ def find_consensus(
     semantic: Int64[np.ndarray, "v h w"],
     rgb: Float32[np.ndarray, "v h w 3"],
     ego: Bool[np.ndarray, "v h w"] | None = None,
+    stands: Bool[np.ndarray, "v h w"] | None = None,
 ) -> Consensus:
     """Compare every image with the others.
 
@@ -99,8 +100,12 @@ def find_consensus(
         semantic: their ``SemanticClass``; what can move, sky and the own car keep their depth and are always shown.
         rgb: their canonical colours.
         ego: pixels known to show the own car, whatever their class.
+        stands: movable pixels that seem to show what stands; those on which the images agree become ``OTHERS``, the
+            rest stay as they are.
     """
     views, camera = views_of(inputs), inputs.camera_idxs[0].cpu().numpy()
+    stands = np.zeros(semantic.shape, np.bool_) if stands is None else stands
+    semantic = np.where(stands, int(SemanticClass.OTHERS), semantic)
     kind = _KIND_OF_CLASS[semantic]
     if ego is not None:
         kind[ego] = UNKNOWN
@@ -118,7 +123,10 @@ def find_consensus(
 
     semantic = np.where((kind == MOVABLE) & (voted == SURFACE), int(SemanticClass.OTHERS), semantic)
     semantic = np.where((kind == SURFACE) & (voted == MOVABLE), int(SemanticClass.MOVABLE), semantic)
-    return Consensus(pictures.depth_m / depth_m, last.owned & last.agreed, semantic, last.rgb, gain)
+    moves = stands & (voted == SURFACE) & ~last.agreed
+    semantic[moves] = SemanticClass.MOVABLE
+    factor = np.where(moves, np.float32(1), pictures.depth_m / depth_m)
+    return Consensus(factor, last.owned & last.agreed | moves, semantic, last.rgb, gain)
 
 
 def _voted(kind: UInt8[np.ndarray, "v h w"], movable: Float32[np.ndarray, "v h w"]) -> UInt8[np.ndarray, "v h w"]:
