@@ -88,9 +88,7 @@ class RemoteSensors(Connection):
         result = {}
         for entry in reply.available_cameras:
             with malformed_reply(self.address, f"get_available_cameras: camera {entry.logical_id!r}"):
-                mounting = wire.read_mounting(entry.rig_to_camera, "rig_to_camera")
-                camera = wire.read_camera(entry.intrinsics, 0, 0, {})
-            result[entry.logical_id] = replace(camera, id=entry.logical_id, rig_from_camera=mounting)
+                result[entry.logical_id] = wire.read_available_camera(entry)
         return result
 
     def lidars(self) -> dict[str, LidarModel]:
@@ -99,9 +97,7 @@ class RemoteSensors(Connection):
         result = {}
         for entry in reply.available_lidars:
             with malformed_reply(self.address, f"get_available_lidars: LiDAR {entry.logical_id!r}"):
-                mounting = wire.read_mounting(entry.rig_from_lidar, "rig_from_lidar")
-                lidar = wire.read_lidar(entry.lidar_config)
-            result[entry.logical_id] = replace(lidar, id=entry.logical_id, rig_from_lidar=mounting)
+                result[entry.logical_id] = wire.read_available_lidar(entry)
         return result
 
     def trajectory(self) -> Trajectory:

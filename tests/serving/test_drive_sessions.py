@@ -204,7 +204,7 @@ def test_what_only_our_clients_submit_is_asked_for_by_name():
         (lambda m: m.rollout_spec.vehicle.available_cameras[0].intrinsics.ClearField("opencv_pinhole_param"),
          "available_cameras, camera 'front_wide': camera_intrinsics must hold"),
         (lambda m: m.rollout_spec.vehicle.available_cameras[0].ClearField("rig_to_camera"),
-         "rig_to_camera of camera 'front_wide' must have a unit quaternion"),
+         "available_cameras, camera 'front_wide': rig_to_camera must have a unit quaternion"),
         (lambda m: m.rollout_spec.vehicle.body.size_m.append(1.0), "vehicle.body needs 3 finite center_m"),
         (lambda m: m.rollout_spec.vehicle.available_cameras.append(m.rollout_spec.vehicle.available_cameras[0]),
          "each camera needs a logical_id of its own, got 'front_wide' beside ['front_wide']"),

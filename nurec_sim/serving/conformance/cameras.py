@@ -35,13 +35,16 @@ def _ftheta(target: Target, *, forward: bool, backward: bool):
     return request
 
 
+def _fill_opencv(lens) -> None:
+    lens.principal_point_x, lens.principal_point_y = WIDTH_PX / 2, HEIGHT_PX / 2
+    lens.focal_length_x = lens.focal_length_y = _FOCAL_PX
+
+
 @check("lens-pinhole")
 def pinhole(target: Target) -> str:
     """A client may send an OpenCV pinhole of its own."""
     request = _ask(target)
-    lens = request.camera_intrinsics.opencv_pinhole_param
-    lens.principal_point_x, lens.principal_point_y = WIDTH_PX / 2, HEIGHT_PX / 2
-    lens.focal_length_x = lens.focal_length_y = _FOCAL_PX
+    _fill_opencv(request.camera_intrinsics.opencv_pinhole_param)
     image = target.picture(request)
     expect(image.shape[:2] == (HEIGHT_PX, WIDTH_PX), f"{WIDTH_PX}x{HEIGHT_PX} was asked, got {image.shape[1::-1]}")
     return f"{image.shape[1]}x{image.shape[0]}"
@@ -52,8 +55,7 @@ def fisheye(target: Target) -> str:
     """An OpenCV fisheye without distortion shows the same as an F-theta with r = f * angle."""
     request = _ask(target)
     lens = request.camera_intrinsics.opencv_fisheye_param
-    lens.principal_point_x, lens.principal_point_y = WIDTH_PX / 2, HEIGHT_PX / 2
-    lens.focal_length_x = lens.focal_length_y = _FOCAL_PX
+    _fill_opencv(lens)
     lens.max_angle = 1.3
     gap = difference(target.picture(request), target.picture(_ftheta(target, forward=True, backward=True)))
     expect(gap < 2, f"the two differ by {gap:.1f} steps; is a principal point half a pixel off?")

@@ -43,18 +43,14 @@ class Discovery(ServiceCore):
         """Cameras of the rig at their native size, both F-theta polynomials filled in."""
         reply = sensorsim.AvailableCamerasReturn()
         for camera in (await self._scene(request.scene_id)).rig.cameras.values():
-            entry = reply.available_cameras.add(logical_id=camera.id)
-            wire.write_camera(_with_both_polynomials(camera), entry.intrinsics)
-            wire.write_mounting(camera.rig_from_camera, entry.rig_to_camera)
+            wire.write_available_camera(_with_both_polynomials(camera), reply.available_cameras.add())
         return reply
 
     async def get_available_lidars(self, request):
         """LiDARs of the rig."""
         reply = sensorsim.AvailableLidarsReturn()
         for lidar in (await self._scene(request.scene_id)).rig.lidars.values():
-            entry = reply.available_lidars.add(logical_id=lidar.id)
-            wire.write_lidar(lidar, entry.lidar_config)
-            wire.write_mounting(lidar.rig_from_lidar, entry.rig_from_lidar)
+            wire.write_available_lidar(lidar, reply.available_lidars.add())
         return reply
 
     async def get_available_trajectories(self, request):

@@ -3,6 +3,16 @@
 Nothing outside this folder knows what a message looks like, except that ``service`` and ``client`` copy plain fields.
 """
 
+from nurec_sim.serving.wire.discovery import (
+    read_available_camera,
+    read_available_lidar,
+    read_track,
+    read_trajectory,
+    write_available_camera,
+    write_available_lidar,
+    write_track,
+    write_trajectory,
+)
 from nurec_sim.serving.wire.messages import (
     MAX_MESSAGE_BYTES,
     METHODS,
@@ -41,12 +51,10 @@ from nurec_sim.serving.wire.requests import (
     read_poses,
     write_camera_request,
     write_lidar_request,
-    write_mounting,
     write_poses,
 )
 from nurec_sim.serving.wire.sensor_specs import read_camera, read_lidar, write_camera, write_lidar
 from nurec_sim.serving.wire.status import code_of, error_of, number_of, text_of
-from nurec_sim.serving.wire.trajectories import read_track, read_trajectory, write_track, write_trajectory
 
 __all__ = [
     "MAX_MESSAGE_BYTES",
@@ -70,6 +78,8 @@ __all__ = [
     "offered_formats",
     "outputs_of",
     "pool",
+    "read_available_camera",
+    "read_available_lidar",
     "read_camera",
     "read_camera_frame",
     "read_camera_request",
@@ -84,13 +94,14 @@ __all__ = [
     "read_trajectory",
     "sensorsim",
     "text_of",
+    "write_available_camera",
+    "write_available_lidar",
     "write_camera",
     "write_camera_request",
     "write_image",
     "write_lidar",
     "write_lidar_frame",
     "write_lidar_request",
-    "write_mounting",
     "write_outputs",
     "write_poses",
     "write_range_map",

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from google.protobuf import message_factory
 
 from nurec_sim.errors import RequestError
+from nurec_sim.serving.wire.discovery import (
+    read_available_camera,
+    read_available_lidar,
+    write_available_camera,
+    write_available_lidar,
+)
 from nurec_sim.serving.wire.messages import Method, pool
 from nurec_sim.serving.wire.replies import read_lidar_frame, write_lidar_frame
-from nurec_sim.serving.wire.requests import MAX_TIME_US, read_mounting, read_poses, write_mounting, write_poses
-from nurec_sim.serving.wire.sensor_specs import (
-    read_camera,
-    read_lidar,
-    write_camera,
-    write_lidar,
-)
+from nurec_sim.serving.wire.requests import MAX_TIME_US, read_poses, write_poses
 from nurec_sim.types import (
     ActorState,
     Box,
@@ -72,13 +73,9 @@ def write_session_start(start: SessionStart, message) -> None:
     message.session_uuid, message.random_seed = start.session_id, start.seed
     vehicle = message.rollout_spec.vehicle
     for camera in start.rig.cameras.values():
-        entry = vehicle.available_cameras.add(logical_id=camera.id)
-        write_camera(camera, entry.intrinsics)
-        write_mounting(camera.rig_from_camera, entry.rig_to_camera)
+        write_available_camera(camera, vehicle.available_cameras.add())
     for lidar in start.rig.lidars.values():
-        entry = vehicle.available_lidars.add(logical_id=lidar.id)
-        write_lidar(lidar, entry.lidar_config)
-        write_mounting(lidar.rig_from_lidar, entry.rig_from_lidar)
+        write_available_lidar(lidar, vehicle.available_lidars.add())
     vehicle.body.center_m.extend(start.rig.body.center_m)
     vehicle.body.size_m.extend(start.rig.body.size_m)
     vehicle.sensor_ids.update(start.sensor_ids)
@@ -96,20 +93,25 @@ def read_session_start(message) -> SessionStart:
     cameras: dict[str, CameraModel] = {}
     for entry in vehicle.available_cameras:
         name = _new_name("camera", entry.logical_id or entry.intrinsics.logical_id, cameras)
-        try:
-            camera = read_camera(entry.intrinsics, 0, 0, {})
-        except RequestError as error:
-            raise RequestError(f"available_cameras, camera {name!r}: {error}") from None
-        mounting = read_mounting(entry.rig_to_camera, f"rig_to_camera of camera {name!r}")
-        cameras[name] = replace(camera, id=name, rig_from_camera=mounting)
+        with _errors_of(f"available_cameras, camera {name!r}"):
+            cameras[name] = replace(read_available_camera(entry), id=name)
     lidars: dict[str, LidarModel] = {}
     for entry in vehicle.available_lidars:
         name = _new_name("LiDAR", entry.logical_id, lidars)
-        mounting = read_mounting(entry.rig_from_lidar, f"rig_from_lidar of LiDAR {name!r}")
-        lidars[name] = replace(read_lidar(entry.lidar_config), id=name, rig_from_lidar=mounting)
+        with _errors_of(f"available_lidars, LiDAR {name!r}"):
+            lidars[name] = read_available_lidar(entry)
     body = _read_body(vehicle.body) if vehicle.HasField("body") else Rig({}, {}).body
     rig = Rig(cameras, lidars, body)
     return SessionStart(message.session_uuid, message.random_seed, rig, dict(vehicle.sensor_ids))
+
+
+@contextlib.contextmanager
+def _errors_of(name: str) -> Iterator[None]:
+    """Errors that begin with the name of what is read."""
+    try:
+        yield
+    except RequestError as error:
+        raise RequestError(f"{name}: {error}") from None
 
 
 def _new_name(kind: str, name: str, known: Mapping[str, object]) -> str:
