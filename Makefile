@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs
 
-.PHONY: demo test check format docs dist bench bench-serving gpu-parity gpu-bench clean
+.PHONY: demo test test-slow check format docs dist bench bench-serving gpu-parity gpu-bench clean
 
 $(VENV)/.installed: pyproject.toml setup.py constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(f"nurec_sim needs Python 3.11 or newer; $(PYTHON) is {sys.version.split()[0]}. Try: make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
@@ -15,8 +15,11 @@ $(VENV)/.installed: pyproject.toml setup.py constraints.txt
 demo: $(VENV)/.installed ## log -> Gaussian scene -> gRPC server -> closed loop -> report
 	$(BIN)/nurec-sim demo --out $(OUT)
 
-test: $(VENV)/.installed ## all tests, at most ten minutes on two cores
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+test: $(VENV)/.installed ## every rule once, at most five minutes on two cores
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+
+test-slow: $(VENV)/.installed ## tests that take many seconds, and repetitions of quick ones
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow
 
 check: $(VENV)/.installed ## format, lint, import arrows, types
 	$(BIN)/ruff format --check .
