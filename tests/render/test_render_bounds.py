@@ -13,9 +13,10 @@ from numba import njit
 
 from nurec_sim import geometry, sensors
 from nurec_sim.render.cpu.grid import LIDAR, PINHOLE, make_grid
-from nurec_sim.render.cpu.pack import BLOCK, pack
+from nurec_sim.render.cpu.pack import BLOCK, LayerBlocks, pack
 from nurec_sim.render.cpu.project.general import lens_boxes, project_general
-from nurec_sim.render.cpu.records import MACRO, RECORD, SCRATCH, place
+from nurec_sim.render.cpu.project.motion import LinePath
+from nurec_sim.render.cpu.records import MACRO, RECORD, SCRATCH, Projected, place
 from nurec_sim.render.cpu.simd import LANES
 from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.rays import ray_grid, reference_pose, world_rays
@@ -87,14 +88,12 @@ def step(rng, turn, travel):
 def project(grid, view, packed):
     """Row of each record's Gaussian, and its macro tiles [n,4]."""
     most = 2 * BLOCK * len(packed)
-    records, keys = np.zeros((most, RECORD), np.float32), np.zeros(most, np.float32)
-    spans, sources = np.zeros((most, 4), np.int16), np.zeros(most, np.int32)
-    chart = grid.chart
-    n = project_general(
-        packed.fields, packed.sh_rest, np.arange(len(packed)), 0, len(packed), view.parameters, grid.kind == LIDAR,
-        chart.params, chart.places, chart.bends, view.lines, view.steps, records, keys, spans, sources, 0,
-    )  # fmt: skip
-    return packed.index[sources[:n]], spans[:n]
+    output = Projected(np.zeros((most, RECORD), np.float32), np.zeros(most, np.float32),
+                       np.zeros((most, 4), np.int16), np.zeros(most, np.int32))  # fmt: skip
+    layer = LayerBlocks(packed.fields, packed.sh_rest, np.arange(len(packed)))
+    n = project_general(layer, 0, len(packed), view.parameters, grid.kind == LIDAR, grid.chart,
+                        LinePath(view.lines, view.steps), output, 0)  # fmt: skip
+    return packed.index[output.sources[:n]], output.spans[:n]
 
 
 def hits(grid, sensor, request, gaussians):

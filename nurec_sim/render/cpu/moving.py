@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -50,6 +50,26 @@ ROTATION, TRANSLATION, TURN, EYE, MOVED = 0, 9, 12, 16, 19
 MOTION = 20
 
 LOG_MAX_OPACITY = float(np.log(MAX_OPACITY))
+
+
+class MovingBlocks(NamedTuple):
+    """Blocks of a ``PackedMoving`` as its kernel reads them."""
+
+    fields: Float32[np.ndarray, "blocks 21 256"]
+    sh_rest: Float32[np.ndarray, "blocks k3 256"]
+    knot_us: Float64[np.ndarray, "blocks 3 256"]
+    knot_m: Float32[np.ndarray, "blocks 9 256"]
+    track: Int64[np.ndarray, " blocks"]
+    reach_m: Float64[np.ndarray, " blocks"]
+
+
+class PlacedBlocks(NamedTuple):
+    """Blocks at an instant, and the spheres that hold what is alive of them."""
+
+    fields: Float32[np.ndarray, "b 21 256"]
+    centre_m: Float64[np.ndarray, "b 3"]
+    radius_m: Float64[np.ndarray, " b"]
+    """0 where nothing is alive."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +163,7 @@ class PackedMoving:
         hidden: Set[str],
         eye_m: Float64[np.ndarray, " 3"],
         workers: Workers,
-        array: Callable[[str, tuple[int, ...], type], np.ndarray],
+        scratch: Callable[[str, tuple[int, ...], type], np.ndarray],
     ) -> PackedGaussians:
         """The layer at an instant, without ``sh_rest``: colours are those seen from ``eye_m``.
 
@@ -153,7 +173,7 @@ class PackedMoving:
             hidden: ids of tracks that are left out.
             eye_m: view point in the world.
             workers: threads to run on.
-            array: lends the frame's arrays (``pipeline.Buffers``); the result lives as long as the loan.
+            scratch: gives the frame's scratch arrays (``workers.Scratch``); the result lives as long as they do.
         """
         instant = float(t_us - self.base_us)
         motions, gone = self._motions(t_us, actors, np.asarray(eye_m, np.float64))
@@ -162,15 +182,15 @@ class PackedMoving:
         lives = (self.life_us[:, 0] <= instant) & (instant <= self.life_us[:, 1])
         blocks = np.flatnonzero(lives & ~np.isin(self.track, gone))
         count = len(blocks)
-        fields = array("moving fields", (count, FIELDS, BLOCK), np.float32)
-        centre, radius = np.empty((count, 3)), np.empty(count)
+        fields = scratch("moving fields", (count, FIELDS, BLOCK), np.float32)
+        placed = PlacedBlocks(fields, np.empty((count, 3)), np.empty(count))
+        moving = MovingBlocks(self.fields, self.sh_rest, self.knot_us, self.knot_m, self.track, self.reach_m)
         workers.run(
             put_in_place,
-            [(self.fields, self.sh_rest, self.knot_us, self.knot_m, self.track, self.reach_m, blocks, first, last,
-              instant, motions, fields, centre, radius)
-             for first, last in workers.ranges(count, 8)],
-        )  # fmt: skip
-        return PackedGaussians(fields, np.zeros((0, 0, 0), np.float32), self.index[blocks].reshape(-1), centre, radius)
+            [(moving, blocks, first, last, instant, motions, placed) for first, last in workers.ranges(count, 8)],
+        )
+        index = self.index[blocks].reshape(-1)
+        return PackedGaussians(fields, np.zeros((0, 0, 0), np.float32), index, placed.centre_m, placed.radius_m)
 
     def _motions(
         self, t_us: int, actors: Mapping[str, Float64[np.ndarray, "4 4"]], eye_m: Float64[np.ndarray, " 3"]
@@ -284,32 +304,24 @@ def _move(motion, out):
 
 
 @kernel
-def put_in_place(
-    fields, sh_rest, knot_us, knot_m, track, reach_m, blocks, first, last, instant, motions, placed, centre, radius
-):
+def put_in_place(moving, blocks, first, last, instant, motions, placed):
     """Write blocks of a ``PackedMoving`` as they are at an instant, and the spheres that hold what is alive of them.
 
     Args:
-        fields: as the following five, see ``PackedMoving``.
-        sh_rest: [blocks,3k,256] or [0,0,0].
-        knot_us: [blocks,3,256].
-        knot_m: [blocks,9,256].
-        track: [blocks]; negative for none.
-        reach_m: [blocks].
+        moving: see ``PackedMoving``.
         blocks: numbers of the blocks to write.
         first: first entry of ``blocks`` to take.
         last: one behind the last.
         instant: time since the layer's base.
         motions: [2 tracks + 1,20].
-        placed: [len(blocks),21,256] output.
-        centre: [len(blocks),3] output.
-        radius: [len(blocks)] output; 0 where nothing is alive.
+        placed: output, an entry per entry of ``blocks``.
     """
+    fields, sh_rest, knot_us, knot_m, track, reach_m = moving
     alive = np.empty(BLOCK, np.float32)
     view, scratch = np.zeros(VIEW, np.float32), np.empty((SCRATCH, LANES), np.float32)
     for n in range(first, last):
         block = blocks[n]
-        out = placed[n]
+        out = placed.fields[n]
         owner = track[block]
         motion = motions[owner if 0 <= owner < len(motions) - 1 else len(motions) - 1]
         for k in range(QUAT, FIELDS):
@@ -326,6 +338,6 @@ def put_in_place(
             for i in range(BLOCK):
                 low = min(low, out[MEAN + k, i] if alive[i] > f4(0) else f4(np.inf))
                 high = max(high, out[MEAN + k, i] if alive[i] > f4(0) else f4(-np.inf))
-            centre[n, k] = (np.float64(low) + np.float64(high)) / 2.0 if count > 0 else 0.0
+            placed.centre_m[n, k] = (np.float64(low) + np.float64(high)) / 2.0 if count > 0 else 0.0
             diagonal += (np.float64(high) - np.float64(low)) ** 2 if count > 0 else 0.0
-        radius[n] = np.sqrt(diagonal) / 2.0 + reach_m[block] if count > 0 else 0.0
+        placed.radius_m[n] = np.sqrt(diagonal) / 2.0 + reach_m[block] if count > 0 else 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -21,6 +22,16 @@ REACH = float(np.sqrt(2 * np.log(255)))
 """Standard deviations at which an opaque Gaussian has faded to 1/255."""
 NEVER_SEEN = -1e9
 """LOG_OPACITY of rows that only fill a block up."""
+
+
+class LayerBlocks(NamedTuple):
+    """Blocks of a layer as the projecting kernels read them."""
+
+    fields: Float32[np.ndarray, "blocks 21 256"]
+    sh_rest: Float32[np.ndarray, "blocks k3 256"]
+    """[0,0,0] without view-dependent colours."""
+    chosen: Int64[np.ndarray, " b"]
+    """Numbers of the blocks to look at."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,18 +16,19 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
 from nurec_sim.render.cpu.blend.binning import count_tiles, depth_cuts, fill_tiles, sort_by_depth
-from nurec_sim.render.cpu.blend.blocks import LIDAR, NORMALS
-from nurec_sim.render.cpu.blend.draw import draw_tiles, record_normals
-from nurec_sim.render.cpu.blend.rays import RayTiles
+from nurec_sim.render.cpu.blend.draw import TileLists, draw_tiles, record_normals
+from nurec_sim.render.cpu.blend.rays import RayTiles, SensorRays
+from nurec_sim.render.cpu.blend.responses import LIDAR, NORMALS
 from nurec_sim.render.cpu.blend.tiles import AFFINE, ROLLING
 from nurec_sim.render.cpu.grid import LIDAR as LIDAR_GRID
-from nurec_sim.render.cpu.pack import BLOCK, PackedGaussians
+from nurec_sim.render.cpu.pack import BLOCK, LayerBlocks, PackedGaussians
 from nurec_sim.render.cpu.project.general import project_general
+from nurec_sim.render.cpu.project.motion import LinePath
 from nurec_sim.render.cpu.project.pinhole import project_pinhole
-from nurec_sim.render.cpu.records import MACRO, RECORD
+from nurec_sim.render.cpu.records import MACRO, RECORD, Projected
 from nurec_sim.render.cpu.simd import LANES
 from nurec_sim.render.cpu.view import ExposureView
-from nurec_sim.render.cpu.workers import SPLIT, Lend, Workers
+from nurec_sim.render.cpu.workers import SPLIT, Scratch, Workers
 
 SLICE_PAIRS, SLICE_BLOCKS, SLICE_RECORDS = 8192, 512, 200_000
 """Pairs of records and macro tiles, blocks of Gaussians, and records in one call of a kernel, at most about; a few
@@ -53,25 +54,21 @@ class FrameStats:
 class Picture:
     """One frame on its way through the stages.
 
-    ``layers`` are Gaussians and the numbers of their blocks to look at; ``kind`` is CAMERA, NORMALS or LIDAR.
-    ``records`` to ``lists`` are filled in by ``bin_pictures``: see ``records``, ``project_pinhole`` and ``binning``;
-    ``runs`` are the first row and the number of records that each layer has written, by range.
+    ``layers`` are Gaussians and the numbers of their blocks to look at; ``output_kind`` is CAMERA, NORMALS or LIDAR.
+    What follows ``scratch`` is filled in by ``bin_pictures``: ``runs`` are the first row and the number of records that
+    each layer has written, by range.
     """
 
     view: ExposureView
     rays: RayTiles
-    kind: int
+    output_kind: int
     layers: Sequence[tuple[PackedGaussians, Int64[np.ndarray, " b"]]]
-    array: Lend
-    records: Float32[np.ndarray, "n 16"] = field(init=False)
-    keys: Float32[np.ndarray, " n"] = field(init=False)
-    spans: np.ndarray = field(init=False)
-    sources: Int32[np.ndarray, " n"] = field(init=False)
+    scratch: Scratch
+    projected: Projected = field(init=False)
     runs: list[tuple[int, int, int]] = field(init=False)
     order: Int32[np.ndarray, " m"] = field(init=False)
     sorted_spans: np.ndarray = field(init=False)
-    starts: Int64[np.ndarray, " t"] = field(init=False)
-    lists: Int32[np.ndarray, " p"] = field(init=False)
+    binned: TileLists = field(init=False)
     stats: FrameStats = field(default_factory=FrameStats)
 
     @property
@@ -100,7 +97,7 @@ class Picture:
     def scratch_bytes(self) -> int:
         """About how much memory it takes on its way: planes, records, and what sorting them takes."""
         width, height = self.cells
-        planes, normal = (9, 16) if self.kind == NORMALS else (6, 0)
+        planes, normal = (9, 16) if self.output_kind == NORMALS else (6, 0)
         return 4 * planes * width * height + (4 * RECORD + 44 + normal) * self.capacity
 
 
@@ -110,12 +107,13 @@ def draw(pictures: Sequence[Picture], workers: Workers) -> list[Float32[np.ndarr
     results, calls, counts = [], [], []
     with _timed("blend", pictures):
         for picture in pictures:
-            planes = _empty_planes(picture)
+            planes, rays, normals = _empty_planes(picture), sensor_rays(picture), _record_normals(picture)
             results.append(planes)
             for tiles in tile_ranges(picture, workers.threads):
                 done = np.zeros(1, np.int64)
                 counts.append((picture, done))
-                calls.append((draw_tiles, *blend_arguments(picture, tiles), planes, done))
+                calls.append((draw_tiles, rays, picture.projected, picture.binned, normals, picture.output_kind, tiles,
+                              planes, done))  # fmt: skip
         workers.run_calls(calls)
     for picture, done in counts:
         picture.stats.evaluations += int(done[0])
@@ -134,26 +132,29 @@ def bin_pictures(pictures: Sequence[Picture], workers: Workers) -> None:
 
 def tile_ranges(picture: Picture, threads: int) -> list[Int64[np.ndarray, " t"]]:
     """Runs of neighbouring macro tiles, which share records, of about equal work."""
-    work = np.cumsum(np.diff(picture.starts) + 8)
+    work = np.cumsum(np.diff(picture.binned.starts) + 8)
     parts = max(threads * SPLIT if threads > 1 else 1, int(-(-work[-1] // SLICE_PAIRS)))
     cuts = np.searchsorted(work, np.linspace(0, work[-1], parts + 1)[1:-1])
     return [tiles for tiles in np.split(np.arange(picture.tiles), cuts) if len(tiles)]
 
 
-def blend_arguments(picture: Picture, tiles: Int64[np.ndarray, " t"]) -> tuple:
-    """The arguments of ``draw.draw_tiles`` up to the size of the grid."""
-    view, grid = picture.view, picture.view.grid
-    normals = picture.array("no normals", (1, 4), np.float32)
-    if picture.kind == NORMALS:
-        normals = picture.array("normals", (len(picture.records), 4), np.float32)
-    return (view.way, picture.kind, tiles, picture.starts, picture.lists, picture.records, normals, grid.intrinsics,
-            picture.rays.table, picture.rays.line, picture.rays.basis, view.turns, view.places, view.motion,
-            np.float32(grid.near_m), *picture.cells)  # fmt: skip
+def sensor_rays(picture: Picture) -> SensorRays:
+    """A picture's rays as the blending kernels find them."""
+    view, grid, rays = picture.view, picture.view.grid, picture.rays
+    return SensorRays(view.projection_mode, grid.intrinsics, rays.table, rays.line, rays.basis, view.turns, view.places,
+                      view.motion, np.float32(grid.near_m), *picture.cells)  # fmt: skip
+
+
+def _record_normals(picture: Picture) -> Float32[np.ndarray, "n 4"]:
+    """Room for a normal per record; a single one where they are not wanted."""
+    if picture.output_kind == NORMALS:
+        return picture.scratch("normals", (picture.capacity, 4), np.float32)
+    return picture.scratch("no normals", (1, 4), np.float32)
 
 
 def _empty_planes(picture: Picture) -> Float32[np.ndarray, "p h w"]:
     width, height = (-(-cells // MACRO) * MACRO for cells in picture.cells)
-    return np.empty((9 if picture.kind == NORMALS else 6, height, width), np.float32)
+    return np.empty((9 if picture.output_kind == NORMALS else 6, height, width), np.float32)
 
 
 def _project(pictures: Sequence[Picture], workers: Workers) -> None:
@@ -162,29 +163,31 @@ def _project(pictures: Sequence[Picture], workers: Workers) -> None:
     for picture in pictures:
         view, grid = picture.view, picture.view.grid
         most, capacity = BLOCK * (2 if grid.kind == LIDAR_GRID else 1), picture.capacity
-        picture.records = picture.array("records", (capacity, RECORD), np.float32)
-        picture.keys = picture.array("keys", (capacity,), np.float32)
-        picture.spans = picture.array("spans", (capacity, 4), np.int16)
-        picture.sources = picture.array("sources", (capacity,), np.int32)
+        output = picture.projected = Projected(
+            picture.scratch("records", (capacity, RECORD), np.float32),
+            picture.scratch("keys", (capacity,), np.float32),
+            picture.scratch("spans", (capacity, 4), np.int16),
+            picture.scratch("sources", (capacity,), np.int32),
+        )
+        path = LinePath(view.lines, view.steps)
         picture.runs, base = [], 0
         for number, (layer, blocks) in enumerate(picture.layers):
+            chosen = LayerBlocks(layer.fields, layer.sh_rest, blocks)
             for first, last in workers.ranges(len(blocks), 4, SLICE_BLOCKS):
-                outputs = (picture.records, picture.keys, picture.spans, picture.sources, base)
-                what = (layer.fields, layer.sh_rest, blocks, first, last, view.parameters)
-                if view.way in (AFFINE, ROLLING):
-                    calls.append((project_pinhole, *what, view.ends, view.motion, *outputs))
+                what = (chosen, first, last, view.parameters)
+                if view.projection_mode in (AFFINE, ROLLING):
+                    calls.append((project_pinhole, *what, view.ends, view.motion, output, base))
                 else:
-                    chart = grid.chart
-                    tables = (chart.params, chart.places, chart.bends, view.lines, view.steps)
-                    calls.append((project_general, *what, picture.kind == LIDAR, *tables, *outputs))
+                    is_lidar = picture.output_kind == LIDAR
+                    calls.append((project_general, *what, is_lidar, grid.chart, path, output, base))
                 owners.append((picture, number, base))
                 base += most * (last - first)
     for (picture, number, base), count in zip(owners, workers.run_calls(calls), strict=True):
         picture.runs.append((number, base, int(count)))
     shading = [
-        (record_normals, layer.fields, picture.sources, first, count, view_eye(picture),
-         picture.array("normals", (len(picture.records), 4), np.float32))
-        for picture in pictures if picture.kind == NORMALS
+        (record_normals, layer.fields, picture.projected.sources, first, count, view_eye(picture),
+         _record_normals(picture))
+        for picture in pictures if picture.output_kind == NORMALS
         for number, first, count in picture.runs for layer in [picture.layers[number][0]]
     ]  # fmt: skip
     workers.run_calls(shading)
@@ -202,13 +205,15 @@ def _sort(pictures: Sequence[Picture], workers: Workers) -> None:
         counts = np.array([count for _, _, count in picture.runs], np.int64)
         total = int(counts.sum())
         picture.stats.visible = total
-        picture.order = picture.array("order", (total,), np.int32)
-        picture.sorted_spans = picture.array("sorted spans", (total, 4), np.int16)
-        spare = picture.array("sorting", (2, total), np.uint64)
-        near = np.float32(picture.view.grid.near_m)
-        cuts = depth_cuts(picture.keys, starts, counts, workers.threads if len(pictures) < workers.threads else 1)
+        picture.order = picture.scratch("order", (total,), np.int32)
+        picture.sorted_spans = picture.scratch("sorted spans", (total, 4), np.int16)
+        spare = picture.scratch("sorting", (2, total), np.uint64)
+        near, made = np.float32(picture.view.grid.near_m), picture.projected
+        cuts = depth_cuts(
+            picture.projected.keys, starts, counts, workers.threads if len(pictures) < workers.threads else 1
+        )
         calls += [
-            (sort_by_depth, picture.keys, starts, counts, near, low, high, picture.spans, picture.order,
+            (sort_by_depth, made.keys, starts, counts, near, low, high, made.spans, picture.order,
              picture.sorted_spans, spare)
             for low, high in zip(cuts[:-1], cuts[1:], strict=True)
         ]  # fmt: skip
@@ -227,14 +232,15 @@ def _bin(pictures: Sequence[Picture], workers: Workers) -> None:
     )  # fmt: skip
     calls = []
     for picture, ranges, count in zip(pictures, splits, counts, strict=True):
-        picture.starts = np.zeros(picture.tiles + 1, np.int64)
-        np.cumsum(count.sum(axis=0), out=picture.starts[1:])
-        position = picture.starts[:-1] + np.cumsum(count, axis=0) - count
-        picture.stats.pairs = int(picture.starts[-1])
-        picture.lists = picture.array("lists", (picture.stats.pairs + LANES,), np.int32)
+        starts = np.zeros(picture.tiles + 1, np.int64)
+        np.cumsum(count.sum(axis=0), out=starts[1:])
+        position = starts[:-1] + np.cumsum(count, axis=0) - count
+        picture.stats.pairs = int(starts[-1])
+        lists = picture.scratch("lists", (picture.stats.pairs + LANES,), np.int32)
+        picture.binned = TileLists(starts, lists)
         calls += [
             (fill_tiles, picture.sorted_spans, picture.order, first, last, picture.tile_columns, position[k],
-             picture.lists)
+             lists)
             for k, (first, last) in enumerate(ranges)
         ]  # fmt: skip
     workers.run_calls(calls)

@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int16, Int32
 from llvmlite import ir
 
 from nurec_sim.render.cpu.kernel import inner
@@ -47,6 +48,19 @@ VIEW = 25
 
 MACRO = 32
 """Side of the tiles that records are handed out to, in cells."""
+
+
+class Projected(NamedTuple):
+    """What projection writes, a row per record: a Gaussian that may be seen."""
+
+    records: Float32[np.ndarray, "n 16"]
+    """Columns as above."""
+    keys: Float32[np.ndarray, " n"]
+    """Depth to sort by (m): z of the centre, or its distance."""
+    spans: Int16[np.ndarray, "n 4"]
+    """First and last column, first and last row of the macro tiles that may see it."""
+    sources: Int32[np.ndarray, " n"]
+    """Its packed row: 256 times the block plus the place in it."""
 
 
 def view_parameters(
@@ -197,19 +211,25 @@ def lowest_bit(v: Lanes, mask: ir.Value) -> ir.Value:
 
 
 @inner
-def emit(mask, rows, scratch, box, source, n, records, keys, spans, sources):
-    """Write the records of the lanes in ``mask`` from row ``n`` on; returns the row after the last.
+def emit(mask, rows, scratch, box, source, n, output):
+    """Write some records of a group; returns the row after the last.
 
-    ``rows`` and ``scratch`` are what ``build_records`` and ``place`` left, ``box`` [4,LANES] the first and last macro
-    tile column and row, ``source`` the packed row of lane 0.
+    Args:
+        mask: the lanes to write.
+        rows: [LANES,16] what ``build_records`` left.
+        scratch: [SCRATCH,LANES] what ``place`` left.
+        box: [4,LANES] first and last macro tile column, first and last row.
+        source: packed row of lane 0.
+        n: first row to write.
+        output: see ``Projected``.
     """
     while mask != 0:
         lane = lowest_bit(mask)
         mask &= mask - 1
-        copy_record(rows.ctypes.data + lane * (4 * RECORD), records.ctypes.data + n * (4 * RECORD))
-        keys[n] = scratch[DEPTH, lane]
+        copy_record(rows.ctypes.data + lane * (4 * RECORD), output.records.ctypes.data + n * (4 * RECORD))
+        output.keys[n] = scratch[DEPTH, lane]
         for k in range(4):
-            spans[n, k] = np.int16(box[k, lane])
-        sources[n] = source + lane
+            output.spans[n, k] = np.int16(box[k, lane])
+        output.sources[n] = source + lane
         n += 1
     return n

@@ -12,16 +12,16 @@ import numpy as np
 from nurec_sim import geometry
 from nurec_sim.compute.cores import usable_cores
 from nurec_sim.compute.turns import rest
-from nurec_sim.render.cpu.blend.blocks import CAMERA, LIDAR, NORMALS
-from nurec_sim.render.cpu.blend.composite import composite
-from nurec_sim.render.cpu.blend.sweep import sweep_returns
+from nurec_sim.render.cpu.blend.composite import CameraPixels, CameraRays, composite
+from nurec_sim.render.cpu.blend.responses import CAMERA, LIDAR, NORMALS
+from nurec_sim.render.cpu.blend.sweep import SweepFilter, SweepRays, SweepReturns, sweep_returns
 from nurec_sim.render.cpu.blend.tiles import AFFINE, ROLLING
 from nurec_sim.render.cpu.moving import PackedMoving
 from nurec_sim.render.cpu.pack import PackedGaussians, pack
 from nurec_sim.render.cpu.pipeline import NO_TABLE, FrameStats, Picture, blocks_in_view, draw
 from nurec_sim.render.cpu.sensor_tables import SensorCache, SensorTables
 from nurec_sim.render.cpu.view import ExposureView
-from nurec_sim.render.cpu.workers import Buffers, Lend, Workers
+from nurec_sim.render.cpu.workers import Buffers, Scratch, Workers
 from nurec_sim.render.lod import Detail
 from nurec_sim.render.rays import actors_at, reference_pose
 from nurec_sim.render.requests import (
@@ -129,13 +129,13 @@ class CpuRenderer:
         frames: list[SensorFrame] = []
         stats: list[FrameStats] = []
         with ExitStack() as loans:
-            lends: list[Lend] = []
+            scratches: list[Scratch] = []
             group: list[_Begun] = []
             for number, request in enumerate(requests):
                 rest()
-                if len(group) == len(lends):
-                    lends.append(loans.enter_context(self._buffers.lend()))
-                group.append(self._begin(request, outputs, lends[len(group)]))
+                if len(group) == len(scratches):
+                    scratches.append(loans.enter_context(self._buffers.lend()))
+                group.append(self._begin(request, outputs, scratches[len(group)]))
                 held = sum(begun.picture.scratch_bytes for begun in group)
                 if held >= GROUP_BYTES or number == len(requests) - 1:
                     frames += self._finish(group, outputs, filter or LidarFilter())
@@ -143,12 +143,15 @@ class CpuRenderer:
                     group = []
         return frames, stats
 
-    def _begin(self, request: SensorRequest, outputs: Sequence[str], array: Lend) -> _Begun:
+    def _begin(self, request: SensorRequest, outputs: Sequence[str], scratch: Scratch) -> _Begun:
         sensor = self._sensors.tables(request.sensor)
         view = ExposureView.of(sensor.grid, request.world_from_sensor)
-        kind = LIDAR if not isinstance(request.sensor, CameraModel) else NORMALS if "normal" in outputs else CAMERA
-        rays = NO_TABLE if view.way in (AFFINE, ROLLING) else sensor.rays
-        return _Begun(request, sensor, Picture(view, rays, kind, self._layers(request, sensor, view, array), array))
+        output_kind = (
+            LIDAR if not isinstance(request.sensor, CameraModel) else NORMALS if "normal" in outputs else CAMERA
+        )
+        rays = NO_TABLE if view.projection_mode in (AFFINE, ROLLING) else sensor.rays
+        layers = self._layers(request, sensor, view, scratch)
+        return _Begun(request, sensor, Picture(view, rays, output_kind, layers, scratch))
 
     def _finish(self, group: Sequence[_Begun], outputs: Sequence[str], filter: LidarFilter) -> list[SensorFrame]:
         planes = draw([begun.picture for begun in group], self._workers)
@@ -169,30 +172,34 @@ class CpuRenderer:
         assert isinstance(request.sensor, CameraModel)
         grid, view = sensor.grid, picture.view
         height, width = grid.valid.shape
-        rgb, label = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.uint8)
-        depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-        normal = np.empty((height, width, 3) if picture.kind == NORMALS else (0, 0, 3), np.float32)
+        pixels = CameraPixels(
+            rgb=np.empty((height, width, 3), np.uint8),
+            depth=np.empty((height, width), np.float32),
+            alpha=np.empty((height, width), np.float32),
+            label=np.empty((height, width), np.uint8),
+            normal=np.empty((height, width, 3) if picture.output_kind == NORMALS else (0, 0, 3), np.float32),
+        )
         corrected = self.apply_isp and request.apply_isp
         response = self.scene.response(request.sensor.id, request.middle_us) if corrected else None
         isp = IDENTITY_ISP if response is None else np.ascontiguousarray(response, np.float32)
         turn = view.world_from_line[:, :3, :3].astype(np.float32)
-        linear = view.way in (AFFINE, ROLLING)
+        linear = view.projection_mode in (AFFINE, ROLLING)
         ray_z = np.zeros((0, 0), np.float32) if linear else sensor.ray_z
+        rays = CameraRays(ray_z, grid.direction, grid.valid, grid.line, turn)
         self._workers.run(
             composite,
-            [(first, last, planes, ray_z, grid.direction, grid.valid, grid.line, turn, self._sky, isp, rgb, depth,
-              alpha, label, normal)
+            [(first, last, planes, rays, self._sky, isp, pixels)
              for first, last in self._workers.ranges(height, 16, SLICE_RAYS // width)],
         )  # fmt: skip
         return CameraFrame(
             camera=request.sensor,
             start_us=request.start_us,
             end_us=request.end_us,
-            rgb=rgb,
-            depth_m=depth if "depth" in outputs else None,
-            alpha=alpha if "alpha" in outputs else None,
-            label=label if "label" in outputs else None,
-            normal=normal if "normal" in outputs else None,
+            rgb=pixels.rgb,
+            depth_m=pixels.depth if "depth" in outputs else None,
+            alpha=pixels.alpha if "alpha" in outputs else None,
+            label=pixels.label if "label" in outputs else None,
+            normal=pixels.normal if "normal" in outputs else None,
         )
 
     def _lidar_frame(
@@ -205,27 +212,28 @@ class CpuRenderer:
         end_from_line = (
             geometry.inverse(np.asarray(request.world_from_sensor[1], np.float64)) @ picture.view.world_from_line
         )
-        limit = np.inf if filter.distance_threshold_m is None else filter.distance_threshold_m
-        filters = (filter.raydrop_threshold, filter.opacity_threshold, limit)
-        ranges, intensities = np.empty(rows * columns, np.float32), np.empty(rows * columns, np.float32)
-        points, beams = np.empty((rows * columns, 3), np.float32), np.empty(rows * columns, np.int32)
+        offset_m = np.inf if filter.distance_threshold_m is None else filter.distance_threshold_m
+        thresholds = (*request.sensor.range_m, filter.raydrop_threshold, filter.opacity_threshold, offset_m)
+        returns = SweepReturns(
+            np.empty(rows * columns, np.float32),
+            np.empty(rows * columns, np.float32),
+            np.empty((rows * columns, 3), np.float32),
+            np.empty(rows * columns, np.int32),
+        )
+        rays = SweepRays(grid.direction, grid.beam, grid.line, np.ascontiguousarray(end_from_line[:, :3]))
+        limits = SweepFilter(*map(float, thresholds))
         parts = self._workers.ranges(rows, 4, SLICE_RAYS // columns)
         counts = self._workers.run(
-            sweep_returns,
-            [(first, last, planes, grid.direction, grid.beam, grid.line, np.ascontiguousarray(end_from_line[:, :3]),
-              np.array(request.sensor.range_m, np.float64), np.array(filters, np.float64), ranges, intensities, points,
-              beams) for first, last in parts],
-        )  # fmt: skip
+            sweep_returns, [(first, last, planes, rays, limits, returns) for first, last in parts]
+        )
         found = [
             slice(first * columns, first * columns + count) for (first, _), count in zip(parts, counts, strict=True)
         ]
-        xyz, range_m, intensity, beam = (
-            np.concatenate([values[part] for part in found]) for values in (points, ranges, intensities, beams)
-        )
+        range_m, intensity, xyz, beam = (np.concatenate([values[part] for part in found]) for values in returns)
         return LidarFrame(request.sensor, request.start_us, request.end_us, xyz, range_m, intensity, beam)
 
     def _layers(
-        self, request: SensorRequest, sensor: SensorTables, view: ExposureView, array: Lend
+        self, request: SensorRequest, sensor: SensorTables, view: ExposureView, scratch: Scratch
     ) -> list[tuple[PackedGaussians, np.ndarray]]:
         """The static layer, and the dynamic one as it is at the reference instant, with their blocks in view."""
         eye = view.world_from_reference[:3, 3]
@@ -236,6 +244,6 @@ class CpuRenderer:
         if len(self.scene.dynamic):
             _, t_us = reference_pose(request, view.grid.reference)
             actors = actors_at(request, view.grid.reference, self._moving.track_of)
-            moving = self._moving.at(t_us, actors, request.hidden, eye, self._workers, array)
+            moving = self._moving.at(t_us, actors, request.hidden, eye, self._workers, scratch)
             layers.append((moving, blocks_in_view(view, moving)))
         return layers

@@ -75,7 +75,7 @@ class ExposureView:
         return len(self.places) == 1
 
     @cached_property
-    def way(self) -> int:
+    def projection_mode(self) -> int:
         """How the rays are weighed; see ``tiles``."""
         if self.still:
             return AFFINE if self.grid.kind == PINHOLE else TABLE

@@ -17,7 +17,7 @@ SPLIT = 16
 KEPT = 4
 """Sets of scratch arrays that are kept for later frames."""
 
-Lend = Callable[[str, tuple[int, ...], type], np.ndarray]
+Scratch = Callable[[str, tuple[int, ...], type], np.ndarray]
 """Gives an uninitialised array of a name, a shape and a type."""
 
 
@@ -89,7 +89,7 @@ class Buffers:
         self._lock = threading.Lock()
 
     @contextlib.contextmanager
-    def lend(self) -> Iterator[Lend]:
+    def lend(self) -> Iterator[Scratch]:
         """A function that gives an uninitialised array of a name, a shape and a type, the caller's until the end."""
         with self._lock:
             arrays = self._free.pop() if self._free else {}

@@ -14,13 +14,13 @@ from jaxtyping import Float32, Float64, Int32
 from nurec_sim.compute.cores import usable_cores
 from nurec_sim.render.cpu.backward.blend import IMAGE_PLANES, SUMS
 from nurec_sim.render.cpu.backward.project import project_back
-from nurec_sim.render.cpu.backward.repack import repack
-from nurec_sim.render.cpu.backward.tiles import draw_tiles_back, number_slots
+from nurec_sim.render.cpu.backward.repack import RawGaussians, repack
+from nurec_sim.render.cpu.backward.tiles import RecordSlots, draw_tiles_back, number_slots
 from nurec_sim.render.cpu.blend.background import draw_sky, draw_sky_back
-from nurec_sim.render.cpu.blend.blocks import CAMERA, LIDAR
+from nurec_sim.render.cpu.blend.responses import CAMERA, LIDAR
 from nurec_sim.render.cpu.blend.tiles import AFFINE, MOVING, ROLLING
 from nurec_sim.render.cpu.pack import BLOCK, FIELDS, PackedGaussians
-from nurec_sim.render.cpu.pipeline import NO_TABLE, Picture, draw, tile_ranges
+from nurec_sim.render.cpu.pipeline import NO_TABLE, Picture, draw, sensor_rays, tile_ranges
 from nurec_sim.render.cpu.sensor_tables import SensorCache, SensorTables
 from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.cpu.workers import Buffers, Workers
@@ -42,9 +42,9 @@ class ExactView(ExposureView):
     """A view whose rays start where they do; a rolling shutter is not drawn to first order."""
 
     @cached_property
-    def way(self) -> int:
+    def projection_mode(self) -> int:
         """AFFINE, TABLE or MOVING."""
-        return MOVING if super().way == ROLLING else super().way
+        return MOVING if super().projection_mode == ROLLING else super().projection_mode
 
 
 class Frame:
@@ -65,12 +65,12 @@ class Frame:
         self._workers = shared_workers(threads)
         loan = ExitStack()
         weakref.finalize(self, loan.close)
-        self._array = loan.enter_context(_BUFFERS.lend())
+        self._scratch = loan.enter_context(_BUFFERS.lend())
 
     @property
     def ray_z(self) -> Float32[np.ndarray, "h w"] | None:
         """Depth per distance along each ray; None where distances are depths already."""
-        return None if self.view.way == AFFINE else self.sensor.grid.direction[..., 2]
+        return None if self.view.projection_mode == AFFINE else self.sensor.grid.direction[..., 2]
 
     def draw_sky(self, sky: Float32[np.ndarray, "6 s s 3"]) -> Float32[np.ndarray, "3 h w"]:
         """Colours of a cubemap behind every ray."""
@@ -101,18 +101,18 @@ class Frame:
         features: Float32[np.ndarray, "n 3"],
     ) -> Float32[np.ndarray, "6 h w"]:
         """Blended planes: alpha, three features, distance, half distance; sides are rounded up to whole macro tiles."""
+        gaussians = RawGaussians(mean, quat, scale, opacity, features)
         blocks = -(-len(mean) // BLOCK)
-        packed = self._array("fields", (blocks, FIELDS, BLOCK), np.float32)
+        packed = self._scratch("fields", (blocks, FIELDS, BLOCK), np.float32)
         self._workers.run(
             repack,
-            [(first, last, mean, quat, scale, opacity, features, self.lidar, packed)
-             for first, last in self._workers.ranges(blocks, 8)],
-        )  # fmt: skip
+            [(first, last, gaussians, self.lidar, packed) for first, last in self._workers.ranges(blocks, 8)],
+        )
         nothing = np.zeros((0, 0, 0), np.float32)
         layer = PackedGaussians(packed, nothing, np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros(0))
-        rays = NO_TABLE if self.view.way == AFFINE else self.sensor.rays
-        kind = LIDAR if self.lidar else CAMERA
-        self._picture = Picture(self.view, rays, kind, [(layer, np.arange(blocks))], self._array)
+        rays = NO_TABLE if self.view.projection_mode == AFFINE else self.sensor.rays
+        output_kind = LIDAR if self.lidar else CAMERA
+        self._picture = Picture(self.view, rays, output_kind, [(layer, np.arange(blocks))], self._scratch)
         self.planes = draw([self._picture], self._workers)[0]
         return self.planes
 
@@ -121,7 +121,7 @@ class Frame:
         """Rows of the Gaussians that can be seen in the frame, rising; others have no gradient."""
         # Every run takes its blocks in their order, and the runs follow each other.
         picture = self._picture
-        return np.concatenate([picture.sources[first : first + many] for _, first, many in picture.runs])
+        return np.concatenate([picture.projected.sources[first : first + many] for _, first, many in picture.runs])
 
     def draw_back(
         self,
@@ -142,31 +142,31 @@ class Frame:
         """
         picture, grid = self._picture, self.sensor.grid
         height, width = grid.valid.shape
-        gradients = self._array("gradients", self.planes.shape, np.float32)
+        gradients = self._scratch("gradients", self.planes.shape, np.float32)
         gradients[:] = 0
         for plane, values in by_planes.items():
             gradients[plane : plane + (len(values) if values.ndim == 3 else 1), :height, :width] = values
         assert len(gradients) == IMAGE_PLANES
         starts = np.array([first for _, first, _ in picture.runs], np.int64)
         counts = np.array([count for _, _, count in picture.runs], np.int64)
-        first_slot = self._array("first slot", (len(picture.records),), np.int64)
-        pairs = number_slots(picture.spans, starts, counts, first_slot)
-        slots = self._array("slots", (pairs, SUMS), np.float32)
-        view, rays = self.view, picture.rays
+        first_slot = self._scratch("first slot", (picture.capacity,), np.int64)
+        pairs = number_slots(picture.projected.spans, starts, counts, first_slot)
+        slots = RecordSlots(first_slot, self._scratch("slots", (pairs, SUMS), np.float32))
+        rays = sensor_rays(picture)
         self._workers.run(
             draw_tiles_back,
-            [(view.way, picture.kind, tiles, picture.starts, picture.lists, picture.records, picture.spans, first_slot,
-              grid.intrinsics, rays.table, rays.line, rays.basis, view.turns, view.places, view.motion,
-              np.float32(grid.near_m), width, height, self.planes, gradients, slots)
+            [(rays, picture.projected, picture.binned, picture.output_kind, tiles, self.planes, gradients, slots)
              for tiles in tile_ranges(picture, self._workers.threads)],
         )  # fmt: skip
-        pose, count = view.world_from_reference, len(mean)
-        shares = [np.zeros((count, *width), np.float32) for width in ((3,), (4,), (3,), (), (3,))]
+        pose, count = self.view.world_from_reference, len(mean)
+        shares = RawGaussians(*(np.zeros((count, *width), np.float32) for width in ((3,), (4,), (3,), (), (3,))))
+        # The features are not needed: what is drawn is linear in them.
+        gaussians = RawGaussians(mean, quat, scale, opacity, shares.features)
         forces = np.zeros((-(-count // BLOCK), 6))
         self._workers.run(
             project_back,
-            [(first, many, picture.records, picture.spans, picture.sources, first_slot, slots, mean, quat, scale,
-              opacity, pose, *shares, forces) for _, first, many in picture.runs],
+            [(first, many, picture.projected, slots, gaussians, pose, shares, forces)
+             for _, first, many in picture.runs],
         )  # fmt: skip
         return *shares, pose_gradient(forces[:, :3].sum(axis=0), forces[:, 3:].sum(axis=0), pose)
 

@@ -90,47 +90,36 @@ def _kernel_matrix(sums, inverse_n, frame, out):
 
 
 @kernel
-def project_back(
-    first, count, records, spans, sources, first_slot, slots, mean, quat, scale, opacity, world_from_sensor,
-    by_mean, by_quat, by_scale, by_opacity, by_features, pose,
-):  # fmt: skip
+def project_back(first, count, projected, slots, gaussians, world_from_sensor, by, pose):
     """Add the gradients of a run of records to those of their Gaussians and of the pose.
 
     Args:
         first: first record.
         count: how many.
-        records: see ``records``.
-        spans: [n,4] macro tiles of the records.
-        sources: [n] their Gaussians.
-        first_slot: [n] first slot of each.
-        slots: [pairs,SUMS] what ``backward.draw_tiles_back`` left.
-        mean: [g,3] of the Gaussians.
-        quat: [g,4].
-        scale: [g,3].
-        opacity: [g].
+        projected: see ``records.Projected``.
+        slots: see ``tiles.RecordSlots``: what ``draw_tiles_back`` left.
+        gaussians: see ``repack.RawGaussians``.
         world_from_sensor: [4,4] float64, at the reference instant.
-        by_mean: [g,3] float32 gradients, added to, like the following four.
-        by_quat: [g,4].
-        by_scale: [g,3].
-        by_opacity: [g].
-        by_features: [g,3].
+        by: gradients by ``gaussians``, added to.
         pose: [blocks,6] float64 per block of 256 Gaussians, added to: force on the eye, torque about it, in the world.
     """
     sums, axes, frame = np.empty(SUMS), np.empty((3, 3)), np.empty((3, 3))
     offset, ball, by_ball, force, s = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     inverse_s, k_ = np.empty(3), np.empty((3, 3))
+    mean, quat, scale, opacity, _ = gaussians
+    spans = projected.spans
     for i in range(first, first + count):
         tiles = (np.int64(spans[i, 1]) - spans[i, 0] + 1) * (np.int64(spans[i, 3]) - spans[i, 2] + 1)
         sums[:] = 0.0
-        for slot in range(first_slot[i], first_slot[i] + tiles):
+        for slot in range(slots.first[i], slots.first[i] + tiles):
             for k in range(SUMS):
-                sums[k] += slots[slot, k]
+                sums[k] += slots.sums[slot, k]
         some = False
         for k in range(SUMS):
             some |= sums[k] != 0.0
         if not some:
             continue
-        g = sources[i]
+        g = projected.sources[i]
         norm = math.sqrt(
             np.float64(quat[g, 0]) ** 2 + np.float64(quat[g, 1]) ** 2
             + np.float64(quat[g, 2]) ** 2 + np.float64(quat[g, 3]) ** 2
@@ -144,7 +133,7 @@ def project_back(
             inverse_s[k] = 1 / s[k]
         for k in range(3):
             ball[k] = (axes[0, k] * offset[0] + axes[1, k] * offset[1] + axes[2, k] * offset[2]) * inverse_s[k]
-        n = _frame(axes, s, ball, records, i, world_from_sensor, frame)
+        n = _frame(axes, s, ball, projected.records, i, world_from_sensor, frame)
         inverse_n = 1 / n
         inverse = inverse_n * inverse_n
         across = 4 * sums[S_WX] * inverse - sums[S_XW] / 4
@@ -158,17 +147,17 @@ def project_back(
         tx = k_[1, 2] * (s[2] * inverse_s[1] - s[1] * inverse_s[2])
         ty = k_[2, 0] * (s[0] * inverse_s[2] - s[2] * inverse_s[0])
         tz = k_[0, 1] * (s[1] * inverse_s[0] - s[0] * inverse_s[1])
-        by_quat[g, 0] += (-q[1] * tx - q[2] * ty - q[3] * tz) * 2 * shrink
-        by_quat[g, 1] += (q[0] * tx + q[2] * tz - q[3] * ty) * 2 * shrink
-        by_quat[g, 2] += (q[0] * ty + q[3] * tx - q[1] * tz) * 2 * shrink
-        by_quat[g, 3] += (q[0] * tz + q[1] * ty - q[2] * tx) * 2 * shrink
+        by.quat[g, 0] += (-q[1] * tx - q[2] * ty - q[3] * tz) * 2 * shrink
+        by.quat[g, 1] += (q[0] * tx + q[2] * tz - q[3] * ty) * 2 * shrink
+        by.quat[g, 2] += (q[0] * ty + q[3] * tx - q[1] * tz) * 2 * shrink
+        by.quat[g, 3] += (q[0] * tz + q[1] * ty - q[2] * tx) * 2 * shrink
         for k in range(3):
-            by_mean[g, k] += force[k]
+            by.mean[g, k] += force[k]
             if scale[g, k] >= MIN_SCALE_M:
-                by_scale[g, k] -= k_[k, k] * inverse_s[k]
-            by_features[g, k] += sums[S_FEATURE + k]
+                by.scale[g, k] -= k_[k, k] * inverse_s[k]
+            by.features[g, k] += sums[S_FEATURE + k]
         if opacity[g] < MAX_OPACITY:
-            by_opacity[g] -= sums[S_FADE] / (8 * np.float64(opacity[g]))
+            by.opacity[g] -= sums[S_FADE] / (8 * np.float64(opacity[g]))
         part = g // BLOCK
         for k in range(3):
             i1, i2 = (k + 1) % 3, (k + 2) % 3

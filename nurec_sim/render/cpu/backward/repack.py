@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float32
 
 from nurec_sim.render.cpu.kernel import f4, inner, kernel
 from nurec_sim.render.cpu.pack import (
@@ -23,9 +25,22 @@ from nurec_sim.render.cpu.pack import (
 from nurec_sim.render.layers import LARGEST
 
 
+class RawGaussians(NamedTuple):
+    """Gaussians as a caller has them, or gradients by them; units as in ``types.Gaussians``."""
+
+    mean: Float32[np.ndarray, "n 3"]
+    quat: Float32[np.ndarray, "n 4"]
+    """Of any norm."""
+    scale: Float32[np.ndarray, "n 3"]
+    opacity: Float32[np.ndarray, " n"]
+    features: Float32[np.ndarray, "n 3"]
+    """Colours, or of LiDARs intensity, whether it is known, and drop probability."""
+
+
 @inner
-def _drawable(mean, quat, scale, opacity, features, i):
+def _drawable(gaussians, i):
     """What ``pack.drawable`` tests; written so that NaN fails."""
+    mean, quat, scale, opacity, features = gaussians
     norm = 0.0
     good = opacity[i] >= f4(1 / 255) and opacity[i] <= f4(LARGEST)
     for k in range(3):
@@ -38,27 +53,24 @@ def _drawable(mean, quat, scale, opacity, features, i):
 
 
 @kernel
-def repack(first, last, mean, quat, scale, opacity, features, lidar, fields):
+def repack(first, last, gaussians, lidar, fields):
     """Fill blocks of ``fields``; row i of the Gaussians becomes packed row i.
 
     Args:
         first: first block.
         last: one behind the last.
-        mean: [n,3] float32.
-        quat: [n,4] of any norm.
-        scale: [n,3].
-        opacity: [n].
-        features: [n,3] colours, or intensity, whether it is known, and drop probability.
-        lidar: whether the features are the latter.
+        gaussians: see ``RawGaussians``.
+        lidar: whether the features are those of a LiDAR.
         fields: [blocks,21,256] output, see ``pack``; only what a frame without normals reads.
     """
     feature = INTENSITY if lidar else COLOUR
+    mean, quat, scale, opacity, features = gaussians
     for block in range(first, last):
         out = fields[block]
         out[LABEL] = f4(0)
         for k in range(BLOCK):
             i = block * BLOCK + k
-            if i >= len(mean) or not _drawable(mean, quat, scale, opacity, features, i):
+            if i >= len(mean) or not _drawable(gaussians, i):
                 for c in range(3):
                     out[MEAN + c, k], out[feature + c, k], out[SCALE + c, k] = f4(0), f4(0), f4(1)
                 for c in range(4):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float32, Int32, UInt8
 from llvmlite import ir
 
 from nurec_sim.render.cpu.kernel import f4, inner, kernel
@@ -17,6 +20,30 @@ VISIBLE_SKY = 1e-4
 
 # Planes of a picture, see ``draw.draw_tiles``; the last two come after the normals.
 ALPHA, COLOUR = 0, 1
+
+
+class CameraRays(NamedTuple):
+    """A camera's rays by pixel, as the finishing pass reads them; see ``grid.Grid``."""
+
+    ray_z: Float32[np.ndarray, "h w"]
+    """Depth per distance: z of the unit rays; [0,0] where distances are depths already."""
+    direction: Float32[np.ndarray, "h w 3"]
+    """Unit rays in the sensor's frame."""
+    valid: UInt8[np.ndarray, "h w"]
+    line: Int32[np.ndarray, "h w"]
+    world_from_line: Float32[np.ndarray, "l 3 3"]
+    """Turns a line's rays into the world; a single one where nothing moves."""
+
+
+class CameraPixels(NamedTuple):
+    """Pixels of a finished camera frame."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    depth: Float32[np.ndarray, "h w"]
+    alpha: Float32[np.ndarray, "h w"]
+    label: UInt8[np.ndarray, "h w"]
+    normal: Float32[np.ndarray, "h w 3"]
+    """[0,0,3] where it is not wanted."""
 
 
 @inner
@@ -137,28 +164,20 @@ def _normals(planes, valid, y, width, normal):
 
 
 @kernel
-def composite(
-    first, last, planes, ray_z, direction, valid, line, world_from_line, sky, isp, rgb, depth, alpha, label, normal
-):
+def composite(first, last, planes, rays, sky, isp, pixels):
     """Finish the rows first..last of a camera frame.
 
     Args:
         first: first row.
         last: one behind the last.
         planes: see ``draw.draw_tiles``; rows are at least LANES longer than the last group of pixels begins.
-        ray_z: [h,w] z of the unit rays, or [0,0] where distances are depths already.
-        direction: [h,w,3] rays in the sensor's frame, with valid and line as in ``Grid``.
-        valid: [h,w].
-        line: [h,w].
-        world_from_line: [l,3,3] turns a line's rays into the world; a single one where nothing moves.
+        rays: see ``CameraRays``.
         sky: cubemap [6,s,s,3].
         isp: [3,4].
-        rgb: output [h,w,3] uint8.
-        depth: output [h,w].
-        alpha: output [h,w].
-        label: output [h,w] uint8.
-        normal: output [h,w,3], or [0,0,3].
+        pixels: output, see ``CameraPixels``.
     """
+    ray_z, direction, valid, line, world_from_line = rays
+    rgb, depth, alpha, label, normal = pixels
     width = valid.shape[1]
     behind = np.zeros((3, LANES), np.float32)
     colours, labels, depths = np.empty(3 * LANES, np.uint8), np.empty(LANES, np.uint8), np.empty(LANES, np.float32)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Int32, Int64
 
 from nurec_sim.render.cpu.blend.blocks import (
-    CAMERA,
-    LIDAR,
     MOST_PLANES,
-    NORMALS,
-    RAY_PLANES,
     blend_affine_camera,
     blend_affine_camera_near,
     blend_affine_normals,
@@ -24,6 +23,7 @@ from nurec_sim.render.cpu.blend.blocks import (
     write_block_9,
 )
 from nurec_sim.render.cpu.blend.rays import moving_tile, pinhole_basis, rolling_basis
+from nurec_sim.render.cpu.blend.responses import CAMERA, LIDAR, NORMALS, RAY_PLANES
 from nurec_sim.render.cpu.blend.tiles import (
     ACROSS,
     AFFINE,
@@ -52,6 +52,9 @@ from nurec_sim.render.cpu.records import MACRO, RECORD
 from nurec_sim.render.cpu.simd import LANES, prefetch
 
 LINE_BYTES = 64
+"""Of a cache line."""
+RAY_BYTES = 4 * RAY_PLANES * RAYS
+"""Of a block's rays."""
 
 
 @inner
@@ -62,153 +65,182 @@ def aligned(count):
     return memory[skip : skip + count]
 
 
+class TileLists(NamedTuple):
+    """Which records each macro tile may see, front to back."""
+
+    starts: Int64[np.ndarray, " tiles+1"]
+    """Where each tile's list starts."""
+    lists: Int32[np.ndarray, " pairs"]
+    """Numbers of records, tile after tile; LANES more entries than used."""
+
+
 @inner
-def prepare(way, ids, records, count, alive, basis, coefficients, lists, counts, entry):
-    """The preparation of a way; see ``tiles``."""
-    if way == AFFINE:
+def _prepare(mode, ids, records, count, alive, basis, coefficients, lists, counts, entry):
+    """The preparation of a projection mode; see ``tiles``."""
+    if mode == AFFINE:
         return prepare_affine(ids, records, count, alive, basis, coefficients, lists, counts, entry)
-    if way == ROLLING:
+    if mode == ROLLING:
         return prepare_rolling(ids, records, count, alive, basis, coefficients, lists, counts, entry)
-    if way == TABLE:
+    if mode == TABLE:
         return prepare_table(ids, records, count, alive, basis, coefficients, lists, counts, entry)
     return prepare_moving(ids, records, count, alive, basis, coefficients, lists, counts, entry)
 
 
 @inner
-def blend_block(way, kind, close, state, numbers, count, coefficients, rays, basis, x0, y0, near):
-    """Blend a list into a block the right way; see ``blend``."""
-    if way == AFFINE or way == ROLLING:
-        if kind == NORMALS:
+def prepare_batch(mode, lists, first, last, end, records_at, alive, basis_at, coefficients, chosen, listed):
+    """Prepare the records ``lists[first:last]`` for the blocks that still want some; 1 if any is close, else 0.
+
+    Args:
+        mode: projection mode.
+        lists: see ``TileLists``.
+        first: first entry of the batch.
+        last: one behind its last.
+        end: one behind the tile's last.
+        records_at: address of the records.
+        alive: bit k is set while block k still wants records.
+        basis_at: address of the tile's basis.
+        coefficients: [COEFFICIENTS,BATCH] output.
+        chosen: [BLOCKS,LIST] output: numbers within the batch of the records that each block sees.
+        listed: [BLOCKS] output: how many they are.
+    """
+    for block in range(BLOCKS):
+        listed[block] = 0
+    close = np.int64(0)
+    for j in range(first, last, LANES):
+        for ahead in range(j + LANES, min(j + 2 * LANES, end)):
+            prefetch(records_at + np.int64(lists[ahead]) * (4 * RECORD))
+        close |= _prepare(mode, lists.ctypes.data + 4 * j, records_at, min(last - j, LANES), alive, basis_at,
+                          coefficients.ctypes.data, chosen.ctypes.data, listed.ctypes.data, j - first)  # fmt: skip
+    return close
+
+
+@inner
+def tile_geometry(rays, tile, turned, basis):
+    """Describe a macro tile's rays.
+
+    Args:
+        rays: see ``rays.SensorRays``.
+        tile: number of the macro tile.
+        turned: [BLOCKS,RAY_PLANES,RAYS] scratch: rays turned into the reference frame (MOVING).
+        basis: [BANDS,BASIS] scratch: the tile's bases (all but TABLE).
+
+    Returns:
+        Its row and column, the addresses of its rays (0 where a formula gives them) and of its bases, and the blocks
+        that lie in the grid, a bit each.
+    """
+    columns = (rays.width + MACRO - 1) // MACRO
+    row, column = tile // columns, tile % columns
+    wide, high = min(MACRO, rays.width - column * MACRO), min(MACRO, rays.height - row * MACRO)
+    rays_at, basis_at = np.int64(0), np.int64(basis.ctypes.data)
+    if rays.mode == TABLE:
+        rays_at = rays.table.ctypes.data + tile * (BLOCKS * RAY_BYTES)
+        basis_at = rays.basis.ctypes.data + tile * (4 * BANDS * BASIS)
+    elif rays.mode == MOVING:
+        line_poses = (rays.turns, rays.places)
+        moving_tile(rays.table[tile], rays.line[tile], line_poses, wide, high, rays.motion, turned, basis)
+        rays_at = turned.ctypes.data
+    else:
+        pinhole_basis(rays.intrinsics, column, row, basis[0])
+        if rays.mode == ROLLING:
+            rolling_basis(rays.motion, row, basis[0])
+    inside = 0
+    for block in range(BLOCKS):
+        if block % ACROSS * WIDE < wide and block // ACROSS * HIGH < high:
+            inside |= 1 << block
+    return row, column, rays_at, basis_at, inside
+
+
+@inner
+def _blend_block(mode, output_kind, close, state, numbers, count, coefficients, rays, basis, x0, y0, near):
+    """Blend a list into a block with the code for a mode and an output kind; see ``blocks``."""
+    if mode == AFFINE or mode == ROLLING:
+        if output_kind == NORMALS:
             return blend_affine_normals(state, numbers, count, coefficients, rays, basis, x0, y0, near)
         if close:
             return blend_affine_camera_near(state, numbers, count, coefficients, rays, basis, x0, y0, near)
         return blend_affine_camera(state, numbers, count, coefficients, rays, basis, x0, y0, near)
-    if way == TABLE:
-        if kind == CAMERA:
+    if mode == TABLE:
+        if output_kind == CAMERA:
             return blend_table_camera(state, numbers, count, coefficients, rays, basis, x0, y0, near)
-        if kind == NORMALS:
+        if output_kind == NORMALS:
             return blend_table_normals(state, numbers, count, coefficients, rays, basis, x0, y0, near)
         return blend_table_lidar(state, numbers, count, coefficients, rays, basis, x0, y0, near)
-    if kind == CAMERA:
+    if output_kind == CAMERA:
         return blend_moving_camera(state, numbers, count, coefficients, rays, basis, x0, y0, near)
-    if kind == NORMALS:
+    if output_kind == NORMALS:
         return blend_moving_normals(state, numbers, count, coefficients, rays, basis, x0, y0, near)
     return blend_moving_lidar(state, numbers, count, coefficients, rays, basis, x0, y0, near)
 
 
 @kernel
-def draw_tiles(
-    way, kind, tiles, starts, lists, records, normals, intrinsics, table, line, bases, turns, places, motion,
-    near, width, height, planes, counts,
-):  # fmt: skip
+def draw_tiles(rays, projected, binned, normals, output_kind, tiles, planes, counts):
     """Blend the given macro tiles into ``planes``.
 
     Args:
-        way: AFFINE, ROLLING (pinholes), TABLE or MOVING (everything else, at one pose or several).
-        kind: CAMERA, NORMALS or LIDAR.
-        tiles: numbers of the macro tiles to do.
-        starts: [tiles+1] where each tile's list starts.
-        lists: record numbers front to back, tile after tile; LANES more entries than used.
-        records: see ``records``.
+        rays: see ``rays.SensorRays``.
+        projected: see ``records.Projected``.
+        binned: see ``TileLists``.
         normals: [n,4] a normal per record (NORMALS).
-        intrinsics: fx, fy, cx, cy (pinholes).
-        table: see ``rays.RayTiles``, as line and bases (TABLE, MOVING).
-        line: see table.
-        bases: see table.
-        turns: [lines,9] rotation of each line into the reference frame (MOVING).
-        places: [lines] where each line's origin lies on the sensor's way (MOVING).
-        motion: see ``rays.rolling_basis``; its velocity for MOVING, too.
-        near: near plane.
-        width: columns of the grid.
-        height: rows of the grid.
+        output_kind: CAMERA, NORMALS or LIDAR.
+        tiles: numbers of the macro tiles to do.
         planes: [6 or 9,h,w] output, sides rounded up to whole blocks: alpha, features, distance, tagged weight or half.
         counts: [1] int64, the number of responses evaluated is added.
     """
-    count_planes = 9 if kind == NORMALS else 6
-    state, rays = aligned(BLOCKS * MOST_PLANES * RAYS), aligned(BLOCKS * RAY_PLANES * RAYS)
-    coefficients, basis = (
-        aligned(COEFFICIENTS * BATCH).reshape(COEFFICIENTS, BATCH),
-        np.zeros((BANDS, BASIS), np.float32),
-    )
-    batch = BATCH if kind == LIDAR else CAMERA_BATCH
+    count_planes = 9 if output_kind == NORMALS else 6
+    state, turned = aligned(BLOCKS * MOST_PLANES * RAYS), aligned(BLOCKS * RAY_PLANES * RAYS)
+    coefficients = aligned(COEFFICIENTS * BATCH).reshape(COEFFICIENTS, BATCH)
+    basis = np.zeros((BANDS, BASIS), np.float32)
+    batch = BATCH if output_kind == LIDAR else CAMERA_BATCH
     chosen, listed = np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
-    turned = rays.reshape(BLOCKS, RAY_PLANES, RAYS)
-    columns = (width + MACRO - 1) // MACRO
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
-    block_bytes, ray_bytes = 4 * count_planes * RAYS, 4 * RAY_PLANES * RAYS
-    state_at, coefficients_at, basis_at = state.ctypes.data, coefficients.ctypes.data, basis.ctypes.data
-    chosen_at, listed_at, lists_at, records_at = (
-        chosen.ctypes.data,
-        listed.ctypes.data,
-        lists.ctypes.data,
-        records.ctypes.data,
-    )
+    block_bytes = 4 * count_planes * RAYS
+    state_at, coefficients_at, chosen_at = state.ctypes.data, coefficients.ctypes.data, chosen.ctypes.data
+    records_at, lists = projected.records.ctypes.data, binned.lists
     evaluations = 0
     for index in range(tiles.shape[0]):
         tile = np.int64(tiles[index])
-        row, column = tile // columns, tile % columns
-        wide, high = min(MACRO, width - column * MACRO), min(MACRO, height - row * MACRO)
-        rays_at = np.int64(0)
-        if way == TABLE:
-            rays_at = table.ctypes.data + tile * (BLOCKS * ray_bytes)
-            basis_at = bases.ctypes.data + tile * (4 * BANDS * BASIS)
-        elif way == MOVING:
-            moving_tile(table[tile], line[tile], turns, places, wide, high, motion, turned, basis)
-            rays_at = rays.ctypes.data
-        else:
-            pinhole_basis(intrinsics, column, row, basis[0])
-            if way == ROLLING:
-                rolling_basis(motion, row, basis[0])
-        alive = 0
+        row, column, rays_at, basis_at, inside = tile_geometry(
+            rays, tile, turned.reshape(BLOCKS, RAY_PLANES, RAYS), basis
+        )
         for block in range(BLOCKS):
-            open_block(state_at + block * block_bytes, count_planes, rays_at + block * ray_bytes if rays_at else 0)
-            if block % ACROSS * WIDE < wide and block // ACROSS * HIGH < high:
-                alive |= 1 << block
-        alive_now = alive
-        j, end = np.int64(starts[tile]), np.int64(starts[tile + 1])
-        while j < end and alive_now != 0:
-            batch_end = min(end, j + batch)
-            for block in range(BLOCKS):
-                listed[block] = 0
-            entry = 0
-            first = j
-            close = np.int64(0)
-            while j < batch_end:
-                for ahead in range(j + LANES, min(j + 2 * LANES, end)):
-                    prefetch(records_at + np.int64(lists[ahead]) * (4 * RECORD))
-                some_count = min(batch_end - j, LANES)
-                close |= prepare(way, lists_at + 4 * j, records_at, some_count, alive_now, basis_at,
-                                 coefficients_at, chosen_at, listed_at, entry)  # fmt: skip
-                entry += LANES
-                j += LANES
-            if kind == NORMALS:
-                for k in range(first, batch_end):
+            open_block(state_at + block * block_bytes, count_planes, rays_at + block * RAY_BYTES if rays_at else 0)
+        alive = inside
+        first, end = np.int64(binned.starts[tile]), np.int64(binned.starts[tile + 1])
+        # A tile is done when its list ends, or when all of its rays are opaque.
+        while first < end and alive != 0:
+            last = min(end, first + batch)
+            close = prepare_batch(
+                rays.mode, lists, first, last, end, records_at, alive, basis_at, coefficients, chosen, listed
+            )
+            if output_kind == NORMALS:
+                for k in range(first, last):
                     for c in range(3):
                         coefficients[C_NORMAL + c, k - first] = normals[np.uint64(lists[k]), c]
-            j = batch_end
             for block in range(BLOCKS):
                 n = listed[block]
                 if n > 0:
                     evaluations += n * RAYS
-                    more = blend_block(
-                        way, kind, close != 0, state_at + block * block_bytes, chosen_at + block * LIST, n,
-                        coefficients_at, rays_at + block * ray_bytes, basis_at, f4(block % ACROSS * WIDE) - f4(15.5),
-                        f4(block // ACROSS * HIGH) - f4(15.5), near,
+                    more = _blend_block(
+                        rays.mode, output_kind, close != 0, state_at + block * block_bytes, chosen_at + block * LIST, n,
+                        coefficients_at, rays_at + block * RAY_BYTES, basis_at,
+                        f4(block % ACROSS * WIDE) - f4(15.5), f4(block // ACROSS * HIGH) - f4(15.5), rays.near,
                     )  # fmt: skip
                     if more == 0:
-                        alive_now &= ~(1 << block)
+                        alive &= ~(1 << block)
+            first = last
         for block in range(BLOCKS):
-            if (alive >> block) & 1:
+            if (inside >> block) & 1:
                 y, x = row * MACRO + block // ACROSS * HIGH, column * MACRO + block % ACROSS * WIDE
                 target = planes.ctypes.data + y * row_bytes + 4 * x
-                if kind == NORMALS:
+                if output_kind == NORMALS:
                     write_block_9(state_at + block * block_bytes, target, row_bytes, plane_bytes)
                 else:
                     write_block_6(state_at + block * block_bytes, target, row_bytes, plane_bytes)
     keep_alive(state)
     keep_alive(chosen)
-    keep_alive(rays)
+    keep_alive(turned)
     keep_alive(coefficients)
+    keep_alive(basis)
     counts[0] += evaluations
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Int16
 
 from nurec_sim.compute.turns import rest
-from nurec_sim.render.cpu.blend.blocks import DX, DY, DZ, PLACE, RAY_PLANES, VALID
+from nurec_sim.render.cpu.blend.responses import DX, DY, DZ, PLACE, RAY_PLANES, VALID
 from nurec_sim.render.cpu.blend.tiles import (
     ACROSS,
     B_BEND,
@@ -48,6 +49,33 @@ class RayTiles:
     table: Float32[np.ndarray, "tiles 32 5 32"]
     line: Int16[np.ndarray, "tiles 32 32"]
     basis: Float32[np.ndarray, "tiles 4 16"]
+
+
+class SensorRays(NamedTuple):
+    """How the blending kernels find the rays of a macro tile; what is not named for a mode is not read in it."""
+
+    mode: int
+    """AFFINE, ROLLING (pinholes), TABLE or MOVING (everything else, at one pose or several), see ``tiles``."""
+    intrinsics: Float32[np.ndarray, " 4"]
+    """fx, fy, cx, cy in pixels (AFFINE, ROLLING)."""
+    table: Float32[np.ndarray, "tiles 32 5 32"]
+    """See ``RayTiles`` (TABLE, MOVING)."""
+    line: Int16[np.ndarray, "tiles 32 32"]
+    """See ``RayTiles`` (MOVING)."""
+    basis: Float32[np.ndarray, "tiles 4 16"]
+    """See ``RayTiles`` (TABLE)."""
+    turns: Float32[np.ndarray, "lines 9"]
+    """Rotation of each line into the reference frame (MOVING)."""
+    places: Float32[np.ndarray, " lines"]
+    """Where each line's origin lies on the sensor's way (MOVING)."""
+    motion: Float32[np.ndarray, " 8"]
+    """See ``rolling_basis`` (ROLLING); its velocity for MOVING, too."""
+    near: np.float32
+    """Near plane: metres along the optical axis, for LiDARs along the beam."""
+    width: int
+    """Columns of the grid."""
+    height: int
+    """Rows of the grid."""
 
 
 def tile_rays(grid: Grid) -> RayTiles:
@@ -140,8 +168,9 @@ def _all_bases(table, columns, width, height, basis):
 
 
 @inner
-def turn_rays(rays, line, turns, places, out):
+def turn_rays(rays, line, line_poses, out):
     """Rays of a macro tile in the reference frame, each by the rotation and with the place of its own line."""
+    turns, places = line_poses
     for block in range(BLOCKS):
         for k in range(RAYS):
             i = np.uint64(line[block, k])
@@ -154,9 +183,20 @@ def turn_rays(rays, line, turns, places, out):
 
 
 @inner
-def moving_tile(rays, line, turns, places, wide, high, motion, out, bases):
-    """Turn a macro tile's rays and describe its bands, for a sensor whose velocity is ``motion[:3]``."""
-    turn_rays(rays, line, turns, places, out)
+def moving_tile(rays, line, line_poses, wide, high, motion, out, bases):
+    """Turn a macro tile's rays and describe its bands.
+
+    Args:
+        rays: [BLOCKS,RAY_PLANES,RAYS] the tile's rays in the sensor's own frame.
+        line: [BLOCKS,RAYS] the line of each.
+        line_poses: ``turns`` and ``places`` of the lines, see ``SensorRays``.
+        wide: columns of the tile that belong to the grid.
+        high: its rows.
+        motion: the sensor's velocity and more, see ``rolling_basis``.
+        out: output, as ``rays``: in the reference frame.
+        bases: [BANDS,BASIS] output.
+    """
+    turn_rays(rays, line, line_poses, out)
     for band in range(BANDS):
         table_basis(out, wide, high, band, bases[band])
         for k in range(3):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float32, Float64, Int32
 
 from nurec_sim.render.cpu.kernel import kernel
 
@@ -11,30 +14,57 @@ ALPHA, INTENSITY, KNOWN, DROP, DISTANCE, HALF = 0, 1, 2, 3, 4, 5
 MIN_ALPHA = 1 / 255
 
 
+class SweepRays(NamedTuple):
+    """A LiDAR's rays by cell of its grid; see ``grid.Grid``."""
+
+    direction: Float32[np.ndarray, "h w 3"]
+    """Unit rays in the sensor's frame."""
+    beam: Int32[np.ndarray, "h w"]
+    """Number of each cell's beam; a row's beams are those of its cells, rolled."""
+    line: Int32[np.ndarray, "h w"]
+    end_from_line: Float64[np.ndarray, "l 3 4"]
+    """From the pose of a line to that at the end of the sweep; one if nothing moves."""
+
+
+class SweepFilter(NamedTuple):
+    """Which beams return; see ``types.LidarFilter``."""
+
+    nearest_m: float
+    farthest_m: float
+    most_drop: float
+    """Largest drop probability."""
+    least_opacity: float
+    """Not included."""
+    most_offset_m: float
+    """Largest distance of the return from the weighted mean along the beam."""
+
+
+class SweepReturns(NamedTuple):
+    """Room for a return per beam; row r of the grid writes from r * columns on."""
+
+    range_m: Float32[np.ndarray, " n"]
+    intensity: Float32[np.ndarray, " n"]
+    xyz_m: Float32[np.ndarray, "n 3"]
+    """In the sensor at the end of the sweep."""
+    beam: Int32[np.ndarray, " n"]
+
+
 @kernel
-def sweep_returns(
-    first, last, planes, direction, beam, line, end_from_line, limits, filters, ranges, intensities, points, beams
-):
+def sweep_returns(first, last, planes, rays, limits, returns):
     """Returns of the rows first..last, in the order of their beams.
 
     Args:
         first: first row.
         last: one behind the last.
         planes: see ``draw.draw_tiles``.
-        direction: [h,w,3] unit rays in the sensor's frame by grid cell.
-        beam: [h,w] number of each cell's beam; a row's beams are those of its cells, rolled.
-        line: [h,w] line of each cell.
-        end_from_line: [l,3,4] float64 from the pose of a line to that at the end of the sweep; one if nothing moves.
-        limits: smallest and largest range.
-        filters: most drop probability, least opacity (not included), most distance from the mean.
-        ranges: output; row r writes from r * columns on, as for the following three.
-        intensities: output.
-        points: output [..,3].
-        beams: output.
+        rays: see ``SweepRays``.
+        limits: see ``SweepFilter``.
+        returns: output, see ``SweepReturns``.
 
     Returns:
         Number of returns, written one after the other from row ``first``'s place on.
     """
+    direction, beam, line, end_from_line = rays
     columns = beam.shape[1]
     moving = end_from_line.shape[0] > 1
     n = first * columns
@@ -47,22 +77,22 @@ def sweep_returns(
         for k in range(columns):
             x = start + k if start + k < columns else start + k - columns
             alpha = np.float64(planes[ALPHA, y, x])
-            if not alpha > filters[1]:
+            if not alpha > limits.least_opacity:
                 continue
             mean = np.float64(planes[DISTANCE, y, x]) / max(alpha, MIN_ALPHA)
             half = np.float64(planes[HALF, y, x])
             distance = half if half > 0.0 else mean
-            if not (limits[0] <= distance <= limits[1]) or planes[DROP, y, x] > filters[0] * alpha:
+            if not (limits.nearest_m <= distance <= limits.farthest_m) or planes[DROP, y, x] > limits.most_drop * alpha:
                 continue
-            if abs(distance - mean) > filters[2]:
+            if abs(distance - mean) > limits.most_offset_m:
                 continue
-            ranges[n] = np.float32(distance)
+            returns.range_m[n] = np.float32(distance)
             intensity = np.float64(planes[INTENSITY, y, x]) / max(np.float64(planes[KNOWN, y, x]), 1e-12)
-            intensities[n] = np.float32(min(max(intensity, 0.0), 1.0))
+            returns.intensity[n] = np.float32(min(max(intensity, 0.0), 1.0))
             m = end_from_line[line[y, x] if moving else 0]
             a, b, c = direction[y, x, 0] * distance, direction[y, x, 1] * distance, direction[y, x, 2] * distance
             for row in range(3):
-                points[n, row] = np.float32(m[row, 0] * a + m[row, 1] * b + m[row, 2] * c + m[row, 3])
-            beams[n] = beam[y, x]
+                returns.xyz_m[n, row] = np.float32(m[row, 0] * a + m[row, 1] * b + m[row, 2] * c + m[row, 3])
+            returns.beam[n] = beam[y, x]
             n += 1
     return n - first * columns

@@ -55,8 +55,8 @@ B_D0, B_DX, B_DY, B_BEND, B_MIDDLE, B_HALF, B_MOTION, B_RATE = 0, 3, 6, 9, 10, 1
 BASIS = 16
 
 AFFINE, ROLLING, TABLE, MOVING = 0, 1, 2, 3
-"""Ways to weigh a tile: linear directions, the same from a pose that moves along y, a table of directions, and a table
-of directions with origins."""
+"""Projection modes, how a tile's rays are described: linear directions, the same from a pose that moves along y, a
+table of directions, and a table of directions with origins."""
 
 NEEDLE = 1e-3
 """Records thinner than this, seen from the side, go to all blocks of their tiles: their centre is ill-conditioned."""
@@ -190,8 +190,8 @@ def _append(v: Lanes, mask: ir.Value, numbers: ir.Value, lists: ir.Value, counts
     b.store(b.add(count, b.zext(b.call(count_bits, [b.bitcast(mask, bits)]), I64)), counter, align=8)
 
 
-def _preparation(way: int) -> Callable[..., Any]:
-    linear, moving = way in (AFFINE, ROLLING), way in (ROLLING, MOVING)
+def _preparation(mode: int) -> Callable[..., Any]:
+    linear, moving = mode in (AFFINE, ROLLING), mode in (ROLLING, MOVING)
 
     @vector_kernel("iiiiiiiii")
     def prepare(
@@ -236,7 +236,7 @@ def _preparation(way: int) -> Callable[..., Any]:
             at = [_times(rows, base[k : k + 3]) for k in (B_D0, B_DX, B_DY)]
             limit, slack = column[LIM], v.number(0)
             drift = _times(rows, base[B_MOTION : B_MOTION + 3]) if moving else []
-            if way == ROLLING:
+            if mode == ROLLING:
                 at, flat = _rolled(at, drift, flat, base[B_MIDDLE], base[B_RATE])
                 limit, _ = _widened(column, drift, base, flat, base[B_HALF])
             height = MACRO / 2 / bands
@@ -246,7 +246,7 @@ def _preparation(way: int) -> Callable[..., Any]:
                 slack = slope * base[B_BEND]
                 depth = (rows[2][0] * rows[2][0] + rows[2][1] * rows[2][1] + rows[2][2] * rows[2][2]).sqrt()
                 widest = widest + depth * base[B_BEND]
-            if way == MOVING:
+            if mode == MOVING:
                 reach = base[B_HALF] + base[B_MIDDLE].abs()
                 limit, sideways = _widened(column, drift, base, flat, reach)
                 middle = at[0][2] * base[B_MIDDLE]
@@ -267,7 +267,7 @@ def _preparation(way: int) -> Callable[..., Any]:
         values = [*shown, flat, column[FADE], column[TAG], *column[FEATURE : FEATURE + 3]]
         for k, value in enumerate(values):
             v.store(value, where, 4 * BATCH * k)
-        if way == MOVING:
+        if mode == MOVING:
             for k in range(3):
                 v.store(drift[k], where, 4 * BATCH * (C_DRIFT + k))
 
@@ -277,4 +277,4 @@ def _preparation(way: int) -> Callable[..., Any]:
     return prepare
 
 
-prepare_affine, prepare_rolling, prepare_table, prepare_moving = (_preparation(way) for way in range(4))
+prepare_affine, prepare_rolling, prepare_table, prepare_moving = (_preparation(mode) for mode in range(4))

@@ -5,7 +5,7 @@ A place is (column, row) with cell centres at +0.5. Charts only bound where a Ga
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -34,8 +34,7 @@ CHECKED_RAYS = 256
 """Rows and columns of an image whose rays a lens chart is checked with."""
 
 
-@dataclass(frozen=True, eq=False)
-class Chart:
+class Chart(NamedTuple):
     """Tables of a sensor.
 
     Lens: ``places`` [s,s,6] by stereographic direction (x, y) / (1 + z) holds column, row, and the derivatives of the

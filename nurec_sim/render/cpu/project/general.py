@@ -101,29 +101,18 @@ def lidar_tiles(
 
 
 @kernel
-def project_general(
-    fields, sh_rest, blocks, first, last, view, is_lidar, params, places, bends, lines, motion,
-    records, keys, spans, sources, base,
-):  # fmt: skip
+def project_general(layer, first, last, view, is_lidar, chart, path, output, base):
     """Records of the Gaussians that a lens or a LiDAR may see, in the order of the blocks.
 
     Args:
-        fields: [blocks,21,256] packed Gaussians.
-        sh_rest: [blocks,3k,256] or [0,0,0].
-        blocks: numbers of the blocks to look at.
-        first: first entry of ``blocks`` to take.
+        layer: see ``pack.LayerBlocks``.
+        first: first entry of ``layer.chosen`` to take.
         last: one behind the last.
         view: see ``records.view_parameters``.
         is_lidar: the chart is that of a LiDAR; the features are its own then.
-        params: of the chart (``charts.Chart``), as are places and bends.
-        places: see params.
-        bends: see params.
-        lines: [l,24] poses per line (``view.ExposureView``); a single one where nothing moves.
-        motion: see ``motion.motion_parameters``.
-        records: [..,16] output, from row ``base`` on.
-        keys: [..] depths to sort by.
-        spans: [..,4] first and last macro tile column, first and last row.
-        sources: [..] packed rows (256 block + place) of the records.
+        chart: see ``charts.Chart``.
+        path: see ``motion.LinePath``.
+        output: see ``records.Projected``.
         base: first row to write; there must be room for 256 per block, for LiDARs 512.
 
     Returns:
@@ -134,66 +123,67 @@ def project_general(
     box, other_box = np.empty((4, LANES), np.float32), np.empty((4, LANES), np.float32)
     tiles, other_tiles = np.empty((4, LANES), np.float32), np.empty((4, LANES), np.float32)
     here, there, around = scratch.ctypes.data, local.ctypes.data, view.ctypes.data
-    chart, table, bend, path = params.ctypes.data, places.ctypes.data, bends.ctypes.data, motion.ctypes.data
-    cells, other_cells, poses = box.ctypes.data, other_box.ctypes.data, lines.ctypes.data
-    moving = lines.shape[0] > 1
+    params, table, bend = chart.params.ctypes.data, chart.places.ctypes.data, chart.bends.ctypes.data
+    motion, poses = path.motion.ctypes.data, path.lines.ctypes.data
+    cells, other_cells = box.ctypes.data, other_box.ctypes.data
+    moving = path.lines.shape[0] > 1
     n = base
     for k in range(first, last):
-        number = np.int64(blocks[k])
+        number = np.int64(layer.chosen[k])
         for lane in range(0, BLOCK, LANES):
-            block = fields.ctypes.data + 4 * (number * (FIELDS * BLOCK) + lane)
+            block = layer.fields.ctypes.data + 4 * (number * (FIELDS * BLOCK) + lane)
             mask = place(block, around, here)
             if mask == 0:
                 continue
             again = 0
             if is_lidar:
                 if moving:
-                    lidar_lines(here, chart, around, path, there)
-                    to_lines(here, poses, path, there)
-                    found = moving_lidar_boxes(there, chart, table, around, path, cells)
+                    lidar_lines(here, params, around, motion, there)
+                    to_lines(here, poses, motion, there)
+                    found = moving_lidar_boxes(there, params, table, around, motion, cells)
                     fast = mask & (found >> APART)
                     seam = mask & found & ~fast
                     if seam != 0:
-                        other_ends(path, there)
-                        to_lines(here, poses, path, there)
-                        found = moving_lidar_boxes(there, chart, table, around, path, other_cells)
+                        other_ends(motion, there)
+                        to_lines(here, poses, motion, there)
+                        found = moving_lidar_boxes(there, params, table, around, motion, other_cells)
                         seam &= found >> (2 * APART)
                         fast |= seam & (found >> APART)
-                        join_ends(seam, chart, cells, other_cells)
+                        join_ends(seam, params, cells, other_cells)
                     if fast != 0:
                         for part in range(PARTS):
-                            part_lines(part, path, there)
-                            to_lines(here, poses, path, there)
-                            add_lidar_part(part, fast, there, chart, table, path, around, cells)
+                            part_lines(part, motion, there)
+                            to_lines(here, poses, motion, there)
+                            add_lidar_part(part, fast, there, params, table, motion, around, cells)
                 else:
-                    lidar_boxes(here, chart, table, around, cells)
-                both = lidar_tiles(cells, around, chart, tiles.ctypes.data, other_tiles.ctypes.data)
+                    lidar_boxes(here, params, table, around, cells)
+                both = lidar_tiles(cells, around, params, tiles.ctypes.data, other_tiles.ctypes.data)
                 again = mask & (both >> APART)
                 mask &= both
             else:
                 if moving:
-                    lens_lines(here, chart, table, path, there)
-                    to_lines(here, poses, path, there)
-                    lens_lines(there, chart, table, path, there)
-                    to_lines(here, poses, path, there)
-                    found = moving_lens_boxes(there, chart, table, bend, path, cells)
+                    lens_lines(here, params, table, motion, there)
+                    to_lines(here, poses, motion, there)
+                    lens_lines(there, params, table, motion, there)
+                    to_lines(here, poses, motion, there)
+                    found = moving_lens_boxes(there, params, table, bend, motion, cells)
                     mask &= found
                     fast = mask & (found >> APART)
                     if fast != 0:
                         for part in range(PARTS):
-                            part_lines(part, path, there)
-                            to_lines(here, poses, path, there)
-                            add_lens_part(part, fast, there, chart, table, bend, path, around, cells)
+                            part_lines(part, motion, there)
+                            to_lines(here, poses, motion, there)
+                            add_lens_part(part, fast, there, params, table, bend, motion, around, cells)
                 else:
-                    mask &= lens_boxes(here, chart, table, bend, cells)
+                    mask &= lens_boxes(here, params, table, bend, cells)
                 mask &= lens_tiles(cells, around, tiles.ctypes.data)
             if mask | again == 0:
                 continue
-            take_features(block, sh_rest, number, lane, around, here, is_lidar)
+            take_features(block, layer.sh_rest, number, lane, around, here, is_lidar)
             build_records(here, rows.ctypes.data, around)
             source = number * BLOCK + lane
-            n = emit(mask, rows, scratch, tiles, source, n, records, keys, spans, sources)
-            n = emit(again, rows, scratch, other_tiles, source, n, records, keys, spans, sources)
+            n = emit(mask, rows, scratch, tiles, source, n, output)
+            n = emit(again, rows, scratch, other_tiles, source, n, output)
     keep_alive(local)
     keep_alive(box)
     keep_alive(other_box)

@@ -9,6 +9,7 @@ what moves past less than half as fast as the lines near its box is not seen aga
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
@@ -33,6 +34,15 @@ MOST = 1e3
 """Radians that stand for any turn."""
 APART = 16
 """Bits between masks in one integer."""
+
+
+class LinePath(NamedTuple):
+    """Where a sensor is when each of its lines is fired."""
+
+    lines: Float32[np.ndarray, "l 24"]
+    """See ``view.ExposureView``; a single row where nothing moves."""
+    motion: Float32[np.ndarray, " 7"]
+    """See ``motion_parameters``."""
 
 
 def motion_parameters(lines: Float32[np.ndarray, "l 24"], line_axis: int) -> Float32[np.ndarray, " 7"]:

@@ -179,22 +179,17 @@ def take_features(block, sh_rest, number, lane, view, scratch, lidar):
 
 
 @kernel
-def project_pinhole(fields, sh_rest, blocks, first, last, view, ends, motion, records, keys, spans, sources, base):
+def project_pinhole(layer, first, last, view, ends, motion, output, base):
     """Records of the Gaussians that an ideal pinhole can see, in the order of the blocks.
 
     Args:
-        fields: [blocks,21,256] packed Gaussians.
-        sh_rest: [blocks,3k,256] or [0,0,0].
-        blocks: numbers of the blocks to look at.
-        first: first entry of ``blocks`` to take.
+        layer: see ``pack.LayerBlocks``.
+        first: first entry of ``layer.chosen`` to take.
         last: one behind the last.
         view: see ``records.view_parameters``.
         ends: [2,13] poses at the ends of a rolling exposure, see ``rolling_boxes``; empty at one pose.
         motion: see ``rays.rolling_basis``.
-        records: [..,16] output, from row ``base`` on.
-        keys: [..] depths to sort by.
-        spans: [..,4] first and last macro tile column, first and last row.
-        sources: [..] packed rows (256 block + place) of the records.
+        output: see ``records.Projected``.
         base: first row to write; there must be room for 256 per block.
 
     Returns:
@@ -205,9 +200,9 @@ def project_pinhole(fields, sh_rest, blocks, first, last, view, ends, motion, re
     box = np.empty((4, LANES), np.float32)
     n = base
     for k in range(first, last):
-        number = np.int64(blocks[k])
+        number = np.int64(layer.chosen[k])
         for lane in range(0, BLOCK, LANES):
-            block = fields.ctypes.data + 4 * (number * (FIELDS * BLOCK) + lane)
+            block = layer.fields.ctypes.data + 4 * (number * (FIELDS * BLOCK) + lane)
             mask = place(block, view.ctypes.data, scratch.ctypes.data)
             if mask == 0:
                 continue
@@ -218,7 +213,7 @@ def project_pinhole(fields, sh_rest, blocks, first, last, view, ends, motion, re
                                       motion[6], motion[7])  # fmt: skip
             if mask == 0:
                 continue
-            take_features(block, sh_rest, number, lane, view.ctypes.data, scratch.ctypes.data, False)
+            take_features(block, layer.sh_rest, number, lane, view.ctypes.data, scratch.ctypes.data, False)
             build_records(scratch.ctypes.data, rows.ctypes.data, view.ctypes.data)
-            n = emit(mask, rows, scratch, box, number * BLOCK + lane, n, records, keys, spans, sources)
+            n = emit(mask, rows, scratch, box, number * BLOCK + lane, n, output)
     return n - base
