@@ -13,7 +13,6 @@ from driving_calls import Looking, driver
 from nurec_sim import plugins
 from nurec_sim.errors import ScenarioError
 from nurec_sim.sim import make_scenario, run_rollout
-from nurec_sim.types import Pinhole
 
 SCRIPT = str(Path(__file__).parents[1] / "helpers" / "generated_driving.py")
 
@@ -29,7 +28,7 @@ def test_generated_code_leads_a_session_on_our_driver(tmp_path):
     assert said["version"].endswith("looking") and len(seen) == len(said["answers"]) == 3
     camera = seen[0].cameras["front"].camera
     assert (camera.id, camera.width_px, camera.height_px) == ("camera_front_wide_120fov", 160, 100)
-    assert isinstance(camera.lens, Pinhole) and not camera.lens.distorted
+    assert camera.ideal_pinhole is not None
     np.testing.assert_allclose(camera.rig_from_camera[:3, 2], [1, 0, 0], atol=1e-6)  # it looks ahead
     assert seen[2].ego.speed_mps == 5.0 and len(seen[2].history) == 3
     for step, answer in enumerate(np.array(said["answers"])):

@@ -115,7 +115,7 @@ def test_rectified_images_show_what_the_policys_pinhole_would_have_seen(lens, se
     camera = replace(CAMERA, width_px=320, height_px=192, lens=lens)
     sent = scaled_camera(camera, sent_width_px, sent_width_px * 192 // 320)
     frame = see_image(encoded(seen_by(sent)), camera, 80)
-    assert isinstance(frame.camera.lens, Pinhole) and not frame.camera.lens.distorted
+    assert frame.camera.ideal_pinhole is not None
     assert (frame.camera.width_px, frame.camera.height_px) == (80, 48) == frame.rgb.shape[1::-1]
     wanted = seen_by(frame.camera)
     visible = frame.rgb.max(axis=2) > 0  # a lens may see less than the wanted pinhole does

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nurec_sim import geometry, sensors
-from nurec_sim.types import Fisheye, FTheta, Pinhole, Shutter
+from nurec_sim.types import Shutter
 from nurec_sim.world import LIDAR_ID, random_readout_us, random_rig
 from nurec_sim.world.plan.random_rigs import LENS_KINDS
 
@@ -13,9 +13,7 @@ NAMES = ["camera_front", "camera_front_left", "camera_front_right", "camera_rear
 
 
 def kind_of(lens):
-    if isinstance(lens, Pinhole):
-        return "distorted" if lens.distorted else "pinhole"
-    return {Fisheye: "fisheye", FTheta: "ftheta"}[type(lens)]
+    return "distorted" if lens.perspective and lens.ideal_pinhole is None else lens.kind
 
 
 @pytest.fixture(scope="module")
