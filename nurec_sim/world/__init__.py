@@ -1,8 +1,7 @@
 """Procedural MuJoCo towns: a seeded plan, true sensors for any pose, and driving logs.
 
-``town_plan(seed)`` decides everything as plain data, ``TrueWorld(plan)`` draws it, ``write_town_clip`` writes
-a log of it with exact boxes and map.
-Names are loaded on first use, so that importing this package does not load MuJoCo.
+``town_plan(seed)`` generates a town as plain data, ``TrueWorld(plan)`` renders it, ``write_town_clip`` records a log
+with exact boxes and map. Names are loaded on first use, so that importing this package does not load MuJoCo.
 """
 
 import lazy_loader

@@ -1,1 +1,1 @@
-"""Meshes and textures of what stands and moves in a town."""
+"""Meshes and textures of static objects and actors."""

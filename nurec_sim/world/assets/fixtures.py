@@ -1,6 +1,6 @@
 """Meshes of street furniture, each as parts (mesh, class, material); origin on the ground, x with the traffic.
 
-Things that drivers read face -x, against the traffic; arms and seats turn to +y, towards the road.
+Signs and lights face -x, against the traffic; arms and seats face +y, towards the road.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _POLE, _FURNITURE, _SIGN = SurfaceClass.POLE, SurfaceClass.FURNITURE, SurfaceCla
 
 
 def fixture_parts(prop: Prop) -> Iterator[Part]:
-    """The parts of anything but plants.
+    """The parts of a prop other than a plant.
 
     Raises:
         ValueError: no such kind of prop.
@@ -49,7 +49,7 @@ def _sign(prop: Prop) -> Iterator[Part]:
     size, middle = 0.72, 2.45
     pole.cylinder([0, 0, -0.3], [0, 0, middle + 0.3], 0.034, sides=8)
     flat = outline(SIGN_SHAPES[picture])
-    # Seen against the traffic, the picture's right is +y ... -y turned: looking along +x, right is -y.
+    # The viewer looks along +x, so the right of the image is -y.
     points = np.stack([np.full(len(flat), -0.05), -flat[:, 0] * size, flat[:, 1] * size + middle], axis=1)
     fan = [[0, i, i + 1] for i in range(1, len(flat) - 1)]
     face.add(points, fan, flat + 0.5)

@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from numpy.typing import ArrayLike
 
 Corners = tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"]]
-"""Positions, unit normals and texture places of triangle corners, three per triangle."""
+"""Positions, unit normals and texture coordinates of triangle corners, three per triangle."""
 UNIT_SQUARE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 
 
@@ -34,7 +34,7 @@ _BOX_FACES = (4 * np.arange(6)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
 
 
 class MeshBuilder:
-    """Gathers triangles; ``corners`` gives them with normals smoothed below a crease angle."""
+    """Collects triangles; ``corners`` returns them with normals smoothed below a crease angle."""
 
     def __init__(self) -> None:
         self._points: list[np.ndarray] = []
@@ -54,7 +54,7 @@ class MeshBuilder:
         return np.concatenate(self._points)
 
     def transform(self, scale: np.ndarray, shift: np.ndarray) -> None:
-        """Scales about the origin, then shifts, everything gathered so far."""
+        """Scales about the origin, then translates, all current vertices."""
         self._points = [points * scale + shift for points in self._points]
 
     def add(self, points: ArrayLike, faces: ArrayLike, uv: ArrayLike, normals: ArrayLike | None = None) -> None:
@@ -77,11 +77,11 @@ class MeshBuilder:
         self._count += other._count
 
     def shrink_texture(self, part: float) -> None:
-        """Puts all texture places into the first ``part`` of the texture, where it is plain."""
+        """Moves all texture coordinates into the first ``part`` of the texture, which is uniform."""
         self._uv = [np.mod(uv, 1.0) * part for uv in self._uv]
 
     def warp(self, move: Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]) -> None:
-        """Moves every vertex, as when flat things are laid on hilly ground."""
+        """Displaces every vertex, for example to follow the terrain."""
         self._points = [move(points) for points in self._points]
 
     def quad(self, a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike, uv: ArrayLike = UNIT_SQUARE) -> None:
@@ -170,7 +170,7 @@ class MeshBuilder:
 
 
 def _corner_angles(place: np.ndarray) -> np.ndarray:
-    """Angle of each triangle at each of its corners: weights that do not depend on how quads are cut in two."""
+    """Angle of each triangle at each of its corners: weights independent of the triangulation of quads."""
     corner = place.reshape(-1, 3, 3)
     ahead, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
     lengths = np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2)
@@ -178,7 +178,7 @@ def _corner_angles(place: np.ndarray) -> np.ndarray:
 
 
 def _smoothed(place: np.ndarray, own: np.ndarray, weighted: np.ndarray, limit: float) -> np.ndarray:
-    """Each corner's normal averaged over those at its place whose cosine to its own exceeds ``limit``."""
+    """Each corner's normal averaged over those at its position whose cosine to its own exceeds ``limit``."""
     grid = np.round(place * 1e4).astype(np.int64)
     key = grid @ np.array([73856093, 19349663, 83492791], np.int64)
     order = np.argsort(key, kind="stable")

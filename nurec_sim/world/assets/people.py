@@ -1,4 +1,4 @@
-"""Meshes of people: rigid parts in the frames of their joints, drawn with the bands of ``textures_people``.
+"""Meshes of people: rigid parts in the frames of their joints, textured with the bands of ``textures_people``.
 
 Body frame: x forward, y left, z up, origin on the ground, for a person of 1.76 m; limbs hang down from their joints.
 """
@@ -51,7 +51,7 @@ def walking_angles(phase_rad: float, stride: float) -> dict[str, float]:
 
 
 def cycling_angles(phase_rad: float) -> dict[str, float]:
-    """Joint angles of a rider whose feet turn the pedals and whose hands hold the bar."""
+    """Joint angles of a cyclist."""
     angles = {}
     for side, shift in (("left", 0.0), ("right", np.pi)):
         angles[f"{side}_thigh"] = -1.05 - 0.36 * np.sin(phase_rad + shift)

@@ -1,4 +1,4 @@
-"""What all procedural textures are made of: tileable noise and grain; images are uint8 RGB ``[h, w, 3]``."""
+"""Building blocks of procedural textures: tileable noise and grain; images are uint8 RGB ``[h, w, 3]``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def noise(
 
 @functools.lru_cache(maxsize=64)
 def _periodic_weights(size: int, n: int) -> sparse.csr_array:
-    """Cubic interpolation ``[size, n]`` from n values on a ring to ``size`` places between them."""
+    """Weights ``[size, n]`` of the periodic cubic interpolation from n values to ``size`` samples."""
     place = (np.arange(size) + 0.5) * n / size - 0.5
     whole = np.floor(place).astype(int)
     t = (place - whole).astype(np.float32)

@@ -1,7 +1,7 @@
 """Textures of buildings: facades of four floors by four bays, shop fronts one floor high, and roofs.
 
-``lit`` 0..1 is the share of lit windows. A texture comes with ``night`` > 0 as a facade seen by weak light: walls keep
-their colour divided by (1 + night), lit windows stay bright, so that a material with that much glow shows them shining.
+``lit`` 0..1 is the fraction of lit windows. With ``night`` > 0 walls are darkened by (1 + night) and lit windows stay
+bright, so that they shine with an emissive material of that strength.
 """
 
 from __future__ import annotations
@@ -149,12 +149,12 @@ def _with_windows(rng: np.random.Generator, wall: np.ndarray, family: str, lit: 
                 cv2.line(image, (x0, y0 + (y1 - y0) // 3), (x1, y0 + (y1 - y0) // 3), [c * dark for c in frame], 2)
             image[y1 + 2 : y1 + 6, x0 - 4 : x1 + 4] = 196 * dark
             image[y1 + 6 : y1 + 10, x0 - 4 : x1 + 4] *= 0.62
-            image[y1 + 10 : y1 + 22, x0 : x1 : max(3, int(width) // 3)] *= 0.88  # rain leaves traces below sills
+            image[y1 + 10 : y1 + 22, x0 : x1 : max(3, int(width) // 3)] *= 0.88  # water stains below sills
     return as_image(image)
 
 
 def _pane(rng: np.random.Generator, pane: np.ndarray, glass: np.ndarray, lit: float, dark: float) -> None:
-    """A window's glass: it mirrors the sky, or shows curtains, blinds or a lit room."""
+    """A window pane: sky reflection, curtains, blinds or a lit room."""
     high, wide = pane.shape[:2]
     down = np.linspace(0, 1, high, dtype=np.float32)[:, None, None]
     if rng.random() < lit:

@@ -1,6 +1,6 @@
-"""Textures of what people drive and walk on: asphalt, paving, kerbs, grass, and the stains that lie on the road.
+"""Ground textures: asphalt, paving, kerbs, grass, and decals on the road.
 
-Images are uint8 ``[h, w, 3]``, tileable, or ``[h, w, 4]`` for decals whose last channel is how much they cover.
+Images are uint8 ``[h, w, 3]``, tileable, or ``[h, w, 4]`` for decals with alpha.
 """
 
 from __future__ import annotations
@@ -143,18 +143,18 @@ def grass(rng: np.random.Generator, size: int = 512) -> Image:
 
 
 def worn_paint(rng: np.random.Generator, colour: tuple[float, float, float], size: int = 256) -> Image:
-    """Road paint with grain, dirt and places where it has come off."""
+    """Road paint with grain, dirt and wear."""
     worn = noise(rng, size, 5, 6)
     light = 1 + 0.08 * grain(rng, size, 0.8) - 0.22 * noise(rng, size, 4, 3)
     gone = np.clip((worn - float(rng.uniform(0.62, 0.78))) * 9, 0, 1)[..., None]
     return as_image(light[..., None] * np.asarray(colour) * (1 - gone) + np.array([92, 92, 93]) * gone)
 
 
-# ------------------------------------------------------------------------------------------- decals, drawn over roads
+# ------------------------------------------------------------------------------------------------ decals on roads
 
 
 def wheel_track(rng: np.random.Generator, size: int = 256) -> Decal:
-    """A strip along a lane (v runs along it): darker where tyres roll and where engines drip, soft at the sides."""
+    """A strip along a lane (v along it): darker in the tyre tracks and the oil line, with soft edges."""
     across = np.linspace(-1, 1, size, dtype=np.float32)
     band = 0.9 * np.exp(-(((np.abs(across) - 0.47) / 0.15) ** 2)) + 0.55 * np.exp(-((across / 0.12) ** 2))
     cover = band[None] * (0.25 + 1.1 * noise(rng, size, 5, 4)) * float(rng.uniform(0.10, 0.26))
@@ -162,7 +162,7 @@ def wheel_track(rng: np.random.Generator, size: int = 256) -> Decal:
 
 
 def stains(rng: np.random.Generator, size: int = 512) -> Decal:
-    """Oil drops, drips and tyre marks on nothing."""
+    """Oil stains and tyre marks with alpha."""
     cover: np.ndarray = np.zeros((size, size), np.float32)
     for _ in range(34):
         (x, y), (a, b) = rng.integers(30, size - 30, 2), rng.integers(3, 26, 2)
@@ -212,7 +212,7 @@ def light_pool(size: int = 64) -> Decal:
 
 
 def puddles(rng: np.random.Generator, colour: tuple[float, float, float], size: int = 512) -> Decal:
-    """Standing water that mirrors a sky of this colour."""
+    """Puddles that reflect a sky of this colour."""
     deep = noise(rng, size, 4, 5)
     edge = np.minimum(np.arange(size), np.arange(size)[::-1])
     cover = np.clip((deep - 0.56) * 14, 0, 1) * np.clip(np.minimum.outer(edge, edge) / 60, 0, 1)

@@ -18,7 +18,7 @@ _SHOES = ((30, 28, 28), (220, 218, 214), (92, 64, 44))
 
 
 def band_uv(band: str, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Texture places ``[..., 2]`` of fractions (u, v) of a band."""
+    """Texture coordinates ``[..., 2]`` of fractions (u, v) of a band."""
     row = BANDS.index(band)
     margin = 0.1
     inside = margin + (1 - 2 * margin) * np.clip(v, 0, 1)

@@ -1,4 +1,4 @@
-"""Pictures on boards: traffic signs, lights and billboards."""
+"""Textures of traffic signs, lights and billboards."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SIGN_SHAPES = {"stop": 8, "yield": -3, "priority": 4, "speed": 0, "narrow": 3, "
 
 
 def sign(rng: np.random.Generator, picture: str, size: int = 128) -> Image:
-    """The face of a traffic sign; outside of its outline the border's colour goes on.
+    """The face of a traffic sign; the border colour extends beyond its outline.
 
     Raises:
         ValueError: no such sign.

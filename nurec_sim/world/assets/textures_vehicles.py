@@ -1,7 +1,7 @@
 """Textures of vehicles: an atlas for painted bodies, wheels, windows, number plates and cargo boxes.
 
 The body atlas holds the side (upper half; rear left, front right), the top (third quarter), and in the last quarter
-front and rear. It is grey, because a geom's colour tints it: seams, grille and wheel arches stay dark in any colour.
+front and rear. It is grey, because the geom's colour tints it; seams, grille and wheel arches stay dark.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _side(side: np.ndarray, family: Family, size_m: tuple[float, float, float]) 
         return int((x + 1) / 2 * ATLAS_PX), int((1 - height) * SIDE_PX)
 
     heights = (1 - (np.arange(SIDE_PX) + 0.5) / SIDE_PX) / family.belt
-    # Upper halves of doors mirror the sky, lower halves the ground; a crease runs along the shoulder.
+    # Upper door halves reflect the sky, lower halves the ground, with a crease along the shoulder line.
     steps = ((0.0, 0.42), (0.3, 0.60), (0.5, 0.74), (0.72, 0.80), (0.86, 1.0), (0.90, 0.88), (1.0, 0.97), (1.05, 0.93),
              (1.7, 1.0))  # fmt: skip
     side *= np.interp(heights, *np.array(steps).T)[:, None].astype(np.float32)
@@ -106,7 +106,7 @@ def wheel(rng: np.random.Generator, size: int = 128) -> Image:
 
 
 def window(rng: np.random.Generator, size: int = 128) -> Image:
-    """Dark glass that mirrors the sky towards its upper edge, with head-rests behind it."""
+    """Dark glass with a sky reflection at its upper edge and head-rests behind it."""
     up = np.linspace(1, 0, size, dtype=np.float32)[:, None]
     grey = 30 + 58 * up**1.6 + np.zeros((size, size), np.float32)
     for x in (0.28, 0.72):
@@ -159,7 +159,7 @@ def cargo_box(rng: np.random.Generator, size: int = 256) -> Image:
 def atlas_uv(
     corner: Float64[np.ndarray, "n 3"], normal: Float64[np.ndarray, "n 3"], size_m: tuple[float, float, float]
 ) -> Float64[np.ndarray, "n 2"]:
-    """Places in the body atlas of points of a vehicle (box frame) on faces with these normals."""
+    """Texture coordinates in the body atlas of vehicle points (box frame) with these normals."""
     along = corner[:, 0] / size_m[0] + 0.5
     across = corner[:, 1] / size_m[1] + 0.5
     high = corner[:, 2] / size_m[2] + 0.5

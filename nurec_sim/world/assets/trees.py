@@ -1,6 +1,6 @@
 """Meshes of trees, bushes and hedges: a rough core inside a shell of leaf clusters, all on one texture.
 
-Origin on the ground below the trunk. Normals point away from the crown's middle, so that light falls softly on it.
+Origin on the ground below the trunk. Normals point away from the crown's centre for soft shading.
 """
 
 from __future__ import annotations
@@ -140,6 +140,6 @@ def _soft(points: np.ndarray, outward: np.ndarray, crown: np.ndarray) -> np.ndar
 
 
 def _in_leaves(uv: np.ndarray) -> np.ndarray:
-    """Texture places kept inside the leaves by mirroring, because bark lies below them."""
+    """Texture coordinates mirrored into the leaf part, because the bark is below it."""
     v = np.abs(np.mod(uv[..., 1], 2.0) - 1.0)
     return np.stack([uv[..., 0], BARK_SHARE + 0.015 + v * (1 - BARK_SHARE - 0.03)], axis=-1)

@@ -1,4 +1,4 @@
-"""Shapes of vehicle families as numbers; ``vehicles`` lofts them. Lengths along x are fractions of the half length.
+"""Shape parameters of vehicle families. Lengths along x are fractions of the half length.
 
 Heights are fractions of the vehicle's height above the ground, widths fractions of its half width.
 """

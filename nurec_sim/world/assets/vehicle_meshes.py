@@ -11,11 +11,11 @@ from nurec_sim.world.assets.textures_vehicles import atlas_uv
 from nurec_sim.world.assets.vehicle_families import FAMILIES, Family
 
 PARTS = ("paint", "glass", "wheel", "headlight", "taillight", "plate", "cargo")
-"""``wheel`` holds trim and bumpers too, which are of the same dark plastic as tyres are of rubber."""
+"""``wheel`` also contains trim and bumpers, which share the dark material."""
 RUBBER = 0.02
-"""The first corner of the wheel's texture is plain."""
+"""The first corner of the wheel texture is uniform."""
 MIRROR_M = 0.075
-"""How far mirrors stand out on each side of the body; the box holds them too."""
+"""Extent of the mirrors beyond each side of the body; included in the box."""
 
 Surface = Callable[[int, float, float], np.ndarray]
 
@@ -51,7 +51,7 @@ def vehicle_parts(kind: str, size_m: tuple[float, float, float]) -> dict[str, Me
 
 
 def _lower_body(paint: MeshBuilder, family: Family, half_l: float, half_w: float, high: float) -> np.ndarray:
-    """Lofts cross-sections from tail to nose below the windows; gives the x of tail and nose."""
+    """Lofts cross-sections from tail to nose below the windows; returns the x of tail and nose."""
     knots = np.array(family.top)
     tail, nose = knots[0, 0], knots[-1, 0]
     inner = np.linspace(tail + 0.10, nose - 0.10, 9)
@@ -81,7 +81,7 @@ def _lower_body(paint: MeshBuilder, family: Family, half_l: float, half_w: float
 
 
 def _cabin(paint: MeshBuilder, family: Family, half_l: float, half_w: float, high: float) -> Surface:
-    """The part with the windows; gives its walls as ``surface(side, s, t)``: side 0 rear, 1 right, 2 front, 3 left."""
+    """The cabin; returns its walls as ``surface(side, s, t)``: side 0 rear, 1 right, 2 front, 3 left."""
     rear_low, rear_high, front_high, front_low = (f * half_l for f in family.cabin)
     boxy = family.roof_width > 0.88
     top_w, low_w = family.roof_width * half_w, half_w * (0.985 if boxy else 0.945)
@@ -196,7 +196,7 @@ def _trim(
 
 
 def _with_atlas(paint: MeshBuilder, size_m: tuple[float, float, float]) -> MeshBuilder:
-    """The same surface with the body atlas on it: each face takes its part of the texture by where it faces."""
+    """The same surface mapped to the body atlas by face orientation."""
     place, smooth, _ = paint.corners(36.0)
     flat = np.cross(place[1::3] - place[::3], place[2::3] - place[::3])
     flat = np.repeat(flat / np.linalg.norm(flat, axis=1, keepdims=True), 3, axis=0)

@@ -1,4 +1,4 @@
-"""Bodies of vehicles, cyclists and pedestrians in the MuJoCo model, and how their limbs move."""
+"""Bodies of vehicles, cyclists and pedestrians in the MuJoCo model, and their limb animation."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ STRIDE_M, BRISK_MPS = 1.45, 1.4
 PEDAL_TURN_M = 5.0
 SMOOTH_DEG = 70.0
 LEAN_RAD = 0.55
-"""How far riders lean forward."""
+"""Forward lean of cyclists."""
 
 
 @dataclass(frozen=True, eq=False)
 class Gait:
-    """Whose limbs move how: joint names, and the distance covered at each time of the recorded path."""
+    """Limb animation: joint names, and the arc length at each time of the recorded path."""
 
     kind: str
     joints: dict[str, str]
@@ -47,7 +47,7 @@ class Gait:
 
 
 class ActorBuilder:
-    """Adds actors to a town. The first of a family is modelled, the others are stretched copies of it."""
+    """Adds actors to a town. The first of a family is modelled, the others are scaled copies."""
 
     def __init__(self, builder: SpecBuilder, plan: TownPlan):
         self.builder, self.plan = builder, plan
@@ -56,7 +56,7 @@ class ActorBuilder:
         self._limbs: dict[tuple[str, bool], Corners] = {}
 
     def add(self, actor: Actor, instance: int) -> Gait | None:
-        """One actor as a mocap body; people get a gait."""
+        """One actor as a mocap body; pedestrians and cyclists get a gait."""
         body = self.builder.spec.worldbody.add_body(name=actor.id, mocap=True)
         rng = np.random.default_rng([self.plan.style.texture_seed, 7, instance])
         if actor.kind in ("pedestrian", "cyclist"):
@@ -95,7 +95,7 @@ class ActorBuilder:
         self.builder.place(body, mesh, SurfaceClass.ROAD, material, decal=True)
 
     def _paint(self, actor: Actor) -> None:
-        """The family's paint, made for the first of its vehicles."""
+        """The family's paint texture, generated for its first vehicle."""
         rng = np.random.default_rng([self.plan.style.texture_seed, 8, *actor.kind.encode()])
         atlas = textures_vehicles.body_atlas(rng, FAMILIES[actor.kind], actor.size_m)
         self.builder.material(f"paint_{actor.kind}", atlas, shine=0.8)
@@ -143,7 +143,7 @@ class ActorBuilder:
 
 
 def _rigid(parent: Any, place: list[float]) -> Any:
-    """A child body with some inertia, which MuJoCo wants of everything that has a joint."""
+    """A child body with some inertia, which MuJoCo requires for bodies with joints."""
     part = parent.add_body(pos=place)
     part.mass, part.inertia, part.explicitinertial = 3.0, [0.1, 0.1, 0.1], True
     return part

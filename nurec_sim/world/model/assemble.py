@@ -1,4 +1,4 @@
-"""From a plan to a compiled MuJoCo model whose every geom knows what it is."""
+"""Compiles a plan to a MuJoCo model with class, instance and reflectivity per geom."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Town:
     sky: Sky
 
     def actor_places(self, actors: dict[str, Float64[np.ndarray, "n 4 4"]], count: int) -> ActorPlaces:
-        """Where MuJoCo wants the actors at ``count`` instants, from the ``world_from_box`` of every one of them."""
+        """MuJoCo poses of all actors at ``count`` instants, from their ``world_from_box``."""
         places = np.zeros((count, self.model.nmocap, 3)), np.zeros((count, self.model.nmocap, 4))
         for name, world_from_box in actors.items():
             places[0][:, self.actor_mocap[name]] = world_from_box[:, :3, 3]
@@ -51,7 +51,7 @@ class Town:
         return places
 
     def pose(self, data: Any, t_us: float, places: ActorPlaces, instant: int = 0) -> None:
-        """Puts all actors where ``places`` says for an instant, moves their limbs, and updates the kinematics."""
+        """Poses all actors and their limbs for an instant, and updates the kinematics."""
         data.mocap_pos[:], data.mocap_quat[:] = places[0][instant], places[1][instant]
         for gait, addresses in self.gaits:
             for joint, angle in gait.angles(t_us).items():
@@ -62,12 +62,12 @@ class Town:
     def through_air(
         self, rgb: UInt8[np.ndarray, "h w 3"], range_m: Float32[np.ndarray, "h w"]
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """A drawn image as seen through the weather's fog; ``range_m`` is 0 for the sky."""
+        """Applies the weather's fog to an image; ``range_m`` is 0 for the sky."""
         return add_fog(rgb, range_m, self.sky, self.plan.weather.fog_per_m)
 
 
 def build_town(plan: TownPlan, network: TownNetwork | None = None) -> Town:
-    """Textures, meshes, lights and actors of a plan; about two seconds of work, the same for the same plan."""
+    """Textures, meshes, lights and actors of a plan; deterministic; takes about two seconds."""
     network = TownNetwork(plan) if network is None else network
     builder = SpecBuilder()
     spec = builder.spec

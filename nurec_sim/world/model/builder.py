@@ -1,4 +1,4 @@
-"""A thin layer over MjSpec: named materials, meshes and visual geoms that know their class, instance and reflectivity.
+"""A thin layer over MjSpec: named materials, meshes and visual geoms with class, instance and reflectivity.
 
 There are no colliders: collisions are measured between boxes by ``metrics``, and ``mj_multiRay`` silently loses visual
 geoms of bodies that also carry a collider (MuJoCo 4.0).
@@ -16,26 +16,26 @@ from nurec_sim.world.assets.meshes import Corners, MeshBuilder
 from nurec_sim.world.plan.surface import REFLECTIVITY, SurfaceClass
 
 DECAL_GROUP = 3
-"""Geoms that are drawn in colour images only: no depth, no label, no laser return."""
+"""Geoms visible in colour images only: no depth, label or laser return."""
 DECAL_ALPHA = 0.99
-"""The classic renderer blends only what is not quite opaque."""
+"""The classic renderer blends only materials with alpha below 1."""
 STATIC = 0
-"""Instance id of everything that is no actor; actor i of the plan is instance i + 1."""
+"""Instance id of static geoms; actor i of the plan is instance i + 1."""
 
 
 class SpecBuilder:
-    """Collects a world in ``spec``; remembers each material's mean colour for images without OpenGL."""
+    """Builds a world in ``spec``; keeps each material's mean colour for images without OpenGL."""
 
     def __init__(self) -> None:
         self.spec = mujoco.MjSpec()
-        self.spec.nuser_geom = 6  # class, instance, reflectivity, and the colour [3] that stands for its texture
+        self.spec.nuser_geom = 6  # class, instance, reflectivity, mean colour [3]
         self._colour: dict[str, np.ndarray] = {}
         self._mean_colour: dict[str, np.ndarray] = {}
         self._meshes = 0
 
     @property
     def world(self) -> Any:
-        """The body that holds everything static."""
+        """The static world body."""
         return self.spec.worldbody
 
     def material(
@@ -57,20 +57,20 @@ class SpecBuilder:
         self._mean_colour[name] = mean
 
     def texture(self, name: str, image: np.ndarray, kind: Any) -> None:
-        """A texture; linear, because the classic renderer knows no gamma and would turn sRGB dark."""
+        """A texture; linear, because the classic renderer has no gamma and would darken sRGB."""
         height, width, channels = image.shape
         texture = self.spec.add_texture(name=name, type=kind, width=width, height=height, nchannel=channels)
         texture.data = np.ascontiguousarray(image).tobytes()
         texture.colorspace = mujoco.mjtColorSpace.mjCOLORSPACE_LINEAR
 
     def mesh(self, builder: MeshBuilder, crease_deg: float = 38.0) -> str:
-        """Registers a mesh and gives its name."""
+        """Registers a mesh and returns its name."""
         return self.shared_mesh(builder.corners(crease_deg))
 
     def shared_mesh(self, corners: Corners, scale: Sequence[float] = (1.0, 1.0, 1.0)) -> str:
-        """Registers what ``MeshBuilder.corners`` gave, stretched along the axes, and gives its name."""
+        """Registers the result of ``MeshBuilder.corners``, scaled along the axes, and returns its name."""
         points, normals, uv = corners
-        if len(points) == 3:  # MuJoCo wants at least four vertices
+        if len(points) == 3:  # MuJoCo requires at least four vertices
             points, normals, uv = (np.concatenate([values, values]) for values in (points, normals, uv))
         self._meshes += 1
         mesh = self.spec.add_mesh(name=f"mesh{self._meshes}")
@@ -97,7 +97,7 @@ class SpecBuilder:
         crease_deg: float = 38.0,
         decal: bool = False,
     ) -> None:
-        """A mesh on a body. A ``decal`` is blended over what lies below it and exists in colour images only."""
+        """Adds a mesh to a body. A ``decal`` is alpha-blended and exists in colour images only."""
         name = mesh if isinstance(mesh, str) else self.mesh(mesh, crease_deg)
         geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=xyz, quat=_yaw_quat(yaw))
         self._dress(geom, surface, material, instance, tint, reflectivity, shadow and not decal)
@@ -106,7 +106,7 @@ class SpecBuilder:
 
     def _dress(self, geom: Any, surface: SurfaceClass, material: str, instance: int, tint: Sequence[float],
                reflectivity: float | None, shadow: bool) -> None:  # fmt: skip
-        # A geom's own colour replaces its material's, so the tint has to hold both.
+        # A geom's colour replaces its material's, so the tint combines both.
         geom.material, geom.rgba, geom.castshadow = material, [*(self._colour[material] * np.asarray(tint)), 1], shadow
         geom.contype = geom.conaffinity = 0
         geom.group, geom.mass = 1, 0

@@ -1,4 +1,4 @@
-"""Static things gathered by place and material, so that few geoms cover much and those out of sight can be skipped."""
+"""Static meshes merged by location and material: few geoms, and those out of view can be culled."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Key = tuple[int, int, SurfaceClass, str, tuple[float, ...], bool, bool, float]
 
 
 class Chunks:
-    """Meshes in world coordinates, joined per square of ``size_m``, class and material; ``place`` makes the geoms."""
+    """Meshes in world coordinates, merged per square of ``size_m``, class and material; ``place`` creates the geoms."""
 
     def __init__(self, size_m: float = CHUNK_M):
         self.size_m = size_m
@@ -31,7 +31,7 @@ class Chunks:
         decal: bool = False,
         crease_deg: float = 38.0,
     ) -> MeshBuilder:
-        """The mesh to which things of this kind around a place are added."""
+        """The mesh for this class and material at a location."""
         column, row = (int(np.floor(v / self.size_m)) for v in xy[:2])
         key = (column, row, surface, material, tint, shadow, decal, crease_deg)
         return self._meshes.setdefault(key, MeshBuilder())
@@ -46,7 +46,7 @@ class Chunks:
         *,
         decal: bool = False,
     ) -> None:
-        """Adds triangles ``[n,3,3]`` that throw no shadow, each to the square of its first corner."""
+        """Adds triangles ``[n,3,3]`` without shadows, each to the square of its first corner."""
         squares = np.floor(corners[:, 0, :2] / self.size_m).astype(np.int64)
         unique, index = np.unique(squares, axis=0, return_inverse=True)
         for number, square in enumerate(unique):
@@ -57,12 +57,12 @@ class Chunks:
                      normals[chosen].reshape(-1, 3))  # fmt: skip
 
     def join(self, other: Chunks) -> None:
-        """Takes over the meshes of another collection as they are, with its own squares."""
+        """Adds the meshes of another collection, keeping its squares."""
         for key, mesh in other._meshes.items():
             self._meshes[(-(10**6) - len(self._meshes), *key[1:])] = mesh
 
     def place(self, builder: SpecBuilder) -> None:
-        """Makes one geom of each square, class and material."""
+        """Creates one geom per square, class and material."""
         for (_, _, surface, material, tint, shadow, decal, crease_deg), mesh in self._meshes.items():
             if not mesh.empty:
                 builder.place(builder.world, mesh, surface, material, tint=tint, shadow=shadow, decal=decal,

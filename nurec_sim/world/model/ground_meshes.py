@@ -1,4 +1,4 @@
-"""The ground as meshes: roads, kerbs, sidewalks, paint, grass, wear, and the hills at the horizon."""
+"""Ground meshes: roads, kerbs, sidewalks, paint, grass, wear, and hills at the horizon."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MARKING_LIFT_M = 0.006
 DECAL_LIFT_M = 0.004
 GRASS_STEP_M, FAR_STEP_M = 5.0, 40.0
 GRASS_BELOW_M, FAR_BELOW_M = 0.04, 1.4
-"""Coarser ground lies this much lower, so that it never comes through the finer ground that it reaches under."""
+"""Coarser ground is lowered by this, so that it never penetrates overlapping finer ground."""
 EDGE_M = 0.3
 NEAR_MARGIN_M = 60.0
 FAR_REACH_M, HILLS_M, HILLS_END_M = 640.0, 540.0, 900.0
@@ -30,7 +30,7 @@ def add_ground(chunks: Chunks, network: TownNetwork, rng: np.random.Generator, w
     _lay(chunks, network, network.surface, 0.0, SurfaceClass.ROAD, "asphalt", ASPHALT_TILE_M)
     _lay(chunks, network, network.kerb, high, SurfaceClass.KERB, "kerb", 2.0)
     _walls(chunks, network, network.surface, 0.0, high, SurfaceClass.KERB, "kerb", inwards=True)
-    # Grass lies a little lower than paving, and without an edge one would see below the paving from the grass.
+    # Grass is slightly lower than paving, so paving needs a side face towards it.
     _walls(chunks, network, network.paved, high - EDGE_M, high, SurfaceClass.SIDEWALK, "paving", inwards=False)
     outside = shapely.union_all([shapely.Polygon(part.exterior) for part in network.surface.geoms])
     for area, surface in ((network.sidewalk.difference(outside), SurfaceClass.SIDEWALK),
@@ -46,7 +46,7 @@ def add_ground(chunks: Chunks, network: TownNetwork, rng: np.random.Generator, w
 
 def _lay(chunks: Chunks, network: TownNetwork, area: shapely.Geometry, lift_m: float, surface: SurfaceClass,
          material: str, tile_m: float, step_m: float = STEP_M) -> None:  # fmt: skip
-    """An area as triangles on the terrain; its texture lies in world axes."""
+    """An area as triangles on the terrain, textured in world axes."""
     if area.is_empty:
         return
     flat = ground_triangles(area, step_m)
@@ -62,11 +62,11 @@ def _normals(network: TownNetwork, xy: Float64[np.ndarray, "*n 2"]) -> Float64[n
 
 def _walls(chunks: Chunks, network: TownNetwork, area: shapely.Geometry, low_m: float, high_m: float,
            surface: SurfaceClass, material: str, inwards: bool) -> None:  # fmt: skip
-    """Upright faces along the edge of an area, between two heights over the terrain."""
+    """Vertical faces along the edge of an area, between two heights over the terrain."""
     for polygon in shapely.get_parts(area):
         oriented = shapely.orient_polygons(polygon)
         for ring in (oriented.exterior, *oriented.interiors):
-            # The area lies to the left of its rings, and walls face to the right of their line.
+            # The area is to the left of its rings; walls face to the right of their line.
             points = _split_at_lattice(np.asarray(ring.coords)[:: -1 if inwards else 1, :2])
             along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]) * 0.5
             ground = network.height_m(points)
@@ -86,7 +86,7 @@ def _walls(chunks: Chunks, network: TownNetwork, area: shapely.Geometry, low_m: 
 
 
 def _split_at_lattice(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "m 2"]:
-    """A line with more points where it crosses the lattice of ``ground_triangles``."""
+    """A line with additional points where it crosses the lattice of ``ground_triangles``."""
     out = [points[:1]]
     for a, b in zip(points[:-1], points[1:], strict=True):
         cuts = []
@@ -102,7 +102,7 @@ def _split_at_lattice(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray,
 
 
 def _green(chunks: Chunks, network: TownNetwork) -> None:
-    """Grass around the town, coarser far away, and wooded hills that close the view."""
+    """Grass around the town, coarser far away, and wooded hills at the horizon."""
     high, bounds = network.plan.kerb.height_m, np.array(network.surface.bounds)
     low, top = bounds[:2] - NEAR_MARGIN_M, bounds[2:] + NEAR_MARGIN_M
     near, lawns = shapely.box(*low, *top), Chunks(2 * chunks.size_m)
@@ -138,7 +138,7 @@ def _hills(chunks: Chunks, middle: np.ndarray, rng: np.random.Generator) -> None
 
 
 def _wear(chunks: Chunks, network: TownNetwork, rng: np.random.Generator, wetness: float) -> None:
-    """Wheel tracks along lanes, and stains, sealed cracks, manhole covers and puddles strewn over the road."""
+    """Wheel tracks along lanes, and random stains, sealed cracks, manhole covers and puddles."""
     for lane in network.lanes:
         if lane.in_junction:
             continue
@@ -170,7 +170,7 @@ def _wear(chunks: Chunks, network: TownNetwork, rng: np.random.Generator, wetnes
 
 
 def add_light_pools(chunks: Chunks, network: TownNetwork) -> None:
-    """The light of street lamps on the road and the sidewalk below them."""
+    """Light pools of street lamps on road and sidewalk."""
     for prop in network.plan.props:
         if prop.kind != "lamp":
             continue
@@ -183,7 +183,7 @@ def add_light_pools(chunks: Chunks, network: TownNetwork) -> None:
 
 def _decal_grid(chunks: Chunks, network: TownNetwork, xy: Float64[np.ndarray, "n m 2"], uv: np.ndarray,
                 material: str) -> None:  # fmt: skip
-    """A lattice of places on the road that shows a decal."""
+    """A lattice on the road, textured with a decal."""
     high = network.plan.terrain.height_m(xy)[..., None] + DECAL_LIFT_M
     points, normals = np.concatenate([xy, high], axis=-1), _normals(network, xy)
     cut = [(slice(None, -1), slice(None, -1)), (slice(1, None), slice(None, -1)), (slice(1, None), slice(1, None)),

@@ -1,6 +1,6 @@
 """Meshes of buildings: plinth, shop front, facade, cornice, balconies, and a gable or a flat roof.
 
-A house's front looks towards +y of its own frame; x runs along the street.
+A house's front faces +y of its own frame; x is along the street.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def add_house(chunks: Chunks, house: Building, terrain: Terrain, kerb_m: float, 
     else:
         mesh.flat_roof(tall, rng)
     here, pose = (house.x_m, house.y_m), pose_from_xyyaw(house.x_m, house.y_m, house.yaw_rad, floor)
-    tint = tuple(round(0.5 + 0.5 * float(c), 2) for c in house.tint)  # walls of one colour, not of many
+    tint = tuple(round(0.5 + 0.5 * float(c), 2) for c in house.tint)  # only for uniformly coloured walls
     plain, kind = (1.0, 1.0, 1.0), house.facade % 2
     parts = ((mesh.facade, f"facade_{house.family}{house.facade}", tint), (mesh.shop, f"shop{kind}", plain),
              (mesh.roof, f"roof{kind}", plain), (mesh.trim, "concrete", plain),
@@ -66,13 +66,13 @@ class _House:
         self.outline = np.array([[-x, -y], [x, -y], [x, y], [-x, y], [-x, -y]])
 
     def plinth(self, low: float) -> None:
-        """A base down into the slope, and a step around the walls."""
+        """A base extending below the slope, and a step around the walls."""
         out = self.outline * (1 + 0.03 / self.half)
         self.trim.wall(out, low, 0.35, 0.5, 0.0, 0.5)
         self.trim.quad(*([*corner, 0.35] for corner in out[:4]))
 
     def walls(self, mesh: MeshBuilder, low: float, high: float, v_span: float) -> None:
-        """Walls with a whole number of bays each; the texture begins somewhere else on every wall."""
+        """Walls with an integer number of bays and different texture offsets."""
         for side in range(4):
             a, b = self.outline[side], self.outline[side + 1]
             bays = max(1, round(float(np.linalg.norm(b - a)) / BAY_M))

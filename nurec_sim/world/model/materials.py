@@ -1,4 +1,4 @@
-"""All materials of a town: which textures its style and weather ask for, how they shine and how they glow."""
+"""All materials of a town: textures, shininess and emission by style and weather."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from nurec_sim.world.model.weather import illumination
 from nurec_sim.world.plan.town import SIGNS, TownPlan
 
 WET_DARKER = 0.45
-"""How much of its light a soaked road swallows."""
+"""Darkening of a wet road."""
 LAMPS_ON = 0.7
-"""From this dusk on lamps and rooms are lit."""
+"""Lamps and rooms are lit above this ``dusk``."""
 
 
 def add_materials(builder: SpecBuilder, plan: TownPlan, sky: Sky) -> None:
-    """Everything but the paint and the clothes of actors; each group has a random stream of its own."""
+    """All materials except paint and clothes of actors; each group has its own random stream."""
     _ground(builder, plan, sky)
     _facades(builder, plan)
     _plants(builder, plan)

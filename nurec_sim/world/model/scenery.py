@@ -1,4 +1,4 @@
-"""Everything of a town that stands still: ground, buildings, plants and street furniture."""
+"""Static parts of a town: ground, buildings, plants and street furniture."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TREE_SIZES = (0.8, 1.0, 1.25)
 
 
 def add_scenery(builder: SpecBuilder, network: TownNetwork) -> None:
-    """Ground, houses, plants and furniture of a network's plan; ``materials`` has made their materials."""
+    """Ground, houses, plants and furniture of a network's plan; requires their materials (``materials``)."""
     plan, chunks = network.plan, Chunks(DETAIL_CHUNK_M)
     ground = Chunks()
     add_ground(ground, network, np.random.default_rng([plan.style.texture_seed, 20]), plan.weather.wetness)
@@ -58,14 +58,14 @@ def _pose(network: TownNetwork, prop: Prop) -> np.ndarray:
 
 
 class _Plants:
-    """Trees and bushes from a few shapes of each family and size."""
+    """Trees and bushes instanced from a few shapes per family and size."""
 
     def __init__(self, builder: SpecBuilder, network: TownNetwork):
         self.builder, self.style = builder, network.plan.style
         self._shapes: dict[tuple[str, int, int, int], str] = {}
 
     def add(self, prop: Prop, pose: np.ndarray) -> None:
-        """One plant as a geom of its own, because its shape is shared."""
+        """One plant as its own geom with a shared mesh."""
         family = prop.variant % len(self.style.foliages)
         shape = (prop.variant // len(self.style.foliages)) % 2
         size = int(np.abs(np.array(TREE_SIZES) - prop.scale).argmin())

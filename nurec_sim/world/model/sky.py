@@ -1,4 +1,4 @@
-"""The sky as a function of the viewing direction, so that every projection of it agrees, and as MuJoCo's cube."""
+"""The sky as a function of the viewing direction, consistent for all projections, and as MuJoCo skybox."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class SkyColours:
-    """Colours (0..255) of a preset. ``glow`` is how strongly the air around the sun shines, 0 where no sun is seen."""
+    """Colours (0..255) of a preset. ``glow`` is the strength of the halo around the sun, 0 without a visible sun."""
 
     zenith: Colour
     horizon: Colour
@@ -60,7 +60,7 @@ class Sky:
 
     @property
     def horizon(self) -> Float64[np.ndarray, " 3"]:
-        """The colour (0..255) into which far things fade."""
+        """The horizon colour (0..255), into which distant objects fade."""
         return np.asarray(self.colours.horizon) * float(self._tone)
 
     def colour(self, direction: Float64[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -84,10 +84,10 @@ class Sky:
         return np.clip(colour * self._tone, 0, 255).astype(np.uint8)
 
     def _cloud(self, direction: np.ndarray) -> tuple[Float32[np.ndarray, "h w 1"], Float32[np.ndarray, "h w 1"]]:
-        """How much cloud covers the sky, and how bright it is, 0..1."""
+        """Cloud opacity and brightness, 0..1."""
         up = np.maximum(direction[..., 2], 0.045)
         plane = direction[..., :2] / up[..., None]
-        # Towards the sun a cloud is lit, so the second look-up is a step nearer to the sun.
+        # Clouds are lit from the sun, so the second look-up is a step towards it.
         here = self._thickness(plane)
         nearer = self._thickness(plane + np.float32(0.09) * _single(self.sun[:2]))
         limit = 0.5 + 0.75 * (0.5 - self.cover)
@@ -101,7 +101,7 @@ class Sky:
                          cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)  # fmt: skip
 
     def skybox(self, size: int = 512) -> UInt8[np.ndarray, "six_h w 3"]:
-        """The six faces stacked as MuJoCo wants them: right left up down front back of OpenGL's cube, y up."""
+        """The six faces stacked for MuJoCo: right left up down front back of OpenGL's cube, y up."""
         t = ((np.arange(size) + 0.5) / size * 2 - 1).astype(np.float32)
         u, v = np.meshgrid(t, t)
         one = np.ones_like(u)
@@ -109,7 +109,7 @@ class Sky:
         return np.concatenate([self._face(np.stack([x, -z, y], axis=-1)) for x, y, z in faces])
 
     def _face(self, direction: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
-        """One face; ``direction`` need not be of unit length. What lies below the horizon costs nothing."""
+        """One face; ``direction`` need not be normalised. Pixels below the horizon are skipped."""
         rows = int((direction[:, :, 2] > 0).any(axis=1).sum())
         width, image = direction.shape[1], np.empty(direction.shape, np.uint8)
         if rows < len(image):

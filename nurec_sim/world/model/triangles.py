@@ -1,7 +1,8 @@
-"""Cutting areas of a plan into triangles so small that they follow the rolling ground.
+"""Triangulates areas of a plan finely enough to follow the terrain.
 
-All areas are cut along one lattice, so that neighbouring surfaces meet without gaps and paint stays above asphalt: the
-plane through a triangle's corners lies within 4 mm of the smooth terrain (waves of 140 m and more, slopes up to 6 %).
+All areas are split along one lattice, so that neighbouring surfaces meet without gaps and paint stays above asphalt:
+the plane through a triangle's corners lies within 4 mm of the smooth terrain (waves of 140 m and more, slopes up to 6
+%).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _SMALLEST_M2 = 1e-6
 def ground_triangles(area: shapely.Geometry, step_m: float = STEP_M) -> Float64[np.ndarray, "n 3 2"]:
     """Triangles (counter-clockwise, seen from above) that cover an area exactly, none larger than half a lattice cell.
 
-    Areas that are cut with different steps meet at different heights: let the coarser one reach under the finer one.
+    Areas with different steps do not meet exactly: extend the coarser one below the finer one.
     """
     found = []
     for tile in _tiles(area, step_m * TILE_STEPS):
@@ -39,7 +40,7 @@ def on_ground(
 
 
 def _tiles(area: shapely.Geometry, size_m: float) -> np.ndarray:
-    """Squares that an area touches."""
+    """Lattice squares that intersect an area."""
     low_x, low_y, high_x, high_y = np.asarray(area.bounds) / size_m
     x, y = np.meshgrid(np.arange(np.floor(low_x), np.ceil(high_x)), np.arange(np.floor(low_y), np.ceil(high_y)))
     x, y = x.ravel() * size_m, y.ravel() * size_m

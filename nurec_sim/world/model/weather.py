@@ -1,4 +1,4 @@
-"""Lights and air of a weather: sun, fill and ambient light for MuJoCo's classic renderer, and fog.
+"""Weather: sun, fill and ambient light for MuJoCo's classic renderer, and fog.
 
 The classic renderer adds light without any gamma: colours are those of the final image.
 """
@@ -18,7 +18,7 @@ from nurec_sim.world.plan.town import Weather
 
 @dataclass(frozen=True)
 class Illumination:
-    """Diffuse light 0..1 of the sun, of the sky from all sides, and from the side away from the sun."""
+    """Diffuse light 0..1 of the sun, ambient light of the sky, and fill light opposite to the sun."""
 
     sun: Colour
     ambient: Colour
@@ -49,7 +49,7 @@ def illumination(weather: Weather) -> Illumination:
 
 
 def add_lights(spec: Any, weather: Weather) -> None:
-    """A sun, a weak fill from the other side so that shaded walls keep their shape, and ambient light."""
+    """Sun, a weak fill light from the opposite side so that shaded walls keep contrast, and ambient light."""
     light, sun = illumination(weather), sun_direction(weather)
     directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     fill = np.array([-sun[0], -sun[1], 0.8])
@@ -66,7 +66,7 @@ def add_lights(spec: Any, weather: Weather) -> None:
 def add_fog(
     rgb: UInt8[np.ndarray, "h w 3"], distance_m: Float32[np.ndarray, "h w"], sky: Sky, fog_per_m: float
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The image as seen through fog of the horizon's colour; where ``distance_m`` is 0 there is sky, which stays.
+    """Applies fog of the horizon's colour; sky pixels (``distance_m`` 0) are unchanged.
 
     Fog leaves ``exp(-fog_per_m * distance)`` of the light (Beer-Lambert).
     """

@@ -1,4 +1,4 @@
-"""What a town looks like, by seed: its materials, its light and its weather."""
+"""Random appearance of a town: materials, light and weather."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from nurec_sim.world.plan.terrain import Terrain, Wave
 from nurec_sim.world.plan.town import Style, Weather
 
 STEEPEST = 0.06
-"""Rise per metre that no town exceeds."""
+"""Maximum slope of any town."""
 SUN_ELEVATION_RAD = {"sunset": (0.12, 0.22), "dusk": (0.05, 0.14)}
 CLOUD_COVER = {
     "clear": (0.1, 0.45), "hazy": (0.2, 0.5), "overcast": (0.9, 1.0), "sunset": (0.3, 0.6), "dusk": (0.2, 0.6),
@@ -19,13 +19,13 @@ FOG_PER_M = {"hazy": (0.002, 0.005), "overcast": (0.0, 0.0015), "foggy": (0.008,
 
 
 def _pick(rng: np.random.Generator, choices: Choices, split: Split) -> str:
-    """A shared name in training, a held-out one in tests."""
+    """A shared name for split train, a held-out one for test."""
     names = choices.held_out if split == "test" else choices.shared
     return str(names[int(rng.integers(len(names)))])
 
 
 def _several(rng: np.random.Generator, choices: Choices, split: Split, count: int) -> tuple[str, ...]:
-    """Some shared names; in tests a held-out one comes first."""
+    """Several shared names; for split test the first one is held out."""
     names = [str(name) for name in rng.permutation(choices.shared)[:count]]
     return tuple([_pick(rng, choices, split), *names[:-1]]) if split == "test" else tuple(names)
 
@@ -45,7 +45,7 @@ def town_style(rng: np.random.Generator, split: Split) -> Style:
 
 
 def town_weather(rng: np.random.Generator, split: Split) -> Weather:
-    """A sky preset and its numbers. Every other test town has a preset that training knows."""
+    """A sky preset and its numbers. Every other test town has a shared preset."""
     shared = split == "train" or rng.random() < 0.5
     names = SKIES.shared if shared else SKIES.held_out
     chance = np.array([2.0 if name == "clear" else 1.0 for name in names])
@@ -66,7 +66,7 @@ def town_weather(rng: np.random.Generator, split: Split) -> Weather:
 
 
 def town_terrain(rng: np.random.Generator) -> Terrain:
-    """Flat ground every fifth time, else two to four long waves."""
+    """Flat ground with probability 0.2, else two to four long waves."""
     if rng.random() < 0.2:
         return Terrain()
     count = int(rng.integers(2, 5))

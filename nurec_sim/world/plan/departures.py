@@ -1,4 +1,4 @@
-"""Where everybody who drives starts, and where to: the ego, a car before it, and whoever comes along nearby."""
+"""Start states and routes of the ego, its lead car and nearby vehicles."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from nurec_sim.world.plan.town import EGO_MIDDLE_M, ActorKind
 
 EGO_SIZE_M = (4.9, 1.9, 1.5)
 EGO_EAGERNESS = (0.5, 1.3)
-"""The ego's wanted speed against the limit."""
+"""The ego's desired speed relative to the limit."""
 FASTEST_EGO_MPS = 16.0
 EGO_TRIES = 8
 VEHICLES = (8, 18)
 SEEN_M = 90.0
-"""Nobody further from the ego's way is worth his steps."""
+"""Vehicles further from the ego's route are not simulated."""
 LEAVING_M = 60.0
-"""Nor is who leaves the town anyway."""
+"""Nor are vehicles about to leave the town."""
 CYCLISTS = 0.13
 LEAD = 0.8
 FREE_M = 2.5
 FLOWING_RANK = 3
-"""Who is of this rank at a junction rarely has to wait: the ego chooses such ways a little more often."""
+"""Rank that rarely has to wait at a junction; the ego prefers such routes slightly."""
 
 
 @dataclass(frozen=True, eq=False)
 class Vehicle:
-    """A driver and what others see of it."""
+    """A driver with its vehicle's appearance."""
 
     name: str
     kind: ActorKind
@@ -43,7 +43,7 @@ class Vehicle:
 
 
 def ego_driver(rng: np.random.Generator, rules: Rules, seconds: float) -> Driver:
-    """The ego: through a junction where there is one, and not into a red light as a rule."""
+    """The ego: through a junction if there is one, usually not into a red light."""
     eagerness = float(rng.uniform(*EGO_EAGERNESS))
     firsts = [lane for lane in rules.lanes.values() if not lane.in_junction]
     best: tuple[float, Route, float] | None = None
@@ -73,7 +73,7 @@ def ego_driver(rng: np.random.Generator, rules: Rules, seconds: float) -> Driver
 def other_vehicles(
     rng: np.random.Generator, rules: Rules, split: Split, ego: Driver, way: shapely.LineString
 ) -> list[Vehicle]:
-    """A car before the ego as a rule, and whoever is on any lane around ``way``, nearest first."""
+    """Usually a lead car, and vehicles on the lanes around ``way``, nearest first."""
     places = _lead(rng, rules, ego) + _places(rng, rules, way)
     wanted = int(rng.integers(VEHICLES[0], VEHICLES[1] + 1))
     taken = [(ego.route.at(np.array(ego.station_m)), EGO_SIZE_M[0])]
@@ -84,7 +84,7 @@ def other_vehicles(
         leads = away < 0
         kind: ActorKind = "cyclist" if not leads and rng.random() < CYCLISTS else fleet.pick_kind(rng, split)
         if kind in fleet.LONG_KINDS and any(rules.lanes[leg.lane].turn not in ("", "straight") for leg in route.legs):
-            kind = "van"  # what is long does not turn at junctions: it would need both lanes
+            kind = "van"  # long vehicles do not turn at junctions, since they would need both lanes
         size, lanes = fleet.pick_size(rng, kind), [leg.lane for leg in route.legs]
         if kind == "cyclist":
             pace = float(rng.uniform(3.0, 6.5)) / rules.lanes[lanes[0]].speed_limit_mps
@@ -106,7 +106,7 @@ Place = tuple[float, Route, float]
 
 
 def _lead(rng: np.random.Generator, rules: Rules, ego: Driver) -> list[Place]:
-    """A place before the ego, most of the time, for somebody who is rather slower."""
+    """Start of a slower lead car ahead of the ego, most of the time."""
     station = ego.station_m + EGO_SIZE_M[0] + float(rng.uniform(7.0, 28.0)) + 0.5 * ego.speed_mps
     slower = float(rng.uniform(0.7, 1.1))
     if rng.random() > LEAD or station > ego.route.length_m - LEAVING_M:
@@ -115,7 +115,7 @@ def _lead(rng: np.random.Generator, rules: Rules, ego: Driver) -> list[Place]:
 
 
 def _places(rng: np.random.Generator, rules: Rules, way: shapely.LineString) -> list[Place]:
-    """Places on all lanes of roads, in no even order, but near ones first."""
+    """Start positions on all lanes of roads, roughly nearest first."""
     places: list[Place] = []
     for lane in rules.lanes.values():
         if lane.in_junction:
@@ -137,7 +137,7 @@ def _allowed(route: Route, station_m: float) -> float:
 
 
 def _cycling_m(rules: Rules, lanes: Sequence[str]) -> float:
-    """How far to the right of a lane's middle one cycles: half a metre from its edge, where it is narrowest."""
+    """Lateral offset of cyclists from the lane centre: half a metre from its edge at the narrowest point."""
     roads = [rules.network.roads.get(rules.lanes[name].road) for name in lanes]
     narrow = [road.plan.narrowing.lane_width_m for road in roads if road is not None and road.plan.narrowing]
     return 0.5 * min([*narrow, *(rules.lanes[name].width_m for name in lanes)]) - 0.55

@@ -1,8 +1,8 @@
-"""How everybody who drives moves: speeds by the intelligent driver model, and who waits for whom.
+"""Vehicle simulation: speeds by the intelligent driver model, and right of way.
 
-Free roads and followed cars: Treiber, Hennecke, Helbing, "Congested traffic states in empirical observations and
-microscopic simulations" (2000). The middle of a vehicle follows its route and its rear axle is dragged along without
-slipping (a tractrix). Arrays have one row per vehicle; the ego is an ordinary vehicle.
+Free driving and car following: Treiber, Hennecke, Helbing, "Congested traffic states in empirical observations and
+microscopic simulations" (2000). The centre of a vehicle follows its route and its rear axle follows without slip (a
+tractrix). Arrays have one row per vehicle; the ego is an ordinary vehicle.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ STEP_S = 0.05
 ACCEL_MPS2, BRAKE_MPS2, HARD_BRAKE_MPS2 = 1.6, 2.0, 6.0
 STAND_GAP_M, HEADWAY_S = 2.0, 1.2
 LOOK_AHEAD_M = 60.0 * np.linspace(0.0, 1.0, 48) ** 1.5
-"""Where drivers look for what stands in their way, from the front bumper on; finest where it is close."""
-ASIDE_M = 0.25  # what somebody leaves free beside oneself
+"""Look-ahead distances from the front bumper for obstacles, finest nearby."""
+ASIDE_M = 0.25  # lateral clearance
 STOP_SHORT_M = 0.6
 AXLE_BEHIND_MIDDLE = 0.29  # of the length
 
@@ -31,15 +31,14 @@ class Driver:
     """A vehicle with its route.
 
     Attributes:
-        route: where it goes.
-        station_m: where its middle is at first.
-        speed_mps: how fast it is at first.
+        route: its route.
+        station_m: initial station of its centre.
+        speed_mps: initial speed.
         size_m: length, width, height.
-        rank: who drives first where two routes through a junction cross, per lane of the route that leads through a
-            junction; a negative rank never drives (a red light).
-        stop_short_m: how far before each such lane it has to stop.
-        must_halt: lanes before which it has to halt even if nobody comes (a stop sign).
-        axle_m: from the rear axle to the middle.
+        rank: right of way per junction lane of the route; a negative rank never enters (red light).
+        stop_short_m: distance of the stop line before each such lane.
+        must_halt: lanes with a stop sign.
+        axle_m: distance from the rear axle to the centre.
     """
 
     route: Route
@@ -54,7 +53,7 @@ class Driver:
 
 @dataclass(frozen=True)
 class Pass:
-    """Somebody walks across a route: ``driver`` waits at ``stop_m`` from ``from_s`` to ``until_s``."""
+    """A pedestrian crosses a route: ``driver`` waits at ``stop_m`` from ``from_s`` to ``until_s``."""
 
     driver: int
     stop_m: float
@@ -69,14 +68,14 @@ def simulate(
     walkers: Boxes,
     passes: Sequence[Pass],
 ) -> Boxes:
-    """Everybody's way over ``steps`` steps of ``STEP_S``, the start included.
+    """Stations of all drivers over ``steps`` steps of ``STEP_S``, the start included.
 
     Args:
-        drivers: who drives, n.
-        steps: how long.
+        drivers: n drivers.
+        steps: number of steps.
         meetings: ``routes.conflicts`` of the network.
-        walkers: people on the road at the same times; who drives brakes for them.
-        passes: where people cross.
+        walkers: pedestrians on the road at the same times; drivers brake for them.
+        passes: pedestrian crossings to wait for.
     """
     count = len(drivers)
     half = np.array([[driver.size_m[0] / 2, driver.size_m[1] / 2] for driver in drivers])
@@ -98,7 +97,7 @@ def simulate(
         stop = np.minimum(yields.stops_m(front, speed, half[:, 0]), stops.stops_m(front, speed, step * STEP_S))
         wanted = follow(speed, road.allowed(station), gap, lead_speed)
         wanted = np.minimum(wanted, follow(speed, road.allowed(station), stop - front + STAND_GAP_M - STOP_SHORT_M))
-        accel = accel + np.clip(wanted - accel, -14.0 * STEP_S, 5.0 * STEP_S)  # nobody moves the pedal in no time
+        accel = accel + np.clip(wanted - accel, -14.0 * STEP_S, 5.0 * STEP_S)  # jerk limit
         after = np.maximum(speed + accel * STEP_S, 0.0)
         accel = np.where(after == 0.0, np.maximum(accel, 0.0), accel)
         station, speed = station + (speed + after) / 2 * STEP_S, after
@@ -121,7 +120,7 @@ def follow(
 
 
 class _Roads:
-    """All routes in one array, so that everybody's place is looked up at once."""
+    """All routes in one array, for vectorised look-up."""
 
     def __init__(self, routes: Sequence[Route]):
         longest = max(len(route.xy_m) for route in routes)
@@ -131,7 +130,7 @@ class _Roads:
         self.rows = np.arange(len(routes))
 
     def at(self, station_m: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n ... 2"]:
-        """Points of everybody's own route, straight on beyond both ends."""
+        """Points of each driver's route, extrapolated straight beyond both ends."""
         shape = (-1,) + (1,) * (station_m.ndim - 1)
         row, place = self.rows.reshape(shape), station_m / SPACING_M
         index = np.clip(place.astype(int), 0, self.last.reshape(shape))
@@ -139,7 +138,7 @@ class _Roads:
         return low + (place - index)[..., None] * (self.xy[row, index + 1] - low)
 
     def allowed(self, station_m: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-        """Speeds that the routes allow there."""
+        """Allowed speeds on the routes."""
         return self.speed[self.rows, np.clip(np.rint(station_m / SPACING_M).astype(int), 0, self.last)]
 
 
@@ -147,7 +146,7 @@ def _what_is_ahead(
     road: _Roads, front: np.ndarray, half: np.ndarray, middle: np.ndarray, yaw: np.ndarray, speed: np.ndarray,
     walkers: Boxes, step: int,
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:  # fmt: skip
-    """The free way before everybody's front bumper, and how fast what ends it moves in the same direction."""
+    """Free distance ahead of each front bumper, and the speed of the obstacle along the route."""
     count = len(front)
     way = road.at(front[:, None] + LOOK_AHEAD_M)
     boxes = np.concatenate([middle, walkers.middle_m[step]])
@@ -157,7 +156,7 @@ def _what_is_ahead(
     away = way[:, :, None] - boxes  # [n, look, box, 2]
     c, s = np.cos(box_yaw), np.sin(box_yaw)
     along, across = away[..., 0] * c + away[..., 1] * s, away[..., 1] * c - away[..., 0] * s
-    # Seen square to the way, a box is as wide as its direction makes it; its length needs no margin of mine.
+    # Half extent of a rotated box perpendicular to the route; only the width gets a margin.
     aside = half[:, None, None, 1] + ASIDE_M
     hit = (np.abs(along) < box_half[:, 0] + 0.3) & (np.abs(across) < box_half[:, 1] + aside)
     turned = np.abs(np.sin(yaw[:, None] - box_yaw))[:, None]
@@ -172,7 +171,7 @@ def _what_is_ahead(
 
 
 class _Yields:
-    """Who lets whom pass at which junction: one row per pair of drivers whose lanes come close."""
+    """Right of way at junctions: one row per pair of drivers with conflicting lanes."""
 
     def __init__(self, drivers: Sequence[Driver], meetings: Mapping[tuple[str, str], Conflict]):
         rows, reds = [], []
@@ -211,12 +210,12 @@ class _Yields:
         self.halted: Bool[np.ndarray, " h"] = np.zeros(len(halts), bool)
 
     def stops_m(self, front: np.ndarray, speed: np.ndarray, half_length: np.ndarray) -> Float64[np.ndarray, " n"]:
-        """Where everybody's front has to stop, infinite if nowhere."""
+        """Stop position of each front bumper, infinite if none."""
         stops = np.full(self.count, np.inf)
         me, other = self.me, self.other
         inside, they_inside = front[me] > self.stop + 0.5, front[other] > self.their_stop + 0.5
         passed = front[other] - 2 * half_length[other] > self.their_far
-        # Who stands may start at any moment: both are taken to be a little faster than they are.
+        # Stopped vehicles may start at any time, so both speeds are overestimated slightly.
         my_pace, their_pace = speed[me] + 1.5, speed[other] + 1.5
         they_come = np.maximum(self.their_near - front[other], 0.0) / their_pace
         they_leave = (self.their_far + 2 * half_length[other] - front[other]) / np.maximum(speed[other], 0.5)
@@ -240,7 +239,7 @@ class _Yields:
 
 
 class _Stops:
-    """Who waits for people that cross."""
+    """Waiting for crossing pedestrians."""
 
     def __init__(self, drivers: Sequence[Driver], passes: Sequence[Pass]):
         self.count = len(drivers)
@@ -249,7 +248,7 @@ class _Stops:
         self.span = np.array([(each.from_s, each.until_s) for each in passes]).reshape(-1, 2)
 
     def stops_m(self, front: np.ndarray, speed: np.ndarray, now_s: float) -> Float64[np.ndarray, " n"]:
-        """Where everybody's front has to stop, infinite if nowhere."""
+        """Stop position of each front bumper, infinite if none."""
         stops = np.full(self.count, np.inf)
         if len(self.me):
             open_now = (self.span[:, 0] <= now_s) & (now_s < self.span[:, 1]) & (front[self.me] < self.stop + 0.5)
@@ -259,5 +258,5 @@ class _Stops:
 
 
 def _concerns(distance_m: np.ndarray, speed: np.ndarray) -> Bool[np.ndarray, " r"]:
-    """Whether a stop lies near enough to brake for, and not so near that one cannot stop any more."""
+    """Whether a stop is near enough to brake for, and far enough to be reachable."""
     return (distance_m < speed**2 / 3.0 + 10.0) & (distance_m > speed**2 / (2 * HARD_BRAKE_MPS2) - 1.0)

@@ -1,4 +1,4 @@
-"""What drives and stands in a town: kinds of vehicles, their sizes and colours, and the cars along the kerb."""
+"""Vehicle kinds, sizes and colours, and parked cars."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SIZE_OF_KIND_M: dict[str, tuple[float, float, float]] = {
     "cyclist": (1.80, 0.62, 1.76),
 }
 SHARE_OF_KIND = {"truck": 0.4, "bus": 0.25, "sports": 0.4}
-"""How often a kind is seen, against 1 for the others."""
+"""Relative frequency of a kind; default 1."""
 LONG_KINDS = ("truck", "bus")
 HELD_OUT_SHARE = 0.5
 COLOURS = (
@@ -38,7 +38,7 @@ CLEAR_M = 5.0
 
 
 def pick_kind(rng: np.random.Generator, split: Split, parked: bool = False) -> ActorKind:
-    """A kind of vehicle; half of those in test towns are of kinds that training never sees."""
+    """A random vehicle kind; half of those in test towns are held out from training."""
     kinds = VEHICLES.held_out if split == "test" and rng.random() < HELD_OUT_SHARE else VEHICLES.shared
     usual = [kind for kind in kinds if not (parked and kind in LONG_KINDS)]
     share = np.array([SHARE_OF_KIND.get(kind, 1.0) for kind in usual])
@@ -46,20 +46,20 @@ def pick_kind(rng: np.random.Generator, split: Split, parked: bool = False) -> A
 
 
 def pick_size(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
-    """A size of that kind, in millimetres that JSON keeps."""
+    """A random size of that kind, rounded to millimetres."""
     length, width, height = np.array(SIZE_OF_KIND_M[kind]) * (1 + np.clip(rng.normal(0, 0.025, 3), -0.05, 0.05))
     return round(float(length), 3), round(float(min(width, 2.55)), 3), round(float(height), 3)
 
 
 def pick_colour(rng: np.random.Generator) -> tuple[float, float, float]:
-    """One of the colours of cars and clothes."""
+    """A random colour of cars and clothes."""
     return COLOURS[int(rng.integers(len(COLOURS)))]
 
 
 def parked_cars(
     rng: np.random.Generator, network: TownNetwork, split: Split, span_us: tuple[int, int], way: shapely.LineString
 ) -> list[Actor]:
-    """Cars in the parking strips around the way of the ego, nearest first, a little off the ideal."""
+    """Cars in the parking strips around the ego's route, nearest first, with small pose noise."""
     found: list[tuple[float, Actor]] = []
     for name, road in network.roads.items():
         kept_free = _kept_free(network, name)
@@ -69,7 +69,7 @@ def parked_cars(
                 kind = pick_kind(rng, split, parked=True)
                 size = pick_size(rng, kind)
                 room = float(rng.uniform(0.9, 2.6))
-                # On the inside of a bend a metre of the strip is more than a metre of stations.
+                # On the inside of a bend a metre of the strip spans more than a metre of stations.
                 strip = road.at(np.array([station, station + 1.0]), road.edge_m(side, station))[0]
                 per_m = max(1.0, 1.0 / float(np.linalg.norm(strip[1] - strip[0])))
                 ends, station = (station, station + size[0] * per_m), station + (size[0] + room) * per_m
@@ -79,7 +79,7 @@ def parked_cars(
                     continue
                 middle = (ends[0] + ends[1]) / 2
                 edge = side * float((side * road.edge_m(side, np.array([*ends, middle]))).min())
-                # Wheels stand a hand's breadth from the kerb.
+                # Wheels are about 10 cm from the kerb.
                 xy, yaw = road.at(middle, edge - side * (size[1] / 2 + 0.1 + out))
                 away = float(shapely.distance(way, shapely.Point(xy)))
                 against = road.count(-1) == 0 or (side > 0 and road.count(1) > 0)
@@ -93,7 +93,7 @@ def parked_cars(
 
 
 def _kept_free(network: TownNetwork, road: str) -> list[tuple[float, float]]:
-    """Stretches of a road where nobody parks: before junctions, at crossings and at stop lines."""
+    """No-parking sections of a road: before junctions, at crossings and at stop lines."""
     length = network.roads[road].length_m
     spans = [
         (-CLEAR_M, CLEAR_M) if mouth.outward else (length - CLEAR_M, length + CLEAR_M)

@@ -1,4 +1,4 @@
-"""Trees, lamps, signs and everything else that stands beside the road (and the cones on it)."""
+"""Street furniture and plants beside the road, and cones on it."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from nurec_sim.world.plan.road import RoadLanes
 from nurec_sim.world.plan.town import SIGNS, Building, Prop, PropKind, Style
 
 VARIANTS = 4
-"""Looks of a kind of prop."""
+"""Number of variants of a prop kind."""
 ROOM_M = {"tree": 1.0, "bus_stop": 2.2, "billboard": 3.0, "hedge": 0.5, "fence": 0.2}
-"""Free space around a prop's middle, 0.35 m for kinds that are not listed."""
+"""Clearance around a prop's centre; 0.35 m for other kinds."""
 
 
 def town_props(
     rng: np.random.Generator, network: TownNetwork, houses: tuple[Building, ...], style: Style
 ) -> tuple[Prop, ...]:
-    """Everything that stands about; nothing reaches into a house or onto the road, but for cones."""
+    """All props; only cones are on the road, and none intersects a house."""
     return _Furniture(rng, network, houses, style).build()
 
 
@@ -62,7 +62,7 @@ class _Furniture:
 
     def _stand(self, kind: PropKind, xy: np.ndarray, yaw: float, *, variant: int | None = None, scale: float = 1.0,
                length: float = 0.0, off_paving: bool = False) -> bool:  # fmt: skip
-        """Adds a prop where there is room; says whether there was."""
+        """Adds a prop if there is space; returns whether it was added."""
         point = shapely.Point(xy)
         room = ROOM_M.get(kind, 0.35)
         reach = point.buffer(0.25 if kind == "tree" else min(room, 0.35), quad_segs=2)
@@ -79,7 +79,7 @@ class _Furniture:
         return True
 
     def _beside(self, line: RoadLanes, station: float, side: int, beyond: float) -> tuple[np.ndarray, float]:
-        """A place ``beyond`` the kerb of a side, and the heading of the traffic there."""
+        """A position ``beyond`` the kerb of a side, and the heading of the traffic there."""
         offset = float(line.edge_m(side, station)) + side * (self.network.plan.kerb.width_m + beyond)
         xy, yaw = line.at(station, offset)
         with_stations = side < 0 or line.plan.lanes_backward == 0
@@ -88,7 +88,7 @@ class _Furniture:
     # --------------------------------------------------------------------------------------------------- junctions
 
     def _at_mouth(self, mouth: Mouth) -> None:
-        """Lights or a sign at the right side of who drives in."""
+        """Lights or a sign at the right side of incoming traffic."""
         rule, side = mouth.arm.rule, 1 if mouth.outward else -1
         if not mouth.lanes(inbound=True):
             return
@@ -173,7 +173,7 @@ class _Furniture:
                 count += 1
 
     def _boundary(self, line: RoadLanes, side: int) -> None:
-        """Hedges and fences along the back of the sidewalk, in pieces with gaps for the doors."""
+        """Hedges and fences behind the sidewalk, with gaps for doors."""
         kind: PropKind = "hedge" if self.rng.random() < 0.6 else "fence"
         share = 0.75 if self.style.district == "suburb" else 0.25
         beyond = self.network.plan.kerb.sidewalk_width_m + 0.55

@@ -1,4 +1,4 @@
-"""How roads meet: where their mouths are, and the paths of lines and arcs that lead from lane to lane."""
+"""Junctions: the mouths of their roads, and connecting paths of lines and arcs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Pose2 = tuple[np.ndarray, float]
 
 @dataclass(frozen=True)
 class Mouth:
-    """An arm of a junction, seen from the junction: where it points, and what lies beside its centre line."""
+    """An arm of a junction, seen from the junction: direction and cross-section."""
 
     arm: Arm
     line: RoadLanes
@@ -33,16 +33,16 @@ class Mouth:
 
     @property
     def station_m(self) -> float:
-        """Where the road meets the junction."""
+        """Station at which the road meets the junction."""
         return 0.0 if self.outward else self.line.length_m
 
     def pose(self, offset_m: float = 0.0) -> Pose2:
-        """A place across the mouth (offset to the road's own left), with the heading away from the junction."""
+        """A position across the mouth (offset to the road's own left), heading away from the junction."""
         xy, yaw = self.line.at(self.station_m, offset_m)
         return xy, float(yaw) + (0.0 if self.outward else np.pi)
 
     def lanes(self, inbound: bool) -> list[int]:
-        """Numbers of the lanes that lead into the junction or out of it, from the centre line outwards."""
+        """Numbers of the lanes into or out of the junction, from the centre line outwards."""
         backward = inbound == self.outward
         count = self.line.count(1 if backward else -1)
         return [k if backward else -k for k in range(1, count + 1)]
@@ -54,7 +54,7 @@ class Mouth:
 
 
 def reaches(arms: Sequence[tuple[float, float, float]], corner_radius_m: float) -> list[float]:
-    """How far from the centre of a crossing its mouths have to be, so that kerbs of the given radius fit in.
+    """Distance of the mouths from the centre of a crossing that leaves space for kerbs of a given radius.
 
     Args:
         arms: per arm its direction (rad, counter-clockwise order), and its width to the left and to the right of its
@@ -141,10 +141,10 @@ def ring_path(start: Pose2, end: Pose2, centre: np.ndarray, ring_m: float, flare
 
 def connections(junction: str, mouths: Sequence[Mouth], ring: tuple[np.ndarray, float, float] | None = None
                 ) -> tuple[Connection, ...]:  # fmt: skip
-    """Every allowed way through a junction; ``ring`` is a roundabout's centre, radius and flare.
+    """Every allowed path through a junction; ``ring`` is a roundabout's centre, radius and flare.
 
-    Left turns go from and to the innermost lane, right turns from and to the outermost, and lanes that lead straight
-    on keep their place. Nobody turns back.
+    Left turns go from and to the innermost lane, right turns from and to the outermost, and straight lanes keep their
+    index. There are no U-turns.
     """
     found: list[Connection] = []
     for a, source in enumerate(mouths):
@@ -193,7 +193,7 @@ def crossing(junction: str, kind: Literal["crossing", "fork"], centre: np.ndarra
 
 def roundabout(junction: str, centre: np.ndarray, arms: Sequence[Arm], roads: dict[str, Road], corner_radius_m: float,
                ring_radius_m: float, ring_width_m: float, flare_m: float) -> Junction:  # fmt: skip
-    """A ring that is entered to the right and run counter-clockwise."""
+    """A roundabout, entered to the right and driven counter-clockwise."""
     mouths = [Mouth(arm, RoadLanes(roads[arm.road])) for arm in arms]
     paths = connections(junction, mouths, (centre, ring_radius_m, flare_m))
     return Junction(junction, "roundabout", float(centre[0]), float(centre[1]), corner_radius_m, tuple(arms), paths,

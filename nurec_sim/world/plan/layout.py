@@ -1,4 +1,4 @@
-"""From a seed to a town: roads, houses, furniture, light, and the traffic of a drive."""
+"""Generates a town from a seed: roads, houses, furniture, light, and traffic."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from nurec_sim.world.plan.town import Crossing, Kerb, StopLine, TownPlan
 
 START_US = 1_000_000
 STEP_US = 50_000
-"""Poses of a plan are this far apart in time."""
+"""Time step of the poses of a plan."""
 MOST_SECONDS = 30.0
 
 
 def town_plan(seed: int, split: Split = "train", template: str | None = None, seconds: float = 12.0) -> TownPlan:
-    """The town of a seed, and ``seconds`` of traffic in it; less than a second of work.
+    """The town of a seed with ``seconds`` of traffic; takes less than a second.
 
     Args:
         seed: same seed, same split, same plan to the byte.
-        split: ``train`` towns show only what ``splits`` shares; ``test`` towns always show held-out materials, every
-            other one a held-out template, and never repeat a training town.
+        split: ``train`` towns use only shared assets of ``splits``; ``test`` towns always have held-out materials,
+            every other one a held-out template, and never repeat a training town.
         template: one of ``splits.TEMPLATES``; by seed if not given.
         seconds: length of the drive, 1..30.
 
@@ -43,7 +43,7 @@ def town_plan(seed: int, split: Split = "train", template: str | None = None, se
 
 
 def still_town(seed: int, split: Split = "train", template: str | None = None, seconds: float = 12.0) -> TownPlan:
-    """The same town without anybody in it; arguments and errors as in ``town_plan``."""
+    """The same town without traffic; arguments and errors as in ``town_plan``."""
     if seed < 0 or not 1.0 <= seconds <= MOST_SECONDS:
         raise ValueError(
             f"a town needs a seed >= 0 and 1..{MOST_SECONDS:g} seconds, got seed {seed}, {seconds} seconds"
@@ -90,7 +90,7 @@ def still_town(seed: int, split: Split = "train", template: str | None = None, s
 
 
 def _crossings(rng: np.random.Generator, network: TownNetwork) -> tuple[tuple[Crossing, ...], tuple[StopLine, ...]]:
-    """Crossings at the mouths of most junctions, and here and there along a road; stop lines where drivers may wait."""
+    """Crossings at most junction mouths and some mid-block; stop lines where drivers may wait."""
     crossings: list[Crossing] = []
     stops: list[StopLine] = []
     for junction in network.plan.junctions:

@@ -1,4 +1,4 @@
-"""Houses along the roads, at the ends of the roads so that no view is open, and far away above the roofs."""
+"""Houses along the roads, at road ends to close the view, and in the skyline."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NEAR_HOUSE_M = 1.0
 
 @dataclass(frozen=True)
 class _Manner:
-    """How a district is built: ranges in metres."""
+    """Building parameters of a district: ranges in metres."""
 
     width: tuple[float, float]
     depth: tuple[float, float]

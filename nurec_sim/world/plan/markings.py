@@ -14,7 +14,7 @@ from nurec_sim.world.plan.road import RoadLanes
 from nurec_sim.world.plan.town import Crossing, RoadPiece, StopLine, TownPlan
 
 LINE_PART_M = 20.0
-"""Long lines come in parts, so that those out of sight can be left out of an image."""
+"""Long lines are split so that parts out of view can be culled."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _stripe(line: RoadLanes, start: float, end: float, offset: float | np.ndarra
 
 def _dashes(line: RoadLanes, start: float, end: float, offset_of: float, on: float, off: float, width: float
             ) -> list[shapely.Polygon]:  # fmt: skip
-    """Dashes in step with the road's stations, ``offset_of`` lane widths from the centre line."""
+    """Dashes aligned with the road's stations, ``offset_of`` lane widths from the centre line."""
     found = []
     for dash in np.arange(np.floor(start / (on + off)) * (on + off), end, on + off):
         low, high = max(dash, start), min(dash + on, end)
@@ -133,7 +133,7 @@ def _edge_lines(line: RoadLanes, start: float, end: float) -> list[shapely.Polyg
 
 
 def _crossing(line: RoadLanes, crossing: Crossing) -> list[shapely.Polygon]:
-    """Zebra stripes, or two thin lines that walkers keep between."""
+    """Zebra stripes, or two thin boundary lines."""
     start, end = crossing.station_m, crossing.station_m + crossing.depth_m
     right, left = (float(line.edge_m(side, (start + end) / 2)) for side in (-1, 1))
     if not crossing.zebra:

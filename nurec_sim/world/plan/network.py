@@ -1,4 +1,4 @@
-"""The road network of a plan: exact areas, paint, and lanes to drive along. Everything here follows from the plan."""
+"""The road network of a plan: exact areas, markings and lanes, all derived from the plan."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from nurec_sim.world.plan.town import TownPlan
 class Lane:
     """A lane of a road (``<road>:<number>``) or a path through a junction (``<junction>:<k>``), in driving direction.
 
-    ``polyline`` lies on the ground, with points at most 1 m apart; it ends exactly where its successors begin.
-    ``width_m`` is that of the narrowest place. ``road`` is the lane's road or the path's junction, ``turn`` is
-    ``straight``, ``left`` or ``right`` on paths, and ``ends_at`` is the junction that a lane of a road leads to.
+    ``polyline`` lies on the ground, with points at most 1 m apart; it ends exactly where its successors start.
+    ``width_m`` is the minimum width. ``road`` is the lane's road or the path's junction, ``turn`` is ``straight``,
+    ``left`` or ``right`` on paths, and ``ends_at`` is the junction that a lane of a road leads to.
     """
 
     id: str
@@ -39,7 +39,7 @@ class Lane:
 
     @property
     def length_m(self) -> float:
-        """Seen from above."""
+        """Horizontal length."""
         return float(np.linalg.norm(np.diff(self.polyline[:, :2], axis=0), axis=1).sum())
 
 

@@ -12,11 +12,11 @@ from nurec_sim.world.plan.road import RoadLanes, RoadLine
 from nurec_sim.world.plan.town import Junction
 
 GRID_M = 1e-4
-"""Vertices lie on this grid, so that the areas that share an edge share its vertices."""
+"""Vertices are snapped to this grid, so that adjacent areas share vertices."""
 SMOOTH_M = 0.004
-"""Vertices that change an outline by less than this are left out."""
+"""Simplification tolerance of outlines."""
 ARM_REACH_M = 14.0
-"""How much of each road takes part in the rounding of a junction's corners."""
+"""Length of each road used for rounding a junction's corners."""
 QUARTER_SEGMENTS = 12
 
 

@@ -1,4 +1,4 @@
-"""Who walks where: along sidewalks, across roads where there is a crossing, or standing about."""
+"""Pedestrians: walking along sidewalks, using crossings, or standing."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from nurec_sim.world.plan.town import Crossing, Kerb
 SIZE_M = (0.9, 0.62, 1.74)
 PACE_MPS = (0.9, 1.7)
 NEAR_M = 45.0
-"""People walk within this distance of where the ego drives; further away nobody sees them."""
+"""Pedestrians are placed within this distance of the ego's path."""
 BEHIND_TREES_M, BEFORE_BENCHES_M = 1.3, 1.1
-"""Lamps and trees stand within this distance of the kerb, benches and bus stops within this one of the other edge."""
+"""Lamps and trees are within this distance of the kerb, benches and bus stops within this one of the far edge."""
 ROOM_M = {"bus_stop": 1.3, "bench": 0.9, "billboard": 1.5}
 USUAL_ROOM_M = 0.45
-"""How far people keep from the middle of what stands about, by its kind."""
+"""Clearance of pedestrians from the centre of props, by kind."""
 WALKERS = (3, 8)
 CROSSERS = (0.5, 0.35, 0.15)
-"""How often nobody, one or two people use a crossing nearby."""
+"""Probability of zero, one or two pedestrians at a nearby crossing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Walker:
-    """Somebody's way: places, headings and heights of the feet above the road.
+    """A pedestrian's path: positions, headings and heights of the feet above the road.
 
-    ``on_road_s`` says for the right and the left side of the road at ``crossing`` from when to when it is not free.
+    ``on_road_s``: time intervals in which the right and the left side of the road at ``crossing`` are occupied.
     """
 
     xy_m: Float64[np.ndarray, "t 2"]
@@ -49,13 +49,13 @@ class Walker:
 def people(
     rng: np.random.Generator, network: TownNetwork, ego_xy: Float64[np.ndarray, "k 2"], t_s: Float64[np.ndarray, " t"]
 ) -> list[Walker]:
-    """Walkers around the way of the ego.
+    """Pedestrians around the ego's path.
 
     Args:
-        rng: decides everything.
+        rng: random generator.
         network: sidewalks, roads and crossings.
-        ego_xy: where the ego is going to drive.
-        t_s: the times of the ways, from the start on.
+        ego_xy: the ego's path.
+        t_s: sample times of the paths.
     """
     way = shapely.LineString(ego_xy)
     found = _on_crossings(rng, network, way, t_s)
@@ -63,7 +63,7 @@ def people(
 
 
 def boxes_of(walkers: Sequence[Walker], t_s: Float64[np.ndarray, " t"]) -> Boxes:
-    """Their boxes at their times."""
+    """Boxes of pedestrians at their sample times."""
     if not walkers:
         return standing([], np.zeros((0, 2)), len(t_s))
     half = np.array([[walker.size_m[0] / 2, walker.size_m[1] / 2] for walker in walkers])
@@ -112,18 +112,18 @@ def _on_sidewalks(
 
 
 def _walking_m(kerb: Kerb) -> tuple[float, float]:
-    """How far behind the kerb one walks with it to the left and to the right; the same on narrow sidewalks."""
+    """Distances from the kerb for walking in each direction; equal on narrow sidewalks."""
     near = min(BEHIND_TREES_M, kerb.sidewalk_width_m - 0.45)
     return near, max(near, kerb.sidewalk_width_m - BEFORE_BENCHES_M)
 
 
 def _rings(area: shapely.Geometry) -> list[Float64[np.ndarray, "k 2"]]:
-    """Outer outlines of an area, closed and counter-clockwise (nobody walks on islands)."""
+    """Outer outlines of an area, closed and counter-clockwise, without islands."""
     return [np.array(shapely.orient_polygons(polygon).exterior.coords) for polygon in shapely.get_parts(area)]
 
 
 def _runs_into_something(xy: Float64[np.ndarray, "t 2"], network: TownNetwork) -> bool:
-    """Whether a way leads through a tree, a lamp or the like."""
+    """Whether a path collides with a prop."""
     props = network.plan.props
     places = np.array([(prop.x_m, prop.y_m) for prop in props]).reshape(-1, 2)
     room = np.array([ROOM_M.get(prop.kind, USUAL_ROOM_M) for prop in props])
@@ -153,7 +153,7 @@ def _on_crossings(
 def _crosser(
     rng: np.random.Generator, network: TownNetwork, crossing: Crossing, station_m: float, t_s: np.ndarray
 ) -> Walker:
-    """Along the sidewalk to the crossing, over it, and on along the other sidewalk."""
+    """Along the sidewalk to the crossing, across it, and along the other sidewalk."""
     road, kerb = network.roads[crossing.road], network.plan.kerb
     side = int(rng.choice([-1, 1]))
     beyond = kerb.width_m + _walking_m(kerb)[0]
@@ -174,7 +174,7 @@ def _crosser(
     both_ways = road.count(-1) > 0 and road.count(1) > 0
     sides = ((edges[0], 0.0), (0.0, edges[1])) if both_ways else ((edges[0], edges[1]),) * 2
     busy = []
-    for low, high in sides:  # one is in the way of a side from a step before it until a step behind it
+    for low, high in sides:  # a side is occupied from one step before entering until one step after leaving
         inside = length[(places[:, 1] > low - 0.7) & (places[:, 1] < high + 0.7)]
         busy.append((start_s + float(inside[0]) / pace, start_s + float(inside[-1]) / pace))
     yaw = np.unwrap(np.arctan2(*(ahead - behind).T[::-1]))
@@ -183,7 +183,7 @@ def _crosser(
 
 
 def _rounded(corners: np.ndarray) -> np.ndarray:
-    """The same way with its corners cut (Chaikin), finely sampled."""
+    """The path with corners smoothed (Chaikin), finely sampled."""
     points = corners
     for _ in range(3):
         low, high = 0.8 * points[:-1] + 0.2 * points[1:], 0.2 * points[:-1] + 0.8 * points[1:]

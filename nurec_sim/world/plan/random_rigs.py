@@ -1,4 +1,4 @@
-"""Cars with other eyes: rigs of one to five cameras of any lens, drawn from a seed.
+"""Random sensor rigs with one to five cameras of any lens type, by seed.
 
 Cameras of a rig share their size and the kind of their lenses. Angles in the tables are degrees.
 """
@@ -27,7 +27,7 @@ from nurec_sim.world.plan.rig import CAMERA_FROM_RIG_AXES, LIDAR_ID, dense_near_
 
 CAMERA_COUNTS = (1, 3, 5)
 LENS_KINDS = {"pinhole": 0.6, "distorted": 0.15, "fisheye": 0.1, "ftheta": 0.15}
-"""How often each kind of lens is drawn."""
+"""Probability of each lens type."""
 SHUTTERS = {
     Shutter.GLOBAL: 0.72,
     Shutter.TOP_TO_BOTTOM: 0.2,
@@ -53,9 +53,9 @@ def random_rig(
 
     Args:
         seed: at least 0.
-        cameras: 1 (front), 3 (with front left and right) or 5 (with rear left and right); drawn if None.
+        cameras: 1 (front), 3 (with front left and right) or 5 (with rear left and right); random if None.
         pixels: width times height, met within 10 percent; sides are multiples of 14 pixels.
-        lens: ``pinhole``, ``distorted``, ``fisheye`` or ``ftheta``; drawn if None, most often a pinhole.
+        lens: ``pinhole``, ``distorted``, ``fisheye`` or ``ftheta``; random if None, most often a pinhole.
         lidar: ``64x900``, a key of ``sensors.LIDAR_TABLES``, or None for a rig without a LiDAR.
 
     Raises:
@@ -89,7 +89,7 @@ def random_readout_us(seed: int) -> int:
 
 
 def _size_px(rng: np.random.Generator, pixels: int) -> tuple[int, int]:
-    """Sides in whole patches: of all that meet the wanted number of pixels, those nearest to a drawn aspect ratio."""
+    """Sides in whole patches: of all that meet the wanted number of pixels, those nearest to a random aspect ratio."""
     patches = pixels / PATCH_PX**2
     wanted = np.exp(rng.uniform(*np.log(ASPECT)))
     rows = np.arange(4, int(np.sqrt(patches)) + 2)
@@ -153,7 +153,7 @@ def _lens(rng: np.random.Generator, kind: str, size_px: tuple[int, int], field_r
 
 Centre = tuple[float, float]
 Shape = Float64[np.ndarray, " 6"]
-"""How far each property of a lens is from usual, within -1..1."""
+"""Deviation of each lens property from its nominal value, within -1..1."""
 
 
 def _pinhole(width: int, centre: Centre, half_rad: float, shape: Shape) -> Lens:
@@ -184,7 +184,7 @@ def _fisheye(width: int, centre: Centre, half_rad: float, shape: Shape) -> Lens:
 
 
 def _ftheta(width: int, centre: Centre, half_rad: float, shape: Shape) -> Lens:
-    """Exact in one direction or in the other, as makers choose."""
+    """With either polynomial as the reference."""
     focal, k1, k2 = _angular(width, half_rad, shape)
     distances = (0.0, focal, 0.0, focal * k1, 0.0, focal * k2)
     lens = FTheta(*centre, FThetaReference.ANGLE_TO_PIXELDIST, angle_to_pixeldist=distances)

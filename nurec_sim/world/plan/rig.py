@@ -1,4 +1,4 @@
-"""The car that drives through the town: three cameras and one spinning LiDAR."""
+"""The demo rig: three cameras and one spinning LiDAR."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CAMERA_FROM_RIG_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 
 
 
 def street_rig(width_px: int = 448, height_px: int = 256, lidar_rows: int = 48, lidar_columns: int = 600) -> Rig:
-    """The rig of the demonstration clip, in any resolution.
+    """The rig of the demo clip, in any resolution.
 
     Raises:
         ValueError: images smaller than 16 pixels, or a LiDAR with fewer than 2 rows or 8 columns.
@@ -30,7 +30,7 @@ def street_rig(width_px: int = 448, height_px: int = 256, lidar_rows: int = 48, 
     cameras = {}
     for name, (yaw_deg, view_deg, place) in CAMERAS.items():
         focal = width_px / 2 / np.tan(np.deg2rad(view_deg) / 2)
-        # The horizon lies above the middle: a driver needs the road more than the sky.
+        # The horizon is above the image centre, to show more road than sky.
         lens = Pinhole(focal, focal, width_px / 2, 0.44 * height_px)
         rotation = geometry.rotation_from_yaw(np.deg2rad(yaw_deg)) @ CAMERA_FROM_RIG_AXES
         cameras[name] = CameraModel(name, width_px, height_px, lens, geometry.pose(rotation, np.array(place)))
@@ -39,7 +39,7 @@ def street_rig(width_px: int = 448, height_px: int = 256, lidar_rows: int = 48, 
 
 
 def dense_near_horizon(rows: int, columns: int, rig_from_lidar: Matrix4) -> LidarModel:
-    """A clockwise LiDAR whose rows lie closest around the horizon, where the street is far, and reach up to roofs."""
+    """A clockwise LiDAR with the densest rows around the horizon, reaching up to roofs."""
     steep, high = rows // 3, rows // 5
     bands = ((-26.0, -9.0, steep), (-9.0, 6.0, rows - steep - high), (6.0, 21.0, high))
     elevation_deg = np.concatenate([np.linspace(low, top, count, endpoint=False) for low, top, count in bands])

@@ -1,6 +1,6 @@
-"""Centre lines made of lines, arcs and clothoids, evaluated exactly, and the lanes and strips along them.
+"""Centre lines of lines, arcs and clothoids, evaluated exactly, with lanes and parking strips.
 
-Places on a road are (station, offset): metres along the centre line and metres to its left.
+Road coordinates are (station, offset): metres along the centre line and metres to its left.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Curve(Protocol):
 
 
 class RoadLine:
-    """A curve with places on it; exact to 1e-9 m at any station."""
+    """An evaluated curve; exact to 1e-9 m at any station."""
 
     def __init__(self, curve: Curve):
         self.curve = curve
@@ -44,7 +44,7 @@ class RoadLine:
 
     @property
     def end(self) -> tuple[Float64[np.ndarray, " 2"], float]:
-        """Position and heading of the last place."""
+        """Position and heading of the end."""
         return self._starts[-1]
 
     def start_of(self, piece: int) -> tuple[Float64[np.ndarray, " 2"], float]:
@@ -54,7 +54,7 @@ class RoadLine:
     def at(
         self, station_m: float | Float64[np.ndarray, "*n"], offset_m: float | Float64[np.ndarray, "*n"] = 0.0
     ) -> tuple[Float64[np.ndarray, "*n 2"], Float64[np.ndarray, "*n"]]:
-        """Position and heading of places on the curve; stations before the start or past the end are held there."""
+        """Position and heading on the curve; stations are clamped to its range."""
         station = np.clip(np.asarray(station_m, np.float64), 0.0, self.length_m)
         piece_of = np.clip(
             np.searchsorted(self.piece_station_m, station, side="right") - 1, 0, len(self.curve.pieces) - 1
@@ -120,7 +120,7 @@ class RoadLanes(RoadLine):
         return self.lane_edge_m(side, station_m) + side * self.strip_width_m(side, station_m)
 
     def lane_offset_m(self, number: int, station_m: float | Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-        """Offset of a lane's middle."""
+        """Offset of a lane's centre line."""
         return np.sign(number) * (abs(number) - 0.5) * self.lane_width_m(station_m)
 
     def surface(self, start_m: float, end_m: float) -> shapely.Polygon:
@@ -129,7 +129,7 @@ class RoadLanes(RoadLine):
         return self.band(start_m, end_m, self.edge_m(-1, stations), self.edge_m(1, stations))
 
     def _eased(self, station_m: float | np.ndarray, usual: float, narrow_value: float | None) -> np.ndarray:
-        """A width that eases to another one along the narrowing, by a cubic as in OpenDRIVE."""
+        """A width that changes along the narrowing by a cubic, as in OpenDRIVE."""
         station = np.asarray(station_m, np.float64)
         narrow = self.plan.narrowing
         if narrow is None or narrow_value is None:
@@ -142,7 +142,7 @@ class RoadLanes(RoadLine):
 def _along(
     piece: RoadPiece, start: np.ndarray, yaw_rad: float, distance_m: np.ndarray
 ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
-    """Position and heading some way along a piece: closed form for arcs, Gauss-Legendre for clothoids."""
+    """Position and heading along a piece: closed form for arcs, Gauss-Legendre for clothoids."""
     first = piece.start_curvature_per_m
     change = (piece.end_curvature_per_m - first) / piece.length_m
     yaw = yaw_rad + (first + change * distance_m / 2) * distance_m

@@ -1,4 +1,4 @@
-"""Ways through a lane network: which lanes one after another, where they cross other ways, and how fast they may go.
+"""Routes through a lane network: lane sequences, conflicts with other routes, and allowed speeds.
 
 Stations of a route are metres along it.
 """
@@ -19,9 +19,9 @@ SPACING_M = 0.5
 SIDEWAYS_MPS2 = 2.2
 BRAKE_MPS2 = 1.6
 END_M = 8.0
-"""Nobody drives into the last metres of a route: the town ends there."""
+"""Vehicles stop before the last metres of a route, where the town ends."""
 CONFLICT_M = 2.5
-"""Paths through a junction that come closer than this cannot be driven at the same time."""
+"""Paths through a junction that come closer than this conflict."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Leg:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """A polyline with a point every ``SPACING_M``, the speed that its bends, limits and end allow, and its lanes."""
+    """A polyline with a point every ``SPACING_M``, allowed speeds by curvature, limits and end, and its lanes."""
 
     xy_m: Float64[np.ndarray, "k 2"]
     allowed_mps: Float64[np.ndarray, " k"]
@@ -48,7 +48,7 @@ class Route:
         return (len(self.xy_m) - 1) * SPACING_M
 
     def at(self, station_m: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n 2"]:
-        """Points of the route; before its start it goes straight on backwards."""
+        """Points of the route, extrapolated straight before its start."""
         return _on_grid(self.xy_m, np.asarray(station_m, np.float64) / SPACING_M)
 
 
@@ -58,7 +58,7 @@ def _on_grid(points: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def random_lanes(rng: np.random.Generator, lanes: Mapping[str, Lane], first: str, length_m: float) -> tuple[str, ...]:
-    """Lane after lane, from the start of ``first``, until they are ``length_m`` long or the town ends."""
+    """A random lane sequence from the start of ``first``, until ``length_m`` or the end of the town."""
     way, length = [first], lanes[first].length_m
     while length < length_m and lanes[way[-1]].successors:
         options = lanes[way[-1]].successors
@@ -68,7 +68,7 @@ def random_lanes(rng: np.random.Generator, lanes: Mapping[str, Lane], first: str
 
 
 def lay_route(lanes: Mapping[str, Lane], way: Sequence[str], right_m: float = 0.0, speed_factor: float = 1.0) -> Route:
-    """The route along lanes, ``right_m`` to the right of their middle, for someone who takes limits times a factor."""
+    """The route along lanes, ``right_m`` to the right of their centre, with limits scaled by a factor."""
     pieces: list[np.ndarray] = []
     limits, legs, start = [], [], 0.0
     for name in way:
@@ -94,8 +94,8 @@ def lay_route(lanes: Mapping[str, Lane], way: Sequence[str], right_m: float = 0.
 
 
 def _allowed(xy: np.ndarray, limit_mps: np.ndarray, speed_factor: float) -> Float64[np.ndarray, " k"]:
-    """Limits, lowered in bends for little sideways acceleration, and before them so that one can brake."""
-    reach = 4  # points: curvature over 4 m, so that the corners of polylines do not count
+    """Speed limits, reduced in bends by lateral acceleration and before them by braking distance."""
+    reach = 4  # points: curvature over 4 m, insensitive to polyline corners
     yaw = np.unwrap(np.arctan2(*np.diff(xy, axis=0).T[::-1]))
     padded = np.pad(yaw, reach, mode="edge")
     bend = np.abs(padded[2 * reach :] - padded[: -2 * reach]) / (2 * reach * SPACING_M)
@@ -109,17 +109,16 @@ def _allowed(xy: np.ndarray, limit_mps: np.ndarray, speed_factor: float) -> Floa
 
 @dataclass(frozen=True)
 class Conflict:
-    """Where two lanes through a junction come close: stations of each lane, from its own start."""
+    """Conflict zone of two junction lanes: stations of each lane, from its own start."""
 
     first: tuple[float, float]
     second: tuple[float, float]
 
 
 def conflicts(lanes: Mapping[str, Lane]) -> dict[tuple[str, str], Conflict]:
-    """All pairs of lanes through junctions that come close, other than those that only part from one another.
+    """All conflicting pairs of junction lanes, except those that only diverge.
 
-    Where both go on into the same lane, the second one's stretch ends soon after it begins: from there on one simply
-    follows.
+    If both merge into the same lane, the zone of the second one is short: beyond it vehicles simply follow.
     """
     inside = {name: lane for name, lane in lanes.items() if lane.in_junction}
     before: dict[str, set[str]] = {name: set() for name in lanes}

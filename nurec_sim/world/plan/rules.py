@@ -1,4 +1,4 @@
-"""Who has to let whom pass, and where one stops for it: the rules of a network's junctions and crossings."""
+"""Traffic rules at junctions and crossings: right of way and stop positions."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from nurec_sim.world.plan.network import TownNetwork
 from nurec_sim.world.plan.routes import Conflict, Route, conflicts
 
 RANK_OF_RULE = {"priority": 4, "green": 4, "stop": 2, "yield": 2, "red": -2}
-"""Who drives first; a negative rank never drives."""
+"""Right-of-way ranks; a negative rank never enters."""
 LEFT_TURN_RANK = -1
 BEFORE_CROSSING_M = 0.6
 STEP_OUT_S = 2.0
-"""So long before somebody steps on the road, drivers begin to wait."""
+"""Drivers start waiting this long before a pedestrian steps on the road."""
 
 
 class Rules:
-    """What all drivers of a network share.
+    """Rules shared by all drivers of a network.
 
     Attributes:
         lanes: by id.
-        meetings: where lanes through junctions come close.
-        rank: per lane through a junction, who drives first.
-        stop_short_m: how far before each of them the stop line is.
-        must_halt: those before which one halts even if nobody comes.
+        meetings: conflict zones of junction lanes.
+        rank: right of way per junction lane.
+        stop_short_m: distance of the stop line before each of them.
+        must_halt: lanes with a stop sign.
     """
 
     def __init__(self, network: TownNetwork):
@@ -58,12 +58,12 @@ class Rules:
         size_m: tuple[float, float, float],
         axle_m: float | None = None,
     ) -> Driver:
-        """Somebody who keeps these rules; the rear axle lies as usual for the length if ``axle_m`` is None."""
+        """A driver with these rules; the rear axle position follows from the length if ``axle_m`` is None."""
         axle = drivers.AXLE_BEHIND_MIDDLE * size_m[0] if axle_m is None else axle_m
         return Driver(route, station_m, speed_mps, size_m, self.rank, self.stop_short_m, self.must_halt, axle)
 
     def passes(self, everyone: Sequence[Driver], walkers: Sequence[pedestrians.Walker], delay_s: float) -> list[Pass]:
-        """Where who drives waits for people; the drivers' clock starts ``delay_s`` before that of the walkers."""
+        """Stops of drivers for pedestrians; the drivers' clock starts ``delay_s`` before the pedestrians'."""
         found = []
         for index, driver in enumerate(everyone):
             for leg in driver.route.legs:

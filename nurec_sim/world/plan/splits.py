@@ -1,7 +1,7 @@
-"""What training worlds are made of, and what only test worlds show: the one place that decides it.
+"""Assets of training towns, and assets held out for test towns.
 
-A town of split ``test`` is never like one of split ``train``: its seeds open other random streams, its ground has a
-texture family that training never sees, and it has held-out facades, vehicles and, every other time, a held-out sky.
+Towns of split ``test`` differ from those of split ``train``: independent random streams, held-out ground texture
+families, facades and vehicles, and, every other time, a held-out sky.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Literal, get_args
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 STREAM_OF_SPLIT: dict[Split, int] = {"train": 0x7121, "test": 0x7E57}
-"""First word of every random stream: equal seeds of the two splits share nothing."""
+"""First key of every random stream: equal seeds of the two splits are independent."""
 
 
 @dataclass(frozen=True)
 class Choices:
-    """Names that both splits use, and names that only test towns use."""
+    """Names shared by both splits, and names held out for test."""
 
     shared: tuple[str, ...]
     held_out: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""What a surface of the world is: its class, what policies call it, and how well it reflects a laser."""
+"""Surface classes of the world, their labels and LiDAR reflectivities."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Upright boxes over time, seen from above, and which of them ever touch."""
+"""Upright boxes over time in bird's-eye view, and their collisions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Middles, headings, half lengths and half widths of n boxes at t instants."""
+    """Centres, headings, half lengths and half widths of n boxes at t instants."""
 
     middle_m: Float64[np.ndarray, "t n 2"]
     yaw_rad: Float64[np.ndarray, "t n"]
@@ -23,7 +23,7 @@ class Boxes:
 
 
 def standing(places: Sequence[tuple[float, float, float]], half_m: np.ndarray, instants: int) -> Boxes:
-    """Boxes that keep their place (x, y, yaw)."""
+    """Static boxes at (x, y, yaw)."""
     table = np.array(places, np.float64).reshape(-1, 3)
     shape = (instants, len(table))
     middle, yaw = np.broadcast_to(table[:, :2], (*shape, 2)), np.broadcast_to(table[:, 2], shape)
@@ -31,7 +31,7 @@ def standing(places: Sequence[tuple[float, float, float]], half_m: np.ndarray, i
 
 
 def together(groups: Sequence[Boxes]) -> Boxes:
-    """All boxes of some groups, in their order."""
+    """Concatenation of boxes."""
     middle = np.concatenate([group.middle_m for group in groups], axis=1)
     yaw = np.concatenate([group.yaw_rad for group in groups], axis=1)
     return Boxes(middle, yaw, np.concatenate([group.half_m for group in groups]))
@@ -40,7 +40,7 @@ def together(groups: Sequence[Boxes]) -> Boxes:
 def touching(boxes: Boxes, margin_m: float = 0.0) -> list[tuple[int, int]]:
     """Pairs of boxes that come closer than ``margin_m`` at any of their times, by separating axes.
 
-    Two boxes that never move are left out. With a margin, corners count as close a little earlier than they are.
+    Pairs of static boxes are skipped. The margin is slightly larger at corners.
     """
     radius = np.linalg.norm(boxes.half_m, axis=1) + margin_m
     moves = np.ptp(boxes.middle_m, axis=0).max(axis=1) > 1e-6

@@ -1,4 +1,4 @@
-"""Road layouts by name: which roads and junctions a town has. They end some 100 to 180 m from the origin."""
+"""Road layouts by name. Roads end some 100 to 180 m from the origin."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _narrowing(rng: np.random.Generator) -> RoadGraph:
 
 @dataclass(frozen=True)
 class _Spoke:
-    """An arm to be built: its direction, its cross-section, its rule and the pieces beyond its straight mouth."""
+    """Specification of an arm: direction, cross-section, rule and the pieces beyond its straight mouth."""
 
     name: str
     angle_rad: float
@@ -229,7 +229,7 @@ def _double_junction(rng: np.random.Generator) -> RoadGraph:
         angles = [outer, outer + np.pi, *(turn + s * (np.pi / 2 + float(rng.normal(0, 0.06))) for s in sides)]
         names = ["west" if i == 0 else "east", "link", *(f"{'left' if s > 0 else 'right'}_{i}" for s in sides)]
         spokes = _spokes(rng, angles, main if i else _turned(main), side, names)
-        # The side roads stay straight or turn away, so that they never meet each other.
+        # The side roads stay straight or diverge, so that they never intersect.
         spokes_at.append([replace(s, tail=(RoadPiece(100.0),)) if k > 1 else s for k, s in enumerate(spokes)])
     junctions = []
     reach = [_reaches(spokes, corner) for spokes in spokes_at]

@@ -1,4 +1,4 @@
-"""The rolling ground of a town: a sum of long waves, so smooth that cars can be put on its tangent planes."""
+"""Terrain as a sum of long waves, smooth enough to place cars on tangent planes."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Terrain:
         *,
         upright: bool = False,
     ) -> Float64[np.ndarray, "n 4 4"]:
-        """Poses of bodies that stand on the ground.
+        """Poses of bodies on the ground.
 
         Args:
             xy: points on the ground.

@@ -1,4 +1,4 @@
-"""A town as pure data: everything that a seed decides, ready for JSON, before any mesh or texture exists.
+"""A town as pure, JSON-serialisable data, before any mesh or texture exists.
 
 World: metres, z up; the road surface is the terrain's height, sidewalks and everything beyond lie a kerb higher. Yaw is
 about z from the x axis. Times are integer microseconds. Traffic keeps right. Lanes are numbered as in OpenDRIVE: -1, -2
@@ -21,7 +21,7 @@ from nurec_sim.world.plan.terrain import FLAT, Terrain
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 Positive = Annotated[float, Field(gt=0)]
 EGO_MIDDLE_M = 1.4
-"""From the ego's rear axle to the middle between its axles, where the slope under it is taken."""
+"""Distance from the ego's rear axle to the centre of its wheelbase, where the slope is evaluated."""
 
 PropKind = Literal[
     "tree", "bush", "hedge", "lamp", "sign", "traffic_light", "bin", "bench", "bus_stop", "fence", "cone", "billboard",
@@ -29,7 +29,7 @@ PropKind = Literal[
 ]  # fmt: skip
 PROP_KINDS: tuple[str, ...] = get_args(PropKind)
 SIGNS = ("speed", "stop", "yield", "priority", "crossing", "narrow", "no_parking", "roundabout")
-"""Pictures of signs, in the order of ``Prop.variant``."""
+"""Sign types, in the order of ``Prop.variant``."""
 Rule = Literal["priority", "yield", "stop", "red", "green"]
 ActorKind = Literal[
     "hatch", "sedan", "wagon", "suv", "van", "pickup", "truck", "bus", "sports", "minivan", "cyclist", "pedestrian"
@@ -91,7 +91,7 @@ class Road:
 
 @dataclass(frozen=True)
 class Arm:
-    """A road's end in a junction, and what its drivers have to do there (lights stay as they are for a clip)."""
+    """A road's end in a junction, with its traffic control (lights are constant during a clip)."""
 
     road: str
     end: Literal["start", "end"]
@@ -116,7 +116,7 @@ class Connection:
 
 @dataclass(frozen=True)
 class Junction:
-    """Where roads meet. Drivable between the mouths of its arms; its corners are rounded by ``corner_radius_m``.
+    """A junction, drivable between the mouths of its arms; its corners are rounded by ``corner_radius_m``.
 
     A roundabout has a ring of ``ring_radius_m`` (middle of its lane) and ``ring_width_m`` around a raised island.
     """
@@ -135,7 +135,7 @@ class Junction:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where people cross a road: ``depth_m`` long from ``station_m`` on, with or without zebra stripes."""
+    """A pedestrian crossing: ``depth_m`` long from ``station_m`` on, with or without zebra stripes."""
 
     road: str
     station_m: float
@@ -217,7 +217,7 @@ class Actor:
         return LABEL_OF_KIND.get(self.kind, "automobile")
 
     def track(self, terrain: Terrain = FLAT) -> Track:
-        """The exact box over time; vehicles lean with the ground, people stand upright."""
+        """The exact box over time; vehicles follow the slope, pedestrians stay upright."""
         times = np.array([point[0] for point in self.path], np.int64)
         x, y, z, yaw = np.array([point[1:] for point in self.path], np.float64).T
         poses = terrain.poses(np.stack([x, y], axis=1), yaw, z, upright=self.kind == "pedestrian")
@@ -236,7 +236,7 @@ class Kerb:
 
 @dataclass(frozen=True)
 class Style:
-    """What a town is made of: names from ``splits`` and the seed of its textures."""
+    """Asset names from ``splits`` and the texture seed."""
 
     district: Literal["urban", "suburb", "mixed"]
     facades: tuple[str, ...]
@@ -267,9 +267,9 @@ class Weather:
 
 @dataclass(frozen=True)
 class TownPlan:
-    """A town and what happens in it in ``span_us`` [start, end). ``ego`` holds (t_us, x, y, yaw) of the rig.
+    """A town with its traffic in ``span_us`` [start, end). ``ego`` holds (t_us, x, y, yaw) of the rig.
 
-    Make one with ``town_plan(seed)``; ``to_json`` and ``from_json`` keep every bit.
+    Created by ``town_plan(seed)``; ``to_json`` and ``from_json`` are lossless.
     """
 
     seed: int
@@ -291,7 +291,7 @@ class TownPlan:
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
     def ego_trajectory(self) -> Trajectory:
-        """The recorded drive: rear axle on the ground, leaning with the slope under the middle of the car."""
+        """The recorded drive: rear axle on the ground, tilted by the slope under the centre of the car."""
         times = np.array([point[0] for point in self.ego], np.int64)
         x, y, yaw = np.array([point[1:] for point in self.ego], np.float64).T
         ahead = EGO_MIDDLE_M * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
@@ -312,7 +312,7 @@ class TownPlan:
         """A plan from its text.
 
         Raises:
-            ClipError: a field is missing, misspelt or of the wrong kind, or something is named that is not there.
+            ClipError: a field is missing, misspelt or of the wrong kind, or a name does not exist.
         """
         try:
             plan = TypeAdapter(TownPlan).validate_json(text)
@@ -326,7 +326,7 @@ class TownPlan:
 
 
 def _check_names(plan: TownPlan) -> None:
-    """Refuses roads and actors that share a name, and names of roads and lanes that are not there."""
+    """Raises for duplicate road or actor names and for unknown roads and lanes."""
     roads = {road.id: road for road in plan.roads}
     for what, items in (("road", plan.roads), ("actor", plan.actors)):
         names = [item.id for item in items]

@@ -1,7 +1,7 @@
-"""The traffic of a town: the recorded ego, who drives around it, who stands at the kerb and who walks.
+"""The traffic of a town: the ego, other vehicles, parked cars and pedestrians.
 
-Everybody drives with everybody else from ``WARM_UP_S`` before the log begins, so that its first instant is as likely
-as any other. Whoever would touch somebody is left out, and the rest drives again.
+All vehicles are simulated together from ``WARM_UP_S`` before the log starts, so that its first frame is in a steady
+state. Colliding actors are removed and the simulation is repeated.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from nurec_sim.world.plan.town import EGO_MIDDLE_M, Actor, ActorKind
 
 WARM_UP_S = 3.0
 AHEAD_M = 130.0
-"""So far along the ego's route others are worth drawing."""
+"""Length of the ego's route around which other actors are generated."""
 KEPT_EVERY = 2
-"""Every so-manieth step of an actor is kept; the ego's are all kept."""
+"""Subsampling of actor paths; the ego keeps every step."""
 ATTEMPTS, AGAIN = 3, 5
 APART_M = 0.08
 LIVELY_SHARE, LIVELY_COUNT, LIVELY_M = 0.6, 2, 40.0
-"""A drive is lively if in this share of it so many actors move within so many metres in front of the ego."""
+"""A drive is lively if for this fraction of time this many actors move within this distance ahead of the ego."""
 
 EgoPath = tuple[tuple[int, float, float, float], ...]
 
 
 def drive(network: TownNetwork, seed: int, split: Split, span_us: tuple[int, int]) -> tuple[EgoPath, tuple[Actor, ...]]:
-    """Who drives where in a town, always the same for the same seed and split.
+    """All trajectories in a town, deterministic for seed and split.
 
     Returns:
         The ego as (t_us, x, y, yaw) every 50 ms over the whole span, and all other actors; no two boxes ever touch.
@@ -59,7 +59,7 @@ def drive(network: TownNetwork, seed: int, split: Split, span_us: tuple[int, int
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """Everybody's boxes (the ego, vehicles, walkers, parked cars) at ``t_us``, and who of them stays."""
+    """Boxes of all actors (ego, vehicles, pedestrians, parked cars) at ``t_us``, and which are kept."""
 
     t_us: Int64[np.ndarray, " t"]
     boxes: Boxes
@@ -70,7 +70,7 @@ class _Scene:
 
     @property
     def movers(self) -> Bool[np.ndarray, " n"]:
-        """Who is neither the ego nor parked, and stays."""
+        """Kept actors other than the ego and parked cars."""
         index = np.arange(len(self.stays))
         return self.stays & (index > 0) & (index <= len(self.vehicles) + len(self.walkers))
 
@@ -115,7 +115,7 @@ class _Scene:
 
 
 def _scene(rng: np.random.Generator, rules: Rules, split: Split, span_us: tuple[int, int]) -> _Scene:
-    """One attempt: everybody drives; who touches somebody is left out, until nobody does."""
+    """One attempt: simulates and removes colliding actors until none is left."""
     seconds = (span_us[1] - span_us[0]) * 1e-6
     steps, warm = round(seconds / STEP_S), round(WARM_UP_S / STEP_S)
     t_s = (np.arange(warm + steps + 1) - warm) * STEP_S
@@ -146,7 +146,7 @@ def _scene(rng: np.random.Generator, rules: Rules, split: Split, span_us: tuple[
 
 
 def _superfluous(everything: Boxes, driving: int, walking: int) -> Bool[np.ndarray, " n"]:
-    """Whom to leave out so that nobody touches anybody: people first, then parked cars, then who was placed last.
+    """Actors to remove to avoid collisions: pedestrians first, then parked cars, then the one placed last.
 
     Args:
         everything: vehicles [0, driving), the ego first, people [driving, walking), parked cars.
@@ -163,7 +163,7 @@ def _superfluous(everything: Boxes, driving: int, walking: int) -> Bool[np.ndarr
 
 
 def liveliness(everything: Boxes, who: Bool[np.ndarray, " n"]) -> float:
-    """The share of the time in which ``LIVELY_COUNT`` of ``who`` move near in front of box 0, the ego."""
+    """Fraction of time in which ``LIVELY_COUNT`` of ``who`` move close ahead of box 0, the ego."""
     each = round(0.5 / STEP_S)
     middle, yaw = everything.middle_m[::each], everything.yaw_rad[::each, :1]
     away = middle[:-1, who] - middle[:-1, :1]
