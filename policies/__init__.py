@@ -1,1 +1,1 @@
-"""Drivers that anyone can copy, one file each; found by name through ``nurec_sim.plugins``."""
+"""Example policies, one file each; found by name through ``nurec_sim.plugins``."""

@@ -1,4 +1,4 @@
-"""One image laid on the ground, compared with the colour of the road: what ``camera_road_follower`` sees.
+"""Bird's-eye projection of one image, classified by road colour, for ``camera_road_follower``.
 
 Grids ``[x, y]`` lie in the rig frame: rows ahead from the rear axle, columns from the right (-SIDE_M) to the left.
 """
@@ -13,25 +13,25 @@ from nurec_sim.types import CameraFrame, CameraModel
 
 CELL_M, AHEAD_M, SIDE_M = 0.25, 32.0, 10.0
 TINT_TOLERANCE, DARKER, BRIGHTER = 0.09, -0.9, 0.28
-"""Road differs from its known colour by at most this in log colour ratios, and by this in log brightness."""
+"""Maximum difference of road from its known colour in log colour ratios, and in log brightness."""
 SUNLIGHT, SUN_TOLERANCE, SUN_SPREAD, SUN_STEP, SUN_RANGE = (0.11, -0.14), 0.03, 0.05, (0.45, 0.9), 2.0
-"""From shade, lit by the sky, into the sun, log r/g and log b/g of asphalt change by this times the log brightness."""
+"""Change of log r/g and log b/g of asphalt from shade (lit by the sky) to sun, per log brightness."""
 PAINT_TOLERANCE, PAINT_CELLS = 0.08, 2
 ISLAND_M = 3.5
 SEED_LENGTH_M, SEED_HALF_WIDTH_M = 4.0, 1.0
 SHADE, SHADE_SHARE = 0.4, 0.015
-"""Sun and shade differ by at least this in log brightness; so much of the view in shade shows that the sun is out."""
+"""Minimum difference of sun and shade in log brightness; fraction of shaded view that indicates sunshine."""
 
 
 class RoadColour:
-    """What the road looks like: learnt from the seed, the ground right ahead of the car, from plan to plan."""
+    """Road appearance model, updated at every plan from the seed: the ground right ahead of the car."""
 
     def __init__(self) -> None:
         self.road: Float64[np.ndarray, " 3"] | None = None
         self.sunlit = False
 
     def blocked(self, seen: Bool[np.ndarray, "x y"], colours: Float64[np.ndarray, "x y 3"]) -> Bool[np.ndarray, "x y"]:
-        """Seen ground cells that do not look like road."""
+        """Visible ground cells that do not match the road colour."""
         middle, half = seen.shape[1] // 2, int(SEED_HALF_WIDTH_M / CELL_M)
         first = int(np.argmax(seen[:, middle]))
         ahead = np.zeros_like(seen)
@@ -42,7 +42,7 @@ class RoadColour:
         return without_paint(seen & ~looks_like(colours, road, self.sunlit), colours, road) & seen
 
     def learn(self, seed: Float64[np.ndarray, "n 3"], view: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, " 3"]:
-        """Follow the seed while it looks like road, up into the sun at once, never down into the shade."""
+        """Follows the seed while it matches, adapting to sun at once, never to shade."""
         here = np.median(seed, axis=0)
         road = here if self.road is None else self.road
         brighter = here[2] - road[2]
@@ -50,7 +50,7 @@ class RoadColour:
             self.sunlit |= bool(brighter > SHADE)
             road = road + (1.0 if brighter > SHADE else 0.3) * (here - road)
         difference = view - road
-        # Shade is lit by the sky, so it is bluer; what is only darker may be a tyre or wet asphalt.
+        # Shade is lit by the sky, so it is bluer; merely darker patches may be a tyre or wet asphalt.
         bluer = (difference[:, 0] < 0.05 * difference[:, 2]) & (difference[:, 1] > -0.05 * difference[:, 2])
         shaded = looks_like(view, road, sunlit=True) & (difference[:, 2] < -SHADE) & bluer
         self.sunlit |= bool(shaded.mean() > SHADE_SHARE)
@@ -59,7 +59,7 @@ class RoadColour:
 
 
 def ground_view(frame: CameraFrame) -> tuple[Bool[np.ndarray, "x y"], Float64[np.ndarray, "x y 3"]]:
-    """The image laid on the ground: which cells it shows, and their (log r/g, log b/g, log brightness)."""
+    """Projects the image to the ground: visible cells, and their (log r/g, log b/g, log brightness)."""
     pixels = ground_pixels(frame.camera)
     seen = pixels[..., 0] >= 0
     rgb = smoothed(frame.rgb)[pixels[..., 1], pixels[..., 0]]
@@ -68,14 +68,14 @@ def ground_view(frame: CameraFrame) -> tuple[Bool[np.ndarray, "x y"], Float64[np
 
 
 def ground_pixels(camera: CameraModel) -> np.ndarray:
-    """Image column and row [x, y, 2] at which an ideal pinhole sees each ground cell; -1 where it does not."""
+    """Image column and row [x, y, 2] at which an ideal pinhole sees each ground cell; -1 where invisible."""
     x = (np.arange(int(AHEAD_M / CELL_M)) + 0.5) * CELL_M
     y = (np.arange(int(2 * SIDE_M / CELL_M)) + 0.5) * CELL_M - SIDE_M
     ground = np.stack(np.broadcast_arrays(x[:, None], y[None, :], 0.0), axis=-1)
     inside_camera = geometry.transform_points(geometry.inverse(camera.rig_from_camera), ground)
     depth = np.maximum(inside_camera[..., 2], 0.1)
     lens = camera.ideal_pinhole
-    assert lens is not None, "the loop hands ideal pinholes to policies"
+    assert lens is not None, "the loop gives policies ideal pinholes"
     u = np.floor(lens.fx_px * inside_camera[..., 0] / depth + lens.cx_px)
     v = np.floor(lens.fy_px * inside_camera[..., 1] / depth + lens.cy_px)
     good = (inside_camera[..., 2] > 0.5) & (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
@@ -92,9 +92,9 @@ def smoothed(rgb: UInt8[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"]:
 def looks_like(
     colours: Float64[np.ndarray, "*n 3"], road: Float64[np.ndarray, " 3"], sunlit: bool
 ) -> Bool[np.ndarray, "*n"]:
-    """Whether log colours are the road's: same tint and about as bright, or the same asphalt in shade or sun.
+    """Whether log colours match the road: same tint and brightness, or the same asphalt in shade or sun.
 
-    The sun brightens by at least ``SUN_STEP``, a pavement by less; more is asked for once the road seemed sunlit.
+    Sun brightens by at least ``SUN_STEP``, a sidewalk by less; the threshold is higher once the road is sunlit.
     """
     difference = colours - road
     brighter = difference[..., 2]
@@ -109,7 +109,7 @@ def looks_like(
 def without_paint(
     blocked: Bool[np.ndarray, "x y"], colours: Float64[np.ndarray, "x y 3"], road: Float64[np.ndarray, " 3"]
 ) -> Bool[np.ndarray, "x y"]:
-    """Blocked cells less what is thin: cracks and single pixels up to 0.5 m, white paint up to 1 m."""
+    """Blocked cells without thin structures: cracks and single pixels up to 0.5 m, white paint up to 1 m."""
     difference = colours - road
     paint = (np.abs(difference[..., :2]).max(axis=-1) < PAINT_TOLERANCE) & (difference[..., 2] > 0)
     return opened(blocked & ~paint, 1) | opened(blocked, PAINT_CELLS)
@@ -118,14 +118,14 @@ def without_paint(
 def borders(seen: Bool[np.ndarray, "x y"], blocked: Bool[np.ndarray, "x y"]) -> Bool[np.ndarray, "x y"]:
     """Blocked cells that bound the road: all but islands up to 3.5 m wide with road on their right and their left.
 
-    Islands are cars and people: one brakes for them, but the road does not bend around them.
+    Islands are cars and pedestrians: a reason to brake, not a road boundary.
     """
     right, left = room_beside(opened(seen & ~blocked, 2), np.inf)
     return blocked & (right + left > ISLAND_M)
 
 
 def opened(mask: Bool[np.ndarray, "x y"], cells: int) -> Bool[np.ndarray, "x y"]:
-    """A mask without its parts that are no wider than 2 ``cells``."""
+    """Morphological opening: removes parts no wider than 2 ``cells``."""
     return grown(~grown(~mask, cells), cells)
 
 

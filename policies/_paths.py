@@ -1,4 +1,4 @@
-"""What the shipped policies share: plan times, and a small model of a car that pursues a path."""
+"""Shared by the bundled policies: plan times, and a path-tracking vehicle model."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ STEP_S, STEPS = 0.1, 50
 MAX_LATERAL_ACCEL_MPS2 = 2.5
 MAX_CURVATURE_PER_M = 0.2
 FRONT_M, HALF_WIDTH_M = 3.85, 0.95
-"""Front bumper ahead of the rear axle and half the width, where the rig does not say otherwise."""
+"""Default distance from rear axle to front bumper, and half width."""
 
 AccelOf = Callable[[float, float, float], float]
-"""Acceleration wanted at (time s, distance m, speed m/s) along the path."""
+"""Target acceleration at (time s, distance m, speed m/s) along the path."""
 
 
 def straight_plan(observation: Observation, speed_mps: float) -> Plan:
-    """Straight ahead at one speed."""
+    """Straight ahead at constant speed."""
     times = STEP_S * np.arange(1, STEPS + 1)
     return make_plan(observation, np.column_stack([speed_mps * times, np.zeros(STEPS), np.zeros(STEPS)]))
 
@@ -33,10 +33,10 @@ def make_plan(observation: Observation, pose: Float64[np.ndarray, "50 3"]) -> Pl
 
 
 def pursue(path_m: Float64[np.ndarray, "k 2"], speed_mps: float, accel_of: AccelOf) -> Float64[np.ndarray, "50 3"]:
-    """Poses of a car at the origin that pursues a path for 5 s: pure pursuit, lookahead clip(0.8 v, 4, 15) m.
+    """Poses of a car that tracks a path from the origin for 5 s: pure pursuit, lookahead clip(0.8 v, 4, 15) m.
 
-    ``path_m`` starts near the car, in its frame; it goes on straight beyond its end. Where the path bends, speed is
-    kept below sqrt(2.5 m/s^2 / curvature).
+    ``path_m`` starts near the car, in its frame; it is extrapolated straight beyond its end. In curves, speed is
+    limited to sqrt(2.5 m/s^2 / curvature).
     """
     line = extended(path_m)
     arc = geometry.arc_length(line)
@@ -65,10 +65,10 @@ def pursue(path_m: Float64[np.ndarray, "k 2"], speed_mps: float, accel_of: Accel
 
 
 def extended(path_m: Float64[np.ndarray, "k 2"], by_m: float = 150.0) -> Float64[np.ndarray, "j 2"]:
-    """A path from the car on, without doubled points, and straight on beyond its end."""
+    """A path from the car on, without duplicate points, extrapolated straight beyond its end."""
     line = [np.zeros(2)]
     for point in np.asarray(path_m, np.float64):
-        # The origin is no way point: it only leads to the path, so a first point beside or behind the car is skipped.
+        # The origin is not a waypoint: a first point beside or behind the car is skipped.
         if np.linalg.norm(point - line[-1]) > 0.05 and (len(line) > 1 or point[0] > 0.0):
             line.append(point)
     tangent = line[-1] - line[-2] if len(line) > 1 else np.array([1.0, 0.0])
@@ -77,7 +77,7 @@ def extended(path_m: Float64[np.ndarray, "k 2"], by_m: float = 150.0) -> Float64
 
 
 def route_speed(observation: Observation, distance_m: float) -> float:
-    """Recorded speed so far along the route; 0 where the recording holds no way ahead."""
+    """Recorded speed at a distance along the route; 0 if the route is empty."""
     if len(observation.route_m) == 0:
         return 0.0
     stations = np.linalg.norm(observation.route_m[0]) + geometry.arc_length(observation.route_m)
@@ -85,5 +85,5 @@ def route_speed(observation: Observation, distance_m: float) -> float:
 
 
 def toward_speed(wanted_mps: float, speed_mps: float) -> float:
-    """Acceleration that brings a speed to another in about a second, between -3 and 1.5 m/s^2."""
+    """Acceleration that reaches the target speed in about a second, between -3 and 1.5 m/s^2."""
     return min(max(wanted_mps - speed_mps, -3.0), 1.5)

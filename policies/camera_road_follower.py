@@ -1,8 +1,7 @@
-"""Sees one front image, calls road what looks like the road under its bonnet, and drives where it is free.
+"""Drives by one front image along free ground with the colour of the road right ahead.
 
-The image is laid out on the ground, colours are compared with those just ahead of the car, and of a fan of two-arc
-paths the one with the most room is driven that keeps the car's place between the borders of the road. No route, no
-map, no actors, no depth.
+The image is projected to the ground and compared with the colours right ahead of the car; of a fan of two-arc paths it
+selects the one with most free space that keeps the lateral position on the road. No route, map, actors or depth.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ FIRST_ARC_M, STEP_M = 10.0, 0.5
 BORDER_LIMIT_M, BORDER_SLACK_M, NEARER, PLACE_M = 8.0, 0.2, 0.5, (8.0, 22.0)
 BRAKE_MPS2, STOP_GAP_M, START_SPEED_MPS = 3.0, 3.0, 4.0
 SPARE_WEIGHT, PLACE_WEIGHT, BEND_WEIGHT, S_BEND_WEIGHT, CHANGE_WEIGHT = 6.0, 9.0, 25.0, 12.0, 20.0
-"""Worth of a metre of spare room, of a metre out of place, and of curvature, in metres of road ahead."""
+"""Weights of clearance, lateral displacement and curvature, in metres of free road ahead."""
 
 
 class CameraRoadFollower:
-    """Steers for room on road-coloured ground; drives as fast as it can stop in what it sees free."""
+    """Steers to free road-coloured ground; its speed allows stopping within the visible free distance."""
 
     name = "camera_road_follower"
     needs = Needs(cameras=("front",), image_width_px=320)
@@ -44,7 +43,7 @@ class CameraRoadFollower:
         self.reset(Rig({}, {}), 0)
 
     def reset(self, rig: Rig, seed: int) -> None:
-        """Forget the road's colour, the place on it, and the speed at the start."""
+        """Resets road colour, lateral position and initial speed."""
         self.front_m = rig.body.center_m[0] + rig.body.size_m[0] / 2
         self.road = RoadColour()
         self.place_m: Float64[np.ndarray, " 2"] | None = None
@@ -52,7 +51,7 @@ class CameraRoadFollower:
         self.curvature = 0.0
 
     def plan(self, observation: Observation) -> Plan:
-        """Five seconds along the roomiest path."""
+        """Five seconds along the best path."""
         if self.cruise_mps == 0.0:
             self.cruise_mps = max(observation.ego.speed_mps, START_SPEED_MPS)
         seen, colours = ground_view(observation.cameras["front"])
@@ -68,7 +67,7 @@ class CameraRoadFollower:
     def roomiest(
         self, blocked: Bool[np.ndarray, "x y"], seen: Bool[np.ndarray, "x y"]
     ) -> tuple[Float64[np.ndarray, "k 2"], float]:
-        """The best two-arc path and how far it is free."""
+        """The best two-arc path and its free distance."""
         first, second = (c.ravel() for c in np.meshgrid(CURVATURES, CURVATURES, indexing="ij"))
         station = np.arange(0.0, AHEAD_M, STEP_M)
         paths = two_arcs(first, second, station)
@@ -84,7 +83,7 @@ class CameraRoadFollower:
         room_to_edges = distance_to(edges, CAR_HALF_WIDTH_M + SPARE_M)[row, column]
         road = free_along(station, hidden | (room_to_edges < CAR_HALF_WIDTH_M))
         spare = mean_where(station < free[:, None], np.clip(room - CAR_HALF_WIDTH_M, 0.0, SPARE_M))
-        # More way than it takes to stop from cruising speed is worth nothing: a lane is as good as a square.
+        # Free distance beyond the stopping distance from cruising speed has no value.
         enough = self.front_m + STOP_GAP_M + self.cruise_mps**2 / (2 * BRAKE_MPS2) + 4.0
         counted = (station < road[:, None]) & (station >= PLACE_M[0]) & (station < PLACE_M[1])
         gain = np.minimum(road, enough) + SPARE_WEIGHT * spare
@@ -97,11 +96,11 @@ class CameraRoadFollower:
     def displaced(
         self, edges: Bool[np.ndarray, "x y"], row: np.ndarray, column: np.ndarray, counted: Bool[np.ndarray, "p s"]
     ) -> Float64[np.ndarray, " p"]:
-        """Metres by which each path is farther from a border of the road than the car was at the start, or nearer."""
+        """Change of each path's distance to a road border relative to the initial one, in metres."""
         beside = room_beside(edges, BORDER_LIMIT_M)[:, row, column]
         rooms = np.stack([mean_where(counted, side) for side in beside])
         if self.place_m is None:
-            self.place_m = rooms[:, len(CURVATURES) ** 2 // 2]  # of the straight path, the middle one of all
+            self.place_m = rooms[:, len(CURVATURES) ** 2 // 2]  # of the straight path, the middle one
         farther = rooms - self.place_m[:, None]
         cost = np.clip(farther - BORDER_SLACK_M, 0.0, None) + NEARER * np.clip(-farther - BORDER_SLACK_M, 0.0, None)
         known = (self.place_m > 0) & (self.place_m < BORDER_LIMIT_M)
@@ -109,7 +108,7 @@ class CameraRoadFollower:
 
 
 def free_along(station: Float64[np.ndarray, " s"], stops: Bool[np.ndarray, "p s"]) -> Float64[np.ndarray, " p"]:
-    """Metres along each path to its first stop."""
+    """Metres along each path to its first obstacle."""
     return np.where(stops.any(axis=1), station[np.argmax(stops, axis=1)], AHEAD_M)
 
 
@@ -121,7 +120,7 @@ def mean_where(mask: Bool[np.ndarray, "p s"], values: Float64[np.ndarray, "p s"]
 def two_arcs(
     first: Float64[np.ndarray, " p"], second: Float64[np.ndarray, " p"], station: Float64[np.ndarray, " s"]
 ) -> Float64[np.ndarray, "p s 2"]:
-    """Points of paths that bend by ``first`` for 10 m and by ``second`` from there."""
+    """Points of paths with curvature ``first`` for 10 m and ``second`` beyond."""
     bend = np.where(station < FIRST_ARC_M, first[:, None], second[:, None])
     step = np.diff(station, prepend=0.0)
     yaw = np.cumsum(bend * step, axis=1)

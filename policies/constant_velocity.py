@@ -1,4 +1,4 @@
-"""Straight on at the speed of now: the floor that every driver must beat."""
+"""Straight ahead at the current speed: the lower baseline."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from nurec_sim.types import Needs, Observation, Plan, Rig
 
 
 class ConstantVelocity:
-    """Sees nothing, turns nowhere, never brakes."""
+    """Uses no sensors; never turns or brakes."""
 
     name = "constant_velocity"
     needs = Needs()
 
     def reset(self, rig: Rig, seed: int) -> None:
-        """Nothing to forget."""
+        """No state to reset."""
 
     def plan(self, observation: Observation) -> Plan:
         """Five seconds straight ahead."""

@@ -1,4 +1,4 @@
-"""Follows the recorded route and brakes for what the rendered LiDAR shows in its way: automatic emergency braking."""
+"""Automatic emergency braking: follows the recorded route and brakes for LiDAR obstacles."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ MIN_HEIGHT_M, MAX_HEIGHT_M = 0.5, 2.2
 CORRIDOR_MARGIN_M, SIDE_MARGIN_M = 0.25, 2.0
 MIN_POINTS, STEEPEST = 5, 0.06
 TTC_S, BRAKE_MPS2, STOP_GAP_M = 2.0, 4.0, 2.0
-"""Brake when the time to collision falls below 2 s, or the distance below v^2 / (2 * 4) + 2 m."""
+"""Brakes if the time to collision is below 2 s, or the distance below v^2 / (2 * 4) + 2 m."""
 
 
 class LidarAeb:
-    """Blind to all but the LiDAR points in its own corridor."""
+    """Uses only the LiDAR points in its own corridor."""
 
     name = "lidar_aeb"
     needs = Needs(lidars=("any",))
@@ -35,13 +35,13 @@ class LidarAeb:
         self.reset(Rig({}, {}), 0)
 
     def reset(self, rig: Rig, seed: int) -> None:
-        """Forget the obstacle of the last plan."""
+        """Resets the obstacle of the last plan."""
         self.front_m = rig.body.center_m[0] + rig.body.size_m[0] / 2 if rig.lidars else FRONT_M
         self.half_width_m = rig.body.size_m[1] / 2 if rig.lidars else HALF_WIDTH_M
         self.last: tuple[int, float] | None = None
 
     def plan(self, observation: Observation) -> Plan:
-        """Five seconds along the route, braking where something stands in the way."""
+        """Five seconds along the route, braking for obstacles."""
         speed = observation.ego.speed_mps
         points = points_in_rig(observation.lidars["any"])
         distance = self.free_distance(points, extended(observation.route_m))
@@ -73,12 +73,12 @@ class LidarAeb:
         nearest = np.sort(station[inside & (station < RANGE_M)])
         if len(nearest) < MIN_POINTS:
             return None
-        # A lone point is noise; an obstacle is where five lie within a metre.
+        # Isolated points are noise; an obstacle has five points within a metre.
         solid = nearest[MIN_POINTS - 1 :] - nearest[: len(nearest) - MIN_POINTS + 1] < 1.0
         return float(nearest[np.argmax(solid)]) - self.front_m if solid.any() else None
 
     def speed_of_obstacle(self, observation: Observation, distance: float | None) -> float:
-        """Its speed along the path from the last two sweeps; 0 (standing) when it was not there before."""
+        """Obstacle speed along the path from the last two sweeps; 0 if newly detected."""
         if distance is None or self.last is None:
             return 0.0
         elapsed_s = (observation.t_us - self.last[0]) / 1e6
@@ -89,15 +89,15 @@ class LidarAeb:
 
 
 def points_in_rig(frame: LidarFrame) -> Float64[np.ndarray, "n 3"]:
-    """Returns in the rig frame, of the region ahead that matters."""
+    """Returns in the rig frame, in the region ahead."""
     points = geometry.transform_points(frame.lidar.rig_from_lidar, frame.xyz_m)
     ahead = (points[:, 0] > 0) & (points[:, 0] < RANGE_M) & (np.abs(points[:, 1]) < SIDE_M)
-    # Rendered sweeps hold stray returns under the road, which would make the road around them an obstacle.
+    # Rendered sweeps have stray returns below the road, which would turn the road around them into obstacles.
     return points[ahead & (points[:, 2] > -0.3 - STEEPEST * points[:, 0])]
 
 
 def above_ground(points: Float64[np.ndarray, "n 3"]) -> np.ndarray:
-    """Which points stand on the ground: their height above the lowest point of their and the eight next 1 m cells."""
+    """Mask of points above the ground, by height over the lowest point in the 3 x 3 neighbourhood of 1 m cells."""
     columns = int(2 * SIDE_M / CELL_M) + 2
     rows = int(RANGE_M / CELL_M) + 2
     row = (points[:, 0] / CELL_M).astype(np.int64) + 1

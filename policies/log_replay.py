@@ -1,4 +1,4 @@
-"""Drives what the log drove: the sanity check of a scene, not a contestant."""
+"""Replays the recorded drive, as a sanity check of a scene."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from nurec_sim.types import Needs, Observation, Plan, Rig
 
 
 class LogReplay:
-    """The recorded future as a plan; where the recording ends it goes on at its last speed and heading."""
+    """The recorded future as a plan; beyond its end it continues at the last speed and heading."""
 
     name = "log_replay"
     needs = Needs()
 
     def reset(self, rig: Rig, seed: int) -> None:
-        """Nothing to forget."""
+        """No state to reset."""
 
     def plan(self, observation: Observation) -> Plan:
         """The recorded poses of the next 5 s."""

@@ -1,7 +1,7 @@
-"""Follows the recorded route and keeps its distance to the true actors: the best that a scripted driver can do.
+"""Follows the recorded route and keeps its distance to ground-truth actors: the upper scripted baseline.
 
-Privileged: it reads actors that no sensor showed. Steering is pure pursuit, speed the Intelligent Driver Model
-(Treiber et al. 2000) behind the nearest actor that is, or by constant velocity will be, in the corridor to be driven.
+Privileged: it uses ground-truth actors instead of sensors. Steering is pure pursuit, speed the Intelligent Driver Model
+(Treiber et al. 2000) behind the nearest actor that is, or by constant velocity will be, in its corridor.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ REACH_MARGIN_M = 3.0
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Something in the corridor: free metres to it from the front bumper now, and its speed along the path."""
+    """An obstacle in the corridor: current distance from the front bumper, and speed along the path."""
 
     gap_m: float
     speed_mps: float
 
 
 class RouteFollower:
-    """Pure pursuit on the route, IDM behind true actors."""
+    """Pure pursuit on the route, IDM behind ground-truth actors."""
 
     name = "route_follower"
     needs = Needs(privileged=True)
@@ -39,7 +39,7 @@ class RouteFollower:
         self.front_m, self.half_width_m = FRONT_M, HALF_WIDTH_M
 
     def reset(self, rig: Rig, seed: int) -> None:
-        """Learn the outline of the car."""
+        """Stores the dimensions of the car."""
         self.front_m = rig.body.center_m[0] + rig.body.size_m[0] / 2
         self.half_width_m = rig.body.size_m[1] / 2
 
@@ -58,12 +58,12 @@ class RouteFollower:
         return make_plan(observation, pursue(observation.route_m, ego_speed, accel_of))
 
     def obstacle(self, actor: ActorState, line: np.ndarray, ego_speed: float) -> Obstacle | None:
-        """An actor as an obstacle on the path, at the earliest time when it is in the way of the ego."""
+        """An actor as an obstacle on the path, at the earliest time it blocks the ego."""
         if actor.rig_from_box[0, 3] + actor.size_m[0] / 2 < 0:
-            return None  # behind: it must keep its own distance
+            return None  # behind the ego
         corners = geometry.box_corners_xy(actor.rig_from_box, actor.size_m[0], actor.size_m[1])
         outline = np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2])
-        # Speeds along and across the path, so that who drives along a curving road is not taken to leave it.
+        # Speeds along and across the path, so that an actor following a curve stays in the corridor.
         station, lateral = geometry.project_to_polyline(outline, line)
         soon = geometry.project_to_polyline(outline + 0.1 * actor.velocity_mps, line)
         along, across = float((soon[0] - station).mean()) / 0.1, float((soon[1] - lateral).mean()) / 0.1

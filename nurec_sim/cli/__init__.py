@@ -10,19 +10,19 @@ import nurec_sim
 __all__ = ["main"]
 
 FIRST_STEPS = """\
-nurec-sim, an open closed-loop sensor simulator for driving. To begin with:
+nurec-sim, an open closed-loop sensor simulator for driving. First steps:
 
-  nurec-sim demo           the whole chain on the log that comes with it
-  nurec-sim inspect CLIP   what a log of yours holds, and its faults
-  nurec-sim run CLIP       reconstruct it, drive policies through it, report
+  nurec-sim demo           run the whole chain on the bundled demo log
+  nurec-sim inspect CLIP   show the contents and faults of your log
+  nurec-sim run CLIP       reconstruct it, run policies in it, write a report
 
-All verbs: nurec-sim --help; the options of one: nurec-sim VERB --help"""
+All commands: nurec-sim --help; options of a command: nurec-sim COMMAND --help"""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb; errors of ours become one line and exit status 1, Ctrl-C becomes 130."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if words[:1] == ["health"]:  # asked every few seconds by whoever watches over a server
+    if words[:1] == ["health"]:  # called every few seconds by container health checks
         from nurec_sim.cli import health
 
         health.run(words[1:])

@@ -25,14 +25,14 @@ def conformance(
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
     rules: bool = False,
 ) -> None:
-    """Check a sensor server, ours or another, against the published contract; exit status 1 if a rule is broken.
+    """Check any sensor server against the published contract; exit status 1 if a rule is violated.
 
     Args:
         address: host:port of a server without TLS.
-        scene: id of the scene to look at; the first one listed if not given.
-        only: names of the checks to run; all if not given.
-        changes: also run the check that edits the scene for a moment, which other clients would see.
-        timeout_s: for one call; the first may have to load the scene.
+        scene: id of the scene to use; default: the first one listed.
+        only: names of the checks to run; default: all.
+        changes: also run the check that edits the scene temporarily, which other clients would see.
+        timeout_s: per call; the first may have to load the scene.
         as_json: print one JSON document.
         rules: list the rules and stop.
     """

@@ -1,4 +1,4 @@
-"""What every verb shares: consoles, tables, progress."""
+"""Consoles, tables and progress for all commands."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ OnePath = Annotated[Path, tyro.conf.Positional]
 
 
 def progress(title: str) -> AbstractContextManager[Report]:
-    """How far the work of the block is, on stderr, fed with (what is being done, fraction 0..1)."""
+    """Progress of the block on stderr, updated by calls of (stage, fraction 0..1)."""
     return shown(err, title)
 
 
 def part_of(advance: Report, index: int, count: int, name: str) -> Report:
-    """Reports one of several equal parts of some work."""
+    """Progress callback for one of ``count`` equal parts."""
     start = f"{name} ({index + 1} of {count}), " if count > 1 else ""
     return lambda stage, fraction: advance(start + stage, (index + fraction) / count)
 

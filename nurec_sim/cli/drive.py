@@ -29,18 +29,18 @@ def drive_grpc(
 ) -> None:
     """Serve a policy over gRPC as the driver of AlpaSim's runtime, or of `run --policies grpc://HOST:PORT`.
 
-    Prints `Serving on <host>:<port>` when ready; Ctrl-C stops. Each session has its own instance of the policy. The
-    interface knows no TLS and no token: other machines are let in only with --insecure.
+    Prints `Serving on <host>:<port>` when ready; Ctrl-C stops. Each session has its own policy instance. The interface
+    supports neither TLS nor tokens: remote clients require --insecure.
 
     Args:
         policy: a policy's name, my_policy.py:Class, or an entry point.
-        host: address to listen on; only this machine unless said otherwise.
-        port: 0 takes a free one.
-        sessions: how many rollouts may be driven at the same time.
+        host: address to listen on; default: localhost only.
+        port: 0 selects a free one.
+        sessions: maximum number of concurrent rollouts.
         idle: seconds after which a session without a call is closed.
-        plan_timeout: seconds after which a policy that has not answered has failed.
-        route_speed: m/s along the routes of clients that tell no speed; AlpaSim's do not.
-        insecure: let anybody who can reach the port call.
+        plan_timeout: seconds after which a policy that has not replied has failed.
+        route_speed: m/s along routes of clients that send no speed, such as AlpaSim.
+        insecure: accept any client that can reach the port.
         allow_shut_down: let clients stop the server with shut_down.
     """
     from nurec_sim.plugins import load_policy

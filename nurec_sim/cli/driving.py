@@ -48,25 +48,25 @@ def run(
     plan_timeout: float = 60.0,
     device: str = "auto",
 ) -> None:
-    """Drive policies closed-loop through scenes, measure, and write a report; exit status 1 if a rollout failed.
+    """Run policies closed-loop in scenes, compute metrics, and write a report; exit status 1 if a rollout failed.
 
-    Starts a server of its own unless --address names one. The run folder holds report.html, metrics.parquet,
+    Starts its own server unless --address is given. The run folder has report.html, metrics.parquet,
     metrics.csv and one folder per rollout; runs/latest points to the newest.
 
     Args:
         sources: scene archives or clips.
-        scenario: a shipped scenario's name, or a YAML file.
-        policies: names, files as my_policy.py:Class, or entry points; the scenario's own if not given.
-        seeds: one rollout each per scene and policy; the scenario's own if not given.
-        out_path: folder that collects run folders.
-        resume: go on with this run folder; finished rollouts are kept.
-        address: host:port of a running server that serves the same scenes.
-        true_world: also drive in the town that the clip was drawn in, given by the plan.json of its truth folder; the
-            report shows it as the reconstruction `truth` (docs/world.md).
+        scenario: name of a bundled scenario, or a YAML file.
+        policies: names, files as my_policy.py:Class, or entry points; default: those of the scenario.
+        seeds: one rollout per seed, scene and policy; default: those of the scenario.
+        out_path: parent folder of run folders.
+        resume: resume this run folder; finished rollouts are kept.
+        address: host:port of a running server with the same scenes.
+        true_world: also drive in the original town of the clip, given by the plan.json of its ground truth folder; the
+            report shows it as reconstruction `truth` (docs/world.md).
         cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
         video: also record the front camera of every rollout.
-        plan_timeout: seconds for making a policy and for each of its answers; one that takes longer has failed.
-        device: that renders, without --address: auto (a GPU if one can be used), cpu, cuda or cuda:N.
+        plan_timeout: time limit in seconds for creating a policy and for each plan.
+        device: render device without --address: auto (a GPU if available), cpu, cuda or cuda:N.
     """
     drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video, true_world, plan_timeout, device)
 
@@ -79,23 +79,23 @@ def demo(
     cache: Path | None = None,
     device: str = "auto",
 ) -> None:
-    """Run the whole chain on the log that ships with the package: about five minutes on two cores.
+    """Run the whole chain on the bundled demo log: about five minutes on two cores.
 
     Args:
-        out_path: folder that collects run folders.
-        resume: go on with this run folder; finished rollouts are kept.
+        out_path: parent folder of run folders.
+        resume: resume this run folder; finished rollouts are kept.
         cache: where the reconstructed scene is kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
-        device: that renders: auto (a GPU if one can be used), cpu, cuda or cuda:N.
+        device: render device: auto (a GPU if available), cpu, cuda or cuda:N.
     """
     drive((), "demo", (), (), out_path, resume, None, cache, True, device=device)
 
 
 @app.command
 def report(run_folder: OnePath) -> None:
-    """Write report.html of a run folder anew.
+    """Rewrite report.html of a run folder.
 
     Args:
-        run_folder: a folder made by `nurec-sim run`.
+        run_folder: a folder written by `nurec-sim run`.
     """
     from nurec_sim import runs
 
@@ -106,7 +106,7 @@ def report(run_folder: OnePath) -> None:
 
 @app.command
 def policies(check: Annotated[str | None, tyro.conf.Positional] = None) -> None:
-    """List the policies that can be driven, or check that one keeps the contract.
+    """List the available policies, or check one against the policy contract.
 
     Args:
         check: a policy's name, or my_policy.py:Class.
@@ -122,7 +122,7 @@ def policies(check: Annotated[str | None, tyro.conf.Positional] = None) -> None:
 
     faults = check_policy(plugins.load_policy(check))
     print_faults(faults)
-    out.print(f"{check} keeps the contract")
+    out.print(f"{check} conforms to the policy contract")
 
 
 def drive(
@@ -139,7 +139,7 @@ def drive(
     plan_timeout_s: float = 60.0,
     device: str = "auto",
 ) -> None:
-    """Policies, scenes, server, rollouts, report: what `run` and `demo` share."""
+    """Policies, scenes, server, rollouts and report, for `run` and `demo`."""
     from nurec_sim import runs, sim
     from nurec_sim.serving.client import RemoteSensors
     from nurec_sim.serving.server import SensorServer
@@ -149,11 +149,11 @@ def drive(
     scenario_path = sim.scenario_file(scenario_name)
     scenario = sim.load_scenario(scenario_path)
     if not sources and scenario.clip is None:
-        raise NurecSimError(f"scenario {scenario.name!r} names no clip; give clips or scenes to drive through")
+        raise NurecSimError(f"scenario {scenario.name!r} has no clip; give clips or scenes")
     loaded = runs.load_policies(policy_names or scenario.policies, plan_timeout_s)
     if address is not None:
         with RemoteSensors(address) as sensors:
-            sensors.version()  # a server that is not there ends this here
+            sensors.version()  # fails here if there is no server
     device = "cpu" if address is not None else chosen_device(device)
     store = SceneStore(sources or [scenario_path.parent / str(scenario.clip)], cache_dir=cache, device=device)
     for fault in store.faults.values():
@@ -173,9 +173,9 @@ def drive(
         ]
         if true_world is not None:
             if len(scenes) != 1:
-                raise NurecSimError(f"--true-world goes with one clip or scene, got {len(scenes)}")
+                raise NurecSimError(f"--true-world needs exactly one clip or scene, got {len(scenes)}")
             scene, sense = stack.enter_context(runs.true_world(true_world, scenes[0]))
-            worlds.append(("driving in the truth", [scene], lambda scene_id: sense))
+            worlds.append(("driving in the original world", [scene], lambda scene_id: sense))
         out.print(f"sensors from {address}; {len(scenes)} scene(s), scenario {scenario.name}")
         folder = resume
         for title, driven, sense_for in worlds:
@@ -198,21 +198,21 @@ def drive(
     out.print(f"{time.monotonic() - started:.0f} s. Report: {(folder / 'report.html').resolve()}", soft_wrap=True)
     rollouts, failed = (sum(int(row[heading.index(name)]) for row in rows) for name in ("rollouts", "failed"))
     if failed:
-        _notice(f"{failed} of {rollouts} rollouts failed; the report has their reasons")
+        _notice(f"{failed} of {rollouts} rollouts failed; the report gives the reasons")
         _leave(1)
 
 
 def _notice(text: str) -> None:
-    """A line beside the progress."""
+    """Prints a line without disturbing the progress display."""
     err.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
 
 
 def _leave(status: int) -> None:
-    """Ends the verb with a status, whatever threads of policies that were given up still do."""
+    """Exits with a status even if threads of timed-out policies are still running."""
     from nurec_sim.sim.policy_thread import still_abandoned
 
     if still_abandoned():
-        # Python would wait for threads that a policy has started, or trip over one that writes to the console.
+        # A normal exit would wait for threads started by a policy, or crash on one that writes to the console.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)

@@ -1,4 +1,4 @@
-"""The verb that measures reconstructions: evaluate, on one log or by a protocol."""
+"""The command ``evaluate``: scores reconstructions of one log, or methods by a protocol."""
 
 from __future__ import annotations
 
@@ -34,47 +34,47 @@ class LogFlags:
     method: Method = "lift"
     """CLIP: how to reconstruct."""
     refine: float | None = None
-    """CLIP: seconds to spend on fitting the scene to its input images and sweeps."""
+    """CLIP: time budget in seconds for optimising the scene on its input images and sweeps."""
     input_cameras: tuple[str, ...] = ()
-    """CLIP: cameras that the reconstruction may see; all if not given."""
+    """CLIP: input cameras of the reconstruction; default: all."""
     target_cameras: tuple[str, ...] = ()
-    """CLIP: cameras to compare with; the input cameras if not given."""
+    """CLIP: target cameras for scoring; default: the input cameras."""
     hold_out_sweeps: int = 0
-    """CLIP: leave out every so-manieth sweep and simulate it; 0 leaves out none."""
+    """CLIP: hold out every N-th sweep for scoring; 0 holds out none."""
     local: bool = False
     """CLIP: render in this process instead of through gRPC."""
     images: Path | None = None
     """CLIP: also write rendered and recorded images side by side into this folder."""
     json: Path | None = None
-    """CLIP: write all figures here."""
+    """CLIP: write all metrics to this JSON file."""
 
 
 @dataclass(frozen=True)
 class ProtocolFlags:
-    """Methods side by side, on worlds that training never sees or on logs (with --protocol)."""
+    """Compare methods on held-out procedural worlds or on logs (with --protocol)."""
 
     methods: tuple[Compared, ...] = ()
-    """Protocol: what to compare; what the protocol is about if not given."""
+    """Protocol: methods to compare; default: those of the protocol."""
     worlds: int | None = None
-    """Protocol: how many drawn worlds; 12 for storm, 3 for clip, 6 for shift if not given."""
+    """Protocol: number of procedural worlds; default: 12 for storm, 3 for clip, 6 for shift."""
     seed: int = 0
-    """Protocol: seed of the first drawn world; the others count on from it."""
+    """Protocol: seed of the first procedural world; the others follow consecutively."""
     clips: tuple[Path, ...] = ()
-    """Protocol: recorded logs instead of drawn worlds."""
+    """Protocol: recorded logs instead of procedural worlds."""
     boxes: bool = False
-    """Protocol: give the log's boxes of things that can move to the methods; the paper's network has none."""
+    """Protocol: give the methods the log's boxes of movable objects; the paper's network uses none."""
     seconds: float = 10.0
     """Protocol: length of a clip, 2 to 20."""
     hold_out_every: int = 2
-    """Protocol: which frames of a clip are held out: every so-manieth."""
+    """Protocol: hold out every N-th frame of a clip."""
     clip_cameras: Literal[1, 3] = 3
     """Protocol: cameras of a clip."""
     selective_checkpoint: Path | None = None
     """Protocol: weights of `selective`; --checkpoint is for `dense`."""
     out: Path = Path("evaluations")
-    """Protocol: folder that collects run folders."""
+    """Protocol: parent folder of run folders."""
     resume: Path | None = None
-    """Protocol: go on with this run folder; finished windows are kept."""
+    """Protocol: resume this run folder; finished windows are kept."""
 
 
 LogGroup = Annotated[LogFlags, tyro.conf.arg(name="")]
@@ -91,19 +91,19 @@ def evaluate(
     side_by_side: ProtocolGroup = NO_PROTOCOL_FLAGS,
     network: NetworkFlags = NO_FLAGS,
 ) -> None:
-    """Measure reconstructions: of one log, or methods side by side by a protocol (docs/evaluation.md).
+    """Score the reconstruction of one log, or compare methods by a protocol (docs/evaluation.md).
 
-    `evaluate CLIP` compares with what the log recorded: images of other cameras, LiDAR sweeps left out.
-    `evaluate --protocol NAME` prints the paper's tables: `storm` is 2 s with four seen frames (Table 1), `clip` a whole
-    log through the chunked pipeline (Table 2), `shift` views beside the driven path. evaluations/latest holds tables,
+    `evaluate CLIP` compares with the recording: images of target cameras, held-out LiDAR sweeps.
+    `evaluate --protocol NAME` prints the paper's tables: `storm` is 2 s with four input frames (Table 1), `clip` a
+    whole log through the chunked pipeline (Table 2), `shift` views at lateral offsets. evaluations/latest has tables,
     contact sheets and report.html.
 
     Args:
         clip: a clip folder, or a .zip of one.
-        protocol: how to compare methods.
-        log: how to measure one log.
-        side_by_side: what to compare on what.
-        network: how logs go through the network (`nurec-sim reconstruct --help` says more); --device also renders.
+        protocol: evaluation protocol.
+        log: options for one log.
+        side_by_side: options for protocols.
+        network: network settings (see `nurec-sim reconstruct --help`); --device also applies to rendering.
     """
     if protocol is None:
         _refuse(given(side_by_side, NO_PROTOCOL_FLAGS), "without --protocol")
@@ -118,7 +118,7 @@ def evaluate(
 
 
 def given(flags: Any, usual: Any) -> list[str]:
-    """Names of the flags that were changed."""
+    """Names of the flags that differ from their default."""
     names = [field.name for field in dataclasses.fields(flags)]
     return ["--" + name.replace("_", "-") for name in names if getattr(flags, name) != getattr(usual, name)]
 
@@ -129,7 +129,7 @@ def _refuse(names: list[str], where: str) -> None:
 
 
 def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> None:
-    """Measure one method on one log."""
+    """Score one method on one log."""
     from nurec_sim import logs
     from nurec_sim.evaluate import evaluate as run_evaluation
 
@@ -161,9 +161,9 @@ def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> N
 
 
 def evaluate_protocol(name: ProtocolName, flags: ProtocolFlags, network: FeedForwardSettings) -> None:
-    """Compare methods side by side, print the tables and keep everything in a run folder."""
+    """Compare methods, print the tables and write a run folder."""
     if flags.clips and (flags.worlds is not None or flags.seed):
-        raise NurecSimError("--worlds and --seed are for drawn worlds, --clips for recorded logs; give one of the two")
+        raise NurecSimError("--worlds and --seed select procedural worlds, --clips recorded logs; give one of the two")
     from nurec_sim.evaluate import Protocol, contenders, run_protocol
     from nurec_sim.evaluate.methods import without_weights
     from nurec_sim.evaluate.run import settings_of
@@ -186,8 +186,8 @@ def evaluate_protocol(name: ProtocolName, flags: ProtocolFlags, network: FeedFor
         missing = {method: why for method in methods if (why := without_weights(method)) is not None}
         methods = tuple(method for method in methods if method not in missing)
         for method, why in missing.items():
-            err.print(f"note: {method.name} is left out: {why}", style="yellow", markup=False, soft_wrap=True)
-    settings_of(protocol, methods)  # what is missing is said before a folder is made
+            err.print(f"note: {method.name} is skipped: {why}", style="yellow", markup=False, soft_wrap=True)
+    settings_of(protocol, methods)  # fails on missing weights before a folder is created
     stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
     folder = new_run_folder(flags.out, stamp) if flags.resume is None else existing_run_folder(flags.resume)
     device = chosen_device(network.device)

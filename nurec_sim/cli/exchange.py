@@ -1,4 +1,4 @@
-"""Verbs that trade scenes with other programs: export, import."""
+"""Commands that exchange scenes with other programs: export, import."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ def export(
     at_us: int | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a scene as a 3DGS PLY, for viewers and other simulators, with its sky beside it.
+    """Write a scene as a 3DGS PLY with a sky file, for viewers and other simulators.
 
-    Three files: X.ply holds the Gaussians, X.sky.npz the sky cubemap and the cameras' colour corrections, X.sky.png the
-    sky as a picture. A PLY holds one instant: without --at-us the moving Gaussians are left out. docs/exchange.md says
-    which viewers were tried and what a PLY does not keep.
+    Three files: X.ply has the Gaussians, X.sky.npz the sky cubemap and the cameras' colour corrections, X.sky.png a
+    preview of the sky. A PLY represents one instant: without --at-us moving Gaussians are skipped. docs/exchange.md
+    lists tested viewers and what a PLY cannot store.
 
     Args:
         scene: a scene archive or a clip.
         out_path: the PLY to write.
-        layout: inria has the properties that all 3DGS programs know; release those of the public Instant NuRec release,
-            which keep what is road, but which some viewers misread.
-        up: axis of the files that points up; y for viewers based on three.js (Spark, gsplat.js).
-        at_us: also write the moving Gaussians, where and as opaque as they are at this time.
-        overwrite: replace files that are there.
+        layout: inria is the standard 3DGS layout; release is that of the public Instant NuRec release, which stores
+            road labels but is misread by some viewers.
+        up: up axis of the files; y for viewers based on three.js (Spark, gsplat.js).
+        at_us: also write the moving Gaussians, with their position and opacity at this time.
+        overwrite: replace existing files.
     """
     from nurec_sim.scene import export_scene
     from nurec_sim.types import Label
@@ -52,10 +52,10 @@ def export(
     left_out = [("left out: not finite, or without extent", f"{exported.not_finite:,}")] if exported.not_finite else []
     if exported.moving_left_out:
         start_us, end_us = world.span_us
-        hint = f"{exported.moving_left_out:,} (--at-us {start_us} to {end_us - 1} has them as they are then)"
+        hint = f"{exported.moving_left_out:,} (use --at-us {start_us} to {end_us - 1} to include them)"
         left_out.append(("left out: moving", hint))
     if layout == "inria" and (world.static.label == Label.ROAD).any():
-        left_out.append(("not kept", "which Gaussians are road (--layout release keeps it)"))
+        left_out.append(("not stored", "road labels (--layout release stores them)"))
     sky = f"6 x {world.sky.shape[1]} x {world.sky.shape[2]}"
     rows = [("Gaussians", f"{exported.written:,}"), *left_out, ("sky", sky),
             ("colour correction", ", ".join(world.isp) or "none")]  # fmt: skip
@@ -74,27 +74,27 @@ def import_(
     up: UpAxis | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Make a scene archive (.usdz) from a file of another program.
+    """Convert a third-party scene to a scene archive (.usdz).
 
-    A 3DGS PLY: ours, the Instant NuRec release's, any trained one, or a compressed one (SuperSplat); SPZ. A NuRec
-    archive (.usdz), or its volume.nurec or checkpoint.ckpt alone. OpenUSD particle fields (.usdz, .usda, .usdc, .usd).
+    Formats: any 3DGS PLY, compressed PLY (SuperSplat), SPZ; NuRec archives (.usdz), or volume.nurec or checkpoint.ckpt
+    alone; OpenUSD particle fields (.usdz, .usda, .usdc, .usd).
 
-    What a file does not know, sensors with path and times, boxes, map, sky or colour corrections, comes from --like;
-    without it the car stands at the origin for one second with one camera that looks along x, under a black sky. What
-    is not known or not read is listed below the table. A PLY's lengths are taken for metres.
+    Missing sensors with path and times, tracks, map, sky or colour corrections come from --like; without it the car is
+    at the origin for one second with one camera facing along x, under a black sky. Missing and ignored parts are listed
+    below the table. Lengths are assumed to be metres.
 
-    Ours again: nurec-sim import demo.ply --like scenarios/demo_clip.zip
+    Our own export: nurec-sim import demo.ply --like scenarios/demo_clip.zip
 
     Trained on COLMAP poses: nurec-sim import garden.ply --up=-y
 
     Args:
-        file: the file (docs/exchange.md says what a PLY must have, docs/foreign_scenes.md what is read of others).
-        out_path: the archive to write; the file's name with .usdz in the current folder if not given.
-        sky: a .sky.npz file; X.sky.npz beside X.ply if not given and it is there.
+        file: the file to import (formats: docs/exchange.md, docs/foreign_scenes.md).
+        out_path: the archive to write; default: the file's name with .usdz in the current folder.
+        sky: a .sky.npz file; default: X.sky.npz beside X.ply, if it exists.
         like: a scene archive or a clip of the same place; a clip has no sky and no colour corrections.
-        up: which axis of a PLY or SPZ file points up; -y for most trained PLY files. Unless given it is y for SPZ, and
-            for a PLY what our export noted in it, else z.
-        overwrite: replace an archive that is there.
+        up: up axis of a PLY or SPZ file; -y for most trained PLY files. Default: y for SPZ; for PLY the axis recorded
+            by our export, else z.
+        overwrite: replace an existing archive.
     """
     from nurec_sim import logs, scene
 
@@ -102,7 +102,7 @@ def import_(
     if target.exists() and not overwrite:
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
     if file.resolve() == target.resolve():
-        raise NurecSimError(f"{target} is the file to import; give another --out")
+        raise NurecSimError(f"--out --out {target} is the file to import; give another --out")
     check_writable(target)
     with progress(f"reading {file.name}"):
         opened = scene.read_scene if like and like.suffix.lower() in scene.SCENE_SUFFIXES else logs.open_clip

@@ -1,4 +1,4 @@
-"""The verb about what a log or a scene archive holds: inspect."""
+"""The command ``inspect``: contents and faults of a log or a scene archive."""
 
 from __future__ import annotations
 
@@ -17,23 +17,22 @@ if TYPE_CHECKING:
 
 @app.command
 def inspect(source: OnePath, *, overlay: Path | None = None, time_s: float | None = None) -> None:
-    """Show what a driving log or a scene archive holds, and check it.
+    """Show the contents of a driving log or a scene archive, and check it.
 
-    Prints a table of sensors, rates, spans and boxes; whether ground, cameras, LiDARs and boxes fit together; then
-    every fault as one line. Exit status 1 if there are faults.
+    Prints a table of sensors, rates, spans and boxes; the consistency of ground, cameras, LiDARs and boxes; then every
+    fault as one line. Exit status 1 if there are faults.
 
     Args:
         source: a clip folder, or a .zip of one (docs/clip_format.md), or a scene archive (.usdz).
-        overlay: a PNG to write with LiDAR points (red near, blue far) and boxes over the image of each camera; of
-            clips only.
-        time_s: which time the overlay shows, in seconds after the start of the clip; the middle if not given.
+        overlay: write a PNG with LiDAR points (red near, blue far) and boxes over the image of each camera; clips only.
+        time_s: time of the overlay in seconds after the start of the clip; default: the middle.
     """
     from nurec_sim import logs
     from nurec_sim.logs.describe import SENSOR_COLUMNS
     from nurec_sim.serving.store.sources import is_archive
 
     if time_s is not None and overlay is None:
-        raise NurecSimError("--time-s is the time of the picture that --overlay writes; give both")
+        raise NurecSimError("--time-s is the time of the --overlay image; give both")
     if time_s is not None and not math.isfinite(time_s):
         raise NurecSimError(f"--time-s must be a number of seconds, got {time_s}")
     if is_archive(source):
@@ -51,7 +50,7 @@ def inspect(source: OnePath, *, overlay: Path | None = None, time_s: float | Non
     with progress("comparing ground, cameras and boxes with the LiDAR"):
         measures = logs.measure_clip(log)
     if measures:
-        print_table("do they fit together", [(each.what, each.found) for each in measures])
+        print_table("consistency", [(each.what, each.found) for each in measures])
     print_faults([*faults, *(fault for each in measures for fault in each.faults)])
     out.print("no faults")
 

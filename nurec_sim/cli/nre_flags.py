@@ -1,6 +1,6 @@
-"""The command line of NVIDIA's renderer: which of its flags are taken, which are passed over, which are none.
+"""Command-line compatibility with NVIDIA's renderer: supported, ignored and unknown flags.
 
-Names of flags are those of NRE 25.x to 26.10 and of AlpaSim's launch line; old spellings and new ones.
+Flag names are those of NRE 25.x to 26.10 and of AlpaSim's launch command, in old and new spellings.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ IGNORED_SWITCHES = (
 """Flags without a value; each may also be given as ``--no-...`` or with ``=true`` or ``=false``."""
 IGNORED_VALUES = ("renderer", "ray-chunk-size", "metrics-output-dir", "multiproc-workers")
 IGNORED_FAMILIES = ("difix-", "harmonizer-")
-"""How flags of the image-to-image networks begin; they take a value, if the next word is not a flag."""
+"""Prefixes of flags of the image-to-image networks; they take a value if the next word is not a flag."""
 _TRUTH = {"true": True, "1": True, "yes": True, "on": True, "false": False, "0": False, "no": False, "off": False}
 
 
 @dataclass(frozen=True)
 class Sorted:
-    """A command line without the flags that do not apply."""
+    """A command line split into applicable and ignored flags."""
 
     arguments: list[str]
-    """What is left, switches spelt ``--flag`` or ``--no-flag``."""
+    """Applicable arguments, switches as ``--flag`` or ``--no-flag``."""
     ignored: list[str]
-    """Flags that were passed over, as they were given."""
+    """Ignored flags, as given."""
 
 
 def sort_flags(
     arguments: Sequence[str], switches: Iterable[str], values: Iterable[str], lists: Iterable[str] = ()
 ) -> Sorted:
-    """Takes out of a command line what this renderer has no use for.
+    """Removes flags that do not apply to this renderer.
 
     Args:
-        arguments: the words after the verb.
-        switches: names of the flags without a value that apply, with hyphens.
-        values: names of those with one.
-        lists: names of those with one or more.
+        arguments: the words after the command.
+        switches: applicable flags without a value, with hyphens.
+        values: applicable flags with one value.
+        lists: applicable flags with one or more values.
 
     Raises:
-        NurecSimError: a word is no flag, or none that is known; the text names the nearest one.
+        NurecSimError: a word is not a flag, or an unknown one; the text suggests the nearest known flag.
     """
     ours, with_several = set(switches) | {"help"}, set(lists)
     with_value = set(values) | with_several

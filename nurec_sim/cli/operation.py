@@ -1,4 +1,4 @@
-"""Flags of every verb that serves over gRPC: who may call, how much, and what the server tells of itself."""
+"""Flags of all gRPC serving commands: access, limits and monitoring."""
 
 from __future__ import annotations
 
@@ -19,64 +19,64 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OperationFlags:
-    """Who may call, how much, and what the server tells of itself."""
+    """Access, limits and monitoring."""
 
     insecure: bool = False
-    """Let anybody who can reach the port call: no TLS, no token."""
+    """Accept any client that can reach the port: no TLS, no token."""
     tls_cert: Path | None = None
     """Serve TLS with this certificate (PEM)."""
     tls_key: Path | None = None
     """Private key of the certificate (PEM, no password)."""
     tls_client_ca: Path | None = None
-    """Mutual TLS: clients must show a certificate that one of these (PEM) signed."""
+    """Mutual TLS: clients must present a certificate signed by one of these (PEM)."""
     token_file: Path | None = None
-    """Clients must send `authorization: Bearer <content of this file>`; $NUREC_SIM_TOKEN holds one too."""
+    """Clients must send `authorization: Bearer <content of this file>`; alternatively $NUREC_SIM_TOKEN."""
     rate: float | None = None
-    """Calls a second that one client address may make; any number if not given."""
+    """Maximum calls per second per client address; default: unlimited."""
     rate_burst: int = 32
-    """Calls that it may make at once after a pause."""
+    """Maximum burst of calls per client address."""
     max_pixels: int | None = None
-    """Pixels, or beams, of one frame; 33.2 million if not given."""
+    """Maximum pixels or beams per frame; default: 33.2 million."""
     max_batch_items: int | None = None
-    """Frames of one call; 64 if not given."""
+    """Maximum frames per call; default: 64."""
     max_call_rays: int | None = None
-    """Pixels and beams of all frames of one call; 134 million if not given."""
+    """Maximum pixels and beams per call; default: 134 million."""
     max_client_rays: int | None = None
-    """Pixels and beams that the calls of one connection may ask for at a time; 268 million if not given."""
+    """Maximum pixels and beams in concurrent calls of one connection; default: 268 million."""
     max_actors: int | None = None
-    """Actors that a request for a frame may place; 4096 if not given."""
+    """Maximum actors per frame request; default: 4096."""
     max_request_mb: int | None = None
-    """Megabytes (2^20 bytes) of a request, or of a part of an upload; 16 if not given."""
+    """Maximum size of a request or an upload chunk in MiB; default: 16."""
     max_message_mb: int | None = None
-    """Megabytes (2^20 bytes) of a reply; 64 if not given."""
+    """Maximum size of a reply in MiB; default: 64."""
     device: str = "auto"
     """Device that renders: auto (a GPU if one can be used), cpu, cuda or cuda:N."""
     workers: int | None = None
-    """Frames rendered at the same time; as many as there are cores if not given."""
+    """Frames rendered concurrently; default: the number of cores."""
     health_port: int | None = None
-    """A second, plain-text port that answers health only."""
+    """A second, unencrypted port for health checks only."""
     metrics_port: int | None = None
     """HTTP port of Prometheus metrics."""
     metrics_host: str = "127.0.0.1"
-    """Address of the metrics; only this machine unless said otherwise."""
+    """Listen address for metrics; default: localhost only."""
     grace: float = 5.0
-    """Seconds that calls in progress get to finish after SIGTERM or Ctrl-C; a second signal ends at once."""
+    """Grace period in seconds for running calls after SIGTERM or Ctrl-C; a second signal exits immediately."""
     allow_shut_down: bool = False
     """Let clients stop the server with shut_down."""
     allow_remote_scenes: bool = False
-    """Let clients name scenes by http(s) address, and not only by file://."""
+    """Allow clients to load scenes from http(s) addresses, not only file://."""
     scene_dirs: tuple[Path, ...] = ()
-    """Folders that a file:// address may lead to, beside those of the scenes given here."""
+    """Folders accessible through file:// addresses, in addition to those of the given scenes."""
     allow_any_file: bool = False
-    """Let a file:// address lead to any .usdz file that the server can read."""
+    """Allow file:// addresses of any .usdz file that the server can read."""
     upload_dir: Path | None = None
-    """Let clients upload scenes and clips, and keep them here."""
+    """Allow clients to upload scenes and clips to this folder."""
     clip_dirs: tuple[Path, ...] = ()
-    """Let clients have clips in these folders reconstructed."""
+    """Allow clients to reconstruct clips in these folders."""
     log_format: Literal["text", "json"] = "text"
-    """Log lines on stderr as text or as one JSON object each."""
+    """Log format on stderr: text, or one JSON object per line."""
     log_level: Literal["debug", "info", "warning", "error"] = "warning"
-    """The least important lines to log; info has one for each call."""
+    """Minimum log level; info logs every call."""
 
 
 Operation = Annotated[OperationFlags, tyro.conf.arg(name="")]
@@ -84,7 +84,7 @@ NO_FLAGS = OperationFlags()
 
 
 def server_options(flags: OperationFlags) -> ServerOptions:
-    """What the flags ask of the server; sets up the log.
+    """Server options from the flags; also sets up logging.
 
     Raises:
         NurecSimError: the flags contradict each other, or the token cannot be read.
@@ -114,10 +114,10 @@ def server_options(flags: OperationFlags) -> ServerOptions:
 
 
 def service_options(flags: OperationFlags, **more: Any) -> ServiceOptions:
-    """What the flags ask of the service; what is not given stays as it is by default.
+    """Service options from the flags, with defaults for those not given.
 
     Raises:
-        NurecSimError: a limit lets nothing through.
+        NurecSimError: a limit is not positive.
     """
     from nurec_sim.serving.sensor_service import ServiceOptions
 
@@ -146,10 +146,10 @@ def service_options(flags: OperationFlags, **more: Any) -> ServiceOptions:
 
 
 def scene_dirs(flags: OperationFlags, sources: Iterable[str | Path]) -> tuple[Path, ...]:
-    """What ``file://`` addresses may lead to: the sources, the folders of those that are files, and ``--scene-dirs``.
+    """Folders accessible through ``file://``: the sources, the parents of source files, and ``--scene-dirs``.
 
     Raises:
-        NurecSimError: one of ``--scene-dirs`` is no folder.
+        NurecSimError: one of ``--scene-dirs`` is not a folder.
     """
     for folder in flags.scene_dirs:
         if not folder.is_dir():

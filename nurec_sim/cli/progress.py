@@ -1,4 +1,4 @@
-"""How far long work is: a bar with the time left on a terminal, else a line every ten seconds."""
+"""Progress of long commands: a bar with the time left on a terminal, else a line every ten seconds."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from rich.table import Column
 
 Report = Callable[[str, float], None]
 EVERY_S = 10.0
-"""Between two lines where there is no terminal."""
+"""Seconds between lines without a terminal."""
 BAR_WIDTH, FIGURES_WIDTH = 16, 33
-"""On a terminal; share, time so far and time left, with the spaces between all."""
+"""Width of percentage, elapsed and remaining time with spacing on a terminal."""
 
 
 @contextlib.contextmanager
 def shown(console: Console, title: str) -> Iterator[Report]:
-    """Tells a console how far the work of the block is, as the block reports it.
+    """Shows the progress that the block reports.
 
-    What is yielded takes what is being done and the fraction 0..1 of all that is done, from any thread. Before its
-    first call, and where it is never called, only the time that passed is shown.
+    Yields a callback (stage, fraction 0..1) that may be called from any thread. Until its first call only the elapsed
+    time is shown.
     """
     work = _Work(title)
     with _bar(console, work) if console.is_terminal else _lines(console, work):
@@ -32,16 +32,16 @@ def shown(console: Console, title: str) -> Iterator[Report]:
 
 
 class _Work:
-    """What is known of some work: its stage, how much of it is done, and how fast it went lately."""
+    """State of a task: stage, fraction done, and recent speed."""
 
     def __init__(self, title: str) -> None:
         self.title, self.stage, self.fraction = title, "", 0.0
         self.since = time.monotonic()
         self.listener: Callable[[], None] = lambda: None
-        self._known: deque[tuple[float, float]] = deque()  # (seconds, fraction), since half of the time ago
+        self._known: deque[tuple[float, float]] = deque()  # (seconds, fraction) over the last half of the elapsed time
 
     def advance(self, stage: str, fraction: float) -> None:
-        if self._known and fraction < self._known[-1][1]:  # it begins anew
+        if self._known and fraction < self._known[-1][1]:  # restarted
             self._known.clear()
         self._known.append((self.seconds, fraction))
         while len(self._known) > 2 and self._known[1][0] <= self.seconds / 2:
@@ -55,9 +55,9 @@ class _Work:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds that are left at the speed of the last half of the time; None where nobody knows.
+        """Remaining seconds at the speed over the last half of the elapsed time; None if unknown.
 
-        What was found finished when the work began, as by --resume, so soon counts no more.
+        Work that was already finished at the start, as with --resume, thus soon drops out of the estimate.
         """
         if not self._known:
             return None

@@ -19,29 +19,29 @@ def upload(
     client_cert: Path | None = None,
     client_key: Path | None = None,
 ) -> None:
-    """Send a scene archive or a zipped clip to a running server, which offers it from then on.
+    """Upload a scene archive or a zipped clip to a running server, which serves it from then on.
 
-    The server must have been started with --upload-dir. $NUREC_SIM_TOKEN may hold its token.
+    The server must have been started with --upload-dir. The token may be given in $NUREC_SIM_TOKEN.
 
     Args:
         source: a scene archive (.usdz), or a clip (.zip).
         server: HOST:PORT.
-        reconstruct: also reconstruct the clip now, and not when somebody first asks for it.
-        token_file: file with the token that the server wants.
-        root_ca: certificates (PEM) that vouch for the server's; plain text if not given.
-        client_cert: certificate (PEM) to show, for mutual TLS.
+        reconstruct: reconstruct the clip now instead of on first use.
+        token_file: file with the server's token.
+        root_ca: root certificates (PEM) for TLS; default: unencrypted.
+        client_cert: client certificate (PEM) for mutual TLS.
         client_key: its private key (PEM).
     """
     from nurec_sim.serving.scene_client import SceneClient
     from nurec_sim.serving.server import read_token
 
     if reconstruct and source.suffix != ".zip":
-        raise NurecSimError(f"--reconstruct is for clips, {source.name} is none")
+        raise NurecSimError(f"--reconstruct is for clips, {source.name} is not one")
     try:
         with SceneClient(
             server, token=read_token(token_file), root_ca=root_ca, client_cert=client_cert, client_key=client_key
         ) as client:
-            client.stats()  # a server that is not there ends this here, at its time limit
+            client.stats()  # fails here, at the timeout, if there is no server
             with progress("uploading") as advance:
                 scene_id = client.upload(source, advance)
             if reconstruct:

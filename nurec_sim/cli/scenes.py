@@ -37,21 +37,21 @@ def reconstruct(
     """Turn a driving log into a Gaussian scene archive (.usdz).
 
     Methods: `lift` colours LiDAR points, without learning. `dense` and `selective` are the Instant NuRec network, with
-    one Gaussian per pixel or with clusters around chosen points; the options of the second group are theirs.
-    `nurec-sim weights list` shows the profiles, and which weights are here. `optimized` fits the result of `lift` to
-    the log for five minutes, or as long as --refine says; --refine does so after any other method too. Ctrl-C while
-    it fits keeps what has been reached.
+    one Gaussian per pixel or clusters around selected points; the second group of options applies to them. `nurec-sim
+    weights list` shows profiles and local weights. `optimized` optimises the result of `lift` on the log for five
+    minutes, or for --refine seconds; --refine does so after any other method. Ctrl-C during optimisation keeps its
+    result so far.
 
     Args:
         clip: a clip folder, or a .zip of one.
-        out_path: the archive to write; CLIP's name with .usdz in the current folder if not given.
-        method: how to reconstruct.
-        cameras: use only these cameras; all if not given, or as many as the network's profile takes.
-        map_from_gaussians: for a log without a map, give other simulators one (map.xodr) whose drivable area is that of
-            the road-class Gaussians; without it they get none.
-        refine: seconds to spend on fitting the scene to the log's images and sweeps.
-        overwrite: replace an archive that is there.
-        network: how the clip goes through the network.
+        out_path: the archive to write; default: CLIP's name with .usdz in the current folder.
+        method: reconstruction method.
+        cameras: use only these cameras; default: all, or as many as the network's profile supports.
+        map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
+            road-class Gaussians.
+        refine: time budget in seconds for optimising the scene on the log's images and sweeps.
+        overwrite: replace an existing archive.
+        network: network settings.
     """
     from nurec_sim import logs, scene
     from nurec_sim.reconstruct import reconstruct as run_method
@@ -98,18 +98,18 @@ def render(
     width: int | None = None,
     device: str = "auto",
 ) -> None:
-    """Render one camera image of a scene to a PNG, from where it was recorded or beside it.
+    """Render one camera image of a scene to a PNG, at a recorded pose or beside it.
 
     Args:
         source: a scene archive or a clip.
         out_path: the PNG to write.
-        camera: camera id; the first if not given.
-        frame: which recorded frame's time and pose to take.
-        left_m: move the car to the left by so many metres.
-        yaw_deg: turn the car to the left by so many degrees.
-        layer: what to draw.
-        width: image width in pixels; the camera's own if not given.
-        device: that renders: auto (a GPU if one can be used), cpu, cuda or cuda:N.
+        camera: camera id; default: the first.
+        frame: index of the recorded frame that gives time and pose.
+        left_m: lateral offset of the car in metres, left positive.
+        yaw_deg: yaw offset of the car in degrees, left positive.
+        layer: output layer.
+        width: image width in pixels; default: that of the camera.
+        device: render device: auto (a GPU if available), cpu, cuda or cuda:N.
     """
     from nurec_sim.render.images.still import render_still
 
@@ -123,7 +123,7 @@ def network_settings(method: str, network: FeedForwardSettings) -> FeedForwardSe
     """The flags of the network, for the methods that use it.
 
     Raises:
-        NurecSimError: flags were given to a method that has no use for them.
+        NurecSimError: flags were given to a method that does not use them.
     """
     if method in ("dense", "selective"):
         return network
@@ -138,10 +138,10 @@ def network_settings(method: str, network: FeedForwardSettings) -> FeedForwardSe
 
 
 def refinement(seconds: float | None) -> OptimizeSettings | None:
-    """Settings of an optimisation of so many seconds.
+    """Optimisation settings for a time budget.
 
     Raises:
-        NurecSimError: no time at all.
+        NurecSimError: the budget is not positive.
     """
     if seconds is None:
         return None

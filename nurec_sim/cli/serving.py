@@ -1,4 +1,4 @@
-"""Verbs that serve scenes over gRPC: serve for people, serve-grpc with the command line of NVIDIA's renderer."""
+"""Commands that serve scenes over gRPC: serve, and serve-grpc with the command line of NVIDIA's renderer."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ def serve(
 ) -> None:
     """Serve scenes over gRPC, for AlpaSim, CARLA and NuRec clients. Ctrl-C stops.
 
-    Prints `Serving on <host>:<port>` when ready. Clips are reconstructed on first use and kept in the cache. Other
-    machines are let in only behind TLS or a token, or with --insecure.
+    Prints `Serving on <host>:<port>` when ready. Clips are reconstructed on first use and cached. Remote clients
+    require TLS, a token, or --insecure.
 
     Args:
         sources: scene archives, clips, or folders of them.
-        host: address to listen on; only this machine unless said otherwise.
-        port: 0 takes a free one.
+        host: address to listen on; default: localhost only.
+        port: 0 selects a free one.
         threads: CPU threads that work on one frame; half of the cores if not given, so that many clients get the most.
         cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
-        cache_size: scenes kept in memory.
-        cache_gb: gigabytes of memory for them; half of the machine's if not given.
-        ego_mask_dir: pictures of the ego car, FOLDER/<rig>/<camera>.png.
-        operation: who may call, how much, and what the server tells of itself.
+        cache_size: maximum number of scenes in memory.
+        cache_gb: maximum memory for scenes in gigabytes; default: half of the machine's.
+        ego_mask_dir: images of the ego car, FOLDER/<rig>/<camera>.png.
+        operation: access, limits and monitoring.
     """
     from nurec_sim.serving.server import check_exposure
 
@@ -86,29 +86,31 @@ def serve_grpc(
 ) -> None:
     """Serve scene archives with the command line of NVIDIA's renderer, as AlpaSim starts it.
 
-    Takes every flag of that renderer, as `--flag value` or `--flag=value`; those that do not apply here (--renderer,
+    Accepts every flag of that renderer, as `--flag value` or `--flag=value`; those that do not apply (--renderer,
     --no-enable-nrend, --use-gsplat, --ray-chunk-size, --enable-timing, --metrics-output-dir, --multiproc-workers, and
-    the difix and harmonizer families) are named in one warning and otherwise passed over. Prints
-    `Serving on <host>:<port>` when ready. Listens where it is told without further ado: mind who can reach it.
+    the difix and harmonizer families) are ignored with one warning. Prints
+    `Serving on <host>:<port>` when ready. Accepts remote clients without TLS or token: restrict network access.
 
     Args:
         artifact_glob: archives to serve, such as 'scenes/**/*.usdz'; must end in .usdz.
         host: address to listen on; 0.0.0.0 for all.
-        port: 0 takes a free one.
-        egocar_hood_dir: pictures of the ego car, FOLDER/<rig>/<camera>.png.
-        enable_editing_actors: draw only the moving actors that a request lists, if it lists any.
-        cache_size: scenes kept in memory.
-        max_workers: frames rendered at the same time; as many as there are cores if not given.
-        download_cache_dir: where scenes that clients name by URL are kept.
-        download_cache_size: how many of them are kept.
-        test_scenes_are_valid: load every scene first, and end with 1 if one of them is bad.
-        operation: who may call, how much, and what the server tells of itself.
+        port: 0 selects a free one.
+        egocar_hood_dir: images of the ego car, FOLDER/<rig>/<camera>.png.
+        enable_editing_actors: render only the moving actors listed in a request, if it lists any.
+        cache_size: maximum number of scenes in memory.
+        max_workers: frames rendered concurrently; default: the number of cores.
+        download_cache_dir: folder for scenes downloaded from client URLs.
+        download_cache_size: maximum number of downloaded scenes.
+        test_scenes_are_valid: load every scene first, and exit with 1 if one is invalid.
+        operation: access, limits and monitoring.
     """
     from nurec_sim.serving.server import is_loopback
 
     options = server_options(operation)
     if not (is_loopback(host) or operation.insecure or options.tls or options.token):
-        warn(f"anybody who can reach {host}:{port} may call; --tls-cert and --tls-key, or --token-file, protect it")
+        warn(
+            f"any client that can reach {host}:{port} may call; protect it by --tls-cert and --tls-key, or --token-file"
+        )
     if max_workers is not None and operation.workers is None:
         operation = dataclasses.replace(operation, workers=max_workers)
     matches = _matches(artifact_glob)
@@ -130,18 +132,18 @@ def serve_grpc(
 
 @app.command
 def health(address: str, *, root_ca: Path | None = None, timeout: float = 4.0) -> None:
-    """Ask a gRPC server whether it serves; exit status 1 if it does not, or not yet."""
-    # Here for the list of verbs: `cli.main` goes to the other module at once, which starts quicker.
+    """Check the health of a gRPC server; exit status 1 if it is not serving."""
+    # Only for the command list: `cli.main` calls the other module directly for a fast start.
     from nurec_sim.serving.health import check_health
 
     check_health(address, root_ca=root_ca, timeout_s=timeout)
 
 
 def sort_serve_grpc(arguments: Sequence[str]) -> list[str]:
-    """The words after ``serve-grpc`` without what does not apply, which is named in one warning.
+    """The arguments of ``serve-grpc`` without those that do not apply, with one warning.
 
     Raises:
-        NurecSimError: a flag is not known.
+        NurecSimError: unknown flag.
     """
     own = [p for p in inspect.signature(serve_grpc).parameters.values() if p.name != "operation"]
     kinds = [(p.name, p.default) for p in own] + [(f.name, f.default) for f in dataclasses.fields(OperationFlags)]
@@ -163,10 +165,10 @@ def _store(
     gigabytes: float | None = None,
     device: str = "auto",
 ) -> SceneStore:
-    """The scenes of the sources.
+    """Scene store of the sources.
 
     Raises:
-        NurecSimError: a bound leaves room for nothing, or the device cannot be used.
+        NurecSimError: a limit is not positive, or the device cannot be used.
     """
     from nurec_sim.compute.cores import usable_cores
     from nurec_sim.serving.store import SceneStore
@@ -230,7 +232,7 @@ def _matches(pattern: str | None) -> list[str]:
 
 
 def _glob_folder(pattern: str | None) -> list[Path]:
-    """The folder that a pattern searches: what comes before the first part with a wildcard."""
+    """The folder of a pattern: its parts before the first wildcard."""
     if pattern is None:
         return []
     parts = Path(pattern).parent.parts
@@ -242,7 +244,7 @@ def _test_scenes(store: SceneStore) -> None:
     """Loads every scene once.
 
     Raises:
-        NurecSimError: some are bad; the text names them.
+        NurecSimError: some are invalid; the text lists them.
     """
     bad = dict(store.faults)
     with progress("loading") as advance:
@@ -254,4 +256,4 @@ def _test_scenes(store: SceneStore) -> None:
                 bad[scene_id] = str(error)
     if bad:
         texts = "".join(f"\n  {name}: {reason}" for name, reason in bad.items())
-        raise NurecSimError(f"{len(bad)} of {len(store.ids) + len(store.faults)} scenes are bad:{texts}")
+        raise NurecSimError(f"{len(bad)} of {len(store.ids) + len(store.faults)} scenes are invalid:{texts}")

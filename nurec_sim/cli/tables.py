@@ -1,4 +1,4 @@
-"""Tables that stay readable however narrow the terminal: what does not fit is turned round, never cut off."""
+"""Tables that fit any terminal: wide ones are transposed, never truncated."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from rich.table import Table
 
 Columns = list[list[str]]
 PROSE_WORDS, PROSE_WIDTH = 4, 28
-"""From so many words on a cell is text that may wrap, in so much room."""
+"""Cells with at least this many words may wrap, at this width."""
 
 
 def draw_table(console: Console, title: str, rows: Sequence[Sequence[object]], heading: Sequence[str] = ()) -> None:
     """Prints rows as a table, with or without a heading.
 
-    Texts of several words wrap, and headings where that saves room; figures and names never do. Where all that is too
-    wide, the table is turned round, with a row for each heading, in as many parts as it takes.
+    Multi-word texts wrap, and headings if that saves width; numbers and names do not. A table that is still too wide is
+    transposed, one row per heading, in as many parts as needed.
 
     Args:
-        console: where to.
+        console: output console.
         title: printed above.
-        rows: each of as many cells as the others.
-        heading: names of the columns.
+        rows: cells, equally many per row.
+        heading: column names.
     """
     cells = [[str(cell) for cell in row] for row in rows]
     count = max(map(len, [heading, *cells]))
@@ -47,7 +47,7 @@ def draw_table(console: Console, title: str, rows: Sequence[Sequence[object]], h
 def _table(
     title: str, columns: Columns, names: Sequence[str], style: box.Box | None, widths: Sequence[int] = ()
 ) -> Table:
-    """A table whose columns are at least so wide; without widths everything wraps."""
+    """A table with minimum column widths; without widths everything wraps."""
     table = Table(title=title, title_justify="left", show_header=bool(names), box=style, pad_edge=style is not None)
     for k, column in enumerate(columns):
         wraps = not widths or any(_is_prose(cell) for cell in column)
@@ -59,7 +59,7 @@ def _table(
 
 
 def _parts(cells: list[list[str]], heading: Sequence[str], width: int) -> list[list[list[str]]]:
-    """The rows in groups that fit beside each other, and their headings, when they are columns."""
+    """Groups of transposed rows that fit the width, with their headings."""
     parts: list[list[list[str]]] = []
     free = 0
     for row in cells:
@@ -73,7 +73,7 @@ def _parts(cells: list[list[str]], heading: Sequence[str], width: int) -> list[l
 
 
 def _broken(name: str, column: list[str]) -> str:
-    """A heading in several lines where it would be wider than its column."""
+    """Wraps a heading that is wider than its column."""
     room = max(map(cell_len, [*name.split(), *(cell for cell in column if not _is_prose(cell))]), default=0)
     lines: list[str] = []
     for word in name.split():

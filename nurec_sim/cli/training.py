@@ -1,4 +1,4 @@
-"""The verb that trains the network in the true world."""
+"""The command ``train``."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ def train(
     until: int | None = None,
     ablation: AblationName = "full",
 ) -> None:
-    """Train the network in towns that are drawn meanwhile, as a recipe says (docs/training.md).
+    """Train the network in procedural towns generated on the fly (docs/training.md).
 
-    Writes curves, sample renders, checkpoints and weights to the run folder. The same command again goes on where the
-    run was cut off. For several processes or GPUs: `torchrun --nproc-per-node N -m nurec_sim.cli train RECIPE`.
+    Writes curves, sample renders, checkpoints and weights to the run folder. The same command resumes an interrupted
+    run. For several processes or GPUs: `torchrun --nproc-per-node N -m nurec_sim.cli train RECIPE`.
 
     Args:
         recipe: a YAML file such as nurec_sim/training/recipes/tiny.yaml.
-        out_path: the run folder; runs/train/NAME-OF-THE-RECIPE if not given.
-        clips: folder for the clips that are drawn, which may hold those of other runs too.
-        drawers: processes that draw clips; 0 uses those that are there.
+        out_path: the run folder; default: runs/train/RECIPE-NAME.
+        clips: cache folder for generated clips, which may be shared between runs.
+        drawers: processes that generate clips; 0 uses existing clips only.
         loaders: processes that prepare samples; 0 is a thread of the training process.
-        threads: of torch and of the renderer; all cores if not given.
-        until: stop after so many steps, counted from the beginning of the recipe.
-        ablation: what to leave out, a row of the paper's Table 2; concatenation trains as full does.
+        threads: of torch and of the renderer; default: all cores.
+        until: stop after this step, counted from the start of the recipe.
+        ablation: a row of the paper's Table 2; concatenation trains like full.
     """
     import torch
 

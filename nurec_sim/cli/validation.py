@@ -1,4 +1,4 @@
-"""Verbs that check scene archives: validate, and the part of inspect that is about them."""
+"""Commands that check scene archives: validate, and inspect for archives."""
 
 from __future__ import annotations
 
@@ -24,14 +24,13 @@ def validate(
     for_: Annotated[str, tyro.conf.arg(name="for", metavar="NAMES")] = "alpasim,carla,openusd,own",
     json_: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Say what AlpaSim, CARLA, USD tools and our own reader will miss in a scene archive, one line each.
+    """Check a scene archive for AlpaSim, CARLA, USD tools and our own reader.
 
-    The archive may be anyone's. A line says who needs what, what was found, and what does not work without it; the
-    name in brackets is that of the rule (docs/scene_format.md). Exit status 1 if there is an error; warnings are
-    things that a consumer can do without.
+    Works for any archive. Each line gives consumer, finding, requirement and consequence, with the rule name in
+    brackets (docs/scene_format.md). Exit status 1 if there is an error; consumers run despite warnings.
 
     Args:
-        scenes: scene archives (.usdz); of several, none may share a scene_id.
+        scenes: scene archives (.usdz) with different scene_ids.
         for_: consumers, separated by commas: alpasim, carla, openusd, own.
         json_: print one JSON document instead of lines.
     """
@@ -61,7 +60,7 @@ def validate(
 
 
 def inspect_scene(path: Path) -> None:
-    """Prints what a scene holds, then what our reader finds wrong or unknown; exit status 1 if there are errors."""
+    """Prints the contents of a scene, then the findings of our reader; exit status 1 if there are errors."""
     from nurec_sim.scene import summary
     from nurec_sim.scene.interop.validate import read_and_validate
 
@@ -74,7 +73,7 @@ def inspect_scene(path: Path) -> None:
 
 
 def _print_findings(path: Path, findings: list[Finding], consumers: list[Consumer]) -> None:
-    """One line per finding, errors red; consumers without findings are named in one line."""
+    """One line per finding, errors in red; one line for consumers without findings."""
     from nurec_sim.scene.interop.validate import NAMES
 
     for finding in findings:

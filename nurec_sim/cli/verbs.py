@@ -1,4 +1,4 @@
-"""All verbs together; heavy modules are imported by the verb that needs them."""
+"""All commands; heavy modules are imported by the command that needs them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import logging
 import os
 import sys
 
-from nurec_sim.cli import (  # noqa: F401  (each adds its verbs to the app)
+from nurec_sim.cli import (  # noqa: F401  (each registers its commands)
     conformance,
     drive,
     driving,
@@ -27,11 +27,11 @@ from nurec_sim.cli.console import app, err
 from nurec_sim.errors import NurecSimError
 
 KEPT = {
-    "run": "finished rollouts are kept: go on with --resume runs/latest (or your run folder)",
-    "demo": "finished rollouts are kept: go on with --resume runs/latest (or your run folder)",
-    "evaluate": "finished windows of a protocol are kept: go on with --resume evaluations/latest (or your run folder)",
+    "run": "finished rollouts are kept: resume with --resume runs/latest (or your run folder)",
+    "demo": "finished rollouts are kept: resume with --resume runs/latest (or your run folder)",
+    "evaluate": "finished windows of a protocol are kept: resume with --resume evaluations/latest (or your run folder)",
 }
-"""What an interrupted verb leaves behind."""
+"""Messages after Ctrl-C."""
 
 
 def run(words: list[str]) -> None:
@@ -55,14 +55,14 @@ def run(words: list[str]) -> None:
         err.print(f"nurec-sim: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         raise SystemExit(1) from None
     except BrokenPipeError:
-        _forget_output()  # whoever read the output has left, as `head` does
+        _forget_output()  # the reader of a pipe has closed it, as `head` does
         raise SystemExit(1) from None
     except OSError as error:
-        if error.errno is None:  # not the system's: a bug
+        if error.errno is None:  # not an operating system error: a bug
             raise
         where = error.filename
         if where is None and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO):
-            where = "standard output"  # whatever else is written has a name
+            where = "standard output"  # all other outputs have a file name
             _forget_output()
         text = f"{where}: {error.strerror}" if where else error.strerror
         err.print(f"nurec-sim: {text}", style="red", markup=False, highlight=False, soft_wrap=True)
@@ -73,17 +73,17 @@ def run(words: list[str]) -> None:
 
 
 def _check_verb(words: list[str]) -> None:
-    """Names the verb that was meant, and ends with 2, where the first word is none."""
-    known = sorted(getattr(app, "_subcommands", ()))  # tyro has no public name for them, and a help of its own without
+    """Suggests the nearest command and exits with 2 if the first word is not a command."""
+    known = sorted(getattr(app, "_subcommands", ()))  # tyro has no public API for them
     if not known or not words or words[0].startswith("-") or words[0] in known:
         return
     near = difflib.get_close_matches(words[0], known, n=1, cutoff=0.5)
     hint = f"did you mean '{near[0]}'?" if near else f"have {', '.join(known)}."
-    text = f"nurec-sim: there is no verb '{words[0]}'; {hint} All of them: nurec-sim --help"
+    text = f"nurec-sim: unknown command '{words[0]}'; {hint} All commands: nurec-sim --help"
     err.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
     raise SystemExit(2)
 
 
 def _forget_output() -> None:
-    """Lets what cannot be written to standard output go, which Python would try once more at the end."""
+    """Discards unwritable standard output, which Python would retry at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

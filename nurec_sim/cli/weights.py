@@ -1,4 +1,4 @@
-"""Verbs about the weights of the network: weights list, fetch, check, share."""
+"""Commands for network weights: weights list, fetch, check, share."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ weights = tyro.extras.SubcommandApp()
 app.command(
     weights,
     name="weights",
-    help="Weights of the network: list what there is, fetch released ones, check a file, leave out what two share.",
+    help="Network weights: list, fetch released ones, check a file, deduplicate two files.",
 )
 
 Fetchable = Literal["pa-front", "pa-multiview", "pq-front", "da3-base"]
@@ -22,10 +22,10 @@ Checkable = Literal["pa-front", "pa-multiview", "pq-front", "pa-full", "tiny", "
 
 @weights.command(name="list")
 def list_weights() -> None:
-    """Show every profile of the network, its size, and where its weights are.
+    """Show every network profile, its size, and the location of its weights.
 
-    `reconstruct` takes the first of: --checkpoint PATH, the file that $INSTANT_NUREC_FULL_PT names, weights that come
-    with this package, released weights that were fetched.
+    `reconstruct` uses the first of: --checkpoint PATH, the file in $INSTANT_NUREC_FULL_PT, bundled weights, fetched
+    released weights.
     """
     from nurec_sim.network import PROFILES
     from nurec_sim.network.checkpoints import download
@@ -39,9 +39,9 @@ def list_weights() -> None:
     for name in (*PROFILES, *(name for name in RELEASED if name not in PROFILES)):
         released, shipped = RELEASED.get(name), download.shipped_weights(name)
         if shipped is not None:
-            facts = (shipped.name, f"{shipped.stat().st_size:,}", "", "part of this package")
+            facts = (shipped.name, f"{shipped.stat().st_size:,}", "", "bundled")
         elif released is None:
-            facts = ("", "", "", "none published")
+            facts = ("", "", "", "not published")
         else:
             digest = released.sha256[:12] if released.sha256 else "not published"
             cached = download.cached_file(released)
@@ -51,8 +51,8 @@ def list_weights() -> None:
         rows.append((name, parameters.get(name, ""), *facts))
     print_table("weights", rows, ("profile", "parameters", "file", "bytes", "SHA-256", "here"))
     repositories = ", ".join(dict.fromkeys(released.repository for released in RELEASED.values()))
-    out.print(f"`nurec-sim weights fetch PROFILE` gets missing files from {repositories} on Hugging Face;")
-    out.print("da3-base is what training starts from.")
+    out.print(f"`nurec-sim weights fetch PROFILE` downloads missing files from {repositories} on Hugging Face;")
+    out.print("training can start from da3-base.")
 
 
 @weights.command
@@ -64,13 +64,13 @@ def fetch(
 ) -> None:
     """Download released weights from Hugging Face and check their size and digest.
 
-    Needs the extra: pip install 'nurec-sim[hub]'. Interrupted downloads go on where they stopped. The weights are their
-    owner's, under the licence that is printed. Exit status 1 if the file is not the released one.
+    Needs the extra: pip install 'nurec-sim[hub]'. Interrupted downloads are resumed. The weights are subject to their
+    owner's licence, which is printed. Exit status 1 if the file is not the released one.
 
     Args:
-        profile: whose weights; da3-base is the file that training starts from.
-        revision: commit, tag or branch of the repository; its main branch if not given.
-        to: put the file into this folder instead of the cache of Hugging Face ($HF_HOME); use it with --checkpoint.
+        profile: profile name; da3-base is a starting point for training.
+        revision: commit, tag or branch of the repository; default: main.
+        to: download to this folder instead of the Hugging Face cache ($HF_HOME); use the file with --checkpoint.
     """
     from nurec_sim.network.checkpoints import download
     from nurec_sim.network.checkpoints.released import RELEASED
@@ -86,14 +86,14 @@ def fetch(
 
 @weights.command
 def check(path: OnePath, *, profile: Checkable | None = None) -> None:
-    """Say what a weights file is, which profile it fits, and what is wrong with it.
+    """Identify a weights file, its profile and its faults.
 
-    Reads .pth files of torch.save, training checkpoints (.ckpt) and .safetensors; nothing in them is run. Prints a
-    table, then every fault as one line. Exit status 1 if there are faults.
+    Reads .pth files of torch.save, training checkpoints (.ckpt) and .safetensors, without executing code in them.
+    Prints a table, then every fault as one line. Exit status 1 if there are faults.
 
     Args:
         path: the file.
-        profile: what it should fit; whichever it does if not given.
+        profile: expected profile; default: any matching one.
     """
     with progress(f"reading {path.name}"):
         from nurec_sim.network.checkpoints.fit import check_weights
@@ -106,17 +106,17 @@ def check(path: OnePath, *, profile: Checkable | None = None) -> None:
 
 @weights.command
 def share(path: OnePath, *, other: Path, to: Path) -> None:
-    """Write a weights file without the tensors that another one beside it has too, value by value.
+    """Write a weights file without the tensors that are identical in another file.
 
-    For profiles that differ in a part only: the small file is read together with the other one, which must stay beside
-    it, unchanged.
+    For profiles that differ in one part only: the small file is read together with the other one, which must stay
+    unchanged in the same folder.
 
     Args:
-        path: the whole file, .safetensors.
-        other: the file with which it shares tensors, .safetensors.
-        to: the file to write, in the folder of the other one; one that is there is replaced.
+        path: the complete file, .safetensors.
+        other: the file with the shared tensors, .safetensors.
+        to: the file to write, in the folder of the other one; an existing file is replaced.
     """
     from nurec_sim.network.checkpoints.shared import save_difference
 
     count = save_difference(path, other, to)
-    out.print(f"{to}: {count} tensors are those of {other.name}; {to.stat().st_size:,} bytes", soft_wrap=True)
+    out.print(f"{to}: {count} tensors shared with {other.name}; {to.stat().st_size:,} bytes", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""The verb that draws true worlds: world."""
+"""The command ``world``: generates procedural towns."""
 
 from __future__ import annotations
 
@@ -41,31 +41,31 @@ def world(
     imperfect: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Draw a drive through a procedural town and write it as a driving log.
+    """Generate a procedural town and record a drive through it as a driving log.
 
-    Everything about a town is known exactly: with --truth its depth, labels, normals, motion and plan are written
-    beside the log, where no reader of the log can see them. Without any of the last group of options the car is that
-    of the demonstration: three pinhole cameras of 448 x 256 pixels and one LiDAR.
+    --truth writes exact depth, labels, normals, motion and the plan to a separate folder, which no reader of the log
+    can access. Without any of the last group of options the rig is that of the demo: three pinhole cameras of 448 x 256
+    pixels and one LiDAR.
 
     Examples: `nurec-sim world --seed 7 --out town.zip`;
     `nurec-sim world --split test --template roundabout --cameras 5 --lens fisheye --truth truth --out town.zip`.
 
     Args:
         out_path: the clip to write: a folder, or a .zip.
-        seed: same seed, same town, same log; 7 if not given.
-        split: train if not given; towns of split test show templates, materials and vehicles that training never sees.
-        template: how the roads lie; by the seed if not given. roundabout and double_junction are of split test only.
-        seconds: length of the drive, 1 to 30; 12 if not given.
-        plan_path: draw this plan.json (of a truth folder) instead of a new town.
+        seed: seed of the town and the log; default: 7.
+        split: default: train; towns of split test have templates, materials and vehicles that training never uses.
+        template: road layout; default: by the seed. roundabout and double_junction are in split test only.
+        seconds: length of the drive, 1 to 30; default: 12.
+        plan_path: use this plan.json (of a ground truth folder) instead of a new town.
         truth: also write the ground truth into this folder, which must not exist (docs/world.md).
-        hz: sets of frames per second: up to 10 with a LiDAR, up to 25 without.
-        cameras: a random car with so many cameras: front, + front left and right, + rear left and right.
-        lens: a random car with lenses of this kind.
-        pixels: a random car with so many pixels per image (width times height, about).
-        lidar: a random car with this LiDAR: 64x900, PANDAR128, AT128, HDL-64, HDL-32, VLP-16, or none.
-        rig_seed: another random car; the town's seed if not given.
-        imperfect: give every camera colours, vignette and noise of its own, and let the LiDAR lose faint echoes.
-        overwrite: replace a clip that is there.
+        hz: frame sets per second: up to 10 with a LiDAR, up to 25 without.
+        cameras: random rig with this many cameras: front, + front left and right, + rear left and right.
+        lens: random rig with this lens type.
+        pixels: random rig with about this many pixels per image (width times height).
+        lidar: random rig with this LiDAR: 64x900, PANDAR128, AT128, HDL-64, HDL-32, VLP-16, or none.
+        rig_seed: seed of the random rig; default: the town's seed.
+        imperfect: add per-camera colour response, vignette and noise, and drop weak LiDAR returns.
+        overwrite: replace an existing clip.
     """
     from nurec_sim.world import random_readout_us, random_responses, write_town_clip
 
@@ -75,7 +75,7 @@ def world(
     if not 0.1 <= hz <= 25.0:
         raise NurecSimError(f"--hz must be within 0.1..25, got {hz:g}")
     check_writable(out_path, folder=out_path.suffix != ".zip")
-    with progress("drawing the town") as advance:
+    with progress("rendering the town") as advance:
         path = write_town_clip(
             plan,
             out_path,
@@ -93,7 +93,7 @@ def world(
         ("template", plan.template), ("sky", plan.weather.preset), ("seconds", f"{_seconds(plan):g}"),
         ("actors", f"{moving} moving, {len(plan.actors) - moving} standing"),
     ])  # fmt: skip
-    out.print(f"wrote {path}" + ("" if truth is None else f" and its truth {truth}"), soft_wrap=True)
+    out.print(f"wrote {path}" + ("" if truth is None else f" and its ground truth {truth}"), soft_wrap=True)
 
 
 def _plan(
@@ -114,7 +114,7 @@ def _plan(
     given = {"--seed": seed, "--split": split, "--template": template, "--seconds": seconds}
     both = [name for name, value in given.items() if value is not None]
     if both:
-        raise NurecSimError(f"--plan says everything about the town; leave out {', '.join(both)}")
+        raise NurecSimError(f"--plan defines the town; remove {', '.join(both)}")
     try:
         return TownPlan.from_json(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -126,7 +126,7 @@ def _plan(
 def _rig(
     seed: int, cameras: int | None, lens: str | None, pixels: int | None, lidar: str | None, *, chosen: bool
 ) -> Rig:
-    """The demonstration's car, or a random one where anything about it is asked for."""
+    """The demo rig, or a random one if any of its options is given."""
     from nurec_sim.world import random_rig, street_rig
 
     if not chosen and (cameras, lens, pixels, lidar) == (None, None, None, None):
@@ -146,7 +146,7 @@ def _seconds(plan: TownPlan) -> float:
 
 
 def _command(plan: TownPlan, plan_path: Path | None) -> str:
-    """What makes the same town again, wherever it is written to: the same log has the same bytes."""
+    """The command that reproduces the log, without output paths: the same log has the same bytes."""
     if plan_path is not None:
         return f"nurec-sim world --plan {plan_path.name}"
     town = f"--seed {plan.seed} --split {plan.split} --template {plan.template} --seconds {_seconds(plan):g}"

@@ -1,1 +1,1 @@
-"""How kernels are compiled, and how long computations give way to others."""
+"""Kernel compilation, and cooperative scheduling of long computations."""

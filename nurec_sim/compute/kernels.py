@@ -1,8 +1,8 @@
-"""How loops are compiled with Numba: without the interpreter lock, and once per machine and source.
+"""Numba compilation of kernels: without the GIL, cached on disk per machine and source.
 
-Numba's cache only watches the file of the function that is called, not those of the functions that it calls in turn
-and compiles into it. So a digest of all these files becomes part of an entry point's name, by which its machine code
-is found on disk. Where nothing can be written it is compiled anew in every process.
+Numba's cache only tracks the file of the entry function, not those of inlined callees. So a digest of all these files
+is part of an entry point's name, the key of its machine code on disk. Without a writable folder every process compiles
+again.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _IMPORT = re.compile(rb"^from (nurec_sim[\w.]+) import", re.MULTILINE)
 
 @functools.cache
 def source_digest(module: str, salt: str = "") -> str:
-    """Digest of the files that the kernels of a module may be made of: its own, and all that it imports in turn.
+    """Digest of all source files that may be compiled into a module's kernels: its own and its transitive imports.
 
-    A kernel takes functions and constants from where they are written, not from a package that passes them on (there
-    is a test of that), so packages themselves are left out.
+    Kernels import functions and constants from their defining module, not from a re-exporting package (tested), so
+    packages themselves are excluded.
     """
     names, seen, digest = [module], set(), hashlib.sha256(salt.encode())
     while names:
@@ -41,22 +41,22 @@ def source_digest(module: str, salt: str = "") -> str:
 
 
 def entry_point(function: Callable, salt: str = "", **options: Any) -> Callable:
-    """A function that Python calls, compiled with Numba's ``options``, its machine code kept on disk.
+    """A compiled function callable from Python, with Numba ``options``, cached on disk.
 
-    ``salt`` is what else its machine code depends on.
+    ``salt`` is anything else that its machine code depends on.
     """
     function.__qualname__ += f"_{source_digest(function.__module__, salt)}"
     try:
         return njit(cache=True, **options)(function)
-    except RuntimeError:  # no folder to write to
+    except RuntimeError:  # no writable folder
         return njit(**options)(function)
 
 
 def kernel(function: Callable) -> Callable:
-    """An entry point with Python's arithmetic."""
+    """An entry point with default (strict) arithmetic."""
     return entry_point(function, nogil=True)
 
 
 def inner(function: Callable) -> Callable:
-    """A function that only kernels call."""
+    """A device function, callable from kernels only."""
     return njit(nogil=True)(function)

@@ -1,8 +1,8 @@
-"""From the long table to one number per rollout, and to one row per policy with its interval.
+"""Aggregation: one value per rollout and metric, then one row per policy with its interval.
 
-Truncation, both profiles: states after the first collision or off-road state do not count (what a car does after it
-crashed says nothing), so the two are competing risks. Profile ``alpasim`` also drops states after the ego is 4 m off
-the recorded path; ``strict`` never does, and counts how often it would have (``censored_4m``).
+Truncation, both profiles: states after the first collision or off-road state are ignored (driving after a crash is
+meaningless), so the two are competing risks. Profile ``alpasim`` also truncates when the ego is 4 m off the recorded
+path; ``strict`` does not, and counts how often that occurs (``censored_4m``).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 CENSOR_M = 4.0
 MAX_UNKNOWN_FRAC = 0.2
-"""A scene with more unknown states than this is left out of ``offroad`` for every policy."""
+"""Scenes with a larger fraction of unknown states are excluded from ``offroad`` for every policy."""
 BOOTSTRAP = 10_000
 CONFIDENCE = 0.95
 ROLLOUT_KEYS = (
@@ -30,10 +30,13 @@ DERIVED: dict[str, tuple[str, str]] = {
     "collision_offroad_mean": ("share", "mean of collision_any and offroad"),
     "offroad_or_collision": ("bool", "collision_any or offroad"),
     "scene_score": ("share", "0 after a collision at fault or off-road, else progress / 0.8, at most 1"),
-    "time_to_first_event_s": ("s", "from take-over to the first collision or off-road state; none if neither"),
+    "time_to_first_event_s": (
+        "s",
+        "from the first policy-driven state to the first collision or off-road state; none if neither",
+    ),
     "censored_4m": ("bool", "the ego was 4 m off the recorded path at some time"),
 }
-"""Metrics of whole rollouts, on top of ``METRICS``: unit and meaning."""
+"""Rollout-level metrics in addition to ``METRICS``: unit and meaning."""
 
 
 def rollout_values(table: pl.DataFrame, profile: str = "strict") -> pl.DataFrame:
@@ -65,9 +68,9 @@ def rollout_values(table: pl.DataFrame, profile: str = "strict") -> pl.DataFrame
 def summarize(values: pl.DataFrame, seed: int = 0) -> pl.DataFrame:
     """One row per reconstruction, policy and metric: ``n, n_failed, n_valid, scenes, mean, low, high``.
 
-    ``mean`` is the scene mean of trial means, over scenes with a valid trial. ``low``..``high`` is the 95 % interval of
-    a bootstrap that draws whole scenes; null with a single scene, which says nothing of others. All policies and
-    metrics share the draws, so that differences between them are paired.
+    ``mean`` is the mean over scenes of the mean over trials, over scenes with a valid trial. ``low``..``high`` is the
+    95 % bootstrap interval over scenes; null for a single scene, which does not generalise. All policies and metrics
+    share the resamples, so that differences between them are paired.
     """
     import polars as pl
 
@@ -105,7 +108,7 @@ def _summary_schema() -> pl.Schema:
 
 
 def _interval(means: np.ndarray, draws: np.ndarray) -> tuple[float | None, float | None]:
-    """Percentile interval over draws of scenes; draws without a valid scene do not count."""
+    """Percentile interval over resamples of scenes, ignoring those without a valid scene."""
     known = np.isfinite(means)
     if known.sum() < 2:
         return None, None
@@ -139,7 +142,7 @@ def _rollout_numbers(series: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _scene_score(numbers: dict[str, float]) -> float:
-    """AlpaSim's scene score; NaN where one of its parts is not known."""
+    """AlpaSim's scene score; NaN if one of its parts is unknown."""
     at_fault, offroad = numbers["collision_at_fault"], numbers["offroad"]
     if at_fault == 1 or offroad == 1:
         return 0.0
@@ -151,7 +154,7 @@ def _scene_score(numbers: dict[str, float]) -> float:
 
 
 def _first_us(series: tuple[np.ndarray, np.ndarray, np.ndarray] | None, at_least: float) -> float:
-    """First valid time with a value of at least so much; infinite if there is none."""
+    """First valid time at which the value reaches the threshold; infinite if never."""
     if series is None:
         return float("inf")
     t_us, values, valid = series
@@ -168,7 +171,7 @@ def _reduce(series: tuple[np.ndarray, np.ndarray, np.ndarray], how: str, end_us:
 
 
 def _without_unseen_scenes(values: pl.DataFrame) -> pl.DataFrame:
-    """Take ``offroad`` and what builds on it out of scenes where too many states are unknown, for all policies."""
+    """Invalidates ``offroad`` and derived metrics in scenes with too many unknown states, for all policies."""
     import polars as pl
 
     unknown = values.filter((pl.col("name") == "offroad_unknown_frac") & pl.col("valid"))

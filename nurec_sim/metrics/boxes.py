@@ -1,7 +1,7 @@
 """Ego and actor boxes of a rollout seen from above: rounded outlines and the exact distance between them.
 
 A rounded outline is a rectangle grown by a disk, so the gap between two of them is the distance between the two
-rectangles less both radii: no polygons, no tolerance. Shrink and rounding are AlpaSim's (docs/metrics.md).
+rectangles minus both radii: no polygons, no tolerance. Shrink and rounding are AlpaSim's (docs/metrics.md).
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from nurec_sim import geometry
 from nurec_sim.types import Box, Rollout
 
 SHRINK = 0.02
-"""Share of its length and width that a box loses before any test."""
+"""Relative shrinking of box length and width."""
 ROUNDNESS = 0.5
-"""Corner radius over half of the shorter side."""
+"""Corner radius relative to half of the shorter side."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class BoxPath:
 
     @property
     def present(self) -> Bool[np.ndarray, " t"]:
-        """When the box has a pose."""
+        """Times at which the box has a pose."""
         return np.isfinite(self.world_from_box).all(axis=(1, 2))
 
     @property
@@ -49,7 +49,7 @@ class BoxPath:
         return length - 2 * self.radius_m, width - 2 * self.radius_m
 
     def at(self, index: np.ndarray | slice | list[int]) -> BoxPath:
-        """The box at some of the times."""
+        """The box at selected times."""
         return BoxPath(self.world_from_box[index], self.size_m)
 
 
@@ -81,7 +81,7 @@ def actor_boxes(rollout: Rollout) -> dict[str, BoxPath]:
 
 
 def heights_overlap(a: BoxPath, b: BoxPath) -> Bool[np.ndarray, " t"]:
-    """Where the height intervals of two boxes overlap: a bridge above the road is no obstacle."""
+    """Whether the height intervals of two boxes overlap; excludes bridges above the road."""
     gap = np.abs(a.world_from_box[:, 2, 3] - b.world_from_box[:, 2, 3])
     return gap < (a.size_m[2] + b.size_m[2]) / 2
 
@@ -100,8 +100,8 @@ def rectangle_distance(
 ) -> Float64[np.ndarray, "*n"]:
     """Distance between upright rectangles (length, width) in the plane, 0 when they overlap.
 
-    Two convex outlines apart from each other are closest at a corner of one of them; they are apart if and only if
-    an axis of one of the rectangles separates them.
+    Disjoint convex polygons are closest at a corner of one of them, and rectangles are disjoint if and only if an axis
+    of one of them separates them (separating axis theorem).
     """
     distance_a, apart_a = _corners_to_rectangle(world_from_a, size_a_m, world_from_b, size_b_m)
     distance_b, apart_b = _corners_to_rectangle(world_from_b, size_b_m, world_from_a, size_a_m)

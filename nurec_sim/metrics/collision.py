@@ -1,9 +1,9 @@
-"""Contacts between the ego and actors: who, when, on which side, how hard.
+"""Contacts between the ego and actors: actor, time, side, severity.
 
-Profiles: ``strict`` keeps the class of an actor's first contact for as long as that actor exists, joins the classes of
-actors that touch at once, and ignores an actor that appears inside the ego until the two have been apart once.
-``alpasim`` follows AlpaSim: every frame is classified anew, the last touching actor decides the class of the frame,
-overlaps at the start count. Both shrink and round the boxes; only ours also asks that the heights overlap.
+Profiles: ``strict`` keeps the class of an actor's first contact as long as the actor exists, combines the classes of
+simultaneous contacts, and ignores an actor that appears inside the ego until the two have separated once. ``alpasim``
+follows AlpaSim: every frame is classified independently, the last touching actor determines the class of the frame,
+initial overlaps count. Both shrink and round the boxes; only ``strict`` also requires overlapping heights.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from nurec_sim.types import Rollout, Series
 PROFILES = ("strict", "alpasim")
 SIDES = ("front", "rear", "lateral")
 AT_FAULT_RULE = "front_or_lateral"
-"""Name of the rule behind ``collision_at_fault``: front and lateral contacts are the ego's, rear ones are not."""
+"""Rule for ``collision_at_fault``: the ego is at fault in front and lateral contacts, not in rear ones."""
 
 SUB_STEPS = 10
-"""Places between two states that are looked at for the first touch."""
+"""Interpolation steps between two states to find the first contact."""
 _ARC_TOLERANCE_M = 2e-3  # shapely's arcs are inscribed polygons, up to 0.6 mm inside the true outline
 
 
 @dataclass(frozen=True)
 class Contact:
-    """The first counted touch between the ego and one actor."""
+    """The first counted contact between the ego and an actor."""
 
     actor: str
     label: str
@@ -43,10 +43,10 @@ class Contact:
 
 
 def check_profile(profile: str) -> None:
-    """Refuse an unknown profile.
+    """Raises for an unknown profile.
 
     Raises:
-        ValueError: the name is none of ``PROFILES``.
+        ValueError: the name is not in ``PROFILES``.
     """
     if profile not in PROFILES:
         raise ValueError(f"unknown metric profile '{profile}'; have {list(PROFILES)}")
@@ -58,8 +58,8 @@ def collision_series(rollout: Rollout, profile: str = "strict", actors_known: bo
     Args:
         rollout: states and actors.
         profile: ``strict`` or ``alpasim``.
-        actors_known: whether the log knows its actors; None means that it does if the rollout has any. Where they are
-            not known nothing can be said, and every series is invalid.
+        actors_known: whether the log has actor labels; None: if the rollout has any actor. Without labels every series
+            is invalid.
     """
     check_profile(profile)
     t_us = times_of(rollout)
@@ -80,7 +80,7 @@ def collision_series(rollout: Rollout, profile: str = "strict", actors_known: bo
 
 
 def find_contacts(rollout: Rollout, profile: str = "strict") -> list[Contact]:
-    """One contact per actor that the ego touched once the policy drove, in the order of time."""
+    """One contact per actor touched while the policy drives, in time order."""
     check_profile(profile)
     if not rollout.states:
         return []
@@ -109,10 +109,10 @@ def touching(ego: BoxPath, actor: BoxPath) -> np.ndarray:
 
 
 def contact_side(ego: BoxPath, actor: BoxPath) -> str:
-    """Side of the ego on which an actor touches it, for boxes at one time: ``front``, ``rear`` or ``lateral``.
+    """Contact side on the ego for boxes at one time: ``front``, ``rear`` or ``lateral``.
 
-    The bumper regions are the front and the rear edge of the box grown by the corner radius, cut to the outline; a
-    contact that meets the front one is ``front`` whatever else it meets.
+    The bumper regions are the front and the rear edge of the box grown by the corner radius, clipped to the outline;
+    the front region takes precedence.
     """
     import shapely
 
@@ -135,10 +135,10 @@ def _outline(box: BoxPath):
 
 
 def _counted(ego: BoxPath, actor: BoxPath, profile: str, relevant: np.ndarray) -> np.ndarray:
-    """[t] touches that count once the policy drives.
+    """[t] counted contacts while the policy drives.
 
-    ``strict`` leaves out a touch that an actor was born with or brought along from the forced replay of the log
-    (where the ego was where it really was: the boxes are wrong, not the policy) until the two have been apart.
+    ``strict`` ignores overlaps that exist when an actor appears or at the end of the log replay (where the ego is at
+    its recorded pose, so the boxes are wrong, not the policy) until the two have separated.
     """
     touches = touching(ego, actor)
     if profile == "alpasim":
@@ -151,10 +151,10 @@ def _counted(ego: BoxPath, actor: BoxPath, profile: str, relevant: np.ndarray) -
 
 
 def _first_side(ego: BoxPath, actor: BoxPath, index: int, profile: str) -> str:
-    """Side of a contact first seen at a state.
+    """Side of a contact first detected at a state.
 
-    A car moves metres between two states, far enough to swallow a pedestrian beyond its bumper, so ``strict`` looks
-    where the two first touched on the way from the state before.
+    A car moves metres between two states, enough for a pedestrian to end up behind its bumper, so ``strict``
+    interpolates the first contact from the previous state on.
     """
     if profile == "strict" and index > 0 and ego.present[index - 1] and actor.present[index - 1]:
         on_the_way = np.arange(1, SUB_STEPS + 1) / SUB_STEPS
@@ -167,7 +167,7 @@ def _first_side(ego: BoxPath, actor: BoxPath, index: int, profile: str) -> str:
 
 
 def _side_flags(rollout: Rollout, profile: str) -> dict[str, np.ndarray]:
-    """Per side, [t] whether an actor touches there."""
+    """Per side, [t] whether there is a contact."""
     ego = ego_boxes(rollout)
     flags = {side: np.zeros(len(rollout.states), bool) for side in SIDES}
     relevant = rollout.t_us >= rollout.first_closed_loop_us
@@ -178,7 +178,7 @@ def _side_flags(rollout: Rollout, profile: str) -> dict[str, np.ndarray]:
             if profile == "strict":
                 flags[first_side][index] = True
                 continue
-            for side in SIDES:  # AlpaSim resets the flags for every touching actor: the last one wins
+            for side in SIDES:  # AlpaSim resets the flags for every touching actor, so only the last one counts
                 flags[side][index] = False
             flags[contact_side(ego.at([index]), box.at([index]))][index] = True
     return flags

@@ -25,11 +25,11 @@ BOUNDS: dict[str, tuple[float, float]] = {
 ACCEL_WINDOW, DERIVATIVE_WINDOW, ORDER = 8, 5, 2
 MAX_ACCEL_MPS2 = 10.4
 MAX_CURVATURE_PER_M = 0.3
-_STILL_M = 1e-3  # below this length of a step its direction, hence its curvature, is noise
+_STILL_M = 1e-3  # for shorter steps direction and curvature are noise
 
 
 def comfort_series(rollout: Rollout) -> list[Series]:
-    """``comfort`` and the sizes of the six signals; invalid with fewer than 8 evenly spaced states."""
+    """``comfort`` and the magnitudes of the six signals; invalid with fewer than 8 evenly spaced states."""
     t_us = times_of(rollout)
     signals = motion_signals(rollout)
     if signals is None:
@@ -44,7 +44,7 @@ def comfort_series(rollout: Rollout) -> list[Series]:
 
 
 def motion_signals(rollout: Rollout) -> dict[str, Float64[np.ndarray, " t"]] | None:
-    """The six smoothed signals of the states that the policy drove, NaN before; None where they cannot be had."""
+    """The six smoothed signals while the policy drives, NaN before; None if they cannot be computed."""
     from scipy.signal import savgol_filter
 
     driven = np.flatnonzero(times_of(rollout) >= rollout.first_closed_loop_us)
@@ -84,7 +84,7 @@ def motion_signals(rollout: Rollout) -> dict[str, Float64[np.ndarray, " t"]] | N
 def infeasible_steps(
     t_us: Int64[np.ndarray, " t"], xy_m: Float64[np.ndarray, "t 2"], yaw_rad: Float64[np.ndarray, " t"]
 ) -> Bool[np.ndarray, " t"]:
-    """Whether the motion into each pose needs more than 10.4 m/s2 or curves tighter than 0.3 1/m; first ones False."""
+    """Whether the motion into each pose exceeds 10.4 m/s2 or a curvature of 0.3 1/m; False for the first poses."""
     t_s = (np.asarray(t_us) - t_us[0]) / 1e6
     heading = np.stack([np.cos(yaw_rad[:-1]), np.sin(yaw_rad[:-1])], axis=1)
     step = np.diff(xy_m, axis=0)

@@ -1,6 +1,6 @@
-"""Ground heights around a recorded path, grown outward from the wheels over road-class Gaussians.
+"""Ground heights around a recorded path, propagated from the wheel contacts over road-class Gaussians.
 
-Growing by small height steps keeps to the deck that was driven: a bridge above, or a road below, is never reached.
+Small height steps keep the result on the driven surface: bridges above and roads below are never reached.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from jaxtyping import Float64
 
 PITCH_M = 0.5
 STEP_M = 0.15
-"""Height difference that a neighbour may always have ..."""
+"""Constant part of the height difference allowed between neighbouring cells ..."""
 STEP_PER_M = 0.08
-"""... and what it may have on top for each metre: roads bend and bank, kerbs are 0.10 to 0.20 m."""
+"""... and its part per metre: roads slope and bank, kerbs are 0.10 to 0.20 m."""
 SEED_STEP_M = 0.5
-"""Height difference allowed under the wheels, where the recorded pose, not a neighbour, is the reference."""
+"""Height difference allowed under the wheels, relative to the recorded pose."""
 QUANTILE = 0.2
 PLANE_SIGMA_M = 3.0
 MAX_SLOPE = 0.15
@@ -31,7 +31,7 @@ class GroundHeights:
     observed: np.ndarray
 
     def at(self, xy_m: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, " n"]:
-        """Heights at points, bilinear between cell centres; held beyond the border."""
+        """Heights at points, bilinear between cell centres; constant beyond the border."""
         from scipy.ndimage import map_coordinates
 
         place = (np.asarray(xy_m, np.float64) - np.asarray(self.origin_m)) / PITCH_M - 0.5
@@ -74,7 +74,7 @@ def fit_ground(
 
 
 class _CellHeights:
-    """Heights grouped by cell and sorted, so that the quantile inside a gate is two binary searches."""
+    """Heights sorted within cells, so that a quantile inside a gate takes two binary searches."""
 
     def __init__(self, cell: np.ndarray, height_m: np.ndarray) -> None:
         order = np.lexsort((height_m, cell))
@@ -93,7 +93,7 @@ class _CellHeights:
 
 
 def _grow(level: np.ndarray, heights: _CellHeights) -> bool:
-    """Accept the neighbours of accepted cells whose heights fit; False when nothing was added."""
+    """Accepts neighbours of accepted cells with matching heights; False if nothing was added."""
     rows, columns = level.shape
     total, count = np.zeros_like(level), np.zeros(level.shape, np.int64)
     padded = np.pad(level, 1, constant_values=np.nan)
@@ -128,7 +128,7 @@ def _extrapolate(level: np.ndarray, observed: np.ndarray) -> np.ndarray:
     xx, yy = smooth(x * x) / mass - mean_x**2, smooth(y * y) / mass - mean_y**2
     xy = smooth(x * y) / mass - mean_x * mean_y
     xz, yz = smooth(x * z) / mass - mean_x * mean_z, smooth(y * z) / mass - mean_y * mean_z
-    ridge = 0.05  # m^2: a strip seen edge-on has no cross slope; hold it level
+    ridge = 0.05  # m^2, ridge term: the cross slope of a narrow strip is unobservable; keep it level
     xx, yy = xx + ridge, yy + ridge
     determinant = np.maximum(xx * yy - xy**2, 1e-9)
     slope_x = np.clip((xz * yy - yz * xy) / determinant, -MAX_SLOPE, MAX_SLOPE)

@@ -1,8 +1,8 @@
-"""Off-road, three-valued: the ego's footprint against the Gaussian road grid, and against the map where there is one.
+"""Three-valued off-road test of the ego's footprint against the Gaussian road grid, and against the map if any.
 
-A footprint is *off* if it reaches more than ``TOLERANCE_M`` beyond everything that may be road, *unknown* if it does so
-only should the unseen not be road, else *on*. Off counts from the second state in a row. An unknown state is never
-counted as either (docs/metrics.md).
+A footprint is *off* if it extends more than ``TOLERANCE_M`` beyond all cells that may be road, *unknown* if that
+depends on unknown cells, else *on*. Off counts from the second consecutive state on. Unknown states count as neither
+(docs/metrics.md).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MAX_OUTSIDE_FRAC = 0.25
 
 
 class Verdict(enum.IntEnum):
-    """Where one footprint stands."""
+    """Result for one footprint."""
 
     ON = 0
     OFF = 1
@@ -35,7 +35,7 @@ class Verdict(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Footprints:
-    """The grid's answer for n footprints: verdict, deepest reach beyond possible road, share of area beyond it."""
+    """Results for n footprints: verdict, largest excursion beyond possible road, fraction of area beyond it."""
 
     verdict: UInt8[np.ndarray, " n"]
     excursion_m: Float64[np.ndarray, " n"]
@@ -48,7 +48,7 @@ def judge_footprints(
     body: Box,
     tolerance_m: float = TOLERANCE_M,
 ) -> Footprints:
-    """Judge the whole outline of the body, sampled every 0.1 m, at n rig poses."""
+    """Classifies the body's footprint, sampled every 0.1 m, at n rig poses."""
     centre = body_boxes(world_from_rig, body).world_from_box
     along, across = (
         np.linspace(-size / 2, size / 2, int(np.ceil(size / SAMPLE_STEP_M)) + 1) for size in body.size_m[:2]
@@ -66,7 +66,7 @@ def judge_footprints(
 
 
 def debounced(verdict: UInt8[np.ndarray, " t"]) -> tuple[Float64[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
-    """Off-road values and their validity: 1 from the second ``OFF`` in a row, invalid where that cannot be decided."""
+    """Off-road values and validity: 1 from the second consecutive ``OFF``; invalid where undecidable."""
     verdict = np.asarray(verdict)
     before = np.concatenate([[Verdict.ON], verdict[:-1]])
     off = verdict == Verdict.OFF
@@ -76,10 +76,10 @@ def debounced(verdict: UInt8[np.ndarray, " t"]) -> tuple[Float64[np.ndarray, " t
 
 
 def offroad_series(rollout: Rollout, grid: OffroadGrid | None) -> list[Series]:
-    """``offroad`` and its excursion, area and unknown shares; all invalid without a grid.
+    """``offroad`` with excursion, area and unknown fractions; all invalid without a grid.
 
-    Start rule: where the ego is off or unknown at the first state that counts, and the recorded ego was too, the grid
-    does not fit the scene and nothing is valid.
+    Start rule: if both ego and recorded ego are off or unknown at the first evaluated state, the grid does not fit the
+    scene and everything is invalid.
     """
     t_us = times_of(rollout)
     names = ("offroad", "offroad_max_excursion_m", "offroad_area_frac", "offroad_unknown_frac")
@@ -102,7 +102,7 @@ def offroad_series(rollout: Rollout, grid: OffroadGrid | None) -> list[Series]:
 
 
 def true_offroad_series(rollout: Rollout, road_map: RoadMap | None) -> Series:
-    """``offroad_true`` against the drivable polygons of the map; invalid without one, or if it misfits the start."""
+    """``offroad_true`` against the map's drivable polygons; invalid without one, or if it does not fit at the start."""
     t_us = times_of(rollout)
     if road_map is None or not road_map.drivable or not rollout.states:
         return unknown_series("offroad_true", t_us)
@@ -118,7 +118,7 @@ def true_offroad_series(rollout: Rollout, road_map: RoadMap | None) -> Series:
 
 
 def corners_outside_m(area, world_from_rig: Float64[np.ndarray, "n 4 4"], body: Box) -> Float64[np.ndarray, " n"]:
-    """How far the outermost corner of the body lies outside a shapely area, 0 if all are inside."""
+    """Largest distance of a body corner outside a shapely area, 0 if all are inside."""
     import shapely
 
     corners = geometry.box_corners_xy(body_boxes(world_from_rig, body).world_from_box, *body.size_m[:2])
@@ -127,11 +127,11 @@ def corners_outside_m(area, world_from_rig: Float64[np.ndarray, "n 4 4"], body: 
 
 @dataclass(frozen=True)
 class Agreement:
-    """The Gaussian grid against the true polygon on random placements.
+    """Agreement of the Gaussian grid with the true polygon at random placements.
 
-    ``agreement`` counts placements with a verdict only. ``false_alarms`` are off in the grid but not in truth,
-    ``misses`` the other way round. ``error_margin_p95_m``: how far from the tolerance the true corner was, where the
-    two disagree (NaN if they never do).
+    ``agreement`` excludes unknown placements. ``false_alarms`` are off in the grid only, ``misses`` off in the polygon
+    only. ``error_margin_p95_m``: distance of the true excursion from the tolerance where the two disagree (NaN if they
+    never do).
     """
 
     placements: int
@@ -152,9 +152,9 @@ def offroad_agreement(
     seed: int = 0,
     max_offset_m: float = 5.5,
 ) -> Agreement:
-    """Compare the grid with the true drivable area on footprints beside the recorded path.
+    """Compares the grid with the true drivable area at footprints beside the recorded path.
 
-    Places are uniform along the path and within ``max_offset_m`` to either side, headed along it.
+    Placements are uniform along the path and within ``max_offset_m`` to either side, heading along it.
 
     Raises:
         ValueError: the map has no drivable area, or the path is shorter than a metre.

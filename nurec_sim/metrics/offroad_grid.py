@@ -1,4 +1,4 @@
-"""Where the road is, read from road-class Gaussians: a grid seen from above with road, non-road and unknown cells.
+"""Bird's-eye grid of road, non-road and unknown cells from road-class Gaussians.
 
 ``build_offroad_grid`` follows docs/metrics.md step by step: ground heights, evidence, adaptive bandwidth,
 specks, driven corridor, closing, holes, two distance fields. Cells are [row along y, column along x]; a cell's index is
@@ -19,11 +19,11 @@ from nurec_sim.metrics.ground import GroundHeights, fit_ground
 from nurec_sim.types import Box, Gaussians, GaussianScene, Label, RoadMap, Trajectory
 
 FAR_M = 1e6
-"""Distance to something that is nowhere on the grid."""
+"""Distance to a class that does not occur in the grid."""
 
 
 class Cell(enum.IntEnum):
-    """What a cell is known to be."""
+    """Cell class."""
 
     UNKNOWN = 0
     ROAD = 1
@@ -34,7 +34,8 @@ class Cell(enum.IntEnum):
 class GridSettings:
     """Parameters of the grid (``docs/metrics.md``).
 
-    ``reach_m``: farther from the driven path nothing counts as non-road, for reconstructions label road only so far.
+    ``reach_m``: beyond this distance from the driven path non-road is unknown, because reconstructions label road only
+    up to there.
     """
 
     cell_m: float = 0.1
@@ -58,11 +59,11 @@ class GridSettings:
 
 @dataclass(frozen=True)
 class OffroadGrid:
-    """The grid and its two distance fields, both 0 inside and growing outwards, in metres.
+    """The grid and its two distance fields in metres, 0 inside and increasing outwards.
 
     ``beyond_possible_m`` is the distance to the nearest cell that is road or unknown, ``beyond_known_m`` the distance
-    to the nearest road cell. ``overruled_frac`` is the share of the driven corridor whose labels said non-road: a
-    measure of label quality.
+    to the nearest road cell. ``overruled_frac`` is the fraction of the driven corridor labelled non-road: a measure of
+    label quality.
     """
 
     origin_m: tuple[float, float]
@@ -77,7 +78,7 @@ class OffroadGrid:
     def from_state(
         cls, origin_m: tuple[float, float], cell_m: float, state: np.ndarray, bandwidth_m: float, overruled: float
     ) -> OffroadGrid:
-        """A grid from its cells; the distance fields follow from them."""
+        """A grid from its cells; computes the distance fields."""
         possible = distance_to(state != Cell.NONROAD, cell_m)
         known = distance_to(state == Cell.ROAD, cell_m)
         return cls(origin_m, cell_m, state.astype(np.uint8), possible, known, bandwidth_m, overruled)
@@ -85,7 +86,7 @@ class OffroadGrid:
     def look_up(
         self, xy_m: Float64[np.ndarray, "*n 2"]
     ) -> tuple[Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
-        """Both distances at points, bilinear between cell centres, and which points lie on the grid."""
+        """Both distances at points, bilinear between cell centres, and whether the points lie on the grid."""
         rows, columns = self.state.shape
         place = (np.asarray(xy_m, np.float64) - np.asarray(self.origin_m)) / self.cell_m
         inside = np.all((place >= 0) & (place < np.array([columns, rows])), axis=-1)
@@ -109,13 +110,13 @@ def build_offroad_grid(
     """The grid around a recorded path.
 
     Args:
-        static: the static layer; labels ROAD and OTHER are evidence, movable objects say nothing of the ground.
+        static: the static layer; only labels ROAD and OTHER are used, not movable objects.
         ego: recorded rig poses; the rig's origin lies on the ground.
-        body: outline of the car that was driven; its front and rear extend the driven corridor at the ends.
+        body: box of the recorded car; its front and rear extend the driven corridor at the ends.
         settings: parameters.
 
     Raises:
-        ReconstructError: no Gaussian is labelled road, so nothing can be said.
+        ReconstructError: no Gaussian is labelled road.
     """
     settings = settings or GridSettings()
     path = driven_path(ego, body)
@@ -131,7 +132,7 @@ def build_offroad_grid(
     if not is_road.any():
         raise ReconstructError(
             f"no Gaussian near the recorded path is labelled road ({len(static)} Gaussians, {int(usable.sum())} of "
-            "them opaque and within reach): off-road cannot be decided"
+            "them opaque and within reach): off-road is unknown"
         )
     ground = fit_ground(mean[is_road], path, (low[0], low[1]), (high[0], high[1]))
     layer = _near_ground(mean, ground, settings)
@@ -168,7 +169,7 @@ def scene_offroad_grid(scene: GaussianScene, settings: GridSettings | None = Non
 
 
 def road_map_of_grid(grid: OffroadGrid, smooth_m: float = 0.2) -> RoadMap:
-    """The road cells as drivable polygons, their steps smoothed; no lanes. Unknown cells are not drivable."""
+    """The road cells as drivable polygons with smoothed outlines, without lanes; unknown cells are not drivable."""
     import shapely
 
     road = np.pad((grid.state == Cell.ROAD).astype(np.int8), ((0, 0), (1, 1)))
@@ -184,7 +185,7 @@ def road_map_of_grid(grid: OffroadGrid, smooth_m: float = 0.2) -> RoadMap:
 
 
 def driven_path(ego: Trajectory, body: Box, step_m: float = 0.05) -> Float64[np.ndarray, "k 3"]:
-    """Ground points under the middle of the car, from its tail at the first pose to its nose at the last one."""
+    """Ground points under the car's centre line, from its rear at the first pose to its front at the last one."""
     nose = body.center_m[0] + body.size_m[0] / 2
     tail = body.center_m[0] - body.size_m[0] / 2
     poses = ego.world_from_body
@@ -198,13 +199,13 @@ def driven_path(ego: Trajectory, body: Box, step_m: float = 0.05) -> Float64[np.
 
 
 def distance_to(mask: Bool[np.ndarray, "rows columns"], cell_m: float) -> Float32[np.ndarray, "rows columns"]:
-    """Distance in metres from every cell to the edge of a mask, 0 inside it; ``FAR_M`` where the mask is empty."""
+    """Distance in metres from every cell to the edge of a mask, 0 inside; ``FAR_M`` if the mask is empty."""
     import cv2
 
     if not mask.any():
         return np.full(mask.shape, FAR_M, np.float32)
     cells = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    # Cell centres are counted; the mask's edge lies half a cell this side of its nearest centre.
+    # Distances are to cell centres; the mask's edge is half a cell nearer.
     return np.maximum((cells - 0.5) * np.float32(cell_m), 0).astype(np.float32)
 
 
@@ -214,13 +215,13 @@ def _near_ground(mean_m: np.ndarray, ground: GroundHeights, settings: GridSettin
 
 
 def _decide(road: np.ndarray, other: np.ndarray, cell: float, bandwidth: float, settings: GridSettings) -> np.ndarray:
-    """Cells decided by the finest of two bands that holds enough opacity; the rest stays unknown."""
+    """Classifies cells with the smaller of two bandwidths that has enough opacity; the rest is unknown."""
     from scipy.ndimage import gaussian_filter
 
     state = np.zeros(road.shape, np.uint8)
     for sigma_m in (bandwidth, 1.5 * bandwidth):
         sigma = sigma_m / cell
-        # The filter's kernel sums to one; times its area it peaks at one and so adds up the opacities around.
+        # The normalised kernel times its area peaks at one, so that it sums the opacities around.
         peak = 2 * np.pi * sigma**2
         smooth_road = gaussian_filter(road, sigma, mode="constant", truncate=3.0) * peak
         smooth_other = gaussian_filter(other, sigma, mode="constant", truncate=3.0) * peak
@@ -230,7 +231,7 @@ def _decide(road: np.ndarray, other: np.ndarray, cell: float, bandwidth: float, 
 
 
 def _drop_specks(state: np.ndarray, cell: float, settings: GridSettings) -> None:
-    """Small islands of a class become unknown, never the other class."""
+    """Small islands of a class become unknown, not the other class."""
     from scipy.ndimage import label
 
     for kind, area_m2 in ((Cell.ROAD, settings.road_speck_m2), (Cell.NONROAD, settings.nonroad_speck_m2)):
@@ -241,14 +242,14 @@ def _drop_specks(state: np.ndarray, cell: float, settings: GridSettings) -> None
 
 
 def _close(state: np.ndarray, cell: float, settings: GridSettings) -> None:
-    """Morphological closing of the road; observed non-road is never overwritten."""
+    """Morphological closing of the road, without overwriting observed non-road."""
     grown = distance_to(state == Cell.ROAD, cell) <= settings.closing_m
     closed = distance_to(~grown, cell) > settings.closing_m
     state[closed & (state == Cell.UNKNOWN)] = Cell.ROAD
 
 
 def _fill_holes(state: np.ndarray, cell: float, settings: GridSettings) -> None:
-    """Small unknown holes inside the road (the shadow of a parked car) become road."""
+    """Fills small unknown holes inside the road (such as under a parked car)."""
     from scipy.ndimage import binary_dilation, label
 
     holes, count = label(state == Cell.UNKNOWN)

@@ -1,4 +1,4 @@
-"""How steady plans are from one to the next, and how well the car follows them."""
+"""Plan consistency and tracking error."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TRACKING_AHEAD_US = 500_000
 def plan_series(rollout: Rollout) -> list[Series]:
     """``plan_deviation`` (AlpaSim's weights; invalid with fewer than 5 shared times) and ``tracking_error_m``.
 
-    A plan is in the rig frame of the state it was made at; both metrics are taken in the world.
+    A plan is in the rig frame of its start state; both metrics are computed in the world frame.
     """
     names = ("plan_deviation", "tracking_error_m")
     if not rollout.plans or not rollout.states:
@@ -45,7 +45,7 @@ def _along(plan: Plan, line: np.ndarray, t_us: np.ndarray) -> Float64[np.ndarray
 
 
 def _deviation(old: Plan, old_line: np.ndarray, new: Plan, new_line: np.ndarray) -> float:
-    """Mean distance at the new plan's times that the old one covers, the first left out, weighted exp(-0.1 i)."""
+    """Mean distance at shared times after the first, with weights exp(-0.1 i)."""
     if len(old.t_us) < 2 or len(new.t_us) < 2:
         return float("nan")
     shared = np.flatnonzero((new.t_us >= old.t_us[0]) & (new.t_us <= old.t_us[-1]))[1:]
@@ -56,7 +56,7 @@ def _deviation(old: Plan, old_line: np.ndarray, new: Plan, new_line: np.ndarray)
 
 
 def _tracking_error(rollout: Rollout, now_us: int, pose: np.ndarray, plan: Plan, line: np.ndarray) -> float:
-    """Distance 0.5 s after a plan; NaN where the plan or the rollout ends before."""
+    """Distance 0.5 s after a plan; NaN if the plan or the rollout ends before."""
     later = now_us + TRACKING_AHEAD_US
     if len(plan.t_us) < 1 or later > plan.t_us[-1] or later > rollout.states[-1].t_us:
         return float("nan")

@@ -22,7 +22,7 @@ from nurec_sim.metrics.series import make_series, speed_of, times_of, unknown_se
 from nurec_sim.types import Rollout, Series
 
 SEARCH_WINDOW_M = 30.0
-"""A projection stays within this of the last one, so that a route that meets itself is not jumped along."""
+"""Maximum step between projections, so that self-crossing routes stay unambiguous."""
 TTC_HORIZON_S = 3.0
 TTC_STEP_S = 0.1
 
@@ -42,7 +42,7 @@ def progress_series(rollout: Rollout) -> list[Series]:
     steps = np.linalg.norm(np.diff(centre, axis=0, prepend=centre[:1]), axis=1)
     steps[~relevant] = 0
     if relevant.any():
-        steps[np.argmax(relevant)] = 0  # the step into the first counted state was still the log's
+        steps[np.argmax(relevant)] = 0  # the step into the first counted state belongs to the log replay
     length = geometry.arc_length(line)
     inside_log = (t_us >= rollout.recorded.start_us) & (t_us <= rollout.recorded.end_us)
     series = [
@@ -50,7 +50,7 @@ def progress_series(rollout: Rollout) -> list[Series]:
         make_series("dist_traveled_m", t_us, np.cumsum(steps)),
         make_series("gt_dist_traveled_m", t_us, np.full(len(t_us), length[-1])),
     ]
-    if length[-1] < 0.1:  # a car that stood still has a place, but no path to make progress along
+    if length[-1] < 0.1:  # a stationary recording has no path for progress
         away = np.linalg.norm(centre - line[0], axis=1)
         series.append(make_series("dist_to_gt_trajectory", t_us, away))
         return [*series, unknown_series("progress", t_us), unknown_series("progress_rel", t_us)]
@@ -68,7 +68,7 @@ def progress_series(rollout: Rollout) -> list[Series]:
 def _follow(
     points: Float64[np.ndarray, "t 2"], line: Float64[np.ndarray, "k 2"], length: Float64[np.ndarray, " k"]
 ) -> tuple[Float64[np.ndarray, " t"], Float64[np.ndarray, " t"]]:
-    """Arc length and distance of each point's projection, each near the one before it."""
+    """Arc length and distance of each point's projection, each near the previous one."""
     reached, away = np.zeros(len(points)), np.zeros(len(points))
     first, last = 0, len(line)
     for index, point in enumerate(points):
@@ -105,9 +105,9 @@ def proximity_series(rollout: Rollout) -> list[Series]:
 def _time_to_contact(
     ego: BoxPath, ego_velocity: np.ndarray, actor: BoxPath, actor_velocity: np.ndarray, gap_m: np.ndarray
 ) -> Float64[np.ndarray, " t"]:
-    """First time at which both boxes, moved at constant velocity, overlap; infinite beyond the horizon.
+    """First time at which both boxes, moved at constant velocity, overlap; infinite if later than the horizon.
 
-    As in nuPlan, an actor counts only if its centre is ahead of the ego's, it is not in contact now, and the ego moves.
+    As in nuPlan, an actor counts only if its centre is ahead of the ego's, there is no contact yet, and the ego moves.
     """
     offset = actor.world_from_box[:, :2, 3] - ego.world_from_box[:, :2, 3]
     yaw = geometry.yaw_of(ego.world_from_box)

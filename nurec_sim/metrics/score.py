@@ -1,4 +1,4 @@
-"""Every metric of one rollout, always the same names in the same order."""
+"""All metrics of one rollout, with fixed names and order."""
 
 from __future__ import annotations
 
@@ -23,18 +23,17 @@ def score_rollout(
     profile: str = "strict",
     actors_known: bool | None = None,
 ) -> list[Series]:
-    """Score one rollout, also a failed one, as far as it came.
+    """Computes the metrics of a rollout, including failed ones up to their last state.
 
-    A metric that cannot be computed is a series that is nowhere valid; none is ever missing, none falls back to 0.
-    States of the forced replay (before ``rollout.first_closed_loop_us``) are invalid in every metric but
-    ``eval_relevant``.
+    A metric that cannot be computed is a series without valid samples; none is missing or defaults to 0. States of the
+    log replay (before ``rollout.first_closed_loop_us``) are invalid in every metric but ``eval_relevant``.
 
     Args:
-        rollout: what happened.
-        grid: where the reconstruction has road; None makes ``offroad`` invalid.
+        rollout: the rollout.
+        grid: road grid of the reconstruction; None makes ``offroad`` invalid.
         road_map: the log's map, for ``offroad_true``.
         profile: ``strict`` or ``alpasim``, see ``metrics.collision``.
-        actors_known: whether the log knows its actors; None means it does if the rollout has any.
+        actors_known: whether the log has actor labels; None: if the rollout has any actor.
 
     Raises:
         ValueError: unknown profile, or actors that do not fit the states.

@@ -1,6 +1,6 @@
-"""The long table of all rollouts: AlpaSim's columns first, ours behind (docs/metrics.md).
+"""The long table of all rollouts: AlpaSim's columns, then ours (docs/metrics.md).
 
-One row per rollout, metric and time. Ids are uuid5 of what they name, so the same run gives the same bytes.
+One row per rollout, metric and time. Ids are uuid5 of the named object, so the same run gives the same bytes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NAMESPACE = uuid.UUID("6f3b8f5e-52d1-5f0e-9a2e-5b0f7c1d2a44")
 
 
 def rollout_id(rollout: Rollout) -> str:
-    """A uuid of scenario, scene, reconstruction, policy and seed."""
+    """UUID of scenario, scene, reconstruction, policy and seed."""
     parts = (rollout.scenario, rollout.scene_id, rollout.reconstruction, rollout.policy, str(rollout.seed))
     return str(uuid.uuid5(NAMESPACE, "\0".join(parts)))
 
@@ -39,12 +39,12 @@ def metric_table(
     """Rollouts and their series as one table, sorted by scene, reconstruction, policy, seed, metric and time.
 
     Args:
-        scored: each rollout with what ``score_rollout`` gave for it.
+        scored: rollouts with the result of ``score_rollout``.
         run_name: name of the run, for all rows.
-        worlds: reconstruction -> what was rendered; "reconstruction" where it is not named.
+        worlds: reconstruction -> rendered world; default "reconstruction".
 
     Raises:
-        ValueError: two rollouts are the same scenario, scene, reconstruction, policy and seed.
+        ValueError: two rollouts have the same scenario, scene, reconstruction, policy and seed.
     """
     import polars as pl
 
@@ -53,7 +53,7 @@ def metric_table(
         twice = next(rollout for (rollout, _), id_ in zip(scored, ids, strict=True) if ids.count(id_) > 1)
         raise ValueError(
             f"two rollouts of policy '{twice.policy}', seed {twice.seed}, in scene '{twice.scene_id}', "
-            f"scenario '{twice.scenario}': a run holds each once"
+            f"scenario '{twice.scenario}': each may occur only once in a run"
         )
     order = sorted(range(len(ids)), key=lambda i: (*_place(scored[i][0]), ids[i]))
     run_uuid = str(uuid.uuid5(NAMESPACE, _digest((ids[i], scored[i][1]) for i in order)))
@@ -90,10 +90,10 @@ def metric_table(
 
 
 def write_table(table: pl.DataFrame, folder: Path) -> tuple[Path, Path]:
-    """Write ``metrics.parquet`` and ``metrics.csv`` into a folder, each in one step; returns both paths."""
+    """Writes ``metrics.parquet`` and ``metrics.csv`` atomically; returns both paths."""
     parquet, text = Path(folder) / "metrics.parquet", Path(folder) / "metrics.csv"
     for path, write in ((parquet, table.write_parquet), (text, table.write_csv)):
-        content = io.BytesIO()  # of an error of the disk polars would tell the text only
+        content = io.BytesIO()  # polars would turn a disk error into mere text
         write(content)
         write_file(path, content.getvalue())
     return parquet, text
@@ -110,7 +110,7 @@ def read_table(path: Path) -> pl.DataFrame:
     table = pl.read_parquet(path)
     missing = [name for name in (*ALPASIM_COLUMNS, *OWN_COLUMNS) if name not in table.columns]
     if missing:
-        raise ValueError(f"{path} is no metric table: it lacks the columns {missing}")
+        raise ValueError(f"{path} is not a metric table: missing columns {missing}")
     return table
 
 
@@ -128,7 +128,7 @@ def _place(rollout: Rollout) -> tuple[str, str, str, str, int]:
 
 
 def _trials(rollouts: Sequence[Rollout]) -> list[int]:
-    """Rank of each rollout's seed among those of the same scene, scenario, reconstruction and policy."""
+    """Index of each rollout's seed among those of the same scene, scenario, reconstruction and policy."""
     seeds: dict[tuple, list[int]] = {}
     for rollout in rollouts:
         seeds.setdefault(_place(rollout)[:4], []).append(rollout.seed)

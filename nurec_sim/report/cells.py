@@ -24,9 +24,9 @@ def by_policy(summary: pl.DataFrame) -> Iterator[tuple[tuple[str, str], dict[str
 
 
 def summary_cell(row: Row) -> str:
-    """A table cell: mean, interval, and in how many rollouts it could be computed."""
+    """A table cell: mean, interval, and the number of rollouts with a known value."""
     if row["mean"] is None:
-        return f'<td class="n"><span class="none">not known</span><small>0 of {row["n"]}</small></td>'
+        return f'<td class="n"><span class="none">unknown</span><small>0 of {row["n"]}</small></td>'
     interval = ""
     if row["low"] is not None:
         low, high = (shown(row[end], row["unit"]) for end in ("low", "high"))
@@ -37,9 +37,9 @@ def summary_cell(row: Row) -> str:
 
 
 def shown(value: object, unit: object) -> str:
-    """A value with its unit; shares in percent."""
+    """A value with its unit; fractions in percent."""
     if not isinstance(value, float):
-        return '<span class="none">not known</span>'
+        return '<span class="none">unknown</span>'
     if unit in ("bool", "share"):
         return f"{100 * value:.0f} %"
     return f"{value:.2f} {escape(str(unit))}"
@@ -55,18 +55,18 @@ def fact_list(facts: Mapping[str, object]) -> str:
 
 
 def meaning(name: str) -> str:
-    """What a metric means, in a phrase."""
+    """The meaning of a metric."""
     return METRICS[name].meaning if name in METRICS else DERIVED[name][1]
 
 
 def full_name(entry: ReportRollout) -> str:
-    """A rollout in words."""
+    """The full name of a rollout."""
     rollout = entry.rollout
     return f"{rollout.policy} in {rollout.scene_id} ({rollout.reconstruction}), seed {rollout.seed}"
 
 
 def list_items(items: Sequence[str]) -> str:
-    """HTML list items of texts that are HTML already."""
+    """HTML list items; the texts must be HTML."""
     return "".join(f"<li>{item}</li>" for item in items)
 
 

@@ -13,7 +13,7 @@ from nurec_sim.types import Rollout, Series
 if TYPE_CHECKING:
     import polars as pl
 
-CLASS_COLOURS = {"front": "#d55e00", "lateral": "#e69f00", "rear": "#0072b2"}  # Okabe-Ito: told apart by all eyes
+CLASS_COLOURS = {"front": "#d55e00", "lateral": "#e69f00", "rear": "#0072b2"}  # Okabe-Ito palette, colour-blind safe
 
 
 def time_view(entry: ReportRollout) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What goes into a report."""
+"""Input data of a report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportScene:
-    """A scene under one reconstruction; ``unknown`` says in words what it does not tell."""
+    """A scene with one reconstruction; ``unknown`` lists missing information."""
 
     id: str
     reconstruction: str
@@ -44,7 +44,7 @@ class ReportRollout:
 
 @dataclass(frozen=True)
 class RunReport:
-    """All of a run. ``values`` and ``summary`` are the tables of ``metrics.aggregate``."""
+    """A complete run. ``values`` and ``summary`` are the tables of ``metrics.aggregate``."""
 
     title: str
     profile: str

@@ -1,4 +1,4 @@
-"""What the figures of the report share: colours, layout, lines. Figures are plain plotly JSON."""
+"""Colours, layout and lines shared by all figures of the report. Figures are plain plotly JSON."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def base_layout(height: int) -> dict[str, Any]:
 
 
 def plain(text: str) -> str:
-    """Text that plotly shows as it is; it would take tags for markup."""
+    """Text escaped for plotly, which interprets tags as markup."""
     return html.escape(text, quote=False)
 
 

@@ -1,4 +1,4 @@
-"""The report's HTML: headline first, then what is not known, what failed, and every rollout."""
+"""The report's HTML: headline, unknowns, failures, and every rollout."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def render_report(report: RunReport) -> str:
             figures[f"time{index}"] = time_view(entry)
         cards.append(rollout_card(index, entry, report, embed))
     stored = json.dumps({"figures": figures, "images": images}, separators=(",", ":"), allow_nan=False)
-    stored = stored.replace("<", "\\u003c")  # whatever the texts say, they cannot end the script
+    stored = stored.replace("<", "\\u003c")  # so that no text can close the script element
     body = [
         _header(report),
         _headline(report),
@@ -61,7 +61,7 @@ def render_report(report: RunReport) -> str:
         _unknown(report),
         _failures(report),
         "<h2>Rollouts</h2>",
-        '<p class="soft">Click one to open it. Plans are turned so that the recorded drive goes to the right.</p>',
+        '<p class="soft">Click a rollout to open it. In top views the recorded drive goes to the right.</p>',
         *cards,
         _all_metrics(report.summary),
         _reconstructions(report.scenes),
@@ -110,56 +110,56 @@ def _headline(report: RunReport) -> str:
         rows.append(f'<tr><td><b>{escape(policy)}</b>{where}</td><td class="n">{first["n"]}{failed}</td>{values}</tr>')
     one_scene = report.values["clipgt_id"].n_unique() < 2
     interval = (
-        "One scene only, so there are no intervals: they would say nothing of other scenes."
+        "No intervals: a single scene does not generalise to others."
         if one_scene
-        else "Brackets: 95 % interval of a bootstrap over scenes, the same draws for every policy."
+        else "Brackets: 95 % bootstrap interval over scenes, with the same resamples for every policy."
     )
     return (
         '<h2>Headline</h2><div class="card scroll"><table><thead><tr><th>Policy</th><th class="n">Rollouts</th>'
         f"{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
-        f'<p class="key">Small print under a value: rollouts in which it could be computed, of all. {interval} '
-        "A value that cannot be computed is <i>not known</i>, never 0. States after a rollout's first collision or "
-        "off-road state do not count, so the two compete.</p>"
+        f'<p class="key">Below each value: rollouts with a known value, of all. {interval} '
+        "A value that cannot be computed is <i>unknown</i>, never 0. A rollout is evaluated up to its first "
+        "collision or off-road state, so one event can mask the other.</p>"
     )
 
 
 def _collisions() -> str:
     return (
         '<h2>Collision classes</h2><div class="card"><div class="plot" id="collisions"></div>'
-        '<p class="key">Actors replay the log, so a car that is slower than the log is hit from behind: a timid policy '
+        '<p class="key">Actors replay the log, so a car that is slower than the log is hit from behind: a slow policy '
         f"shows as <i>rear</i>. At fault: {escape(AT_FAULT_RULE.replace('_', ' '))}.</p></div>"
     )
 
 
 def _unknown(report: RunReport) -> str:
-    """Everything that limits what this report can say."""
+    """All limitations of this report."""
     items = []
     for scene in report.scenes:
         items += [f"{escape(scene.id)} ({escape(scene.reconstruction)}): {escape(text)}" for text in scene.unknown]
     for (reconstruction, policy), cells in by_policy(report.summary):
         first = next(iter(cells.values()))
         if first["n_failed"] == first["n"]:
-            items.append(f"{escape(policy)} ({escape(reconstruction)}): every rollout failed, so nothing was measured")
+            items.append(f"{escape(policy)} ({escape(reconstruction)}): every rollout failed, so there are no metrics")
             continue
         dead = [
             name for name, row in cells.items()
             if row["n_valid"] == 0 and name not in ("time_to_first_event_s", "collision_delta_v_mps")
         ]  # fmt: skip
         if dead:
-            items.append(f"{escape(policy)} ({escape(reconstruction)}): never computed: {escape(', '.join(dead))}")
+            items.append(f"{escape(policy)} ({escape(reconstruction)}): not computed: {escape(', '.join(dead))}")
         share = cells["offroad_unknown_frac"]["mean"]
         if share is not None and share > 0:
             items.append(
                 f"{escape(policy)} ({escape(reconstruction)}): the road under the car was unknown in "
-                f"{100 * share:.1f} % of the states; a scene above {100 * MAX_UNKNOWN_FRAC:.0f} % does not count"
+                f"{100 * share:.1f} % of the states; scenes above {100 * MAX_UNKNOWN_FRAC:.0f} % are excluded"
             )
     items += [
         f"{escape(full_name(entry))}: no video: {escape(entry.video_error)}"
         for entry in report.rollouts
         if entry.video_error
     ]
-    items.append("Actors follow their recording and do not react to the ego; after a contact they drive on through it.")
-    return f'<h2>What this report could not know</h2><div class="card"><ul>{list_items(items)}</ul></div>'
+    items.append("Actors replay their recording without reacting to the ego; after a contact they continue through it.")
+    return f'<h2>Unknowns</h2><div class="card"><ul>{list_items(items)}</ul></div>'
 
 
 def _failures(report: RunReport) -> str:
@@ -168,8 +168,8 @@ def _failures(report: RunReport) -> str:
         return '<h2>Failures</h2><div class="card">No rollout failed.</div>'
     items = [
         f"<h3>{escape(full_name(entry))}</h3><pre>{escape(entry.rollout.error or 'no error text')}</pre>"
-        f'<p class="key">{len(entry.rollout.states)} states were driven before. It counts as a rollout; its metrics '
-        "do not count.</p>"
+        f'<p class="key">{len(entry.rollout.states)} states were driven before. It counts as a rollout, without '
+        "metrics.</p>"
         for entry in failed
     ]
     return f'<h2>Failures</h2><div class="card">{"".join(items)}</div>'
@@ -223,12 +223,12 @@ def _definitions(report: RunReport) -> str:
         for n, (u, m) in DERIVED.items()
     ]
     censoring = (
-        f"States after the ego is {CENSOR_M:g} m off the recorded path are dropped."
+        f"Rollouts are truncated when the ego is {CENSOR_M:g} m off the recorded path."
         if report.profile == "alpasim"
-        else f"Nothing is dropped for being {CENSOR_M:g} m off the recorded path; censored_4m says how often."
+        else f"Rollouts are not truncated at {CENSOR_M:g} m off the recorded path; censored_4m counts them."
     )
     return (
-        '<h2>Definitions</h2><details class="card"><summary>What each metric means</summary>'
+        '<h2>Definitions</h2><details class="card"><summary>Meaning of each metric</summary>'
         f'<p class="key">{censoring}</p><div class="scroll"><table><thead><tr><th>Metric</th><th>Meaning</th>'
         f"<th>Unit</th><th>Over time</th></tr></thead><tbody>{''.join(rows)}</tbody></table></div></details>"
     )

@@ -1,6 +1,6 @@
-"""A rollout seen from above.
+"""Bird's-eye view of a rollout.
 
-Plans are turned so that the recorded drive goes to the right: x is metres along its chord, y metres to the left.
+The recorded drive goes to the right: x is metres along its chord, y metres to the left.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def plan_view(entry: ReportRollout, view: PlanAxes, image_key: str | None, road_
         else:
             movers.append(box)
             moving += [_outline(view, box, index) for index in seconds if box.present[index]]
-    data.append(_outlines("standing actors", parked, PARKED, fill="rgba(148,163,184,0.45)"))
+    data.append(_outlines("static actors", parked, PARKED, fill="rgba(148,163,184,0.45)"))
     data.append(_outlines("moving actors, each second", moving, ACTOR, width=1))
     line = view.points(rollout.recorded.position_m)
     data.append(line_trace("recorded path", line, RECORDED, dash="dash", width=1.5))

@@ -1,4 +1,4 @@
-"""One rollout of the report: video, events, plan, curves and numbers, folded away until it is opened."""
+"""One rollout of the report: video, events, bird's-eye view, curves and metrics, in a collapsible card."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ OPEN_ROLLOUTS = 1
 
 
 def rollout_card(index: int, entry: ReportRollout, report: RunReport, embed: bool) -> str:
-    """The card of one rollout; figures are drawn into ``plan<index>`` and ``time<index>`` when it is opened."""
+    """The card of one rollout; figures ``plan<index>`` and ``time<index>`` are rendered when it is opened."""
     rollout = entry.rollout
     summary = (
         f"<summary>{escape(rollout.policy)} <span class='where'>· {escape(rollout.scene_id)} · "
@@ -31,10 +31,10 @@ def rollout_card(index: int, entry: ReportRollout, report: RunReport, embed: boo
             "Grey shade: road unknown.</p></div></div>"
             f'<div class="plot" id="plan{index}"></div>'
             '<p class="key">Blue: ego, each second. Dashed: recorded path. Brown: moving actors, each second. '
-            "Grey boxes: standing actors. Red box: ego at the first event.</p>"
+            "Grey boxes: static actors. Red box: ego at the first event.</p>"
         )
     else:
-        parts.append('<p class="none">No state was reached: nothing to draw.</p>')
+        parts.append('<p class="none">No states.</p>')
     parts.append(_value_table(rollout, report.values))
     if entry.scenario:
         parts.append(f"<details><summary class='soft'>scenario</summary><pre>{escape(entry.scenario)}</pre></details>")
@@ -52,9 +52,9 @@ def _tags(entry: ReportRollout) -> str:
     if offroad.value() > 0.5:
         tags.append('<span class="tag bad">off-road</span>')
     elif not offroad.valid.any():
-        tags.append('<span class="tag warn">off-road not known</span>')
+        tags.append('<span class="tag warn">off-road unknown</span>')
     if not entry.series["collision_any"].valid.any():
-        tags.append('<span class="tag warn">collisions not known</span>')
+        tags.append('<span class="tag warn">collisions unknown</span>')
     return "".join(tags) or '<span class="tag good">no event</span>'
 
 

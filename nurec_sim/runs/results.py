@@ -84,7 +84,7 @@ def headline(run: Path | str) -> list[tuple[str, ...]]:
     ):  # fmt: skip
         cells = {row["name"]: row for row in part.iter_rows(named=True)}
         first = next(iter(cells.values()))
-        shown = ["not known" if cells[name]["mean"] is None else f"{cells[name]['mean']:.2f}" for name in columns]
+        shown = ["unknown" if cells[name]["mean"] is None else f"{cells[name]['mean']:.2f}" for name in columns]
         rows.append((policy, reconstruction, str(first["n"]), str(first["n_failed"]), *shown))
     return rows
 

@@ -65,7 +65,7 @@ def record_video(
             requests = [_request(rollout, index, camera, overrides) for index in indices]
             frames = list(sense(requests))
             if len(frames) != len(requests):
-                raise RequestError(f"the renderer answered {len(frames)} frames to {len(requests)} requests")
+                raise RequestError(f"the renderer returned {len(frames)} frames for {len(requests)} requests")
             for index, frame in zip(indices, frames, strict=True):
                 if not isinstance(frame, CameraFrame) or frame.rgb.shape != (height, width, 3):
                     raise RequestError(f"wanted an image of {width}x{height}, got {_described(frame)}")

@@ -1,4 +1,4 @@
-"""The others on the road: recorded actors replayed, and what a scenario moves, delays or hides."""
+"""Actors: replay of recorded tracks with the edits of a scenario (shift, delay, hide)."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from nurec_sim.sim.scenario import ActorEdit
 from nurec_sim.types import ActorState, Track
 
 HIDDEN_BELOW_M = 100.0
-"""Hidden actors are drawn this far under the ground, as AlpaSim's clients do."""
+"""Hidden actors are placed this far below the ground, as in AlpaSim's clients."""
 VELOCITY_WINDOW_US = 100_000
 
 
 class Actors:
     """Recorded tracks under the edits of a scenario. An actor is present only while its recorded path covers the time.
 
-    Tracks that are no actors (``types.Track.actor``) are left out: they are part of the picture only.
+    Tracks that are not actors (``types.Track.actor``) are skipped: they are rendered only.
 
     Raises:
         ScenarioError: an edit names a track that the scene does not have.
@@ -36,7 +36,7 @@ class Actors:
     def poses(self, track_id: str, t_us: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 4 4"]:
         """Box poses in the world, NaN while the actor is absent or hidden."""
         track, edit = self.tracks[track_id], self.edits.get(track_id, ActorEdit())
-        # A delayed actor is there only where its Gaussians are: inside the recorded span of its path too.
+        # A delayed actor also needs its Gaussians, which exist only inside the recorded span of its path.
         asked = t_us - int(round(edit.delay_s * 1e6))
         first, last = track.path.start_us, track.path.end_us
         present = (t_us >= first) & (t_us <= last) & (asked >= first) & (asked <= last) & (not edit.hide)
@@ -45,7 +45,7 @@ class Actors:
         return result
 
     def overrides(self, start_us: int, end_us: int) -> dict[str, Float64[np.ndarray, "2 4 4"]]:
-        """What a sensor request must re-pose: only actors that the scenario edits; the rest moves as recorded."""
+        """Actor poses for a sensor request: only edited actors; the others move as recorded."""
         result = {}
         for track_id, edit in self.edits.items():
             track = self.tracks[track_id]
@@ -59,7 +59,7 @@ class Actors:
         return result
 
     def seen_from(self, t_us: int, world_from_rig: Float64[np.ndarray, "4 4"]) -> tuple[ActorState, ...]:
-        """The true actors of now, in the rig frame; velocities are over ground, in rig axes."""
+        """Current ground-truth actors in the rig frame; velocities are over ground, in rig axes."""
         rig_from_world = geometry.inverse(world_from_rig)
         result = []
         for track_id, track in self.tracks.items():

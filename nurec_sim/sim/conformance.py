@@ -1,9 +1,9 @@
-"""A kit for authors of policies: does a policy answer what the loop can drive, every time the same?
+"""Conformance test kit for policies: valid, reproducible plans.
 
 ::
 
     from nurec_sim.sim.conformance import check_policy
-    print(check_policy(MyPolicy()))      # [] when all is well
+    print(check_policy(MyPolicy()))      # [] if it conforms
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from nurec_sim.types import Needs, Observation, Plan, Policy, Rig, Track, Trajec
 
 
 def check_policy(policy: Policy) -> list[str]:
-    """Drive a policy through small flat worlds and list what an author should mend; empty when it conforms.
+    """Runs a policy in small flat worlds and returns a list of faults, empty if it conforms.
 
-    Checked: ``name``, ``needs``, ``reset`` and ``plan`` are there; plans can be driven (``plans.check_plan``) on a
-    straight road at speed, at a standstill, behind another car and at the recording's end; a second run after
-    ``reset`` answers the same bytes. Observations cannot be written to: a policy that tries fails.
+    Checked: ``name``, ``needs``, ``reset`` and ``plan`` exist; plans are valid (``plans.check_plan``) on a straight
+    road at speed, at a standstill, behind another car and at the end of the recording; a second run after ``reset``
+    gives identical plans. Observations are read-only: a policy that modifies them fails.
     """
     faults = _surface(policy)
     if faults:
@@ -39,7 +39,7 @@ def check_policy(policy: Policy) -> list[str]:
         second = run_rollout(scenario, policy, world.sense, world, seed=1)
         if _bytes(first.plans) != _bytes(second.plans):
             faults.append(
-                f"{world.id}: a second run after reset(rig, seed) gave other plans; keep no state, seed all noise"
+                f"{world.id}: a second run after reset(rig, seed) gave different plans; reset all state, seed all noise"
             )
     return faults
 
@@ -47,7 +47,7 @@ def check_policy(policy: Policy) -> list[str]:
 def _surface(policy: Policy) -> list[str]:
     faults = []
     if not isinstance(getattr(policy, "name", None), str) or not policy.name:
-        faults.append("name must be a text that is not empty")
+        faults.append("name must be a non-empty string")
     if not isinstance(getattr(policy, "needs", None), Needs):
         faults.append("needs must be a nurec_sim.types.Needs")
     faults += [f"{method}() is missing" for method in ("reset", "plan") if not callable(getattr(policy, method, None))]
@@ -55,7 +55,7 @@ def _surface(policy: Policy) -> list[str]:
 
 
 class _Watched:
-    """A policy that is looked at while it works."""
+    """Wraps a policy and records faults in its plans."""
 
     def __init__(self, policy: Policy) -> None:
         self.policy, self.name, self.needs = policy, policy.name, policy.needs

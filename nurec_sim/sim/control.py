@@ -1,8 +1,8 @@
-"""Drives the car along a plan: pure pursuit with PI speed control, or perfectly.
+"""Controllers that track a plan: pure pursuit with PI speed control, or perfect tracking.
 
-A plan is anchored at the car's pose when it was made. Its stations count metres along it from there, so that the
-distance driven since then, compared with the station the plan wants by now, is the integral of the speed error: the
-"I" of the speed control, without wind-up.
+A plan is anchored at the car's pose at planning time. Its stations are arc lengths from there, so the difference
+between the station due now and the distance driven since then is the integral of the speed error: the "I" of the speed
+control, without wind-up.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PREVIEW_S = 0.2
 
 
 class PlannedPath:
-    """A checked plan in the world, anchored at the state it starts from."""
+    """A validated plan in the world, anchored at its start state."""
 
     def __init__(self, plan: Plan, start: VehicleState, start_us: int) -> None:
         future = plan.t_us > start_us
@@ -32,13 +32,13 @@ class PlannedPath:
         self.t_s = np.concatenate([[0.0], (plan.t_us[future] - start_us) / 1e6])
         self.x_m, self.y_m = np.concatenate([[start.x_m], x]), np.concatenate([[start.y_m], y])
         self.yaw_rad = np.unwrap(np.concatenate([[start.yaw_rad], start.yaw_rad + local[:, 2]]))
-        # The first pose may lie behind the car, when it is ahead of its schedule; later ones only add up.
+        # The first pose may lie behind the car if the car is ahead of schedule; later steps are non-negative.
         steps = np.hypot(np.diff(self.x_m), np.diff(self.y_m))
         backwards = np.diff(self.x_m) * np.cos(self.yaw_rad[1:]) + np.diff(self.y_m) * np.sin(self.yaw_rad[1:]) < 0
         steps = np.where(backwards, 0.0, steps)
         steps[0] = local[0, 0] if local[0, 0] < 0 else math.hypot(local[0, 0], local[0, 1])
         self.station_m = np.concatenate([[0.0], np.cumsum(steps)])
-        if len(steps) > 1:  # the first step also corrects the car's place, so it says nothing of the speed wanted
+        if len(steps) > 1:  # the first step also corrects the position, so it does not give the target speed
             self._speed_t_s = (self.t_s[1:-1] + self.t_s[2:]) / 2
             self._speed_mps = steps[1:] / np.diff(self.t_s)[1:]
         else:
@@ -47,15 +47,15 @@ class PlannedPath:
         self._line = (self.station_m[first:], self.x_m[first:], self.y_m[first:])
 
     def speed_at(self, t_s: float) -> float:
-        """Speed wanted ``t_s`` after the anchor."""
+        """Target speed ``t_s`` after the anchor."""
         return float(np.interp(t_s, self._speed_t_s, self._speed_mps))
 
     def station_at(self, t_s: float) -> float:
-        """Metres along the plan wanted ``t_s`` after the anchor."""
+        """Target arc length ``t_s`` after the anchor."""
         return float(np.interp(t_s, self.t_s, self.station_m))
 
     def point_at(self, station_m: float) -> tuple[float, float]:
-        """Place on the plan; beyond its end straight on."""
+        """Point on the plan, extrapolated straight beyond its end."""
         station, x, y = self._line
         beyond = max(0.0, station_m - float(station[-1]))
         yaw = float(self.yaw_rad[-1])
@@ -78,7 +78,7 @@ def pursuit_pi(path: PlannedPath, state: VehicleState, since_us: int, driven_m: 
     behind_m = path.station_at(now_s) - driven_m
     accel = (soon - wanted) / PREVIEW_S + SPEED_GAIN * (wanted - state.speed_mps) + STATION_GAIN * behind_m
     if soon < 0.05 and wanted < 0.05 and behind_m < 0.1:
-        accel = min(accel, -2.0)  # at a standstill the brake stays on
+        accel = min(accel, -2.0)  # hold the brake at a standstill
     lookahead = min(max(LOOKAHEAD_S * state.speed_mps, LOOKAHEAD_M[0]), LOOKAHEAD_M[1])
     x, y = path.point_at(driven_m + lookahead)
     dx, dy = x - state.x_m, y - state.y_m
@@ -88,7 +88,7 @@ def pursuit_pi(path: PlannedPath, state: VehicleState, since_us: int, driven_m: 
 
 
 def perfect(path: PlannedPath, state: VehicleState, since_us: int, driven_m: float, limits: Limits) -> VehicleState:
-    """One tick of teleporting along the plan: isolates the policy from the car."""
+    """One tick of moving exactly along the plan: isolates the policy from vehicle dynamics."""
     del driven_m
     t_s = (since_us + TICK_US) / 1e6
     speed, before = path.speed_at(t_s), path.speed_at(t_s - 0.1)

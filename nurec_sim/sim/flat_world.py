@@ -1,7 +1,7 @@
-"""A flat hand-made world to try policies in: a road, a verge, boxes, and sensors that are ray-cast in numpy.
+"""A flat synthetic world for testing policies: road, verge, boxes, and sensors ray-cast in numpy.
 
-It is scene facts and renderer in one: ``run_rollout(scenario, policy, world.sense, world)``. Frames are exact for the
-geometry, not pretty; all rays start at the pose of the end of the exposure.
+It provides scene facts and renderer: ``run_rollout(scenario, policy, world.sense, world)``. Frames are geometrically
+exact with simple colours; all rays start at the pose of the end of the exposure.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def demo_rig() -> Rig:
 
 @dataclass(frozen=True)
 class FlatWorld:
-    """Scene facts with a renderer. ``road_m`` is the middle of the road; the ego drives ``ego``."""
+    """Scene facts with a renderer. ``road_m`` is the centre line of the road; ``ego`` the ego trajectory."""
 
     id: str
     rig: Rig
@@ -95,7 +95,7 @@ class FlatWorld:
         t_us: int,
         actors: Mapping[str, Float64[np.ndarray, "2 4 4"]],
     ) -> tuple[Float64[np.ndarray, " n"], np.ndarray]:
-        """Distance along each unit ray and what it meets: an index of ``tracks``, -1 the ground, -2 nothing."""
+        """Distance along each unit ray and the object hit: an index of ``tracks``, -1 the ground, -2 nothing."""
         with np.errstate(divide="ignore"):
             distance = np.where(directions[:, 2] < -1e-6, -origin[2] / directions[:, 2], np.inf)
         hit = np.where(np.isfinite(distance), -1, -2)
@@ -116,7 +116,7 @@ class FlatWorld:
         return np.where(hit == -2, 0.0, distance), hit
 
     def _ground_rgb(self, xy_m: Float64[np.ndarray, "n 2"]) -> UInt8[np.ndarray, "n 3"]:
-        """Asphalt with a dashed middle line, grass beside it, and a grain of 0.25 m so that nothing is uniform."""
+        """Asphalt with a dashed centre line, grass beside it, and noise in cells of 0.25 m as texture."""
         station, lateral = geometry.project_to_polyline(xy_m, self.road_m)
         rgb = np.where((np.abs(lateral) < self.road_width_m / 2)[:, None], ROAD_RGB, VERGE_RGB).astype(np.float64)
         rgb[(np.abs(lateral) < 0.08) & (station % 9 < 3)] = MARK_RGB
@@ -133,9 +133,10 @@ def flat_world(
     tracks: Sequence[Track] = (),
     lane_offset_m: float = -1.75,
 ) -> FlatWorld:
-    """A world whose ego drove along ``line_m``, in the right lane of a road that runs beside it.
+    """A world whose ego drove along ``line_m`` on a parallel road.
 
-    ``speed_mps`` is one speed or one per 0.1 s. ``lane_offset_m`` is the ego's place on the road, left positive.
+    ``speed_mps`` is one speed or one per 0.1 s. ``lane_offset_m`` is the ego's lateral position on the road, left
+    positive.
     """
     steps = int(round(duration_s * 1e6)) // LOG_STEP_US + 1
     speeds = np.broadcast_to(np.asarray(speed_mps, np.float64), (steps,))

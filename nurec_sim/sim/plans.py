@@ -1,4 +1,4 @@
-"""Checks a policy's answer before anything drives along it."""
+"""Validates the plans of policies."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from nurec_sim.errors import PlanError
 from nurec_sim.types import Plan
 
 MIN_HORIZON_US = 2_500_000
-"""A plan must reach this far beyond its observation; 5 s are asked for."""
+"""Minimum length of a plan beyond its observation; 5 s are recommended."""
 FARTHEST_M = 10_000.0
 
 
 def check_plan(plan: object, now_us: int) -> Plan:
-    """A copy of the plan with arrays of int64 and float64, or an error that says what cannot be driven.
+    """A validated copy of the plan with arrays of int64 and float64.
 
-    The poses of a plan that asks to stop the session are not checked, for nobody will drive along them; they are left
-    out where they cannot be read.
+    Poses of a plan that requests a stop are not checked, since they are not executed; unreadable ones are dropped.
 
     Raises:
-        PlanError: no Plan, wrong shapes, empty, not finite, times that do not increase, all in the past, or too short.
+        PlanError: not a Plan, wrong shapes, empty, not finite, times that do not increase, all in the past, or too
+            short.
     """
     if not isinstance(plan, Plan):
         raise PlanError(f"the policy must return a nurec_sim.types.Plan, got {type(plan).__name__}")
@@ -53,7 +53,7 @@ def check_plan(plan: object, now_us: int) -> Plan:
 
 
 def _last(plan: Plan) -> Plan:
-    """A plan that asks to stop, with the poses that it has, or none."""
+    """A plan that requests a stop, with its poses if readable."""
     try:
         t_us, pose = np.array(plan.t_us, np.int64), np.array(plan.pose, np.float64)
     except (TypeError, ValueError, OverflowError):

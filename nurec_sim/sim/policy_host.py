@@ -1,4 +1,4 @@
-"""Policies kept apart from the loop that asks them: in a thread of their own, with copies, and with a time limit."""
+"""Isolates policies from the loop: own thread, copied data, and a time limit."""
 
 from __future__ import annotations
 
@@ -21,21 +21,20 @@ WAKE_S = 0.5
 
 
 class PolicyHost:
-    """A policy, made and asked in one thread of its own; itself a policy.
+    """Creates and calls a policy in its own thread; is itself a policy.
 
-    Whatever the policy raises, also ``SystemExit`` and ``KeyboardInterrupt``, is a ``PolicyError`` here, so that only a
-    real Ctrl-C interrupts the caller. It gets copies that cannot be written to, and its plans are copied. A call that
-    takes longer than ``timeout_s`` is given up: its thread is abandoned, and the next ``reset`` makes the policy anew
-    in a new one. What ends the process or never lets other threads run cannot be caught here (``os._exit``, a crash, a
-    library that holds Python's lock): drive such policies through ``grpc://``.
+    Any exception of the policy, including ``SystemExit`` and ``KeyboardInterrupt``, becomes a ``PolicyError``, so only
+    a real Ctrl-C interrupts the caller. The policy gets read-only copies, and its plans are copied. After ``timeout_s``
+    a call is cancelled: its thread is abandoned, and the next ``reset`` creates the policy again in a new one. Process
+    exits, crashes and libraries that hold the GIL cannot be handled here: run such policies through ``grpc://``.
 
     Args:
-        make: makes the policy, or gives one that is there.
-        timeout_s: for making the policy, and for each ``reset`` and ``plan``.
+        make: creates the policy, or returns an existing one.
+        timeout_s: time limit for creation and for each ``reset`` and ``plan``.
 
     Raises:
-        NurecSimError: what ``make`` raised of ours.
-        PolicyError: it raised something else, or did not end in time.
+        NurecSimError: raised by ``make``.
+        PolicyError: any other exception of ``make``, or a timeout.
         ValueError: ``timeout_s`` is not a finite number above 0.
     """
 
@@ -50,8 +49,8 @@ class PolicyHost:
         """Begin a new rollout.
 
         Raises:
-            NurecSimError: the policy had to be made anew, and that failed.
-            PolicyError: the policy raised, did not end in time, or is still busy with a call that was given up.
+            NurecSimError: the policy could not be created again.
+            PolicyError: the policy raised, timed out, or is still busy with a cancelled call.
         """
         if not self._usable:
             self._make_anew()
@@ -59,17 +58,17 @@ class PolicyHost:
         self._ask(self._thread, "reset()", lambda: _own(lambda: policy.reset(seen, seed)))
 
     def plan(self, observation: Observation) -> Plan:
-        """The policy's answer, copied and checked.
+        """The policy's plan, copied and validated.
 
         Raises:
-            PolicyError: the policy raised, or did not answer in time.
+            PolicyError: the policy raised or timed out.
             PlanError: the plan cannot be driven.
         """
         policy, seen, t_us = self._policy, sealed(observation), observation.t_us
 
         def answer() -> Plan:
             plan = _own(lambda: policy.plan(seen))
-            return _own(lambda: check_plan(plan, t_us), PlanError)  # reading a plan may run code of the policy's too
+            return _own(lambda: check_plan(plan, t_us), PlanError)  # reading a plan may execute code of the policy
 
         return self._ask(self._thread, "plan()", answer)
 
@@ -83,7 +82,7 @@ class PolicyHost:
         if busy and policy is before:
             thread.stop()
             self._usable = False
-            raise PolicyError("it is still busy with a call that it did not answer in time")
+            raise PolicyError("it is still busy with a call that timed out")
         self._thread, self._policy, self.needs = thread, policy, needs
 
     def _made(self) -> tuple[PolicyThread, Policy, str, Needs]:
@@ -94,7 +93,7 @@ class PolicyHost:
             return policy, *_own(lambda: (str(policy.name), policy.needs))
 
         try:
-            made = self._ask(thread, "making the policy", make)
+            made = self._ask(thread, "creating the policy", make)
         except BaseException:
             thread.stop()
             raise
@@ -110,12 +109,12 @@ class PolicyHost:
         self._usable = False
         thread.abandon()
         raise PolicyError(
-            f"{what} did not end within {self._timeout_s:g} s; --plan-timeout (plan_timeout_s) allows more"
+            f"{what} did not finish within {self._timeout_s:g} s; --plan-timeout (plan_timeout_s) sets the limit"
         )
 
 
 def described(error: BaseException) -> str:
-    """Class and text of an exception, even of one whose text cannot be had."""
+    """Class and text of an exception, even if its ``__str__`` fails."""
     try:
         return f"{type(error).__name__}: {error}"
     except BaseException:
@@ -123,7 +122,7 @@ def described(error: BaseException) -> str:
 
 
 def _own(function: Callable[[], T], passing: type[BaseException] | tuple[()] = ()) -> T:
-    """Calls code of a policy; whatever it raises becomes a ``PolicyError``, but for what may pass."""
+    """Calls policy code; exceptions other than ``passing`` become ``PolicyError``."""
     try:
         return function()
     except passing:

@@ -1,8 +1,8 @@
-"""Which sensors a policy gets, and the requests that fill them.
+"""The sensors of a policy, and their sensor requests.
 
-Policies only ever meet ideal pinhole images: where the rig's camera has a fisheye, F-theta, distorted or behind-glass
-lens, the renderer is asked for a virtual ideal pinhole at the same pose, with the same horizontal field of view up to
-100 degrees. Exposures and sweeps end at the time of the plan, so that nothing is old when it is used.
+Policies get ideal pinhole images only: a camera with a fisheye, F-theta or distorted lens, or behind a windshield, is
+replaced by a virtual ideal pinhole at the same pose, with the same horizontal field of view up to 100 degrees.
+Exposures and sweeps end at planning time, so there is no sensor latency.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Exposures = Int64[np.ndarray, "frames 2"]
 
 
 class SceneFacts(Protocol):
-    """What the loop knows of a scene: a ``types.Clip`` and a ``types.GaussianScene`` both fit."""
+    """Scene data for the loop, satisfied by ``types.Clip`` and ``types.GaussianScene``."""
 
     @property
     def id(self) -> str: ...  # noqa: D102
@@ -59,15 +59,15 @@ class SceneFacts(Protocol):
 
     @property
     def camera_times_us(self) -> Mapping[str, Exposures] | Callable[[str], Exposures]:
-        """Start and end of every exposure by camera: a scene has a mapping, a clip a method; cameras may be missing."""
+        """Start and end of every exposure by camera: a mapping (scenes) or a method (clips); cameras may be missing."""
         ...
 
 
 class SensorSuite:
-    """The sensors of one rollout, by the name that the policy or the scenario used for them.
+    """The sensors of one rollout, by their name in the policy or the scenario.
 
     Raises:
-        ScenarioError: a sensor is asked for that the rig does not have.
+        ScenarioError: the rig lacks a required sensor.
     """
 
     def __init__(self, needs: Needs, settings: SensorSettings, facts: SceneFacts) -> None:
@@ -91,10 +91,10 @@ class SensorSuite:
         pose_at: PoseAt,
         actors: Callable[[int, int], Mapping[str, Float64[np.ndarray, "2 4 4"]]],
     ) -> dict[str, SensorFrame]:
-        """All frames that end at ``t_us``, by name; one call of ``sense``, none where nothing is needed.
+        """All frames that end at ``t_us``, by name, in at most one call of ``sense``.
 
         Raises:
-            RequestError: the renderer answered with other frames than were asked for.
+            RequestError: the renderer returned frames other than those requested.
         """
         sensors: dict[str, CameraModel | LidarModel] = {**self.cameras, **self.lidars}
         requests = [self._request(name, sensor, t_us, pose_at, actors) for name, sensor in sensors.items()]
@@ -102,7 +102,7 @@ class SensorSuite:
             return {}
         frames = list(sense(requests))
         if len(frames) != len(requests):
-            raise RequestError(f"the renderer answered {len(frames)} frames to {len(requests)} requests")
+            raise RequestError(f"the renderer returned {len(frames)} frames for {len(requests)} requests")
         for (name, sensor), frame in zip(sensors.items(), frames, strict=True):
             wanted = CameraFrame if isinstance(sensor, CameraModel) else LidarFrame
             if not isinstance(frame, wanted):
@@ -110,7 +110,7 @@ class SensorSuite:
         return dict(zip(sensors, frames, strict=True))
 
     def for_policy(self, frames: Mapping[str, SensorFrame]) -> tuple[dict[str, CameraFrame], dict[str, LidarFrame]]:
-        """The cameras and LiDARs that the policy asked for; frames only recorded for videos stay out."""
+        """Cameras and LiDARs in the policy's ``needs``, without frames recorded for videos only."""
         mine = {name: frame for name, frame in frames.items() if name in self._policy_names}
         cameras = {name: frame for name, frame in mine.items() if isinstance(frame, CameraFrame)}
         return cameras, {name: frame for name, frame in mine.items() if isinstance(frame, LidarFrame)}
@@ -123,17 +123,17 @@ class SensorSuite:
         else:
             rig_from_sensor, lasts_us = sensor.rig_from_camera, self._exposure_us[name]
         start_us = max(t_us - lasts_us, self._span_us[0])
-        # An instant is [t, t + 1), as clients of NuRec write it; both ends lie inside the half-open span.
+        # An instant is [t, t + 1), as in NuRec clients; both ends lie inside the half-open span.
         end_us = max(t_us, start_us + 1)
         poses = np.stack([pose_at(start_us), pose_at(t_us)]) @ rig_from_sensor
         return SensorRequest(self._scene_id, sensor, start_us, end_us, poses, actors(start_us, t_us))
 
 
 def find_camera(rig: Rig, name: str) -> CameraModel:
-    """A camera by id, or the most forward one for ``front``.
+    """A camera by id, or the most forward-facing one for ``front``.
 
-    Of the cameras that look forward within 10 degrees of the best one, ``front`` is the one with the widest view, and
-    of these the first in the rig: so a tele camera or the right eye of a stereo pair is not picked.
+    Of the cameras within 10 degrees of the most forward-facing one, ``front`` is the one with the widest view, and of
+    these the first in the rig, which excludes tele cameras and the right camera of a stereo pair.
 
     Raises:
         ScenarioError: no such camera; the text lists the rig's.
@@ -162,7 +162,7 @@ def find_lidar(rig: Rig, name: str) -> LidarModel:
 
 
 def horizontal_fov_rad(camera: CameraModel) -> float:
-    """Angle between the rays at the middle of the left and right image borders, or as far as the lens is valid."""
+    """Angle between the rays at the centres of the left and right image borders, limited to the lens's valid range."""
     from nurec_sim.sensors import unproject
 
     columns = np.linspace(0.0, camera.width_px, 33)
@@ -174,7 +174,7 @@ def horizontal_fov_rad(camera: CameraModel) -> float:
 
 
 def policy_camera(camera: CameraModel, width_px: int) -> CameraModel:
-    """The ideal pinhole that a policy gets for a camera of the rig: same id, pose and shutter, ``width_px`` wide."""
+    """The ideal pinhole that replaces a rig camera: same id, pose and shutter, ``width_px`` wide."""
     from nurec_sim.sensors import scaled_camera
 
     height_px = max(8, round(width_px * camera.height_px / camera.width_px))
@@ -187,7 +187,7 @@ def policy_camera(camera: CameraModel, width_px: int) -> CameraModel:
 
 
 def exposure_us(facts: SceneFacts, camera: CameraModel) -> int:
-    """Usual duration of this camera's exposures in the log; 0 for a global shutter or where the log does not say."""
+    """Median exposure duration of this camera in the log; 0 for a global shutter or if unknown."""
     if camera.shutter is Shutter.GLOBAL:
         return 0
     times = facts.camera_times_us

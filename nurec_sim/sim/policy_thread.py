@@ -1,4 +1,4 @@
-"""A thread for one policy: what it is asked happens one after the other, and nobody waits for one that hangs."""
+"""A worker thread for one policy that can be abandoned if it hangs."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _abandoned: list[threading.Thread] = []
 
 
 class PolicyThread:
-    """Runs functions one after the other in a daemon thread, which does not keep the process alive.
+    """Runs functions sequentially in a daemon thread, which does not block process exit.
 
-    ``concurrent.futures`` would wait at exit for a policy that never answers.
+    ``concurrent.futures`` would wait at exit for a hanging policy.
     """
 
     def __init__(self, name: str) -> None:
@@ -27,36 +27,36 @@ class PolicyThread:
         self._thread.start()
 
     def submit(self, function: Callable[[], T]) -> Future[T]:
-        """What ``function`` will give, or raise, whatever that is."""
+        """A future with the result or exception of ``function``."""
         future: Future[T] = Future()
         self._jobs.put((future, function))
         return future
 
     async def run(self, function: Callable[[], T], timeout_s: float) -> T:
-        """What ``function`` gives; it is not begun if the await is cancelled or times out before its turn.
+        """The result of ``function``, which is not started if the await is cancelled or times out before its turn.
 
         Raises:
-            TimeoutError: it took longer than ``timeout_s``; if it had begun, it goes on and the next one waits for it.
+            TimeoutError: after ``timeout_s``; a running function continues and the next one waits for it.
         """
         async with asyncio.timeout(timeout_s):
             return await asyncio.wrap_future(self.submit(function))
 
     @property
     def alive(self) -> bool:
-        """Whether it still works or waits for work."""
+        """Whether the thread is running or waiting for work."""
         return self._thread.is_alive()
 
     def stop(self) -> None:
-        """Ends the thread after what it is doing; does not wait."""
+        """Ends the thread after its current function; does not wait."""
         self._jobs.put(None)
 
     def abandon(self) -> None:
-        """Ends the thread now if it runs Python code; one that is inside of a library ends when that returns."""
+        """Ends the thread now if it runs Python code, or when its native call returns."""
         self.stop()
         _abandoned.append(self._thread)
         ident = self._thread.ident
         if ident is not None:
-            # SystemExit, because threads end by it without a message.
+            # SystemExit ends a thread without a message.
             ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), ctypes.py_object(SystemExit))
 
     def _work(self) -> None:
@@ -74,6 +74,6 @@ class PolicyThread:
 
 
 def still_abandoned() -> int:
-    """How many threads were abandoned and have not ended."""
+    """Number of abandoned threads that are still running."""
     _abandoned[:] = [thread for thread in _abandoned if thread.is_alive()]
     return len(_abandoned)

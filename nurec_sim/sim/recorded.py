@@ -1,4 +1,4 @@
-"""The recorded drive as the closed loop uses it: ground under the car, route ahead, and the log's own motion."""
+"""The recorded drive in the closed loop: ground height, route ahead, and recorded motion."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ ROUTE_SPACING_M, ROUTE_POINTS = 4.0, 20
 FUTURE_STEP_US, FUTURE_POINTS = 100_000, 50
 SPEED_WINDOW_US = 250_000
 SEARCH_M = (10.0, 40.0)
-"""How far behind and ahead of its last place along the path the car is looked for, so that crossings do not confuse."""
+"""Search range around the last arc length, so that self-crossing paths stay unambiguous."""
 
 
 class RecordedDrive:
-    """A recorded ego trajectory with arc length; a standing one has a single vertex and no length."""
+    """A recorded ego trajectory with arc length; a stationary one has a single vertex and zero length."""
 
     def __init__(self, ego: Trajectory) -> None:
         self.ego = ego
@@ -37,7 +37,7 @@ class RecordedDrive:
         return float(self.station_m[-1])
 
     def station(self, x_m: float, y_m: float, near_m: float | None = None) -> float:
-        """Arc length of the nearest place on the recorded path, looked for around ``near_m`` where given."""
+        """Arc length of the nearest point on the recorded path, searched around ``near_m`` if given."""
         if len(self.line_m) < 2:
             return 0.0
         low, high = 0, len(self.line_m)
@@ -49,21 +49,21 @@ class RecordedDrive:
         return float(self.station_m[low] + along[0])
 
     def time_at(self, station_m: float) -> int:
-        """When the log was there (the first time, where it stood)."""
+        """Time at which the log reached a station (the first time if it stopped there)."""
         if len(self.line_m) < 2:
             return int(self.t_us[0])
         since = np.interp(station_m, self.station_m, (self.t_us - self.t_us[0]).astype(np.float64))
         return int(self.t_us[0]) + int(round(float(since)))
 
     def station_of_time(self, t_us: int) -> float:
-        """Metres that the log had driven by ``t_us``."""
+        """Recorded arc length at ``t_us``."""
         return float(np.interp(t_us - self.t_us[0], self.t_us - self.t_us[0], self.station_m))
 
     def on_ground(self, x_m: float, y_m: float, yaw_rad: float, station_m: float) -> Float64[np.ndarray, "4 4"]:
-        """A rig pose at a planar pose: height, pitch and roll of the recorded car at ``station_m``, turned to ``yaw``.
+        """A rig pose at a planar pose: height, pitch and roll of the recorded car at ``station_m``, rotated to ``yaw``.
 
-        So cameras keep their height above a sloping road. Across the path the ground counts as level: a car 3 m beside
-        the recorded path of a road banked by 2 degrees is 0.1 m too high or too low.
+        Cameras thus keep their height above a sloping road. Across the path the ground is assumed level: a car 3 m
+        beside the recorded path of a road banked by 2 degrees is 0.1 m too high or too low.
         """
         recorded = self.ego.at(self.time_at(station_m))
         turn = geometry.rotation_from_yaw(yaw_rad - float(geometry.yaw_of(recorded)))
@@ -98,9 +98,9 @@ class RecordedDrive:
     def route(
         self, x_m: float, y_m: float, yaw_rad: float, station_m: float
     ) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, " k"]]:
-        """Up to 20 way points every 4 m of the recorded path ahead, in the rig frame, and the recorded speed at each.
+        """Up to 20 waypoints every 4 m of the recorded path ahead, in the rig frame, and the recorded speed at each.
 
-        The recording's end is the last one; beyond it there are none, nor for a car that stood.
+        The end of the recording is the last one; beyond it, and for a stationary recording, there are none.
         """
         wanted = station_m + ROUTE_SPACING_M * np.arange(1, ROUTE_POINTS + 1)
         ahead = wanted[wanted < self.length_m]
@@ -114,7 +114,7 @@ class RecordedDrive:
     def future(
         self, t_us: int, x_m: float, y_m: float, yaw_rad: float
     ) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
-        """The log's next 5 s every 0.1 s as (x, y, yaw) in the rig frame; shorter where the recording ends."""
+        """The log's next 5 s every 0.1 s as (x, y, yaw) in the rig frame; shorter at the end of the recording."""
         times = t_us + FUTURE_STEP_US * np.arange(1, FUTURE_POINTS + 1, dtype=np.int64)
         times = times[times <= self.ego.end_us]
         poses = self.ego.at(times)
@@ -124,6 +124,6 @@ class RecordedDrive:
 
 
 def to_local(world_m: Float64[np.ndarray, "k 2"], x_m: float, y_m: float, yaw_rad: float) -> Float64[np.ndarray, "k 2"]:
-    """Points seen from above, in the axes of a car at (x, y, yaw)."""
+    """World points (x, y) in the frame of a car at (x, y, yaw)."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return (world_m - [x_m, y_m]) @ np.array([[c, -s], [s, c]])

@@ -4,8 +4,8 @@
 
     log ──► warm-up (ego pinned to the log) ──► every replan_s: sense ──► plan ──► check ──► track in 10 ms ticks
 
-The loop sees frames only through ``sense``, so it never knows who renders. It uses integer microseconds, no wall clock
-and no randomness but the seeded start, so a second run gives the same bytes.
+The loop gets frames only through ``sense``, independent of the renderer. It uses integer microseconds, no wall clock
+and no randomness except the seeded initial state, so a second run gives the same bytes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from nurec_sim.types import EgoState, Event, Observation, Plan, Policy, Rollout,
 
 STATE_US = int(round(STATE_S * 1e6))
 HISTORY_STATES = 21
-"""A policy sees its last 2 s at 10 Hz, the present included."""
+"""Length of the state history: 2 s at 10 Hz, the current state included."""
 
 OnFrames = Callable[[int, Mapping[str, SensorFrame]], None]
 
@@ -49,15 +49,15 @@ def run_rollout(
     on_frames: OnFrames | None = None,
     plan_timeout_s: float = PLAN_TIMEOUT_S,
 ) -> Rollout:
-    """Drive ``policy`` through a scene and keep everything that metrics need.
+    """Runs ``policy`` in a scene and records everything that metrics need.
 
-    Whatever goes wrong inside (a policy that raises, tries to exit, hangs or answers a bad plan, a renderer that fails,
-    a sensor that the rig lacks, a scenario that does not fit the scene) gives a rollout of status ``failed`` with the
-    text of the error and all states so far; nothing is raised but by a real Ctrl-C. ``progress`` hears fractions of the
-    scenario; ``on_frames`` hears time and frames by sensor name whenever sensors were rendered.
+    Every fault (a policy that raises, exits, hangs or returns an invalid plan, a failing renderer, a missing sensor, a
+    scenario that does not fit the scene) gives a rollout of status ``failed`` with the error text and all states so
+    far; only a real Ctrl-C raises. ``progress`` gets the fraction of the scenario; ``on_frames`` gets time and frames
+    by sensor name after each rendering.
 
-    The policy works in a thread of its own for this rollout, with ``plan_timeout_s`` for each call, unless it is a
-    ``PolicyHost``, which has its own thread and limit. It gets copies that cannot be written to.
+    The policy runs in its own thread, with ``plan_timeout_s`` per call, unless it is a ``PolicyHost``, which has its
+    own thread and limit. It gets read-only copies.
     """
     if not isinstance(policy, PolicyHost):
         host = PolicyHost(lambda: policy, plan_timeout_s)
@@ -107,7 +107,7 @@ class Timeline:
 
 
 def timeline(scenario: Scenario, facts: SceneFacts) -> Timeline:
-    """Fit a scenario into what was recorded, like AlpaSim: a log that ends early ends the rollout.
+    """Clips a scenario to the recording, as AlpaSim does: a log that ends early ends the rollout.
 
     Raises:
         ScenarioError: the scenario starts after the end of the recording.
@@ -127,7 +127,7 @@ def timeline(scenario: Scenario, facts: SceneFacts) -> Timeline:
 
 
 def start_offset(perturbation: Perturbation, scene_id: str, seed: int) -> tuple[float, float, float]:
-    """Lateral metres, yaw radians and speed factor of a start: a function of scene and seed, never of the policy."""
+    """Lateral offset (m), yaw offset (rad) and speed factor of the initial state, from scene and seed only."""
     key = int.from_bytes(hashlib.sha256(f"{scene_id}/start".encode()).digest()[:8], "little")
     lateral, yaw, speed = np.random.Generator(np.random.Philox(key=[key, seed])).standard_normal(3)
     return (
@@ -147,7 +147,7 @@ class _Failure(Exception):
 
 @contextmanager
 def _failing_as(kind: str) -> Iterator[None]:
-    """Turn any exception into the end of this rollout; other rollouts go on."""
+    """Converts any exception into a failure of this rollout; other rollouts continue."""
     try:
         yield
     except _Failure:
@@ -159,7 +159,7 @@ def _failing_as(kind: str) -> Iterator[None]:
 
 
 class _Drive:
-    """The moving parts of one rollout."""
+    """The mutable state of one rollout."""
 
     def __init__(
         self, scenario: Scenario, policy: Policy, sense: Sense, facts: SceneFacts, seed: int,
@@ -177,7 +177,7 @@ class _Drive:
         self.offset = np.eye(4)
         self.trace: list[
             tuple[int, VehicleState]
-        ] = []  # every tick of the closed loop, for exposures that began earlier
+        ] = []  # every tick of the closed loop, for exposures that started earlier
         self.station_m = 0.0
 
     def note(self, kind: str, text: str) -> None:
@@ -186,7 +186,7 @@ class _Drive:
         self.events.append(Event(t_us, kind, text))
 
     def run(self) -> None:
-        """Warm up, then drive in closed loop to the end of the scenario."""
+        """Warm-up, then closed loop to the end of the scenario."""
         try:
             times = timeline(self.scenario, self.facts)
             self.actors = Actors(self.facts.tracks, self.scenario.actors)
@@ -204,7 +204,7 @@ class _Drive:
             suite = SensorSuite(self.policy.needs, self.scenario.sensors, self.facts)
         except ScenarioError as error:
             raise _Failure("sensor_missing", f"policy '{self.policy.name}': {error}") from None
-        except Exception as error:  # needs of other kinds than Needs says
+        except Exception as error:  # needs with invalid types
             raise _Failure("policy_error", f"its needs cannot be met: {described(error)}") from error
         with _failing_as("policy_error"):
             self.policy.reset(self.facts.rig, self.seed)
@@ -212,7 +212,7 @@ class _Drive:
         self.progress(1.0)
 
     def closed_loop(self, suite: SensorSuite, times: Timeline, speed_factor: float) -> None:
-        """Sense, plan and track until the end, or until the policy asks to stop."""
+        """Sense, plan and track until the end, or until the policy requests a stop."""
         car = self.car_at_start(speed_factor)
         if speed_factor != 1.0:
             self.states[-1] = self.state_of(times.first_closed_us, car)
@@ -231,7 +231,7 @@ class _Drive:
                 plan = self.ask(suite, t_us, frames)
                 self.plans.append((t_us, plan))
                 if plan.stop_session:
-                    self.note("stop_session", f"policy '{self.policy.name}' asked to stop")
+                    self.note("stop_session", f"policy '{self.policy.name}' requested a stop")
                     return
                 path, planned_us, driven_m = PlannedPath(plan, car, t_us), t_us, 0.0
             assert path is not None
@@ -244,7 +244,7 @@ class _Drive:
     # ------------------------------------------------------------------------------------------- one plan
 
     def render(self, suite: SensorSuite, t_us: int) -> dict[str, SensorFrame]:
-        """Frames of now."""
+        """Renders the current frames."""
         with _failing_as("sense_error"):
             frames = suite.sense(self.sense, t_us, self.pose_at, self.actors.overrides)
         if self.on_frames is not None and frames:
@@ -252,7 +252,7 @@ class _Drive:
         return frames
 
     def ask(self, suite: SensorSuite, t_us: int, frames: Mapping[str, SensorFrame]) -> Plan:
-        """The policy's checked answer to what it sees at ``t_us``."""
+        """The policy's validated plan at ``t_us``."""
         observation = self.observe(suite, t_us, frames)
         try:
             return self.policy.plan(observation)
@@ -261,7 +261,7 @@ class _Drive:
             raise _Failure(kind, str(error)) from None
 
     def observe(self, suite: SensorSuite, t_us: int, frames: Mapping[str, SensorFrame]) -> Observation:
-        """All that the policy may know at ``t_us``."""
+        """The policy's observation at ``t_us``."""
         ego, car = self.states[-1], self.trace[-1][1]
         cameras, lidars = suite.for_policy(frames)
         route, route_speed = self.recorded.route(car.x_m, car.y_m, car.yaw_rad, self.station_m)
@@ -275,14 +275,14 @@ class _Drive:
     # ------------------------------------------------------------------------------------------- the ego
 
     def logged_state(self, t_us: int) -> EgoState:
-        """The ego as the log had it, moved by the start offset."""
+        """The recorded ego state, with the initial offset applied."""
         speed, accel, yaw_rate = self.recorded.motion(t_us)
         steering = math.atan(yaw_rate * self.limits.wheelbase_m / speed) if speed > 0.5 else 0.0
         steering = min(max(steering, -self.limits.steering_rad), self.limits.steering_rad)
         return EgoState(t_us, self.facts.ego.at(t_us) @ self.offset, speed, accel, yaw_rate, steering)
 
     def car_at_start(self, speed_factor: float) -> VehicleState:
-        """The car as the warm-up leaves it."""
+        """The car state at the end of the warm-up."""
         last = self.states[-1]
         x, y = last.world_from_rig[:2, 3]
         self.station_m = self.recorded.station(x, y, near_m=self.recorded.station_of_time(last.t_us))
@@ -292,14 +292,14 @@ class _Drive:
         )  # fmt: skip
 
     def state_of(self, t_us: int, car: VehicleState) -> EgoState:
-        """The car as a state on the ground; also moves along the recorded path."""
+        """The car as a state on the ground; also advances the station on the recorded path."""
         self.station_m = self.recorded.station(car.x_m, car.y_m, near_m=self.station_m)
         pose = self.recorded.on_ground(car.x_m, car.y_m, car.yaw_rad, self.station_m)
         rate = car.yaw_rate_radps(self.limits)
         return EgoState(t_us, pose, car.speed_mps, car.accel_mps2, rate, car.steering_rad)
 
     def pose_at(self, t_us: int) -> Float64[np.ndarray, "4 4"]:
-        """Rig pose at a time up to now: from the ticks of the closed loop, before them from the log."""
+        """Rig pose at a past time: from the ticks of the closed loop, before that from the log."""
         if t_us == self.states[-1].t_us:
             return self.states[-1].world_from_rig
         if t_us < self.first_closed_us:

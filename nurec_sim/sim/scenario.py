@@ -1,4 +1,4 @@
-"""Scenario files: what the closed loop runs, as YAML checked key by key."""
+"""Scenario files in YAML, strictly validated."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class _Strict(BaseModel):
 
 
 class Perturbation(_Strict):
-    """Standard deviations of the ego's start, drawn once per scene and seed whatever the policy; 0 by default."""
+    """Standard deviations of the initial ego state, sampled once per scene and seed for all policies; default 0."""
 
     lateral_m: float = Field(0.0, ge=0, le=3)
     yaw_deg: float = Field(0.0, ge=0, le=30)
@@ -41,10 +41,10 @@ class Perturbation(_Strict):
 
 
 class SensorSettings(_Strict):
-    """What is rendered beside or instead of what a policy asks for.
+    """Additional or modified sensor rendering.
 
-    ``image_width_px`` replaces the policies' own. ``record_cameras`` and ``record_lidars`` are rendered at every plan
-    time for ``on_frames`` whatever the policy needs; ``interval_s`` renders them more often than the plans.
+    ``image_width_px`` overrides the policies' value. ``record_cameras`` and ``record_lidars`` are rendered at every
+    planning time for ``on_frames``, independent of the policy; ``interval_s`` renders them more often than the plans.
     """
 
     image_width_px: int | None = Field(None, ge=16, le=4096)
@@ -54,7 +54,7 @@ class SensorSettings(_Strict):
 
 
 class ActorEdit(_Strict):
-    """A recorded actor moved from where the log had it: shifted along its own axes, delayed, or hidden."""
+    """Edits a recorded actor: shifted along its own axes, delayed, or hidden."""
 
     shift_m: tuple[float, float] = (0.0, 0.0)
     delay_s: float = Field(0.0, ge=-20, le=20)
@@ -62,9 +62,9 @@ class ActorEdit(_Strict):
 
 
 class Scenario(_Strict):
-    """One scenario. Every key but ``name`` has a default; durations are multiples of 0.1 s.
+    """One scenario. Every key except ``name`` has a default; durations are multiples of 0.1 s.
 
-    ``clip`` is a clip or scene (path or name), left out where the command line gives it. ``warm_up_s`` of
+    ``clip`` is a clip or scene (path or name), optional if given on the command line. ``warm_up_s`` of
     ``duration_s`` follow the log before the policy drives.
     """
 
@@ -90,7 +90,7 @@ class Scenario(_Strict):
 
 
 def load_scenario(path: str | Path) -> Scenario:
-    """Read a scenario file; a bare name such as ``demo`` means the shipped one.
+    """Reads a scenario file; a bare name such as ``demo`` is a bundled one.
 
     Raises:
         ScenarioError: the file cannot be read, is no YAML mapping, or a key is unknown or wrong; the text names the
@@ -111,10 +111,10 @@ def load_scenario(path: str | Path) -> Scenario:
 
 
 def scenario_file(name: str | Path) -> Path:
-    """The file of a shipped scenario's name, or ``name`` itself if it is a path; a scenario's ``clip`` lies beside it.
+    """The file of a bundled scenario, or ``name`` itself if it is a path; ``clip`` is relative to it.
 
     Raises:
-        ScenarioError: no shipped scenario of that name.
+        ScenarioError: no bundled scenario of that name.
     """
     path = Path(name)
     if path.suffix or path.exists():
@@ -126,13 +126,13 @@ def scenario_file(name: str | Path) -> Path:
 
 
 def shipped_scenarios() -> list[str]:
-    """Names of the scenarios that come with the package, sorted."""
+    """Names of the bundled scenarios, sorted."""
     names = (entry.name for entry in resources.files("nurec_sim.scenarios").iterdir())
     return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
 
 
 def make_scenario(content: dict, source: str = "scenario") -> Scenario:
-    """A scenario of plain values; ``source`` starts the error text.
+    """A scenario from plain values; ``source`` prefixes error texts.
 
     Raises:
         ScenarioError: a key is unknown or its value wrong.
@@ -144,7 +144,7 @@ def make_scenario(content: dict, source: str = "scenario") -> Scenario:
 
 
 def _fault(item: Mapping[str, Any]) -> str:
-    """One pydantic complaint as a sentence: key, what is allowed, what was given."""
+    """A pydantic error as one sentence: key, allowed values, given value."""
     location = [str(part) for part in item["loc"]]
     key = ".".join(location) or "(top level)"
     if item["type"] == "extra_forbidden":
@@ -157,7 +157,7 @@ def _fault(item: Mapping[str, Any]) -> str:
 
 
 def _fields_at(location: list[str]) -> list[str]:
-    """Names allowed at a place of the file."""
+    """Allowed keys at a location in the file."""
     parts: dict[str, type[BaseModel]] = {"sensors": SensorSettings, "perturbation": Perturbation, "actors": ActorEdit}
     model = parts.get(location[0], Scenario) if location else Scenario
     return sorted(model.model_fields)

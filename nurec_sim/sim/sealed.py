@@ -1,4 +1,4 @@
-"""Copies for policies that nobody can write to: whatever a policy does to them, the loop keeps what it had."""
+"""Read-only copies for policies, which cannot affect the loop."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _IMMUTABLE = (str, bytes, int, float, complex, bool, type(None), enum.Enum, np.g
 
 
 class ReadOnlyMapping(Mapping[Key, Value]):
-    """A mapping without methods that change it; unlike ``types.MappingProxyType`` it can be copied and pickled."""
+    """An immutable mapping; unlike ``types.MappingProxyType`` it can be copied and pickled."""
 
     __slots__ = ("_items",)
 
@@ -39,9 +39,9 @@ class ReadOnlyMapping(Mapping[Key, Value]):
 
 
 def sealed(value: T) -> T:
-    """A deep copy of dataclasses, arrays, sequences and mappings that shares no memory and cannot be written to.
+    """A read-only deep copy of dataclasses, arrays, sequences and mappings that shares no memory.
 
-    Arrays lie over ``bytes``, so not even ``flags.writeable = True`` makes them writable. Sequences become tuples,
+    Arrays are backed by ``bytes``, so not even ``flags.writeable = True`` makes them writable. Sequences become tuples,
     mappings ``ReadOnlyMapping``; objects of other classes are copied by ``copy.deepcopy``.
     """
     return _sealed(value)
@@ -53,7 +53,7 @@ def _sealed(value: Any) -> Any:
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         return np.ndarray(value.shape, value.dtype, buffer=value.tobytes())
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        result = object.__new__(type(value))  # without __post_init__: the fields have been checked
+        result = object.__new__(type(value))  # without __post_init__: the fields are already validated
         for field in dataclasses.fields(value):
             object.__setattr__(result, field.name, _sealed(getattr(value, field.name)))
         return result

@@ -1,4 +1,4 @@
-"""The ego car: a kinematic bicycle at the rear axle, exact for constant steering and acceleration within a step."""
+"""Kinematic bicycle model at the rear axle, exact for constant steering and acceleration within a step."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 
 TICK_US = 10_000
-"""Step of the car and of its controller."""
+"""Time step of vehicle model and controller."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the car can do; the defaults are those of ``docs/closed_loop.md``."""
+    """Vehicle limits; defaults as in ``docs/closed_loop.md``."""
 
     wheelbase_m: float = 2.85
     steering_rad: float = 0.6
@@ -23,7 +23,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class VehicleState:
-    """The rear axle seen from above (world), its speed, and the actuators behind their lags."""
+    """Planar pose of the rear axle in the world, speed, and lagged actuator states."""
 
     x_m: float
     y_m: float
@@ -33,14 +33,14 @@ class VehicleState:
     steering_rad: float = 0.0
 
     def yaw_rate_radps(self, limits: Limits) -> float:
-        """Rate of turn that the steering angle and the speed give."""
+        """Yaw rate from steering angle and speed."""
         return self.speed_mps * math.tan(self.steering_rad) / limits.wheelbase_m
 
 
 def advance(state: VehicleState, dt_s: float, limits: Limits) -> VehicleState:
-    """Move for ``dt_s`` with steering and acceleration held: the rear axle runs along an exact circular arc.
+    """Moves for ``dt_s`` with constant steering and acceleration: the rear axle follows an exact circular arc.
 
-    A braking car stops within the step and stays; it never rolls backwards.
+    A braking car stops within the step and never rolls backwards.
     """
     speed, accel = state.speed_mps, state.accel_mps2
     moving_s = dt_s
@@ -49,7 +49,7 @@ def advance(state: VehicleState, dt_s: float, limits: Limits) -> VehicleState:
     distance = speed * moving_s + 0.5 * accel * moving_s**2
     turn = distance * math.tan(state.steering_rad) / limits.wheelbase_m
     half = turn / 2
-    # The chord of the arc; sin(x)/x by its series where the quotient would lose digits.
+    # Chord of the arc; sin(x)/x by its series near 0, where the quotient loses precision.
     chord = distance * (math.sin(half) / half if abs(half) > 1e-4 else 1 - half**2 / 6)
     return VehicleState(
         state.x_m + chord * math.cos(state.yaw_rad + half),
@@ -62,7 +62,7 @@ def advance(state: VehicleState, dt_s: float, limits: Limits) -> VehicleState:
 
 
 def actuate(state: VehicleState, steering_rad: float, accel_mps2: float, dt_s: float, limits: Limits) -> VehicleState:
-    """Let the actuators follow their commands for ``dt_s``: limits, first-order lag, bounded steering rate."""
+    """Actuator response to commands over ``dt_s``: limits, first-order lag, bounded steering rate."""
     follow = 1 - math.exp(-dt_s / limits.lag_s)
     target = _clip(steering_rad, -limits.steering_rad, limits.steering_rad)
     most = limits.steering_rate_radps * dt_s

@@ -123,7 +123,7 @@ def test_readme_uses_only_verbs_that_exist() -> None:
     [
         (["serve", "nowhere.usdz"], "nothing to serve: nowhere.usdz does not exist"),
         (["run", "--scenario", "nope"], "no scenario named 'nope'; have ['demo', 'short']"),
-        (["run", "--scenario", "short"], "names no clip"),
+        (["run", "--scenario", "short"], "has no clip"),
         (["render", "nowhere.usdz"], "nowhere.usdz does not exist"),
         (["evaluate", "nowhere"], "no clip at 'nowhere'"),
         (["policies", "nobody"], "unknown policy 'nobody'; have ['camera_road_follower'"),
@@ -208,7 +208,7 @@ def test_a_misspelt_verb_is_one_line_that_names_the_nearest(word: str, hint: str
         cli.main([word, "scene.usdz"])
     assert stop.value.code == 2
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and f"there is no verb '{word}'; {hint}" in lines[0]
+    assert len(lines) == 1 and f"unknown command '{word}'; {hint}" in lines[0]
 
 
 @pytest.mark.parametrize(

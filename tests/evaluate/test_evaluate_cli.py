@@ -53,7 +53,7 @@ def test_usual_methods_without_weights_are_left_out_and_named(streets, monkeypat
     monkeypatch.setitem(evaluation.USUAL_METHODS, "storm", ("dense", "copy"))
     run_cli("--protocol", "storm", "--worlds", 1)
     said = capsys.readouterr()
-    assert "dense is left out: weights of 'tiny' are not part of this version" in " ".join(said.err.split())
+    assert "dense is skipped: weights of 'tiny' are not part of this version" in " ".join(said.err.split())
     assert "copy" in said.out and "dense" not in said.out
     with pytest.raises(SystemExit):
         run_cli("--protocol", "storm", "--worlds", 1, "--methods", "dense")

@@ -70,7 +70,7 @@ def test_twice_the_same_rollout_and_foreign_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="two rollouts of policy 'follower', seed 0, in scene 's1'"):
         metric_table([drive(), drive()], "run")
     pl.DataFrame({"name": ["x"]}).write_parquet(tmp_path / "metrics.parquet")
-    with pytest.raises(ValueError, match="is no metric table: it lacks the columns .'timestamps_us'"):
+    with pytest.raises(ValueError, match="is not a metric table: missing columns .'timestamps_us'"):
         read_table(tmp_path / "metrics.parquet")
 
 

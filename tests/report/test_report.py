@@ -96,16 +96,16 @@ def test_headline_counts_validity_and_never_zero_for_unknown(text):
     page = words(text)
     assert re.search(r"drifter\s+1\s+0 %\s+1 of 1\s+100 %\s+1 of 1\s+50 %", page), "C, O, (C+O)/2"
     broken = re.search(r"&lt;b&gt;broken&lt;/b&gt;\s+1\s+1 failed(.*?)drifter", page, re.S).group(1)
-    assert broken.count("not known") == 9 and "0 %" not in broken
-    assert "One scene only, so there are no intervals" in page
+    assert broken.count("unknown") == 9 and "0 %" not in broken
+    assert "No intervals: a single scene" in page
 
 
 def test_failures_unknowns_and_classes_are_told(text):
     page = words(text)
     assert "PlanError: plan has NaN poses" in page and "1 failed" in page
-    unknown = page[page.index("What this report could not know") : page.index("Failures")]
+    unknown = page[page.index("Unknowns") : page.index("Failures")]
     assert "no boxes of pedestrians" in unknown and "every rollout failed" in unknown
-    assert "do not react to the ego" in unknown
+    assert "without reacting to the ego" in unknown
     assert "front or lateral" in page, "the rule of fault is named"
     assert [trace["name"] for trace in figures(text)["figures"]["collisions"]["data"]] == ["front", "lateral", "rear"]
     for name in METRICS:
@@ -128,7 +128,7 @@ def test_plans_show_road_boxes_path_and_events(text):
     stored = figures(text)
     drifter = stored["figures"]["plan1"]
     names = {trace["name"] for trace in drifter["data"]}
-    assert {"road", "not road", "unknown", "recorded path", "driven path", "standing actors", "off-road"} <= names
+    assert {"road", "not road", "unknown", "recorded path", "driven path", "static actors", "off-road"} <= names
     assert {"moving actors, each second", "ego at the first event", "true road edge"} <= names
     (image,) = drifter["layout"]["images"]
     assert stored["images"][image["image_key"]]["source"].startswith("data:image/png;base64,")
@@ -184,5 +184,5 @@ def test_many_scenes_get_intervals(report):
         entries.append(ReportRollout(run, {one.name: one for one in series}))
     values = rollout_values(metric_table(scored, "r"))
     page = words(render_report(RunReport("r", "alpasim", (), tuple(entries), values, summarize(values))))
-    assert "[0 %, 100 %]" in page and "bootstrap over scenes" in page and "collisions not known" in page
-    assert "4 m off the recorded path are dropped" in page
+    assert "[0 %, 100 %]" in page and "bootstrap interval over scenes" in page and "collisions unknown" in page
+    assert "truncated when the ego is 4 m off the recorded path" in page

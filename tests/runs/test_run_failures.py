@@ -77,8 +77,8 @@ BAD = {
     "Exits": "SystemExit: 0",
     "Interrupts": "KeyboardInterrupt: ",
     "Closes": "GeneratorExit: ",
-    "Hangs": "plan() did not end within 1 s; --plan-timeout (plan_timeout_s) allows more",
-    "Spins": "plan() did not end within 1 s; --plan-timeout (plan_timeout_s) allows more",
+    "Hangs": "plan() did not finish within 1 s; --plan-timeout (plan_timeout_s) sets the limit",
+    "Spins": "plan() did not finish within 1 s; --plan-timeout (plan_timeout_s) sets the limit",
 }
 SCENARIO = """
 name: brief
@@ -115,7 +115,7 @@ def test_hostile_policies_are_failed_rows_and_the_others_are_driven(place):
     said = " ".join(done.stderr.split())
     for name, text in BAD.items():
         assert f"{name.lower()} in street (lift), seed 0 failed: {text.strip()}" in said
-    assert "6 of 8 rollouts failed; the report has their reasons" in said and "Traceback" not in done.stderr
+    assert "6 of 8 rollouts failed; the report gives the reasons" in said and "Traceback" not in done.stderr
     assert (place / "runs" / "latest" / "report.html").exists()
     cli.main(["run", str(place / "street.usdz"), "--scenario", str(place / "brief.yaml"), "--policies", "log_replay",
               "--out", str(place / "good"), "--no-video"])  # fmt: skip  # ends without a status

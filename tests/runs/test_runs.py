@@ -154,7 +154,7 @@ def test_video_refuses_what_it_cannot_show(tmp_path):
     camera = run.rig.cameras["front"]
     with pytest.raises(RequestError, match="without states"):
         runs.record_video(failed_rollout(), striped, camera, tmp_path / "a.mp4")
-    with pytest.raises(RequestError, match="answered 0 frames to 3 requests"):
+    with pytest.raises(RequestError, match="returned 0 frames for 3 requests"):
         runs.record_video(run, lambda requests: [], camera, tmp_path / "a.mp4")
     small = [dataclasses.replace(frame, rgb=np.zeros((4, 4, 3), np.uint8)) for frame in striped_of(run)]
     with pytest.raises(RequestError, match=r"wanted an image of 64x36, got one of \(4, 4, 3\)"):
@@ -223,7 +223,7 @@ def test_a_run_folder_holds_everything(finished):
     heading, *rows = runs.headline(run)
     assert heading[:4] == ("policy", "reconstruction", "rollouts", "failed")
     by_policy = {row[0]: row for row in rows}
-    assert by_policy["crash"][2:5] == ("2", "2", "not known") and by_policy["log_replay"][4:6] == ("0.00", "0.00")
+    assert by_policy["crash"][2:5] == ("2", "2", "unknown") and by_policy["log_replay"][4:6] == ("0.00", "0.00")
 
 
 def test_resume_keeps_what_is_finished_and_drives_the_rest(finished):

@@ -286,7 +286,7 @@ def test_scenes_are_tested_before_they_are_served(not_served, scenes, tmp_path, 
     (tmp_path / "cut.usdz").write_bytes(data[: len(data) // 2])
     (tmp_path / "good.usdz").write_bytes(data)
     said = fails(capsys, f"--artifact-glob={tmp_path}/*.usdz", "--test-scenes-are-valid")
-    assert "1 of 2 scenes are bad:\n  cut: " in said and len(not_served) == 1
+    assert "1 of 2 scenes are invalid:\n  cut: " in said and len(not_served) == 1
     cli.main(["serve-grpc", f"--artifact-glob={tmp_path}/*.usdz"])  # without the flag the good one is served
     assert not_served[1][0].ids == ("clipgt-other",)
 

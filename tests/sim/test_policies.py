@@ -48,7 +48,7 @@ def test_the_kit_finds_what_is_wrong():
     Bad.plan = lambda self, observation: None
     assert all("must return a nurec_sim.types.Plan" in fault for fault in check_policy(Bad()))
     Bad.needs, Bad.name = None, ""
-    assert check_policy(Bad()) == ["name must be a text that is not empty", "needs must be a nurec_sim.types.Needs"]
+    assert check_policy(Bad()) == ["name must be a non-empty string", "needs must be a nurec_sim.types.Needs"]
 
 
 @pytest.mark.parametrize("name", ["route_follower", "lidar_aeb"])

@@ -270,7 +270,7 @@ def test_a_policy_that_hangs_fails_in_time_and_python_loops_are_ended(honest):
 
     rollout = drive(Acts(spin), timeout_s=1.0)
     assert rollout.status == "failed"
-    assert rollout.error == "plan() did not end within 1 s; --plan-timeout (plan_timeout_s) allows more"
+    assert rollout.error == "plan() did not finish within 1 s; --plan-timeout (plan_timeout_s) sets the limit"
     assert_same_drive(rollout, honest)
     until = time.monotonic() + 10
     while still_abandoned() and time.monotonic() < until:
@@ -287,7 +287,7 @@ def test_a_policy_that_hung_is_made_anew_for_the_next_rollout():
         return made[-1]
 
     host = PolicyHost(make, timeout_s=0.5)
-    assert "did not end within 0.5 s" in drive(host).error
+    assert "did not finish within 0.5 s" in drive(host).error
     assert drive(host).status == "ok" and len(made) == 2
     host.close()
     release.set()
@@ -297,9 +297,9 @@ def test_an_object_that_still_hangs_is_not_asked_again():
     release, policy = threading.Event(), Acts()
     policy.act = lambda observation: release.wait(30) and None
     host = PolicyHost(lambda: policy, timeout_s=0.5)
-    assert "did not end within 0.5 s" in drive(host).error
+    assert "did not finish within 0.5 s" in drive(host).error
     plans, before = policy.plans, time.monotonic()
-    assert drive(host).error == "it is still busy with a call that it did not answer in time"
+    assert drive(host).error == "it is still busy with a call that timed out"
     assert policy.plans == plans and time.monotonic() - before < 5
     release.set()
     host.close()
@@ -307,7 +307,7 @@ def test_an_object_that_still_hangs_is_not_asked_again():
 
 def test_making_a_policy_has_a_limit_and_may_not_exit():
     release = threading.Event()
-    with pytest.raises(PolicyError, match="making the policy did not end within 0.2 s"):
+    with pytest.raises(PolicyError, match="creating the policy did not finish within 0.2 s"):
         PolicyHost(lambda: release.wait(30), timeout_s=0.2)
     release.set()
     with pytest.raises(PolicyError, match="KeyboardInterrupt"):

@@ -229,7 +229,7 @@ def test_a_reset_that_raises_and_a_renderer_that_fails():
     assert rollout.status == "failed" and rollout.error == "OSError: connection lost"
     assert rollout.events[0].kind == "sense_error"
     rollout = drive(Scripted(ahead, needs), worlds.straight_road(), lambda requests: [])
-    assert "answered 0 frames to 1 requests" in rollout.error
+    assert "returned 0 frames for 1 requests" in rollout.error
 
 
 # ------------------------------------------------------------------------------------------- sensors
