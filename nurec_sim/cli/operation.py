@@ -50,7 +50,7 @@ class OperationFlags:
     max_message_mb: int | None = None
     """Maximum size of a reply in MiB; default: 64."""
     device: str = "auto"
-    """Device that renders: auto (a GPU if one can be used), cpu, cuda or cuda:N."""
+    """Render device: auto (a GPU if available), cpu, cuda or cuda:N."""
     workers: int | None = None
     """Frames rendered concurrently; default: the number of cores."""
     health_port: int | None = None
