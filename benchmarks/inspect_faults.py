@@ -99,7 +99,7 @@ def remade(clip: logs.Clip, **changes: object) -> logs.Clip:
         "road_map": clip.road_map,
         "images": {name: clip.image_records(name) for name in clip.rig.cameras},
         "sweeps": {name: clip.sweep_records(name) for name in clip.rig.lidars},
-        "storage": clip.storage,
+        "source": clip.source,
         "facts": clip.facts,
         "rig_from_log": clip.rig_from_log,
     }

@@ -162,6 +162,9 @@ class Drive:
         """There is no LiDAR."""
         raise KeyError(lidar_id)
 
+    def ego_mask(self, camera_id: str) -> None:
+        """The car does not see itself."""
+
     def sweep(self, lidar_id: str, index: int) -> Sweep:
         """There is no LiDAR."""
         raise KeyError(lidar_id)

@@ -3,7 +3,7 @@
 import pytest
 
 from nurec_sim import plugins
-from nurec_sim.errors import ScenarioError
+from nurec_sim.errors import ClipError, ReconstructError, ScenarioError
 
 GOOD = """
 from nurec_sim.types import Needs, Plan
@@ -64,8 +64,12 @@ def test_unknown_names_list_what_there_is():
         plugins.load_policy("log_reply")
     with pytest.raises(ScenarioError, match=r"policy file 'nowhere.py' does not exist"):
         plugins.load_policy("nowhere.py:Mine")
-    with pytest.raises(ScenarioError, match=r"a class can be named only after a file"):
+    with pytest.raises(ScenarioError, match=r"'log_replay:LogReplay' cannot be imported: ModuleNotFoundError"):
         plugins.load_policy("log_replay:LogReplay")
+    with pytest.raises(
+        ReconstructError, match=r"unknown reconstruction method 'lyft'; have .*'lift'.*my_method.py:Class"
+    ):
+        plugins.load(plugins.METHODS, "lyft")
 
 
 def test_installed_packages_offer_policies(monkeypatch, tmp_path):
@@ -86,3 +90,37 @@ def test_installed_packages_offer_policies(monkeypatch, tmp_path):
     monkeypatch.setattr(plugins, "entry_points", lambda group: [Point()] if group == "nurec_sim.policies" else [])
     assert "installed" in plugins.available_policies()
     assert isinstance(plugins.load_policy("installed"), Installed)
+
+
+KINDS = [plugins.POLICIES, plugins.LOG_READERS, plugins.METHODS]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.noun)
+def test_shipped_plugins_of_every_kind_are_found_and_are_what_they_must_be(kind):
+    names = plugins.available(kind)
+    assert names and [name for name, _ in plugins.load_all(kind)] == names
+    for name in names:
+        assert plugins.lacking(kind, plugins.load(kind, name)) == []
+
+
+def test_an_importable_class_is_loaded_by_module_and_name():
+    assert plugins.load_policy("nurec_sim.policies.log_replay:LogReplay").name == "log_replay"
+    assert plugins.load(plugins.METHODS, "nurec_sim.reconstruct.methods.lift:Lift").name == "lift"
+    with pytest.raises(ClipError, match=r"log reader 'json:JSONDecoder' is not a log reader: it lacks can_open, open"):
+        plugins.load(plugins.LOG_READERS, "json:JSONDecoder")
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.noun)
+def test_a_broken_plugin_is_reported_by_name_and_the_others_work(kind, monkeypatch):
+    class Broken:
+        name = "broken"
+
+        def load(self):
+            raise ImportError("no module named sdk")
+
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [Broken()] if group == kind.group else [])
+    found = dict(plugins.load_all(kind))
+    assert isinstance(found.pop("broken"), kind.error) and found
+    assert not any(isinstance(each, Exception) for each in found.values())
+    with pytest.raises(kind.error, match=f"{kind.noun} 'broken' is installed but cannot be imported: ImportError"):
+        plugins.load(kind, "broken")

@@ -114,8 +114,10 @@ def policies(check: Annotated[str | None, tyro.conf.Positional] = None) -> None:
     from nurec_sim import plugins
 
     if check is None:
-        found = [(name, plugins.load_policy(name)) for name in plugins.available_policies()]
-        rows = [(name, (inspect.getdoc(policy) or "").split("\n")[0]) for name, policy in found]
+        rows = [
+            (name, str(policy) if isinstance(policy, NurecSimError) else (inspect.getdoc(policy) or "").split("\n")[0])
+            for name, policy in plugins.load_all(plugins.POLICIES)
+        ]
         print_table("policies", rows, ("name", "what it does"))
         return
     from nurec_sim.sim.conformance import check_policy

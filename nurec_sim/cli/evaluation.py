@@ -12,14 +12,13 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from nurec_sim.cli.console import app, chosen_device, err, out, print_table, progress
-from nurec_sim.cli.scenes import NO_FLAGS, Method, NetworkFlags, network_settings, refinement
+from nurec_sim.cli.scenes import NO_FLAGS, MethodName, NetworkFlags, method_settings, refinement
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable, write_file
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 
 ProtocolName = Literal["storm", "clip", "shift"]
-Compared = Literal["dense", "dense-lidar", "selective", "dense-concatenated", "lift", "optimized", "copy"]
-USUAL_METHODS: dict[str, tuple[Compared, ...]] = {
+USUAL_METHODS: dict[str, tuple[str, ...]] = {
     "storm": ("dense", "dense-lidar", "selective", "lift", "copy"),
     "clip": ("dense", "dense-lidar", "dense-concatenated", "lift", "copy"),
     "shift": ("dense", "dense-lidar", "selective", "lift", "copy"),
@@ -31,8 +30,8 @@ USUAL_WORLDS = {"storm": 12, "clip": 3, "shift": 6}
 class LogFlags:
     """One log, cameras and sweeps held out (without --protocol)."""
 
-    method: Method = "lift"
-    """CLIP: how to reconstruct."""
+    method: MethodName = "lift"
+    """CLIP: the method, as in `nurec-sim reconstruct`."""
     refine: float | None = None
     """CLIP: time budget in seconds for optimising the scene on its input images and sweeps."""
     input_cameras: tuple[str, ...] = ()
@@ -53,8 +52,9 @@ class LogFlags:
 class ProtocolFlags:
     """Compare methods on held-out procedural worlds or on logs (with --protocol)."""
 
-    methods: tuple[Compared, ...] = ()
-    """Protocol: methods to compare; default: those of the protocol."""
+    methods: tuple[str, ...] = ()
+    """Protocol: methods to compare: dense, dense-lidar, dense-concatenated, selective, lift, optimized, copy, or any
+    other method that `nurec-sim reconstruct` accepts; default: those of the protocol."""
     worlds: int | None = None
     """Protocol: number of procedural worlds; default: 12 for storm, 3 for clip, 6 for shift."""
     seed: int = 0
@@ -133,6 +133,7 @@ def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> N
     from nurec_sim import logs
     from nurec_sim.evaluate import evaluate as run_evaluation
 
+    settings = method_settings(flags.method, network)
     log = logs.open_clip(path)
     if flags.json is not None:
         check_writable(flags.json)
@@ -152,7 +153,7 @@ def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> N
             device=device,
             images_dir=flags.images,
             progress=advance,
-            settings=network_settings(flags.method, network),
+            settings=settings,
             refine=refinement(flags.refine),
         )
     if flags.json is not None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 
@@ -17,7 +18,7 @@ from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 if TYPE_CHECKING:
     from nurec_sim.serving.store import LoadedScene
 
-Method = Literal["lift", "dense", "selective", "optimized"]
+MethodName = Annotated[str, tyro.conf.arg(metavar="NAME|FILE.py:CLASS|MODULE:CLASS")]
 NetworkFlags = Annotated[FeedForwardSettings, tyro.conf.arg(name="")]
 NO_FLAGS = FeedForwardSettings()
 
@@ -27,11 +28,14 @@ def reconstruct(
     clip: OnePath,
     *,
     out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
-    method: Method = "lift",
+    method: MethodName = "lift",
     cameras: tuple[str, ...] = (),
     map_from_gaussians: bool = False,
     refine: float | None = None,
     overwrite: bool = False,
+    changes: Annotated[
+        tuple[str, ...], tyro.conf.arg(name="set", metavar="NAME=VALUE"), tyro.conf.UseAppendAction
+    ] = (),
     network: NetworkFlags = NO_FLAGS,
 ) -> None:
     """Turn a driving log into a Gaussian scene archive (.usdz).
@@ -43,9 +47,10 @@ def reconstruct(
     result so far.
 
     Args:
-        clip: a clip folder, or a .zip of one.
+        clip: a driving log, such as a clip folder or a .zip of one.
         out_path: the archive to write; default: CLIP's name with .usdz in the current folder.
-        method: reconstruction method.
+        method: lift, dense, selective, optimized, one of an installed package, or a class (docs/write_a_method.md).
+        changes: a setting of the method, repeatable: --set sky_px=256 --set views.levels=48.
         cameras: use only these cameras; default: all, or as many as the network's profile supports.
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
@@ -56,6 +61,7 @@ def reconstruct(
     from nurec_sim import logs, scene
     from nurec_sim.reconstruct import reconstruct as run_method
 
+    settings = method_settings(method, network, changes)
     log = logs.open_clip(clip)
     target = out_path or Path(f"{log.id}.usdz")
     if target.exists() and not overwrite:
@@ -67,7 +73,7 @@ def reconstruct(
             method,
             cameras=cameras or None,
             progress=advance,
-            settings=network_settings(method, network),
+            settings=settings,
             refine=refinement(refine),
         )
     derived = None
@@ -101,7 +107,7 @@ def render(
     """Render one camera image of a scene to a PNG, at a recorded pose or beside it.
 
     Args:
-        source: a scene archive or a clip.
+        source: a scene archive or a driving log.
         out_path: the PNG to write.
         camera: camera id; default: the first.
         frame: index of the recorded frame that gives time and pose.
@@ -119,22 +125,52 @@ def render(
     out.print(f"wrote {out_path}", soft_wrap=True)
 
 
-def network_settings(method: str, network: FeedForwardSettings) -> FeedForwardSettings | None:
-    """The flags of the network, for the methods that use it.
+def method_settings(method: str, network: FeedForwardSettings, given: Sequence[str] = ()) -> Any:
+    """Settings of a method: the flags of the network for those that use it, changed as ``--set NAME=VALUE`` says.
 
     Raises:
-        NurecSimError: flags were given to a method that does not use them.
+        NurecSimError: flags of the network were given to a method without one, or a setting does not exist or fit.
     """
-    if method in ("dense", "selective"):
-        return network
-    given = [
-        "--" + each.name.replace("_", "-")
-        for each in dataclasses.fields(network)
-        if getattr(network, each.name) != getattr(NO_FLAGS, each.name)
-    ]
-    if given:
-        raise NurecSimError(f"method {method!r} does not use {', '.join(given)}; choose --method dense or selective")
-    return None
+    from nurec_sim.reconstruct import load_method
+
+    made = load_method(method).settings
+    if made is not FeedForwardSettings:
+        flags = [
+            "--" + each.name.replace("_", "-")
+            for each in dataclasses.fields(network)
+            if getattr(network, each.name) != getattr(NO_FLAGS, each.name)
+        ]
+        if flags:
+            raise NurecSimError(
+                f"method {method!r} does not use {', '.join(flags)}; choose --method dense or selective"
+            )
+    settings = network if made is FeedForwardSettings else None
+    for text in given:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise NurecSimError(f"--set takes NAME=VALUE, got {text!r}")
+        settings = _changed(made() if settings is None else settings, name, name.split("."), value)
+    return settings
+
+
+def _changed(settings: Any, name: str, path: Sequence[str], value: str) -> Any:
+    """Settings with one field, maybe of a group of settings, read from a text."""
+    from pydantic import TypeAdapter, ValidationError
+
+    types = get_type_hints(type(settings))
+    if path[0] not in types:
+        raise NurecSimError(f"--set: there is no setting {name!r}; have {sorted(types)}")
+    inner = getattr(settings, path[0])
+    try:
+        if len(path) > 1:
+            parsed = _changed(inner, name, path[1:], value)
+        else:
+            parsed = None if value == "none" else value
+            parsed = TypeAdapter(types[path[0]]).validate_python(parsed)
+        return dataclasses.replace(settings, **{path[0]: parsed})
+    except (ValidationError, ValueError) as error:
+        why = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        raise NurecSimError(f"--set {name}={value}: {why}") from None
 
 
 def refinement(seconds: float | None) -> OptimizeSettings | None:

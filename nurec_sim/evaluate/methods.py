@@ -13,7 +13,7 @@ import numpy as np
 
 from nurec_sim.errors import ReconstructError, WeightsError
 from nurec_sim.evaluate.windows import Window
-from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, OptimizeSettings
+from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, OptimizeSettings, load_method
 from nurec_sim.render import make_renderer
 from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, SensorRequest
 
@@ -38,11 +38,14 @@ OPTIMIZED = OptimizeSettings(seconds=None, steps=400)
 
 @dataclass(frozen=True)
 class Contender:
-    """A method under the name that tables call it; ``settings`` are those of ``reconstruct``, None for a copy."""
+    """A method under the name that tables call it; ``settings`` are those of ``reconstruct``, None for a copy.
+
+    ``method`` is a reference as ``reconstruct.load_method`` takes it, or ``copy``.
+    """
 
     name: str
     method: str
-    settings: FeedForwardSettings | LiftSettings | OptimizeSettings | None = None
+    settings: Any = None
 
 
 @dataclass(frozen=True)
@@ -65,10 +68,11 @@ def contenders(
     selective_checkpoint: Path | None = None,
     lift: LiftSettings | None = None,
 ) -> tuple[Contender, ...]:
-    """The methods of these names (``CHOICES``).
+    """The methods of these names.
 
     Args:
-        names: in the order of the tables; none twice.
+        names: of ``CHOICES``, or references to other methods as ``reconstruct.load_method`` takes them, which get their
+            default settings; in the order of the tables, none twice.
         network: how logs go through the network; profile and checkpoint are for ``dense``, or for ``selective`` if the
             profile is one of its. Both share the rest.
         selective_checkpoint: weights of ``selective``.
@@ -77,11 +81,11 @@ def contenders(
     Raises:
         ReconstructError: an unknown name, one given twice, or none.
     """
-    unknown = [name for name in names if name not in CHOICES]
-    if unknown or not names or len(set(names)) < len(names):
-        raise ReconstructError(f"methods must be some of {list(CHOICES)}, each once; got {list(names)}")
     settings = network or FeedForwardSettings()
-    return tuple(_contender(name, settings, selective_checkpoint, lift or LIFT) for name in names)
+    found = tuple(_contender(name, settings, selective_checkpoint, lift or LIFT) for name in names)
+    if not found or len({contender.name for contender in found}) < len(found):
+        raise ReconstructError(f"methods must be named, each once, as {list(CHOICES)} are; got {list(names)}")
+    return found
 
 
 def _contender(name: str, network: FeedForwardSettings, selective: Path | None, lift: LiftSettings) -> Contender:
@@ -91,6 +95,12 @@ def _contender(name: str, network: FeedForwardSettings, selective: Path | None, 
         return Contender(name, "lift", lift)
     if name == "optimized":
         return Contender(name, "optimized", OPTIMIZED)
+    if name not in CHOICES:
+        try:
+            made = load_method(name)
+        except ReconstructError as error:
+            raise ReconstructError(f"{error}; or one of {list(CHOICES)}") from error
+        return Contender(made.name, name, made.settings())
     method = "selective" if name == "selective" else "dense"
     if name == "dense-concatenated":
         network = dataclasses.replace(network, merge="concatenate")

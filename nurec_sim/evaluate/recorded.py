@@ -117,7 +117,10 @@ def recorded_window(
     }
     names = [name for name in clip.rig.cameras if name in {*cameras, *shown_by}]
     rig = Rig({name: clip.rig.cameras[name] for name in names}, clip.rig.lidars, clip.rig.body)
-    context = ContextClip(id, rig, clip.ego, _wider(turns, span_us), shots, turns, tuple(clip.tracks) if boxes else ())
+    context = ContextClip(
+        id, rig, clip.ego, _wider(turns, span_us), shots, turns, tuple(clip.tracks) if boxes else (),
+        ego_mask=clip.ego_mask,
+    )  # fmt: skip
     targets = tuple(_target(clip, *view, nearest[view], beyond=view[1] > max(seen)) for view in views)
     ends = clip.ego.at(np.array(span_us))[:, :3, 3]
     about: dict[str, str | int | float] = {

@@ -48,6 +48,7 @@ class ContextClip:
         tracks: labelled objects; none where the methods shall not have them.
         time_offset_us: how much later all times are than the log's own.
         road_map: what is known of the road.
+        ego_mask: pixels of a camera in which the car sees itself, or None.
     """
 
     id: str
@@ -59,6 +60,7 @@ class ContextClip:
     tracks: Sequence[Track] = ()
     time_offset_us: int = 0
     road_map: RoadMap | None = None
+    ego_mask: Callable[[str], Bool[np.ndarray, "h w"] | None] = lambda camera_id: None
 
     def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:
         """Exposure start and end of every frame."""

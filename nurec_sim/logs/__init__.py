@@ -1,11 +1,14 @@
-"""Driving logs: open, check, describe and write clip folders."""
+"""Driving logs: open any format that a reader knows, check and describe them; write clip folders."""
 
 from nurec_sim.logs.check import check_clip
 from nurec_sim.logs.checks import Measure, measure_clip
-from nurec_sim.logs.clip import Clip
+from nurec_sim.logs.clip import Clip, ImageRecord
+from nurec_sim.logs.conformance import check_reader
 from nurec_sim.logs.describe import SENSOR_COLUMNS, ClipSummary, describe_clip
 from nurec_sim.logs.overlay import draw_overlay
-from nurec_sim.logs.reader import open_clip
+from nurec_sim.logs.reader import is_log, open_clip
+from nurec_sim.logs.storage import decode_image
+from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.logs.write import CameraEntry, LidarEntry, write_clip
 
 __all__ = [
@@ -13,11 +16,16 @@ __all__ = [
     "CameraEntry",
     "Clip",
     "ClipSummary",
+    "ImageRecord",
     "LidarEntry",
     "Measure",
+    "SweepRecord",
     "check_clip",
+    "check_reader",
+    "decode_image",
     "describe_clip",
     "draw_overlay",
+    "is_log",
     "measure_clip",
     "open_clip",
     "write_clip",

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Bool, Float64, Int64, UInt8
 
 from nurec_sim.errors import ClipError
-from nurec_sim.logs.storage import Storage
-from nurec_sim.logs.sweeps import SweepRecord, read_sweep
-from nurec_sim.types import CameraModel, LidarModel, Matrix4, Rig, RoadMap, Sweep, Track, Trajectory
+from nurec_sim.logs.sweeps import SweepRecord, compensated_sweep
+from nurec_sim.types import CameraModel, LidarModel, LogSource, Matrix4, Rig, RoadMap, Sweep, Track, Trajectory
 
 IMAGES_KEPT = 6
 SWEEPS_KEPT = 2
@@ -27,7 +28,14 @@ _TIMES = ("start_us", "t_us", "end_us")
 
 @dataclass(frozen=True, eq=False)
 class ImageRecord:
-    """One frame of a camera: where its file is, when it was exposed and from where."""
+    """One frame of a camera: where it is stored, when it was exposed and from where.
+
+    Attributes:
+        file: where it is stored, for messages.
+        start_us: start of the exposure.
+        end_us: its end; equal to the start where the log knows one time only.
+        world_from_camera: poses of the camera at both times.
+    """
 
     file: str
     start_us: int
@@ -57,30 +65,42 @@ class _Recent:
 
 
 class Clip:
-    """A driving log (``types.Clip``); make one with ``open_clip``.
+    """A driving log (``types.Clip``); ``open_clip`` makes one from a path, a log reader from its parts.
 
-    Attributes:
+    Args:
         id: name of the clip.
         rig: its sensors.
         ego: poses of the rig.
+        images: records of each camera's frames, in the order of time.
+        sweeps: records of each LiDAR's sweeps, in the order of time.
+        source: loads images and sweeps by sensor and index into these records.
         tracks: labelled objects; poses are those of box centres in the world.
         road_map: what the log knows of the road, or None.
-        rig_from_log: the log's own ego frame, in which its calibration is written, in the rig frame.
         facts: what else the log says of itself (dataset, licence, source of poses, ...), plain JSON.
+        rig_from_log: the log's own ego frame, in which its calibration is written, in the rig frame; the same if None.
+
+    Attributes:
         time_offset_us: how much later all times are than the log's own.
+        path: where it was opened; None if it was not.
+        format: name of the reader that opened it.
     """
+
+    path: Path | None = None
+    format: str = ""
+    time_offset_us: int = 0
 
     def __init__(
         self,
         id: str,
         rig: Rig,
         ego: Trajectory,
-        tracks: Sequence[Track],
-        road_map: RoadMap | None,
         images: Mapping[str, Sequence[ImageRecord]],
         sweeps: Mapping[str, Sequence[SweepRecord]],
-        storage: Storage,
-        facts: Mapping[str, Any],
+        source: LogSource,
+        *,
+        tracks: Sequence[Track] = (),
+        road_map: RoadMap | None = None,
+        facts: Mapping[str, Any] | None = None,
         rig_from_log: Matrix4 | None = None,
     ) -> None:
         self.id = id
@@ -88,16 +108,15 @@ class Clip:
         self.ego = ego
         self.tracks = tuple(tracks)
         self.road_map = road_map
-        self.facts = dict(facts)
+        self.facts = dict(facts or {})
         self.rig_from_log = np.eye(4) if rig_from_log is None else rig_from_log
-        self.storage = storage
+        self.source = source
         self._images = {name: tuple(records) for name, records in images.items()}
         self._sweeps = {name: tuple(records) for name, records in sweeps.items()}
         records = [record for group in (self._images, self._sweeps) for rows in group.values() for record in rows]
         starts = [ego.start_us, *(record.start_us for record in records)]
         ends = [ego.end_us, *(record.end_us for record in records)]
         self._span_us = (min(starts), max(ends) + 1)
-        self.time_offset_us = 0
         self._recent_images = _Recent(IMAGES_KEPT)
         self._recent_sweeps = _Recent(SWEEPS_KEPT)
 
@@ -118,14 +137,15 @@ class Clip:
             id=self.id,
             rig=self.rig,
             ego=moved(self.ego),
-            tracks=[dataclasses.replace(track, path=moved(track.path)) for track in self.tracks],
-            road_map=self.road_map,
             images={name: [put_off(record) for record in rows] for name, rows in self._images.items()},
             sweeps={name: [put_off(record) for record in rows] for name, rows in self._sweeps.items()},
-            storage=self.storage,
+            source=self.source,
+            tracks=[dataclasses.replace(track, path=moved(track.path)) for track in self.tracks],
+            road_map=self.road_map,
             facts=self.facts,
             rig_from_log=self.rig_from_log,
         )
+        clip.path, clip.format = self.path, self.format
         clip.time_offset_us = self.time_offset_us + offset_us
         return clip
 
@@ -189,34 +209,67 @@ class Clip:
             ClipError: no such frame; its file is missing or broken, or its size is not the calibration's.
         """
         record = self._record("camera", camera_id, self.image_records(camera_id), index)
-        return self._recent_images.get((camera_id, index), lambda: self._read_image(camera_id, record))
+        return self._recent_images.get((camera_id, index), lambda: self._read_image(camera_id, index, record))
 
     def sweep(self, lidar_id: str, index: int) -> Sweep:
         """One motion-compensated sweep; its arrays are read-only.
 
         Raises:
-            ClipError: no such sweep; its file is missing or broken.
+            ClipError: no such sweep; its file is missing or broken, or its arrays do not fit together.
         """
         record = self._record("LiDAR", lidar_id, self.sweep_records(lidar_id), index)
-        spin = self.rig.lidars[lidar_id].spin
-        return self._recent_sweeps.get((lidar_id, index), lambda: read_sweep(self.storage, record, spin, self.ego))
+        return self._recent_sweeps.get((lidar_id, index), lambda: self._read_sweep(lidar_id, index, record))
+
+    def ego_mask(self, camera_id: str) -> Bool[np.ndarray, "h w"] | None:
+        """Pixels in which the car sees itself; None where the log does not know.
+
+        Raises:
+            ClipError: no such camera, or the mask is not as large as its images.
+        """
+        camera = self.camera(camera_id)
+        with self._reading(f"ego mask of camera {camera_id!r}"):
+            mask = self.source.ego_mask(camera_id)
+            if mask is not None and (mask.dtype != bool or mask.shape != (camera.height_px, camera.width_px)):
+                raise ClipError(f"must be bool {(camera.height_px, camera.width_px)}, got {mask.dtype} {mask.shape}")
+        return mask
 
     def _record(self, kind: str, name: str, records: Sequence[T], index: int) -> T:
         if not 0 <= index < len(records):
             raise ClipError(f"clip {self.id!r}: {kind} {name!r} has frames 0 to {len(records) - 1}, asked for {index}")
         return records[index]
 
-    def _read_image(self, camera_id: str, record: ImageRecord) -> UInt8[np.ndarray, "h w 3"]:
+    def _read_image(self, camera_id: str, index: int, record: ImageRecord) -> UInt8[np.ndarray, "h w 3"]:
         camera = self.rig.cameras[camera_id]
-        image = self.storage.read_image(record.file)
+        with self._reading(f"image {record.file}"):
+            image = self.source.image(camera_id, index)
+            if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+                raise ClipError(f"must be uint8 [h,w,3], got {image.dtype} {image.shape}")
         height, width = image.shape[:2]
         if (width, height) != (camera.width_px, camera.height_px):
             raise ClipError(
                 f"clip {self.id!r}: image {record.file} is {width} x {height} pixels, "
                 f"but the calibration of {camera_id!r} says {camera.width_px} x {camera.height_px}"
             )
+        image = image.view()
         image.setflags(write=False)
         return image
+
+    def _read_sweep(self, lidar_id: str, index: int, record: SweepRecord) -> Sweep:
+        with self._reading(f"sweep {record.file}"):
+            stored = self.source.sweep(lidar_id, index)
+            return compensated_sweep(record, stored, self.rig.lidars[lidar_id], self.ego)
+
+    @contextlib.contextmanager
+    def _reading(self, what: str) -> Iterator[None]:
+        """What a log's source raises or gives in the block becomes an error that names the log and the file."""
+        name = self.id if self.path is None else self.path.name
+        try:
+            yield
+        except ClipError as error:
+            # What the reader says may begin with the name already.
+            raise error if str(error).startswith(f"{name}: ") else ClipError(f"{name}: {what}: {error}") from None
+        except Exception as error:
+            raise ClipError(f"{name}: {what} cannot be read: {type(error).__name__}: {error}") from error
 
 
 def _named(clip_id: str, kind: str, name: str, known: Mapping[str, T]) -> T:

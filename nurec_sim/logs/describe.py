@@ -33,7 +33,8 @@ def describe_clip(clip: Clip) -> ClipSummary:
     road_map = clip.road_map
     facts = [
         ("clip", clip.id),
-        ("path", str(clip.storage.path)),
+        ("path", "none" if clip.path is None else str(clip.path)),
+        ("format", clip.format),
         ("span", f"{start_us} to {end_us} us ({(end_us - start_us) / 1e6:.3f} s)"),
         *([("times", f"those of the log and {clip.time_offset_us} us")] if clip.time_offset_us else []),
         ("ego", f"{len(clip.ego.t_us)} poses{_rate_text(clip.ego.t_us)}, {path_m:.1f} m driven"),

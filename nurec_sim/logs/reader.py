@@ -1,55 +1,117 @@
-"""Opening a clip: which format it is, and the checks that every clip passes before it is used."""
+"""Opening a log: which reader knows its format, and the checks that every log passes before it is used."""
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
-from nurec_sim.errors import ClipError
-from nurec_sim.logs import fields, native, pack, write
+from nurec_sim import plugins
+from nurec_sim.errors import ClipError, NurecSimError
 from nurec_sim.logs.clip import Clip
 from nurec_sim.logs.consistency import EARLIEST_US, table_faults
-from nurec_sim.logs.storage import META_FILE, Storage
+from nurec_sim.types import LogReader
 
 SECOND_US = 1_000_000
-_READERS = {pack.SCHEMA: pack.read_pack, write.SCHEMA: native.read_native}
+_NAMES_SHOWN = 8
 
 
-def open_clip(path: str | Path) -> Clip:
-    """Open a driving log: a clip folder, or a zip file of one. Images and sweeps are read when asked for.
+def open_clip(path: str | Path, reader: LogReader | str | None = None) -> Clip:
+    """Open a driving log. Images and sweeps are read when asked for.
 
     A log that starts before 1 000 000 us, at 0 for instance, is read with all its times later by whole seconds, so
     that it starts in the second that begins there; ``Clip.time_offset_us`` says by how much.
 
+    Args:
+        path: a file or folder of any format that a reader knows.
+        reader: a reader, or a reference to one as ``plugins.load`` takes it; the first that knows the log if None.
+
     Raises:
-        ClipError: nothing there, an unknown schema, a broken file, or poses and times that contradict themselves; the
-            text names the file and the place. ``check_clip`` lists all faults of a clip.
+        ClipError: nothing there, a format that no reader knows, a broken file, or poses and times that contradict
+            themselves; the text names the file and the place. ``check_clip`` lists all faults of a clip.
     """
-    clip = read_tables(path)
-    faults = table_faults(clip)
-    if faults:
-        raise ClipError(f"{clip.storage.path.name}: {faults[0]}")
+    clip = read_tables(path, reader)
+    if faults := table_faults(clip):
+        raise ClipError(f"{Path(path).name}: {faults[0]}")
     return clip
 
 
-def read_tables(path: str | Path) -> Clip:
-    """A clip whose poses and times are read but not yet checked against each other.
+def read_tables(path: str | Path, reader: LogReader | str | None = None) -> Clip:
+    """A clip whose poses and times are read but not yet checked against each other (arguments of ``open_clip``).
 
     Raises:
-        ClipError: nothing there, an unknown schema, or a broken file.
+        ClipError: nothing there, a format that no reader knows, or a broken file.
     """
-    storage = Storage(path)
-    if not storage.exists(META_FILE):
-        raise ClipError(f"{str(storage.path)!r} has no {META_FILE}; this is not a clip folder")
-    meta = storage.read_json(META_FILE)
-    name = storage.path.name
+    path = Path(path)
+    if not path.exists():
+        raise ClipError(f"no clip at {str(path)!r}: give a log, such as a clip folder or a .zip of one")
+    if reader is None:
+        reader = find_reader(path)
+    elif isinstance(reader, str):
+        reader = plugins.load(plugins.LOG_READERS, reader)
     try:
-        schema = fields.of_kind(META_FILE, meta, "schema", str)
-        if schema not in _READERS:
-            raise ClipError(f"unknown clip schema {schema!r}; known are {sorted(_READERS)}")
-        return _late_enough(_READERS[schema](storage, meta))
+        clip = reader.open(path)
     except ClipError as error:
-        # What the storage says begins with the clip's name already.
-        raise error if str(error).startswith(f"{name}: ") else ClipError(f"{name}: {error}") from None
+        # What the reader says may begin with the log's name already.
+        raise error if str(error).startswith(f"{path.name}: ") else ClipError(f"{path.name}: {error}") from None
+    except Exception as error:
+        raise ClipError(f"{path.name}: log reader {reader.name!r} failed: {type(error).__name__}: {error}") from error
+    if not isinstance(clip, Clip):
+        raise ClipError(
+            f"{path.name}: log reader {reader.name!r} must return a nurec_sim.logs.Clip, got {type(clip).__name__}"
+        )
+    clip.path, clip.format = path, reader.name
+    return _late_enough(clip)
+
+
+def is_log(path: Path) -> bool:
+    """Whether a reader can open a file or folder."""
+    try:
+        find_reader(path)
+    except ClipError:
+        return False
+    return True
+
+
+def find_reader(path: Path) -> LogReader:
+    """The first reader that can open a log, shipped ones first.
+
+    A reader that cannot be loaded, or fails to look at the log, is passed over with a warning.
+
+    Raises:
+        ClipError: the log is damaged, or in no format that is known; the text lists those that are.
+    """
+    damaged: ClipError | None = None
+    known, broken = [], []
+    for name, reader in plugins.load_all(plugins.LOG_READERS):
+        if isinstance(reader, NurecSimError):
+            broken.append(str(reader))
+            continue
+        known.append(f"{reader.name}: {reader.description}")
+        try:
+            if reader.can_open(path):
+                for text in broken:
+                    warnings.warn(text, RuntimeWarning, stacklevel=2)
+                return reader
+        except ClipError as error:
+            damaged = damaged or error
+        except Exception as error:
+            broken.append(f"log reader '{name}' cannot look at {path.name}: {type(error).__name__}: {error}")
+    if damaged is not None:
+        raise damaged
+    raise ClipError(
+        f"{path.name}: no log reader knows this format; it is {_looks(path)}. Known are "
+        + "; ".join([*known, *broken])
+        + ". docs/write_a_log_reader.md says how to read others"
+    )
+
+
+def _looks(path: Path) -> str:
+    """What is at a path, in a few words."""
+    if not path.is_dir():
+        return f"a file of {path.stat().st_size:,} bytes"
+    names = sorted(each.name for each in path.iterdir())
+    more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+    return f"a folder with {', '.join(names[:_NAMES_SHOWN])}{more}" if names else "an empty folder"
 
 
 def _late_enough(clip: Clip) -> Clip:

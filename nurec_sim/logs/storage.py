@@ -45,6 +45,37 @@ def checked_name(name: str) -> str:
     return name
 
 
+def schema_of(path: Path) -> str | None:
+    """The ``schema`` in the ``meta.json`` of a clip folder or zip file; None if there is none.
+
+    Raises:
+        ClipError: the zip file or ``meta.json`` is damaged or unsafe.
+    """
+    if not path.is_dir() and not zipfile.is_zipfile(path):
+        return None
+    storage = Storage(path)
+    schema = storage.read_json(META_FILE).get("schema") if storage.exists(META_FILE) else None
+    return schema if isinstance(schema, str) else None
+
+
+def decode_image(data: bytes) -> UInt8[np.ndarray, "h w 3"]:
+    """The bytes of a JPEG or PNG file as RGB.
+
+    Raises:
+        ValueError: they are truncated, not an image, or have too many pixels.
+    """
+    import cv2
+
+    check_image(data)  # a decoder fills the missing part of a truncated file with grey and says nothing
+    try:
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        bgr = None
+    if bgr is None:
+        raise ValueError("cannot be decoded")
+    return np.ascontiguousarray(bgr[:, :, ::-1])
+
+
 class Storage:
     """The files of one clip, from a folder or a zip file (whose clip may lie in one folder at its root).
 
@@ -83,9 +114,7 @@ class Storage:
             except TooMuchError as error:
                 raise ClipError(f"{self.path.name}: {info.filename} {error}") from None
         metas = [info.filename for info in infos if PurePosixPath(info.filename).name == META_FILE]
-        if not metas:
-            raise ClipError(f"{self.path.name}: no {META_FILE} in the zip; this is not a clip")
-        return min(metas, key=lambda name: (name.count("/"), name))[: -len(META_FILE)]
+        return min(metas, key=lambda name: (name.count("/"), name), default=META_FILE)[: -len(META_FILE)]
 
     def exists(self, name: str) -> bool:
         """Whether the clip has a file of that name."""
@@ -140,20 +169,10 @@ class Storage:
         Raises:
             ClipError: it is missing, truncated, not an image, or has too many pixels.
         """
-        import cv2
-
-        data = self.read(name)
-        try:  # a decoder fills the missing part of a truncated file with grey and says nothing
-            check_image(data)
+        try:
+            return decode_image(self.read(name))
         except ValueError as error:
             raise ClipError(f"{self.path.name}: image {name} {error}") from None
-        try:
-            bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        except cv2.error:
-            bgr = None
-        if bgr is None:
-            raise ClipError(f"{self.path.name}: image {name} cannot be decoded")
-        return np.ascontiguousarray(bgr[:, :, ::-1])
 
     def read_arrays(self, name: str) -> dict[str, np.ndarray]:
         """The arrays of an .npz file; nothing in it is ever unpickled.

@@ -1,8 +1,8 @@
-"""Reading LiDAR files: millimetre points, intensities, times; and undoing the car's motion during a turn."""
+"""Sweeps of LiDARs: checked as a reader gives them, timed, and the car's motion during a turn undone."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -10,18 +10,23 @@ from jaxtyping import Float64, Int64
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import LIMITS
-from nurec_sim.logs.storage import Storage
-from nurec_sim.types import Matrix4, Spin, Sweep, Trajectory
+from nurec_sim.types import LidarModel, Matrix4, Spin, Sweep, SweepPoints, Trajectory
 
 INSTANT_US = 20
 
 
 @dataclass(frozen=True, eq=False)
 class SweepRecord:
-    """One sweep of a LiDAR: where its file is, when it was measured, from where, and how the file stores it.
+    """One sweep of a LiDAR: where it is stored, when it was measured, and from where.
 
-    ``lidar_from_file`` turns the axes of the file to ours (x forward); ``compensated`` says whether the points are
-    already where they would be at ``t_us``.
+    Attributes:
+        file: where it is stored, for messages.
+        t_us: the instant to which its points belong, within ``start_us`` to ``end_us``.
+        start_us: start of the turn.
+        end_us: end of the turn; equal to the start where the log knows one time only.
+        world_from_lidar: pose of the LiDAR at ``t_us``.
+        compensated: whether the points are already where they would be at ``t_us``; if not, they are moved by the ego's
+            own motion between their time and ``t_us``.
     """
 
     file: str
@@ -29,68 +34,65 @@ class SweepRecord:
     start_us: int
     end_us: int
     world_from_lidar: Matrix4
-    intensity_scale: float
-    compensated: bool
-    lidar_from_file: Matrix4 = field(default_factory=lambda: np.eye(4))
+    compensated: bool = True
 
 
-def encode_points(xyz_m: Float64[np.ndarray, "n 3"]) -> np.ndarray:
-    """Points as whole millimetres, each coordinate as the difference to the point before (``dxyz_mm``, int32)."""
-    millimetres = np.rint(np.asarray(xyz_m, np.float64) * 1000.0).astype(np.int64).T
-    return np.diff(millimetres, axis=1, prepend=0).astype(np.int32)
+def compensated_sweep(record: SweepRecord, stored: SweepPoints, lidar: LidarModel, ego: Trajectory) -> Sweep:
+    """A sweep, motion compensated to its reference time; its arrays are read-only.
 
-
-def read_sweep(storage: Storage, record: SweepRecord, spin: Spin, ego: Trajectory) -> Sweep:
-    """One sweep, motion compensated to its reference time.
+    Args:
+        record: its times and pose.
+        stored: its points as the log stores them.
+        lidar: tells in which direction it spins, for points without times of their own.
+        ego: how the car moved.
 
     Raises:
-        ClipError: the file is missing, broken, or its arrays do not fit together.
+        ClipError: the arrays do not fit together, or hold too many points.
     """
-    arrays = _checked_arrays(storage, record.file)
-    xyz = np.cumsum(arrays["dxyz_mm"], axis=1, dtype=np.int64).T / 1000.0
-    xyz = geometry.transform_points(record.lidar_from_file, xyz)
-    point_t_us = _point_times(spin, record, arrays, xyz)
+    xyz_m, intensity, dt_us = _checked(stored)
+    point_t_us = _point_times(lidar, record, dt_us, xyz_m)
     if not record.compensated:
-        xyz = _compensated(ego, record, xyz, point_t_us)
-    intensity = None
-    if "intensity" in arrays:
-        intensity = np.clip(arrays["intensity"] / record.intensity_scale, 0.0, 1.0).astype(np.float32)
-        intensity.setflags(write=False)
-    xyz.setflags(write=False)
-    point_t_us.setflags(write=False)
+        xyz_m = _compensated(ego, record, xyz_m, point_t_us)
+    xyz_m, point_t_us = _read_only(xyz_m), _read_only(point_t_us)
+    intensity = None if intensity is None else _read_only(intensity)
     return Sweep(
-        record.t_us, record.start_us, record.end_us, record.world_from_lidar.copy(), xyz, intensity, point_t_us
+        record.t_us, record.start_us, record.end_us, record.world_from_lidar.copy(), xyz_m, intensity, point_t_us
     )
 
 
-def _checked_arrays(storage: Storage, file: str) -> dict[str, np.ndarray]:
-    arrays = storage.read_arrays(file)
-    points = arrays.get("dxyz_mm")
-    if points is None or points.ndim != 2 or points.shape[0] != 3 or points.dtype.kind not in "iu":
-        found = "nothing" if points is None else f"{points.dtype} {points.shape}"
-        raise ClipError(f"{storage.path.name}: {file} needs whole numbers dxyz_mm [3,n], got {found}")
-    if points.shape[1] > LIMITS.sweep_points:
-        raise ClipError(
-            f"{storage.path.name}: {file} has {points.shape[1]:,} points; a sweep may have {LIMITS.sweep_points:,}"
-        )
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.setflags(write=False)
+    return view
+
+
+def _checked(stored: SweepPoints) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Points [n,3], intensities and times [n] in the types in which they are used."""
+    xyz_m = np.asarray(stored.xyz_m, np.float64)
+    if xyz_m.ndim != 2 or xyz_m.shape[1] != 3 or not np.isfinite(xyz_m).all():
+        raise ClipError(f"points must be finite numbers [n,3], got {xyz_m.dtype} {xyz_m.shape}")
+    if len(xyz_m) > LIMITS.sweep_points:
+        raise ClipError(f"{len(xyz_m):,} points; a sweep may have {LIMITS.sweep_points:,}")
     for name in ("intensity", "dt_us"):
-        if name in arrays and arrays[name].shape != points.shape[1:]:
-            raise ClipError(
-                f"{storage.path.name}: {file} has {points.shape[1]} points but {name} of shape {arrays[name].shape}"
-            )
-    return arrays
+        array = getattr(stored, name)
+        if array is not None and np.shape(array) != xyz_m.shape[:1]:
+            raise ClipError(f"{len(xyz_m)} points but {name} of shape {np.shape(array)}")
+    intensity = None if stored.intensity is None else np.asarray(stored.intensity, np.float32)
+    if intensity is not None and not ((intensity >= 0) & (intensity <= 1)).all():
+        raise ClipError(f"intensities must lie in 0..1, got {intensity.min():g} to {intensity.max():g}")
+    return xyz_m, intensity, None if stored.dt_us is None else np.asarray(stored.dt_us).astype(np.int64)
 
 
 def _point_times(
-    spin: Spin, record: SweepRecord, arrays: dict[str, np.ndarray], xyz: Float64[np.ndarray, "n 3"]
+    lidar: LidarModel, record: SweepRecord, dt_us: Int64[np.ndarray, " n"] | None, xyz: Float64[np.ndarray, "n 3"]
 ) -> Int64[np.ndarray, " n"]:
     """When each point was measured: as stored, else by its azimuth in a raw turn, else the sweep's one time."""
-    if "dt_us" in arrays:
-        return record.start_us + arrays["dt_us"].astype(np.int64)
+    if dt_us is not None:
+        return record.start_us + dt_us
     if record.compensated or record.end_us <= record.start_us:
         return np.full(len(xyz), record.t_us, np.int64)
     # The turn begins and ends behind the car and looks straight ahead at the reference time.
-    sign = -1.0 if spin is Spin.CLOCKWISE else 1.0
+    sign = -1.0 if lidar.spin is Spin.CLOCKWISE else 1.0
     turn = sign * np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi)
     return record.t_us + np.rint(turn * (record.end_us - record.start_us)).astype(np.int64)
 

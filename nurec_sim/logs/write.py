@@ -21,9 +21,10 @@ from jaxtyping import Float64, UInt8
 from nurec_sim import sensors
 from nurec_sim.errors import ClipError
 from nurec_sim.files.new_files import writing
-from nurec_sim.logs import calibration, sweeps, tables
+from nurec_sim.logs import calibration, tables
 from nurec_sim.logs.consistency import EARLIEST_US
 from nurec_sim.logs.storage import META_FILE
+from nurec_sim.logs.stored import encode_points
 from nurec_sim.types import Rig, RoadMap, Sweep, Track, Trajectory
 
 SCHEMA = "nurec-sim-clip-1"
@@ -215,7 +216,7 @@ def _write_sweep(folder: Path, entry: LidarEntry, index: int, where: str) -> dic
     sweep = entry.sweep
     if not np.isfinite(sweep.xyz_m).all() or not np.isfinite(sweep.world_from_lidar).all():
         raise ClipError(f"{where}: points and pose must be finite")
-    arrays = {"dxyz_mm": sweeps.encode_points(sweep.xyz_m)}
+    arrays = {"dxyz_mm": encode_points(sweep.xyz_m)}
     if sweep.intensity is not None:
         arrays["intensity"] = np.rint(np.clip(sweep.intensity, 0.0, 1.0) * INTENSITY_SCALE).astype(np.uint8)
     if (np.asarray(sweep.point_t_us) != sweep.t_us).any():

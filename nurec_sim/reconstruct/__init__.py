@@ -4,52 +4,67 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from nurec_sim import plugins
 from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.reconstruct.lift.settings import GroundSettings, LiftSettings, PointSettings, ViewSettings
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 
 if TYPE_CHECKING:
-    from nurec_sim.types import Clip, GaussianScene
+    from nurec_sim.types import Clip, GaussianScene, Method
 
-METHODS = ("lift", "dense", "selective", "optimized")
 START_SHARE = 0.15
-"""Of the work of a reconstruction that is fitted to its log, about, is what it starts from."""
+"""Share of all work, about, that is done before the optimisation starts."""
 
 __all__ = [
-    "METHODS",
     "FeedForwardSettings",
     "GroundSettings",
     "LiftSettings",
     "OptimizeSettings",
     "PointSettings",
     "ViewSettings",
+    "available_methods",
+    "load_method",
     "reconstruct",
 ]
 
 
+def available_methods() -> list[str]:
+    """Names of the shipped methods and of those that installed packages offer, sorted."""
+    return plugins.available(plugins.METHODS)
+
+
+def load_method(reference: str) -> Method:
+    """Make a method from a name, a file (``my_method.py:Class``) or an importable object (``module:Class``).
+
+    Raises:
+        ReconstructError: nothing of that name, or what was found is no method; the text says what is available.
+    """
+    return plugins.load(plugins.METHODS, reference)
+
+
 def reconstruct(
     clip: Clip,
-    method: str = "lift",
+    method: str | Method = "lift",
     *,
     cameras: Sequence[str] | None = None,
     hold_out_sweeps: Sequence[int] = (),
     progress: Callable[[str, float], None] | None = None,
-    settings: LiftSettings | FeedForwardSettings | OptimizeSettings | None = None,
+    settings: Any = None,
     refine: OptimizeSettings | None = None,
 ) -> GaussianScene:
     """Build a Gaussian scene from a clip.
 
     Args:
         clip: the driving log.
-        method: one of ``METHODS``.
+        method: a method, or a reference as ``load_method`` takes it.
         cameras: ids of the cameras to use; if None all, or as many as the network's profile takes.
         hold_out_sweeps: indices of sweeps that must not be read, of every LiDAR.
         progress: called with the stage's name and the fraction of all work that is done, about.
-        settings: ``LiftSettings`` for ``lift``, ``OptimizeSettings`` for ``optimized``, ``FeedForwardSettings`` for the
-            others; the defaults if None.
+        settings: an instance of the method's settings class: ``LiftSettings`` for ``lift``, ``FeedForwardSettings`` for
+            ``dense`` and ``selective``, ``OptimizeSettings`` for ``optimized``; the defaults if None.
         refine: fit the scene to the images and sweeps afterwards; ``optimized`` is ``lift`` with this step.
 
     Raises:
@@ -57,8 +72,16 @@ def reconstruct(
             method needs.
         WeightsError: the network's weights are not there or cannot be used.
     """
-    if method not in METHODS:
-        raise ReconstructError(f"no reconstruction method {method!r}; have {list(METHODS)}")
+    made = load_method(method) if isinstance(method, str) else method
+    if made.settings is OptimizeSettings and refine is not None:
+        if settings is not None:
+            raise ReconstructError("the optimisation was given settings twice: as settings and as refine")
+        settings, refine = refine, None
+    if settings is None:
+        settings = made.settings()
+    if not isinstance(settings, made.settings):
+        wanted, given = made.settings.__name__, type(settings).__name__
+        raise ReconstructError(f"method {made.name!r} takes {wanted}, got {given}")
     chosen = list(clip.rig.cameras) if cameras is None else list(cameras)
     unknown = [camera for camera in chosen if camera not in clip.rig.cameras]
     if unknown:
@@ -70,36 +93,23 @@ def reconstruct(
 
     held = {int(index) for index in hold_out_sweeps}
     report = progress or (lambda stage, fraction: None)
-    if refine is not None or method == "optimized":
-        if isinstance(settings, OptimizeSettings) and refine is not None:
-            raise ReconstructError("the optimisation was given settings twice: as settings and as refine")
-        start = "lift" if method == "optimized" else method
-        plain = None if isinstance(settings, OptimizeSettings) else settings
-        fit = settings if isinstance(settings, OptimizeSettings) else refine or OptimizeSettings()
-        scene = reconstruct(
-            clip, start, cameras=cameras, hold_out_sweeps=hold_out_sweeps, settings=plain,
-            progress=lambda stage, share: report(stage, START_SHARE * share),
-        )  # fmt: skip
-        from nurec_sim.reconstruct.optimize.method import refine as fit_to_log
-
-        return fit_to_log(scene, clip, list(scene.provenance["cameras"]), held,
-                          lambda stage, share: report(stage, START_SHARE + (1 - START_SHARE) * share), fit)  # fmt: skip
-    wanted = LiftSettings if method == "lift" else FeedForwardSettings
-    if settings is None:
-        settings = wanted()
-    if isinstance(settings, LiftSettings) and method == "lift":
-        from nurec_sim.reconstruct.lift.method import lift
-
-        return _timed(clip, lift(clip, chosen, held, report, settings))
-    if isinstance(settings, FeedForwardSettings) and method != "lift":
-        from nurec_sim.reconstruct.feedforward.method import feedforward
-
-        return _timed(clip, feedforward(clip, method, cameras, held, report, settings))
-    raise ReconstructError(f"method {method!r} takes {wanted.__name__}, got {type(settings).__name__}")
-
-
-def _timed(clip: Clip, scene: GaussianScene) -> GaussianScene:
-    """The scene; where its times are not those of the log, the provenance says so."""
-    if clip.time_offset_us == 0:
+    share = 1.0 if refine is None else START_SHARE
+    scene = made.reconstruct(
+        clip, settings, cameras=cameras, hold_out_sweeps=held, progress=lambda stage, done: report(stage, share * done)
+    )
+    scene = _with_provenance(scene, clip, made.name, chosen)
+    if refine is None:
         return scene
-    return dataclasses.replace(scene, provenance={**scene.provenance, "time_offset_us": clip.time_offset_us})
+    from nurec_sim.reconstruct.optimize.method import refine as fit_to_log
+
+    used = list(scene.provenance["cameras"])
+    return fit_to_log(scene, clip, used, held, lambda stage, done: report(stage, share + (1 - share) * done), refine)
+
+
+def _with_provenance(scene: GaussianScene, clip: Clip, method: str, cameras: list[str]) -> GaussianScene:
+    """The scene with what every provenance says, where the method left it out."""
+    known: dict[str, Any] = {"method": method, "cameras": cameras}
+    if clip.time_offset_us:
+        known["time_offset_us"] = clip.time_offset_us
+    missing = {key: value for key, value in known.items() if key not in scene.provenance}
+    return dataclasses.replace(scene, provenance={**scene.provenance, **missing}) if missing else scene

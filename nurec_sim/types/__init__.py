@@ -12,8 +12,11 @@ from nurec_sim.types.frames import CameraFrame, LidarFilter, LidarFrame, Sense, 
 from nurec_sim.types.logs import (
     MOVABLE_LABELS,
     Clip,
+    LogReader,
+    LogSource,
     RoadMap,
     Sweep,
+    SweepPoints,
     Track,
 )
 from nurec_sim.types.loop import (
@@ -28,6 +31,7 @@ from nurec_sim.types.loop import (
     Rollout,
     Series,
 )
+from nurec_sim.types.methods import Method, Progress
 from nurec_sim.types.scenes import (
     GAUSSIAN_FIELDS,
     OPTIONAL_GAUSSIAN_FIELDS,
@@ -71,14 +75,18 @@ __all__ = [
     "LidarFilter",
     "LidarFrame",
     "LidarModel",
+    "LogReader",
+    "LogSource",
     "MOVABLE_LABELS",
     "Matrix4",
+    "Method",
     "Needs",
     "OPTIONAL_GAUSSIAN_FIELDS",
     "Observation",
     "Pinhole",
     "Plan",
     "Policy",
+    "Progress",
     "Reduce",
     "Rig",
     "RoadMap",
@@ -90,6 +98,7 @@ __all__ = [
     "Shutter",
     "Spin",
     "Sweep",
+    "SweepPoints",
     "Track",
     "Trajectory",
     "Windshield",

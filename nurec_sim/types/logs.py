@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.types.sensors import Rig
@@ -116,4 +117,66 @@ class Clip(Protocol):
 
     def sweep(self, lidar_id: str, index: int) -> Sweep:
         """One motion-compensated sweep."""
+        ...
+
+    def ego_mask(self, camera_id: str) -> Bool[np.ndarray, "h w"] | None:
+        """Pixels in which the car sees itself; None where the log does not know."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SweepPoints:
+    """The points of a sweep as a log stores them.
+
+    ``xyz_m`` is in the frame of the LiDAR (x forward, y left, z up); ``intensity`` in 0..1, or None; ``dt_us`` is when
+    each point was measured, in microseconds after the start of the sweep, or None.
+    """
+
+    xyz_m: Float64[np.ndarray, "n 3"]
+    intensity: Float32[np.ndarray, " n"] | None = None
+    dt_us: Int64[np.ndarray, " n"] | None = None
+
+
+class LogSource(Protocol):
+    """Loads what is large in a log, one piece at a time: the part of a log reader that a ``logs.Clip`` keeps.
+
+    It is called when an image or a sweep is asked for, from several threads at once, with ids of the clip's rig and
+    indices into its records. What it raises becomes a ``ClipError`` that names the image or the sweep.
+    """
+
+    def image(self, camera_id: str, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        """One RGB frame, as large as the calibration says."""
+        ...
+
+    def sweep(self, lidar_id: str, index: int) -> SweepPoints:
+        """The points of one sweep."""
+        ...
+
+    def ego_mask(self, camera_id: str) -> Bool[np.ndarray, "h w"] | None:
+        """Pixels in which the car sees itself, as large as the camera's images; None where the log does not know."""
+        ...
+
+
+class LogReader(Protocol):
+    """Opens driving logs of one format (docs/write_a_log_reader.md)."""
+
+    name: str
+    """Of the format, for messages."""
+    description: str
+    """What a log of this format looks like, in one line: "a folder with ...". Shown when no reader knows a log."""
+
+    def can_open(self, path: Path) -> bool:
+        """Whether a file or folder that exists is of this format; a quick look at names and headers.
+
+        Raises:
+            ClipError: it is of this format, but damaged.
+        """
+        ...
+
+    def open(self, path: Path) -> Clip:
+        """The log as a ``logs.Clip``; images and sweeps are not read yet.
+
+        Raises:
+            ClipError: something is missing or wrong; the text names the file and the place.
+        """
         ...

@@ -125,7 +125,7 @@ def test_choosing_methods():
     assert (selective.settings.profile, selective.settings.checkpoint) == ("pq-front", Path("a.pt"))
     (own,) = contenders(("selective",), FeedForwardSettings(checkpoint=Path("a.pt")), Path("b.pt"))
     assert own.settings.checkpoint == Path("b.pt") and without_weights(own) is None
-    with pytest.raises(ReconstructError, match=r"methods must be some of \['dense'"):
+    with pytest.raises(ReconstructError, match=r"methods must be named, each once, as \['dense'"):
         contenders(("dense", "dense"))
     with pytest.raises(ReconstructError, match="no network profile 'big'"):
         contenders(("dense",), FeedForwardSettings(profile="big"))

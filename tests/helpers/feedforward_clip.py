@@ -68,6 +68,9 @@ class MadeClip:
     def world_from_camera(self, camera_id: str, index: int) -> np.ndarray:
         return self.ego.at(self.times[camera_id][index]) @ self.cameras[camera_id].rig_from_camera
 
+    def ego_mask(self, camera_id: str) -> np.ndarray | None:
+        return None
+
     def image(self, camera_id: str, index: int) -> np.ndarray:
         camera = self.cameras[camera_id]
         rows, columns = np.indices((camera.height_px, camera.width_px))

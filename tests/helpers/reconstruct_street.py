@@ -91,6 +91,9 @@ class Street:
         rgb = colour_of(what, hit) * self.gains.get(camera_id, 1.0)
         return np.clip(rgb * 255, 0, 255).astype(np.uint8).reshape(rays.shape)
 
+    def ego_mask(self, camera_id: str) -> None:
+        return None
+
     def sweep(self, lidar_id: str, index: int) -> Sweep:
         from nurec_sim import sensors
 

@@ -42,6 +42,9 @@ class WallStreet:
         start = EPOCH_US + STEP_US * np.arange(self.frames) - STEP_US // 2
         return np.stack([start, start + STEP_US], axis=1)
 
+    def ego_mask(self, camera_id: str) -> None:
+        return None
+
     def sweep(self, lidar_id: str, index: int) -> Sweep:
         self.read.append(index)
         start, end = self.sweep_times_us(lidar_id)[index].tolist()

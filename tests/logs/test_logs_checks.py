@@ -209,7 +209,7 @@ def parked(demo: logs.Clip) -> Track:
 def vars_of(clip: logs.Clip) -> dict:
     return {
         "id": clip.id, "rig": clip.rig, "ego": clip.ego, "road_map": None, "images": {}, "sweeps": {},
-        "storage": clip.storage, "facts": {},
+        "source": clip.source, "facts": {},
     }  # fmt: skip
 
 

@@ -9,7 +9,8 @@ import tiny_clip
 
 from nurec_sim import geometry, logs
 from nurec_sim.errors import ClipError
-from nurec_sim.logs.sweeps import encode_points, prolonged
+from nurec_sim.logs.stored import encode_points
+from nurec_sim.logs.sweeps import prolonged
 from nurec_sim.types import Pinhole, Rig, Track, Trajectory
 
 

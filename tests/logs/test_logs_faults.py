@@ -158,9 +158,9 @@ FRONT = ("cameras", "front")
         (
             "meta.json",
             set_path("schema", value="nuplan"),
-            "unknown clip schema 'nuplan'; known are .'nurec-sim-clip-1'",
+            "no log reader knows this format; it is a folder with calib",
         ),
-        ("meta.json", set_path("schema", value=...), "meta.json: 'schema' is missing; have"),
+        ("meta.json", set_path("schema", value=...), "no log reader knows this format"),
         ("meta.json", set_path("name", value=7), "meta.json: 'name' must be a str, got int"),
         ("calib.json", set_path("cameras", value=...), "calib.json: 'cameras' is missing; have .'body'"),
         (
@@ -237,12 +237,14 @@ def test_broken_json_is_named(clip_folder, text, fault):
 
 
 def test_paths_that_are_no_clips_are_named(tmp_path):
-    with pytest.raises(ClipError, match="no clip at .*nowhere': give a clip folder or a .zip of one"):
+    with pytest.raises(ClipError, match="no clip at .*nowhere': give a log, such as a clip folder or a .zip of one"):
         logs.open_clip(tmp_path / "nowhere")
-    with pytest.raises(ClipError, match="has no meta.json; this is not a clip folder"):
+    with pytest.raises(
+        ClipError, match="no log reader knows this format; it is an empty folder. Known are nurec-sim-clip"
+    ):
         logs.open_clip(tmp_path)
     (tmp_path / "file").write_text("hello")
-    with pytest.raises(ClipError, match="is neither a clip folder nor a zip file"):
+    with pytest.raises(ClipError, match="file: no log reader knows this format; it is a file of 5 bytes"):
         logs.open_clip(tmp_path / "file")
 
 
@@ -258,7 +260,7 @@ def test_zips_that_climb_out_are_refused(tmp_path, name):
 def test_zips_without_a_clip_or_too_large_are_refused(tmp_path, monkeypatch):
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("readme.txt", "x" * 100)
-    with pytest.raises(ClipError, match="no meta.json in the zip; this is not a clip"):
+    with pytest.raises(ClipError, match="other.zip: no log reader knows this format"):
         logs.open_clip(tmp_path / "other.zip")
     monkeypatch.setattr(storage, "LIMITS", Limits(file_bytes=99))
     with pytest.raises(ClipError, match="readme.txt unpacks to 100 bytes; at most 99 are allowed"):

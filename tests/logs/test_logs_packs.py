@@ -7,7 +7,7 @@ import pytest
 
 from nurec_sim import geometry, logs, sensors
 from nurec_sim.errors import ClipError
-from nurec_sim.logs.sweeps import encode_points
+from nurec_sim.logs.stored import encode_points
 
 PACKS = {
     "kitti_raw_0009": (2, 51, 20),
@@ -204,7 +204,7 @@ def test_compensating_kittis_turns_makes_sweeps_agree(realdata):
     records = clip.sweep_records("lidar")
 
     def raw(index: int) -> np.ndarray:
-        arrays = clip.storage.read_arrays(records[index].file)
+        arrays = clip.source.storage.read_arrays(records[index].file)
         xyz = np.cumsum(arrays["dxyz_mm"], axis=1, dtype=np.int64).T / 1000
         return geometry.transform_points(records[index].world_from_lidar, xyz)
 

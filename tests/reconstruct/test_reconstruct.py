@@ -159,7 +159,8 @@ def test_held_out_sweeps_are_not_read(street):
 
 def test_errors_say_what_there_is(street):
     with pytest.raises(
-        ReconstructError, match=r"no reconstruction method 'magic'; have \['lift', 'dense', 'selective', 'optimized'\]"
+        ReconstructError,
+        match=r"unknown reconstruction method 'magic'; have \['dense', 'lift', 'optimized', 'selective'\]",
     ):
         reconstruct(street, "magic")
     with pytest.raises(ReconstructError, match=r"has no camera \['back'\]; have \['front'\]"):

@@ -87,7 +87,7 @@ def test_weights_that_are_missing_are_an_error_of_the_load(clip, tmp_path):
 
 
 def test_recipes_are_checked_when_the_store_is_made(clip):
-    with pytest.raises(ReconstructError, match="no reconstruction method 'magic'; have"):
+    with pytest.raises(ReconstructError, match="unknown reconstruction method 'magic'; have"):
         SceneStore([clip], method="magic")
 
 

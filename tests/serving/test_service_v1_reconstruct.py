@@ -145,7 +145,7 @@ def test_bad_requests_are_explained_and_leave_no_scene(client, clip, store, tmp_
         (ArchiveError, "no reconstruction method 'magic'", {"path": str(clip), "method": "magic"}),
         (ArchiveError, "no network profile 'huge'", {"path": str(clip), "method": "dense", "profile": "huge"}),
         (ArchiveError, "has no camera", {"path": str(clip), "method": "lift", "cameras": ["none"]}),
-        (ArchiveError, "neither a clip folder nor a zip", {"path": str(broken)}),
+        (ArchiveError, "broken.zip: no log reader knows this format", {"path": str(broken)}),
         (ArchiveError, "no clip at|does not exist", {"path": str(clip.parent / "gone.zip")}),
     ]:
         with pytest.raises((kind, ClipError, ReconstructError, WeightsError), match=text):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import worlds
+from doc_examples import names_of
 
 from nurec_sim import geometry
 from nurec_sim.plugins import available_policies, load_policy
@@ -122,3 +123,7 @@ def test_route_follower_waits_for_a_crossing_pedestrian():
     ahead = boxes[:, 0] - rollout.world_from_rig[:, 0, 3]
     inside = (np.abs(boxes[:, 1]) < 1.25) & (ahead > -1.4) & (ahead < 4.15)
     assert not inside.any() and min(state.speed_mps for state in rollout.states) < 6.0
+
+
+def test_the_documents_policy_keeps_the_contract():
+    assert check_policy(names_of("policies.md")["Creep"]()) == []

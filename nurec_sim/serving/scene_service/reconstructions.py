@@ -9,8 +9,8 @@ from collections.abc import AsyncGenerator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from nurec_sim.errors import CancelledError, NurecSimError, RequestError
-from nurec_sim.reconstruct import FeedForwardSettings
+from nurec_sim.errors import CancelledError, NurecSimError, ReconstructError, RequestError
+from nurec_sim.reconstruct import FeedForwardSettings, available_methods, load_method
 from nurec_sim.serving.store import LoadedScene, Recipe, SceneStore
 from nurec_sim.serving.store.sources import is_archive
 from nurec_sim.serving.store.uploads import check_name
@@ -123,13 +123,18 @@ class Reconstructions:
 
 def _recipe(request) -> Recipe | None:
     """How a request wants it; None if it leaves that open."""
+    known = available_methods()
     if not request.method:
         if request.profile or request.cameras:
-            raise RequestError("profile and cameras need a method: lift, dense or selective")
+            raise RequestError(f"profile and cameras need a method: {', '.join(known)}")
         return None
-    if request.profile and request.method == "lift":
-        raise RequestError(f"method 'lift' uses no network, so no profile either; got {request.profile!r}")
-    settings = None if request.method == "lift" else FeedForwardSettings(profile=request.profile or None)
+    if request.method not in known:  # a client must not make the server run a file
+        raise ReconstructError(f"no reconstruction method {request.method!r}; have {known}")
+    settings = None
+    if load_method(request.method).settings is FeedForwardSettings:
+        settings = FeedForwardSettings(profile=request.profile or None)
+    elif request.profile:
+        raise RequestError(f"method {request.method!r} uses no network, so no profile either; got {request.profile!r}")
     return Recipe(request.method, settings, tuple(request.cameras))
 
 

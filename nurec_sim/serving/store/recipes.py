@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import nurec_sim
-from nurec_sim.errors import ReconstructError, WeightsError
-from nurec_sim.reconstruct import METHODS, FeedForwardSettings, LiftSettings
-from nurec_sim.types import GaussianScene
+from nurec_sim.reconstruct import load_method
+from nurec_sim.types import GaussianScene, Method, Progress
 
-Progress = Callable[[str, float], None]
 _CODE = ("reconstruct", "network")
 
 
@@ -24,7 +23,7 @@ class Recipe:
     """A reconstruction method and its settings.
 
     Args:
-        method: one of ``reconstruct.METHODS``.
+        method: a reference as ``reconstruct.load_method`` takes it.
         settings: of that method; None for its defaults.
         cameras: ids of the cameras to use; empty for what the method takes by itself.
 
@@ -33,12 +32,11 @@ class Recipe:
     """
 
     method: str = "lift"
-    settings: LiftSettings | FeedForwardSettings | None = None
+    settings: Any = None
     cameras: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise ReconstructError(f"no reconstruction method {self.method!r}; have {list(METHODS)}")
+        load_method(self.method)
 
     def reconstruct(self, clip_path: Path, progress: Progress | None) -> GaussianScene:
         """The scene of a clip, made now.
@@ -61,33 +59,27 @@ class Recipe:
         settings = None if self.settings is None else dataclasses.asdict(self.settings)
         if settings is not None:
             settings = {name: _plain(value) for name, value in settings.items()}
-        said = {"method": self.method, "settings": settings, "cameras": self.cameras, "weights": self._weights()}
-        return json.dumps(said, sort_keys=True, default=str)
+        method = load_method(self.method)
+        files = [files_hash(path) for path in method.files(method.settings() if settings is None else self.settings)]
+        said = {"method": self.method, "settings": settings, "cameras": self.cameras, "files": files}
+        return json.dumps(said | {"code": _foreign_code(method)}, sort_keys=True, default=str)
 
-    def _weights(self) -> str | None:
-        """Hash of the file that the network's weights come from; None where none is read, or none is there."""
-        if self.method in ("lift", "optimized"):
-            return None
-        settings = self.settings if isinstance(self.settings, FeedForwardSettings) else FeedForwardSettings()
-        if settings.random_weights is not None:
-            return None
-        from nurec_sim.network.checkpoints.download import find_weights
-        from nurec_sim.reconstruct.feedforward.method import profile_name
 
-        try:
-            return files_hash(find_weights(profile_name(self.method, settings.profile), settings.checkpoint))
-        except WeightsError:  # says more when the clip is reconstructed
-            return None
+def _foreign_code(method: Method) -> str | None:
+    """Hash of the file that holds a method which is not ours; ours are part of every key."""
+    module = type(method).__module__
+    return None if module.startswith("nurec_sim.") else files_hash(Path(inspect.getfile(type(method))))
 
 
 def content_key(clip_path: Path, recipe: Recipe | str) -> str:
-    """A name for what a reconstruction depends on: the clip's files, the recipe, the weights, our version and code."""
+    """A name for what a reconstruction depends on: the clip's files, the recipe, our version and code."""
     if isinstance(recipe, str):
         recipe = Recipe(recipe)
     package = Path(nurec_sim.__file__).parent
     code = "".join(files_hash(package / folder, "*.py") for folder in _CODE)
     facts = "\0".join([nurec_sim.__version__, code, recipe.text(), files_hash(clip_path)])
-    return f"{clip_path.stem}-{recipe.method}-{hashlib.sha256(facts.encode()).hexdigest()[:24]}"
+    name = load_method(recipe.method).name
+    return f"{clip_path.stem}-{name}-{hashlib.sha256(facts.encode()).hexdigest()[:24]}"
 
 
 def files_hash(path: Path, pattern: str = "*") -> str:

@@ -61,13 +61,14 @@ def default_cache_dir() -> Path:
 
 
 def find_sources(path: Path) -> list[Path]:
-    """Archives and clips in a folder, at any depth; the path itself if it is one of them, or holds none.
+    """Archives and clip folders in a folder, at any depth; the path itself if it is a log or holds none of them.
 
     Files and folders whose names begin with a dot are passed over: they may be half written.
     """
+    from nurec_sim.logs import is_log
     from nurec_sim.logs.storage import META_FILE
 
-    if not path.is_dir() or (path / META_FILE).exists():
+    if not path.is_dir() or is_log(path):
         return [path]
     found = [*path.rglob("*.usdz"), *path.rglob("*.zip"), *(meta.parent for meta in path.rglob(META_FILE))]
     seen = [each for each in found if not any(part.startswith(".") for part in each.relative_to(path).parts)]

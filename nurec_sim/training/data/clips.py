@@ -208,6 +208,9 @@ class CachedClip:
         """Training clips hold none."""
         raise ClipError(f"training clip {self.id!r} holds no LiDAR sweeps")
 
+    def ego_mask(self, camera_id: str) -> None:
+        """The car does not see itself."""
+
     def _meta(self) -> dict[str, Any]:
         try:
             meta = json.loads((self._folder / META_FILE).read_text())

@@ -116,6 +116,9 @@ class ReframedClip:
         """As in the clip, which has none."""
         return self._clip.sweep(lidar_id, index)
 
+    def ego_mask(self, camera_id: str) -> None:
+        """The car does not see itself."""
+
     def _exposure(self, camera_id: str, index: int) -> tuple[tuple[int, int], Float64[np.ndarray, "2 4 4"]]:
         start_us, end_us = (int(t) for t in self._clip.camera_times_us(camera_id)[index])
         poses = self._clip.world_from_camera(camera_id, index)

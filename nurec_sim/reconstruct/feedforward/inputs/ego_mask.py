@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -18,17 +18,23 @@ FAINTEST_COVER = 1e-3
 
 
 def ego_masks(folder: Path | None, clip: Clip, crops: Mapping[str, Crop]) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Where the car covers the view of each camera in ``crops``; nowhere for cameras without a file.
+    """Where the car covers the view of each camera in ``crops``; nowhere for cameras without a mask.
 
-    A mask ``<folder>/<camera>.png`` may have any size and is stretched over the whole image. One with an alpha channel
-    covers where alpha is not 0, one without where it is not black; a pixel is covered as soon as a part of it is.
+    Without a folder, masks are those of the log (``Clip.ego_mask``). A mask ``<folder>/<camera>.png`` may have any size
+    and is stretched over the whole image. One with an alpha channel covers where alpha is not 0, one without where it
+    is not black; a pixel is covered as soon as a part of it is.
 
     Raises:
         ReconstructError: the folder does not exist or has no mask for any camera of the clip, or a file is broken.
     """
-    masks = {camera: np.zeros(crop.size[::-1], bool) for camera, crop in crops.items()}
-    if folder is None:
-        return masks
+    own = {camera: clip.ego_mask(camera) for camera in crops} if folder is None else _masks_in(folder, clip, crops)
+    return {
+        camera: np.zeros(crop.size[::-1], bool) if (mask := own.get(camera)) is None else _scaled(mask, crop)
+        for camera, crop in crops.items()
+    }
+
+
+def _masks_in(folder: Path, clip: Clip, cameras: Iterable[str]) -> dict[str, Bool[np.ndarray, "h w"]]:
     if not folder.is_dir():
         raise ReconstructError(f"the folder of ego masks {folder} does not exist")
     names = sorted(path.stem for path in folder.glob("*.png"))
@@ -36,13 +42,10 @@ def ego_masks(folder: Path | None, clip: Clip, crops: Mapping[str, Crop]) -> dic
         raise ReconstructError(
             f"no file in {folder} is named after a camera: need <camera>.png of {list(clip.rig.cameras)}, have {names}"
         )
-    return {
-        camera: _scaled(folder / f"{camera}.png", crop) if camera in names else masks[camera]
-        for camera, crop in crops.items()
-    }
+    return {camera: _read(folder / f"{camera}.png") for camera in cameras if camera in names}
 
 
-def _scaled(path: Path, crop: Crop) -> Bool[np.ndarray, "h w"]:
+def _read(path: Path) -> Bool[np.ndarray, "h w"]:
     try:
         check_image(data := path.read_bytes())
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -51,7 +54,10 @@ def _scaled(path: Path, crop: Crop) -> Bool[np.ndarray, "h w"]:
     if pixels is None:
         raise ReconstructError(f"the ego mask {path} is not a readable PNG")
     channels = np.atleast_3d(pixels)
-    cover = channels[..., 3] if channels.shape[2] == 4 else channels.max(axis=2)
-    resized = cv2.resize((cover > 0).astype(np.float32), crop.resized, interpolation=cv2.INTER_AREA)
+    return (channels[..., 3] if channels.shape[2] == 4 else channels.max(axis=2)) > 0
+
+
+def _scaled(mask: Bool[np.ndarray, "h w"], crop: Crop) -> Bool[np.ndarray, "h w"]:
+    resized = cv2.resize(mask.astype(np.float32), crop.resized, interpolation=cv2.INTER_AREA)
     (x, y), (width, height) = crop.offset, crop.size
     return resized[y : y + height, x : x + width] > FAINTEST_COVER

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,10 @@ from nurec_sim.errors import ClipError
 from nurec_sim.logs import calibration, fields
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.labels import IGNORED, is_movable, our_label
-from nurec_sim.logs.storage import Storage, checked_name
+from nurec_sim.logs.storage import META_FILE, Storage, checked_name, schema_of
+from nurec_sim.logs.stored import StoredFiles
 from nurec_sim.logs.sweeps import SweepRecord
-from nurec_sim.types import CameraModel, LidarModel, Matrix4, Pinhole, Rig, Spin, Track, Trajectory
+from nurec_sim.types import CameraModel, LidarModel, Matrix4, Pinhole, Rig, Track, Trajectory
 
 SCHEMA = "realdata-pack-1"
 LIDAR_ID = "lidar"
@@ -35,12 +37,27 @@ _TABLE_OF_WORDS = {
 }
 
 
-def read_pack(storage: Storage, meta: dict[str, Any]) -> Clip:
-    """A pack as a clip, its rig frame moved to the ground.
+class RealdataPackReader:
+    """Reads packs as clips, their rig frame moved to the ground (``types.LogReader``)."""
 
-    Raises:
-        ClipError: a file or a field is missing or wrong.
-    """
+    name = "realdata-pack"
+    description = f"a folder, or a .zip of one, whose {META_FILE} has the schema {SCHEMA!r}"
+
+    def can_open(self, path: Path) -> bool:
+        """Whether it is a pack."""
+        return schema_of(path) == SCHEMA
+
+    def open(self, path: Path) -> Clip:
+        """The pack as a clip.
+
+        Raises:
+            ClipError: a file or a field is missing or wrong.
+        """
+        storage = Storage(path)
+        return _read(storage, storage.read_json(META_FILE))
+
+
+def _read(storage: Storage, meta: dict[str, Any]) -> Clip:
     calib = storage.read_json(calibration.CALIBRATION_FILE)
     rig_from_ego = calibration.ground_shift(calib)
     ego_from_rig = geometry.inverse(rig_from_ego)
@@ -53,7 +70,8 @@ def read_pack(storage: Storage, meta: dict[str, Any]) -> Clip:
     }
     facts = {key: value for key, value in meta.items() if key != "schema"}
     lidars: dict[str, LidarModel] = {}
-    sweeps: list[SweepRecord] = []
+    sweeps: dict[str, list[SweepRecord]] = {}
+    scale, lidar_from_file = FULL_BYTE, np.eye(4)
     if calib.get("lidar") is not None:
         rate = fields.number("meta.json", meta, "rate_hz", default=10.0)
         lidar, lidar_from_file, note = _lidar(calib["lidar"], rig_from_ego, rate)
@@ -62,7 +80,7 @@ def read_pack(storage: Storage, meta: dict[str, Any]) -> Clip:
         scale = calibration.positive_scale(f"{calibration.CALIBRATION_FILE}: lidar", calib["lidar"])
         if scale == 1:
             scale = FULL_BYTE  # "as in the source": bytes over their full range
-        sweeps = list(_sweeps(frames, lidar_from_file, scale, lidar.spin))
+        sweeps[LIDAR_ID] = list(_sweeps(frames, lidar_from_file))
     times = [_microseconds(f"frames.json: frame {i}", frame, "timestamp_s") for i, frame in enumerate(frames)]
     for index in range(1, len(times)):
         if times[index] <= times[index - 1]:
@@ -73,15 +91,15 @@ def read_pack(storage: Storage, meta: dict[str, Any]) -> Clip:
     world_from_ego = [
         fields.transform(f"frames.json: frame {i}", frame, "T_world_ego") for i, frame in enumerate(frames)
     ]
+    images = {name: list(_images(frames, name)) for name in cameras}
     return Clip(
         id=fields.of_kind("meta.json", meta, "name", str),
         rig=Rig(cameras, lidars),
         ego=Trajectory(np.array(times, np.int64), np.array(world_from_ego) @ ego_from_rig),
+        images=images,
+        sweeps=sweeps,
+        source=StoredFiles(storage, images, sweeps, {LIDAR_ID: scale}, lidar_from_file),
         tracks=_tracks(frames, times, world_from_ego),
-        road_map=None,
-        images={name: list(_images(frames, name)) for name in cameras},
-        sweeps={name: sweeps for name in lidars},
-        storage=storage,
         facts=facts,
         rig_from_log=rig_from_ego,
     )
@@ -132,7 +150,7 @@ def _lidar(row: Any, rig_from_ego: Matrix4, rate_hz: float) -> tuple[LidarModel,
     return dataclasses.replace(lidar, frequency_hz=rate_hz), lidar_from_file, note
 
 
-def _sweeps(frames: list[Any], lidar_from_file: Matrix4, scale: float, spin: Spin) -> Iterator[SweepRecord]:
+def _sweeps(frames: list[Any], lidar_from_file: Matrix4) -> Iterator[SweepRecord]:
     file_from_lidar = geometry.inverse(lidar_from_file)
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict) or frame.get("lidar") is None:
@@ -150,9 +168,7 @@ def _sweeps(frames: list[Any], lidar_from_file: Matrix4, scale: float, spin: Spi
             start_us=start_us,
             end_us=end_us,
             world_from_lidar=fields.transform(where, row, "T_world_lidar") @ file_from_lidar,
-            intensity_scale=scale,
             compensated=fields.of_kind(where, row, "motion_compensated", bool),
-            lidar_from_file=lidar_from_file,
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,17 +13,34 @@ from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.logs import calibration, fields, tables
 from nurec_sim.logs.clip import Clip, ImageRecord
-from nurec_sim.logs.storage import Storage, checked_name
+from nurec_sim.logs.storage import META_FILE, Storage, checked_name, schema_of
+from nurec_sim.logs.stored import StoredFiles
 from nurec_sim.logs.sweeps import SweepRecord
+from nurec_sim.logs.write import SCHEMA
 from nurec_sim.types import CameraModel, LidarModel, Matrix4, Trajectory
 
 
-def read_native(storage: Storage, meta: dict[str, Any]) -> Clip:
-    """A clip of our own format.
+class NativeReader:
+    """Reads clip folders (``types.LogReader``)."""
 
-    Raises:
-        ClipError: a file or a field is missing or wrong.
-    """
+    name = "nurec-sim-clip"
+    description = f"a folder, or a .zip of one, whose {META_FILE} has the schema {SCHEMA!r}"
+
+    def can_open(self, path: Path) -> bool:
+        """Whether it is a clip folder of ours."""
+        return schema_of(path) == SCHEMA
+
+    def open(self, path: Path) -> Clip:
+        """The clip.
+
+        Raises:
+            ClipError: a file or a field is missing or wrong.
+        """
+        storage = Storage(path)
+        return _read(storage, storage.read_json(META_FILE))
+
+
+def _read(storage: Storage, meta: dict[str, Any]) -> Clip:
     calib = storage.read_json(calibration.CALIBRATION_FILE)
     rig, scales = calibration.rig_from_json(calib)
     ego_from_rig = geometry.inverse(calibration.ground_shift(calib))
@@ -31,8 +49,10 @@ def read_native(storage: Storage, meta: dict[str, Any]) -> Clip:
         "frames.json: ego", fields.required("frames.json", frames, "ego"), "T_world_ego"
     )
     ego = Trajectory(recorded.t_us, recorded.world_from_body @ ego_from_rig)
-    images = _grouped(frames, "cameras", list(rig.cameras))
-    sweeps = _grouped(frames, "lidars", list(rig.lidars))
+    image_rows = _grouped(frames, "cameras", list(rig.cameras))
+    images = {name: list(_images(rows, rig.cameras[name], ego)) for name, rows in image_rows.items()}
+    sweep_rows = _grouped(frames, "lidars", list(rig.lidars))
+    sweeps = {name: list(_sweeps(rows, rig.lidars[name], ego)) for name, rows in sweep_rows.items()}
     tracks: list[Any] = []
     if storage.exists("tracks.json"):
         tracks = fields.of_kind("tracks.json", storage.read_json("tracks.json"), "tracks", list)
@@ -44,11 +64,11 @@ def read_native(storage: Storage, meta: dict[str, Any]) -> Clip:
         id=fields.of_kind("meta.json", meta, "name", str),
         rig=rig,
         ego=ego,
+        images=images,
+        sweeps=sweeps,
+        source=StoredFiles(storage, images, sweeps, scales),
         tracks=parsed,
         road_map=tables.map_from_json(storage.read_json("map.json")) if storage.exists("map.json") else None,
-        images={name: list(_images(rows, rig.cameras[name], ego)) for name, rows in images.items()},
-        sweeps={name: list(_sweeps(rows, rig.lidars[name], ego, scales[name])) for name, rows in sweeps.items()},
-        storage=storage,
         facts={key: value for key, value in meta.items() if key != "schema"},
         rig_from_log=geometry.inverse(ego_from_rig),
     )
@@ -88,7 +108,7 @@ def _pose_pair(where: str, row: Any) -> Float64[np.ndarray, "2 4 4"]:
     return np.stack([pose, pose])
 
 
-def _sweeps(rows: list[Any], lidar: LidarModel, ego: Trajectory, scale: float) -> Iterator[SweepRecord]:
+def _sweeps(rows: list[Any], lidar: LidarModel, ego: Trajectory) -> Iterator[SweepRecord]:
     for index, row in enumerate(rows):
         where = f"frames.json: LiDAR {lidar.id!r} sweep {index}"
         start_us, end_us = _interval(where, row)
@@ -104,6 +124,5 @@ def _sweeps(rows: list[Any], lidar: LidarModel, ego: Trajectory, scale: float) -
             start_us=start_us,
             end_us=end_us,
             world_from_lidar=pose,
-            intensity_scale=scale,
             compensated=fields.of_kind(where, row, "motion_compensated", bool, default=True),
         )

@@ -1,0 +1,77 @@
+"""Images and sweeps as our own clip folders store them: JPEG or PNG, and whole millimetres in .npz files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from nurec_sim import geometry
+from nurec_sim.errors import ClipError
+from nurec_sim.files.decoding import LIMITS
+from nurec_sim.logs.clip import ImageRecord
+from nurec_sim.logs.storage import Storage
+from nurec_sim.logs.sweeps import SweepRecord
+from nurec_sim.types import Matrix4, SweepPoints
+
+
+@dataclass(frozen=True)
+class StoredFiles:
+    """The files of a clip folder as a ``types.LogSource``.
+
+    Attributes:
+        storage: the folder or zip file.
+        images: records of each camera's frames.
+        sweeps: records of each LiDAR's sweeps.
+        intensity_scale: of each LiDAR: what stored intensities are divided by.
+        lidar_from_file: turns the axes of sweep files to ours (x forward).
+    """
+
+    storage: Storage
+    images: Mapping[str, Sequence[ImageRecord]]
+    sweeps: Mapping[str, Sequence[SweepRecord]]
+    intensity_scale: Mapping[str, float]
+    lidar_from_file: Matrix4 = field(default_factory=lambda: np.eye(4))
+
+    def image(self, camera_id: str, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        """One RGB frame."""
+        return self.storage.read_image(self.images[camera_id][index].file)
+
+    def sweep(self, lidar_id: str, index: int) -> SweepPoints:
+        """The points of one sweep."""
+        arrays = _checked_arrays(self.storage, self.sweeps[lidar_id][index].file)
+        xyz_m = np.cumsum(arrays["dxyz_mm"], axis=1, dtype=np.int64).T / 1000.0
+        intensity = arrays.get("intensity")
+        if intensity is not None:
+            intensity = np.clip(intensity / self.intensity_scale[lidar_id], 0.0, 1.0).astype(np.float32)
+        return SweepPoints(geometry.transform_points(self.lidar_from_file, xyz_m), intensity, arrays.get("dt_us"))
+
+    def ego_mask(self, camera_id: str) -> None:
+        """Clip folders have none."""
+        return None
+
+
+def encode_points(xyz_m: Float64[np.ndarray, "n 3"]) -> np.ndarray:
+    """Points as whole millimetres, each coordinate as the difference to the point before (``dxyz_mm``, int32)."""
+    millimetres = np.rint(np.asarray(xyz_m, np.float64) * 1000.0).astype(np.int64).T
+    return np.diff(millimetres, axis=1, prepend=0).astype(np.int32)
+
+
+def _checked_arrays(storage: Storage, file: str) -> dict[str, np.ndarray]:
+    arrays = storage.read_arrays(file)
+    points = arrays.get("dxyz_mm")
+    if points is None or points.ndim != 2 or points.shape[0] != 3 or points.dtype.kind not in "iu":
+        found = "nothing" if points is None else f"{points.dtype} {points.shape}"
+        raise ClipError(f"{storage.path.name}: {file} needs whole numbers dxyz_mm [3,n], got {found}")
+    if points.shape[1] > LIMITS.sweep_points:
+        raise ClipError(
+            f"{storage.path.name}: {file} has {points.shape[1]:,} points; a sweep may have {LIMITS.sweep_points:,}"
+        )
+    for name in ("intensity", "dt_us"):
+        if name in arrays and arrays[name].shape != points.shape[1:]:
+            raise ClipError(
+                f"{storage.path.name}: {file} has {points.shape[1]} points but {name} of shape {arrays[name].shape}"
+            )
+    return arrays

@@ -1,0 +1,49 @@
+"""What a reconstruction method is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from nurec_sim.types.logs import Clip
+from nurec_sim.types.scenes import GaussianScene
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the fraction of all work that is done, about; it may raise to end the work."""
+
+
+class Method(Protocol):
+    """Turns a driving log into a Gaussian scene (docs/write_a_method.md)."""
+
+    name: str
+    """As in ``reconstruct --method NAME`` and in the provenance of its scenes."""
+    settings: type[Any]
+    """A frozen dataclass, documented field by field, every field with a default."""
+
+    def files(self, settings: Any) -> Sequence[Path]:
+        """Files beside the log that the result depends on, weights for instance; scenes are kept until they change."""
+        ...
+
+    def reconstruct(
+        self,
+        clip: Clip,
+        settings: Any,
+        *,
+        cameras: Sequence[str] | None,
+        hold_out_sweeps: Collection[int],
+        progress: Progress,
+    ) -> GaussianScene:
+        """The scene of a log.
+
+        Args:
+            clip: the driving log.
+            settings: an instance of the class ``settings``.
+            cameras: ids of the cameras whose images may be read, all of the rig; None leaves the choice to the method.
+            hold_out_sweeps: indices of sweeps that must not be read, of every LiDAR.
+            progress: see ``Progress``.
+
+        Raises:
+            ReconstructError: the log lacks what the method needs.
+        """
+        ...
