@@ -13,8 +13,9 @@ from render_scenes import START_US, camera, cloud, moved, moving_cloud, request,
 
 from nurec_sim import geometry, sensors
 from nurec_sim.render import CpuRenderer, spec
-from nurec_sim.render.cpu import pipeline
+from nurec_sim.render.cpu import pipeline, sensor_tables
 from nurec_sim.render.cpu import renderer as renderer_module
+from nurec_sim.render.cpu.grid import make_grid
 from nurec_sim.sensors import camera as camera_rays
 from nurec_sim.types import Fisheye, FTheta, FThetaReference, Pinhole, Shutter
 
@@ -81,6 +82,32 @@ def test_the_mixture_has_something_to_see(alone):
 @pytest.mark.parametrize("threads", [1, 2, 3, 7])
 def test_same_bytes_at_any_thread_count(world, alone, threads):
     assert_same_bytes(CpuRenderer(world, threads=threads).sense(list(mixture())), alone)
+
+
+def test_tables_of_one_sensor_do_not_wait_for_those_of_another(monkeypatch):
+    """A job that pauses while it makes tables goes on only when the job that runs meanwhile has ended."""
+    paused, ended, tile_rays = threading.Event(), threading.Event(), sensor_tables.tile_rays
+
+    def pause(grid):
+        if threading.current_thread() is slow:
+            paused.set()
+            assert ended.wait(20)
+        return tile_rays(grid)
+
+    monkeypatch.setattr(sensor_tables, "tile_rays", pause)
+    first, second = (sensor_tables.SensorTables(make_grid(camera(32, 16 * k))) for k in (1, 2))
+    slow = threading.Thread(target=lambda: first.rays)
+    quick = threading.Thread(target=lambda: (second.rays, ended.set()))
+    slow.start()
+    assert paused.wait(20)
+    quick.start()
+    quick.join(10)
+    waited = not ended.is_set()
+    ended.set()
+    slow.join()
+    quick.join()
+    assert not waited
+    assert first.rays is first.rays
 
 
 def test_a_batch_gives_what_one_by_one_gives_in_any_order(world, alone):

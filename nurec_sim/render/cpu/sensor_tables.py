@@ -27,10 +27,15 @@ class SensorTables:
 
     grid: Grid
 
-    @cached_property
+    @property
     def rays(self) -> RayTiles:
         """The rays as the blending kernels read them."""
-        return tile_rays(self.grid)
+        # Before Python 3.12 ``cached_property`` holds a lock of all instances while it computes. ``tile_rays`` lets
+        # other jobs of a server run meanwhile; one that needs this lock would never let it run again.
+        kept = vars(self)
+        if "_rays" not in kept:
+            kept["_rays"] = tile_rays(self.grid)
+        return kept["_rays"]
 
     @cached_property
     def ray_z(self) -> Float32[np.ndarray, "h w"]:
