@@ -75,7 +75,7 @@ def make_renderer(
     from nurec_sim.render.gpu.launcher import shared_launcher
     from nurec_sim.render.gpu.renderer import GpuRenderer
 
-    return GpuRenderer(scene, shared_launcher(chosen), apply_isp)
+    return GpuRenderer(scene, shared_launcher(chosen), apply_isp, detail_px)
 
 
 @functools.cache

@@ -136,6 +136,16 @@ def choose_blocks(
     return chosen[::-1]
 
 
+def check_detail(tolerance_px: float) -> None:
+    """Check a tolerance.
+
+    Raises:
+        ValueError: it is negative or not finite.
+    """
+    if not 0 <= tolerance_px < np.inf:
+        raise ValueError(f"detail_px must be finite and not negative, got {tolerance_px}")
+
+
 def ray_spacing(direction: Float32[np.ndarray, "h w 3"]) -> float:
     """Usual angle in radians between neighbouring unit rays, along the middle row and the middle column of a grid."""
     height, width = direction.shape[:2]

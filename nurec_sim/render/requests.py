@@ -9,10 +9,13 @@ from jaxtyping import Bool, Float64
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import OutOfRangeError, RequestError, TooLargeError
+from nurec_sim.render.cpu.grid import grid_key
 from nurec_sim.types import CameraModel, GaussianScene, LidarModel, SensorRequest
 
 MAX_SIDE_PX = 8192
 MAX_RAYS = 7680 * 4320
+MOST_KNOWN = 1024
+"""Sensors that need no second check, at most."""
 CAMERA_OUTPUTS = ("rgb", "depth", "alpha", "label", "normal")
 SENSED_OUTPUTS = ("rgb", "depth", "alpha", "label")
 """What ``sense`` asks of cameras."""
@@ -34,7 +37,19 @@ def check_request(request: SensorRequest, scene: GaussianScene) -> None:
         TooLargeError: more pixels or beams than allowed.
         OutOfRangeError: the exposure does not lie within ``scene.span_us``, its end included as an instant.
     """
-    sensor = request.sensor
+    check_sensor(request.sensor)
+    check_pose_pair(f"sensor {request.sensor.id!r}: world_from_sensor", request.world_from_sensor)
+    _check_actors(request)
+    _check_exposure(request, scene)
+
+
+def check_sensor(sensor: CameraModel | LidarModel) -> None:
+    """Check a sensor.
+
+    Raises:
+        RequestError: it is malformed.
+        TooLargeError: more pixels or beams than allowed.
+    """
     if not isinstance(sensor, (CameraModel, LidarModel)):
         raise RequestError(f"the sensor must be a CameraModel or a LidarModel, got {type(sensor).__name__}")
     try:
@@ -53,8 +68,9 @@ def check_request(request: SensorRequest, scene: GaussianScene) -> None:
             f"sensor {sensor.id!r}: {width} x {height} {what} are too many; "
             f"at most {MAX_SIDE_PX} a side and {MAX_RAYS} in all"
         )
-    check_pose_pair(f"sensor {sensor.id!r}: world_from_sensor", request.world_from_sensor)
-    _check_actors(request)
+
+
+def _check_exposure(request: SensorRequest, scene: GaussianScene) -> None:
     if request.end_us <= request.start_us:
         raise RequestError(f"an exposure must end after it starts, got [{request.start_us}, {request.end_us}) us")
     first, end = scene.span_us
@@ -63,6 +79,69 @@ def check_request(request: SensorRequest, scene: GaussianScene) -> None:
             f"scene {scene.id!r} covers [{first}, {end}] us, the request asks for "
             f"[{request.start_us}, {request.end_us})"
         )
+
+
+def sensor_key(sensor: CameraModel | LidarModel) -> tuple | None:
+    """All that ``check_sensor`` looks at, as something hashable; None if the sensor is malformed.
+
+    A sensor whose key was seen before needs no other check.
+    """
+    try:
+        pose = np.asarray(sensor.rig_from_camera if isinstance(sensor, CameraModel) else sensor.rig_from_lidar)
+        key = (pose.shape, pose.dtype.char, pose.tobytes(), grid_key(sensor))
+        hash(key)
+    except (AttributeError, TypeError, ValueError):
+        return None
+    return key
+
+
+def check_requests(
+    requests: Sequence[SensorRequest], scene: GaussianScene, known: set[tuple | None]
+) -> tuple[Float64[np.ndarray, "n 2 4 4"], Float64[np.ndarray, "m 2 4 4"]]:
+    """``check_request`` of many, their poses all at once.
+
+    Args:
+        requests: what is asked for.
+        scene: of what.
+        known: keys of sensors that were checked before (``sensor_key``); gets those that are checked now.
+
+    Returns:
+        Poses of the sensors, and of all actors, request after request.
+
+    Raises:
+        RequestError, OutOfRangeError, TooLargeError: see ``check_request``.
+    """
+    pairs = [request.world_from_sensor for request in requests]
+    for request in requests:
+        pairs.extend(request.actors.values())
+    poses = _stacked(pairs)
+    first, end = scene.span_us
+    sound = all(first <= r.start_us < r.end_us <= end + 1 for r in requests)
+    keys = {sensor_key(request.sensor) for request in requests}
+    if poses is None or not sound or not keys <= known:
+        for request in requests:
+            check_request(request, scene)
+        poses = np.array(pairs, np.float64)
+        if len(known) > MOST_KNOWN:
+            known.clear()
+        known |= keys
+    return poses[: len(requests)], poses[len(requests) :]
+
+
+def _stacked(pairs: Sequence[np.ndarray]) -> Float64[np.ndarray, "n 2 4 4"] | None:
+    """Pairs of poses in one array; None if one of them is not [2,4,4], not finite, or not rigid."""
+    try:
+        if not {2}.issuperset(map(len, pairs)):
+            return None
+        poses = np.concatenate(pairs)
+    except (TypeError, ValueError):
+        return None
+    if poses.shape != (2 * len(pairs), 4, 4) or poses.dtype.kind not in "fiu":
+        return None
+    poses = poses.astype(np.float64, copy=False)
+    if not (geometry.are_rotations(poses[:, :3, :3]) & are_affine(poses)).all():
+        return None
+    return poses.reshape(-1, 2, 4, 4)
 
 
 def check_outputs(outputs: Sequence[str]) -> None:
@@ -101,11 +180,8 @@ def _check_actors(request: SensorRequest) -> None:
     """``check_pose_pair`` of every actor, all at once."""
     if not request.actors:
         return
-    pairs = [np.asarray(pair) for pair in request.actors.values()]
-    if all(pair.shape == (2, 4, 4) and pair.dtype.kind in "fiu" for pair in pairs):
-        poses = np.array(pairs, np.float64).reshape(-1, 4, 4)
-        if (geometry.are_rotations(poses[:, :3, :3]) & are_affine(poses)).all():
-            return
+    if _stacked([np.asarray(pair) for pair in request.actors.values()]) is not None:
+        return
     for name, pair in request.actors.items():  # one of them is wrong
         check_pose_pair(f"actor {name!r}: world_from_box", pair)
 

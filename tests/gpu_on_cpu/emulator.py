@@ -12,13 +12,13 @@ import numpy as np
 import torch
 
 from nurec_sim.render.gpu.compiler import KERNEL_FOLDER, kernel_names, translation_unit
-from nurec_sim.render.gpu.launcher import THREADS, as_scalar
+from nurec_sim.render.gpu.launcher import THREADS, TorchOperations, as_scalar
 from nurec_sim.render.gpu.views import VIEW
 
 HERE = Path(__file__).parent
 
 
-class EmulatedLauncher:
+class EmulatedLauncher(TorchOperations):
     """A ``Launcher`` whose device is the CPU; one kernel at a time."""
 
     device = torch.device("cpu")

@@ -22,7 +22,7 @@ from nurec_sim.render.cpu.pipeline import NO_TABLE, FrameStats, Picture, blocks_
 from nurec_sim.render.cpu.sensor_tables import SensorCache, SensorTables
 from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.cpu.workers import Buffers, Scratch, Workers
-from nurec_sim.render.lod import Detail
+from nurec_sim.render.lod import Detail, check_detail
 from nurec_sim.render.rays import actors_at, reference_pose
 from nurec_sim.render.requests import (
     SENSED_OUTPUTS,
@@ -69,8 +69,7 @@ class CpuRenderer:
     ) -> None:
         if threads is not None and threads < 1:
             raise ValueError(f"a renderer needs at least 1 thread, got {threads}")
-        if not 0 <= detail_px < np.inf:
-            raise ValueError(f"detail_px must be finite and not negative, got {detail_px}")
+        check_detail(detail_px)
         self.scene = scene
         self.apply_isp = apply_isp
         self._workers = Workers(threads or usable_cores())

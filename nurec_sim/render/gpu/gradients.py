@@ -20,12 +20,12 @@ from nurec_sim.errors import RequestError
 from nurec_sim.render import torch_maths
 from nurec_sim.render.cpu.backward.gradients import CameraImages, GaussianTensors, LidarImages
 from nurec_sim.render.cpu.grid import make_grid
-from nurec_sim.render.cpu.pack import MAX_OPACITY, MIN_SCALE_M
+from nurec_sim.render.cpu.pack import BLOCK, MAX_OPACITY, MIN_SCALE_M
 from nurec_sim.render.gpu.launcher import CudaLauncher, Launcher
-from nurec_sim.render.gpu.pipeline import ALPHA, DISTANCE, HALF, Blocks, draw, draw_backward
+from nurec_sim.render.gpu.pipeline import ALPHA, DISTANCE, HALF, Blocks, Drawn, Room, Rooms, draw, draw_backward
 from nurec_sim.render.gpu.sky_lookup import sky_colour
 from nurec_sim.render.gpu.tensors import blocks_of
-from nurec_sim.render.gpu.views import Batch, GridTensors, SensorView, make_batch, rotation_vector
+from nurec_sim.render.gpu.views import Batch, GridTensors, make_batch, rotation_vector, view_rows
 from nurec_sim.render.spec import MIN_ALPHA, SURFACE_ALPHA
 from nurec_sim.types import CameraModel, LidarModel
 
@@ -52,6 +52,7 @@ class DifferentiableRenderer:
         self.device = self._launcher.device
         self._grids = [GridTensors.of(make_grid(sensor), self.device) for sensor in sensors]
         self._lidar = isinstance(sensors[0], LidarModel)
+        self._rooms = Rooms()
         self._no_sky = torch.zeros((6, 1, 1, 3), device=self.device)
 
     def render(
@@ -75,13 +76,14 @@ class DifferentiableRenderer:
             *(_poses(poses, grid.grid.reference) for poses, grid in zip(world_from_sensor, self._grids, strict=True)),
             strict=True,
         )
-        views = [SensorView(grid, pair) for grid, pair in zip(self._grids, pairs, strict=True)]
-        batch = make_batch(views, self._no_sky)
+        rows = view_rows(self._grids, np.array(pairs))
+        rows["sky"], rows["sky_size"] = self._no_sky.data_ptr(), 1
+        batch = make_batch(self._grids, rows, self._launcher.upload(rows.view(np.uint8)), self._no_sky)
         planes = _Blend.apply(
-            self._launcher, batch, gaussians.mean_m, gaussians.quat_wxyz, gaussians.scale_m, gaussians.opacity,
-            self._features(gaussians, references[0]), *references,
+            self._launcher, batch, self._rooms, gaussians.mean_m, gaussians.quat_wxyz, gaussians.scale_m,
+            gaussians.opacity, self._features(gaussians, references[0]), *references,
         )  # fmt: skip
-        parts = [planes[:, batch.first_ray[k] : batch.first_ray[k + 1]] for k in range(len(views))]
+        parts = [planes[:, batch.first_ray[k] : batch.first_ray[k + 1]] for k in range(batch.view_count)]
         if self._lidar:
             return [_sweep(part, grid) for part, grid in zip(parts, self._grids, strict=True)]
         return [
@@ -159,6 +161,7 @@ class _Blend(torch.autograd.Function):
         ctx: Any,
         launcher: Launcher,
         batch: Batch,
+        rooms: Rooms,
         mean: Tensor,
         quat: Tensor,
         scale: Tensor,
@@ -167,7 +170,12 @@ class _Blend(torch.autograd.Function):
         *references: Tensor,
     ) -> Tensor:
         static = blocks_of(mean, quat, scale, opacity, features, launcher.device)
-        drawn = draw(launcher, batch, static, Blocks.none(launcher.device), keep_rows=True)
+
+        def attempt(room: Room) -> tuple[np.ndarray, Drawn]:
+            drawn = draw(launcher, batch, static, Blocks.none(launcher.device), room, keep_rows=True)
+            return launcher.read(drawn.totals), drawn
+
+        drawn = rooms.until_it_fits(batch.ray_count, Room.first(batch.view_count * len(static) * BLOCK), attempt)
         ctx.save_for_backward(mean, quat, scale, opacity)
         ctx.stages = launcher, batch, static, drawn
         ctx.references = references
@@ -179,7 +187,7 @@ class _Blend(torch.autograd.Function):
         launcher, batch, static, drawn = ctx.stages
         mean, quat, scale, opacity = ctx.saved_tensors
         rows, by_view = draw_backward(
-            launcher, batch, static, drawn, grads[0].float(), each_view=any(ctx.needs_input_grad[7:])
+            launcher, batch, static, drawn, grads[0].float(), each_view=any(ctx.needs_input_grad[8:])
         )
         rows = rows[:, : len(opacity)]
         length = quat.float().norm(dim=1, keepdim=True).clamp(min=1e-12)
@@ -198,7 +206,7 @@ class _Blend(torch.autograd.Function):
             _pose_gradient(mean, unit, part[:, : len(opacity)], reference)
             for part, reference in zip(by_view, ctx.references, strict=False)
         ]
-        return None, None, *results, *(poses or [None] * len(ctx.references))
+        return None, None, None, *results, *(poses or [None] * len(ctx.references))
 
 
 def _pose_gradient(mean: Tensor, unit_quat: Tensor, rows: Tensor, reference: Tensor) -> Float64[Tensor, "4 4"]:

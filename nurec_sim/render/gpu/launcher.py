@@ -34,8 +34,53 @@ class Launcher(Protocol):
         """Run a kernel on ``grid`` blocks (x, y) of ``THREADS`` threads; nothing if there are none."""
         ...
 
+    def upload(self, data: np.ndarray) -> torch.Tensor:
+        """A copy on the device; does not wait for it."""
+        ...
 
-class CudaLauncher:
+    def sort(self, keys: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Sorted keys and their places before; equal keys keep their order."""
+        ...
+
+    def running_sum(self, counts: torch.Tensor) -> torch.Tensor:
+        """Running sums as int64."""
+        ...
+
+    def read(self, tensor: torch.Tensor) -> np.ndarray:
+        """A copy on the host. Waits for the device; nothing else does."""
+        ...
+
+
+class TorchOperations:
+    """What a ``Launcher`` does besides running kernels, by torch on any device."""
+
+    device: torch.device
+
+    def upload(self, data: np.ndarray) -> torch.Tensor:
+        """See ``Launcher``."""
+        import torch
+
+        return torch.from_numpy(data).to(self.device)
+
+    def sort(self, keys: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """See ``Launcher``."""
+        import torch
+
+        ordered, places = torch.sort(keys, stable=True)
+        return ordered, places
+
+    def running_sum(self, counts: torch.Tensor) -> torch.Tensor:
+        """See ``Launcher``."""
+        import torch
+
+        return torch.cumsum(counts, 0, dtype=torch.int64)
+
+    def read(self, tensor: torch.Tensor) -> np.ndarray:
+        """See ``Launcher``."""
+        return tensor.cpu().numpy()
+
+
+class CudaLauncher(TorchOperations):
     """Runs kernels on a CUDA device, on torch's current stream.
 
     Args:
@@ -67,6 +112,12 @@ class CudaLauncher:
         config = self._core.LaunchConfig(grid=grid, block=THREADS)
         values = [as_scalar(argument, self.device) for argument in arguments]
         self._core.launch(_TorchStream(self.device), config, self._kernels[kernel], *values)
+
+    def upload(self, data: np.ndarray) -> torch.Tensor:
+        """See ``Launcher``; copies from pinned memory, because a copy from other memory waits for the device."""
+        import torch
+
+        return torch.from_numpy(data).pin_memory().to(self.device, non_blocking=True)
 
 
 @functools.lru_cache

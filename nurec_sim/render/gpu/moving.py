@@ -2,34 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Int32
 
-from nurec_sim import geometry
 from nurec_sim.render.cpu.pack import BLOCK, FIELDS, LOG_OPACITY, MAX_OPACITY, gaussian_columns, to_blocks
-from nurec_sim.render.gpu.launcher import Launcher
+from nurec_sim.render.gpu.launcher import THREADS, Launcher
 from nurec_sim.render.gpu.pipeline import Blocks
 from nurec_sim.render.gpu.views import Batch
 from nurec_sim.render.layers import drawable
-from nurec_sim.render.rays import reference_pose
 from nurec_sim.types import DynamicGaussians, SensorRequest, Track
 
 if TYPE_CHECKING:
     import torch
 
-MOTION = np.dtype(
-    [
-        ("rotation", np.float64, (3, 3)),
-        ("translation", np.float64, 3),
-        ("quat", np.float32, 4),
-        ("moved", np.float32),
-        ("gone", np.float32),
-    ]
-)
-"""The struct ``Motion`` of ``kernels/moving.cu``, field by field."""
+MOTION_BYTES = 120
+"""Of the struct ``Motion`` of ``kernels/moving.cu``."""
+NOT_ASKED, HIDDEN = -1, -2
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +30,8 @@ class MovingLayer:
 
     ``fields`` [b,21,256] are those of the middle knots with opacities that are not capped, ``sh_rest`` [b,3k,256] or
     [0,0,0], ``knot_m`` [b,9,256], ``knot_us`` [b,3,256] and ``track`` [b,256]. Gaussians in the box of track k have
-    ``track`` k plus the number of tracks.
+    ``track`` k plus the number of tracks. Recorded paths lie one after the other: samples ``path_first[k]`` to
+    ``path_first[k + 1] - 1`` of ``path_us`` and ``path`` [samples,4,4] are those of track k.
     """
 
     fields: torch.Tensor
@@ -46,7 +39,10 @@ class MovingLayer:
     knot_m: torch.Tensor
     knot_us: torch.Tensor
     track: torch.Tensor
-    tracks: Sequence[Track]
+    path_first: torch.Tensor
+    path_us: torch.Tensor
+    path: torch.Tensor
+    number_of: Mapping[str, int]
 
     def __len__(self) -> int:
         """Number of blocks."""
@@ -77,51 +73,50 @@ class MovingLayer:
             to_blocks(dynamic.knot_m[chosen].reshape(len(chosen), 9), blocks),
             np.ascontiguousarray(times.reshape(blocks, BLOCK, 3).transpose(0, 2, 1)),
             track,
+            np.cumsum([0, *(len(each.path.t_us) for each in tracks)], dtype=np.int32),
+            np.concatenate([np.zeros(0, np.int64), *(each.path.t_us for each in tracks)]),
+            np.concatenate([np.zeros((0, 4, 4)), *(each.path.world_from_body for each in tracks)]),
         )
-        fields, sh, knot_m, knot_us, of_track = (torch.from_numpy(array).to(device) for array in arrays)
-        return cls(fields, sh, knot_m, knot_us, of_track, tracks)
+        on_device = (torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in arrays)
+        return cls(*on_device, number_of={each.id: k for k, each in enumerate(tracks)})  # type: ignore[misc]
 
-    def placed(self, launcher: Launcher, batch: Batch, requests: Sequence[SensorRequest]) -> Blocks:
-        """The layer as each sensor of a batch sees it, view after view."""
+    def asked(self, requests: Sequence[SensorRequest]) -> Int32[np.ndarray, "views tracks"]:
+        """Which of all actors' pairs, request after request, poses each track anew; NOT_ASKED, or HIDDEN."""
+        table = np.full((len(requests), len(self.number_of)), NOT_ASKED, np.int32)
+        number, first = self.number_of, 0
+        for row, request in zip(table, requests, strict=True):
+            tracks = np.array([number.get(name, -1) for name in request.actors], np.int64)
+            known = tracks >= 0
+            row[tracks[known]] = first + np.flatnonzero(known)
+            first += len(tracks)
+            hidden = [number[name] for name in request.hidden if name in number]
+            if hidden:
+                row[hidden] = HIDDEN
+        return table
+
+    def placed(self, launcher: Launcher, batch: Batch, asked: torch.Tensor, pairs: torch.Tensor) -> Blocks:
+        """The layer as each sensor of a batch sees it, view after view.
+
+        Args:
+            launcher: runs the kernels.
+            batch: the sensors.
+            asked: see there; on the device.
+            pairs: [n,2,4,4] float64 on the device.
+        """
         import torch
 
+        device, tracks, empty = launcher.device, len(self.number_of), Blocks.none(launcher.device)
         if len(self) == 0:
-            return Blocks.none(launcher.device)
-        views = len(requests)
-        motions = np.zeros((views, max(2 * len(self.tracks), 1)), MOTION)
-        instants = np.zeros(views, np.int64)
-        for k, (request, sensor) in enumerate(zip(requests, batch.sensors, strict=True)):
-            reference = sensor.tensors.grid.reference
-            _, instants[k] = reference_pose(request, reference)
-            self._fill(motions[k], request, reference, int(instants[k]))
-        device = launcher.device
+            return empty
+        views = batch.view_count
+        motions = torch.empty(views * 2 * tracks * MOTION_BYTES, dtype=torch.uint8, device=device)
+        launcher.launch(
+            "move_tracks", (-(-tracks // THREADS), views), batch.views, tracks, asked, pairs, self.path_first,
+            self.path_us, self.path, motions,
+        )  # fmt: skip
         fields = torch.empty((views * len(self), FIELDS, BLOCK), device=device)
         launcher.launch(
             "place_moving", (len(self), views), batch.views, self.fields, self.sh_rest, self.sh_rest.shape[1] // 3,
-            self.knot_m, self.knot_us, self.track, torch.from_numpy(motions.view(np.uint8)).to(device),
-            motions.shape[1], torch.from_numpy(instants).to(device), float(np.log(MAX_OPACITY)), fields,
+            self.knot_m, self.knot_us, self.track, motions, 2 * tracks, float(np.log(MAX_OPACITY)), fields,
         )  # fmt: skip
-        empty = Blocks.none(device)
         return Blocks(fields, empty.sh_rest, empty.spheres)
-
-    def _fill(self, motions: np.ndarray, request: SensorRequest, reference: float, t_us: int) -> None:
-        """Where each track's Gaussians are shown, those in the world first, then those in its box."""
-        for k, track in enumerate(self.tracks):
-            if track.id in request.hidden:
-                for row in (motions[k], motions[k + len(self.tracks)]):
-                    row["moved"] = row["gone"] = 1
-                continue
-            recorded, pair = track.path.at(t_us), request.actors.get(track.id)
-            shown = recorded
-            if pair is not None:
-                shown = geometry.interpolate_pose_pair(np.asarray(pair, np.float64), np.array(reference))
-                _move(motions[k], shown @ geometry.inverse(recorded))
-            boxed = motions[k + len(self.tracks)]
-            _move(boxed, shown)
-            boxed["gone"] = pair is None and not track.path.covers(t_us)
-
-
-def _move(row: np.void, new_from_given: np.ndarray) -> None:
-    row["rotation"], row["translation"] = new_from_given[:3, :3], new_from_given[:3, 3]
-    row["quat"] = geometry.quat_from_matrix(new_from_given[:3, :3])
-    row["moved"] = 1

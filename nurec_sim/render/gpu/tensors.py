@@ -19,7 +19,7 @@ from nurec_sim.render.cpu.pack import (
     QUAT,
     SCALE,
 )
-from nurec_sim.render.gpu.pipeline import Blocks
+from nurec_sim.render.gpu.pipeline import SPHERE, Blocks
 
 EVERYWHERE_M = 1e30
 """Radius of a sphere that no view can miss."""
@@ -61,6 +61,7 @@ def blocks_of(
     rows[:, INTENSITY : INTENSITY + 3] = given[:, 10:13]
     rows[:, LOG_OPACITY] = torch.where(sound, given[:, 13].clamp(max=MAX_OPACITY).log(), NEVER_SEEN)
     fields = columns.reshape(blocks, BLOCK, FIELDS).transpose(1, 2).contiguous()
-    spheres = torch.zeros((blocks, 4), device=device)
+    spheres = torch.zeros((blocks, SPHERE), device=device)
     spheres[:, 3] = EVERYWHERE_M
+    spheres.view(torch.int32)[:, 5] = -1
     return Blocks(fields, torch.zeros((0, 0, 0), device=device), spheres)

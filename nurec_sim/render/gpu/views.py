@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
 from nurec_sim import geometry
 from nurec_sim.render.cpu.grid import LENS, LIDAR, Grid
@@ -25,6 +25,7 @@ from nurec_sim.render.cpu.project.charts import (
     PERIOD,
     TEXELS,
 )
+from nurec_sim.render.lod import ray_spacing
 
 if TYPE_CHECKING:
     import torch
@@ -36,6 +37,8 @@ _POINTER = np.dtype(np.uint64)
 VIEW = np.dtype(
     [
         ("eye", np.float64, 3),
+        ("reference", np.float64),
+        ("instant_us", np.int64),
         ("rays", _POINTER),
         ("table", _POINTER),
         ("sky", _POINTER),
@@ -46,6 +49,8 @@ VIEW = np.dtype(
         ("params", np.float32, 5),
         ("isp", np.float32, 12),
         ("end_from_reference", np.float32, 12),
+        ("range_m", np.float32, 2),
+        ("detail", np.float32),
         ("near_m", np.float32),
         ("field_cos", np.float32),
         *((name, np.int32) for name in (
@@ -63,16 +68,16 @@ class GridTensors:
     """A sensor's grid of rays on the device; immutable.
 
     ``rays`` [h,w,4] holds unit directions in the sensor (zero where there is no ray) and the instant of each ray, in
-    exposures after the reference instant. ``table`` leads from directions to places: [s,s,2] of a lens, [t] of a LiDAR;
-    ``params`` are its parameters (``kernels/bounds.cuh``).
+    exposures after the reference instant. ``table`` leads from directions to places: [s,s,2] of a lens, [t] of a LiDAR.
+    ``row`` are the bytes of a ``VIEW`` with all that depends on the sensor alone.
     """
 
     grid: Grid
     rays: torch.Tensor
     table: torch.Tensor
-    params: Float32[np.ndarray, " p"]
     beam: torch.Tensor
     timed: bool
+    row: bytes
 
     @classmethod
     def of(cls, grid: Grid, device: torch.device) -> GridTensors:
@@ -83,105 +88,88 @@ class GridTensors:
         direction = np.where(grid.valid[..., None] != 0, grid.direction, 0)
         rays = np.concatenate([direction, instant[..., None]], axis=-1).astype(np.float32)
         beam = np.zeros(1, np.int32) if grid.beam is None else grid.beam
-
-        def on_device(array: np.ndarray) -> torch.Tensor:
-            return torch.from_numpy(np.ascontiguousarray(array)).to(device)
-
         table, params = np.zeros(1, np.float32), grid.intrinsics
         if grid.kind == LENS:
             table, params = grid.chart.places[..., :2], grid.chart.params[[TEXELS, MIDDLE, MISFIT]]
         elif grid.kind == LIDAR:
             table = grid.chart.places.reshape(-1)
             params = grid.chart.params[[PER_RADIAN, AZIMUTH, PERIOD, LEAST_AHEAD, MOST_AHEAD]]
-        timed = bool(np.any(instant != 0))
-        return cls(grid, on_device(rays), on_device(table), params, on_device(beam), timed)
-
-
-@dataclass(frozen=True, eq=False)
-class SensorView:
-    """One sensor of a batch: its grid, its poses at both ends of the exposure, and its share of the moving layer."""
-
-    tensors: GridTensors
-    world_from_sensor: Float64[np.ndarray, "2 4 4"]
-    isp: Float32[np.ndarray, "3 4"] | None = None
-    first_block: int = 0
-    blocks: int = 0
+        tensors = [torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in (rays, table, beam)]
+        row = np.zeros(1, VIEW)
+        row["rays"], row["table"], row["beam"] = (tensor.data_ptr() for tensor in tensors)
+        row["params"][0, : len(params)] = params
+        row["isp"] = np.eye(3, 4).ravel()
+        height, width = grid.valid.shape
+        row["rows"], row["columns"] = height, width
+        row["tile_rows"], row["tile_columns"] = -(-height // TILE), -(-width // TILE)
+        row["table_size"], row["reference"], row["detail"] = len(table), grid.reference, ray_spacing(grid.direction)
+        row["near_m"], row["field_cos"], row["by_range"] = grid.near_m, grid.field_cos, grid.by_range
+        row["kind"], row["intensity"] = grid.kind, grid.kind == LIDAR
+        return cls(grid, tensors[0], tensors[1], tensors[2], bool(np.any(instant != 0)), row.tobytes())
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
     """Sensors that are drawn together; their rays and tiles are numbered on.
 
-    ``views`` holds the bytes of one ``VIEW`` each, ``tile_view`` the sensor of each tile; the rays of sensor k begin at
-    ``first_ray[k]``, the last entry is ``ray_count``. Each sensor has at most ``moving_blocks`` of the moving layer.
+    ``views`` holds the bytes of one ``VIEW`` each; the rays of sensor k begin at ``first_ray[k]``, the last entry is
+    ``ray_count``. Each sensor has ``moving_blocks`` of the moving layer. ``largest_grid`` are the cells of the largest
+    sensor.
     """
 
-    sensors: Sequence[SensorView]
     views: torch.Tensor
-    tile_view: torch.Tensor
     first_ray: np.ndarray
+    view_count: int
     ray_count: int
+    tile_count: int
+    largest_grid: int
     moving_blocks: int
-    keep: tuple[torch.Tensor, ...]
-    """Tensors whose addresses ``views`` holds."""
-
-    @property
-    def largest_grid(self) -> int:
-        """Cells of the largest sensor."""
-        return int(np.diff(self.first_ray).max())
+    keep: tuple[Any, ...]
+    """What owns the tensors whose addresses ``views`` holds."""
 
 
-def make_batch(sensors: Sequence[SensorView], sky: torch.Tensor) -> Batch:
-    """Put sensors together; ``sky`` [6,s,s,3] float32 lies on their device."""
-    import torch
-
-    rows = np.zeros(len(sensors), VIEW)
-    cells: list[int] = []
-    tiles: list[int] = []
-    for row, sensor in zip(rows, sensors, strict=True):
-        row["first_ray"], row["first_tile"] = sum(cells), sum(tiles)
-        _fill(row, sensor)
-        row["sky"], row["sky_size"] = sky.data_ptr(), sky.shape[1]
-        cells.append(int(row["rows"]) * int(row["columns"]))
-        tiles.append(int(row["tile_rows"]) * int(row["tile_columns"]))
-    device = sky.device
-    return Batch(
-        sensors=sensors,
-        views=torch.from_numpy(rows.view(np.uint8).copy()).to(device),
-        tile_view=torch.from_numpy(np.repeat(np.arange(len(sensors), dtype=np.int32), tiles)).to(device),
-        first_ray=np.concatenate([[0], np.cumsum(cells)]),
-        ray_count=sum(cells),
-        moving_blocks=max(sensor.blocks for sensor in sensors),
-        keep=(sky, *(t for s in sensors for t in (s.tensors.rays, s.tensors.table, s.tensors.beam))),
-    )
+def view_rows(tensors: Sequence[GridTensors], world_from_sensor: Float64[np.ndarray, "n 2 4 4"]) -> np.ndarray:
+    """A ``VIEW`` per sensor at its poses at both ends of the exposure, [n]."""
+    rows = np.frombuffer(b"".join([sensor.row for sensor in tensors]), VIEW).copy()
+    start, end = world_from_sensor[:, 0], world_from_sensor[:, 1]
+    reference = geometry.interpolate_pose_pairs(world_from_sensor, rows["reference"])
+    turn = reference[:, :3, :3].transpose(0, 2, 1)
+    rows["eye"], rows["turn"] = reference[:, :3, 3], turn.reshape(-1, 9)
+    rows["end_from_reference"] = (geometry.inverse(end) @ reference)[:, :3].reshape(-1, 12)
+    moving = np.array([sensor.timed for sensor in tensors]) & (start != end).any(axis=(1, 2))
+    rows["moving"] = moving
+    if moving.any():
+        shift = (end - start)[moving, :3, 3]
+        rows["travel"][moving] = (turn[moving] @ shift[:, :, None])[:, :, 0]
+        rows["swing"][moving] = rotation_vector(start[moving, :3, :3].transpose(0, 2, 1) @ end[moving, :3, :3])
+    cells, tiles = rows["rows"] * rows["columns"], rows["tile_rows"] * rows["tile_columns"]
+    rows["first_ray"], rows["first_tile"] = np.cumsum(cells) - cells, np.cumsum(tiles) - tiles
+    return rows
 
 
-def _fill(row: np.void, sensor: SensorView) -> None:
-    """Everything of a view that depends on its sensor alone."""
-    tensors, grid = sensor.tensors, sensor.tensors.grid
-    pair = np.asarray(sensor.world_from_sensor, np.float64)
-    world_from_reference = geometry.interpolate_pose_pair(pair, np.array(grid.reference))
-    rotation = world_from_reference[:3, :3]
-    row["moving"] = tensors.timed and not np.array_equal(pair[0], pair[1])
-    if row["moving"]:
-        row["travel"] = rotation.T @ (pair[1, :3, 3] - pair[0, :3, 3])
-        row["swing"] = rotation_vector(pair[0, :3, :3].T @ pair[1, :3, :3])
-    row["eye"], row["turn"] = world_from_reference[:3, 3], rotation.T.ravel()
-    row["end_from_reference"] = (geometry.inverse(pair[1]) @ world_from_reference)[:3].ravel()
-    row["rays"], row["table"], row["beam"] = (t.data_ptr() for t in (tensors.rays, tensors.table, tensors.beam))
-    row["params"][: len(tensors.params)] = tensors.params
-    row["isp"] = (np.eye(3, 4) if sensor.isp is None else sensor.isp).ravel()
-    height, width = grid.valid.shape
-    row["rows"], row["columns"] = height, width
-    row["tile_rows"], row["tile_columns"] = -(-height // TILE), -(-width // TILE)
-    row["table_size"] = len(tensors.table)
-    row["near_m"], row["field_cos"], row["by_range"] = grid.near_m, grid.field_cos, grid.by_range
-    row["kind"], row["intensity"] = grid.kind, grid.kind == LIDAR
-    row["first_block"], row["blocks"] = sensor.first_block, sensor.blocks
+def make_batch(
+    tensors: Sequence[GridTensors], rows: np.ndarray, views: torch.Tensor, sky: torch.Tensor, moving_blocks: int = 0
+) -> Batch:
+    """Put sensors together.
+
+    Args:
+        tensors: their tables.
+        rows: their views, ``view_rows``, with the sky's address.
+        views: the bytes of these on the device.
+        sky: [6,s,s,3] float32 on their device.
+        moving_blocks: of the moving layer, per sensor.
+    """
+    cells = rows["rows"] * rows["columns"]
+    first_ray = np.append(rows["first_ray"], cells[-1] + rows["first_ray"][-1]).astype(np.int64)
+    tile_count = int(rows["first_tile"][-1] + rows["tile_rows"][-1] * rows["tile_columns"][-1])
+    return Batch(views, first_ray, len(rows), int(first_ray[-1]), tile_count, int(cells.max()), moving_blocks,
+                 (*tensors, sky))  # fmt: skip
 
 
-def rotation_vector(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 3"]:
-    """Axis times angle (at most pi) of a rotation matrix."""
+def rotation_vector(rotation: Float64[np.ndarray, "*n 3 3"]) -> Float64[np.ndarray, "*n 3"]:
+    """Axis times angle (at most pi) of rotation matrices."""
     quat = geometry.quat_from_matrix(rotation)
-    sine = np.linalg.norm(quat[1:])
-    return quat[1:] * (2 * np.arctan2(sine, quat[0]) / sine if sine > 1e-12 else 2.0)
+    sine = np.linalg.norm(quat[..., 1:], axis=-1, keepdims=True)
+    small = sine <= 1e-12
+    angle = 2 * np.arctan2(sine, quat[..., :1])
+    return quat[..., 1:] * np.where(small, 2.0, angle / np.where(small, 1.0, sine))

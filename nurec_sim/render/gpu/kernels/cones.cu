@@ -1,13 +1,16 @@
 // Cones around the rays of each tile and of each of its warps.
 #include "view.cuh"
 
-// One block per tile; writes CONES per tile: that of the tile, then those of its warps.
+// One block per tile; writes its view, and CONES: that of the tile, then those of its warps.
 extern "C" __global__ void __launch_bounds__(THREADS)
-gather_cones(const View* views, const int* tile_view, Cone* cones) {
+gather_cones(const View* views, int view_count, int* tile_view, Cone* cones) {
     __shared__ float4 sums[WARPS];
     __shared__ float4 limits[WARPS];
     int tile = blockIdx.x, warp = threadIdx.x / 32;
-    const View& view = views[tile_view[tile]];
+    int number = 0;
+    while (number + 1 < view_count && views[number + 1].first_tile <= tile) ++number;
+    const View& view = views[number];
+    if (threadIdx.x == 0) tile_view[tile] = number;
     Ray ray = ray_of(view, cell_of(view, tile));
     bool is_ray = dot(ray.direction, ray.direction) > 0;
 

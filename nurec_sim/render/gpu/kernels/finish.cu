@@ -7,9 +7,9 @@ INLINE float3 toned(const float* isp, float3 c) {
 }
 INLINE unsigned char rounded(float v) { return (unsigned char)floorf(fminf(fmaxf(v, 0.0f), 1.0f) * 255 + 0.5f); }
 
-// One thread per ray (x) and view (y); views of LiDARs are left alone.
+// One thread per ray (x) and view (y); views of LiDARs are left alone. Outputs that nobody asked for are null.
 extern "C" __global__ void __launch_bounds__(THREADS)
-finish_images(const View* views, long long rays, const float* planes, unsigned char* rgb, float* depth,
+finish_images(const View* views, long long rays, const float* planes, unsigned char* rgb, float* depth, float* opaque,
               unsigned char* label, float* normal) {
     const View& view = views[blockIdx.y];
     int cell = blockIdx.x * THREADS + threadIdx.x;
@@ -18,12 +18,16 @@ finish_images(const View* views, long long rays, const float* planes, unsigned c
     const float* plane = planes + n;
     float alpha = plane[ALPHA * rays];
     bool surface = alpha >= SURFACE_ALPHA;
-    float3 facing = make_float3(plane[FACING * rays], plane[(FACING + 1) * rays], plane[(FACING + 2) * rays]);
-    float size = length(facing);
-    facing = (surface && size > 1e-6f ? 1 / size : 0.0f) * facing;
-    label[n] = surface ? (unsigned char)plane[CLASS * rays] : SKY;
-    depth[n] = surface ? fmaxf(plane[DISTANCE * rays] / alpha * view.rays[cell].z, 0.0f) : 0.0f;
-    normal[3 * n] = facing.x, normal[3 * n + 1] = facing.y, normal[3 * n + 2] = facing.z;
+    if (opaque) opaque[n] = alpha;
+    if (label) label[n] = surface ? (unsigned char)plane[CLASS * rays] : SKY;
+    if (depth) depth[n] = surface ? fmaxf(plane[DISTANCE * rays] / alpha * view.rays[cell].z, 0.0f) : 0.0f;
+    if (normal) {
+        float3 facing = make_float3(plane[FACING * rays], plane[(FACING + 1) * rays], plane[(FACING + 2) * rays]);
+        float size = length(facing);
+        facing = (surface && size > 1e-6f ? 1 / size : 0.0f) * facing;
+        normal[3 * n] = facing.x, normal[3 * n + 1] = facing.y, normal[3 * n + 2] = facing.z;
+    }
+    if (!rgb) return;
 
     Ray ray = ray_of(view, cell);
     float3 colour = make_float3(0, 0, 0);
@@ -39,15 +43,15 @@ finish_images(const View* views, long long rays, const float* planes, unsigned c
 // Writes x, y, z (in the sensor at the end of the sweep), range, intensity and whether it returns (spec.sweep_frame),
 // per beam. A negative distance threshold stands for none.
 extern "C" __global__ void __launch_bounds__(THREADS)
-finish_beams(const View* views, long long rays, const float* planes, const float* range_m, float opacity_threshold,
-             float drop_threshold, float distance_threshold, float* returns) {
+finish_beams(const View* views, long long rays, const float* planes, float opacity_threshold, float drop_threshold,
+             float distance_threshold, float* returns) {
     const View& view = views[blockIdx.y];
     int cell = blockIdx.x * THREADS + threadIdx.x;
     if (view.kind != LIDAR || cell >= view.columns * view.rows) return;
     const float* plane = planes + view.first_ray + cell;
     float alpha = plane[ALPHA * rays], half = plane[HALF * rays];
     float mean = plane[DISTANCE * rays] / fmaxf(alpha, 1 / 255.0f), range = half > 0 ? half : mean;
-    bool back = alpha > opacity_threshold && range >= range_m[2 * blockIdx.y] && range <= range_m[2 * blockIdx.y + 1];
+    bool back = alpha > opacity_threshold && range >= view.range_m[0] && range <= view.range_m[1];
     back = back && plane[2 * rays] <= drop_threshold * alpha;
     back = back && (distance_threshold < 0 || fabsf(range - mean) <= distance_threshold);
     Ray ray = ray_of(view, cell);

@@ -9,21 +9,128 @@ struct Motion {
     float quat[4];
     float moved, gone;
 };
-static_assert(sizeof(Motion) == 120, "gpu/moving.py lays it out alike");
+static_assert(sizeof(Motion) == 120, "gpu/moving.py makes room for it");
+
+struct Pose {
+    double rotation[9], translation[3];
+};
+
+INLINE Pose load_pose(const double* m) {
+    return {{m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]}, {m[3], m[7], m[11]}};
+}
+
+// Unit quaternion of a rotation, w first and not negative (geometry.quat_from_matrix).
+INLINE void quat_of(const double* m, double* q) {
+    double d[4] = {1 + m[0] + m[4] + m[8], 1 + m[0] - m[4] - m[8], 1 - m[0] + m[4] - m[8], 1 - m[0] - m[4] + m[8]};
+    double a = m[7] - m[5], b = m[2] - m[6], c = m[3] - m[1], xy = m[3] + m[1], xz = m[2] + m[6], yz = m[7] + m[5];
+    double rows[4][4] = {{d[0], a, b, c}, {a, d[1], xy, xz}, {b, xy, d[2], yz}, {c, xz, yz, d[3]}};
+    int best = 0;
+    for (int k = 1; k < 4; ++k) best = d[k] > d[best] ? k : best;
+    double size = 0;
+    for (int k = 0; k < 4; ++k) size += rows[best][k] * rows[best][k];
+    size = rows[best][0] < 0 ? -sqrt(size) : sqrt(size);
+    for (int k = 0; k < 4; ++k) q[k] = rows[best][k] / size;
+}
+
+// Between two poses [4][4]: positions linear, rotations along the shorter arc (geometry.interpolate_pose_pair).
+INLINE Pose between(const double* from, const double* to, double fraction) {
+    Pose a = load_pose(from), b = load_pose(to);
+    bool turns = false;
+    for (int k = 0; k < 9; ++k) turns = turns || a.rotation[k] != b.rotation[k];
+    for (int k = 0; k < 3; ++k) a.translation[k] += fraction * (b.translation[k] - a.translation[k]);
+    if (!turns) return a;
+    double p[4], q[4], dot = 0, gap = 0, size = 0;
+    quat_of(a.rotation, p), quat_of(b.rotation, q);
+    for (int k = 0; k < 4; ++k) dot += p[k] * q[k];
+    for (int k = 0; k < 4; ++k) q[k] = dot < 0 ? -q[k] : q[k];
+    for (int k = 0; k < 4; ++k) gap += (q[k] - p[k]) * (q[k] - p[k]);
+    double half = sqrt(gap) / 2, angle = 2 * asin(half < 1 ? half : 1.0);
+    double first = 1 - fraction, second = fraction;
+    if (angle >= 1e-9) first = sin(first * angle) / sin(angle), second = sin(second * angle) / sin(angle);
+    for (int k = 0; k < 4; ++k) q[k] = first * p[k] + second * q[k], size += q[k] * q[k];
+    size = 1 / sqrt(size);
+    double w = q[0] * size, x = q[1] * size, y = q[2] * size, z = q[3] * size;
+    return {{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z),
+             1 - 2 * (x * x + z * z), 2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x),
+             1 - 2 * (x * x + y * y)},
+            {a.translation[0], a.translation[1], a.translation[2]}};
+}
+
+// The pose of a path at an instant, held before its first sample and after its last (geometry.interpolate_poses).
+INLINE Pose on_path(const long long* times, const double* poses, int first, int last, long long now) {
+    int low = first, high = last - 1;  // the last sample that is not later than now
+    if (now < times[low]) now = times[low];
+    while (low < high) {
+        int middle = (low + high + 1) / 2;
+        if (times[middle] <= now) low = middle;
+        else high = middle - 1;
+    }
+    if (low == last - 1) return load_pose(poses + 16 * (size_t)low);
+    double fraction = (double)(now - times[low]) / (double)(times[low + 1] - times[low]);
+    const double* from = poses + 16 * (size_t)low;
+    return fraction > 0 ? between(from, from + 16, fraction) : load_pose(from);
+}
+
+INLINE Motion motion_of(const Pose& pose, bool gone) {
+    Motion motion;
+    double q[4];
+    quat_of(pose.rotation, q);
+    for (int k = 0; k < 9; ++k) motion.rotation[k] = pose.rotation[k];
+    for (int k = 0; k < 3; ++k) motion.translation[k] = pose.translation[k];
+    for (int k = 0; k < 4; ++k) motion.quat[k] = (float)q[k];
+    motion.moved = 1, motion.gone = gone ? 1 : 0;
+    return motion;
+}
+
+// One thread per track (x) and view (y): how its Gaussians are moved in that view, those in the world first, then those
+// in its box. `asked` [views][tracks] is the pair of `pairs` [n][2][4][4] that the request has for the track; -1 for
+// none, -2 for a hidden track. Track k is recorded by samples firsts[k] to firsts[k + 1] - 1.
+extern "C" __global__ void __launch_bounds__(THREADS)
+move_tracks(const View* views, int tracks, const int* asked, const double* pairs, const int* firsts,
+            const long long* times, const double* poses, Motion* motions) {
+    int track = blockIdx.x * THREADS + threadIdx.x;
+    if (track >= tracks) return;
+    const View& view = views[blockIdx.y];
+    Motion& in_world = motions[((size_t)blockIdx.y * 2) * tracks + track];
+    Motion& in_box = motions[((size_t)blockIdx.y * 2 + 1) * tracks + track];
+    int pair = asked[(size_t)blockIdx.y * tracks + track], first = firsts[track], last = firsts[track + 1];
+    long long now = view.instant_us;
+    in_world.moved = in_world.gone = pair == -2 ? 1 : 0;
+    in_box.moved = in_box.gone = 1;
+    if (pair == -2) return;
+    Pose recorded = on_path(times, poses, first, last, now);
+    if (pair < 0) {
+        in_box = motion_of(recorded, now < times[first] || now > times[last - 1]);
+        return;
+    }
+    Pose shown = between(pairs + 32 * (size_t)pair, pairs + 32 * (size_t)pair + 16, view.reference), carried;
+    const double *s = shown.rotation, *r = recorded.rotation;
+    for (int i = 0; i < 3; ++i) {
+        double moved = shown.translation[i];
+        for (int j = 0; j < 3; ++j) {
+            double turn = s[3 * i] * r[3 * j] + s[3 * i + 1] * r[3 * j + 1] + s[3 * i + 2] * r[3 * j + 2];
+            carried.rotation[3 * i + j] = turn;
+            moved -= turn * recorded.translation[j];
+        }
+        carried.translation[i] = moved;
+    }
+    in_world = motion_of(carried, false);
+    in_box = motion_of(shown, false);
+}
 
 // One block of threads per block of Gaussians (x) and view (y). `recorded` [blocks][FIELDS][BLOCK] holds the middle
 // knots and opacities that are not capped yet; `knots` [blocks][3 knots][3][BLOCK] positions; `times` [blocks][3][BLOCK]
-// and `instants` [views] microseconds; `tracks` [blocks][BLOCK] rows of `motions` [views][track_count], -1 for none.
+// microseconds; `tracks` [blocks][BLOCK] rows of `motions` [views][track_count], -1 for none.
 extern "C" __global__ void __launch_bounds__(THREADS)
 place_moving(const View* views, const float* recorded, const float* sh_rest, int sh_count, const float* knots,
              const long long* times, const int* tracks, const Motion* motions, int track_count,
-             const long long* instants, float log_max_opacity, float* placed) {
+             float log_max_opacity, float* placed) {
     int block = blockIdx.x, lane = threadIdx.x;
     const View& view = views[blockIdx.y];
     const float* f = recorded + (size_t)block * FIELDS * BLOCK + lane;
     float* out = placed + ((size_t)blockIdx.y * gridDim.x + block) * FIELDS * BLOCK + lane;
     const long long* time = times + (size_t)block * 3 * BLOCK + lane;
-    long long now = instants[blockIdx.y], first = time[0], middle = time[BLOCK], last = time[2 * BLOCK];
+    long long now = view.instant_us, first = time[0], middle = time[BLOCK], last = time[2 * BLOCK];
     bool after = now >= middle;
     long long start = after ? middle : first, end = after ? last : middle;
     double fraction = (double)(now - start) / (double)(end - start > 1 ? end - start : 1);

@@ -13,18 +13,31 @@ struct Gaussian {
     float log_opacity, k2, reach, distance, nearest;
 };
 
+INLINE float distance_of(const View& view, const Sphere& s) {
+    return length(make_float3((float)(s.x - view.eye[0]), (float)(s.y - view.eye[1]), (float)(s.z - view.eye[2])));
+}
+
+// Whether a block is drawn rather than those that it stands for (render/lod.py).
+INLINE bool fine_enough(const View& view, const Sphere& s) {
+    return s.error_m <= 0 || s.error_m <= fmaxf(distance_of(view, s) - s.radius, NEAREST_M) * view.detail;
+}
+
 // Where a block's Gaussians lie in memory; null if the view has no such block, or cannot see anything of its sphere.
 INLINE const float* block_fields(const View& view, int block, int static_blocks, const float* static_fields,
-                                 const float* moving_fields, const float* static_spheres) {
+                                 const float* moving_fields, const Sphere* spheres) {
     if (block >= static_blocks) {
         block -= static_blocks;
         return block < view.blocks ? moving_fields + (size_t)(view.first_block + block) * FIELDS * BLOCK : nullptr;
     }
-    const float* sphere = static_spheres + 4 * block;
+    const Sphere& sphere = spheres[block];
+    if (!fine_enough(view, sphere)) return nullptr;
+    for (int above = sphere.parent; above >= 0; above = spheres[above].parent) {
+        if (fine_enough(view, spheres[above])) return nullptr;
+    }
     float travel = length(load3(view.travel)), swing = length(load3(view.swing));
-    float3 offset = make_float3((float)(sphere[0] - view.eye[0]), (float)(sphere[1] - view.eye[1]),
-                                (float)(sphere[2] - view.eye[2]));
-    float distance = length(offset), radius = sphere[3] + travel;
+    float3 offset = make_float3((float)(sphere.x - view.eye[0]), (float)(sphere.y - view.eye[1]),
+                                (float)(sphere.z - view.eye[2]));
+    float distance = length(offset), radius = sphere.radius + travel;
     if (view.field_cos > -1 && distance > radius) {
         // The cone of the view's rays against that of the sphere.
         float angle = acosf(fminf(fmaxf(dot(load3(view.turn + 6), offset) / distance, -1.0f), 1.0f));
@@ -83,10 +96,10 @@ INLINE Record record_of(const Gaussian& g) {
 
 extern "C" __global__ void __launch_bounds__(THREADS)
 count_visible(const View* views, int static_blocks, const float* static_fields, const float* moving_fields,
-              const float* static_spheres, int* counts) {
+              const Sphere* spheres, int* counts) {
     const View& view = views[blockIdx.y];
     const float* fields =
-        block_fields(view, blockIdx.x, static_blocks, static_fields, moving_fields, static_spheres);
+        block_fields(view, blockIdx.x, static_blocks, static_fields, moving_fields, spheres);
     int count = 0;
     if (fields) {
         Gaussian g;
@@ -96,17 +109,18 @@ count_visible(const View* views, int static_blocks, const float* static_fields, 
     if (threadIdx.x == 0) counts[blockIdx.y * gridDim.x + blockIdx.x] = count;
 }
 
-// `ends` are the running sums of the counts; `record_of_row` (or null) receives each Gaussian's record in each view.
+// `ends` are the running sums of the counts. Records that there is no `room` for are left out. `depths` receives what they
+// are sorted by, `record_of_row` (or null) each Gaussian's record in each view.
 extern "C" __global__ void __launch_bounds__(THREADS)
 project(const View* views, int static_blocks, const float* static_fields, const float* moving_fields,
-        const float* static_spheres, const float* static_sh, int sh_count, const long long* ends, const int* counts,
-        Record* records, Span* spans, int* record_of_row) {
+        const Sphere* spheres, const float* static_sh, int sh_count, const long long* ends, const int* counts, int room,
+        Record* records, Span* spans, int* depths, int* record_of_row) {
     __shared__ int warp_counts[WARPS];
     int slot = blockIdx.y * gridDim.x + blockIdx.x, count = counts[slot];
     if (count == 0) return;
     const View& view = views[blockIdx.y];
     const float* fields =
-        block_fields(view, blockIdx.x, static_blocks, static_fields, moving_fields, static_spheres);
+        block_fields(view, blockIdx.x, static_blocks, static_fields, moving_fields, spheres);
     Gaussian g;
     Span span;
     bool seen = look(view, fields, &g, &span);
@@ -117,6 +131,7 @@ project(const View* views, int static_blocks, const float* static_fields, const 
     if (!seen) return;
     for (int k = 0; k < warp; ++k) rank += warp_counts[k];
     long long n = ends[slot] - count + rank;
+    if (n >= room) return;
 
     const float* f = fields + threadIdx.x;
     Record r = record_of(g);
@@ -140,5 +155,13 @@ project(const View* views, int static_blocks, const float* static_fields, const 
     span.view = blockIdx.y;
     records[n] = r;
     spans[n] = span;
+    depths[n] = span.depth_bits;
     if (record_of_row) record_of_row[(size_t)blockIdx.y * gridDim.x * BLOCK + row] = (int)n;
+}
+
+// Behind the records, keys that are sorted to the end.
+extern "C" __global__ void __launch_bounds__(THREADS)
+pad_depths(const long long* ends, int slots, int room, int* depths) {
+    long long n = blockIdx.x * (long long)THREADS + threadIdx.x;
+    if (n < room && n >= (slots ? ends[slots - 1] : 0)) depths[n] = 0x7fffffff;
 }

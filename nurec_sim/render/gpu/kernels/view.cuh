@@ -19,6 +19,7 @@
 #define LIDAR_MIN_TRANSMITTANCE 1e-2f
 #define SURFACE_ALPHA 0.5f
 #define SKY 3
+#define NEAREST_M 0.5f          // blocks nearer than this count as this far away (render/lod.py)
 
 // Fields of a block of packed Gaussians, [FIELDS][BLOCK] (render/cpu/pack.py).
 enum Field {
@@ -32,6 +33,8 @@ enum Plane { FEATURES = 0, DISTANCE = 3, ALPHA = 4, HALF = 5, FACING = 6, CLASS 
 // and its origin in the eye. An instant runs from 0 there; 1 is a whole exposure later.
 struct View {
     double eye[3];              // origin of the reference frame in the world
+    double reference;           // share of the exposure after which the reference instant comes
+    long long instant_us;       // the reference instant
     const float4* rays;         // [rows * columns] unit direction in the sensor (zero: no ray), and its instant
     const float* table;         // from direction to place on the grid (bounds.cuh)
     const float* sky;           // [6, sky_size, sky_size, 3]
@@ -42,6 +45,8 @@ struct View {
     float params[5];            // of the table; see there
     float isp[12];              // colour correction [3,4]
     float end_from_reference[12];
+    float range_m[2];           // LiDAR: of what it returns
+    float detail;               // metres per metre of distance that a merged Gaussian may paint wrong; 0 for none
     float near_m;
     float field_cos;            // cosine of the largest angle between a ray and the z axis; -1 for LiDARs
     int kind, columns, rows, tile_columns, tile_rows, first_tile, first_ray, table_size, sky_size;
@@ -70,6 +75,13 @@ struct Span {
 struct Cone {
     float4 axis;                // xyz; spread, negative where there are no rays
     float4 time;                // middle, span
+};
+
+// Where a block of static Gaussians lies, how wrong it is (render/lod.py; 0: not merged), and the block that stands for it
+// and its neighbours one level above; -1 for none.
+struct Sphere {
+    float x, y, z, radius, error_m;
+    int parent;
 };
 
 struct Ray {
