@@ -46,6 +46,7 @@ dist: $(VENV)/.installed ## the wheel and the source distribution, in dist
 
 bench: $(VENV)/.installed ## timings of the renderer and the network, written to build/bench.json and build/bench_network.json
 	$(BIN)/python benchmarks/render.py
+	$(BIN)/python benchmarks/gpu_host.py
 	$(BIN)/python benchmarks/network.py
 
 bench-serving: $(VENV)/.installed ## 32 clients for 60 s against one, written to build/bench_serving.json

@@ -41,6 +41,7 @@ CASES = {
     "tick-8": EIGHT,
 }
 TRAINED = ("pinhole-960", "lidar-128")
+DETAILED = ("pinhole-1920", "lidar-128", "tick-8")
 SceneName = Literal[tuple(SCENES)]  # type: ignore[valid-type]
 SensorName = Literal[tuple(CASES)]  # type: ignore[valid-type]
 Timed = Callable[[Callable[[], Any]], tuple[Any, float]]
@@ -53,6 +54,7 @@ class Options:
     Args:
         scenes: scenes to render.
         sensors: sensors to render.
+        detail_px: level of detail of further rows, for the sensors of DETAILED; 0 leaves them out.
         frames: frames per row, each from another pose of the path.
         parity_rays: pixels or beams per row that the reference draws; 0 leaves it out.
         device: a CUDA device.
@@ -61,6 +63,7 @@ class Options:
 
     scenes: tuple[SceneName, ...] = ("driving", "2m", "6m")
     sensors: tuple[SensorName, ...] = tuple(CASES)
+    detail_px: float = 0.15
     frames: int = 200
     parity_rays: int = 400
     device: str = "cuda"
@@ -89,20 +92,25 @@ def scene_rows(
     name: str, bench: BenchScene, launcher: Launcher, timed: Timed, options: Options
 ) -> Iterator[dict[str, Any]]:
     """A row per sensor, and one for the gradients of some."""
-    renderer, path = GpuRenderer(bench.scene, launcher), next(iter(bench.paths))
-    for sensor in options.sensors:
+    full, path = GpuRenderer(bench.scene, launcher), next(iter(bench.paths))
+    rows = [(full, sensor, "") for sensor in options.sensors]
+    detailed = [sensor for sensor in options.sensors if sensor in DETAILED and options.detail_px]
+    if detailed:
+        coarse = GpuRenderer(bench.scene, launcher, detail_px=options.detail_px)
+        rows += [(coarse, sensor, " lod") for sensor in detailed]
+    for renderer, sensor, kind in rows:
         ticks = cases.tick_requests(bench, CASES[sensor], path, options.frames)
         for tick in ticks[:10]:
             renderer.sense(tick)
-        ms = [timed(lambda tick=tick: renderer.draw(tick))[1] for tick in ticks]
+        ms = [timed(lambda tick=tick, renderer=renderer: renderer.draw(tick))[1] for tick in ticks]
         wall = []
         for tick in ticks[: max(1, options.frames // 4)]:
             began = time.perf_counter()
             frames = renderer.sense(tick)
             wall.append((time.perf_counter() - began) * 1e3)
         against = parity.against_spec(bench.scene, tick, frames, options.parity_rays) if options.parity_rays else {}
-        yield {**facts(name, sensor, path, bench, ms), "sense_ms_median": float(np.median(wall)), **against}
-        if sensor in TRAINED:
+        yield {**facts(name, sensor + kind, path, bench, ms), "sense_ms_median": float(np.median(wall)), **against}
+        if sensor in TRAINED and not kind:
             yield backward_row(name, sensor, path, bench, launcher, timed, options)
 
 

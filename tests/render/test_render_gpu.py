@@ -9,15 +9,17 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from gpu_on_cpu.emulator import EmulatedLauncher, compiler_missing
 from gpu_on_cpu.places import PLACES, launcher_at
 from render_scenes import LENSES, LIDARS, START_US, camera, cloud, moved, moving_cloud, psnr_db, request, scene, track
 
 from nurec_sim import geometry
-from nurec_sim.errors import RequestError, TooLargeError
-from nurec_sim.render import spec
+from nurec_sim.errors import NurecSimError, RequestError, TooLargeError
+from nurec_sim.render import CpuRenderer, spec
+from nurec_sim.render.gpu.pipeline import Room
 from nurec_sim.render.gpu.renderer import GpuRenderer
 from nurec_sim.render.requests import CAMERA_OUTPUTS
-from nurec_sim.types import LidarFilter, Shutter, Windshield, WindshieldReference
+from nurec_sim.types import LidarFilter, LidarModel, Shutter, Windshield, WindshieldReference
 
 SHUTTERS = {
     "pinhole": Shutter.TOP_TO_BOTTOM,
@@ -153,6 +155,82 @@ def test_memory_that_does_not_suffice_is_the_requests_fault(launcher, monkeypatc
         GpuRenderer(scene(cloud(5)), launcher).render_camera(request(camera()))
 
 
+def tick(world, count=3):
+    """Cameras and a LiDAR that move, all actors posed anew."""
+    poses = (moved(0.3), moved(0.42, 1.2, 0.3))
+    sensors = [camera(40, 30, id=str(k), shutter=Shutter.TOP_TO_BOTTOM) for k in range(count - 1)]
+    return [
+        request(sensor, *poses, end_us=START_US + 100_000, actors={each.id: np.stack(poses) for each in world.tracks})
+        for sensor in (*sensors, LIDARS["sector"])
+    ]
+
+
+class Counting(EmulatedLauncher):
+    """Counts what the host asks of the device."""
+
+    def __init__(self):
+        super().__init__()
+        self.launches, self.uploads, self.reads = [], 0, 0
+
+    def launch(self, kernel, grid, *arguments):
+        self.launches.append(kernel)
+        super().launch(kernel, grid, *arguments)
+
+    def upload(self, data):
+        self.uploads += 1
+        return super().upload(data)
+
+    def read(self, tensor):
+        self.reads += 1
+        return super().read(tensor)
+
+
+@pytest.mark.parametrize("sensors", [2, 4])
+def test_the_host_waits_once_per_batch(sensors):
+    if why := compiler_missing():
+        pytest.skip(why)
+    world, counts = scene(cloud(), moving_cloud(), [track()]), Counting()
+    renderer, asked = GpuRenderer(world, counts), tick(scene(tracks=[track()]), sensors)
+    renderer.sense(asked)
+    counts.launches, counts.uploads, counts.reads = [], 0, 0
+    renderer.sense(asked)
+    assert (counts.reads, counts.uploads) == (1, 1)
+    assert len(counts.launches) == len(set(counts.launches)) == 13  # whatever the number of sensors and actors
+
+
+def test_a_batch_that_needs_more_room_is_drawn_again(launcher, monkeypatch):
+    world, asked = scene(cloud()), request(camera(64, 48))
+    enough = GpuRenderer(world, launcher).render_camera(asked)
+    tried = []
+    first = Room.first
+    monkeypatch.setattr(Room, "first", lambda gaussians: tried.append(gaussians) or Room(7, 5))
+    renderer = GpuRenderer(world, launcher)
+    assert np.array_equal(renderer.render_camera(asked).rgb, enough.rgb)
+    (room,) = renderer._rooms._known.values()
+    assert room.records > 7 and room.pairs > 5 and tried
+    assert first(0) == Room(1, 4) and not Room(7, 5).holds(np.array([8, 0])) and Room(7, 5).holds(np.array([7, 5]))
+    assert np.array_equal(renderer.render_camera(asked).rgb, enough.rgb)
+
+
+def test_levels_of_detail_are_those_of_the_cpu(launcher):
+    rng = np.random.default_rng(3)
+    mean = np.stack([rng.uniform(30, 31, 8000), *rng.uniform(-12, 12, (2, 8000))], axis=1).astype(np.float32)
+    many = dataclasses.replace(cloud(8000), mean_m=mean, scale_m=np.full((8000, 3), 0.3, np.float32), normal=mean * 0)
+    world = scene(many)
+    for asked in (request(camera(48, 32)), request(LIDARS["sector"])):
+        frames = [
+            make(world, device, detail_px=detail_px).sense([asked])[0]
+            for make, device, detail_px in ((CpuRenderer, 2, 0.0), (CpuRenderer, 2, 2.0), (GpuRenderer, launcher, 2.0))
+        ]
+        full, coarse, ours = frames
+        if isinstance(asked.sensor, LidarModel):
+            assert_same_sweep(ours, coarse, least=20)
+            continue
+        assert psnr_db(ours.rgb, coarse.rgb) >= 60 > psnr_db(full.rgb, coarse.rgb)
+    with pytest.raises(ValueError, match="detail_px must be finite"):
+        GpuRenderer(world, launcher, detail_px=-1.0)
+
+
 def test_degenerate_gaussians(launcher):
     static = cloud(40, 4)
     values = {name: getattr(static, name).copy() for name in ("mean_m", "scale_m", "quat_wxyz", "opacity", "rgb")}
@@ -185,11 +263,29 @@ def test_requests_are_checked(launcher):
         renderer.render_camera(request(LIDARS["full"]))
 
 
+def test_poses_of_a_batch_are_checked_together(launcher):
+    world = scene(cloud(5), moving_cloud(), [track()])
+    renderer, good = GpuRenderer(world, launcher), tick(world)
+    renderer.sense(good)  # from now on the sensors are known
+    skewed, far, long = np.stack([np.eye(4)] * 2), np.stack([np.eye(4)] * 2), np.stack([np.eye(4)] * 3)
+    skewed[1, 0, 1], far[0, 0, 3] = 0.5, np.nan
+    wrong = {
+        r"actor 'car': world_from_box has a 3 x 3 part that is not a rotation": {"actors": {"car": skewed}},
+        r"actor 'unknown': world_from_box must be finite": {"actors": {"unknown": far}},
+        r"actor 'car': world_from_box must be two 4 x 4 poses": {"actors": {"car": long}},
+        r"sensor 'lidar': world_from_sensor must be finite": {"world_from_sensor": far},
+        r"an exposure must end after it starts": {"end_us": good[-1].start_us},
+        r"covers \[": {"start_us": 1, "end_us": 2},
+    }
+    for text, change in wrong.items():
+        with pytest.raises(NurecSimError, match=text.replace("'lidar'", repr(good[-1].sensor.id))):
+            renderer.sense([*good[:-1], dataclasses.replace(good[-1], **change)])
+    assert len(renderer.sense(good)) == 3
+
+
 @pytest.mark.needs_gpu
 def test_a_million_pixels_against_the_cpu():
     """Sizes that the emulator and the reference are too slow for."""
-    from nurec_sim.render import CpuRenderer
-
     launcher = launcher_at("on a GPU")
     static = cloud(50_000, 1, low=(-40, -40, -5), high=(60, 40, 15))
     world = scene(dataclasses.replace(static, scale_m=static.scale_m * 0.3))

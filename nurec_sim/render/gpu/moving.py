@@ -77,8 +77,10 @@ class MovingLayer:
             np.concatenate([np.zeros(0, np.int64), *(each.path.t_us for each in tracks)]),
             np.concatenate([np.zeros((0, 4, 4)), *(each.path.world_from_body for each in tracks)]),
         )
-        on_device = (torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in arrays)
-        return cls(*on_device, number_of={each.id: k for k, each in enumerate(tracks)})  # type: ignore[misc]
+        moved = [torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in arrays]
+        fields, sh, knot_m, knot_us, of_track, path_first, path_us, path = moved
+        number_of = {each.id: k for k, each in enumerate(tracks)}
+        return cls(fields, sh, knot_m, knot_us, of_track, path_first, path_us, path, number_of)
 
     def asked(self, requests: Sequence[SensorRequest]) -> Int32[np.ndarray, "views tracks"]:
         """Which of all actors' pairs, request after request, poses each track anew; NOT_ASKED, or HIDDEN."""
