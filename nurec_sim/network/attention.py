@@ -14,7 +14,7 @@ ROPE_BASE = 100.0
 
 
 class LayerScale(nn.Module):
-    """One learned factor per channel."""
+    """One learned factor per channel (Touvron et al. 2021): small at first, deep networks begin as identities."""
 
     def __init__(self, width: int, initial: float) -> None:
         super().__init__()
@@ -48,13 +48,16 @@ class Rope:
 
     def __init__(self, positions: Int64[Tensor, "n 2"], head_width: int) -> None:
         axis = head_width // 2
+        # Su et al. 2021, for each axis by itself: channel pair k turns by position * base^(-2k / axis), so that the dot
+        # product of a query and a key depends on how far apart they are, not on where they are.
         power = torch.arange(0, axis, 2, device=positions.device, dtype=torch.float32) / axis
         angle = positions.to(torch.float32)[:, :, None] * ROPE_BASE**-power  # [n, 2, axis / 2]
         angle = torch.cat([angle, angle], dim=-1)
         self.cos, self.sin = angle.cos(), angle.sin()
 
     def __call__(self, x: Float[Tensor, "b heads n c"]) -> Float[Tensor, "b heads n c"]:
-        """Turned queries or keys; neighbours in the two halves of an axis' channels form the pairs."""
+        """Queries or keys turned by their positions."""
+        # [.., axis (y, x), channels of the axis]; pairs are (k, k + half), as in the checkpoints, not neighbours.
         halves = x.unflatten(-1, (2, -1))
         first, second = halves.chunk(2, dim=-1)
         turned = halves * self.cos + torch.cat([-second, first], dim=-1) * self.sin
@@ -123,6 +126,7 @@ class CrossAttention(nn.Module):
         q = self.to_q(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
         if self.normed:
             q = self.q_norm(q).to(v.dtype)
+        # Queries have no positions here: where a query lies is part of its token.
         return self.proj(functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(-2))
 
 

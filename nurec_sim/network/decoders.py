@@ -21,6 +21,8 @@ from nurec_sim.network.tensors import SCENE_RESCALE, ContextMaps, NetworkInputs,
 
 LARGEST_SCALE = 0.045
 """In the network's unit; 0.30 m."""
+# An output of 0 means a scale of exp(-2.9) times the largest, about 17 mm, and an opacity of sigmoid(-2), about 0.12:
+# training begins with Gaussians that are small and let others through.
 SCALE_SHIFT = 2.9
 OPACITY_SHIFT = 2.0
 GAUSSIAN_CHANNELS = 8
@@ -85,6 +87,7 @@ class DenseDecoder(ContextDecoder):
         raw = self.gaussians_head([feature.patches.flatten(0, 1) for feature in features], (h, w))
         raw = raw.float().permute(0, 2, 3, 1).reshape(b, v * h * w, GAUSSIAN_CHANNELS)
         source = torch.arange(v * h * w, device=raw.device).expand(b, -1)
+        # The sky is a cubemap and the own car is no part of the scene: their pixels give Gaussians of opacity 0.
         visible = (outside_probability(context.logits) > 0.5).reshape(b, -1).to(raw.dtype)
         shapes = footprints(inputs, context, source, raw.new_ones(v * h * w)) if self.begins_as_footprints else None
         return gaussians_at(source, raw, visible, lifted_points(context, inputs), context, shapes)
@@ -123,6 +126,7 @@ class SelectiveDecoder(ContextDecoder):
         source = torch.cat([regular, road]).flatten()[None]
         points = lifted_points(context, inputs)
         raw = self.decode(points.gather(1, source[..., None].expand(-1, -1, 3)), features)
+        # The probability itself, where the dense decoder takes a decision: as in the release.
         visible = outside_probability(context.logits).reshape(1, -1).gather(1, source)
         visible[:, source.shape[1] - road.numel() :] *= filled.repeat_interleave(self.size.cell**2)
         shapes = None
@@ -136,6 +140,7 @@ class SelectiveDecoder(ContextDecoder):
         """Raw attributes of the Gaussians at points, whole clusters of ``cell``**2 after each other."""
         stacked = torch.cat([feature.patches.flatten(1, 3) for feature in features], dim=-1)
         k, v = self.ca_kv_projector(self.ca_feature_norm(self.ca_kv_proj(stacked)))
+        # One token per cluster: the points of a whole cell, side by side.
         x = self.xyz_embed(points.reshape(len(points), -1, 3 * self.size.cell**2))
         for block in self.ca_blocks:
             x = block(x, k, v)
@@ -159,7 +164,7 @@ class SelectiveDecoder(ContextDecoder):
         slots = min(self.size.road_slots, cells.shape[1])
         chosen, filled = [], []
         for image_cells, is_road in zip(cells, road, strict=True):
-            ranked = torch.argsort(~is_road, stable=True)
+            ranked = torch.argsort(~is_road, stable=True)  # road cells first, in their order
             count = int(is_road.sum())
             if count > slots:
                 ranked = ranked[torch.arange(slots, device=ranked.device) * count // slots]
@@ -179,6 +184,7 @@ def _cells(maps: Tensor, cell: int) -> Tensor:
 
 def lifted_points(context: ContextMaps, inputs: NetworkInputs) -> Float[Tensor, "b n 3"]:
     """Where each pixel's ray reaches its depth, scene frame, metres."""
+    # Rays have unit length: distance is z-depth over the z of the ray.
     distance = context.depth_m[..., None] / inputs.distance_to_depth_scale
     return (inputs.rays[..., :3] + inputs.rays[..., 3:] * distance).flatten(1, 3)
 

@@ -35,6 +35,8 @@ class Reassemble(nn.Module):
         maps = []
         for level, feature in enumerate(features):
             x = self.proj_layers[level](self.norm_layer(feature).permute(0, 3, 1, 2))
+            # Deeper levels are coarser: together they are the pyramid that a convolutional backbone would give
+            # (Ranftl et al. 2021).
             x = self.resize_layers[level](x + position_waves(x, aspect))
             maps.append(self.output_layers[level](x))
         return maps
@@ -79,6 +81,7 @@ class Fusion(nn.Module):
         detail: Float[Tensor, "n e h w"] | None = None,
     ) -> Float[Tensor, "n out h w"]:
         """The head's output; ``detail`` is added at full resolution."""
+        # From coarse to fine; every level enlarges to the size of the next.
         x: Tensor = self.refinement_blocks[3](maps[3], None, maps[2].shape[-2:])
         x = self.refinement_blocks[2](x, maps[2], maps[1].shape[-2:])
         x = self.refinement_blocks[1](x, maps[1], maps[0].shape[-2:])
@@ -128,6 +131,7 @@ def position_waves(x: Float[Tensor, "n d h w"], aspect: float) -> Float[Tensor, 
     The picture spans the unit diagonal; half of the channels tell the column, half the row.
     """
     channels, height, width = x.shape[-3:]
+    # Relative to the diagonal, so that a pixel's waves do not change when an image is scaled.
     diagonal = (aspect**2 + 1) ** 0.5
     columns = _centred(width, aspect / diagonal, x.device)
     rows = _centred(height, 1 / diagonal, x.device)

@@ -18,6 +18,7 @@ from nurec_sim.network.attention import Mlp, Rope, SelfBlock
 from nurec_sim.network.car_view import CHANNELS
 from nurec_sim.network.profiles import PATCH_PX, EncoderSize
 
+# Of ImageNet, with which DINOv2 was trained.
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
 RAY_OCTAVES = 6
@@ -75,6 +76,7 @@ class CameraEmbedding(nn.Module):
     def forward(self, c2w: Float[Tensor, "b v 4 4"], fov: Float[Tensor, "b v 2"]) -> Float[Tensor, "b v c"]:
         """Camera tokens; always in float32."""
         with torch.autocast(c2w.device.type, enabled=False):
+            # Position (3), rotation (4), vertical and horizontal field of view (2): the order of the checkpoints.
             code = torch.cat([c2w[..., :3, 3], quaternion_xyzw(c2w[..., :3, :3]), fov.flip(-1)], dim=-1)
             x = self.token_norm(self.pose_branch(code.float()))
             for block in self.trunk:
@@ -125,17 +127,20 @@ class AlternatingTransformer(nn.Module):
         class_token = (self.cls_tokens + self.cls_pos_embed).expand(b * v, 1, width)
         x = torch.cat([class_token.to(patches.dtype), patches.reshape(b * v, rows * columns, width)], dim=1)
         head_width = width // self.size.heads
+        # Within an image, attention depends on how far apart patches are; across images that distance has no meaning.
         local = Rope(local_positions(rows, columns, 1, x.device), head_width)
         everywhere = Rope(global_positions(rows * columns, v, x.device), head_width)
         taps, local_x = [], x
         for number, block in enumerate(self.blocks):
             if number == self.size.alternate_from:
+                # From here on images are compared, so that each one's token has to say where it was taken.
                 x = torch.cat([camera_token.reshape(b * v, 1, width).to(x.dtype), x[:, 1:]], dim=1)
             if number < self.size.alternate_from:
                 x = block(x)
             elif number % 2 == 0:
                 x = local_x = block(x, local)
             else:
+                # All tokens of a clip attend to each other: [b, v * n, c].
                 x = block(x.reshape(b, -1, width), everywhere).reshape(b * v, -1, width)
             if number in self.size.taps:
                 state = torch.cat([local_x[:, 1:], self.norm_layer(x[:, 1:]).to(x.dtype)], dim=-1)
@@ -194,6 +199,8 @@ def resampled_positions(grid: Float[Tensor, "g g c"], rows: int, columns: int) -
 
 def quaternion_xyzw(rotation: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
     """Unit quaternions (x, y, z, w) of rotation matrices, w >= 0, by the largest of the four components."""
+    # Row k of the candidates is 4 q_k (x, y, z, w). The row of the largest component never divides by nearly zero
+    # (Shepperd 1978), and choosing it keeps the gradient finite everywhere.
     m = rotation.flatten(-2)
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = m.unbind(-1)
     candidates = torch.stack(
@@ -205,6 +212,7 @@ def quaternion_xyzw(rotation: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
         ],
         dim=-2,
     )
+    # The diagonal holds 4 q_k^2.
     best = candidates.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*rotation.shape[:-2], 1, 4)
     quaternion = functional.normalize(candidates.gather(-2, best)[..., 0, :], dim=-1)
     return torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)

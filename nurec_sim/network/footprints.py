@@ -55,6 +55,7 @@ def footprints(
         spacing: pixels from one Gaussian to the next.
     """
     direction, distance = inputs.rays[..., 3:], context.depth_m / inputs.distance_to_depth_scale[..., 0]
+    # Geometric mean of the angles to the next pixel to the right and below: the angle of a square of the same area.
     apart = torch.stack([_difference(direction, axis) for axis in (2, 3)]).prod(0).sqrt()
 
     def at_source(values: Tensor) -> Tensor:
@@ -70,6 +71,7 @@ def footprints(
     other = torch.linalg.cross(normal, ray.new_tensor([0.6, 0.8, 0.0]).expand_as(ray))
     along = functional.normalize(torch.where(slant > 0.999, other, along), dim=-1)
     across = torch.linalg.cross(normal, along)
+    # Angle times distance is a pixel's width across the view; on a slanted surface it is 1 / cos as long along it.
     width = (SHARE * spacing * at_source(distance * apart))[..., None]
     stretch = 1 / slant.clamp(min=1 / STEEPEST)
     scale = torch.cat([width * stretch, width, width * THICKNESS], dim=-1)

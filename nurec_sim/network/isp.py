@@ -28,6 +28,7 @@ class IspDecoder(nn.Module):
             ValueError: images are not camera-major with the same number for every camera.
         """
         cameras = cameras_of(camera_idxs)
+        # All frames of a camera side by side: the response is that of the camera.
         tokens = self.kv_norm(patches).reshape(len(patches) * cameras, -1, patches.shape[-1])
         query = self.affine_token.expand(len(tokens), 1, -1)
         k, v = self.affine_attention.kv_projector(tokens)

@@ -15,7 +15,7 @@ from nurec_sim.network.encoder import Encoder, Features
 from nurec_sim.network.image_colours import image_colours
 from nurec_sim.network.isp import IspDecoder
 from nurec_sim.network.profiles import PATCH_PX, Profile, SkySize
-from nurec_sim.network.sky.background import stands
+from nurec_sim.network.sky.background import is_static
 from nurec_sim.network.sky.learned import SkyDecoder
 from nurec_sim.network.sky.mlp import SkyMlp
 from nurec_sim.network.sky.observed import observed_sky
@@ -92,8 +92,8 @@ class InstantNuRec(nn.Module):
         return NetworkOutputs(context, gaussians, sky, seen, self.sky is not None, isp)
 
     def refined(self, context: ContextMaps, inputs: NetworkInputs) -> ContextMaps:
-        """Context with the depth of what stands as matching refines it; a factor, so that gradients pass through."""
-        factor = depth_factor(inputs, context.depth_m, stands(context.logits))
+        """Context with the depth of static surfaces refined by matching; a factor, so that gradients pass through."""
+        factor = depth_factor(inputs, context.depth_m, is_static(context.logits))
         return dataclasses.replace(context, depth_m=context.depth_m * factor)
 
     def features(self, inputs: NetworkInputs) -> tuple[Features, ...]:

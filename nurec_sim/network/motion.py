@@ -49,6 +49,7 @@ class ModulatedBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "n t c"], condition: Float[Tensor, "n c"], rope: Rope) -> Float[Tensor, "n t c"]:
         """Tokens after the block."""
+        # Peebles and Xie 2023; the feed-forward half stays unconditioned, as in the checkpoints.
         shift, scale, gate = self.modulation(functional.silu(condition))[:, None].chunk(3, dim=-1)
         x = x + gate * self.ls1(self.attn(self.norm1(x) * (1 + scale) + shift, rope))
         return x + self.ls2(self.mlp(self.norm2(x)))
@@ -96,24 +97,6 @@ class MotionDecoder(nn.Module):
         self.final_motion_head = DptHead(2 * width, profile.head, out=6)
         self.cls_token_norm = nn.LayerNorm(width)
 
-    def raw(
-        self,
-        features: Sequence[Features],
-        image_size: tuple[int, int],
-        time: Float[Tensor, "b v"],
-        time_before: Float[Tensor, "b v"],
-        time_after: Float[Tensor, "b v"],
-    ) -> Float[Tensor, "n 6 h w"]:
-        """The head's output: displacement before (3), after (3), in the network's unit."""
-        source = self.source_time_norm(self.source_time_embed(time.flatten()))
-        targets = self.target_time_embed(torch.stack([time_before.flatten(), time_after.flatten()], dim=-1)).flatten(-2)
-        levels = []
-        for level in (feature.merged for feature in features):
-            token = self.cls_token_norm(level.token.flatten(0, 1))
-            extra = torch.stack([token, source.to(token.dtype)], dim=1)
-            levels.append(self.vit(level.patches.flatten(0, 1), extra, targets))
-        return self.final_motion_head(levels, image_size)
-
     def forward(
         self,
         features: Sequence[Features],
@@ -122,7 +105,23 @@ class MotionDecoder(nn.Module):
         time_before: Float[Tensor, "b v"],
         time_after: Float[Tensor, "b v"],
     ) -> Float[Tensor, "b v h w 2 3"]:
-        """Displacements in metres, in the scene frame."""
-        raw = self.raw(features, image_size, time, time_before, time_after)
+        """Displacements to the times before and after, in metres, in the scene frame.
+
+        Args:
+            features: four levels of the encoder.
+            image_size: height and width.
+            time: of each image, as a fraction of the chunk.
+            time_before: the time of the camera's last frame.
+            time_after: that of its next one.
+        """
+        source = self.source_time_norm(self.source_time_embed(time.flatten()))
+        # Half of the condition's channels for each of the two times that displacements lead to.
+        targets = self.target_time_embed(torch.stack([time_before.flatten(), time_after.flatten()], dim=-1)).flatten(-2)
+        levels = []
+        for level in (feature.merged for feature in features):
+            token = self.cls_token_norm(level.token.flatten(0, 1))
+            extra = torch.stack([token, source.to(token.dtype)], dim=1)
+            levels.append(self.vit(level.patches.flatten(0, 1), extra, targets))
+        raw = self.final_motion_head(levels, image_size)
         metres = raw.permute(0, 2, 3, 1).unflatten(-1, (2, 3)) / SCENE_RESCALE
         return metres.unflatten(0, time.shape)

@@ -42,9 +42,9 @@ def test_the_nearer_a_thing_the_more_counts_what_the_network_says(monkeypatch):
 def test_what_moves_or_has_no_other_frame_keeps_its_depth(monkeypatch):
     inputs = wall_inputs(LENSES["pinhole"])
     depth = predicted(inputs, 0.85, monkeypatch=monkeypatch)
-    stands = torch.ones_like(depth, dtype=torch.bool)
-    stands[..., :40] = False
-    factor = depth_factor(inputs, depth, stands)
+    is_static = torch.ones_like(depth, dtype=torch.bool)
+    is_static[..., :40] = False
+    factor = depth_factor(inputs, depth, is_static)
     assert (factor[..., :40] == 1).all() and (factor[..., 40:] != 1).any()
     alone = wall_inputs(LENSES["pinhole"], images=1)
     depth = predicted(alone, 0.85, monkeypatch=monkeypatch)
@@ -61,5 +61,5 @@ def test_without_texture_the_depth_stays(monkeypatch):
 def test_the_same_input_gives_the_same_bytes():
     inputs = wall_inputs(LENSES["fisheye"])
     depth = torch.full(inputs.rgb.shape[:-1], 10.0)
-    stands = torch.ones_like(depth, dtype=torch.bool)
-    assert torch.equal(depth_factor(inputs, depth, stands), depth_factor(inputs, depth, stands))
+    is_static = torch.ones_like(depth, dtype=torch.bool)
+    assert torch.equal(depth_factor(inputs, depth, is_static), depth_factor(inputs, depth, is_static))

@@ -218,12 +218,12 @@ def test_isp_of_cameras_that_share_points():
     other = (np.column_stack([true, np.ones(2000)]) @ gain.T).astype(np.float32)
     everything = np.ones(2000, bool)
     nothing = np.zeros(2000, bool)
-    isp, lonely = colour.solve_isp(
+    isp, unaligned_cameras = colour.solve_isp(
         ["a", "b", "c"], {"a": (true, everything), "b": (other, everything), "c": (true, nothing)}
     )
     assert np.allclose(isp["a"], np.eye(3, 4)) and np.allclose(isp["c"], np.eye(3, 4))
     assert np.abs(isp["b"] - gain).max() < 0.06
-    assert lonely == ["c"]
+    assert unaligned_cameras == ["c"]
     assert np.abs(colour.to_canonical(other * 255, isp["b"]) - true * 255).mean() < 4
 
 

@@ -187,10 +187,10 @@ def test_the_response_of_a_camera_is_not_that_of_the_glare_in_it():
 @pytest.mark.parametrize(("count", "compared"), [(299, False), (300, True)])
 def test_cameras_are_compared_from_300_shared_points_on(count, compared):
     true = np.random.default_rng(0).uniform(0.1, 0.9, (1000, 3)).astype(np.float32)
-    isp, lonely = colour.solve_isp(
+    isp, unaligned_cameras = colour.solve_isp(
         ["a", "b"], {"a": (true, np.ones(1000, bool)), "b": (0.8 * true, np.arange(1000) < count)}
     )
-    assert (lonely == []) == compared and np.allclose(isp["b"], np.eye(3, 4)) != compared
+    assert (unaligned_cameras == []) == compared and np.allclose(isp["b"], np.eye(3, 4)) != compared
 
 
 # ------------------------------------------------------------------------------------------------------------- depth

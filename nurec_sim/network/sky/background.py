@@ -20,8 +20,8 @@ LEAST = 1e-6
 """Blurred pixels per texel from which on a direction counts as covered."""
 
 
-def stands(logits: Float[Tensor, "*n 5"]) -> Bool[Tensor, "*n"]:
-    """Pixels that show what stands: no sky, not the own car, and nothing that can move."""
+def is_static(logits: Float[Tensor, "*n 5"]) -> Bool[Tensor, "*n"]:
+    """Pixels that show static surfaces: no sky, not the own car, and nothing that can move."""
     semantic = logits.argmax(-1)
     return (semantic == SemanticClass.OTHERS) | (semantic == SemanticClass.ROAD)
 
@@ -32,7 +32,7 @@ def background(
     """Blurred mean colours of surfaces by direction, and where there are any (1, elsewhere 0).
 
     Args:
-        colour: of pixels that show what stands.
+        colour: of pixels that show static surfaces.
         direction: where they look, in the cubemap's axes (``network.sky.cubemap``).
         size: edge of a face.
     """

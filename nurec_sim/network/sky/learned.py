@@ -45,28 +45,47 @@ class SkyUpsampling(nn.Module):
         return self.decode_head(self.reassemble([feature] * 4, 1.0), (edge_px, edge_px))
 
 
-class SkyDecoder(nn.Module):
-    """Colours of all directions, from the encoder's deepest features, the images and their rays."""
+class SkyQueries(nn.Module):
+    """What both sky decoders begin with: the directions of the cubemap, and tokens of the images with their rays."""
 
     query_rays: Tensor
 
-    def __init__(self, profile: Profile, size: SkySize) -> None:
+    def __init__(self, profile: Profile, size: SkySize, stored: bool) -> None:
         super().__init__()
         self.size = size
         self.token = nn.Parameter(torch.zeros(size.width))
-        self.register_buffer("query_rays", cubemap.directions(size.cubemap_px), persistent=profile.training_buffers)
+        self.register_buffer("query_rays", cubemap.directions(size.cubemap_px), persistent=stored)
         self.feature_transform = nn.Sequential(
             nn.Linear(2 * profile.encoder.width, size.width), nn.LayerNorm(size.width)
         )
         self.patch_embed_img = PatchEmbedding(size.width, normed=True)
         self.patch_embed_ray = RayEmbedding(size.width)
-        self.blocks = nn.ModuleList(QueryBlock(size.width, size.heads, scale=1.0) for _ in range(size.depth))
-        self.kv_projector = KeyValueProjector(size.width, size.heads, normed=True)
-        self.upsample = SkyUpsampling(size, profile.head)
 
     def set_constants(self) -> None:
         """Compute the directions again, where the module was made without values."""
         self.query_rays.copy_(cubemap.directions(self.size.cubemap_px, self.query_rays.device))
+
+    def seen(
+        self,
+        patches: Float[Tensor, "b v y x c"],
+        rgb: Float[Tensor, "b v h w 3"],
+        directions: Float[Tensor, "b v h w 3"],
+    ) -> Float[Tensor, "b tokens c"]:
+        """Tokens of all patches of a clip: what the encoder says of them, their colours, and where they look."""
+        tokens = self.feature_transform(patches).flatten(0, 1)
+        tokens = tokens + self.patch_embed_img(normalized(rgb.flatten(0, 1)))
+        tokens = tokens + self.patch_embed_ray(directions.flatten(0, 1))
+        return tokens.reshape(len(rgb), -1, self.size.width)
+
+
+class SkyDecoder(SkyQueries):
+    """Colours of all directions, from the encoder's deepest features, the images and their rays."""
+
+    def __init__(self, profile: Profile, size: SkySize) -> None:
+        super().__init__(profile, size, profile.training_buffers)
+        self.blocks = nn.ModuleList(QueryBlock(size.width, size.heads, scale=1.0) for _ in range(size.depth))
+        self.kv_projector = KeyValueProjector(size.width, size.heads, normed=True)
+        self.upsample = SkyUpsampling(size, profile.head)
 
     def forward(
         self,
@@ -75,11 +94,9 @@ class SkyDecoder(nn.Module):
         directions: Float[Tensor, "b v h w 3"],
     ) -> Float[Tensor, "b 6 s s 3"]:
         """The sky in the frame of the directions, 0..1."""
-        b, v = rgb.shape[:2]
-        seen = self.feature_transform(patches).flatten(0, 1)
-        seen = seen + self.patch_embed_img(normalized(rgb.flatten(0, 1)))
-        seen = seen + self.patch_embed_ray(directions.flatten(0, 1))
-        k, values = self.kv_projector(seen.reshape(b, -1, self.size.width))
+        b = len(rgb)
+        k, values = self.kv_projector(self.seen(patches, rgb, directions))
+        # Texels and image patches code their directions alike, so that a texel finds the patches that look its way.
         query = self.patch_embed_ray(self.query_rays) + self.token
         x = query.reshape(1, -1, self.size.width).expand(b, -1, -1)
         for block in self.blocks:

@@ -33,18 +33,18 @@ SMALL_STEP, LARGE_STEP = 0.02, 0.5
 
 @torch.no_grad()
 def depth_factor(
-    inputs: NetworkInputs, depth_m: Float[Tensor, "b v h w"], stands: Bool[Tensor, "b v h w"]
+    inputs: NetworkInputs, depth_m: Float[Tensor, "b v h w"], is_static: Bool[Tensor, "b v h w"]
 ) -> Float[Tensor, "b v h w"]:
-    """What to multiply depths by so that the images fit better; 1 where nothing stands or no other frame helps.
+    """What to multiply depths by so that the images fit better; 1 where nothing is static or no other frame helps.
 
     Args:
         inputs: the images.
         depth_m: predicted.
-        stands: pixels of things that stand still: no sky, nothing that can move.
+        is_static: pixels of static surfaces: no sky, nothing that can move.
     """
     with torch.autocast(depth_m.device.type, enabled=False):
         factors = [_clip_factor(inputs, clip, depth_m[clip].float()) for clip in range(len(depth_m))]
-    return torch.where(stands, torch.stack(factors), 1.0)
+    return torch.where(is_static, torch.stack(factors), 1.0)
 
 
 def _clip_factor(inputs: NetworkInputs, clip: int, depth_m: Float[Tensor, "v h w"]) -> Float[Tensor, "v h w"]:

@@ -72,7 +72,7 @@ def _search_clip(
 ) -> None:
     """Writes what is found into ``motion_m``."""
     images = small_images(inputs, clip)
-    looks = torch.cat([images.local / CONTRAST, images.rgb / COLOUR], dim=1)
+    appearance = torch.cat([images.local / CONTRAST, images.rgb / COLOUR], dim=1)
     time = inputs.time[clip]
     gaps = torch.stack([inputs.time_before[clip] - time, inputs.time_after[clip] - time], dim=-1)
     distance = depth_m / inputs.distance_to_depth_scale[clip, ..., 0].clamp(min=1e-3)
@@ -83,11 +83,11 @@ def _search_clip(
         if not others or min(abs(span) for span in spans) <= 0:
             continue
         unit = min(abs(span) for span in spans)
-        frames = [_Frame(images.views[n], looks[n], span / unit) for n, span in zip(others, spans, strict=True)]
+        frames = [_Frame(images.views[n], appearance[n], span / unit) for n, span in zip(others, spans, strict=True)]
         thing_of = torch.from_numpy(things(depth_m[k], movable[k])).to(depth_m.device)
         for number in range(1, int(thing_of.max()) + 1):
             mine = thing_of == number
-            thing = _Thing(points[k][mine], _looks_at(looks[k], mine))
+            thing = _Thing(points[k][mine], _appearance_at(appearance[k], mine))
             shift = thing.search(frames, car_axes, images.size[1])
             motion_m[k][mine] = (gaps[k, :, None] / unit * shift)[None].to(motion_m.dtype)
 
@@ -111,7 +111,7 @@ def things(depth_m: Float[Tensor, "h w"], movable: Bool[Tensor, "h w"]) -> Int32
     return np.where(mask & (numbers == 0), joined, numbers)
 
 
-def _looks_at(look: Float[Tensor, "4 h w"], mine: Bool[Tensor, "h w"]) -> Float[Tensor, "4 n"]:
+def _appearance_at(look: Float[Tensor, "4 h w"], mine: Bool[Tensor, "h w"]) -> Float[Tensor, "4 n"]:
     """Normalized brightness and colours of an image at some of its full-size pixels."""
     height, width = mine.shape
     y, x = torch.nonzero(mine, as_tuple=True)
@@ -120,7 +120,7 @@ def _looks_at(look: Float[Tensor, "4 h w"], mine: Bool[Tensor, "h w"]) -> Float[
 
 
 class _Frame(NamedTuple):
-    """A frame to look into: projection, looks, and how long after the thing's own (in units of the least gap)."""
+    """A frame to look into: projection, appearance features, and how long after the thing's own (least gap = 1)."""
 
     view: ImageView
     look: Float[Tensor, "4 h w"]
@@ -128,7 +128,7 @@ class _Frame(NamedTuple):
 
 
 class _Thing:
-    """Some points of one thing and how they look."""
+    """Some points of one thing and their appearance features."""
 
     def __init__(self, points: Float[Tensor, "n 3"], look: Float[Tensor, "4 n"]) -> None:
         step = max(1, len(points) // SAMPLES)
@@ -167,7 +167,7 @@ class _Thing:
         car_axes: Float[Tensor, "2 3"],
         every: int = 1,
     ) -> Float[Tensor, " d"]:
-        """How badly each shift (along and across, metres) fits, about 0..1, by every so manieth point."""
+        """How badly each shift (along and across, metres) fits, about 0..1, comparing one point in ``every``."""
         points, own = self.points[::every], self.look[:, None, None, ::every]
         total = (tried.abs() / tried.new_tensor(FARTHEST_M)).sum(-1) * FAR_PENALTY
         for view, look, span in frames:

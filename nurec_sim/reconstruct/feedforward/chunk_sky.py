@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from nurec_sim import geometry
 from nurec_sim.network.sky import cubemap
-from nurec_sim.network.sky.background import background, stands
+from nurec_sim.network.sky.background import background, is_static
 from nurec_sim.network.sky.observed import texture
 from nurec_sim.network.tensors import ContextMaps, SemanticClass
 from nurec_sim.reconstruct.sky_fill import fill_unseen
@@ -88,8 +88,8 @@ def world_background(
     size: int,
     ego: Bool[np.ndarray, "v h w"] | None = None,
 ) -> tuple[Float32[np.ndarray, "6 size size 3"], Float32[np.ndarray, "6 size size"]]:
-    """``network.sky.background`` over the world, of what one chunk shows of all that stands."""
-    return background(*_pixels(stands(context.logits[0]), context, rays, world_from_scene, ego), size)
+    """``network.sky.background`` over the world, of what one chunk shows of all static surfaces."""
+    return background(*_pixels(is_static(context.logits[0]), context, rays, world_from_scene, ego), size)
 
 
 def _pixels(

@@ -64,7 +64,7 @@ def chunk_layers(clip: Clip, chunk: ChunkInputs, outputs: NetworkOutputs, settin
     Dropped is what is not more opaque than ``settings.min_opacity`` (sky and ego car are not, by the network's mask),
     not finite, or on pixels where the log's own mask shows the ego car. Dynamic is every movable point, with or without
     tracks, and every other point off the road that lies in a track's box. Without a motion head a movable point that no
-    track explains stands still between its knots.
+    track explains is static between its knots.
 
     Args:
         clip: the driving log; its movable tracks, of any source, carry the points in their boxes.
@@ -208,9 +208,9 @@ def _split(
     moved = points[rows]
     displacement = _displacement(chunk, motion_m, moved.query)
     dynamic = _moving_points(actors, image, moved, t_us, owner, displacement, span_us)
-    stands = np.ones(len(label), bool)
-    stands[rows] = False
-    return points.gaussians[stands], dynamic
+    is_static = np.ones(len(label), bool)
+    is_static[rows] = False
+    return points.gaussians[is_static], dynamic
 
 
 def pixel_times_us(image: ContextImage, pixel: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:

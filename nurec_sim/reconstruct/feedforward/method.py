@@ -14,7 +14,7 @@ from nurec_sim.errors import ReconstructError
 from nurec_sim.network.checkpoints.download import find_weights
 from nurec_sim.network.checkpoints.state_dicts import load_weights
 from nurec_sim.network.model import InstantNuRec, Precision
-from nurec_sim.network.sky.background import stands
+from nurec_sim.network.sky.background import is_static
 from nurec_sim.reconstruct.feedforward.chunks import ChunkLayers
 from nurec_sim.reconstruct.feedforward.inputs.frames import ChunkWindow, choose_cameras, chunk_windows
 from nurec_sim.reconstruct.feedforward.inputs.window import chunk_inputs
@@ -170,8 +170,8 @@ def _chunk(
     fit, gaussians, depth_m = None, outputs.gaussians, outputs.context.depth_m[0].cpu().numpy()
     if settings.lidar_depth != "off":
         progress("LiDAR depth", 0.7)
-        standing = stands(outputs.context.logits[0]).cpu().numpy()
-        fit = fit_depth(clip, chunk, depth_m, hold_out, settings.lidar_depth, standing)
+        static = is_static(outputs.context.logits[0]).cpu().numpy()
+        fit = fit_depth(clip, chunk, depth_m, hold_out, settings.lidar_depth, static)
         gaussians, depth_m = fit.apply(gaussians, chunk), fit.factor * depth_m
     outputs = dataclasses.replace(outputs, gaussians=gaussians)
     if settings.consensus:

@@ -53,7 +53,7 @@ def lift(
     pictures = depth_pictures(views, bodies, settings, stages.fraction)
     views = [view for view in views if view.key]
     stages.start("colours")
-    isp, lonely = camera_isp(views, pictures, bodies, cameras)
+    isp, unaligned_cameras = camera_isp(views, pictures, bodies, cameras)
     canonical = [colour.to_canonical(view.rgb, isp[view.camera_id]).astype(np.uint8) for view in views]
     stages.start("lifting")
     static, moving, lifted = Gaussians.empty(), [], 0
@@ -84,7 +84,7 @@ def lift(
         "cameras": list(cameras),
         "held_out_sweeps": sorted(hold_out),
         "counts": counts,
-        "unknown": _unknown(clip, cameras, actors, gathered, lonely),
+        "unknown": _unknown(clip, cameras, actors, gathered, unaligned_cameras),
     }
     return GaussianScene(
         id=clip.id,
@@ -141,7 +141,11 @@ class _Stages:
 
 
 def _unknown(
-    clip: Clip, cameras: Sequence[str], actors: Sequence[Actor], gathered: points.Gathered, lonely: Sequence[str]
+    clip: Clip,
+    cameras: Sequence[str],
+    actors: Sequence[Actor],
+    gathered: points.Gathered,
+    unaligned_cameras: Sequence[str],
 ) -> list[str]:
     """What the log did not tell, in plain words."""
     notes = []
@@ -153,8 +157,10 @@ def _unknown(
         notes.append("no LiDAR intensity: simulated returns have none")
     if not cameras:
         notes.append("no cameras: colours are grey")
-    if len(cameras) > 1 and lonely:
-        notes.append(f"no shared points: colours of {', '.join(lonely)} are not aligned with the other cameras")
+    if len(cameras) > 1 and unaligned_cameras:
+        notes.append(
+            f"no shared points: colours of {', '.join(unaligned_cameras)} are not aligned with the other cameras"
+        )
     if gathered.sweep_count == 1:
         notes.append("one sweep only: surfaces behind what it saw are missing")
     return notes

@@ -249,6 +249,7 @@ def _interpolate(fields, knot_us, knot_m, block, instant, out, alive):
         x = fraction if after else 1.0 - fraction
         x2 = x * x
         x4 = x2 * x2
+        # The opacity fades by exp(-x^10), x being the time from the middle knot over that to the outer one.
         log_opacity = np.float64(fields[block, LOG_OPACITY, i]) - x4 * x4 * x2
         seen = (first <= instant) & (instant <= last) & (log_opacity >= -LOG_255)
         alive[i] = f4(1) if seen else f4(0)

@@ -115,6 +115,7 @@ def morton_order(points: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
     code = np.zeros(len(points), np.uint64)
     for axis in range(3):
         v = cells[:, axis].astype(np.uint64)
+        # Spread 21 bits to every third place (Morton 1966), by halves.
         for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
                             (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):  # fmt: skip
             v = (v | (v << np.uint64(shift))) & np.uint64(mask)

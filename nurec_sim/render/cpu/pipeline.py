@@ -262,6 +262,8 @@ def blocks_in_view(view: ExposureView, layer: PackedGaussians) -> Int64[np.ndarr
     offset = layer.block_centre - view.world_from_reference[:3, 3]
     distance = np.linalg.norm(offset, axis=1)
     radius = layer.block_radius + view.travel_m
+    # A sphere meets the cone where its angle off the axis is at most the cone's half angle and its own angular radius;
+    # 0.02 rad allow for float32 in the kernels.
     angle = np.arccos(np.clip(offset @ axis / np.maximum(distance, 1e-9), -1, 1))
     reach = np.arcsin(np.clip(radius / np.maximum(distance, 1e-9), 0, 1))
     field = np.arccos(view.grid.field_cos) + view.swing_rad + 0.02

@@ -118,6 +118,7 @@ def place(v: Lanes, block: ir.Value, view: ir.Value, scratch: ir.Value) -> ir.Va
     """
     field = [v.load(block, 4 * BLOCK * k) for k in range(LABEL + 1)]
     turn = [[v.broadcast(view, 4 * (TURN + 3 * row + column)) for column in range(3)] for row in range(3)]
+    # Nearby Gaussians far from the origin: the high part cancels exactly (Sterbenz), the low part is what it lacked.
     offset = [
         (field[MEAN + k] - v.broadcast(view, 4 * (EYE_HIGH + k))) - v.broadcast(view, 4 * (EYE_LOW + k))
         for k in range(3)
@@ -174,8 +175,11 @@ def build_records(v: Lanes, scratch: ir.Value, rows: ir.Value, view: ir.Value) -
     for e in (e1, e2):
         across += [(e[0] * canonical[0][k] + e[1] * canonical[1][k] + e[2] * canonical[2][k]) * 0.25 for k in range(3)]
     along = [(x * canonical[0][k] + y * canonical[1][k] + z * canonical[2][k]) * away for k in range(3)]
+    # With |A d|^2 = 16 Q1 + n^2 W^2, q = 16 n^2 Q1 / |A d|^2 = 16 Q1 / (FLAT Q1 + W^2) for FLAT = 16 / n^2.
     flat = away * away * 16
     log_opacity = part(LOG_P)
+    # alpha >= 1/255 is Q1 <= rim Q2, that is Q1 (1 - rim FLAT) <= rim W^2; the first factor is not positive where the
+    # reference point lies within the ellipsoid of 1/255.
     rim = (log_opacity + LOG_255) * 0.125
     room = 1 - rim * flat
     lim = (room > 1e-4).where(rim / room.max(1e-4), INSIDE)

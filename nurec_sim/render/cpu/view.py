@@ -42,6 +42,7 @@ class ExposureView:
         """The view of a grid whose sensor moves from the first to the second pose."""
         pair = np.asarray(pair, np.float64)
         reference = geometry.interpolate_pose_pair(pair, np.array(grid.reference))
+        # A sensor whose two poses are equal is drawn from one, which is faster and exact.
         still = len(grid.line_fraction) == 1 or np.array_equal(pair[0], pair[1])
         fractions = np.array([grid.reference]) if still else np.asarray(grid.line_fraction, np.float64)
         poses = reference[None] if still else geometry.interpolate_pose_pair(pair, fractions)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from nurec_sim.network.image_colours import image_colours
 from nurec_sim.network.model import InstantNuRec
-from nurec_sim.network.sky.background import background, stands
+from nurec_sim.network.sky.background import background, is_static
 from nurec_sim.network.tensors import ContextMaps, NetworkInputs, QueryGaussians
 from nurec_sim.reconstruct.feedforward.merging.consensus import find_consensus
 from nurec_sim.training.config import Part, Stage
@@ -118,7 +118,7 @@ class Objective(nn.Module):
         if profile.image_colours:
             rgb, sky, isp = image_colours(inputs, sky, isp)
             shown = dataclasses.replace(shown, rgb=rgb)
-        surface = stands(shown.logits[0])
+        surface = is_static(shown.logits[0])
         colour, direction = shown.rgb[0][surface], inputs.rays[0, ..., 3:][surface]
         colour, covered = (torch.from_numpy(each).to(sky) for each in background(colour, direction, sky.shape[2]))
         return shown, torch.lerp(sky[0], colour, covered[..., None]), isp

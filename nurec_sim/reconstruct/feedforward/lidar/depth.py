@@ -110,7 +110,7 @@ def fit_depth(
     depth_m: Float32[np.ndarray, "v h w"],
     hold_out_sweeps: set[int],
     kind: Kind,
-    stands: Bool[np.ndarray, "v h w"] | None = None,
+    is_static: Bool[np.ndarray, "v h w"] | None = None,
 ) -> DepthFit:
     """Fit the predicted depth of every image of a chunk to the sweeps around its time.
 
@@ -121,7 +121,7 @@ def fit_depth(
         hold_out_sweeps: sweeps that must not be read, by index, of every LiDAR.
         kind: a factor per image; a factor and a slope over inverse depth (where the points allow one); or a factor and
             local ones.
-        stands: pixels of what stands, to which local factors also come from sweeps farther in time.
+        is_static: pixels of static surfaces, to which local factors also come from sweeps farther in time.
 
     Raises:
         ReconstructError: the log has no sweeps, or all of them are held out.
@@ -132,12 +132,12 @@ def fit_depth(
     factor = np.stack([fit.factor(depth) for fit, depth in zip(fits, depth_m, strict=True)])
     if kind == "local":
         rough_m, use = factor * depth_m, ~chunk.ego
-        if stands is None:
+        if is_static is None:
             factor *= _local_factors(rough_m, use, seen)
         else:
             more = visible_points(clip, chunk, hold_out_sweeps, STANDING_TIME_US, STANDING_SWEEPS)
-            standing, rest = _local_factors(rough_m, use & stands, more), _local_factors(rough_m, use & ~stands, seen)
-            factor *= np.where(stands, standing, rest)
+            static = _local_factors(rough_m, use & is_static, more)
+            factor *= np.where(is_static, static, _local_factors(rough_m, use & ~is_static, seen))
     after = [_compared(*each) for each in zip(factor * depth_m, ~chunk.ego, seen, strict=True)]
     fits = [
         dataclasses.replace(fit, error_before=_error([before]), error_after=_error([fitted]))

@@ -15,7 +15,7 @@ from nurec_sim.network.stereo.matching import ImageView
 from nurec_sim.network.tensors import NetworkInputs
 
 SURFACE, MOVABLE, SKY, UNKNOWN = 0, 1, 2, 3
-"""Kinds of pixels: what stands, what can move, sky, and the own car, which says nothing."""
+"""Kinds of pixels: static surfaces, what can move, sky, and the own car, which says nothing."""
 
 AGREEMENT = 0.1
 """Depths agree up to this difference of their logarithms."""
@@ -47,7 +47,7 @@ class Pictures(NamedTuple):
 
     depth_m: Float32[np.ndarray, "v h w"]
     kind: UInt8[np.ndarray, "v h w"]
-    stands: Bool[np.ndarray, "v h w"]
+    may_own: Bool[np.ndarray, "v h w"]
     rgb: Float32[np.ndarray, "v h w 3"]
     camera: Int64[np.ndarray, " v"]
 
@@ -154,10 +154,118 @@ def _exposed(rgb):
     return min(rgb[0], rgb[1], rgb[2]) > EXPOSED[0] and max(rgb[0], rgb[1], rgb[2]) < EXPOSED[1]
 
 
+@inner
+def _place_in(k, ray, distance, farthest_z, views):
+    """Where image k shows the point at a distance along a ray [6].
+
+    Returns:
+        Whether it does; the point's z-depth and distance from the image's eye; its place (x, y), -1..1 from edge to
+        edge; the row and the column of the pixel there.
+    """
+    px = ray[0] + distance * ray[3] - views.eye[k, 0]
+    py = ray[1] + distance * ray[4] - views.eye[k, 1]
+    pz = ray[2] + distance * ray[5] - views.eye[k, 2]
+    axis = views.turn[k, :, 2]
+    z = px * axis[0] + py * axis[1] + pz * axis[2]
+    if z <= NEAREST_M or z > farthest_z:
+        return False, z, 0.0, 0.0, 0.0, 0, 0
+    x, y = _projected(k, px, py, pz, z, views)
+    if not (abs(x) < 1 and abs(y) < 1):
+        return False, z, 0.0, x, y, 0, 0
+    height, width = views.along.shape[1:]
+    row, column = min(int((y + 1) / 2 * height), height - 1), min(int((x + 1) / 2 * width), width - 1)
+    return True, z, np.sqrt(px * px + py * py + pz * pz), x, y, row, column
+
+
+@inner
+def _add_pair(pair, own, other):
+    """Add the colours [3] of one surface in two cameras to ``Compared.pairs`` [7], unless either may have been cut."""
+    if _exposed(own) and _exposed(other):
+        for channel in range(3):
+            pair[channel] += own[channel]
+            pair[3 + channel] += other[channel]
+        pair[6] += 1
+
+
+@inner
+def _add_colour(mixed, other, nearness):
+    """Add another image's colour [3] of the surface; returns its weight, which grows with the area of its pixels."""
+    weight = SHARED_COLOUR * min(nearness**2, MOST_COLOUR)
+    for channel in range(3):
+        mixed[channel] += weight * other[channel]
+    return weight
+
+
+@inner
+def _compare_pixel(image, row, column, others, pictures, views, mixed, pairs):
+    """What the other images say of one pixel.
+
+    Args:
+        image: the pixel's image, then its row and column.
+        row: see image.
+        column: see image.
+        others: [n] the images to compare it with.
+        pictures: see ``Pictures``.
+        views: see ``Views``.
+        mixed: [3] the pixel's colour, which becomes the one that all images show together.
+        pairs: [cameras,7] added to, see ``Compared``.
+
+    Returns:
+        Its depth, whether its image owns the surface, whether the images agree that there is one, and the share of
+        those that see it which call it movable. The first three mean nothing where the pixel is movable itself.
+    """
+    depth, kind, may_own, rgb, camera = pictures
+    height, width = depth.shape[1:]
+    mine, here = kind[image, row, column], float(depth[image, row, column])
+    ray, distance = views.rays[image, row, column], here / views.along[image, row, column]
+    # The nearest ring owns the surface, in a ring the image with the lowest number.
+    claim = (np.floor(_ring(distance, 2 * (column + 0.5) / width - 1, 2 * (row + 0.5) / height - 1)), image)
+    shift = 0.0
+    moves, rests = (1.0, 0.0) if mine == MOVABLE else (0.0, 1.0)
+    agree = through = 0.0
+    colours = 1.0
+    for k in others:
+        seen, z, away, x, y, v, u = _place_in(k, ray, distance, 1.5 * here, views)
+        its = kind[k, v, u]
+        if not seen or its == UNKNOWN:
+            continue
+        nearness = here / z
+        inside = abs(x) < 1 - 2 * BORDER and abs(y) < 1 - BORDER
+        difference = np.inf if its == SKY else np.log(depth[k, v, u] / z)
+        if difference >= AGREEMENT:
+            through += inside * nearness**2  # it sees something behind: there should be nothing here
+        if abs(difference) >= AGREEMENT:
+            continue
+        if its == MOVABLE:
+            moves += nearness
+        else:
+            rests += nearness
+        if mine == MOVABLE or its == MOVABLE:
+            continue
+        agree += nearness**2
+        if camera[k] != camera[image]:
+            _add_pair(pairs[camera[k]], rgb[image, row, column], rgb[k, v, u])
+        if not inside:
+            continue
+        colours += _add_colour(mixed, rgb[k, v, u], nearness)
+        its_claim = (np.floor(_ring(away, x, y) + OVERLAP / OWNER_RING), k)
+        if may_own[k, v, u] and its_claim < claim:
+            claim = its_claim
+            # A step along the ray is so much of a step along the owner's axis.
+            axis = views.turn[k, :, 2]
+            slope = ray[3] * axis[0] + ray[4] * axis[1] + ray[5] * axis[2]
+            shift = (depth[k, v, u] - z) / max(slope, LEAST_SLOPE)
+    if mine == SURFACE:
+        for channel in range(3):
+            mixed[channel] /= colours
+    moved = here + shift * views.along[image, row, column]
+    return moved, claim[1] == image, through <= agree, moves / (moves + rests)
+
+
 @kernel
 def _compare(image, others, pictures, views):
     """One image's part of ``Compared``."""
-    depth, kind, stands, rgb, camera = pictures
+    depth, kind, _, rgb, camera = pictures
     height, width = depth.shape[1:]
     moved, mixed = depth[image].copy(), rgb[image].copy()
     owned, agreed = np.ones((height, width), np.bool_), np.ones((height, width), np.bool_)
@@ -168,62 +276,9 @@ def _compare(image, others, pictures, views):
             mine = kind[image, row, column]
             if mine != SURFACE and mine != MOVABLE:
                 continue
-            here = float(depth[image, row, column])
-            ray, distance = views.rays[image, row, column], here / views.along[image, row, column]
-            ring = np.floor(_ring(distance, 2 * (column + 0.5) / width - 1, 2 * (row + 0.5) / height - 1))
-            owner, shift = image, 0.0
-            moves, rests = (1.0, 0.0) if mine == MOVABLE else (0.0, 1.0)
-            agree = through = 0.0
-            colours = 1.0
-            for k in others:
-                px = ray[0] + distance * ray[3] - views.eye[k, 0]
-                py = ray[1] + distance * ray[4] - views.eye[k, 1]
-                pz = ray[2] + distance * ray[5] - views.eye[k, 2]
-                axis = views.turn[k, :, 2]
-                z = px * axis[0] + py * axis[1] + pz * axis[2]
-                if z <= NEAREST_M or z > 1.5 * here:
-                    continue
-                x, y = _projected(k, px, py, pz, z, views)
-                if not (abs(x) < 1 and abs(y) < 1):
-                    continue
-                v, u = min(int((y + 1) / 2 * height), height - 1), min(int((x + 1) / 2 * width), width - 1)
-                its, nearness = kind[k, v, u], here / z
-                if its == UNKNOWN:
-                    continue
-                inside = abs(x) < 1 - 2 * BORDER and abs(y) < 1 - BORDER
-                difference = np.inf if its == SKY else np.log(depth[k, v, u] / z)
-                if difference >= AGREEMENT:
-                    through += inside * nearness**2
-                if abs(difference) >= AGREEMENT:
-                    continue
-                if its == MOVABLE:
-                    moves += nearness
-                else:
-                    rests += nearness
-                if mine == MOVABLE or its == MOVABLE:
-                    continue
-                agree += nearness**2
-                if camera[k] != camera[image] and _exposed(rgb[image, row, column]) and _exposed(rgb[k, v, u]):
-                    for channel in range(3):
-                        pairs[camera[k], channel] += rgb[image, row, column, channel]
-                        pairs[camera[k], 3 + channel] += rgb[k, v, u, channel]
-                    pairs[camera[k], 6] += 1
-                if not inside:
-                    continue
-                weight = SHARED_COLOUR * min(nearness**2, MOST_COLOUR)
-                for channel in range(3):
-                    mixed[row, column, channel] += weight * rgb[k, v, u, channel]
-                colours += weight
-                its_ring = np.floor(_ring(np.sqrt(px * px + py * py + pz * pz), x, y) + OVERLAP / OWNER_RING)
-                if stands[k, v, u] and (its_ring, k) < (ring, owner):
-                    ring, owner = its_ring, k
-                    # A step along the ray is so much of a step along the owner's axis.
-                    slope = ray[3] * axis[0] + ray[4] * axis[1] + ray[5] * axis[2]
-                    shift = (depth[k, v, u] - z) / max(slope, LEAST_SLOPE)
-            movable[row, column] = moves / (moves + rests)
+            depth_m, is_owner, is_agreed, movable[row, column] = _compare_pixel(
+                image, row, column, others, pictures, views, mixed[row, column], pairs
+            )
             if mine == SURFACE:
-                for channel in range(3):
-                    mixed[row, column, channel] /= colours
-                moved[row, column] = here + shift * views.along[image, row, column]
-                owned[row, column], agreed[row, column] = owner == image, through <= agree
+                moved[row, column], owned[row, column], agreed[row, column] = depth_m, is_owner, is_agreed
     return moved, owned, agreed, movable, mixed, pairs

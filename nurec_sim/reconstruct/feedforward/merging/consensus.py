@@ -119,7 +119,7 @@ def find_consensus(
     for _ in range(MOVES):
         compared = compare(pictures, views)
         pictures = pictures._replace(depth_m=compared.depth_m)
-    last = compare(pictures._replace(stands=compared.agreed), views)
+    last = compare(pictures._replace(may_own=compared.agreed), views)
 
     semantic = np.where((kind == MOVABLE) & (voted == SURFACE), int(SemanticClass.OTHERS), semantic)
     semantic = np.where((kind == SURFACE) & (voted == MOVABLE), int(SemanticClass.MOVABLE), semantic)

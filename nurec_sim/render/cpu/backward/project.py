@@ -103,6 +103,7 @@ def project_back(first, count, projected, slots, gaussians, world_from_sensor, b
         by: gradients by ``gaussians``, added to.
         pose: [blocks,6] float64 per block of 256 Gaussians, added to: force on the eye, torque about it, in the world.
     """
+    # Float64: sums of many small terms that partly cancel.
     sums, axes, frame = np.empty(SUMS), np.empty((3, 3)), np.empty((3, 3))
     offset, ball, by_ball, force, s = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     inverse_s, k_ = np.empty(3), np.empty((3, 3))
@@ -158,6 +159,7 @@ def project_back(first, count, projected, slots, gaussians, world_from_sensor, b
             by.features[g, k] += sums[S_FEATURE + k]
         if opacity[g] < MAX_OPACITY:
             by.opacity[g] -= sums[S_FADE] / (8 * np.float64(opacity[g]))
+        # By blocks of Gaussians, so that neither threads nor their number change the sum.
         part = g // BLOCK
         for k in range(3):
             i1, i2 = (k + 1) % 3, (k + 2) % 3

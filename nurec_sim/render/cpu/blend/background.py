@@ -109,6 +109,8 @@ def look_back(first, last, direction, turn, sky, by_behind, by_sky, torque):
                 by_sky[face, j1, i, c] += g * (1 - fx) * fy
                 by_sky[face, j1, i1, c] += g * fx * fy
             axis, along, down = FACES[face, 0], FACES[face, 2], FACES[face, 4]
+            # Texel x = (d_along / |d_axis| + 1) / 2 * size: its derivative by d_along. The colour does not depend on
+            # the length of d, which gives the third component; the torque is d x gradient.
             half = size / (2 * abs(d[axis]))
             by_d[along] = by_x * half * FACES[face, 3] if inside_x else 0.0
             by_d[down] = by_y * half * FACES[face, 5] if inside_y else 0.0

@@ -43,7 +43,7 @@ def sort_by_depth(keys, starts, counts, nearest, low_cut, high_cut, spans, order
         sorted_spans: [total,4] output: their spans.
         spare: [2,total] uint64 scratch, of which only this range's part is used.
     """
-    bits = keys.view(np.uint32)
+    bits = keys.view(np.uint32)  # of positive floats, which sort as their bits do
     low = np.array([nearest], np.float32).view(np.uint32)[0] >> np.uint32(DROPPED_BITS)
     size = 1 << RADIX_BITS
     top = np.uint64((1 << (2 * RADIX_BITS)) - 1)
@@ -55,6 +55,7 @@ def sort_by_depth(keys, starts, counts, nearest, low_cut, high_cut, spans, order
             key = np.uint64(bits[i])
             before += 1 if key < low_cut else 0
             n += 1 if low_cut <= key < high_cut else 0
+    # Every range writes the rows that follow those of smaller keys, so that ranges can be sorted side by side.
     now, other = spare[0, before : before + n], spare[1, before : before + n]
     first, second = np.zeros(size + 1, np.int64), np.zeros(size + 1, np.int64)
     n = 0
@@ -64,6 +65,7 @@ def sort_by_depth(keys, starts, counts, nearest, low_cut, high_cut, spans, order
             if low_cut <= key < high_cut:
                 value = key >> np.uint64(DROPPED_BITS)
                 value = min(value - low if value > low else np.uint64(0), top)
+                # The row in the low half makes equal keys sort by row: the order does not depend on the threads.
                 now[n] = (key << np.uint64(32)) | np.uint64(i)
                 first[np.int64(value & mask) + 1] += 1
                 second[np.int64(value >> np.uint64(RADIX_BITS)) + 1] += 1

@@ -123,6 +123,7 @@ def finish_pixels(
         at = b.add(at, plane_bytes)
         colour.append(v.load(at) + left * v.load(behind, STEP * c))
     channels = []
+    # The colour correction comes after the sky, because the camera sees both through the same optics.
     for c in range(3):
         row = [v.broadcast(isp, 4 * (4 * c + k)) for k in range(4)]
         shown = (row[0] * colour[0] + row[1] * colour[1] + row[2] * colour[2] + row[3]).max(0).min(1)
@@ -141,6 +142,7 @@ def finish_pixels(
 
     surface = alpha >= SURFACE_ALPHA
     distance_at = b.add(planes, last)
+    # Expected distance of what the ray met: the sum of weights times distances over the sum of weights.
     far = v.load(distance_at) / alpha.max(1e-6)
     table = b.icmp_signed("!=", ray_z, ir.Constant(ray_z.type, 0))
     z = v.load(b.select(table, ray_z, planes))

@@ -81,12 +81,14 @@ def sweep_returns(first, last, planes, rays, limits, returns):
                 continue
             mean = np.float64(planes[DISTANCE, y, x]) / max(alpha, MIN_ALPHA)
             half = np.float64(planes[HALF, y, x])
+            # An echo comes from one surface: where half of the beam has been stopped, not a mean between surfaces.
             distance = half if half > 0.0 else mean
             if not (limits.nearest_m <= distance <= limits.farthest_m) or planes[DROP, y, x] > limits.most_drop * alpha:
                 continue
             if abs(distance - mean) > limits.most_offset_m:
                 continue
             returns.range_m[n] = np.float32(distance)
+            # The mean over the Gaussians whose intensity is known; the others have added to neither sum.
             intensity = np.float64(planes[INTENSITY, y, x]) / max(np.float64(planes[KNOWN, y, x]), 1e-12)
             returns.intensity[n] = np.float32(min(max(intensity, 0.0), 1.0))
             m = end_from_line[line[y, x] if moving else 0]

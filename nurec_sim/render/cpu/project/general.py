@@ -142,6 +142,7 @@ def project_general(layer, first, last, view, is_lidar, chart, path, output, bas
                     to_lines(here, poses, motion, there)
                     found = moving_lidar_boxes(there, params, table, around, motion, cells)
                     fast = mask & (found >> APART)
+                    # Fired at opposite ends of a turn, the columns beside the seam see it from different places.
                     seam = mask & found & ~fast
                     if seam != 0:
                         other_ends(motion, there)
@@ -158,7 +159,7 @@ def project_general(layer, first, last, view, is_lidar, chart, path, output, bas
                 else:
                     lidar_boxes(here, params, table, around, cells)
                 both = lidar_tiles(cells, around, params, tiles.ctypes.data, other_tiles.ctypes.data)
-                again = mask & (both >> APART)
+                again = mask & (both >> APART)  # what a full turn brings back in at the other side of the grid
                 mask &= both
             else:
                 if moving:

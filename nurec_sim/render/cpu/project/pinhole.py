@@ -63,9 +63,11 @@ def pinhole_box(v: Lanes, centre: list[Vector], axes: list[list[Vector]], k2: Ve
     fx, fy, cx, cy = (v.broadcast(view, 4 * (INTRINSICS + k)) for k in range(4))
     width, height = (v.broadcast(view, 4 * (CELLS + k)) for k in range(2))
     x, y, z = centre
+    # Rows of Sigma = M M^T with M = rotation times standard deviations.
     xx, yy, zz = (dot(axes[k], axes[k]) for k in range(3))
     xz, yz = dot(axes[0], axes[2]), dot(axes[1], axes[2])
     inverse = 1 / z
+    # The image's extent in u are the roots of bottom u^2 - 2 half u + spread = 0 about the centre's tangent.
     scale = k2 * inverse * inverse
     bottom = scale * zz - 1
     crosses = (bottom > -1e-3) | (z <= 0)  # it reaches the plane of the camera
