@@ -1,4 +1,4 @@
-"""A driving log in memory: its poses and tables at once, its images and sweeps when asked for."""
+"""A driving log: poses and tables in memory, images and sweeps loaded on demand."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ImageRecord:
 
 
 class _Recent:
-    """The few values asked for last."""
+    """A small least-recently-used cache."""
 
     def __init__(self, size: int) -> None:
         self._size = size
@@ -124,7 +124,7 @@ class Clip:
         return f"Clip({self.id!r}, cameras={list(self.rig.cameras)}, lidars={list(self.rig.lidars)})"
 
     def later(self, offset_us: int) -> Clip:
-        """The same log with all its times ``offset_us`` later."""
+        """The same log with ``offset_us`` added to all times."""
 
         def moved(path: Trajectory) -> Trajectory:
             return Trajectory(path.t_us + offset_us, path.world_from_body)

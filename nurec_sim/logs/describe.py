@@ -1,4 +1,4 @@
-"""What is in a clip, as rows for people to read."""
+"""Summary of a clip as table rows."""
 
 from __future__ import annotations
 

@@ -27,7 +27,14 @@ def required(where: str, row: Any, key: str) -> Any:
 
 
 def of_kind(where: str, row: Any, key: str, kind: type, default: Any = None) -> Any:
-    """A field of one JSON type (dict, list, str, bool), or ``default`` where that is given and the field is not.
+    """A field of one JSON type (dict, list, str, bool).
+
+    Args:
+        where: file and place, for messages.
+        row: the object that holds the field.
+        key: name of the field.
+        kind: the type.
+        default: the value if the field is absent or null; None makes the field required.
 
     Raises:
         ClipError: it is missing without a default, or of another type.
@@ -42,6 +49,12 @@ def of_kind(where: str, row: Any, key: str, kind: type, default: Any = None) -> 
 
 def number(where: str, row: Any, key: str, default: float | None = None) -> float:
     """A finite number.
+
+    Args:
+        where: file and place, for messages.
+        row: the object that holds the field.
+        key: name of the field.
+        default: the value if the field is absent or null; None makes the field required.
 
     Raises:
         ClipError: it is missing without a default, or not a finite number.
@@ -67,7 +80,13 @@ def integer(where: str, row: Any, key: str) -> int:
 
 
 def array(where: str, row: Any, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Nested lists of finite numbers with a shape; None in ``shape`` allows any length.
+    """Nested lists of finite numbers as an array.
+
+    Args:
+        where: file and place, for messages.
+        row: the object that holds the field.
+        key: name of the field.
+        shape: the required shape; None stands for any length.
 
     Raises:
         ClipError: it is missing, ragged, not finite or of another shape.

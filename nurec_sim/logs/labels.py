@@ -1,4 +1,4 @@
-"""Object labels of other data sets in our words (``types.MOVABLE_LABELS``)."""
+"""Object labels of other data sets mapped to ours (``types.MOVABLE_LABELS``)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _SAME = {
     "train": ("tram", "train_or_tram_car"),
     "other_vehicle": ("misc", "other", "construction_vehicle", "emergency_vehicle", "towed_object", "wheeled_slow"),
     "person": ("pedestrian", "person_sitting", "stroller", "wheelchair"),
-    # A bicycle without a rider is still something that may set off.
+    # A parked bicycle may start to move as well.
     "rider": ("cyclist", "motorcyclist", "bicycle", "bicyclist", "motorcycle", "motorized_slow"),
     "animal": (),
 }
@@ -20,11 +20,11 @@ IGNORED = frozenset({"dontcare"})
 
 
 def our_label(given: str) -> str:
-    """Our word for a label; labels that are in no vocabulary stay as they are, in lower case."""
+    """Our label for a label of another data set; unknown ones are kept, in lower case."""
     label = given.strip().lower().replace(" ", "_")
     return _OURS.get(label, label)
 
 
 def is_movable(label: str) -> bool:
-    """Whether things of this label (one of ours) move by themselves; a traffic cone does not."""
+    """Whether objects of this label (one of ours) can move by themselves; a traffic cone cannot."""
     return label in MOVABLE_LABELS

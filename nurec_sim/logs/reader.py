@@ -1,4 +1,4 @@
-"""Opening a log: which reader knows its format, and the checks that every log passes before it is used."""
+"""Opening a log: the reader of its format is found, and poses and times are validated."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _looks(path: Path) -> str:
 
 
 def _late_enough(clip: Clip) -> Clip:
-    """The clip, put off by whole seconds if it starts too early.
+    """The clip, shifted to later times by whole seconds if it starts too early.
 
     Times travel as unsigned integers, and clients ask for frames from half a second before the first.
     """

@@ -1,4 +1,4 @@
-"""Where the files of a clip lie: a folder, or a zip file read in place; every name and size is checked.
+"""Files of a clip in a folder, or in a zip file without extracting it; every name and size is validated on read.
 
 Paths inside of a clip are relative, with forward slashes. Sizes are those of ``files.decoding.Limits``.
 """
@@ -66,7 +66,7 @@ def decode_image(data: bytes) -> UInt8[np.ndarray, "h w 3"]:
     """
     import cv2
 
-    check_image(data)  # a decoder fills the missing part of a truncated file with grey and says nothing
+    check_image(data)  # decoders fill the missing part of a truncated file with grey, without an error
     try:
         bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:
