@@ -7,7 +7,7 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -16,6 +16,10 @@ from nurec_sim.cli.scenes import NO_FLAGS, MethodName, NetworkFlags, method_sett
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable, write_file
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
+
+if TYPE_CHECKING:
+    from nurec_sim.cli.progress import Report
+    from nurec_sim.types import Clip
 
 ProtocolName = Literal["storm", "clip", "shift"]
 USUAL_METHODS: dict[str, tuple[str, ...]] = {
@@ -39,7 +43,10 @@ class LogFlags:
     target_cameras: tuple[str, ...] = ()
     """CLIP: target cameras for scoring; default: the input cameras."""
     hold_out_sweeps: int = 0
-    """CLIP: hold out every N-th sweep for scoring; 0 holds out none."""
+    """CLIP: hold out every N-th sweep and simulate it; 0 holds out none."""
+    scene: Path | None = None
+    """CLIP: score this scene archive of the log instead of a new reconstruction; what is held out here must not be what
+    it was made from."""
     local: bool = False
     """CLIP: render in this process instead of through gRPC."""
     images: Path | None = None
@@ -65,8 +72,6 @@ class ProtocolFlags:
     """Protocol: give the methods the log's boxes of movable objects; the paper's network uses none."""
     seconds: float = 10.0
     """Protocol: length of a clip, 2 to 20."""
-    hold_out_every: int = 2
-    """Protocol: hold out every N-th frame of a clip."""
     clip_cameras: Literal[1, 3] = 3
     """Protocol: cameras of a clip."""
     selective_checkpoint: Path | None = None
@@ -87,6 +92,7 @@ def evaluate(
     clip: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CLIP]")] = None,
     *,
     protocol: ProtocolName | None = None,
+    hold_out_every: int | None = None,
     log: LogGroup = NO_LOG_FLAGS,
     side_by_side: ProtocolGroup = NO_PROTOCOL_FLAGS,
     network: NetworkFlags = NO_FLAGS,
@@ -101,6 +107,8 @@ def evaluate(
     Args:
         clip: a clip folder, or a .zip of one.
         protocol: evaluation protocol.
+        hold_out_every: hold out every N-th image of a log for scoring; default: none of CLIP, every second frame in
+            protocol `clip`.
         log: options for one log.
         side_by_side: options for protocols.
         network: network settings (see `nurec-sim reconstruct --help`); --device also applies to rendering.
@@ -109,12 +117,12 @@ def evaluate(
         _refuse(given(side_by_side, NO_PROTOCOL_FLAGS), "without --protocol")
         if clip is None:
             raise NurecSimError("nothing to evaluate: give a clip, or --protocol storm, clip or shift")
-        evaluate_log(clip, log, network)
+        evaluate_log(clip, log, hold_out_every or 0, network)
         return
     _refuse(given(log, NO_LOG_FLAGS), "with --protocol")
     if clip is not None:
         raise NurecSimError(f"with --protocol, logs are given by --clips {clip}")
-    evaluate_protocol(protocol, side_by_side, network)
+    evaluate_protocol(protocol, side_by_side, 2 if hold_out_every is None else hold_out_every, network)
 
 
 def given(flags: Any, usual: Any) -> list[str]:
@@ -128,10 +136,11 @@ def _refuse(names: list[str], where: str) -> None:
         raise NurecSimError(f"{', '.join(names)} cannot be used {where}")
 
 
-def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> None:
-    """Score one method on one log."""
+def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: FeedForwardSettings) -> None:
+    """Score one method, or one finished scene, on one log."""
     from nurec_sim import logs
     from nurec_sim.evaluate import evaluate as run_evaluation
+    from nurec_sim.evaluate import figure_rows
 
     settings = method_settings(flags.method, network)
     log = logs.open_clip(path)
@@ -140,28 +149,62 @@ def evaluate_log(path: Path, flags: LogFlags, network: FeedForwardSettings) -> N
     if flags.images is not None:
         check_writable(flags.images, folder=True)
     device = chosen_device(network.device)
+    if flags.scene is not None and flags.refine is not None:
+        raise NurecSimError("--refine fits a new reconstruction; --scene is finished")
     if flags.method not in ("dense", "selective"):
         network = dataclasses.replace(network, device=NO_FLAGS.device)  # its renderer alone uses it
     with progress("evaluating") as advance:
-        figures = run_evaluation(
-            log,
-            flags.method,
-            input_cameras=flags.input_cameras or None,
-            target_cameras=flags.target_cameras or None,
-            hold_out_every=flags.hold_out_sweeps,
-            via_grpc=not flags.local,
-            device=device,
-            images_dir=flags.images,
-            progress=advance,
-            settings=settings,
-            refine=refinement(flags.refine),
-        )
+        if flags.scene is not None:
+            figures = _score_archive(log, flags, hold_out_every, device, advance)
+        else:
+            figures = run_evaluation(
+                log,
+                flags.method,
+                input_cameras=flags.input_cameras or None,
+                target_cameras=flags.target_cameras or None,
+                hold_out_every=hold_out_every,
+                hold_out_sweeps_every=flags.hold_out_sweeps,
+                via_grpc=not flags.local,
+                device=device,
+                images_dir=flags.images,
+                progress=advance,
+                settings=settings,
+                refine=refinement(flags.refine),
+            )
     if flags.json is not None:
         write_file(flags.json, json.dumps(figures, indent=1, sort_keys=True) + "\n")
-    print_table(f"{flags.method} on {log.id}", flatten(figures))
+    title = flags.method if flags.scene is None else flags.scene.name
+    group = ""
+    for row in figure_rows(figures):
+        if row.group != group:
+            group = row.group
+            print_table(
+                f"{title} on {log.id}. {group}", [(r.name, r.text) for r in figure_rows(figures) if r.group == group]
+            )
 
 
-def evaluate_protocol(name: ProtocolName, flags: ProtocolFlags, network: FeedForwardSettings) -> None:
+def _score_archive(log: Clip, flags: LogFlags, hold_out_every: int, device: str, advance: Report) -> dict[str, Any]:
+    from nurec_sim.evaluate import hold_out, score_scene
+    from nurec_sim.scene import read_scene
+
+    assert flags.scene is not None
+    scene = read_scene(flags.scene)
+    cameras = [name for name in scene.provenance.get("cameras", scene.rig.cameras) if name in log.rig.cameras]
+    return score_scene(
+        log,
+        scene,
+        hold_out(log, cameras, images_every=hold_out_every, sweeps_every=flags.hold_out_sweeps),
+        target_cameras=flags.target_cameras or None,
+        via_grpc=not flags.local,
+        device=device,
+        images_dir=flags.images,
+        progress=advance,
+    )
+
+
+def evaluate_protocol(
+    name: ProtocolName, flags: ProtocolFlags, hold_out_every: int, network: FeedForwardSettings
+) -> None:
     """Compare methods, print the tables and write a run folder."""
     if flags.clips and (flags.worlds is not None or flags.seed):
         raise NurecSimError("--worlds and --seed select procedural worlds, --clips recorded logs; give one of the two")
@@ -179,7 +222,7 @@ def evaluate_protocol(name: ProtocolName, flags: ProtocolFlags, network: FeedFor
         tuple(path.resolve() for path in flags.clips),
         boxes=flags.boxes,
         seconds=flags.seconds,
-        hold_out_every=flags.hold_out_every,
+        hold_out_every=hold_out_every,
         cameras=flags.clip_cameras,
     )
     methods = contenders(flags.methods or USUAL_METHODS[name], network, flags.selective_checkpoint)
@@ -199,14 +242,3 @@ def evaluate_protocol(name: ProtocolName, flags: ProtocolFlags, network: FeedFor
         if table.note:
             out.print(table.note, style="dim", markup=False)
     out.print(f"{time.monotonic() - started:.0f} s. Report: {folder / 'report.html'}", soft_wrap=True)
-
-
-def flatten(figures: dict, prefix: str = "") -> list[tuple[str, str]]:
-    """Nested figures as dotted rows; lists stay in the JSON file."""
-    rows: list[tuple[str, str]] = []
-    for key, value in figures.items():
-        if isinstance(value, dict):
-            rows += flatten(value, f"{prefix}{key}.")
-        elif not isinstance(value, list):
-            rows.append((prefix + key, f"{value:.4g}" if isinstance(value, float) else str(value)))
-    return rows

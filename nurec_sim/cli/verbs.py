@@ -9,6 +9,7 @@ import os
 import sys
 
 from nurec_sim.cli import (  # noqa: F401  (each registers its commands)
+    comparison,
     conformance,
     drive,
     driving,

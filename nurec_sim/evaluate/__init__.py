@@ -9,7 +9,12 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "log": ["as_fired", "evaluate", "held_out", "sensing"],
+        "comparison": ["compare_scenes"],
+        "comparison_page": ["render_comparison"],
+        "held_out": ["HeldOut", "hold_out", "without_images"],
+        "lidar_scores": ["as_fired"],
+        "log": ["evaluate", "score_scene", "sensing"],
+        "log_tables": ["figure_rows", "side_by_side"],
         "methods": ["CHOICES", "Contender", "contenders"],
         "protocols": ["PROTOCOLS", "Protocol"],
         "run": ["run_protocol"],

@@ -1,7 +1,7 @@
-"""Measures a reconstruction against its log: images of cameras that it did not see, sweeps that were held out.
+"""Measures a scene against a log: images of cameras that it did not see, images and sweeps that were held out.
 
-The scene is built from the input cameras and the sweeps that are not held out, then asked, over gRPC unless told
-otherwise, for what the target cameras and the held-out sweeps recorded. Figures are plain JSON.
+The scene is built from what is not held out, or given, then renders, over gRPC unless told otherwise, what the log
+recorded. Figures are plain JSON.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
 
-from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate.scores.images import psnr, ssim
-from nurec_sim.evaluate.scores.lidar import LidarScore, scanner_along, score_sweep
-from nurec_sim.files.new_files import write_file
+from nurec_sim.evaluate.held_out import HeldOut, hold_out, without_images
+from nurec_sim.evaluate.image_scores import score_images
+from nurec_sim.evaluate.lidar_scores import score_free_space, score_sweeps
 from nurec_sim.metrics.offroad import offroad_agreement
 from nurec_sim.metrics.offroad_grid import scene_offroad_grid
 from nurec_sim.render import make_renderer
-from nurec_sim.types import CameraFrame, Clip, GaussianScene, LidarFrame, Sense, SensorRequest, Sweep
+from nurec_sim.types import CameraFrame, Clip, GaussianScene, Sense, SensorRequest
 
 Progress = Callable[[str, float], None]
+SAME_PATH_M = 0.01
+"""A scene of the log has the log's path, to rounding."""
 
 
 def evaluate(
@@ -36,6 +36,7 @@ def evaluate(
     input_cameras: Sequence[str] | None = None,
     target_cameras: Sequence[str] | None = None,
     hold_out_every: int = 0,
+    hold_out_sweeps_every: int = 0,
     hold_out_sweeps: Sequence[int] = (),
     via_grpc: bool = True,
     device: str = "auto",
@@ -50,7 +51,8 @@ def evaluate(
         method: reconstruction method.
         input_cameras: cameras that the reconstruction may see; all if None, or as many as the method takes.
         target_cameras: cameras to compare with, at all their frames; the input cameras if None.
-        hold_out_every: hold out sweeps K, 2K, 3K, ...; 0 holds out none.
+        hold_out_every: hold out images N-1, 2N-1, ... of the input cameras, and the sweeps taken meanwhile; 0: none.
+        hold_out_sweeps_every: hold out sweeps K, 2K, ...; 0: none.
         hold_out_sweeps: further sweeps to hold out, by index.
         via_grpc: whether frames come from a sensor server in this process over gRPC, or from a renderer directly.
         device: that renders; see ``render.choose_device``.
@@ -59,12 +61,7 @@ def evaluate(
         options: passed on to ``reconstruct``.
 
     Returns:
-        JSON-ready figures: ``image`` per target camera (``psnr_db``, ``ssim``: means and per-frame lists; ``floor``:
-        the same for copying the input image nearest in time; ``input``: whether the reconstruction saw the camera),
-        and over all of them; ``lidar`` (``median_abs_range_error_m`` over the beams that returned,
-        ``return_recall`` over the beams with a recorded return, shares within 0.1 m and 0.5 m of these, per-sweep
-        lists), None if nothing was held out; ``road``: how off-road from Gaussians agrees with the log's own map
-        (``metrics.offroad_agreement``), None without a map; ``seconds`` per stage; ``counts``; ``unknown``.
+        what ``score_scene`` returns, with ``method`` and the ``seconds`` of each stage of the reconstruction.
 
     Raises:
         ReconstructError: an unknown method, camera or sweep, or a clip that lacks what the method needs.
@@ -72,41 +69,122 @@ def evaluate(
     from nurec_sim.reconstruct import reconstruct
 
     report = progress or (lambda stage, fraction: None)
-    unknown = [camera for camera in target_cameras or () if camera not in clip.rig.cameras]
-    if unknown:
-        raise ReconstructError(f"clip {clip.id!r} has no camera {unknown}; have {list(clip.rig.cameras)}")
-    if hold_out_every < 0:
-        raise ReconstructError(f"hold_out_every must be 0 or more, got {hold_out_every}")
-    held = held_out(clip, hold_out_every, hold_out_sweeps)
+    cameras = list(clip.rig.cameras) if input_cameras is None else list(input_cameras)
+    _check_cameras(clip, [*cameras, *(target_cameras or ())])
+    held = hold_out(
+        clip, cameras, images_every=hold_out_every, sweeps_every=hold_out_sweeps_every, sweeps=hold_out_sweeps
+    )
     stages = _StageClock(_part(report, 0.0, 0.6))
-    scene = reconstruct(clip, method, cameras=input_cameras, hold_out_sweeps=held, progress=stages, **options)
+    scene = reconstruct(
+        without_images(clip, held), method, cameras=input_cameras, hold_out_sweeps=sorted(held.sweeps), progress=stages,
+        **options,
+    )  # fmt: skip
     stages.stop()
-    inputs = list(scene.provenance["cameras"])
-    targets = inputs if target_cameras is None else list(target_cameras)
     seconds = {f"reconstruct: {stage}": round(spent, 3) for stage, spent in stages.seconds.items()}
     seconds["reconstruct"] = round(sum(stages.seconds.values()), 3)
+    figures = score_scene(
+        clip, scene, held, target_cameras=target_cameras, via_grpc=via_grpc, device=device,
+        images_dir=images_dir, progress=_part(report, 0.6, 1.0),
+    )  # fmt: skip
+    return {**figures, "method": method, "seconds": {**seconds, **figures["seconds"]}}
+
+
+def score_scene(
+    clip: Clip,
+    scene: GaussianScene,
+    held: HeldOut | None = None,
+    *,
+    target_cameras: Sequence[str] | None = None,
+    via_grpc: bool = True,
+    device: str = "auto",
+    images_dir: Path | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Score what a scene of a log renders.
+
+    Args:
+        clip: the log.
+        scene: its reconstruction.
+        held: images and sweeps that the scene was not made from.
+        target_cameras: cameras to compare with; the scene's input cameras if None.
+        via_grpc: whether frames come over gRPC or from a renderer directly.
+        device: that renders; see ``render.choose_device``.
+        images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
+        progress: called with a stage and the fraction of all work that is done, about.
+
+    Returns:
+        JSON-ready figures.
+
+        - ``image``: ``psnr_db`` and ``ssim`` over all frames; under ``seen`` and ``unseen`` those of the frames that
+          the scene was made from and of the others, with ``flip``, ``sharpness`` (spectral energy by octave, as a part
+          of the recorded image's), ``region_psnr_db`` (labelled actors, background, around LiDAR points by range),
+          ``holes`` (share of LiDAR points with alpha < 0.5, by range) and the ``worst`` frames; per camera the
+          per-frame lists and ``floor``: copying the seen image nearest in time.
+        - ``lidar``: of the sweeps held out (``lidar_scores.score_sweeps``), None if there are none.
+        - ``free_space``: false obstacles beside the path (``lidar_scores.score_free_space``), None without LiDAR.
+        - ``road``: how off-road from Gaussians agrees with the log's map, None without a map.
+        - ``seconds``, ``counts``, ``unknown``.
+
+    Raises:
+        ReconstructError: an unknown camera, or a scene of another log.
+    """
+    held, report = held or HeldOut(), progress or (lambda stage, fraction: None)
+    inputs = [camera for camera in scene.provenance.get("cameras", scene.rig.cameras) if camera in clip.rig.cameras]
+    targets = inputs if target_cameras is None else list(target_cameras)
+    _check_cameras(clip, targets)
+    _check_path(clip, scene)
+    seconds = {}
     with sensing(scene, via_grpc, device) as sense:
         started = time.perf_counter()
-        image = _score_images(clip, inputs, targets, sense, images_dir, _part(report, 0.6, 0.9))
+        probe = _probe(scene, device)
+        image = score_images(clip, inputs, targets, held, sense, probe, images_dir, _part(report, 0.0, 0.75))
         seconds["images"] = round(time.perf_counter() - started, 3)
         started = time.perf_counter()
-        lidar = _score_lidars(clip, held, sense, _part(report, 0.9, 1.0)) if held else None
+        lidar = score_sweeps(clip, sorted(held.sweeps), sense, _part(report, 0.75, 0.9)) if held.sweeps else None
+        free = score_free_space(clip, sense, _part(report, 0.9, 1.0))
         seconds["lidar"] = round(time.perf_counter() - started, 3)
     return {
         "clip": clip.id,
-        "method": method,
+        "scene": scene.id,
         "input_cameras": inputs,
         "target_cameras": targets,
-        "held_out_sweeps": held,
+        "held_out_images": {camera: sorted(indices) for camera, indices in held.images.items()},
+        "held_out_sweeps": sorted(held.sweeps),
         "via": "grpc" if via_grpc else "local",
         "image": image,
         "lidar": lidar,
+        "free_space": free,
         "road": _score_road(scene),
         "seconds": seconds,
         "counts": {"static": len(scene.static), "dynamic": len(scene.dynamic)}
         | dict(scene.provenance.get("counts", {})),
         "unknown": list(scene.provenance.get("unknown", [])),
     }
+
+
+def _check_cameras(clip: Clip, cameras: Sequence[str]) -> None:
+    unknown = [camera for camera in cameras if camera not in clip.rig.cameras]
+    if unknown:
+        raise ReconstructError(f"clip {clip.id!r} has no camera {unknown}; have {list(clip.rig.cameras)}")
+
+
+def _check_path(clip: Clip, scene: GaussianScene) -> None:
+    """Poses of a scene of another log, or of another cut of it, would be scored as errors of the pictures."""
+    times = clip.ego.t_us[(clip.ego.t_us >= scene.ego.start_us) & (clip.ego.t_us <= scene.ego.end_us)]
+    if not len(times):
+        raise ReconstructError(
+            f"scene {scene.id!r} is of another time than clip {clip.id!r}: {scene.ego.start_us} to {scene.ego.end_us} "
+            f"against {clip.ego.start_us} to {clip.ego.end_us} us"
+        )
+    apart = np.linalg.norm((scene.ego.at(times) - clip.ego.at(times))[:, :3, 3], axis=1).max()
+    if apart > SAME_PATH_M:
+        raise ReconstructError(f"scene {scene.id!r} was not made from clip {clip.id!r}: paths are {apart:.2f} m apart")
+
+
+def _probe(scene: GaussianScene, device: str) -> Callable[[SensorRequest], CameraFrame]:
+    """Renders alpha, which a server's clients do not get."""
+    renderer = make_renderer(scene, device)
+    return lambda request: renderer.render_camera(request, ("alpha",))
 
 
 def _part(report: Progress, begin: float, end: float) -> Progress:
@@ -134,12 +212,6 @@ class _StageClock:
         self.since = now
 
 
-def held_out(clip: Clip, every: int, listed: Sequence[int]) -> list[int]:
-    """Indices of the sweeps to hold out: every K-th but the first, and those listed."""
-    most = max((len(clip.sweep_times_us(lidar)) for lidar in clip.rig.lidars), default=0)
-    return sorted({*(range(every, most, every) if every else ()), *(int(i) for i in listed)})
-
-
 @contextlib.contextmanager
 def sensing(scene: GaussianScene, via_grpc: bool, device: str) -> Iterator[Sense]:
     """A ``sense`` for a scene: through a server on a free port of this machine, or a renderer in this process."""
@@ -157,87 +229,6 @@ def sensing(scene: GaussianScene, via_grpc: bool, device: str) -> Iterator[Sense
         yield remote.sense
 
 
-# ----------------------------------------------------------------------------------------------------------- images
-
-
-def _score_images(
-    clip: Clip, inputs: Sequence[str], targets: Sequence[str], sense: Sense, images_dir: Path | None, report: Progress
-) -> dict[str, object]:
-    per_camera: dict[str, dict[str, Any]] = {}
-    for done, camera in enumerate(targets):
-        shown: dict[str, list[float]] = {"psnr_db": [], "ssim": []}
-        floor: dict[str, list[float]] = {"psnr_db": [], "ssim": []}
-        times = clip.camera_times_us(camera)
-        for index in range(len(times)):
-            report(f"images of {camera}", (done + index / len(times)) / len(targets))
-            recorded = clip.image(camera, index)
-            start_us, end_us = int(times[index, 0]), max(int(times[index, 1]), int(times[index, 0]) + 1)
-            request = SensorRequest(
-                clip.id, clip.rig.cameras[camera], start_us, end_us, clip.world_from_camera(camera, index)
-            )
-            frame = sense([request])[0]
-            assert isinstance(frame, CameraFrame)
-            rendered = frame.rgb
-            copied = _nearest_input(clip, camera, index, inputs)
-            _append(shown, rendered, recorded)
-            if copied is not None:
-                _append(floor, copied, recorded)
-            if images_dir is not None:
-                _write_pair(images_dir / f"{camera}_{index:04d}.png", recorded, rendered)
-        report(f"images of {camera}", (done + 1) / len(targets))
-        per_camera[camera] = {**_with_means(shown), "input": camera in inputs, "floor": _with_means(floor)}
-    means: dict[str, float | None] = {}
-    for name in ("psnr_db", "ssim"):
-        values = [value for row in per_camera.values() for value in row["per_frame"][name]]
-        means[name] = float(np.mean(values)) if values else None
-    return {**means, "cameras": per_camera}
-
-
-def _append(lists: dict[str, list[float]], image: np.ndarray, recorded: np.ndarray) -> None:
-    lists["psnr_db"].append(min(psnr(image, recorded), 100.0))
-    lists["ssim"].append(ssim(image, recorded))
-
-
-def _with_means(lists: dict[str, list[float]]) -> dict[str, object]:
-    if not lists["psnr_db"]:
-        return {"psnr_db": None, "ssim": None, "per_frame": lists}
-    return {**{name: float(np.mean(values)) for name, values in lists.items()}, "per_frame": lists}
-
-
-def _nearest_input(clip: Clip, camera: str, index: int, inputs: Sequence[str]) -> UInt8[np.ndarray, "h w 3"] | None:
-    """What copying would show: the input frame nearest in time, of the camera that looks most alike; never itself."""
-    import cv2
-
-    model, t_us = clip.rig.cameras[camera], int(clip.camera_times_us(camera)[index].sum()) // 2
-    best: tuple[float, float, str, int] | None = None
-    for other in inputs:
-        times = clip.camera_times_us(other).sum(axis=1) // 2
-        gap = np.abs(times - t_us).astype(np.float64)
-        if other == camera:
-            gap[index] = np.inf
-        nearest = int(np.argmin(gap)) if len(gap) else 0
-        if not len(gap) or not np.isfinite(gap[nearest]):
-            continue
-        facing = float(clip.rig.cameras[other].rig_from_camera[:3, 2] @ model.rig_from_camera[:3, 2])
-        candidate = (round(-facing, 2), float(gap[nearest]), other, nearest)
-        best = candidate if best is None or candidate < best else best
-    if best is None or best[0] > 0:
-        return None
-    image = clip.image(best[2], best[3])
-    size = (model.width_px, model.height_px)
-    return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-
-
-def _write_pair(path: Path, recorded: np.ndarray, rendered: np.ndarray) -> None:
-    import cv2
-
-    pair = np.ascontiguousarray(np.vstack([recorded, rendered])[..., ::-1])
-    write_file(path, cv2.imencode(path.suffix, pair)[1].tobytes())
-
-
-# ------------------------------------------------------------------------------------------------------------- road
-
-
 def _score_road(scene: GaussianScene) -> dict[str, object] | None:
     if scene.road_map is None or not scene.road_map.drivable:
         return None
@@ -246,57 +237,3 @@ def _score_road(scene: GaussianScene) -> dict[str, object] | None:
     except (ReconstructError, ValueError) as error:  # no road was labelled, or the car hardly moved
         return {"not_known": str(error)}
     return {name: None if value != value else value for name, value in dataclasses.asdict(found).items()}
-
-
-# ------------------------------------------------------------------------------------------------------------ LiDAR
-
-
-def _score_lidars(clip: Clip, held: Sequence[int], sense: Sense, report: Progress) -> dict[str, object]:
-    scores, names = [], []
-    jobs = [(lidar, i) for lidar in clip.rig.lidars for i in held if i < len(clip.sweep_times_us(lidar))]
-    for done, (lidar, index) in enumerate(jobs):
-        report("held-out sweeps", done / len(jobs))
-        sweep = clip.sweep(lidar, index)
-        fired, poses = as_fired(clip, lidar, sweep)
-        scanner = scanner_along(clip.rig.lidars[lidar], fired)
-        request = SensorRequest(clip.id, scanner, sweep.start_us, max(sweep.end_us, sweep.start_us + 1), poses)
-        frame = sense([request])[0]
-        assert isinstance(frame, LidarFrame)
-        scores.append(score_sweep(frame, fired))
-        names.append({"lidar": lidar, "sweep": index})
-    report("held-out sweeps", 1.0)
-    total = LidarScore.pooled(scores)
-    return {
-        "median_abs_range_error_m": _known(total.median_abs_error_m),
-        "return_recall": _known(total.recall),
-        "within_0.1_m": _within(total, 0.1),
-        "within_0.5_m": _within(total, 0.5),
-        "beams": total.beams,
-        "per_sweep": [
-            {**name, "median_abs_range_error_m": _known(s.median_abs_error_m), "return_recall": _known(s.recall)}
-            for name, s in zip(names, scores, strict=True)
-        ],
-    }
-
-
-def _within(score: LidarScore, limit_m: float) -> float | None:
-    """Share of the beams with a recorded return whose simulated return exists and is as near as this."""
-    return float((score.abs_error_m < limit_m).sum() / score.beams) if score.beams else None
-
-
-def _known(value: float) -> float | None:
-    """JSON has no NaN: what cannot be computed is null."""
-    return float(value) if np.isfinite(value) else None
-
-
-def as_fired(clip: Clip, lidar: str, sweep: Sweep) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "2 4 4"]]:
-    """Returns in the frame of the sensor when each was fired, and the sensor's poses at the sweep's start and end."""
-    rig_from_lidar = clip.rig.lidars[lidar].rig_from_lidar
-    # The log's own pose of the sweep counts; the ego trajectory gives the motion around it.
-    fix = sweep.world_from_lidar @ geometry.inverse(clip.ego.at(sweep.t_us) @ rig_from_lidar)
-    times = np.array([sweep.start_us, sweep.end_us])
-    poses = np.einsum("ij,njk->nik", fix, clip.ego.at(times) @ rig_from_lidar)
-    span = max(sweep.end_us - sweep.start_us, 1)
-    fraction = np.clip((sweep.point_t_us - sweep.start_us) / span, 0, 1)
-    inverse = geometry.inverse(geometry.interpolate_pose_pair(poses, fraction))
-    return np.einsum("nij,nj->ni", inverse[:, :3, :3], sweep.xyz_world_m) + inverse[:, :3, 3], poses

@@ -16,6 +16,7 @@ from nurec_sim.serving.driver import RemotePolicy
 
 REPO = Path(__file__).parents[2]
 VERBS = [
+    "compare",
     "conformance",
     "demo",
     "drive-grpc",
@@ -201,7 +202,11 @@ def test_version_and_first_steps_need_nothing_heavy(capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize(
     ("word", "hint"),
-    [("rnder", "did you mean 'render'?"), ("inspct", "did you mean 'inspect'?"), ("zzz", "have conformance, ")],
+    [
+        ("rnder", "did you mean 'render'?"),
+        ("inspct", "did you mean 'inspect'?"),
+        ("zzz", "have compare, conformance, "),
+    ],
 )
 def test_a_misspelt_verb_is_one_line_that_names_the_nearest(word: str, hint: str, capsys) -> None:
     with pytest.raises(SystemExit) as stop:

@@ -8,7 +8,7 @@ from reconstruct_street import Street, camera
 
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate import as_fired, evaluate, held_out, log
+from nurec_sim.evaluate import HeldOut, as_fired, evaluate, hold_out, log
 from nurec_sim.evaluate.scores.lidar import LidarScore, scanner_along, score_sweep
 from nurec_sim.reconstruct import LiftSettings, ViewSettings
 from nurec_sim.types import LidarFrame, RoadMap
@@ -23,8 +23,8 @@ def street():
 @pytest.fixture(scope="module")
 def figures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("images")
-    result = evaluate(street(), input_cameras=["left"], target_cameras=["right"], hold_out_every=2, images_dir=folder,
-                      via_grpc=False, settings=SMALL)  # fmt: skip
+    result = evaluate(street(), input_cameras=["left"], target_cameras=["right"], hold_out_sweeps_every=2,
+                      images_dir=folder, via_grpc=False, settings=SMALL)  # fmt: skip
     return result, folder
 
 
@@ -54,7 +54,7 @@ def test_pairs_of_images_are_written(figures):
 
 
 def test_over_grpc_the_figures_are_the_same(figures):
-    over = evaluate(street(), input_cameras=["left"], target_cameras=["right"], hold_out_every=2, settings=SMALL)
+    over = evaluate(street(), input_cameras=["left"], target_cameras=["right"], hold_out_sweeps_every=2, settings=SMALL)
     assert over["via"] == "grpc"
     assert over["image"] == figures[0]["image"]
     assert over["lidar"] == figures[0]["lidar"]
@@ -77,11 +77,11 @@ def test_road_is_not_scored_without_a_map_or_a_drive(figures):
 
 
 def test_which_sweeps_are_held_out():
-    assert held_out(street(), 2, []) == [2, 4]
-    assert held_out(street(), 0, [3, 1]) == [1, 3]
-    assert held_out(street(), 0, []) == []
-    with pytest.raises(ReconstructError, match="hold_out_every must be 0 or more, got -1"):
-        evaluate(street(), hold_out_every=-1)
+    assert hold_out(street(), [], sweeps_every=2).sweeps == {2, 4}
+    assert hold_out(street(), [], sweeps=[3, 1]).sweeps == {1, 3}
+    assert hold_out(street(), ["left"]) == HeldOut()
+    with pytest.raises(ReconstructError, match="sweeps_every must be 0 .none. or at least 2, got -1"):
+        evaluate(street(), hold_out_sweeps_every=-1)
     with pytest.raises(ReconstructError, match=r"no camera \['up'\]; have \['left', 'right'\]"):
         evaluate(street(), target_cameras=["up"])
 
@@ -114,7 +114,12 @@ def test_score_of_a_perfect_and_of_a_short_sweep():
 
 
 def test_pooling_weighs_beams():
-    pooled = LidarScore.pooled([LidarScore(3, 1, np.array([1.0])), LidarScore(1, 1, np.array([3.0]))])
+    pooled = LidarScore.pooled(
+        [
+            LidarScore(np.array([[5.0, 0, 0]] * 3), np.array([4.0, np.nan, np.nan])),
+            LidarScore(np.array([[0, 5.0, 0]]), np.array([8.0])),
+        ]
+    )
     assert pooled.recall == 0.5 and pooled.median_abs_error_m == 2.0
 
 

@@ -11,7 +11,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from nurec_sim import sensors
 from nurec_sim.types import LidarFrame, LidarModel
@@ -23,27 +23,71 @@ SAME_SURFACE = 0.05
 
 @dataclass(frozen=True)
 class LidarScore:
-    """Beams with a recorded return, how many of them returned in the simulation, and the errors of those that did."""
+    """Beams with a recorded return, and what the simulation measured along them.
 
-    beams: int
-    returned: int
-    abs_error_m: Float64[np.ndarray, " returned"]
+    Attributes:
+        xyz_m: recorded returns, each in the sensor's frame when its beam was fired.
+        simulated_m: simulated range of each beam, NaN where none came back.
+    """
+
+    xyz_m: Float64[np.ndarray, "beams 3"]
+    simulated_m: Float64[np.ndarray, " beams"]
+
+    @property
+    def beams(self) -> int:
+        """Beams with a recorded return."""
+        return len(self.xyz_m)
+
+    @property
+    def recorded_m(self) -> Float64[np.ndarray, " beams"]:
+        """Recorded ranges."""
+        return np.linalg.norm(self.xyz_m, axis=1)
+
+    @property
+    def returned(self) -> Bool[np.ndarray, " beams"]:
+        """Which beams came back in the simulation."""
+        return np.isfinite(self.simulated_m)
+
+    @property
+    def abs_error_m(self) -> Float64[np.ndarray, " returned"]:
+        """Errors of the ranges of those that came back."""
+        return np.abs(self.simulated_m - self.recorded_m)[self.returned]
 
     @property
     def recall(self) -> float:
-        """Share of recorded returns whose beam has a simulated return."""
-        return self.returned / self.beams if self.beams else float("nan")
+        """Share of recorded returns whose beam has a simulated return; NaN without beams."""
+        return float(self.returned.mean()) if self.beams else float("nan")
 
     @property
     def median_abs_error_m(self) -> float:
         """Median over the beams that returned; NaN if none did."""
-        return float(np.median(self.abs_error_m)) if self.returned else float("nan")
+        return float(np.median(self.abs_error_m)) if self.returned.any() else float("nan")
+
+    def within(self, low_m: float, high_m: float) -> LidarScore:
+        """The beams whose recorded range lies in [low, high)."""
+        chosen = (self.recorded_m >= low_m) & (self.recorded_m < high_m)
+        return LidarScore(self.xyz_m[chosen], self.simulated_m[chosen])
+
+    def chamfer(self) -> tuple[float, float]:
+        """Mean distance from simulated returns to recorded ones (precision) and back (coverage), metres, not squared.
+
+        The simulated cloud is that of the beams with a recorded return. NaN if either cloud is empty.
+        """
+        from scipy.spatial import cKDTree
+
+        back = self.returned
+        if not back.any():
+            return float("nan"), float("nan")
+        simulated = self.xyz_m[back] * (self.simulated_m[back] / self.recorded_m[back])[:, None]
+        precision = cKDTree(self.xyz_m).query(simulated)[0].mean()
+        coverage = cKDTree(simulated).query(self.xyz_m)[0].mean()
+        return float(precision), float(coverage)
 
     @staticmethod
     def pooled(scores: list[LidarScore]) -> LidarScore:
-        """All beams of several sweeps as one."""
-        errors = np.concatenate([score.abs_error_m for score in scores]) if scores else np.zeros(0)
-        return LidarScore(sum(s.beams for s in scores), sum(s.returned for s in scores), errors)
+        """All beams of several sweeps as one; not for ``chamfer``, as their frames differ."""
+        xyz = np.concatenate([np.zeros((0, 3)), *(score.xyz_m for score in scores)])
+        return LidarScore(xyz, np.concatenate([np.zeros(0), *(score.simulated_m for score in scores)]))
 
 
 def scanner_along(lidar: LidarModel, xyz_fired_m: Float64[np.ndarray, "n 3"]) -> LidarModel:
@@ -74,7 +118,7 @@ def score_sweep(simulated: LidarFrame, xyz_fired_m: Float64[np.ndarray, "n 3"]) 
     image = flat.reshape(rows, columns)
     recorded = np.linalg.norm(xyz_fired_m, axis=1)
     usable = np.isfinite(recorded) & (recorded >= lidar.range_m[0]) & (recorded <= lidar.range_m[1])
-    xyz, recorded = xyz_fired_m[usable], recorded[usable]
+    xyz = xyz_fired_m[usable]
     _, column, _ = sensors.beam_coordinates(lidar, xyz)
     column = np.round(np.nan_to_num(column)).astype(np.int64) % columns
     upper = np.clip(np.searchsorted(-lidar.elevation_rad, -_elevation(xyz), side="right") - 1, 0, rows - 2)
@@ -85,8 +129,7 @@ def score_sweep(simulated: LidarFrame, xyz_fired_m: Float64[np.ndarray, "n 3"]) 
     other = np.where(fraction < 0.5, second, first)
     same = np.abs(first - second) < SAME_SURFACE * np.minimum(first, second)
     distance = np.where(same, first + fraction * (second - first), np.where(np.isfinite(nearest), nearest, other))
-    back = np.isfinite(distance)
-    return LidarScore(len(recorded), int(back.sum()), np.abs(distance[back] - recorded[back]))
+    return LidarScore(xyz, distance)
 
 
 def _elevation(xyz_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:

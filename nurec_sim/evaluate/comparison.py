@@ -1,0 +1,167 @@
+"""Scenes of one log compared: the same figures for each, the worst frames, and a video with maps of the differences."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from nurec_sim.errors import ReconstructError
+from nurec_sim.evaluate.held_out import HeldOut
+from nurec_sim.evaluate.image_scores import image_request
+from nurec_sim.evaluate.log import score_scene, sensing
+from nurec_sim.evaluate.scores.flip import flip_map
+from nurec_sim.types import CameraFrame, Clip, GaussianScene, Sense
+
+WIDTH_PX = 480
+"""Width of one image in a row of the video and of the worst frames."""
+WORST = 4
+FRAMES_PER_S = 5
+CODEC_OPTIONS = {"preset": "veryfast", "crf": "26", "threads": "1"}
+BAR_PX = 20
+
+Picture = UInt8[np.ndarray, "h w 3"]
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a comparison found.
+
+    Attributes:
+        clip: id of the log.
+        figures: by name of the scene, see ``log.score_scene``.
+        worst: captions and pictures of the frames that some scene shows worst: recorded and every scene above, maps of
+            the differences (FLIP) below.
+        video: the same for all frames of the first target camera, as MP4.
+    """
+
+    clip: str
+    figures: Mapping[str, Mapping[str, Any]]
+    worst: Sequence[tuple[str, Picture]]
+    video: bytes
+
+
+def compare_scenes(
+    clip: Clip,
+    scenes: Mapping[str, Callable[[], GaussianScene]],
+    held: HeldOut | None = None,
+    *,
+    target_cameras: Sequence[str] | None = None,
+    device: str = "auto",
+    progress: Progress | None = None,
+) -> Comparison:
+    """Scores scenes of a log one after the other, and draws them side by side.
+
+    Args:
+        clip: the log.
+        scenes: two or more by name, loaded when their turn comes and let go after it.
+        held: images and sweeps that none of them was made from.
+        target_cameras: cameras to compare with; the first scene's input cameras if None.
+        device: that renders.
+        progress: called with a stage and the fraction of all work that is done.
+
+    Raises:
+        ReconstructError: fewer than two scenes, an unknown camera, a scene of another log.
+    """
+    if len(scenes) < 2:
+        raise ReconstructError(f"a comparison needs two scenes or more, got {list(scenes)}")
+    report = progress or (lambda stage, fraction: None)
+    figures: dict[str, dict[str, Any]] = {}
+    shown: dict[str, dict[tuple[str, int], Picture]] = {}
+    for done, (name, load) in enumerate(scenes.items()):
+
+        def part(stage: str, fraction: float, name: str = name, done: int = done) -> None:
+            report(f"{name}: {stage}", (done + fraction) / len(scenes))
+
+        scene = load()
+        figures[name] = score_scene(
+            clip, scene, held, target_cameras=target_cameras, via_grpc=False, device=device,
+            progress=lambda stage, fraction: part(stage, 0.9 * fraction),
+        )  # fmt: skip
+        target_cameras = figures[name]["target_cameras"]
+        with sensing(scene, False, device) as sense:
+            shown[name] = _pictures(clip, target_cameras, sense)
+    frames = [frame for frame in next(iter(shown.values())) if frame[0] == target_cameras[0]] if target_cameras else []
+    worst = _worst_frames(figures)
+    report("pictures", 1.0)
+    return Comparison(
+        clip.id,
+        figures,
+        [(f"{camera}, frame {index}", _row(clip, (camera, index), shown)) for camera, index in worst],
+        _video([_row(clip, frame, shown) for frame in frames]),
+    )
+
+
+def _pictures(clip: Clip, cameras: Sequence[str], sense: Sense) -> dict[tuple[str, int], Picture]:
+    """Every frame of some cameras, made small."""
+    pictures = {}
+    for camera in cameras:
+        for index in range(len(clip.camera_times_us(camera))):
+            (frame,) = sense([image_request(clip, camera, index)])
+            assert isinstance(frame, CameraFrame)
+            pictures[camera, index] = _small(frame.rgb)
+    return pictures
+
+
+def _small(picture: Picture) -> Picture:
+    """Both sides even, as video needs them."""
+    height = max(round(picture.shape[0] * WIDTH_PX / picture.shape[1] / 2) * 2, 2)
+    return cv2.resize(picture, (WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+
+
+def _worst_frames(figures: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, int]]:
+    """The frames of which some scene is worst, by the PSNR of that scene; one of each scene in turn."""
+    ranked = []
+    for each in figures.values():
+        rows = [
+            (value, camera, index)
+            for camera, scores in each["image"]["cameras"].items()
+            for index, value in enumerate(scores["per_frame"]["psnr_db"])
+        ]
+        ranked.append([(camera, index) for _, camera, index in sorted(rows)])
+    turns = [frame for place in zip(*ranked, strict=True) for frame in place]
+    return list(dict.fromkeys(turns))[:WORST]
+
+
+def _row(clip: Clip, frame: tuple[str, int], shown: Mapping[str, Mapping[tuple[str, int], Picture]]) -> Picture:
+    """Recorded and every scene side by side; below each scene where it differs, dark where it does not."""
+    recorded = _small(clip.image(*frame))
+    upper, lower = [_captioned(recorded, "recorded")], [np.full_like(recorded, 250)]
+    for name, pictures in shown.items():
+        difference = flip_map(pictures[frame], recorded)
+        upper.append(_captioned(pictures[frame], f"{name}   FLIP {difference.mean():.3f}"))
+        levels = np.rint(255 * np.clip(difference, 0, 1)).astype(np.uint8)
+        lower.append(cv2.applyColorMap(levels, cv2.COLORMAP_MAGMA)[..., ::-1])
+    return np.vstack([np.hstack(upper), np.hstack(lower)])
+
+
+def _captioned(picture: Picture, text: str) -> Picture:
+    bar = np.full((BAR_PX, picture.shape[1], 3), 250, np.uint8)
+    cv2.putText(bar, text, (4, BAR_PX - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA)
+    return np.vstack([bar, picture])
+
+
+def _video(pictures: Sequence[Picture]) -> bytes:
+    """An H.264 video in MP4; no bytes without pictures."""
+    import av
+
+    if not pictures:
+        return b""
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=FRAMES_PER_S, options=CODEC_OPTIONS)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt, stream.time_base = "yuv420p", Fraction(1, FRAMES_PER_S)
+        for index, picture in enumerate(pictures):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            frame.pts = index
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return file.getvalue()

@@ -1,0 +1,100 @@
+"""Regions of a recorded image that the log itself tells apart, the same for every reconstruction.
+
+Actors are the outlines of labelled boxes of things that can move. Range is known around the points of the sweep
+nearest in time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from nurec_sim import geometry, sensors
+from nurec_sim.types import MOVABLE_LABELS, CameraModel, Clip, SensorRequest
+
+RANGES_M = (0.0, 10.0, 20.0, 40.0, 80.0)
+"""Borders of the range bins."""
+NEAREST_SWEEP_US = 100_000
+"""A sweep farther in time from an image says nothing of it."""
+AROUND_PX = 2
+"""Pixels around a LiDAR point that count as at its range."""
+HIDDEN = 1.15
+"""A point this much farther than another one within ``CELL_PX`` was seen from the LiDAR past what hides it here."""
+CELL_PX = 12
+_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
+def range_name(index: int) -> str:
+    """Name of a bin of ``RANGES_M``."""
+    return f"{RANGES_M[index]:g}-{RANGES_M[index + 1]:g} m"
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """LiDAR points in an image: pixel (column, row) and range bin."""
+
+    pixel: Int64[np.ndarray, "n 2"]
+    bin: Int64[np.ndarray, " n"]
+
+
+def actor_mask(clip: Clip, request: SensorRequest) -> Bool[np.ndarray, "h w"]:
+    """Pixels inside the outlines of labelled boxes of things that can move."""
+    camera = _camera(request)
+    mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    for outline in box_outlines(clip, request):
+        cv2.fillConvexPoly(mask, outline.astype(np.int32), 1)
+    return mask.astype(bool)
+
+
+def box_outlines(clip: Clip, request: SensorRequest) -> Iterator[Float64[np.ndarray, "k 2"]]:
+    """Convex outlines, in pixels, of the boxes that are wholly before the camera."""
+    camera = _camera(request)
+    for track in clip.tracks:
+        if track.label not in MOVABLE_LABELS or not track.path.covers(request.start_us):
+            continue
+        corners = geometry.transform_points(track.path.at(request.start_us), _CORNERS * np.asarray(track.size_m))
+        uv, valid, _ = sensors.project_rolling(camera, request.world_from_sensor, corners)
+        if valid.all():
+            yield cv2.convexHull(uv.astype(np.float32))[:, 0]
+
+
+def seen_points(clip: Clip, request: SensorRequest) -> SeenPoints:
+    """Points of the nearest sweeps that the camera sees too: not behind others, and on nothing that can move."""
+    camera = _camera(request)
+    clouds = [cloud for lidar in clip.rig.lidars if (cloud := _nearest_cloud(clip, lidar, request)) is not None]
+    xyz = np.concatenate(clouds) if clouds else np.zeros((0, 3))
+    uv, valid, _ = sensors.project_rolling(camera, request.world_from_sensor, xyz)
+    valid &= sensors.in_image(camera, uv)
+    pixel = np.floor(uv[valid]).astype(np.int64)
+    distance = np.linalg.norm(xyz[valid] - request.world_from_sensor[0, :3, 3], axis=1)
+    keep = (distance < RANGES_M[-1]) & ~_hidden(pixel, distance, camera)
+    if len(pixel):
+        keep &= ~actor_mask(clip, request)[pixel[:, 1], pixel[:, 0]]
+    return SeenPoints(pixel[keep], np.digitize(distance[keep], RANGES_M) - 1)
+
+
+def _camera(request: SensorRequest) -> CameraModel:
+    assert isinstance(request.sensor, CameraModel)
+    return request.sensor
+
+
+def _nearest_cloud(clip: Clip, lidar: str, request: SensorRequest) -> Float64[np.ndarray, "n 3"] | None:
+    middle = clip.sweep_times_us(lidar).sum(axis=1) // 2
+    gap = np.abs(middle - request.middle_us)
+    if not len(gap) or gap.min() > NEAREST_SWEEP_US:
+        return None
+    return clip.sweep(lidar, int(gap.argmin())).xyz_world_m
+
+
+def _hidden(
+    pixel: Int64[np.ndarray, "n 2"], distance_m: Float64[np.ndarray, " n"], camera: CameraModel
+) -> Bool[np.ndarray, " n"]:
+    """Camera and LiDAR sit apart, so beams pass beside what hides their points from the camera."""
+    nearest = np.full((camera.height_px // CELL_PX + 1, camera.width_px // CELL_PX + 1), np.inf)
+    cell = pixel // CELL_PX
+    np.minimum.at(nearest, (cell[:, 1], cell[:, 0]), distance_m)
+    return distance_m > HIDDEN * nearest[cell[:, 1], cell[:, 0]]

@@ -1,0 +1,77 @@
+"""The figures of ``log.score_scene`` as rows for people: one scene, or several side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from nurec_sim.evaluate.scores.sharpness import OCTAVES
+
+SEEN = {"seen": "frames it was made from", "unseen": "frames it has not seen"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure of a scene; ``better`` is 1 where more is better, -1 where less is, 0 where neither."""
+
+    group: str
+    name: str
+    value: float | None
+    digits: int = 3
+    better: int = 0
+
+    @property
+    def text(self) -> str:
+        """The value to print."""
+        return "not known" if self.value is None else f"{self.value:.{self.digits}f}"
+
+
+def figure_rows(figures: Mapping[str, Any]) -> list[Row]:
+    """All headline figures, in the order in which they are read; the same names for every scene of a log."""
+    rows = []
+    for key, title in SEEN.items():
+        if frames := figures["image"].get(key):
+            rows += _image_rows(f"Images: {title}", frames)
+    if lidar := figures["lidar"]:
+        for name, part in [("all ranges", lidar), *lidar["by_range"].items()]:
+            rows += [
+                Row("LiDAR: sweeps held out", f"median error, {name} (m)", part["median_abs_range_error_m"], 3, -1),
+                Row("LiDAR: sweeps held out", f"mean error, {name} (m)", part["mean_abs_range_error_m"], 2, -1),
+                Row("LiDAR: sweeps held out", f"95th percentile, {name} (m)", part["p95_abs_range_error_m"], 2, -1),
+                Row("LiDAR: sweeps held out", f"beams that return, {name}", part["return_recall"], 3, 1),
+            ]
+        rows.append(Row("LiDAR: sweeps held out", "Chamfer: precision + coverage (m)", lidar["cd_l1_sum"], 3, -1))
+    if free := figures["free_space"]:
+        for left, share in free["false_obstacles"].items():
+            percent = None if share is None else 100 * share
+            rows.append(Row("False obstacles", f"{left} beside the path (% of returns)", percent, 2, -1))
+    if road := figures["road"]:
+        rows.append(Row("Road", "off-road agrees with the map", road.get("agreement"), 3, 1))
+    rows += [
+        Row("Scene", "static Gaussians", figures["counts"]["static"], 0),
+        Row("Scene", "moving Gaussians", figures["counts"]["dynamic"], 0),
+    ]
+    if (seconds := figures["seconds"].get("reconstruct")) is not None:
+        rows.append(Row("Scene", "reconstruction (s)", seconds, 1, -1))
+    return rows
+
+
+def _image_rows(group: str, frames: Mapping[str, Any]) -> list[Row]:
+    rows = [
+        Row(group, "frames", frames["frames"], 0),
+        Row(group, "PSNR (dB)", frames["psnr_db"], 2, 1),
+        Row(group, "SSIM", frames["ssim"], 3, 1),
+        Row(group, "FLIP", frames["flip"], 3, -1),
+    ]
+    rows += [Row(group, f"PSNR, {name} (dB)", value, 2, 1) for name, value in frames["region_psnr_db"].items()]
+    rows += [Row(group, f"sharpness from {name} cycle/px", frames["sharpness"][name], 2) for name in OCTAVES]
+    holes = {name: None if share is None else 100 * share for name, share in frames["holes"].items()}
+    return rows + [Row(group, f"holes, {name} (%)", share, 2, -1) for name, share in holes.items()]
+
+
+def side_by_side(scenes: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, list[Row | None]]]:
+    """Group, name and the rows of all scenes, None where a scene lacks the figure; in the first scene's order."""
+    tables = {name: {(row.group, row.name): row for row in figure_rows(figures)} for name, figures in scenes.items()}
+    keys: Sequence[tuple[str, str]] = list(dict.fromkeys(key for table in tables.values() for key in table))
+    return [(group, name, [table.get((group, name)) for table in tables.values()]) for group, name in keys]

@@ -1,0 +1,204 @@
+"""Scores of a scene beside its log: FLIP, sharpness, holes, regions, false obstacles, and what is held out."""
+
+import numpy as np
+import pytest
+from reconstruct_street import Street, camera
+
+from nurec_sim import geometry
+from nurec_sim.errors import ReconstructError
+from nurec_sim.evaluate import hold_out, score_scene, without_images
+from nurec_sim.evaluate.image_scores import image_request
+from nurec_sim.evaluate.log_regions import actor_mask, seen_points
+from nurec_sim.evaluate.scores.flip import flip, flip_map
+from nurec_sim.evaluate.scores.free_space import FiredSweep, RecordedBeams, false_obstacles
+from nurec_sim.evaluate.scores.lidar import LidarScore
+from nurec_sim.evaluate.scores.sharpness import octave_energy, sharpness
+from nurec_sim.reconstruct import LiftSettings, ViewSettings, reconstruct
+from nurec_sim.types import MOVABLE_LABELS, Track, Trajectory
+
+SMALL = LiftSettings(sky_px=32, views=ViewSettings(levels=32))
+
+
+def waves():
+    """A colourful pattern, and the same darker with a red patch."""
+    y, x = np.mgrid[0:120, 0:160]
+    first = np.stack([128 + 100 * np.sin(x / 7), 128 + 90 * np.sin(y / 11 + 1), 128 + 100 * np.cos((x + y) / 5)], -1)
+    second = first * 0.9
+    second[40:60, 50:90] = [250, 20, 30]
+    return np.clip(first, 0, 255).astype(np.uint8), np.clip(second, 0, 255).astype(np.uint8)
+
+
+def test_flip_gives_what_its_authors_program_gives():
+    """``flip_evaluator.evaluate(reference, test, "LDR")`` of flip-evaluator 1.7 on the same arrays."""
+    reference, image = waves()
+    assert flip(image, reference) == pytest.approx(FLIP_MEAN, abs=2e-5)
+    assert flip_map(image, reference)[50, 70] == pytest.approx(FLIP_INSIDE, abs=2e-5)
+
+
+FLIP_MEAN, FLIP_INSIDE = 0.359626, 0.968085
+
+
+def test_flip_of_equal_images_is_nothing_and_sizes_must_agree():
+    image, _ = waves()
+    assert flip(image, image) == 0
+    with pytest.raises(ValueError, match=r"two 8-bit RGB images of one size are needed, got \(120, 159, 3\) uint8"):
+        flip(image[:, 1:], image)
+
+
+@pytest.mark.parametrize("cycles_per_px, octave", [(0.08, "1/16"), (0.2, "1/8"), (0.4, "1/4")])
+def test_energy_of_a_wave_lies_in_its_octave(cycles_per_px, octave):
+    wave = 128 + 100 * np.sin(2 * np.pi * cycles_per_px * np.arange(128))
+    energy = octave_energy(np.broadcast_to(wave[None, :, None], (96, 128, 3)).astype(np.uint8))
+    assert energy[octave] > 0.99 * sum(energy.values())
+
+
+def test_half_the_contrast_is_a_quarter_of_the_energy():
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3))
+    halved = (noise // 2).astype(np.uint8)
+    assert all(abs(part - 0.25) < 0.01 for part in sharpness(halved, noise.astype(np.uint8)).values())
+
+
+def wall_sweep(x_m=20.0, y_m=0.0):
+    """Beams from (0, y, 0) to a wall across the road."""
+    y, z = np.meshgrid(np.arange(-6, 6, 0.05), np.arange(-2, 2, 0.05))
+    ends = np.stack([np.full(y.size, x_m), y.ravel(), z.ravel()], axis=1)
+    pose = geometry.pose_from_xyyaw(0.0, y_m, 0.0)
+    fired = geometry.transform_points(geometry.inverse(pose), ends)
+    return FiredSweep(fired, np.full(len(fired), 0.5), np.stack([pose, pose])), ends
+
+
+def beams_of(sweeps):
+    fired = [wall_sweep(y_m=0.1 * k) for k in range(sweeps)]
+    return RecordedBeams([sweep for sweep, _ in fired], np.concatenate([ends for _, ends in fired]))
+
+
+def test_free_space_is_where_three_beams_passed_away_from_surfaces():
+    points = np.array([[10.0, 0, 0], [19.7, 0, 0], [21.5, 0, 0], [10.0, 9.0, 0], [45.0, 0, 0]])
+    assert beams_of(3).free(points).tolist() == [True, False, False, False, False]
+    assert not beams_of(2).free(points).any()
+
+
+def test_returns_inside_boxes_of_movers_do_not_count():
+    path = Trajectory(np.array([0, 10]), np.stack([geometry.pose_from_xyyaw(10.0, 0.0, 0.0)] * 2))
+    tracks = [Track("a", sorted(MOVABLE_LABELS)[0], (4.0, 2.0, 1.5), path, True)]
+    points = np.array([[10.0, 0, 0], [5.0, 0, 0]])
+    assert false_obstacles(points, beams_of(3), [], 5) == (2, 2)
+    assert false_obstacles(points, beams_of(3), tracks, 5) == (1, 1)
+
+
+def test_a_sweep_fired_on_the_move_is_compared_where_each_beam_was_fired():
+    """The sensor goes 4 m while it turns: seen from the middle of the way, points beside it lie 20 degrees off."""
+    azimuth = np.linspace(-np.pi, np.pi, 1440, endpoint=False) + 1e-3
+    fraction = (azimuth + np.pi) / (2 * np.pi)
+    poses = np.stack([geometry.pose_from_xyyaw(0, 0, 0), geometry.pose_from_xyyaw(4.0, 0, 0)])
+    blocked = np.abs(azimuth - 1.5) < 0.05  # one narrow thing at 4 m, to the left, late in the turn
+    reach = np.where(blocked, 4.0, 30.0)
+    fired = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1) * reach[:, None]
+    beams = RecordedBeams([FiredSweep(fired, fraction, poses)], np.zeros((1, 3)))
+    at = 4.0 * (1.5 + np.pi) / (2 * np.pi)
+    behind = np.array([[at + 8 * np.cos(1.5), 8 * np.sin(1.5), 0.0]])
+    assert beams.passed(behind) == [0]
+    assert beams.passed(behind + [2.0, 0, 0]) == [1]
+
+
+def test_ranges_are_scored_apart_and_clouds_by_their_distances():
+    xyz = np.array([[5.0, 0, 0], [0, 15.0, 0], [0, 0, 30.0]])
+    score = LidarScore(xyz, np.array([5.5, np.nan, 33.0]))
+    assert score.within(0, 10).median_abs_error_m == pytest.approx(0.5)
+    assert score.within(10, 20).recall == 0
+    # Simulated (5.5, 0, 0) and (0, 0, 33): 0.5 and 3 m off; recorded (0, 15, 0) is nearest to (5.5, 0, 0).
+    precision, coverage = score.chamfer()
+    assert precision == pytest.approx((0.5 + 3) / 2)
+    assert coverage == pytest.approx((0.5 + np.hypot(15, 5.5) + 3) / 3)
+
+
+def street():
+    return Street(frames=6, cameras=(camera("left", 0.25), camera("right", -0.25)))
+
+
+def test_every_third_image_is_held_out_with_the_sweeps_of_its_time():
+    clip = street()
+    held = hold_out(clip, ["left"], images_every=3)
+    assert held.images == {"left": {2, 5}}
+    times = clip.camera_times_us("left")[[2, 5]]
+    spins = clip.sweep_times_us("top")
+    overlap = {k for k, (a, b) in enumerate(spins) if any(a <= end and b >= start for start, end in times)}
+    assert held.sweeps == overlap and overlap
+    seen = without_images(clip, held)
+    assert len(seen.camera_times_us("left")) == 4 and len(seen.camera_times_us("right")) == 6
+    assert np.array_equal(seen.image("left", 2), clip.image("left", 3))
+    assert without_images(clip, hold_out(clip, [])) is clip
+
+
+def test_holding_out_everything_or_less_than_nothing_is_refused():
+    with pytest.raises(ReconstructError, match=r"images_every must be 0 \(none\) or at least 2, got 1"):
+        hold_out(street(), ["left"], images_every=1)
+    with pytest.raises(ReconstructError, match="camera 'left' has 6 images, none to hold out when every 9th is"):
+        hold_out(street(), ["left"], images_every=9)
+
+
+def test_lidar_points_in_an_image_have_their_range_and_are_not_hidden():
+    clip = street()
+    request = image_request(clip, "left", 2)
+    points = seen_points(clip, request)
+    assert len(points.pixel) > 50 and points.bin.min() >= 0 and points.bin.max() <= 3
+    assert not actor_mask(clip, request)[points.pixel[:, 1], points.pixel[:, 0]].any()
+
+
+@pytest.fixture(scope="module")
+def figures():
+    clip = street()
+    held = hold_out(clip, ["left"], images_every=3)
+    scene = reconstruct(without_images(clip, held), "lift", cameras=["left"], hold_out_sweeps=sorted(held.sweeps),
+                        settings=SMALL)  # fmt: skip
+    return clip, scene, held, score_scene(clip, scene, held, target_cameras=["left", "right"], via_grpc=False)
+
+
+def test_seen_and_unseen_frames_are_told_apart(figures):
+    image = figures[3]["image"]
+    assert image["seen"]["frames"] == 4 and image["unseen"]["frames"] == 8
+    assert image["seen"]["psnr_db"] > image["unseen"]["psnr_db"] - 1
+    unseen = {f"{name}_{k:04d}" for name, frames in (("left", (2, 5)), ("right", range(6))) for k in frames}
+    assert set(image["unseen"]["worst"]) <= unseen
+    per_frame = image["cameras"]["left"]["per_frame"]["psnr_db"]
+    assert image["seen"]["psnr_db"] == pytest.approx(np.mean([per_frame[k] for k in (0, 1, 3, 4)]))
+
+
+def test_a_scene_has_few_holes_and_one_without_gaussians_only_holes(figures):
+    import dataclasses
+
+    clip, scene, held, scores = figures
+    assert max(share for share in scores["image"]["seen"]["holes"].values() if share is not None) < 0.1
+    none = np.zeros(len(scene.static), bool)
+    empty = dataclasses.replace(scene, static=scene.static[none])
+    bare = score_scene(clip, empty, held, target_cameras=["right"], via_grpc=False)
+    assert all(share == 1 for share in bare["image"]["unseen"]["holes"].values() if share is not None)
+
+
+def test_no_false_obstacles_on_the_path_but_before_a_board_in_the_way(figures):
+    import dataclasses
+
+    clip, scene, _, scores = figures
+    assert scores["free_space"]["false_obstacles"]["0 m"] < 0.02
+    board = scene.static[:400]
+    y, z = np.meshgrid(np.linspace(-1, 1, 20), np.linspace(0.5, 2.5, 20))
+    ahead = clip.ego.at(clip.ego.end_us)[:3, 3] + np.stack([np.full(400, 4.0), y.ravel(), z.ravel()], axis=1)
+    board = dataclasses.replace(board, mean_m=ahead, scale_m=np.full((400, 3), 0.1, np.float32),
+                                opacity=np.ones(400, np.float32))  # fmt: skip
+    from nurec_sim.scene.transform import joined
+
+    blocked = dataclasses.replace(scene, static=joined([scene.static, board]))
+    after = score_scene(clip, blocked, target_cameras=["left"], via_grpc=False)["free_space"]["false_obstacles"]
+    assert after["0 m"] > scores["free_space"]["false_obstacles"]["0 m"] + 0.01
+
+
+def test_a_scene_of_another_path_is_refused(figures):
+    import dataclasses
+
+    _, scene, _, _ = figures
+    clip = Street(frames=6, speed_mps=3.0, cameras=(camera("left", 0.25),))
+    with pytest.raises(ReconstructError, match="was not made from clip .* paths are .* m apart"):
+        score_scene(clip, scene, via_grpc=False)
+    late = dataclasses.replace(scene, ego=Trajectory(scene.ego.t_us + 10**9, scene.ego.world_from_body))
+    with pytest.raises(ReconstructError, match="is of another time than clip"):
+        score_scene(clip, late, via_grpc=False)
