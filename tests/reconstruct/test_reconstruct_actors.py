@@ -1,9 +1,14 @@
 import numpy as np
 
 from nurec_sim import geometry
+from nurec_sim.reconstruct.lift import lifting
 from nurec_sim.reconstruct.lift.actors import in_box, standing_knots_us, tracks_of
-from nurec_sim.reconstruct.lift.points import actors_of
-from nurec_sim.reconstruct.lift.settings import PointSettings
+from nurec_sim.reconstruct.lift.bake import body_pixels
+from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.pictures import DepthPicture
+from nurec_sim.reconstruct.lift.points import Cloud, actors_of
+from nurec_sim.reconstruct.lift.settings import LiftSettings, PointSettings
+from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 from nurec_sim.types import Gaussians, Track, Trajectory
 
 SPAN_US = (1_000_000, 6_000_000)
@@ -79,3 +84,27 @@ def test_a_standing_actor_stays_to_be_hit_after_its_labels_end():
 def test_a_moving_actor_keeps_its_recorded_path():
     clip = Log(Track("car", "automobile", (4.0, 1.8, 1.5), drive()))
     assert tracks_of(clip, actors_of(clip, PointSettings())) == clip.tracks
+
+
+def test_pixels_go_to_the_frame_of_their_body_and_normals_are_computed_once_per_view(monkeypatch):
+    """A wall 10 m ahead of a camera that looks along x; the left half of the picture shows an actor."""
+    shape, calls = (4, 8), []
+    normals_of = lifting.normals_of
+    monkeypatch.setattr(lifting, "normals_of", lambda *given: calls.append(1) or normals_of(*given))
+    mover = actor(drive(speed=8.0))
+    nothing = np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)
+    bodies = [Surfels(each, Cloud.empty(), *nothing) for each in (None, mover)]
+    turn = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    tile = Tile(8, 4, 8.0, (4.0, 2.0), np.eye(3), 1, None, np.ones(shape, bool), np.zeros(3))
+    rgb = np.zeros((*shape, 3), np.uint8)
+    t_us = (1_200_000, 2_200_000)
+    views = [WorkingView("front", 0, t, True, tile, geometry.pose(turn, np.zeros(3)), np.zeros(3), rgb) for t in t_us]
+    body = np.repeat(np.arange(8) < 4, 4).reshape(8, 4).T.astype(np.int32)
+    picture = DepthPicture(np.full(shape, 0.1, np.float32), body, np.full(shape, -1, np.int32), np.zeros(shape, bool))
+    world, box = body_pixels(bodies, views, [picture] * 2, [rgb] * 2, LiftSettings())
+    assert len(calls) == 2 and len(world) == len(box) == 32
+    assert np.allclose(world.xyz_m[:, 0], 10) and (world.xyz_m[:, 1] < 0).all() and np.allclose(world.depth_m, 10)
+    for k, t in enumerate(t_us):
+        mine = box.view == k
+        expected = 10 - mover.path.at(t)[0, 3]
+        assert mine.sum() == 16 and np.allclose(box.xyz_m[mine, 0], expected) and (box.xyz_m[mine, 1] > 0).all()

@@ -62,16 +62,53 @@ def _packed(views: Sequence[WorkingView], body: Surfels | None) -> tuple[np.ndar
     return colour.packed_views(views, poses), np.array([body.present(view.t_us) for view in views])
 
 
+def body_pixels(
+    bodies: Sequence[Surfels],
+    views: Sequence[WorkingView],
+    pictures: Sequence[DepthPicture],
+    rgb: Sequence[np.ndarray],
+    settings: LiftSettings,
+) -> list[Lifted]:
+    """The pixels of all views that show each body, in its frame, thinned to the budget."""
+    parts = [[Lifted.empty()] for _ in bodies]
+    pixels = sum(view.rgb.shape[0] * view.rgb.shape[1] for view in views)
+    thinning = 2 ** max(0, int(np.ceil(np.log2(max(KEPT_SHARE * pixels / settings.views.budget, 1)))))
+    for k, (view, picture) in enumerate(zip(views, pictures, strict=True)):
+        near = (picture.inverse_depth > 1 / settings.views.max_depth_m) & view.tile.valid
+        near &= lifting.lattice(near.shape, thinning)
+        # These are of the whole view, so they are computed before the loop over bodies.
+        points, normals = (
+            lifting.points_of(view, picture.inverse_depth),
+            lifting.normals_of(view, picture.inverse_depth),
+        )
+        rays = lifting.rays_of(view)
+        for number in np.unique(picture.body[near & (picture.body >= 0)]):
+            body, mask = bodies[number], near & (picture.body == number)
+            body_from_world = geometry.inverse(body.world_from_body(view.t_us))
+            xyz = geometry.transform_points(body_from_world, points[mask])
+            surfel = picture.surfel[mask]
+            normal = normals[mask] @ body_from_world[:3, :3].T
+            normal = np.where((surfel >= 0)[:, None], body.normal[surfel] if len(body.cloud) else normal, normal)
+            ray = rays[mask]
+            ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+            ray = ray @ (body_from_world @ view.world_from_view)[:3, :3].T
+            z = 1 / picture.inverse_depth[mask].astype(np.float64)
+            pixel_m = np.sqrt(thinning) * z / view.tile.focal_px
+            mine = np.full(len(z), k, np.int32)
+            parts[number].append(Lifted(xyz, normal, ray, z, pixel_m, rgb[k][mask].astype(np.float32), surfel, mine))
+    return [Lifted.concatenate(each) for each in parts]
+
+
 def body_gaussians(
-    number: int,
     body: Surfels,
+    pixels: Lifted,
     ground: Ground,
     views: Sequence[WorkingView],
     pictures: Sequence[DepthPicture],
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,
 ) -> tuple[Gaussians, int]:
-    """Gaussians of one body in its frame, and how many of them were lifted from pixels."""
+    """Gaussians of one body in its frame, and how many of them were lifted from its ``pixels`` (``body_pixels``)."""
     cloud = body.cloud
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
     shown = colour.fill_unseen(cloud.xyz_m, seen_rgb / 255, np.isfinite(pixel), cloud.intensity)
@@ -81,47 +118,23 @@ def body_gaussians(
         surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.spacing_m[keep], shown[keep], cloud.intensity[keep],
                        body.label[keep], settings.opacity)
     ]  # fmt: skip
-    lifted = _lifted(number, body, views, pictures, rgb, settings)
+    lifted = _owned(pixels, body, views, pictures, rgb, settings)
     if len(lifted):
         parts.append(_lifted_gaussians(lifted, body, ground, settings))
     return Gaussians.concatenate(parts), len(lifted)
 
 
-def _lifted(
-    number: int,
+def _owned(
+    everything: Lifted,
     body: Surfels,
     views: Sequence[WorkingView],
     pictures: Sequence[DepthPicture],
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,
 ) -> Lifted:
-    """The pixels of all views that show a body and that no other view owns."""
-    parts, depths = [], []
-    pixels = sum(view.rgb.shape[0] * view.rgb.shape[1] for view in views)
-    thinning = 2 ** max(0, int(np.ceil(np.log2(max(KEPT_SHARE * pixels / settings.views.budget, 1)))))
-    for k, (view, picture) in enumerate(zip(views, pictures, strict=True)):
-        mask = (picture.body == number) & (picture.inverse_depth > 1 / settings.views.max_depth_m) & view.tile.valid
-        mask &= lifting.lattice(mask.shape, thinning)
-        if not mask.any():
-            continue
-        body_from_world = geometry.inverse(body.world_from_body(view.t_us))
-        xyz = geometry.transform_points(body_from_world, lifting.points_of(view, picture.inverse_depth)[mask])
-        surfel = picture.surfel[mask]
-        normal = lifting.normals_of(view, picture.inverse_depth)[mask] @ body_from_world[:3, :3].T
-        normal = np.where((surfel >= 0)[:, None], body.normal[surfel] if len(body.cloud) else normal, normal)
-        ray = lifting.rays_of(view)[mask]
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        ray = ray @ (body_from_world @ view.world_from_view)[:3, :3].T
-        z = 1 / picture.inverse_depth[mask].astype(np.float64)
-        pixel_m = np.sqrt(thinning) * z / view.tile.focal_px
-        mine = np.full(len(z), k, np.int32)
-        parts.append(Lifted(xyz, normal, ray, pixel_m, rgb[k][mask].astype(np.float32), surfel, mine))
-        depths.append(z)
-    if not parts:
-        return Lifted(
-            *(np.zeros((0, 3)),) * 3, np.zeros(0), np.zeros((0, 3), np.float32), *(np.zeros(0, np.int32),) * 2
-        )
-    everything, z = Lifted.concatenate(parts), np.concatenate(depths)
+    """The pixels of a body that no other view owns."""
+    if not len(everything):
+        return everything
     packed, present = _packed(views, body)
     step = 1 / settings.views.min_depth_m / (settings.views.levels - 1)
     depth_stack, rgb_stack = lifting.stacked([picture.inverse_depth for picture in pictures]), lifting.stacked(rgb)
@@ -132,7 +145,7 @@ def _lifted(
             pool.submit(
                 lifting.owned,
                 everything.xyz_m[part],
-                z[part],
+                everything.depth_m[part],
                 everything.view[part],
                 everything.rgb[part],
                 packed,

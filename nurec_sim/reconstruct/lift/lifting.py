@@ -25,13 +25,14 @@ OWNER_BORDER = 0.04
 class Lifted:
     """Points lifted from views, in the frame of their body: world or box.
 
-    ``ray`` is the unit direction from the camera, ``pixel_m`` the width of one pixel there, ``surfel`` the row of the
-    surfel that gave the depth, or -1.
+    ``ray`` is the unit direction from the camera, ``depth_m`` the depth along its axis, ``pixel_m`` the width of one
+    pixel there, ``surfel`` the row of the surfel that gave the depth, or -1.
     """
 
     xyz_m: Float64[np.ndarray, "n 3"]
     normal: Float64[np.ndarray, "n 3"]
     ray: Float64[np.ndarray, "n 3"]
+    depth_m: Float64[np.ndarray, " n"]
     pixel_m: Float64[np.ndarray, " n"]
     rgb: Float32[np.ndarray, "n 3"]
     surfel: Int32[np.ndarray, " n"]
@@ -42,6 +43,12 @@ class Lifted:
 
     def __getitem__(self, index: np.ndarray) -> Lifted:
         return Lifted(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    @classmethod
+    def empty(cls) -> Lifted:
+        """No points."""
+        some = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0)
+        return cls(*some, np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int32))
 
     @classmethod
     def concatenate(cls, parts: Sequence[Lifted]) -> Lifted:

@@ -16,7 +16,7 @@ import numpy as np
 from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.lift import actors as actor_layer
 from nurec_sim.reconstruct.lift import colour, points
-from nurec_sim.reconstruct.lift.bake import body_gaussians, camera_isp
+from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels, camera_isp
 from nurec_sim.reconstruct.lift.bodies import surfels_of
 from nurec_sim.reconstruct.lift.pictures import DepthPicture, depth_pictures
 from nurec_sim.reconstruct.lift.points import Actor
@@ -57,9 +57,10 @@ def lift(
     canonical = [colour.to_canonical(view.rgb, isp[view.camera_id]).astype(np.uint8) for view in views]
     stages.start("lifting")
     static, moving, lifted = Gaussians.empty(), [], 0
+    pixels = body_pixels(bodies, views, pictures, canonical, settings)
     for number, body in enumerate(bodies):
         stages.fraction(number / len(bodies))
-        gaussians, count = body_gaussians(number, body, ground, views, pictures, canonical, settings)
+        gaussians, count = body_gaussians(body, pixels[number], ground, views, pictures, canonical, settings)
         lifted += count
         if body.actor is None:
             static = gaussians
