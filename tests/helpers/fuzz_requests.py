@@ -141,7 +141,10 @@ class _Handlers:
 
 
 def store() -> SceneStore:
-    return SceneStore([scene(), scene("other", seed=1)], threads=2)
+    """Two scenes. One frame of each sensor is rendered at once: kernels are not compiled within a request's limit."""
+    made = SceneStore([scene(), scene("other", seed=1)], threads=2)
+    made.get("street").renderer.sense([*map(camera_request, ("front", "wide", "fish")), lidar_request()])
+    return made
 
 
 def fuzz_handlers(

@@ -316,6 +316,8 @@ def test_an_8k_image():
 
 def test_no_image_is_larger_than_8k():
     renderer = CpuRenderer(scene(GOOD), threads=2)
+    with pytest.raises(TooLargeError, match="8193 x 1 pixels are too many"):
+        renderer.render_camera(request(camera(8193, 1)))
     with pytest.raises(TooLargeError, match="10000 x 10000 pixels are too many"):
         renderer.render_camera(request(camera(10_000, 10_000)))
     with pytest.raises(TooLargeError, match="8192 x 8192 pixels are too many"):
