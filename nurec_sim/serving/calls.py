@@ -1,4 +1,4 @@
-"""Calls and how they reach procedures: what a procedure may know of its call, and what turns bytes into messages.
+"""Calls and how they reach procedures: the context of a call, parsing of requests, errors as statuses.
 
 A procedure is a coroutine: message in, message out. What it raises becomes a gRPC status.
 """
@@ -56,7 +56,7 @@ class Call:
         return address_of(self.peer), self.peer
 
     def check_deadline(self) -> None:
-        """Ends work that nobody waits for.
+        """Cancels work whose deadline has passed.
 
         Raises:
             DeadlinePassedError: the client has stopped waiting.
@@ -67,7 +67,7 @@ class Call:
 
 
 def address_of(peer: str) -> str:
-    """The address of a client without its port, which every connection has anew: ``ipv4:127.0.0.1``."""
+    """The address of a client without its port, which differs between connections: ``ipv4:127.0.0.1``."""
     return peer.rsplit(":", 1)[0] if peer.startswith(("ipv4:", "ipv6:")) else peer
 
 

@@ -1,4 +1,4 @@
-"""Sensors on the far side of a wire: the same ``sense`` as a renderer in this process, bit for bit."""
+"""Client of the sensor service: the same ``sense`` as a local renderer, bit for bit."""
 
 from __future__ import annotations
 

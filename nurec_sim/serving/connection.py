@@ -94,17 +94,17 @@ class Connection:
         self.close()
 
     def _options(self, timeout_s: float | None) -> Mapping[str, Any]:
-        """Keywords of every call, once the server has been reached; None waits for ever.
+        """Keywords of every call, once the server has been reached; None for no time limit.
 
         Raises:
-            ServerError: it has never been reached, and cannot be in time.
+            ServerError: it cannot be reached in time.
         """
         if not self._reached:
             self._wait_for_contact()
         return {"timeout": timeout_s, "wait_for_ready": False, "metadata": self._metadata}
 
     def _wait_for_contact(self) -> None:
-        """Waits for a new connection: one that is there already says nothing of a server that is frozen."""
+        """Waits for a new connection: an existing one does not show whether the server still responds."""
         with self._open() as channel:
             ready = grpc.channel_ready_future(channel)
             try:
@@ -138,7 +138,13 @@ class Connection:
 def open_channel(
     address: str, root_ca: Path | None = None, client_cert: Path | None = None, client_key: Path | None = None
 ) -> grpc.Channel:
-    """A channel whose calls are repeated when the server goes away in between; the arguments are ``Connection``'s.
+    """A channel whose calls are retried while the server is unavailable.
+
+    Args:
+        address: ``host:port``.
+        root_ca: PEM file of the root certificates to verify the server's; plain text if None.
+        client_cert: PEM file of the certificate to show, for mutual TLS.
+        client_key: PEM file of its private key.
 
     Raises:
         ServerError: a PEM file cannot be read, or a certificate comes without its key or without ``root_ca``.

@@ -1,4 +1,4 @@
-"""A server's health, asked over gRPC; imports next to nothing, so that a probe is quick."""
+"""Client of the gRPC health service; imports little, so that a probe starts quickly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scene service from the client's side: scenes come and go, and frames have geometry (docs/serving_v1.md)."""
+"""Client of the scene service: uploads, reconstruction, frames with geometry (docs/scene_service.md)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class SceneClient(Connection):
     # --------------------------------------------------------------------------------------------------------- scenes
 
     def scenes(self) -> Any:
-        """The ``ListScenesReply``: scenes on offer, and sources that cannot be."""
+        """The ``ListScenesReply``: available scenes, and sources that cannot be opened."""
         return self._call("ListScenes", v1.ListScenesRequest())
 
     def stats(self) -> Mapping[str, float]:
@@ -48,11 +48,11 @@ class SceneClient(Connection):
         return {field.name: getattr(reply, field.name) for field in reply.DESCRIPTOR.fields}
 
     def upload(self, path: Path, progress: Progress | None = None, *, timeout_s: float | None = None) -> str:
-        """Sends a scene archive (``.usdz``) or a zipped clip (``.zip``); gives the id of its scene.
+        """Uploads a scene archive (``.usdz``) or a zipped clip (``.zip``); returns the id of its scene.
 
         Args:
             path: the file.
-            progress: hears what is being done and the fraction of it that is.
+            progress: called with the stage and the fraction done.
             timeout_s: for all of it.
 
         Raises:
@@ -92,10 +92,10 @@ class SceneClient(Connection):
         progress: Progress | None = None,
         timeout_s: float | None = None,
     ) -> str:
-        """Has a clip reconstructed; gives the id of the scene.
+        """Reconstructs a clip on the server; returns the id of the scene.
 
         Args:
-            scene_id: a clip on offer, or
+            scene_id: an available clip, or
             path: one on the server, in a folder that it allows.
             name: id of the new scene, if not the clip's own.
             method: ``lift``, ``dense`` or ``selective``; empty for the server's choice.
@@ -119,7 +119,7 @@ class SceneClient(Connection):
         raise ServerError(f"{self.address}: the reconstruction ended without a scene")
 
     def unload(self, scene_id: str, *, delete_file: bool = False) -> int:
-        """Takes a scene out of the server's memory; gives the bytes that it took.
+        """Removes a scene from the server's memory; returns the bytes freed.
 
         ``delete_file`` also deletes the file of an uploaded one.
         """

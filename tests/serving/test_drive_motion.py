@@ -7,18 +7,18 @@ import pytest
 
 from nurec_sim import geometry
 from nurec_sim.serving.driver.motion import ego_states
-from nurec_sim.serving.wire.driving_states import ToldMotion, ToldState
+from nurec_sim.serving.wire.driving_states import ReportedMotion, ReportedState
 
 HEADING = 0.98  # rad, as on the demo log
 
 
 def told(t_s, along_m, motion=None, yaw=HEADING):
     x, y = 35.0 + along_m * math.cos(HEADING), 38.0 + along_m * math.sin(HEADING)
-    return ToldState(round(t_s * 1e6), geometry.pose_from_xyyaw(x, y, yaw), motion)
+    return ReportedState(round(t_s * 1e6), geometry.pose_from_xyyaw(x, y, yaw), motion)
 
 
 def dynamic(x, y=0.0, accel=0.0, yaw_rate=0.0):
-    return ToldMotion((x, y), accel, yaw_rate)
+    return ReportedMotion((x, y), accel, yaw_rate)
 
 
 def newest(*states):
@@ -67,7 +67,7 @@ def test_the_slack(motion, speed, yaw_rate):
 def test_motion_on_an_arc_is_measured_along_it():
     radius, turn = 20.0, 0.5  # 10 m/s for a second: the chord is 1 % short and 14 degrees off the first heading
     poses = [geometry.pose_from_xyyaw(radius * math.sin(a), radius * (1 - math.cos(a)), a) for a in (0.0, turn)]
-    found = newest(ToldState(1_000_000, poses[0]), ToldState(2_000_000, poses[1]))
+    found = newest(ReportedState(1_000_000, poses[0]), ReportedState(2_000_000, poses[1]))
     assert found.speed_mps == pytest.approx(2 * radius * math.sin(turn / 2), rel=1e-9)
     assert found.yaw_rate_radps == pytest.approx(turn)
 
@@ -92,6 +92,6 @@ def test_states_of_the_past_are_measured_too_the_first_one_forth():
 
 
 def test_fields_of_ours_are_never_doubted():
-    exact = ToldMotion((0.3, 0.0), 0.5, 0.1, 0.2, exact=True)
+    exact = ReportedMotion((0.3, 0.0), 0.5, 0.1, 0.2, exact=True)
     found = newest(told(1.0, 0.0), told(1.1, 1.0, exact))
     assert (found.speed_mps, found.accel_mps2, found.yaw_rate_radps, found.steering_rad) == (0.3, 0.5, 0.1, 0.2)

@@ -34,7 +34,7 @@ from nurec_sim.plugins import load_policy
 from nurec_sim.serving.driver import RemotePolicy, session
 from nurec_sim.serving.driver.session import Session
 from nurec_sim.serving.wire import common, driving, driving_paths, egodriver
-from nurec_sim.serving.wire.driving_states import ToldState
+from nurec_sim.serving.wire.driving_states import ReportedState
 from nurec_sim.sim.flat_world import demo_rig
 from nurec_sim.types import LidarFrame, Needs
 
@@ -350,5 +350,5 @@ def test_sweeps_and_images_share_what_a_session_may_hold(monkeypatch):
     told.add_sweep(sweep(NOW_US))  # in the place of the first
     with pytest.raises(TooLargeError, match="a session may hold 30000 bytes of images and sweeps, got 48000"):
         told.add_sweep(sweep(NOW_US + 1))
-    told.add_states([ToldState(NOW_US, np.eye(4))])
+    told.add_states([ReportedState(NOW_US, np.eye(4))])
     assert told.question(NOW_US).sweeps["any"].end_us == NOW_US

@@ -1,4 +1,4 @@
-"""Whether a sensor server keeps the published contract: one small check for each rule, against any ``host:port``.
+"""Conformance kit: whether a sensor server keeps the published contract, one small check for each rule.
 
 The checks speak the interface's published fields only and know nothing of who answers. A feature that a server may
 leave out is skipped with the reason; a rule that it breaks fails with what was asked, what came and what should have.

@@ -1,4 +1,4 @@
-"""Rules about lenses that clients bring along."""
+"""Rules about lenses that clients define."""
 
 from __future__ import annotations
 

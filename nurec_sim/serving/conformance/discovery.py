@@ -1,4 +1,4 @@
-"""Rules about the service itself and what it tells of its scenes."""
+"""Rules about the service itself and discovery of scenes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def path_short(target: Target) -> str:
 
 @check("version")
 def version(target: Target) -> str:
-    """get_version says the server's version and that of its interface, the same every time."""
+    """get_version returns the server's version and that of its interface, the same every time."""
     one, other = target.call("get_version"), target.call("get_version")
     expect(one.version_id, "version_id is empty")
     expect(one.HasField("grpc_api_version"), "grpc_api_version is missing")

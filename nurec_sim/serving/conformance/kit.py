@@ -24,7 +24,7 @@ class Verdict(enum.StrEnum):
 class Check:
     """One rule: its name, what it says, and what tests it.
 
-    The function gets the server and gives a sentence about what it saw; it raises ``Failed`` or ``Skipped``.
+    The function takes the server and returns a sentence about what it saw; it raises ``Failed`` or ``Skipped``.
     """
 
     name: str
@@ -61,7 +61,7 @@ def check(name: str, *, optional: bool = False) -> Callable[[Callable[[Target], 
 
 
 def run_checks(target: Target, names: Sequence[str] = ()) -> Iterator[Outcome]:
-    """Runs checks one after the other, and gives how each ended as soon as it has.
+    """Runs checks one after the other, and yields each outcome at once.
 
     Args:
         target: the server.

@@ -1,4 +1,4 @@
-"""Rules about limits, ego masks, deadlines, and scenes that clients bring along."""
+"""Rules about limits, ego masks, deadlines, and scenes by URL."""
 
 from __future__ import annotations
 

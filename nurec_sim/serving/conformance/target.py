@@ -87,11 +87,30 @@ class Target:
     # ----------------------------------------------------------------------------------------------------------- calls
 
     def call(self, name: str, request=None, *, path: str = wire.SERVICE, metadata=(), timeout_s: float | None = None):
-        """The reply of a procedure; raises ``grpc.RpcError``."""
+        """The reply of a procedure.
+
+        Args:
+            name: the procedure.
+            request: a message, its bytes, or None for an empty message.
+            path: the service name in the URL of the call.
+            metadata: (key, value) pairs that are sent with it.
+            timeout_s: time limit; the target's own if None.
+
+        Raises:
+            grpc.RpcError: the server refuses it.
+        """
         return self.begin(name, request, path=path, metadata=metadata, timeout_s=timeout_s).result()
 
     def begin(self, name: str, request=None, *, path: str = wire.SERVICE, metadata=(), timeout_s: float | None = None):
-        """A call in progress; ``request`` may be a message, its bytes, or None for an empty one."""
+        """Starts a call.
+
+        Args:
+            name: the procedure.
+            request: a message, its bytes, or None for an empty message.
+            path: the service name in the URL of the call.
+            metadata: (key, value) pairs that are sent with it.
+            timeout_s: time limit; the target's own if None.
+        """
         method = wire.METHODS[name]
         data = request if isinstance(request, bytes) else (request or method.request()).SerializeToString()
         procedure = self.channel.unary_unary(f"/{path}/{name}", response_deserializer=method.reply.FromString)
@@ -136,13 +155,13 @@ class Target:
 
     @cached_property
     def tracks(self) -> list:
-        """The ``DynamicObjectTrack`` messages of the scene; skips the check where they are not told."""
+        """The ``DynamicObjectTrack`` messages of the scene; skips the check where the server does not list them."""
         request = sensorsim.DynamicObjectsRequest(scene_id=self.scene_id)
         try:
             return list(self.call("get_dynamic_objects", request).dynamic_objects)
         except grpc.RpcError as error:
             if error.code() == grpc.StatusCode.UNIMPLEMENTED:
-                raise Skipped("the server does not tell its dynamic objects") from error
+                raise Skipped("the server does not list its dynamic objects") from error
             raise
 
     @property

@@ -1,4 +1,4 @@
-"""Policies on the far side of a wire, both ends: serve one as AlpaSim's egodriver, drive any egodriver in our loop."""
+"""Policies over gRPC, both ends: serve a policy as an egodriver, use any egodriver as a policy."""
 
 from nurec_sim.serving.driver.remote_policy import RemotePolicy
 from nurec_sim.serving.driver.server import DriverServer

@@ -1,4 +1,4 @@
-"""Encoded camera images as policies see them: checked before they are decoded, rectified to ideal pinholes.
+"""Camera images for policies: checked before they are decoded, rectified to ideal pinholes.
 
 Policies only ever meet ideal pinhole images of the width that they ask for (``sim.policy_sensors``). In our own loop
 such an image is rendered; a client of the egodriver interface sends what its camera sees, fisheye and all.
@@ -18,7 +18,7 @@ from nurec_sim.types import CameraFrame, CameraModel
 
 MAX_IMAGE_PIXELS = 4096 * 4096
 MAX_SEEN_PIXELS = 2048 * 2048
-"""Of an image as a policy sees it; a very tall one of a small width would have far more than its width says."""
+"""Limit for the image that a policy sees: at a given width, a very tall image can still have too many pixels."""
 
 
 def image_size(data: bytes, name: str) -> tuple[int, int]:

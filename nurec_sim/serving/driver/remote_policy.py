@@ -1,4 +1,4 @@
-"""A policy on the far side of a wire: any driver that speaks AlpaSim's egodriver interface, in our loop.
+"""A remote policy: any driver with AlpaSim's egodriver interface, in our loop.
 
 The session opens with the first plan of a rollout, for only then it is known which images are rendered.
 """
@@ -23,12 +23,12 @@ from nurec_sim.types import CameraFrame, Needs, Observation, Plan, Rig
 
 SCHEME = "grpc"
 OTHER_NEEDS = Needs(cameras=("front",), image_width_px=512)
-"""Of drivers that do not tell what they read: AlpaSim's are sent the front camera unless told otherwise."""
+"""Default for drivers that do not report their needs: AlpaSim sends them the front camera."""
 MAX_TIMEOUT_S = 3600.0
 _REPEATABLE = ("get_policy", "get_version", "submit_image_observation", "submit_egomotion_observation",
                "submit_route", "submit_recording_ground_truth", "submit_lidar_observation",
                "submit_actor_observation")  # fmt: skip
-"""What is said twice does no harm; a session started twice is refused, and a policy asked twice has moved on."""
+"""Idempotent calls, which may be retried; ``start_session`` and ``drive`` are not."""
 _RETRY = {
     "maxAttempts": 3, "initialBackoff": "0.1s", "maxBackoff": "1s", "backoffMultiplier": 2.0,
     "retryableStatusCodes": ["UNAVAILABLE"],
@@ -39,12 +39,12 @@ _HANG_UP_S = 2.0
 class RemotePolicy:
     """A driver at ``host:port`` as a policy.
 
-    Drivers of ours say what they read; for others name the cameras. A driver that cannot be reached, dies, or refuses
-    raises, so that the rollout becomes a failed one.
+    Drivers of this package report their needs; for others name the cameras. A driver that cannot be
+    reached, dies, or refuses raises, so that the rollout becomes a failed one.
 
     Args:
         address: ``host:port``.
-        cameras: camera ids or ``front``; what the driver says if None, and ``front`` if it does not.
+        cameras: camera ids or ``front``; None for those that the driver reports, or ``front`` if it reports none.
         lidars: LiDAR ids or ``any``; only drivers of ours take sweeps.
         image_width_px: of the rendered images.
         timeout_s: for one call.
@@ -99,7 +99,7 @@ class RemotePolicy:
         """A driver by ``grpc://host:port``, with ``?cameras=a,b&lidars=any&width=512&timeout=60`` where needed.
 
         Raises:
-            ScenarioError: the text is no such URL; it says what is allowed.
+            ScenarioError: the URL is malformed; the text says what is allowed.
             ServerError: the driver cannot be reached.
         """
         form = f"{SCHEME}://host:port?cameras=front&lidars=any&width=512&timeout=60"
@@ -145,7 +145,7 @@ class RemotePolicy:
         """The driver's answer to an observation.
 
         Raises:
-            PlanError: the driver's policy failed, or its answer makes no sense.
+            PlanError: the driver's policy failed, or its plan is invalid.
             ServerError: the driver cannot be reached, refuses, or takes too long.
         """
         if not self._session_id:
@@ -158,7 +158,7 @@ class RemotePolicy:
         try:
             plan = driving_paths.read_plan(observation.ego, reply)
         except RequestError as error:
-            raise PlanError(f"driver {self.address} answered a plan that makes no sense: {error}") from None
+            raise PlanError(f"driver {self.address} returned an invalid plan: {error}") from None
         self._sent_us = observation.t_us
         return plan
 

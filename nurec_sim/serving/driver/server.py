@@ -1,4 +1,4 @@
-"""A server of the egodriver interface: AlpaSim's runtime, or our own loop, asks it to drive."""
+"""Server of the egodriver interface, for AlpaSim's runtime or our own loop."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What every procedure of the egodriver interface does for one policy; ``driver.server`` puts it on the network.
+"""The procedures of the egodriver interface for one policy; ``driver.server`` serves them.
 
-Every session has its own instance of the policy in a thread of its own. What a policy raises, and a plan that cannot
-be driven, is the answer to that one call; the session goes on.
+Every session has its own instance of the policy in its own thread. An exception of the policy, or an invalid plan,
+fails that one call; the session stays open.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ class DriverOptions:
     idle_s: float = 600.0
     """Sessions without a call for this long are closed."""
     plan_timeout_s: float = 60.0
-    """A policy that thinks for longer has failed, whatever its client would wait for."""
+    """A plan that takes longer has failed, whatever deadline the client has."""
     route_speed_mps: float = 8.0
-    """Speed along routes of clients that do not tell any, as AlpaSim's."""
+    """Speed along routes that come without speeds, such as AlpaSim's."""
     max_message_bytes: int = MAX_MESSAGE_BYTES
     allow_shut_down: bool = False
 
@@ -66,12 +66,12 @@ class DriverOptions:
 
 @dataclass
 class _Open:
-    """An open session: what it was told, its policy, and when it was last spoken to."""
+    """An open session: its observations, its policy, and the time of its last call."""
 
     session: Session
     policy: Policy
     thread: PolicyThread
-    spoken_s: float
+    last_call_s: float
 
 
 class DriverService:
@@ -109,11 +109,11 @@ class DriverService:
             self._end(session_id)
 
     async def expire(self) -> None:
-        """Closes sessions that nobody has spoken to for ``idle_s``; runs until cancelled."""
+        """Closes sessions without a call for ``idle_s``; runs until cancelled."""
         while True:
             await asyncio.sleep(min(self._options.idle_s / 4, 5.0))
             for session_id, opened in list(self._sessions.items()):
-                if opened is not None and time.monotonic() - opened.spoken_s > self._options.idle_s:
+                if opened is not None and time.monotonic() - opened.last_call_s > self._options.idle_s:
                     log.warning("session %r is closed: no call for %g s", session_id, self._options.idle_s)
                     self._end(session_id)
 
@@ -163,7 +163,7 @@ class DriverService:
                 f"session {session_id[:MAX_ID_LENGTH]!r} {state}; sessions are closed after "
                 f"{self._options.idle_s:g} s without a call"
             )
-        opened.spoken_s = time.monotonic()
+        opened.last_call_s = time.monotonic()
         return opened
 
     def _end(self, session_id: str) -> None:
@@ -215,7 +215,7 @@ class DriverService:
         try:
             return await self._run(opened.thread, lambda: self._answer(opened, question))
         finally:
-            opened.spoken_s = time.monotonic()
+            opened.last_call_s = time.monotonic()
 
     async def _run(self, thread: PolicyThread, function: Callable[[], T]) -> T:
         try:

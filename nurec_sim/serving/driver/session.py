@@ -1,4 +1,4 @@
-"""What one session has been told, and what its policy sees of it at a time.
+"""The observations of one session, and what its policy sees of them at a given time.
 
 Observations may come in any order and more than once; the newest that is not later than the time of the question
 counts. The car is where its newest ego pose says, so a plan is one of that time, and nothing is extrapolated.
@@ -19,12 +19,12 @@ from nurec_sim.serving.driver.images import image_size, see_image
 from nurec_sim.serving.driver.motion import ego_states
 from nurec_sim.serving.wire.driving import EncodedImage, SessionStart
 from nurec_sim.serving.wire.driving_paths import Placed, RecordedFuture, Route, moved
-from nurec_sim.serving.wire.driving_states import ToldState
+from nurec_sim.serving.wire.driving_states import ReportedState
 from nurec_sim.sim.policy_sensors import find_camera, find_lidar
 from nurec_sim.types import ActorState, EgoState, LidarFrame, Needs, Observation, Rig, Trajectory
 
 MAX_AGE_US = 1_000_000
-"""Older than this, a pose, an image or a sweep says nothing about now."""
+"""Oldest pose, image or sweep that a plan may be based on."""
 KEPT_FRAMES, KEPT_STATES, MAX_SESSION_BYTES = 4, 2000, 256 << 20
 HISTORY_STATES, HISTORY_STEP_US, STEP_SLACK_US = 21, 100_000, 5_000
 FUTURE_STEP_US, FUTURE_POINTS = 100_000, 50
@@ -54,7 +54,7 @@ class Session:
 
     def __init__(self, start: SessionStart, needs: Needs, route_speed_mps: float) -> None:
         self.start, self.needs, self.route_speed_mps = start, needs, route_speed_mps
-        self._states: list[ToldState] = []
+        self._states: list[ReportedState] = []
         self._images: dict[str, list[EncodedImage]] = {}
         self._sweeps: dict[str, list[LidarFrame]] = {}
         self._route: Route | None = None
@@ -63,7 +63,7 @@ class Session:
 
     # ------------------------------------------------------------------------------------------------- what comes in
 
-    def add_states(self, states: list[ToldState]) -> None:
+    def add_states(self, states: list[ReportedState]) -> None:
         """Ego states; one at a time that is known already replaces it."""
         by_time = {state.t_us: state for state in (*self._states, *states)}
         self._states = [by_time[t_us] for t_us in sorted(by_time)][-KEPT_STATES:]
@@ -166,7 +166,7 @@ class Session:
         )  # fmt: skip
 
     def _frames_of_camera(self, name: str) -> list[EncodedImage]:
-        """Images of the camera that the policy calls ``name``: as the client says, or of those that send images."""
+        """Images of the policy's camera ``name``: mapped by the client, else one of those that send images."""
         seen = {camera_id: camera for camera_id, camera in self.start.rig.cameras.items() if camera_id in self._images}
         try:
             camera_id = self.start.sensor_ids.get(name) or find_camera(Rig(seen, {}), name).id
@@ -227,7 +227,7 @@ def _check_age(name: str, t_us: int, now_us: int) -> None:
         )
 
 
-def _history(states: list[ToldState]) -> list[int]:
+def _history(states: list[ReportedState]) -> list[int]:
     """Which states are those of the last 2 s at about 10 Hz, the present last."""
     kept = [len(states) - 1]
     for index in range(len(states) - 2, -1, -1):
@@ -238,7 +238,7 @@ def _history(states: list[ToldState]) -> list[int]:
     return kept[::-1]
 
 
-def _state_at(states: list[ToldState], t_us: int) -> ToldState:
+def _state_at(states: list[ReportedState], t_us: int) -> ReportedState:
     """The car at a time of a route (0: now), between the poses where it has to be."""
     if t_us == 0 or t_us >= states[-1].t_us:
         return states[-1]

@@ -29,7 +29,7 @@ class Frames:
         if not message.HasField("request"):
             raise RequestError("request is missing: the camera frame to render")
         asked = message.request
-        if "rgb" not in outputs:  # the format of colours that nobody wants is not looked at
+        if "rgb" not in outputs:  # without rgb its format is not checked
             asked = type(asked).FromString(asked.SerializeToString())
             asked.image_format = wire.ImageFormat.PNG
         with ExitStack() as held:

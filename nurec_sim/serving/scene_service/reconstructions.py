@@ -1,4 +1,4 @@
-"""Clips that become scenes while their clients watch."""
+"""Reconstruction of clips on request, with progress."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Reconstructions:
     """Reconstructs one clip after the other, in a thread of its own.
 
     Args:
-        store: offers the scenes.
+        store: where the scenes are added.
         clip_dirs: folders whose clips may be named by their path.
     """
 
@@ -45,7 +45,7 @@ class Reconstructions:
     async def run(self, request) -> AsyncGenerator:
         """The events of a ``ReconstructClipRequest``: progress, then the scene.
 
-        When the client leaves, the work ends at its next step, and the store offers no more than before.
+        When the client disconnects, the work stops at its next step, and the store is as before.
         """
         loop, left = asyncio.get_running_loop(), threading.Event()
         events: asyncio.Queue[tuple[str, float] | None] = asyncio.Queue()
@@ -82,7 +82,7 @@ class Reconstructions:
                 self._forget_unawaited(scene_id)
 
     def _forget_unawaited(self, scene_id: str) -> None:
-        """Offers a scene no longer when its work has ended and its clients have left; unless somebody else uses it."""
+        """Removes a scene when its work has ended and its clients have disconnected, unless it is in use."""
         if self._awaited.get(scene_id) == 0:
             del self._awaited[scene_id]
             with contextlib.suppress(NurecSimError):
@@ -94,7 +94,7 @@ class Reconstructions:
             check_name(request.name)
         path, own_recipe = self._clip(request)
         recipe = _recipe(request) or own_recipe
-        with self._offering:  # of two clients that want the same, one offers it and both wait for it
+        with self._offering:  # two clients that request the same clip share one scene
             for source in self._store.sources:
                 if source.is_from(path) and source.recipe == recipe and request.name in ("", *source.names):
                     return source.id, False

@@ -24,7 +24,7 @@ class SceneOptions:
     """What the scene service allows; limits of frames and messages are those of ``ServiceOptions``."""
 
     upload_dir: Path | None = None
-    """Where uploaded scenes and clips are kept, and offered again when a server starts; None: nobody may upload."""
+    """Where uploaded scenes and clips are stored, also for later servers; None disables uploads."""
     max_upload_bytes: int = 4 << 30
     """Of one file; a scene archive cannot be larger."""
     max_uploaded_bytes: int = 64 << 30
@@ -32,7 +32,7 @@ class SceneOptions:
     max_uploads: int = 4
     """Uploads in progress."""
     upload_idle_s: float = 60.0
-    """How long a client may say nothing in the middle of an upload."""
+    """Timeout between parts of an upload."""
     clip_dirs: tuple[Path, ...] = ()
     """Folders whose clips clients may have reconstructed by naming their path."""
 
@@ -61,14 +61,14 @@ class SceneService:
             self._uploads = UploadFolder(self._options.upload_dir, store, max_bytes=sizes[0], max_total_bytes=sizes[1])
 
     def close(self) -> None:
-        """Drops what has not begun and waits for the rest; reconstructions end at their next step."""
+        """Cancels queued work and waits for running work; reconstructions stop at their next step."""
         self._reconstructions.close()
         self._disk.shutdown(wait=True, cancel_futures=True)
 
     # --------------------------------------------------------------------------------------------------------- scenes
 
     async def list_scenes(self, request):
-        """Scenes on offer, and sources that cannot be."""
+        """Available scenes, and sources that cannot be opened."""
         reply = v1.ListScenesReply()
         for entry in self._store.entries:
             reply.scenes.add(
@@ -86,7 +86,7 @@ class SceneService:
         return reply
 
     async def unload_scene(self, request):
-        """Takes a scene out of memory, and deletes it if that is asked for; what cannot be deleted stays as it is."""
+        """Removes a scene from memory, and deletes its file on request; nothing changes if it cannot be deleted."""
         if request.delete_file:
             freed = await self._in_disk_thread(self._upload_folder().delete, request.scene_id)
         else:

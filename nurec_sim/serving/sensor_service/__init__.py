@@ -1,4 +1,4 @@
-"""What every procedure of the sensor interface does; ``server`` puts it on the network."""
+"""The procedures of the sensor interface; ``server`` serves them."""
 
 from nurec_sim.serving.sensor_service.discovery import Discovery
 from nurec_sim.serving.sensor_service.editing import Editing

@@ -1,4 +1,4 @@
-"""What all procedures share: scenes, loaded once for all who ask, and threads to work in."""
+"""What all procedures share: scenes, loaded once for all clients, and thread pools."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ServiceCore:
         self.renders = RenderQueue(options.render_workers)
 
     def close(self) -> None:
-        """Drops what has not begun and waits for the rest; reconstructions end at their next step."""
+        """Cancels queued work and waits for running work; reconstructions stop at their next step."""
         self._closing = True
         for load in self._loads.values():
             load.cancel()
@@ -110,7 +110,7 @@ class ServiceCore:
             raise CancelledError(f"the server is stopping; loading a scene was cancelled at {fraction:.0%} ({stage})")
 
     async def _scene(self, name: str) -> GaussianScene:
-        """What a scene holds, for those who only read it."""
+        """A scene, to be read only."""
         with await self.lease(name) as loaded:
             return loaded.scene
 
@@ -121,7 +121,7 @@ class ServiceCore:
 
 
 async def run_to_end(executor: ThreadPoolExecutor, function: Callable, *arguments):
-    """What a function gives that must not be left half-way: a client that leaves waits for its end all the same."""
+    """Runs a function that must not be interrupted: a cancelled call still waits for its end."""
     work = asyncio.get_running_loop().run_in_executor(executor, function, *arguments)
     try:
         return await asyncio.shield(work)

@@ -1,4 +1,4 @@
-"""The procedures that tell of the server and its scenes."""
+"""Discovery: the procedures that describe the server and its scenes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ API_VERSION = (0, 54, 0)
 
 
 class Discovery(ServiceCore):
-    """What there is."""
+    """Describes the server and its scenes."""
 
     async def get_version(self, request):
         """Version of this package and of the interface."""

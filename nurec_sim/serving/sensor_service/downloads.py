@@ -1,4 +1,4 @@
-"""A folder of scene archives fetched from the web, by address; whole files only, the least recently used go first."""
+"""Download cache of scene archives by URL; complete files only, least recently used ones are removed first."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _STALL_S = 30.0
 _ABANDONED_S = 86_400.0
 _ZIP_START = b"PK\x03\x04"
 _OURS = "[0-9a-f]" * 32 + ".usdz"
-"""What files that were fetched are called; the folder may hold others, which stay."""
+"""Names of downloaded files; other files in the folder are left alone."""
 
 
 class DownloadCache:
-    """Archives that were fetched once are read from the folder, also by a later process.
+    """Downloaded archives are reused, also by later processes.
 
     A file is written under another name, flushed to the disk and renamed, so that whatever carries its name is whole.
 
     Args:
-        folder: made when it is first needed.
+        folder: created on first use.
         capacity: files kept.
         max_bytes: of one file.
         timeout_s: for one file.
@@ -40,11 +40,11 @@ class DownloadCache:
         self._capacity, self._max_bytes, self._timeout_s = capacity, max_bytes, timeout_s
 
     def path_of(self, url: str) -> Path:
-        """Where the archive of an address is kept, whether or not it is there."""
+        """Path of the archive of a URL, whether or not it exists."""
         return self.folder / f"{hashlib.sha256(url.encode()).hexdigest()[:32]}.usdz"
 
     def fetch(self, url: str) -> Path:
-        """The archive at an ``http(s)://`` address, from the folder or from the web.
+        """The archive at an ``http(s)://`` URL, from the folder or from the web.
 
         Raises:
             RequestError: it cannot be fetched or kept, in time, or is no zip archive.
@@ -75,7 +75,7 @@ class DownloadCache:
         return path
 
     def make_room(self) -> list[Path]:
-        """Removes files beyond the capacity and says which; open ones can still be read to their end."""
+        """Removes files beyond the capacity and returns their paths; open files can still be read."""
         kept = sorted(self.folder.glob(_OURS), key=_last_use, reverse=True)
         removed = kept[self._capacity :]
         for path in removed:
@@ -90,7 +90,7 @@ class DownloadCache:
             if said.isdigit() and int(said) > self._max_bytes:
                 raise self._too_large(url, int(said))
             done, start = 0, b""
-            while chunk := reply.read1(_CHUNK):  # what is there: to wait for more could take any time
+            while chunk := reply.read1(_CHUNK):  # what has arrived, without waiting for a full chunk
                 start = (start + chunk)[:8]
                 if not start.startswith(_ZIP_START[: len(start)]):
                     raise RequestError(f"what is at {url} is no .usdz archive: it begins with {start!r}")
@@ -107,7 +107,7 @@ class DownloadCache:
         return TooLargeError(f"a scene may have {self._max_bytes:,} bytes; what is at {url} has {size:,} or more")
 
     def _remove_abandoned(self) -> None:
-        """Removes parts that a process which died has left behind."""
+        """Removes partial files of killed processes."""
         for part in self.folder.glob(".*.part"):
             if time.time() - _last_use(part) > _ABANDONED_S:
                 part.unlink(missing_ok=True)
@@ -116,12 +116,12 @@ class DownloadCache:
 def _last_use(path: Path) -> float:
     try:
         return path.stat().st_mtime
-    except OSError:  # gone meanwhile
+    except OSError:  # removed since it was listed
         return 0.0
 
 
 def _opener() -> urllib.request.OpenerDirector:
-    """Opens web addresses only: neither the address nor a redirection can lead to a file of this machine."""
+    """Opens web URLs only: neither the URL nor a redirection can name a local file."""
     opener = urllib.request.OpenerDirector()
     for handler in (
         urllib.request.ProxyHandler,
@@ -137,5 +137,5 @@ def _opener() -> urllib.request.OpenerDirector:
 
 
 def is_web(url: str) -> bool:
-    """Whether an address is one of the web."""
+    """Whether a URL is a web URL."""
     return urlsplit(url).scheme in ("http", "https")

@@ -1,7 +1,7 @@
-"""The procedures that change which actors a scene has.
+"""Editing: the procedures that insert, remove and replace actors.
 
-An edit makes a copy of the scene, which takes its place for all clients until ``restore_model_parameters`` brings the
-original back; frames in progress are rendered from what they began with. One request is done as a whole or not at all.
+An edit makes a copy of the scene, which replaces it for all clients until ``restore_model_parameters`` restores the
+original; frames in progress use the scene as it was when they started. A request is applied completely or not at all.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ MAX_ID_LENGTH = 200
 
 
 class Editing(ServiceCore):
-    """Actors put in, taken out and exchanged."""
+    """Inserts, removes and replaces actors."""
 
     def __init__(self, *arguments) -> None:
         super().__init__(*arguments)
         self._turns: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._in_work: set[str] = set()
-        """Scenes that an edit is about to be kept of."""
+        """Scenes for which an edit is in progress."""
 
     async def edit_assets(self, request):
-        """Replaces and inserts actors that look like others of this scene or of another one on offer."""
+        """Replaces and inserts actors, with the appearance of tracks of this or another available scene."""
         scene_id = self._store.resolve(request.scene_id)
         count = len(request.replace) + len(request.insert)
         if count > MAX_EDITS:
@@ -50,7 +50,7 @@ class Editing(ServiceCore):
                 with await self.lease(scene_id) as loaded:
                     edited = await self._run(self._loading, self._edited, loaded.scene, request)
                     if count:
-                        # To its end, or an edit of the next client could be overtaken by this one.
+                        # To its end: a cancelled edit must not finish after the next one.
                         await run_to_end(self._loading, self._store.replace, scene_id, edited)
             finally:
                 self._in_work.discard(scene_id)
@@ -59,30 +59,30 @@ class Editing(ServiceCore):
         )
 
     async def restore_model_parameters(self, request):
-        """Brings the original scene back; without effect on one that was not edited."""
+        """Restores the original scene; no effect if it was not edited."""
         scene_id = self._store.resolve(request.scene_id)
         async with self._turns[scene_id]:
             self._store.restore(scene_id)
         return common.Empty()
 
     async def get_dynamic_objects(self, request):
-        """All actors of the scene as it is now; ``asset_id`` says whom one looks like."""
+        """All actors of the current scene; ``asset_id`` is the track whose appearance one has."""
         scene = await self._scene(request.scene_id)
         reply = sensorsim.DynamicObjectsReturn()
-        foreign = _foreign(scene)
+        external = _external_assets(scene)
         for track in (each for each in scene.tracks if each.actor):
             entry = reply.dynamic_objects.add()
             wire.write_track(track, entry)
-            entry.asset_id = foreign.get(track.id, track.id)
+            entry.asset_id = external.get(track.id, track.id)
         return reply
 
     async def get_external_asset_objects(self, request):
-        """Ids of the tracks that an edit has put in or given other looks."""
-        return sensorsim.ExternalAssetObjectsReturn(track_ids=_foreign(await self._scene(request.scene_id)))
+        """Ids of the tracks that an edit has inserted or given another appearance."""
+        return sensorsim.ExternalAssetObjectsReturn(track_ids=_external_assets(await self._scene(request.scene_id)))
 
     def _edited(self, scene: GaussianScene, request) -> GaussianScene:
-        """The scene with all edits of a request; looks are those from before it, so that two tracks can swap theirs."""
-        before, foreign = scene, dict(_foreign(scene))
+        """The scene with all edits of a request; assets are those before it, so two tracks can be swapped."""
+        before, external = scene, dict(_external_assets(scene))
         for i, entry in enumerate(request.replace):
             where = f"replace[{i}]"
             if not entry.original_id:
@@ -92,10 +92,10 @@ class Editing(ServiceCore):
                 if entry.replacement_id:
                     asset = self._asset(before, entry.replacement_id)
                     scene = edits.replaced_track(scene, entry.original_id, asset, size_m)
-                    foreign[entry.original_id] = entry.replacement_id
+                    external[entry.original_id] = entry.replacement_id
                 else:
                     scene = edits.without_track(scene, entry.original_id)
-                    foreign.pop(entry.original_id, None)
+                    external.pop(entry.original_id, None)
             except NurecSimError as error:
                 raise type(error)(f"{where}: {error}") from error
         for i, entry in enumerate(request.insert):
@@ -104,7 +104,7 @@ class Editing(ServiceCore):
                 raise RequestError(f"{where}.id must be a printable text of 1 to {MAX_ID_LENGTH} letters: {entry.id!r}")
             if not entry.asset_id:
                 raise RequestError(
-                    f"{where}.asset_id is missing: the track that it is to look like; {edits.have(scene)}"
+                    f"{where}.asset_id is missing: the track whose appearance it gets; {edits.have(scene)}"
                 )
             try:
                 asset = self._asset(before, entry.asset_id)
@@ -113,11 +113,11 @@ class Editing(ServiceCore):
                 scene = edits.with_track(scene, track, asset)
             except NurecSimError as error:
                 raise type(error)(f"{where}: {error}") from error
-            foreign[entry.id] = entry.asset_id
-        return replace(scene, provenance={**scene.provenance, "external_assets": foreign})
+            external[entry.id] = entry.asset_id
+        return replace(scene, provenance={**scene.provenance, "external_assets": external})
 
     def _asset(self, scene: GaussianScene, asset_id: str) -> edits.Asset:
-        """The looks that ``track_id``, or ``scene_id/track_id`` of another scene, stands for."""
+        """The asset of ``track_id``, or of ``scene_id/track_id`` of another scene."""
         if any(track.id == asset_id for track in scene.tracks) or "/" not in asset_id:
             return edits.asset_of(scene, asset_id)
         scene_name, _, track_id = asset_id.partition("/")
@@ -130,8 +130,8 @@ class Editing(ServiceCore):
             ) from error
 
 
-def _foreign(scene: GaussianScene) -> dict[str, str]:
-    """Asset ids of the tracks that do not look as recorded, by track id."""
+def _external_assets(scene: GaussianScene) -> dict[str, str]:
+    """Asset ids of the tracks with another appearance than recorded, by track id."""
     return dict(scene.provenance.get("external_assets", {}))
 
 

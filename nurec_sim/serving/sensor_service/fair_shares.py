@@ -1,9 +1,9 @@
-"""Whose turn it is: deficit round robin over client addresses, and over the connections of each; small jobs first.
+"""Fair scheduling: deficit round robin over client addresses, and over the connections of each; small jobs first.
 
-A turn lasts ``turn_s`` of one worker's time. It is charged when it begins; what a job has left of it, or has taken
-beyond it, is settled when the job stops. Who is in debt is passed over until it has paid. After M. Shreedhar and G.
-Varghese, Efficient Fair Queueing Using Deficit Round Robin (1995), with time for bytes, for nobody knows before how
-long a job takes. Who has not asked for a round comes first, once, as new flows do in FQ-CoDel (RFC 8290).
+A turn lasts ``turn_s`` of one worker's time. It is charged when it starts; the difference to the time used is settled
+when the job stops. A client with negative credit is skipped until it is positive again. After M. Shreedhar and G.
+Varghese, Efficient Fair Queueing Using Deficit Round Robin (1995), with time instead of bytes, because the duration of
+a job is not known in advance. New clients come first, once, like new flows in FQ-CoDel (RFC 8290).
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class _Member:
         passed = 0
         while passed < len(self.ring):
             member = self.ring[0]
-            if not member.users:  # forgotten only now, or who comes and goes would always be new
+            if not member.users:  # removed only now: a client that reconnects must not always count as new
                 self._go_on()
                 del self.members[self.ring.pop().name]
                 continue
@@ -107,7 +107,7 @@ class FairShares:
         self._count = 0
 
     def join(self, job: Job) -> None:
-        """Lets a new job wait for its turn."""
+        """Adds a new job."""
         self._count += 1
         job.number = self._count
         for member in self._members(job):
@@ -115,28 +115,28 @@ class FairShares:
         self.offer(job)
 
     def offer(self, job: Job) -> None:
-        """Lets a job that has joined wait for a turn again."""
+        """Makes a job wait for another turn."""
         bisect.insort(self._members(job)[-1].jobs, job, key=lambda other: (other.rays, other.number))
 
     def take(self, may_run: Callable[[Job], bool]) -> Job | None:
-        """The job whose turn begins, of those that may run; None if there is none."""
+        """The next job that may run, charged for a turn; None if there is none."""
         return self._all.take(may_run, self._turn_s)
 
     def settle(self, job: Job, used_s: float) -> None:
-        """Charges what a job has used instead of the turn that it has taken."""
+        """Replaces the charge for a turn by the time that was used."""
         self.charge(job, used_s - self._turn_s)
 
     def charge(self, job: Job, seconds: float) -> None:
-        """Charges what a job has used beside its turns."""
+        """Charges time used outside of turns."""
         for member in self._members(job):
             member.credit_s -= seconds
 
     def withdraw(self, job: Job) -> None:
-        """Ends the waiting of a job."""
+        """Removes a waiting job."""
         self._members(job)[-1].jobs.remove(job)
 
     def leave(self, job: Job) -> None:
-        """Forgets a job that has ended and does not wait."""
+        """Removes a job that has ended."""
         for member in self._members(job):
             member.users -= 1
 

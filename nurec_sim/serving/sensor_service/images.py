@@ -1,4 +1,4 @@
-"""Rendered images as replies: encoded, with pictures of the recording car's own body (ego masks) laid over them."""
+"""Image replies: encoding, and ego masks (images of the recording car's own body) overlaid."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class EgoMasks:
         """The (rig, camera) of the mask that is meant: ``key``, or with an empty rig the only one that has the camera.
 
         Raises:
-            RequestError: there is none, or several; the text lists what there is.
+            RequestError: there is none, or more than one; the text lists the masks.
         """
         rigs = [rig for rig, camera in self._paths if camera == key[1]]
         if not key[0] and len(rigs) == 1:
@@ -56,15 +56,15 @@ class EgoMasks:
             raise RequestError(f"there is no ego mask for (rig, camera) {key}; have {list(self._paths)}")
         return key
 
-    def lay_over(self, rgb: UInt8[np.ndarray, "h w 3"], key: tuple[str, str]) -> UInt8[np.ndarray, "h w 3"]:
-        """A copy of an image with the mask, scaled to its size, on top."""
+    def overlay(self, rgb: UInt8[np.ndarray, "h w 3"], key: tuple[str, str]) -> UInt8[np.ndarray, "h w 3"]:
+        """A copy of an image with the mask, scaled to its size, overlaid."""
         picture, cover = _scaled_mask(self._paths[self.find(key)], rgb.shape[1], rgb.shape[0])
         return np.rint(rgb + cover * (picture - rgb)).astype(np.uint8)
 
 
 @lru_cache(maxsize=32)
 def _scaled_mask(path: Path, width_px: int, height_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colour [h,w,3] and cover [h,w,1] of a mask in float32."""
+    """Colour [h,w,3] and alpha [h,w,1] of a mask in float32."""
     import cv2
 
     try:
@@ -78,7 +78,7 @@ def _scaled_mask(path: Path, width_px: int, height_px: int) -> tuple[np.ndarray,
     bgra = np.atleast_3d(bgra.astype(np.float32) * (255 / scale))
     rgb = np.repeat(bgra[..., :1], 3, axis=2) if bgra.shape[2] < 3 else bgra[..., 2::-1]
     cover = bgra[..., 3:4] / 255 if bgra.shape[2] == 4 else (rgb.max(axis=2, keepdims=True) > 0).astype(np.float32)
-    # Colours are weighted by their cover while scaling, so that what lies under alpha 0 does not bleed in.
+    # Premultiplied alpha while scaling, so that colours of transparent pixels do not bleed in.
     layers = np.concatenate([rgb * cover, cover], axis=2)
     layers = cv2.resize(layers, (width_px, height_px), interpolation=cv2.INTER_AREA)
     cover = layers[..., 3:4]
@@ -111,7 +111,7 @@ class ImageReplies:
 
     def _reply(self, frame: CameraFrame, options: wire.ImageOptions):
         try:
-            rgb = self._masks.lay_over(frame.rgb, options.ego_mask) if options.ego_mask else frame.rgb
+            rgb = self._masks.overlay(frame.rgb, options.ego_mask) if options.ego_mask else frame.rgb
             reply = sensorsim.RGBRenderReturn()
             wire.write_image(rgb, options, reply)
             return reply

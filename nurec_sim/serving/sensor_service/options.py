@@ -12,7 +12,7 @@ from nurec_sim.serving import wire
 
 @dataclass(frozen=True)
 class ServiceOptions:
-    """What a server allows and how it reads what the interface leaves open."""
+    """Limits and choices of a sensor server."""
 
     render_workers: int = field(default_factory=usable_cores)
     """Frames rendered at the same time, in threads of their own beside the renderer's; as many as there are cores."""
@@ -34,7 +34,7 @@ class ServiceOptions:
     ego_mask_dir: Path | None = None
     allow_shut_down: bool = False
     warm_up: bool = False
-    """Whether the first scene is loaded, and kernels are compiled, before somebody asks."""
+    """Whether the first scene is loaded, and kernels are compiled, before the first call."""
     max_edited_scenes: int = 8
     """Scenes of which ``edit_assets`` keeps an edited copy in memory."""
     allow_remote_scenes: bool = False
@@ -47,7 +47,7 @@ class ServiceOptions:
     download_cache_dir: Path | None = None
     """Where downloaded scenes are kept; None for a folder in that of the store."""
     download_cache_size: int = 5
-    """Scenes kept there; the one used least recently goes first."""
+    """Scenes kept there; the least recently used one is removed first."""
     max_download_bytes: int = 4 << 30
     """Of one scene."""
     download_timeout_s: float = 300.0

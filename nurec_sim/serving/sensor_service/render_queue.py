@@ -1,4 +1,4 @@
-"""Where frames wait for their turn to be rendered, in threads of their own; clients are served in turn."""
+"""The render queue: frames are rendered in threads, with fair scheduling between clients."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from nurec_sim.serving.sensor_service.fair_shares import FairShares, Job
 T = TypeVar("T")
 
 TURN_S = 0.01
-"""How long somebody may work while others wait: long against what a change costs, short for who waits."""
+"""Longest turn while others wait: long compared with the cost of switching, short for those who wait."""
 LARGE_RAYS = 1 << 21
-"""A job of more rays is a large one; an image of 1920 x 1080 is none."""
+"""A job of more rays counts as large; an image of 1920 x 1080 does not."""
 MOST_RAYS = 1 << 25
-"""Of the small jobs that have begun; large ones get twice as many, and a single one always."""
+"""Limit for all small jobs that have started; large ones get twice as many, and one large job may always run."""
 MOST_BEGUN = 64
 """Jobs, a thread each."""
 
 
 class RenderQueue:
-    """Runs functions in threads, a few at a time, and shares out the time between clients.
+    """Runs functions in threads, a few at a time, with fair scheduling between clients.
 
     A function that calls ``compute.turns.rest`` stops there while others have their turn. Jobs that have begun hold
     memory, so there are bounds: of large ones, a client has one at a time. What its client cancelled, or has stopped
@@ -51,17 +51,17 @@ class RenderQueue:
         self._small_rays = self._large_rays = 0
         self._closed = False
         self.offered = 0
-        """Jobs that wait for a turn, begun or not."""
+        """Jobs that wait for a turn, started or not."""
         self._running = 0
 
     @property
     def waiting(self) -> int:
-        """Functions that have not begun."""
+        """Functions that have not started."""
         return len(self._works) - self._begun.total()
 
     @property
     def running(self) -> int:
-        """Functions at work."""
+        """Functions that are running."""
         return self._running
 
     async def run(self, rays: int, function: Callable[..., T], *arguments: Any) -> T:
@@ -103,7 +103,7 @@ class RenderQueue:
             work.go_on.set()
 
     def close(self) -> None:
-        """Drops what has not begun and waits for the rest."""
+        """Cancels queued work and waits for running work."""
         with self.lock:
             self._closed = True
             unbegun = [work for work in self._works.values() if not work.begun]
@@ -114,7 +114,7 @@ class RenderQueue:
     # ---------------------------------------------------------------------- called by the work, which holds the lock
 
     def stop_waiting(self, work: _Work) -> None:
-        """Takes a job out that waits for a turn."""
+        """Removes a waiting job."""
         self._shares.withdraw(work.job)
         self.offered -= 1
         work.waits = False
@@ -126,18 +126,18 @@ class RenderQueue:
         work.has_place = False
 
     def charge(self, work: _Work, seconds: float) -> None:
-        """Charges work that was done beside all turns."""
+        """Charges work that was done outside of turns."""
         self._shares.charge(work.job, seconds)
 
     def wait_for_place(self, work: _Work) -> None:
-        """Lets a job that has begun wait for a turn."""
+        """Makes a started job wait for a turn."""
         work.go_on.clear()
         work.waits = True
         self._shares.offer(work.job)
         self.offered += 1
 
     def share_out(self) -> None:
-        """Begins turns while there are places."""
+        """Starts turns while workers are free."""
         self._dispatch()
 
     def end(self, work: _Work) -> None:
@@ -229,7 +229,7 @@ class _Work:
 
     @property
     def is_over(self) -> bool:
-        """Whether it is somebody else's turn, or nobody wants the result any more."""
+        """Whether another job is due, or the call was cancelled or has passed its deadline."""
         now = time.monotonic()
         over = self._queue.offered > 0 and now - self.since_s >= TURN_S
         return self.cancelled or over or now >= self._call.deadline_s
@@ -243,7 +243,7 @@ class _Work:
 
     @contextlib.contextmanager
     def aside(self) -> Iterator[None]:
-        """Gives up its place meanwhile; see ``compute.turns.Turn``."""
+        """Releases its worker for the duration; see ``compute.turns.Turn``."""
         began_s = time.monotonic()
         with self._queue.lock:
             self._queue.give_place(self)

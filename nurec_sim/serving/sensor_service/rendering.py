@@ -1,9 +1,9 @@
-"""The procedures that render.
+"""Rendering procedures.
 
-Semantics (public NuRec and AlpaSim behaviour): a frame [start, end) renders if it overlaps the scene's time, for
-AlpaSim's first exposure may begin before the recording and a client's last instant [t, t + 1) end after it; what sticks
-out is clamped in time, poses stay as they are. Actors listed in a request are drawn where it says, unknown ids are
-ignored, and all others, static ones always, are drawn as recorded.
+Semantics (public NuRec and AlpaSim behaviour): a frame [start, end) renders if it overlaps the scene's time, because
+AlpaSim's first exposure may begin before the recording and a client's last instant [t, t + 1) end after it; times
+outside the scene are clamped, poses are not. Actors listed in a request are drawn at its poses, unknown ids are
+ignored, and all other actors are drawn as recorded.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Rendering(ServiceCore):
             return reply
 
     async def batch_render_rgb(self, batch):
-        """Several images; what is wrong with one item is said in that item."""
+        """Several images; an item that fails has the error in its own reply."""
         self._check_batch(len(batch.items))
         self._check_sizes(item.request for item in batch.items)
         with contextlib.ExitStack() as held:
@@ -113,7 +113,7 @@ class Rendering(ServiceCore):
                 return await self._render_lidar(job)
 
     async def render_aggregated(self, request):
-        """Images and sweeps together; one that fails fails all, there is no place for its error in the reply."""
+        """Images and sweeps together; one failure fails the call, because the reply has no field for single errors."""
         self._check_batch(len(request.rgb_requests) + len(request.lidar_requests))
         self._check_sizes(request.rgb_requests)
         with contextlib.ExitStack() as held:
@@ -127,12 +127,12 @@ class Rendering(ServiceCore):
         return sensorsim.AggregatedRenderReturn(rgb_returns=rgb_returns, lidar_returns=lidar_returns)
 
     async def admit_camera(self, message, held: contextlib.ExitStack) -> CameraJob:
-        """Checks a request and borrows its scene until ``held`` ends."""
+        """Parses a request and leases its scene until ``held`` is closed."""
         loaded = await self._borrow(message.scene_id, held)
         return await self._read(len(message.dynamic_objects), self._read_camera, message, loaded)
 
     async def admit_lidar(self, message, held: contextlib.ExitStack) -> LidarJob:
-        """Checks a request and borrows its scene until ``held`` ends."""
+        """Parses a request and leases its scene until ``held`` is closed."""
         loaded = await self._borrow(message.scene_id, held)
         return await self._read(len(message.dynamic_objects), self._read_lidar, message, loaded)
 
@@ -188,7 +188,7 @@ class Rendering(ServiceCore):
         return await self.renders.run(job.beams, render)
 
     def _admit(self, request: SensorRequest, loaded: LoadedScene) -> SensorRequest:
-        """The request as the renderer takes it: in the scene's time, with actors that the scene knows."""
+        """The request for the renderer: times clamped to the scene, unknown actors dropped."""
         scene, (first, last) = loaded.scene, loaded.times_us
         if request.start_us > last or request.end_us <= first:
             raise OutOfRangeError(
@@ -212,7 +212,7 @@ class Rendering(ServiceCore):
             raise TooLargeError(f"a batch may have {self._options.max_batch_items} items, got {count}")
 
     async def _read(self, actors: int, function: Callable[..., T], *arguments) -> T:
-        """What reading a request gives, when it is its client's turn."""
+        """Parses a request, in turn with other clients."""
         if actors > self._options.max_actors:
             raise TooLargeError(
                 f"a frame may place {self._options.max_actors:,} actors (max_actors), got {actors:,} dynamic_objects"
@@ -239,7 +239,7 @@ class Rendering(ServiceCore):
 
     @contextlib.contextmanager
     def spending(self, rays: int) -> Iterator[None]:
-        """Counts what the current call costs while it is in progress.
+        """Counts the pixels and beams of the current call while it is in progress.
 
         Args:
             rays: pixels and beams of all its frames.
@@ -276,7 +276,7 @@ class Rendering(ServiceCore):
             )
 
     def _check_sizes(self, messages: Iterable[Any]) -> None:
-        """Refuses a call that names more pixels than it may have, before anything of it is read."""
+        """Refuses a call with too many pixels before its requests are parsed."""
         self.check_rays(sum(message.resolution_w * message.resolution_h for message in messages))
 
     def _check_images(self, jobs: Iterable[CameraJob]) -> None:
@@ -292,5 +292,5 @@ def _raise_first(results: list[Any]) -> list[Any]:
 
 
 async def _all(tasks: Iterable[Awaitable[T]]) -> list[T]:
-    """What all give once all have ended, so that none is left behind; raises what the first to fail raised."""
+    """The results of all tasks, after all have ended; raises the first error."""
     return _raise_first(await asyncio.gather(*tasks, return_exceptions=True))

@@ -1,8 +1,8 @@
-"""Scenes that clients bring along: their address travels as metadata beside any request.
+"""Scenes that clients name by URL, in the metadata of any request.
 
-``x-nre-scene-url`` is ``file://`` or ``http(s)://`` and ends in ``.usdz``; ``x-nre-scene-id`` is the name under which
-the scene is served from then on, the archive's own if it is left out. A ``file://`` address leads to the folders of
-scenes only, and of files elsewhere a client does not even learn whether they exist.
+``x-nre-scene-url`` is ``file://`` or ``http(s)://`` and ends in ``.usdz``; ``x-nre-scene-id`` is the id under which
+the scene is served afterwards, by default the archive's own. A ``file://`` URL may name files in the scene folders
+only; the reply does not reveal whether files exist elsewhere.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _MAX_URL = 2048
 
 
 class SceneUrls:
-    """Offers scenes of a store by their addresses; safe to use from many threads.
+    """Adds scenes to a store by URL; thread-safe.
 
     Args:
         store: where they are offered.
-        options: whether web addresses are allowed, how much may be fetched, and which folders files may lie in.
+        options: whether web URLs are allowed, download limits, and folders that ``file://`` URLs may name.
     """
 
     def __init__(self, store: SceneStore, options: ServiceOptions) -> None:
@@ -48,15 +48,15 @@ class SceneUrls:
         self._turns: dict[str, threading.Lock] = {}
 
     def is_new(self, metadata: Mapping[str, str]) -> bool:
-        """Whether metadata names a scene that ``offer`` still has to do something about; takes no waiting."""
+        """Whether metadata names a scene that ``offer`` has to add; does not block."""
         return URL_KEY in metadata and self._served(_key(metadata)) is None
 
     def offer(self, metadata: Mapping[str, str]) -> None:
-        """Makes the store offer the scene that metadata names; fetches it if it lies on the web.
+        """Adds the scene that metadata names to the store; downloads it if it is on the web.
 
         Raises:
-            RequestError: the address or the name is malformed, or there is nothing that a client may have.
-            NotAllowedError: it lies on the web, and this server does not go there.
+            RequestError: the URL or the id is malformed, or there is no such file.
+            NotAllowedError: it is a web URL, and this server does not download scenes.
             TooLargeError: it is larger than allowed.
             ArchiveError: it cannot be opened, or another scene has the name.
         """
@@ -75,7 +75,7 @@ class SceneUrls:
                 self._make_room()
 
     def _local_path(self, url: str) -> Path:
-        """The file at an address; where it may not lie and where there is none is the same to who asks."""
+        """The file of a URL; the error is the same for files that do not exist and files that are not allowed."""
         parts = urlsplit(url)
         if parts.netloc not in ("", "localhost"):
             raise RequestError(f"{URL_KEY}: a file:// address names a file of the server, without a host; got {url!r}")
@@ -94,11 +94,11 @@ class SceneUrls:
 
     @contextlib.contextmanager
     def _turn(self, url: str) -> Iterator[None]:
-        """One thread at a time for each address; nothing is kept of those that nobody waits for."""
+        """One thread at a time for each URL; locks without users are removed."""
         while True:
             lock = self._turns.setdefault(url, threading.Lock())
             with lock:
-                if self._turns.get(url) is not lock:  # its last holder has ended meanwhile
+                if self._turns.get(url) is not lock:  # its last holder removed it
                     continue
                 try:
                     yield
@@ -107,7 +107,7 @@ class SceneUrls:
                 return
 
     def _served(self, key: tuple[str, str]) -> str | None:
-        """The id of a scene that is on offer already and whose file is still there."""
+        """The id of a scene that was added before and whose file still exists."""
         scene_id, path = self._offered.get(key, ("", Path()))
         if not scene_id or not path.exists():
             return None
@@ -119,12 +119,12 @@ class SceneUrls:
     def _offer(self, path: Path, name: str) -> Source:
         with contextlib.suppress(UnknownSceneError):
             source = self._store.source(name or identify(path).id)
-            if source.is_from(path):  # served since the start, or fetched anew after it had to make room
+            if source.is_from(path):  # served since the start, or downloaded again after removal
                 return source
         return self._store.source(self._store.offer(path, name))
 
     def _make_room(self) -> None:
-        """Scenes whose files had to go are offered no longer, unless they are being rendered."""
+        """Removes scenes whose files were removed, unless they are being rendered."""
         removed = set(self._cache.make_room())
         for key, (scene_id, path) in list(self._offered.items()):
             if path in removed:
@@ -153,9 +153,9 @@ def _check(url: str, name: str) -> None:
 
 
 def _places(store: SceneStore, given: tuple[Path, ...] | None) -> tuple[Path, ...]:
-    """Folders and files that ``file://`` addresses may lead to, without links.
+    """Folders and files that ``file://`` URLs may name, with links resolved.
 
-    A scene that the store has may lie elsewhere behind a link: its own file counts beside the folder of the link.
+    A scene of the store may be a link: then the file that it points to is allowed beside the folder of the link.
     """
     if given is None:
         files = [source.origin for source in store.sources if isinstance(source.origin, Path)]

@@ -1,4 +1,4 @@
-"""What every call of a server passes: who may call, how often, until when; and what is noted of it when it ends."""
+"""Interceptor for every call: authentication, rate and memory limits, deadlines, metrics and log."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Code = grpc.StatusCode
 _HEALTH = "Health/"
 _DRAIN_STEP_S = 0.02
 _QUIET_S = 0.1
-"""A client that has read its last reply asks again within this time, and is to hear that the server is stopping."""
+"""A client that has read its last reply calls again within this time, and should get UNAVAILABLE."""
 _LONGEST_WAIT_FOR_QUIET_S = 1.0
 _SECRETS = ("authorization", "cookie")
 _MOST_PEERS = 10_000
@@ -28,11 +28,11 @@ _MOST_PEERS = 10_000
 
 
 class RateLimit:
-    """A bucket of tokens for each client address: a call takes one, and they come back at a steady rate.
+    """A token bucket for each client address: a call takes one token; tokens are refilled at a constant rate.
 
     Args:
-        per_s: tokens that come back in a second.
-        burst: tokens that fit.
+        per_s: tokens refilled per second.
+        burst: capacity of the bucket.
         clock: seconds, never going back.
     """
 
@@ -48,12 +48,12 @@ class RateLimit:
         allowed = tokens >= 1
         self._buckets[address] = (tokens - 1 if allowed else tokens, now)
         if len(self._buckets) > _MOST_PEERS:
-            self._buckets.popitem(last=False)  # asked longest ago
+            self._buckets.popitem(last=False)  # least recently used
         return allowed
 
 
 class UnreadReplies:
-    """Bytes of replies that were handed to the network and not taken by their clients yet.
+    """Bytes of replies that clients have not received yet.
 
     Args:
         most: in all; one connection may leave a quarter of it, or a single reply of any size.
@@ -78,22 +78,22 @@ class UnreadReplies:
         return None
 
     def add(self, peer: str, size: int) -> None:
-        """Counts a reply that goes out."""
+        """Counts a reply that is sent."""
         self._by_peer[peer] += size
 
     def remove(self, peer: str, size: int) -> None:
-        """Counts a reply that was taken, or whose client left."""
+        """Counts a reply that was received, or whose client disconnected."""
         self._by_peer[peer] -= size
         if self._by_peer[peer] <= 0:
             del self._by_peer[peer]
 
 
 class Gate(grpc.aio.ServerInterceptor):
-    """Lets calls of every service in, or refuses them; health is always answered.
+    """Admits or refuses calls of every service; health is always answered.
 
     Args:
         options: what is allowed.
-        telemetry: hears of every call that ended.
+        telemetry: counts every call that ended; None for no metrics.
     """
 
     def __init__(self, options: ServerOptions, telemetry: Telemetry | None = None) -> None:
@@ -107,7 +107,7 @@ class Gate(grpc.aio.ServerInterceptor):
         self._rate = RateLimit(options.rate_per_s, options.rate_burst) if options.rate_per_s else None
 
     async def drain(self, seconds: float) -> None:
-        """Lets no more calls in, and waits until those in progress have ended, their replies are read, and it is quiet.
+        """Refuses new calls; waits for calls in progress, for replies to be read, and for a pause without calls.
 
         gRPC's own way to stop would cut off calls that it has received and not begun with CANCELLED, which clients do
         not take for a reason to ask elsewhere.
@@ -213,7 +213,7 @@ class Gate(grpc.aio.ServerInterceptor):
             await context.abort(Code.DEADLINE_EXCEEDED, "the deadline passed before the call began")
 
     async def _hold(self, reply: bytes, context: grpc.aio.ServicerContext) -> None:
-        """Counts a reply as unread until its client has it, or drops it if too many wait already."""
+        """Counts a reply as unread until its client has received it; refuses it if too many bytes are unread."""
         peer, size = context.peer(), len(reply)
         if refusal := self.unread.refusal(peer, size):
             await context.abort(Code.RESOURCE_EXHAUSTED, refusal)

@@ -1,4 +1,4 @@
-"""A gRPC server of any services: listening, health, reflection, metrics, signals, and a stop that lets calls finish."""
+"""A gRPC server of any services: listening, health, reflection, metrics, signals, graceful shutdown."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Application(Protocol):
     services: Sequence[Service]
 
     async def warm_up(self) -> None:
-        """Makes first answers quick; health says NOT_SERVING until it is done. Must not raise."""
+        """Loads what the first calls need; health is NOT_SERVING until it is done. Must not raise."""
         ...
 
     def gauges(self) -> Mapping[str, tuple[str, float]]:
@@ -65,7 +65,7 @@ class GrpcServer:
     """A server in a background thread (``start``, ``stop``, or ``with``), or in the running event loop (``run``).
 
     Args:
-        make_application: makes what is served, for each start anew; gets a function that asks the server to stop.
+        make_application: creates the application, at each start; called with a function that requests a stop.
         host: name or address to listen at; ``0.0.0.0`` for all.
         port: 0 picks a free one.
         options: how it listens, and to whom.
@@ -92,7 +92,7 @@ class GrpcServer:
         self.metrics_address: str | None = None
 
     def start(self) -> str:
-        """Starts serving; gives the address ``host:port``.
+        """Starts serving; returns the address ``host:port``.
 
         Raises:
             OSError: an address cannot be listened at.
@@ -167,7 +167,7 @@ class GrpcServer:
             await server.start()
             self._request_stop = request_stop
             warming = asyncio.create_task(_warm_up(application, monitor, names, settle=handle_signals))
-            await asyncio.sleep(0)  # a server that has nothing to warm says so at once
+            await asyncio.sleep(0)  # a server with nothing to warm up is SERVING at once
             if handle_signals:
                 _stop_on_signals(loop, stopping)
             on_ready(_address(self._host, port))

@@ -1,4 +1,4 @@
-"""How a server listens and whom it lets in: TLS, a bearer token, limits, exposure to other machines."""
+"""Server options: TLS, bearer token, limits, and whether other machines may connect."""
 
 from __future__ import annotations
 
@@ -132,10 +132,10 @@ def is_loopback(host: str) -> bool:
 
 
 def check_exposure(host: str, *, protected: bool, insecure: bool) -> None:
-    """Refuses to open a server to other machines unless it is protected, or that was asked for.
+    """Refuses to listen for other machines unless the server is protected, or ``insecure`` allows it.
 
     Raises:
-        ServerError: other machines can reach ``host``, and neither was said.
+        ServerError: other machines can reach ``host``, and neither is the case.
     """
     if not (is_loopback(host) or protected or insecure):
         raise ServerError(

@@ -33,7 +33,7 @@ class Telemetry:
     """Counters and gauges of one server, in a registry of its own: several servers may live in a process.
 
     Args:
-        gauges: asked at every scrape.
+        gauges: called at every scrape.
     """
 
     def __init__(self, gauges: Gauges) -> None:
@@ -51,7 +51,7 @@ class Telemetry:
         self._seconds.labels(method).observe(seconds)
 
     def listen(self, host: str, port: int) -> tuple[str, Callable[[], None]]:
-        """Serves the figures over HTTP in a thread of its own; gives ``host:port`` and what ends it.
+        """Serves the metrics over HTTP in a background thread; returns ``host:port`` and a function that stops it.
 
         Raises:
             OSError: the address cannot be listened at.
@@ -82,7 +82,15 @@ class _Gauges(Collector):
 
 
 def log_call(method: str, code: str, seconds: float, scene: str, peer: str) -> None:
-    """Writes the line of a call that ended; at level info."""
+    """Writes the log line of a call that ended, at level info.
+
+    Args:
+        method: service and procedure.
+        code: name of the gRPC status.
+        seconds: duration.
+        scene: that the request names.
+        peer: address and port of the client.
+    """
     if log.isEnabledFor(logging.INFO):
         fields = {
             "method": method,
@@ -119,7 +127,7 @@ def set_up_logging(form: LogFormat = "text", level: LogLevel = "warning", stream
     handler.setFormatter(JsonLines() if form == "json" else plain)
     logging.basicConfig(handlers=[handler], level=logging.WARNING, force=True)
     logging.getLogger("nurec_sim").setLevel(level.upper())
-    # gRPC logs a traceback whenever a client leaves before it has read its reply; the call's own line says it too.
+    # gRPC logs a traceback whenever a client leaves before it has read its reply; the call's log line has it too.
     logging.getLogger("grpc._cython.cygrpc").addFilter(_is_not_about_a_client_that_left)
 
 

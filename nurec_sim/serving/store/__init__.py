@@ -1,4 +1,4 @@
-"""The scenes that a server offers: named, loaded or reconstructed once on first use, and kept while there is room."""
+"""The scenes of a server: by name, loaded or reconstructed once on first use, cached within bounds."""
 
 from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats
 from nurec_sim.serving.store.recipes import Recipe, content_key

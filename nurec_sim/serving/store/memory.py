@@ -1,4 +1,4 @@
-"""Scenes in memory: loaded once however many ask, lent while they are used, dropped when others need the room."""
+"""The cache of loaded scenes: loaded once for concurrent callers, leased while in use, evicted by least recent use."""
 
 from __future__ import annotations
 
@@ -45,25 +45,25 @@ class LoadedScene:
 
 @dataclass(frozen=True)
 class MemoryStats:
-    """What happened so far, and what is in memory now."""
+    """Counters since the start, and the current content of the cache."""
 
     hits: int = 0
-    """Scenes asked for that were in memory."""
+    """Requests for scenes that were in memory."""
     loads: int = 0
     failed_loads: int = 0
     evictions: int = 0
-    """Scenes dropped for others; not those that somebody unloaded."""
+    """Scenes evicted for others; not those that were unloaded on request."""
     load_s: float = 0.0
     """Time of all loads, reconstructions among them."""
     loaded: int = 0
     loaded_bytes: int = 0
     in_use: int = 0
-    """Scenes that somebody holds a lease of."""
+    """Scenes with a lease."""
 
 
 @dataclass
 class _Entry:
-    """A scene that is in memory or on its way there."""
+    """A scene that is in memory or being loaded."""
 
     future: Future[LoadedScene] = field(default_factory=Future)
     bytes: int = 0
@@ -76,14 +76,14 @@ class _Entry:
 
 
 class Lease:
-    """The use of a scene; it stays in memory until ``release``, or the end of a ``with`` block, which gives it."""
+    """Keeps a scene in memory until ``release``, or the end of a ``with`` block."""
 
     def __init__(self, loaded: LoadedScene, release: Callable[[], None]) -> None:
         self.loaded = loaded
         self._release: Callable[[], None] | None = release
 
     def release(self) -> None:
-        """Ends the use; harmless the second time."""
+        """Ends the lease; may be called more than once."""
         release, self._release = self._release, None
         if release is not None:
             release()
@@ -96,10 +96,10 @@ class Lease:
 
 
 class SceneMemory:
-    """A cache of scenes, bounded by count and bytes: who was used least recently goes first.
+    """A least-recently-used cache of scenes, bounded by count and bytes.
 
-    Scenes in use never go, and the scene used last never does, whatever its size: for a while there may be more than
-    the bounds allow. Safe to use from many threads.
+    Scenes in use and the most recently used one are never evicted, so the bounds may be exceeded for a while.
+    Thread-safe.
 
     Args:
         capacity: how many.
@@ -113,10 +113,10 @@ class SceneMemory:
         self._stats = MemoryStats()
 
     def lease(self, key: str, load: Callable[[], LoadedScene]) -> Lease:
-        """The use of a scene, which is loaded if it is not in memory; callers meanwhile wait for the same load.
+        """A lease of a scene, which is loaded if it is not in memory; concurrent callers wait for the same load.
 
         Raises:
-            Exception: whatever ``load`` raises, in all who wait; but a cancelled load is started again by the next.
+            Exception: whatever ``load`` raises, in all callers that wait; a cancelled load is restarted by the next.
         """
         while True:
             with self._lock:
@@ -136,7 +136,7 @@ class SceneMemory:
                     raise
 
     def lease_ready(self, key: str) -> Lease | None:
-        """The use of a scene that is in memory, else None; takes no waiting."""
+        """A lease of a scene that is in memory, else None; does not block."""
         with self._lock:
             entry = self._entries.get(key)
             if entry is None or not entry.ready:
@@ -147,7 +147,7 @@ class SceneMemory:
         return Lease(entry.future.result(), partial(self._end_use, entry))
 
     def put(self, key: str, loaded: LoadedScene | None) -> None:
-        """Puts a scene, or nothing, in the place of what is there; who uses that goes on with it."""
+        """Replaces an entry, or removes it if None; existing leases stay valid."""
         with self._lock:
             self._entries.pop(key, None)
             if loaded is None:
@@ -157,7 +157,7 @@ class SceneMemory:
         self._make_room()
 
     def drop(self, key: str) -> int | None:
-        """Takes a scene out of memory if nobody uses or loads it: its bytes, 0 if it is not there, else None."""
+        """Removes a scene that is neither used nor loading; returns its bytes, 0 if there is none, None if it stays."""
         with self._lock:
             entry = self._entries.get(key)
             if entry is None:
@@ -200,7 +200,7 @@ class SceneMemory:
                 if self._entries.get(key) is entry:
                     del self._entries[key]
                     if isinstance(error, CancelledError) and entry.users > 1:
-                        self._entries[key] = _Entry()  # keeps the place until one of those who wait begins anew
+                        self._entries[key] = _Entry()  # keeps the entry until a waiting caller starts again
                 self._count(failed_loads=1)
             entry.future.set_exception(error)
             return
@@ -211,7 +211,7 @@ class SceneMemory:
         self._make_room()
 
     def _measure(self) -> None:
-        """Sizes of all scenes: renderers grow with the sensors that they are asked for."""
+        """Measures all scenes: renderers grow with the number of sensors that they have rendered."""
         with self._lock:
             ready = [entry for entry in self._entries.values() if entry.ready]
         for entry in ready:
@@ -243,7 +243,7 @@ def array_bytes(*things: Any) -> int:
     while stack:
         thing = stack.pop()
         while getattr(thing, "base", None) is not None and hasattr(thing.base, "nbytes"):
-            thing = thing.base  # a view keeps all of what it looks at
+            thing = thing.base  # a view keeps its base alive
         if id(thing) in seen:
             continue
         seen.add(id(thing))

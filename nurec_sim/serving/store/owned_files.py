@@ -1,4 +1,4 @@
-"""Files that belong to one process while it lives, so that what a killed one leaves behind can be told and removed.
+"""Files owned by one process, so that files left by a killed process can be recognised and removed.
 
 Ownership is an advisory lock of the system (``flock``), which ends with its process, whatever ends that. Process ids in
 the files are for people only: ids come again, and mean nothing in another container that shares the folder.
@@ -18,13 +18,13 @@ _POLL_S = 0.1
 
 @contextlib.contextmanager
 def owned_file(path: Path, waiting: Callable[[], None]) -> Iterator[int]:
-    """Makes a file and owns it until the block ends, which removes it; gives its handle.
+    """Creates a file and owns it until the block ends, which removes it; yields its handle.
 
     Waits while another process, or another block of this one, owns it.
 
     Args:
         path: the file; its folder is made if need be.
-        waiting: called again and again meanwhile; what it raises ends the wait.
+        waiting: called repeatedly while waiting; what it raises ends the wait.
 
     Raises:
         OSError: the file cannot be made.
@@ -41,7 +41,7 @@ def owned_file(path: Path, waiting: Callable[[], None]) -> Iterator[int]:
 
 
 def remove_abandoned(path: Path) -> bool:
-    """Removes a file that ``owned_file`` made if nobody owns it any more; says whether it did."""
+    """Removes a file of ``owned_file`` that no process owns; returns whether it did."""
     try:
         handle = _take(path, os.O_RDWR)
     except FileNotFoundError:
@@ -54,7 +54,7 @@ def remove_abandoned(path: Path) -> bool:
 
 
 def _take(path: Path, flags: int) -> int | None:
-    """A handle of the file that holds its lock, None if somebody else does."""
+    """A handle that holds the lock of the file, or None if another process does."""
     handle = os.open(path, flags, 0o644)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""How clips become scenes, and the name under which the result is kept: a hash of all that it depends on."""
+"""Reconstruction recipes, and the cache key of their result: a hash of all that it depends on."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Recipe:
         return reconstruct(open_clip(clip_path), self.method, progress=progress, **chosen)
 
     def text(self) -> str:
-        """Everything that the choice says, as JSON; of files their content, wherever they lie."""
+        """Method, settings, cameras and weights as JSON; files by content, not by path."""
         settings = None if self.settings is None else dataclasses.asdict(self.settings)
         if settings is not None:
             settings = {name: _plain(value) for name, value in settings.items()}

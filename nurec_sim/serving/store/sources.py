@@ -1,4 +1,4 @@
-"""Where scenes come from, and the names that they answer to."""
+"""Sources of scenes, and the catalogue of scenes by name."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Source:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Everything that it answers to."""
+        """All its names."""
         return (self.id, *self.aliases)
 
     def is_from(self, path: Path) -> bool:
@@ -63,7 +63,7 @@ def default_cache_dir() -> Path:
 def find_sources(path: Path) -> list[Path]:
     """Archives and clip folders in a folder, at any depth; the path itself if it is a log or holds none of them.
 
-    Files and folders whose names begin with a dot are passed over: they may be half written.
+    Names that begin with a dot are skipped: such files may be incomplete.
     """
     from nurec_sim.logs import is_log
     from nurec_sim.logs.storage import META_FILE
@@ -150,7 +150,7 @@ def _metadata_id(path: Path) -> tuple[str, ...]:
 
 
 class SceneCatalog:
-    """The scenes on offer, by name; safe to use from many threads."""
+    """The available scenes, by name; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -158,7 +158,7 @@ class SceneCatalog:
         self._faults: dict[str, str] = {}
 
     def add(self, source: GaussianScene | str | Path) -> tuple[str, ...]:
-        """Offers the scene, or all scenes of a folder, and gives their ids; what cannot be opened becomes a fault."""
+        """Adds the scene, or all scenes of a folder, and returns their ids; what cannot be opened becomes a fault."""
         added = []
         for one in [source] if isinstance(source, GaussianScene) else find_sources(Path(source)):
             try:
@@ -171,7 +171,7 @@ class SceneCatalog:
         return tuple(added)
 
     def offer(self, source: GaussianScene | Path, name: str = "", recipe: Recipe | None = None) -> str:
-        """Offers one scene and gives its id; raises what ``add`` makes a fault of.
+        """Adds one scene and returns its id; raises where ``add`` records a fault.
 
         Args:
             source: an object, or the path of an archive or a clip.
@@ -190,19 +190,19 @@ class SceneCatalog:
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """Ids of the scenes on offer, in the order they were added."""
+        """Ids of the available scenes, in the order they were added."""
         with self._lock:
             return tuple(self._sources)
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """Where the scenes on offer come from, in the order they were added."""
+        """The sources of the available scenes, in the order they were added."""
         with self._lock:
             return tuple(self._sources.values())
 
     @property
     def faults(self) -> Mapping[str, str]:
-        """Why a source is not on offer, by file stem."""
+        """Why a source is not available, by file stem."""
         with self._lock:
             return dict(self._faults)
 
@@ -210,7 +210,7 @@ class SceneCatalog:
         """The id of the scene that answers to ``name``.
 
         Raises:
-            UnknownSceneError: there is none; the text lists what there is.
+            UnknownSceneError: there is none; the text lists the scenes.
             ArchiveError: its source was refused; the text says why.
         """
         return self.source(name).id

@@ -11,16 +11,16 @@ from nurec_sim.errors import SceneInUseError
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings
 from nurec_sim.render.device import Renderer
 from nurec_sim.render.device import make_renderer as renderer_on
-from nurec_sim.serving.store.kept import KeptReconstructions
 from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats, SceneMemory, half_of_memory
 from nurec_sim.serving.store.recipes import Progress, Recipe
+from nurec_sim.serving.store.reconstruction_cache import ReconstructionCache
 from nurec_sim.serving.store.sources import SceneCatalog, Source, default_cache_dir
 from nurec_sim.types import GaussianScene
 
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """One scene on offer, as it is now."""
+    """The current state of one available scene."""
 
     id: str
     kind: str
@@ -41,9 +41,9 @@ class SceneStore(SceneCatalog):
     file stem and ``clipgt-<file stem>``. A source that cannot be opened is kept as a fault, under its stem, and does
     not disturb the others.
 
-    Whoever renders a scene holds a ``lease`` of it meanwhile: scenes in use stay in memory. Of the others the least
-    recently used go when there are more than ``capacity`` of them, or they take more than ``max_bytes``; the one used
-    last stays, whatever its size.
+    Rendering holds a ``lease`` of the scene: scenes in use stay in memory. Of the others the least recently used are
+    evicted when there are more than ``capacity`` of them, or they take more than ``max_bytes``; the most recently used
+    one stays, whatever its size.
 
     Args:
         sources: objects, or paths of archives (``.usdz``), clips, and folders of them.
@@ -78,14 +78,14 @@ class SceneStore(SceneCatalog):
             raise ValueError(f"a scene store needs room for at least 1 byte, got max_bytes {max_bytes}")
         super().__init__()
         self.memory = SceneMemory(capacity, half_of_memory() if max_bytes is None else max_bytes)
-        self._kept = KeptReconstructions(cache_dir or default_cache_dir(), on_progress or (lambda text: None))
+        self._kept = ReconstructionCache(cache_dir or default_cache_dir(), on_progress or (lambda text: None))
         self._recipe = Recipe(method, settings)
         self._make_renderer = make_renderer or partial(renderer_on, device=device, threads=threads)
         for source in sources:
             self.add(source)
 
     def remove(self, name: str) -> int:
-        """Offers a scene no longer; its file stays. Gives the bytes of memory that it took.
+        """Removes a scene; its file stays. Returns the bytes of memory freed.
 
         Raises:
             UnknownSceneError, ArchiveError: see ``resolve``.
@@ -103,7 +103,7 @@ class SceneStore(SceneCatalog):
 
     @property
     def entries(self) -> tuple[SceneEntry, ...]:
-        """The scenes on offer, in the order they were added."""
+        """The available scenes, in the order they were added."""
         return tuple(
             SceneEntry(source.id, source.kind, _file_bytes(source), *self.memory.state_of(source.id))
             for source in self.sources
@@ -135,15 +135,15 @@ class SceneStore(SceneCatalog):
         return self.memory.stats
 
     def lease(self, name: str, progress: Progress | None = None) -> Lease:
-        """The use of the scene that answers to ``name``; loads or reconstructs it if it is not in memory.
+        """A lease of the scene of that name; loads or reconstructs it if it is not in memory.
 
         ::
 
             with store.lease("street") as loaded:
                 (frame,) = loaded.renderer.sense([request])
 
-        Callers that come while it loads wait for the same load. ``progress`` hears of a reconstruction: what is being
-        done, and the fraction of it that is. It may raise ``CancelledError`` to end it.
+        Concurrent callers wait for the same load. ``progress`` is called during a reconstruction with the stage and the
+        fraction done. It may raise ``CancelledError`` to end it.
 
         Raises:
             UnknownSceneError: there is no such scene.
@@ -153,7 +153,7 @@ class SceneStore(SceneCatalog):
         return self.memory.lease(source.id, lambda: self._load(source, progress))
 
     def lease_in_memory(self, name: str) -> Lease | None:
-        """The use of the scene that answers to ``name`` if that takes no waiting, else None.
+        """A lease of the scene of that name if it is in memory, else None; does not block.
 
         Raises:
             UnknownSceneError, ArchiveError: see ``resolve``.
@@ -161,12 +161,12 @@ class SceneStore(SceneCatalog):
         return self.memory.lease_ready(self.resolve(name))
 
     def get(self, name: str, progress: Progress | None = None) -> LoadedScene:
-        """As ``lease``, for those who hold the scene but not its place in memory."""
+        """As ``lease``, without keeping the scene in the cache."""
         with self.lease(name, progress) as loaded:
             return loaded
 
     def unload(self, name: str) -> int:
-        """Takes a scene out of memory; it is loaded again when somebody asks. Gives the bytes that it took.
+        """Removes a scene from memory; it is loaded again on the next request. Returns the bytes freed.
 
         Raises:
             UnknownSceneError, ArchiveError: see ``resolve``.
@@ -182,7 +182,7 @@ class SceneStore(SceneCatalog):
         return freed
 
     def replace(self, name: str, scene: GaussianScene) -> None:
-        """Serves an edited copy in the place of a scene until ``restore``; frames in progress are not affected.
+        """Serves an edited copy instead of a scene until ``restore``; frames in progress are not affected.
 
         Raises:
             UnknownSceneError, ArchiveError: see ``resolve``.
@@ -194,7 +194,7 @@ class SceneStore(SceneCatalog):
         self.memory.put(source.id, loaded)
 
     def restore(self, name: str) -> None:
-        """Serves the original of a scene again; without effect on one that was not replaced.
+        """Serves the original scene again; no effect if it was not replaced.
 
         Raises:
             UnknownSceneError, ArchiveError: see ``resolve``.

@@ -1,4 +1,4 @@
-"""The folder of uploaded scenes and clips: each is received under a hidden name, checked, and only then appears.
+"""The folder of uploaded scenes and clips: each is received under a hidden name, checked, then renamed.
 
 A hidden file ``.incoming-<random>.<ending>`` is owned by the process that receives it (``owned_files``): what a killed
 one left is removed by the next that uses the folder.
@@ -32,11 +32,11 @@ _PLACING = ".placing.lock"
 
 
 class UploadFolder:
-    """Uploaded scenes and clips, offered by a store; those that are there already are offered at once.
+    """Uploaded scenes and clips of a store; those of earlier servers are added at once.
 
     Args:
-        folder: made if need be; nothing else should lie in it.
-        store: offers them.
+        folder: created if it does not exist; for uploads only.
+        store: where they are added.
         max_bytes: of one file.
         max_total_bytes: of all files.
 
@@ -56,12 +56,12 @@ class UploadFolder:
 
     @property
     def files(self) -> list[Path]:
-        """Files that arrived completely, sorted."""
+        """Complete files, sorted."""
         return sorted(p for p in self.folder.iterdir() if p.suffix in (".usdz", ".zip") and not p.name.startswith("."))
 
     @property
     def total_bytes(self) -> int:
-        """Size of all files; of those that are arriving the size that was promised."""
+        """Size of all files; incomplete ones count with their announced size."""
         total = 0
         for path in self.folder.iterdir():
             with contextlib.suppress(FileNotFoundError):  # it arrived, or was cancelled, at this moment
@@ -70,7 +70,7 @@ class UploadFolder:
 
     @contextlib.contextmanager
     def receive(self, name: str, size: int, sha256: str, ending: str) -> Iterator[Upload]:
-        """A file that arrives; if the block ends before ``Upload.finish``, nothing stays.
+        """Receives a file; if the block ends before ``Upload.finish``, it is removed.
 
         Args:
             name: file name.
@@ -79,8 +79,8 @@ class UploadFolder:
             ending: that the name must have: ``.usdz`` or ``.zip``.
 
         Raises:
-            RequestError: a name, a size or a hash that cannot be; the text says which.
-            TooLargeError: there is no room for so many bytes.
+            RequestError: an invalid name, size or hash; the text says which.
+            TooLargeError: the file exceeds a limit or the free disk space.
         """
         check_name(name, ending)
         if not _SHA256.fullmatch(sha256):
@@ -91,18 +91,18 @@ class UploadFolder:
             raise TooLargeError(f"an upload may have {self._max_bytes:,} bytes, got {size:,}")
         if (total := self.total_bytes + size) > self._max_total_bytes:
             raise TooLargeError(f"uploads may take {self._max_total_bytes:,} bytes in all, with this one {total:,}")
-        with out_of_room():
+        with disk_errors():
             if size > (free := shutil.disk_usage(self.folder).free):
                 raise TooLargeError(f"the server's disk has {free:,} bytes left, the upload has {size:,}")
         self._refuse_taken(name)
         hidden = self.folder / f"{_INCOMING}{secrets.token_hex(8)}{ending}"
         with owned_file(hidden, lambda: None) as handle, os.fdopen(handle, "wb", closefd=False) as file:
-            with out_of_room():
+            with disk_errors():
                 os.truncate(handle, size)  # so that it counts for whoever comes next
             yield Upload(self, file, hidden, self.folder / name, size, sha256)
 
     def place(self, hidden: Path, target: Path) -> str:
-        """Gives a complete file its name and offers its scene, whose id it returns."""
+        """Renames a complete file and adds its scene, whose id it returns."""
         new_id = identify(hidden).id
         if new_id in self._store.ids:
             raise ArchiveError(f"{target.name}: a scene of id {new_id!r} is already served")
@@ -121,7 +121,7 @@ class UploadFolder:
         return isinstance(path, Path) and path.parent == self.folder
 
     def delete(self, name: str) -> int:
-        """Offers an uploaded scene no longer and deletes its file; gives the bytes of memory that it took.
+        """Removes an uploaded scene and deletes its file; returns the bytes of memory freed.
 
         Raises:
             UnknownSceneError, ArchiveError: see ``SceneStore.resolve``.
@@ -142,7 +142,16 @@ class UploadFolder:
 
 
 class Upload:
-    """One file that arrives; made by ``UploadFolder.receive``."""
+    """One file being received; made by ``UploadFolder.receive``.
+
+    Args:
+        folder: where it belongs.
+        file: open hidden file.
+        hidden: its path.
+        target: its path when it is complete.
+        size: announced bytes.
+        sha256: announced hash, hexadecimal.
+    """
 
     def __init__(
         self, folder: UploadFolder, file: BinaryIO, hidden: Path, target: Path, size: int, sha256: str
@@ -152,32 +161,32 @@ class Upload:
         self._digest, self._received = hashlib.sha256(), 0
 
     def write(self, data: bytes) -> None:
-        """Takes the next bytes.
+        """Writes the next bytes.
 
         Raises:
-            RequestError: more than were promised.
+            RequestError: more bytes than announced.
             TooLargeError: the disk is full.
         """
         self._received += len(data)
         if self._received > self._size:
-            raise RequestError(f"the file has more bytes than the {self._size:,} that the header promised")
+            raise RequestError(f"the file has more bytes than the {self._size:,} that the header announced")
         self._digest.update(data)
-        with out_of_room():
+        with disk_errors():
             self._file.write(data)
 
     def finish(self) -> str:
-        """Checks the file, gives it its name and offers its scene, whose id it returns.
+        """Checks and renames the file and adds its scene, whose id it returns.
 
         Raises:
-            RequestError: the bytes are not those that the header promised.
+            RequestError: the bytes are not those that the header announced.
             ArchiveError, ClipError: it cannot be opened, or its id is taken.
             TooLargeError: the disk is full.
         """
         if self._received != self._size:
-            raise RequestError(f"the header promised {self._size:,} bytes, {self._received:,} came")
+            raise RequestError(f"the header announced {self._size:,} bytes, {self._received:,} came")
         if self._digest.hexdigest() != self._sha256:
-            raise RequestError(f"the bytes have sha256 {self._digest.hexdigest()}, the header promised {self._sha256}")
-        with out_of_room():
+            raise RequestError(f"the bytes have sha256 {self._digest.hexdigest()}, the header announced {self._sha256}")
+        with disk_errors():
             self._file.flush()
             os.fsync(self._file.fileno())
         try:
@@ -185,7 +194,7 @@ class Upload:
                 from nurec_sim.scene import read_scene
 
                 read_scene(self._hidden)
-            with out_of_room():
+            with disk_errors():
                 return self._folder.place(self._hidden, self._target)
         except ArchiveError as error:  # clients know the file by its own name
             raise ArchiveError(str(error).replace(str(self._hidden), self._target.name)) from error
@@ -206,8 +215,8 @@ def check_name(name: str, ending: str = "") -> None:
 
 
 @contextlib.contextmanager
-def out_of_room() -> Iterator[None]:
-    """Errors of the disk become one that the client gets."""
+def disk_errors() -> Iterator[None]:
+    """Turns errors of the disk into one for the client."""
     try:
         yield
     except OSError as error:

@@ -46,7 +46,7 @@ LARGEST = 1e6
 
 @dataclass(frozen=True)
 class SessionStart:
-    """What a client says when it opens a session. ``sensor_ids`` are the policy's names of sensors, where it says."""
+    """How a client opens a session. ``sensor_ids`` maps the policy's names of sensors to ids, if given."""
 
     session_id: str
     seed: int

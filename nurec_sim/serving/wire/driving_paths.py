@@ -20,7 +20,7 @@ from nurec_sim.serving.wire.requests import read_poses, write_poses
 from nurec_sim.types import EgoState, Matrix4, Plan
 
 LEAST_UPRIGHT = 0.2
-"""Cosine of the steepest tilt: beyond it, what a car sees from above makes no sense."""
+"""Cosine of the steepest tilt: beyond it, a top view of the car is undefined."""
 
 FARTHEST = 1e9
 """No distance, angle or speed on the wire is larger."""
@@ -30,7 +30,7 @@ Poses2 = Float64[np.ndarray, "k 3"]
 
 
 class Placed(Protocol):
-    """Where the car is at a time: an ``EgoState``, or a ``ToldState``."""
+    """Where the car is at a time: an ``EgoState``, or a ``ReportedState``."""
 
     @property
     def t_us(self) -> int:
@@ -102,7 +102,14 @@ class Route:
 
 
 def write_route(ego: EgoState, route_m: Points2, speed_mps: Float64[np.ndarray, " k"], message) -> None:
-    """Fills a ``Route``."""
+    """Fills a ``Route``.
+
+    Args:
+        ego: the current state, whose rig frame the way points get.
+        route_m: way points [k,2] in level axes with the car's heading, metres.
+        speed_mps: speed at each.
+        message: to be filled.
+    """
     message.timestamp_us = ego.t_us
     for a, b in np.linalg.solve(_level_from_rig(ego.world_from_rig)[:2, :2], route_m.T).T.tolist():
         message.waypoints.add(x=a, y=b)
@@ -160,7 +167,14 @@ class RecordedFuture:
 
 
 def write_recorded(ego: EgoState, t_us: Int64[np.ndarray, " m"], xyyaw: Poses2, message) -> None:
-    """Fills a ``GroundTruth``."""
+    """Fills a ``GroundTruth``.
+
+    Args:
+        ego: the current state, whose rig frame the poses get.
+        t_us: times [m].
+        xyyaw: recorded poses [m,3] in level axes with the car's heading, metres and radians.
+        message: to be filled.
+    """
     message.timestamp_us = ego.t_us
     samples = [message.trajectory.poses.add(timestamp_us=t) for t in t_us.tolist()]
     tilt = _level_from_rig(ego.world_from_rig)
@@ -197,7 +211,7 @@ def write_plan(ego: EgoState, plan: Plan, message) -> None:
 
 
 def read_plan(ego: EgoState, message) -> Plan:
-    """The plan of a ``DriveResponse`` to a car at ``ego``; poses up to now are left out, nobody drives back to them.
+    """The plan of a ``DriveResponse`` to a car at ``ego``; poses up to the current time are left out.
 
     Raises:
         RequestError: a pose or a time is malformed, or additions of another length.

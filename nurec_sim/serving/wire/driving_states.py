@@ -1,8 +1,8 @@
 """Where the car was and how it moved <-> messages of the egodriver interface.
 
 Poses are of the rig in the session's local frame, which is our world. A dynamic state should be in the rig frame of its
-pose: x forward, so a car that does not slide has no other speed. Not every client keeps to that, so what is read here
-is what the client says; ``serving.driver.motion`` decides what to believe.
+pose: x forward, so a car that does not slide has no other speed. Not every client keeps to that, so this module only
+reads what is reported; ``serving.driver.motion`` decides what is used.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from nurec_sim.types import EgoState, Matrix4
 
 
 @dataclass(frozen=True)
-class ToldMotion:
-    """How the car moves, as a client says: velocity along x and y, acceleration along x.
+class ReportedMotion:
+    """Ego motion as reported by a client: velocity along x and y, acceleration along x.
 
     ``exact`` if it comes in fields of ours; only then there is a steering angle. Else it is a dynamic state.
     """
@@ -33,12 +33,12 @@ class ToldMotion:
 
 
 @dataclass(frozen=True)
-class ToldState:
-    """A rig pose, and what the client says of the motion there, if anything."""
+class ReportedState:
+    """A rig pose, and the motion that the client reports there, if any."""
 
     t_us: int
     world_from_rig: Matrix4
-    motion: ToldMotion | None = None
+    motion: ReportedMotion | None = None
 
 
 def write_states(states: Sequence[EgoState], message) -> None:
@@ -56,7 +56,7 @@ def write_states(states: Sequence[EgoState], message) -> None:
         )  # fmt: skip
 
 
-def read_states(message) -> list[ToldState]:
+def read_states(message) -> list[ReportedState]:
     """The states of a ``RolloutEgoTrajectory``. Fewer dynamic states than poses belong to the last poses.
 
     Raises:
@@ -79,18 +79,18 @@ def read_states(message) -> list[ToldState]:
             motion = _read_exact(f"motion[{i}]", exact[i])
         elif i >= first and dynamic[i - first].HasField("linear_velocity"):
             motion = _read_dynamic(f"dynamic_states[{i - first}]", dynamic[i - first])
-        states.append(ToldState(sample.timestamp_us, world_from_rig[i], motion))
+        states.append(ReportedState(sample.timestamp_us, world_from_rig[i], motion))
     return states
 
 
-def _read_exact(name: str, motion) -> ToldMotion:
+def _read_exact(name: str, motion) -> ReportedMotion:
     values = (motion.speed_mps, motion.accel_mps2, motion.yaw_rate_radps, motion.steering_rad)
     speed, accel, yaw_rate, steering = bounded(name, values)
-    return ToldMotion((speed, 0.0), accel, yaw_rate, steering, exact=True)
+    return ReportedMotion((speed, 0.0), accel, yaw_rate, steering, exact=True)
 
 
-def _read_dynamic(name: str, dynamic) -> ToldMotion:
+def _read_dynamic(name: str, dynamic) -> ReportedMotion:
     velocity = dynamic.linear_velocity
     values = (velocity.x, velocity.y, dynamic.linear_acceleration.x, dynamic.angular_velocity.z)
     x, y, accel, yaw_rate = bounded(name, values)
-    return ToldMotion((x, y), accel, yaw_rate)
+    return ReportedMotion((x, y), accel, yaw_rate)

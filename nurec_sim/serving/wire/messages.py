@@ -22,7 +22,7 @@ SERVICE_PATHS = (SERVICE, "nurec.grpc.protos.sensorsim.SensorsimService", "senso
 SCENE_SERVICE = "nurec_sim.v1.SceneService"
 
 MAX_MESSAGE_BYTES = 64 << 20
-"""Of a request or a reply, unless a server is told otherwise; AlpaSim's clients take no more."""
+"""Default limit of a request or reply; AlpaSim's clients accept no more."""
 
 
 class Method(NamedTuple):

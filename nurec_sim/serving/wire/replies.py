@@ -143,10 +143,10 @@ def _read_buffer(message, name: str, kind: str) -> np.ndarray:
 
 
 def outputs_of(numbers: Sequence[int]) -> tuple[str, ...]:
-    """Names, as the renderer knows them, of the outputs that a ``RenderCameraRequest`` asks for; rgb if none.
+    """The renderer's names of the outputs of a ``RenderCameraRequest``; rgb if none is given.
 
     Raises:
-        RequestError: a number stands for none.
+        RequestError: an unknown number.
     """
     if unknown := sorted(set(numbers) - set(CameraOutput)):
         known = ", ".join(f"{output.name} ({output.value})" for output in CameraOutput)
@@ -155,7 +155,7 @@ def outputs_of(numbers: Sequence[int]) -> tuple[str, ...]:
 
 
 def bytes_a_pixel(outputs: Sequence[str]) -> int:
-    """Bytes that the raw outputs take for each pixel; none for rgb, whose format says."""
+    """Bytes per pixel of the raw outputs; 0 for rgb, which depends on the format."""
     chosen = [spec for output, spec in _RAW.items() if output.name.lower() in outputs]
     return sum(np.dtype(kind).itemsize * int(np.prod(channels)) for _, kind, channels in chosen)
 

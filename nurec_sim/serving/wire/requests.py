@@ -182,7 +182,7 @@ def write_poses(poses: Float64[np.ndarray, "n 4 4"], messages: Sequence) -> None
 
 
 def read_poses(messages: Sequence, names: Sequence[str]) -> Float64[np.ndarray, "n 4 4"]:
-    """Poses of ``common.Pose`` messages; ``names`` say in an error which one was wrong.
+    """Poses of ``common.Pose`` messages; ``names`` identify them in errors.
 
     Raises:
         RequestError: a value is not finite, a quaternion is not a unit one, or ``exact`` is not a rigid transform.
@@ -253,7 +253,7 @@ def _text(values: np.ndarray) -> str:
 
 
 def write_mounting(rig_from_sensor: Matrix4, message) -> None:
-    """Fills the ``common.Pose`` of a sensor in its rig (``rig_to_camera``: the name says the inverse of what it is)."""
+    """Fills the ``common.Pose`` of a sensor in its rig (named ``rig_to_camera``, but it is ``rig_from_camera``)."""
     write_poses(rig_from_sensor[None], [message])
 
 

@@ -121,7 +121,13 @@ def read_camera(message, width_px: int, height_px: int, known: Mapping[str, Came
     """The camera that a ``CameraSpec`` message describes, scaled to the requested size with its field of view kept.
 
     A message without lens parameters names one of the scene's ``known`` cameras by ``logical_id``. A requested width of
-    0 or 1 follows from the height and the native aspect ratio, and so the other way round.
+    0 or 1 follows from the height and the native aspect ratio, and the other way round.
+
+    Args:
+        message: the ``CameraSpec``.
+        width_px: requested width.
+        height_px: requested height.
+        known: the scene's cameras by id.
 
     Raises:
         RequestError: no lens and no known camera of that id, or the parameters make no camera.

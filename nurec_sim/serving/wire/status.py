@@ -26,7 +26,7 @@ _CODES: tuple[tuple[type[errors.NurecSimError], grpc.StatusCode], ...] = (
     (errors.PlanError, grpc.StatusCode.ABORTED),
 )
 _GRPC_SAYS_TOO = (grpc.StatusCode.UNIMPLEMENTED, grpc.StatusCode.DEADLINE_EXCEEDED)
-"""What clients also get from servers that were never reached, or are not ours; to them it is a ``ServerError``."""
+"""Statuses that gRPC itself also produces; for clients they are a ``ServerError``."""
 _CODE_OF_NUMBER = {code.value[0]: code for code in grpc.StatusCode}
 
 
@@ -46,7 +46,7 @@ def text_of(error: Exception) -> str:
 
 
 def error_of(code: grpc.StatusCode | int, text: str) -> errors.NurecSimError:
-    """The error that a status stands for; ``ServerError`` where it stands for none of ours."""
+    """The error of a status; ``ServerError`` where there is none."""
     if isinstance(code, int):
         code = _CODE_OF_NUMBER.get(code, grpc.StatusCode.UNKNOWN)
     kind = next((kind for kind, known in _CODES if known is code and code not in _GRPC_SAYS_TOO), None)

@@ -138,9 +138,9 @@ SHA = "0" * 64
         ([header(DATA, sha256="abc")], RequestError, "sha256 must have 64 hexadecimal digits"),
         ([header(DATA, size=0)], RequestError, "size is missing"),
         ([header(DATA, size=1 << 60)], TooLargeError, "an upload may have 20,971,520 bytes"),
-        ([header(DATA), body(DATA[:-1])], RequestError, "the header promised 180 bytes, 179 came"),
+        ([header(DATA), body(DATA[:-1])], RequestError, "the header announced 180 bytes, 179 came"),
         ([header(DATA), body(DATA), body(b"x")], RequestError, "more bytes than the 180"),
-        ([header(DATA, sha256=SHA), body(DATA)], RequestError, "the bytes have sha256 .*the header promised 0000"),
+        ([header(DATA, sha256=SHA), body(DATA)], RequestError, "the bytes have sha256 .*the header announced 0000"),
         ([header(DATA), body(DATA)], ArchiveError, "new.usdz: not a readable ZIP archive"),
     ],
 )

@@ -1,8 +1,8 @@
-"""Reconstructions kept on disk by the content they depend on: made once, however many processes ask.
+"""Disk cache of reconstructions, keyed by content: computed once for all processes.
 
 A reconstruction is written under the lock ``.<key>.lock``, first to ``.<key>.usdz.<anything>.part`` and, once it is
-complete and on the disk, renamed to ``<key>.usdz``. So a process that dies leaves a lock that nobody holds and perhaps
-a part; both are removed by the next that uses the folder.
+complete and on the disk, renamed to ``<key>.usdz``. A process that dies leaves an unlocked lock file and perhaps
+a part; both are removed by the next process that uses the folder.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _PART = re.compile(rf"\.({_KEY})\.usdz\..*\.part")
 _LOCK = re.compile(rf"\.({_KEY})\.lock")
 
 
-class KeptReconstructions:
-    """The folder of kept reconstructions; what killed processes left there is removed at once.
+class ReconstructionCache:
+    """The folder of cached reconstructions; leftovers of killed processes are removed at once.
 
     Args:
-        folder: made when the first reconstruction is kept.
+        folder: created with the first reconstruction.
         say: called with a line of text when a reconstruction begins.
     """
 
@@ -41,15 +41,15 @@ class KeptReconstructions:
         self._remove_leftovers()
 
     def scene(self, clip_path: Path, recipe: Recipe, progress: Progress) -> GaussianScene:
-        """The reconstruction of a clip, kept or made now; the same bits either way.
+        """The reconstruction of a clip, from the cache or computed now; the same bits either way.
 
-        What is damaged is made again. If it cannot be kept (no room on the disk, a folder that cannot be written), that
-        is said in the log once, and the scene is given all the same.
+        A damaged file is computed again. If it cannot be stored (disk full, folder not writable), that is logged once,
+        and the scene is returned anyway.
 
         Args:
             clip_path: the clip.
-            recipe: how.
-            progress: hears what is being done and the fraction of it that is; what it raises ends the work.
+            recipe: method and settings.
+            progress: called with the stage and the fraction done; what it raises cancels the work.
 
         Raises:
             ClipError, ReconstructError, WeightsError: the clip cannot be reconstructed.
@@ -108,7 +108,7 @@ class KeptReconstructions:
 
 
 def _read(kept: Path) -> GaussianScene | None:
-    """A kept scene; None if there is none, or it is damaged."""
+    """A cached scene; None if there is none, or it is damaged."""
     from nurec_sim.scene import read_scene
 
     if not kept.exists():
