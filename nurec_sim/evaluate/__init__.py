@@ -1,6 +1,6 @@
-"""Measures reconstructions: against what a log recorded, and against the true world.
+"""Evaluation of reconstructions against recorded sensors and against procedural worlds.
 
-``evaluate`` scores one log with cameras and sweeps that were held out. ``run_protocol`` compares methods side by side
+``evaluate`` scores one log with held-out cameras and sweeps. ``run_protocol`` compares methods
 (docs/evaluation.md) on windows of procedural worlds or of real logs. Public names load on first use.
 """
 

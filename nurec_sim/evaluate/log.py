@@ -44,7 +44,7 @@ def evaluate(
     progress: Progress | None = None,
     **options: Any,
 ) -> dict[str, object]:
-    """Reconstruct a clip and score what it renders.
+    """Reconstructs a clip and scores its renderings.
 
     Args:
         clip: the log.
@@ -54,17 +54,17 @@ def evaluate(
         hold_out_every: hold out images N-1, 2N-1, ... of the input cameras, and the sweeps taken meanwhile; 0: none.
         hold_out_sweeps_every: hold out sweeps K, 2K, ...; 0: none.
         hold_out_sweeps: further sweeps to hold out, by index.
-        via_grpc: whether frames come from a sensor server in this process over gRPC, or from a renderer directly.
+        via_grpc: render through a sensor server in this process over gRPC, or directly.
         device: that renders; see ``render.choose_device``.
         images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
-        progress: called with a stage and the fraction of all work that is done, about.
-        options: passed on to ``reconstruct``.
+        progress: called with the stage and the approximate fraction done.
+        options: passed to ``reconstruct``.
 
     Returns:
         what ``score_scene`` returns, with ``method`` and the ``seconds`` of each stage of the reconstruction.
 
     Raises:
-        ReconstructError: an unknown method, camera or sweep, or a clip that lacks what the method needs.
+        ReconstructError: an unknown method, camera or sweep, or a clip without the data that the method needs.
     """
     from nurec_sim.reconstruct import reconstruct
 
@@ -188,12 +188,12 @@ def _probe(scene: GaussianScene, device: str) -> Callable[[SensorRequest], Camer
 
 
 def _part(report: Progress, begin: float, end: float) -> Progress:
-    """Reports a part of all work."""
+    """Maps the progress of a part to the whole."""
     return lambda stage, fraction: report(stage, begin + fraction * (end - begin))
 
 
 class _StageClock:
-    """Passes progress on, and adds up the time between the calls by stage; what follows a comma is no part of it."""
+    """Forwards progress, and accumulates the time per stage (its name up to a comma)."""
 
     def __init__(self, report: Progress) -> None:
         self.report, self.stage, self.since = report, "start", time.perf_counter()
@@ -214,7 +214,7 @@ class _StageClock:
 
 @contextlib.contextmanager
 def sensing(scene: GaussianScene, via_grpc: bool, device: str) -> Iterator[Sense]:
-    """A ``sense`` for a scene: through a server on a free port of this machine, or a renderer in this process."""
+    """A ``sense`` for a scene: through a server on a free local port, or a renderer in this process."""
     if not via_grpc:
         yield make_renderer(scene, device).sense
         return
@@ -234,6 +234,6 @@ def _score_road(scene: GaussianScene) -> dict[str, object] | None:
         return None
     try:
         found = offroad_agreement(scene_offroad_grid(scene), scene.road_map, scene.ego, scene.rig.body)
-    except (ReconstructError, ValueError) as error:  # no road was labelled, or the car hardly moved
+    except (ReconstructError, ValueError) as error:  # no labelled road, or the car hardly moved
         return {"not_known": str(error)}
     return {name: None if value != value else value for name, value in dataclasses.asdict(found).items()}

@@ -1,4 +1,4 @@
-"""The methods that are compared: each turns a log into something that shows views."""
+"""The compared methods: each turns a log into a renderer of views."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from nurec_sim.render import make_renderer
 from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, SensorRequest
 
 Show = Callable[[SensorRequest], CameraFrame]
-"""Answers a request for a camera image; without ``depth_m`` where a method knows none."""
+"""Renders a camera image; without ``depth_m`` if the method has no depth."""
 
 CHOICES: Mapping[str, str] = {
     "dense": "the network, one Gaussian per pixel",
     "selective": "the network, clusters around chosen points",
-    "dense-lidar": "dense, its depth fitted to the LiDAR that lift sees, from place to place",
-    "dense-concatenated": "dense, all Gaussians of all chunks kept instead of merged by ownership",
+    "dense-lidar": "dense, with depth fitted locally to the LiDAR",
+    "dense-concatenated": "dense, with chunks concatenated instead of merged by ownership",
     "lift": "coloured LiDAR and stereo, no learning",
-    "optimized": "lift, then fitted to the seen images and sweeps (400 steps)",
-    "copy": "the input image nearest in time, as it is; knows no depth",
+    "optimized": "lift, then optimised on the input images and sweeps (400 steps)",
+    "copy": "the input image nearest in time, unchanged; no depth",
 }
 
 LIFT = LiftSettings(sky_px=256)
-"""A finer sky would not be seen at the size at which views are compared."""
+"""Sufficient sky resolution for the size at which views are compared."""
 OPTIMIZED = OptimizeSettings(seconds=None, steps=400)
-"""Steps, not seconds: figures must not depend on the machine."""
+"""Steps instead of seconds, so that results do not depend on the machine."""
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A method under the name that tables call it; ``settings`` are those of ``reconstruct``, None for a copy.
+    """A method with its name in tables; ``settings`` are those of ``reconstruct``, None for ``copy``.
 
-    ``method`` is a reference as ``reconstruct.load_method`` takes it, or ``copy``.
+    ``method`` is a reference for ``reconstruct.load_method``, or ``copy``.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Contender:
 
 @dataclass(frozen=True)
 class Built:
-    """What a method made of a log: views on demand, the scene behind them if there is one, the seconds it took."""
+    """Result of a method on a log: a view renderer, the scene if any, and the seconds taken."""
 
     show: Show
     scene: GaussianScene | None
@@ -58,7 +58,7 @@ class Built:
 
     @property
     def gaussians(self) -> int | None:
-        """How many there are."""
+        """Number of Gaussians."""
         return None if self.scene is None else len(self.scene.static) + len(self.scene.dynamic)
 
 
@@ -71,10 +71,10 @@ def contenders(
     """The methods of these names.
 
     Args:
-        names: of ``CHOICES``, or references to other methods as ``reconstruct.load_method`` takes them, which get their
-            default settings; in the order of the tables, none twice.
-        network: how logs go through the network; profile and checkpoint are for ``dense``, or for ``selective`` if the
-            profile is one of its. Both share the rest.
+        names: of ``CHOICES``, or references for ``reconstruct.load_method`` with default settings; in the order of the
+            tables, without duplicates.
+        network: network settings; profile and checkpoint apply to ``dense``, or to ``selective`` if the profile is
+            selective, all other settings to both.
         selective_checkpoint: weights of ``selective``.
         lift: settings of ``lift``; ``LIFT`` if None.
 
@@ -122,7 +122,7 @@ def _decoder(profile: str) -> str:
 
 
 def without_weights(contender: Contender) -> str | None:
-    """Why a method cannot run here: nobody named weights for it, and there are none. None if it can."""
+    """The reason if a method has no weights, else None."""
     settings = contender.settings
     if not isinstance(settings, FeedForwardSettings) or settings.checkpoint is not None:
         return None
@@ -134,10 +134,10 @@ def without_weights(contender: Contender) -> str | None:
 
 
 def describe(contender: Contender) -> dict[str, Any]:
-    """Everything that a method's results depend on, as plain JSON; files by the digest of their bytes.
+    """All settings of a method as plain JSON; files by their digest.
 
     Raises:
-        WeightsError: the network's weights are not there.
+        WeightsError: the network's weights are missing.
     """
     said: dict[str, Any] = {"method": contender.method}
     settings = contender.settings
@@ -157,11 +157,11 @@ def describe(contender: Contender) -> dict[str, Any]:
 
 
 def build(contender: Contender, window: Window, device: str = "auto") -> Built:
-    """Let a method see a window's log; ``device`` renders what it made of it (``render.choose_device``).
+    """Runs a method on a window's log; ``device`` renders its result (``render.choose_device``).
 
     Raises:
-        ReconstructError: the log lacks what the method needs.
-        WeightsError: the network's weights are not there or cannot be used.
+        ReconstructError: the log lacks data that the method needs.
+        WeightsError: the network's weights are missing or unusable.
     """
     if contender.method == "copy":
         return Built(lambda request: _nearest(window.clip, request), None, 0.0)
@@ -180,7 +180,7 @@ def _sees_lidar(contender: Contender) -> bool:
 
 
 def _look(window: Window, sweeps: bool) -> None:
-    """Ask for all that a method reads, so that drawing it is not counted as the method's time."""
+    """Loads all inputs of a method, so that generating them does not count as the method's time."""
     clip = window.clip
     for camera in window.cameras:
         for index in range(len(clip.camera_times_us(camera))):
@@ -191,11 +191,11 @@ def _look(window: Window, sweeps: bool) -> None:
 
 
 def _nearest(clip: Clip, request: SensorRequest) -> CameraFrame:
-    """The frame of the requested camera that was taken nearest in time."""
+    """The frame of the requested camera nearest in time."""
     camera = request.sensor
     assert isinstance(camera, CameraModel)
     middle = clip.camera_times_us(camera.id).sum(axis=1) // 2
     if not len(middle):
-        raise ReconstructError(f"clip {clip.id!r}: camera {camera.id!r} has no seen frame that could be copied")
+        raise ReconstructError(f"clip {clip.id!r}: camera {camera.id!r} has no input frame to copy")
     index = int(np.argmin(np.abs(middle - (request.start_us + request.end_us) // 2)))
     return CameraFrame(camera, request.start_us, request.end_us, clip.image(camera.id, index))

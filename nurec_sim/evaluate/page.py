@@ -21,9 +21,9 @@ from nurec_sim.report.template import SCRIPT, STYLE
 
 JPEG_QUALITY = 88
 TITLES = {
-    "storm": "2 s windows, four seen frames",
+    "storm": "2 s windows, four input frames",
     "clip": "Whole clips through the chunked pipeline",
-    "shift": "Views beside the driven path",
+    "shift": "Views at lateral offsets",
 }
 CURVES = {"psnr_db": "PSNR (dB)", "abs_rel": "AbsRel (aligned)", "abs_rel_metric": "AbsRel (metres)"}
 COLOURS = ("#1d4ed8", "#b45309", "#15803d", "#7e22ce", "#64748b")
@@ -85,7 +85,7 @@ def _methods(methods: Mapping[str, Any]) -> str:
         seed = (said.get("settings") or {}).get("random_weights")
         text = f"{CHOICES.get(name, '')}"
         text += f"; weights {weights[:12]}" if weights else ""
-        text += f"; random weights of seed {seed}: its figures mean nothing" if seed is not None else ""
+        text += f"; random weights of seed {seed}: its results are meaningless" if seed is not None else ""
         items.append(f"<li><b>{escape(name)}</b>: {escape(text)}</li>")
     return f'<h2>Methods</h2><div class="card"><ul>{"".join(items)}</ul></div>'
 
@@ -93,7 +93,7 @@ def _methods(methods: Mapping[str, Any]) -> str:
 def _sheet(path: Path, windows: Sequence[Mapping[str, Any]]) -> str:
     picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
-        raise RunError(f"{path} is no picture; delete it and its window's figures, and run again")
+        raise RunError(f"{path} is not an image; delete it and its window's record, and run again")
     data = base64.b64encode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
     about: Mapping[str, Any] = next((window["about"] for window in windows if window["id"] == path.stem), {})
     facts = " · ".join(f"{key.replace('_', ' ')} {value}" for key, value in about.items())
@@ -104,7 +104,7 @@ def _sheet(path: Path, windows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _curves(methods: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures over the offset from the path; none where there is no such curve."""
+    """Metrics over the offset from the path, if available."""
     if not any(row["curve"] for row in methods.values()):
         return {}
     figures = {}
@@ -119,6 +119,6 @@ def _curves(methods: Mapping[str, Any]) -> dict[str, Any]:
                     "y": [round(y, 4) for _, y in points], "line": {"color": colour, "width": 2},
                 })  # fmt: skip
         layout = base_layout(300)
-        layout["xaxis"]["title"], layout["yaxis"]["title"] = {"text": "metres beside the path"}, {"text": title}
+        layout["xaxis"]["title"], layout["yaxis"]["title"] = {"text": "lateral offset (m)"}, {"text": title}
         figures[f"curve_{column}"] = {"data": traces, "layout": layout}
     return figures

@@ -1,8 +1,8 @@
-"""The protocols: which windows there are, what the methods see of them and what they are asked for.
+"""The protocols: windows, inputs and targets.
 
-``storm``  2 s at 10 Hz; frames 0, 5, 10 and 15 are seen, the other 16 are asked for (paper section 5.1, Table 1).
-``clip``   a whole log through the chunked pipeline; every k-th frame is asked for, the rest is seen (Table 2).
-``shift``  as ``storm``, but asked for are views beside the driven path, where a drawn world has the answer.
+``storm``  2 s at 10 Hz; frames 0, 5, 10 and 15 are inputs, the other 16 targets (paper section 5.1, Table 1).
+``clip``   a whole log through the chunked pipeline; every k-th frame is a target, the rest are inputs (Table 2).
+``shift``  as ``storm``, but with targets at lateral offsets, in procedural worlds only.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate.drawn import Drawing, camera_responses, evaluation_rig, held_out_plan
+from nurec_sim.evaluate.procedural import EvaluationWorld, camera_responses, evaluation_rig, held_out_plan
 from nurec_sim.evaluate.windows import ContextClip, Target, Window
 from nurec_sim.world import Quality, TrueWorld
 
@@ -28,17 +28,17 @@ ProtocolName = Literal["storm", "clip", "shift"]
 STEP_US = 100_000
 STORM_FRAMES, STORM_CONTEXT = 20, (0, 5, 10, 15)
 START_S = 1.0
-"""Windows begin so long after their world does."""
+"""Start of windows after the start of their world."""
 SHIFTS_M = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
 SHIFT_FRAMES = (3, 8, 13)
-"""Frames of the window at which views beside the path are asked for: each about halfway between two seen ones."""
+"""Target frames for lateral offsets: each about halfway between two input frames."""
 NEAR_M, NEAR_SHARE = 1.0, 0.2
-"""A camera with more than this share of its pixels nearer than this is inside of something."""
+"""A camera with more than this fraction of pixels nearer than this is inside an object."""
 QUALITY = Quality(lidar="drawn")
 
 Progress = Callable[[str, float], None]
 Made = tuple[ContextClip, list[Target]]
-"""What the methods see, and what they are asked for."""
+"""Inputs and targets."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,15 @@ class Protocol:
 
     Attributes:
         name: one of ``PROTOCOLS``.
-        seeds: of the drawn worlds.
-        clips: recorded logs to use instead; the three settings of drawn images and ``seconds`` do not count for them.
-        boxes: whether the methods get the boxes of what can move.
-        size_px: width and height of the drawn images.
+        seeds: of the procedural worlds.
+        clips: recorded logs to use instead; ``size_px``, ``seconds`` and ``backend`` do not apply to them.
+        boxes: whether the methods get the boxes of movable objects.
+        size_px: width and height of the images.
         seconds: length of a ``clip``.
         rate_hz: frames per second of a ``clip``.
-        hold_out_every: which frames of a ``clip`` are asked for: k - 1, 2k - 1, ...
+        hold_out_every: target frames of a ``clip``: k - 1, 2k - 1, ...
         cameras: of a ``clip``: 1 or 3.
-        backend: what draws, as in ``TrueWorld``.
+        backend: of ``TrueWorld``.
     """
 
     name: ProtocolName
@@ -78,11 +78,11 @@ class Protocol:
         if self.name not in PROTOCOLS:
             raise ReconstructError(f"no protocol {self.name!r}; have {list(PROTOCOLS)}")
         if bool(self.seeds) == bool(self.clips):
-            raise ReconstructError("a protocol runs on drawn worlds or on recorded logs: give seeds or clips")
+            raise ReconstructError("a protocol runs on procedural worlds or on recorded logs: give seeds or clips")
         if min(self.seeds, default=0) < 0 or len(set(self.seeds)) < len(self.seeds):
             raise ReconstructError(f"seeds must not be negative, and each may be given once, got {self.seeds}")
         if self.clips and self.name == "shift":
-            raise ReconstructError("protocol 'shift' needs drawn worlds: no log recorded what is beside its path")
+            raise ReconstructError("protocol 'shift' needs procedural worlds: logs have no views at lateral offsets")
         if not 2 <= self.seconds <= 20 or not 1 <= self.rate_hz <= 10 or self.hold_out_every < 2:
             raise ReconstructError(
                 "a clip lasts 2..20 seconds at 1..10 Hz and holds out every second frame or fewer, got "
@@ -110,13 +110,13 @@ class Protocol:
             else:
                 new = clip_window(clip, self.cameras, self.hold_out_every, self.boxes)
             if found.keys() & new.keys():
-                raise ReconstructError(f"two of the logs are called {clip.id!r}; give each once")
+                raise ReconstructError(f"two logs have the id {clip.id!r}; give each once")
             found |= new
         return found
 
     @contextlib.contextmanager
     def window(self, index: int, progress: Progress | None = None) -> Iterator[Window]:
-        """Draw or read one window; it can be used until the block ends."""
+        """Generates or reads one window, valid until the block ends."""
         report, name = progress or (lambda stage, fraction: None), self.ids[index]
         if self.clips:
             report("reading the log", 0.0)
@@ -128,57 +128,57 @@ class Protocol:
         rig = evaluation_rig(self.cameras if self.name == "clip" else 1, *self.size_px)
         responses = camera_responses(rig, plan.seed) if self.name == "clip" else {}
         with TrueWorld(plan, self.backend, responses, QUALITY) as world:
-            drawing = Drawing(world, rig)
-            report("drawing", 0.1)
-            clip, targets = _MAKERS[self.name](self, drawing, name, plan.span_us[0] + round(START_S * 1e6), report)
-            yield Window(name, clip, tuple(targets), _about(drawing, clip.span_us))
+            source = EvaluationWorld(world, rig)
+            report("rendering", 0.1)
+            clip, targets = _MAKERS[self.name](self, source, name, plan.span_us[0] + round(START_S * 1e6), report)
+            yield Window(name, clip, tuple(targets), _about(source, clip.span_us))
 
 
-def _storm(protocol: Protocol, drawing: Drawing, id: str, start_us: int, report: Progress) -> Made:
+def _storm(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, report: Progress) -> Made:
     times, span_us = _storm_times(start_us)
-    clip = drawing.clip(id, times[list(STORM_CONTEXT)], span_us, protocol.boxes)
-    camera = next(iter(drawing.rig.cameras))
+    clip = source.clip(id, times[list(STORM_CONTEXT)], span_us, protocol.boxes)
+    camera = next(iter(source.rig.cameras))
     targets = []
     for frame in range(STORM_FRAMES):
-        report("drawing", 0.1 + 0.9 * frame / STORM_FRAMES)
+        report("rendering", 0.1 + 0.9 * frame / STORM_FRAMES)
         if frame not in STORM_CONTEXT:
             beyond = frame > STORM_CONTEXT[-1]
-            targets.append(drawing.target(f"{frame:02d}", camera, int(times[frame]), beyond=beyond))
+            targets.append(source.target(f"{frame:02d}", camera, int(times[frame]), beyond=beyond))
     return clip, targets
 
 
-def _shift(protocol: Protocol, drawing: Drawing, id: str, start_us: int, report: Progress) -> Made:
+def _shift(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, report: Progress) -> Made:
     times, span_us = _storm_times(start_us)
-    clip = drawing.clip(id, times[list(STORM_CONTEXT)], span_us, protocol.boxes)
-    camera = next(iter(drawing.rig.cameras))
+    clip = source.clip(id, times[list(STORM_CONTEXT)], span_us, protocol.boxes)
+    camera = next(iter(source.rig.cameras))
     places = [0.0, *(side * shift for shift in SHIFTS_M for side in (1, -1))]
     targets = []
     for count, left_m in enumerate(places):
-        report("drawing", 0.1 + 0.9 * count / len(places))
+        report("rendering", 0.1 + 0.9 * count / len(places))
         for frame in SHIFT_FRAMES:
-            target = drawing.target(f"{frame:02d}{left_m:+.1f}", camera, int(times[frame]), left_m)
+            target = source.target(f"{frame:02d}{left_m:+.1f}", camera, int(times[frame]), left_m)
             if not _inside_something(target):
                 targets.append(target)
     return clip, targets
 
 
-def _clip(protocol: Protocol, drawing: Drawing, id: str, start_us: int, report: Progress) -> Made:
+def _clip(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, report: Progress) -> Made:
     count = int(protocol.seconds * protocol.rate_hz)
     times = start_us + np.rint(np.arange(count) * 1e6 / protocol.rate_hz).astype(np.int64)
     asked = list(range(protocol.hold_out_every - 1, count, protocol.hold_out_every))
     seen = sorted(set(range(count)) - set(asked))
     span_us = (start_us, start_us + round(protocol.seconds * 1e6))
-    clip = drawing.clip(id, times[seen], span_us, protocol.boxes)
+    clip = source.clip(id, times[seen], span_us, protocol.boxes)
     targets = []
     for number, frame in enumerate(asked):
-        report("drawing", 0.1 + 0.9 * number / len(asked))
-        for camera in drawing.rig.cameras:
+        report("rendering", 0.1 + 0.9 * number / len(asked))
+        for camera in source.rig.cameras:
             beyond = frame > seen[-1]
-            targets.append(drawing.target(f"{camera}-{frame:03d}", camera, int(times[frame]), beyond=beyond))
+            targets.append(source.target(f"{camera}-{frame:03d}", camera, int(times[frame]), beyond=beyond))
     return clip, targets
 
 
-_MAKERS: dict[ProtocolName, Callable[[Protocol, Drawing, str, int, Progress], Made]] = {
+_MAKERS: dict[ProtocolName, Callable[[Protocol, EvaluationWorld, str, int, Progress], Made]] = {
     "storm": _storm,
     "shift": _shift,
     "clip": _clip,
@@ -190,14 +190,14 @@ def _storm_times(start_us: int) -> tuple[np.ndarray, tuple[int, int]]:
 
 
 def _inside_something(target: Target) -> bool:
-    """Whether a view beside the path is from inside or right before a thing: nobody drives there."""
+    """Whether a shifted view is inside or right in front of an object."""
     depth_m = target.true.depth_m
     return depth_m is not None and float(((depth_m > 0) & (depth_m < NEAR_M)).mean()) > NEAR_SHARE
 
 
-def _about(drawing: Drawing, span_us: tuple[int, int]) -> dict[str, str | int | float]:
-    """What a window shows, in plain JSON."""
-    plan, ends = drawing.world.plan, drawing.ego.at(np.array(span_us))[:, :3, 3]
+def _about(source: EvaluationWorld, span_us: tuple[int, int]) -> dict[str, str | int | float]:
+    """Description of a window in plain JSON."""
+    plan, ends = source.world.plan, source.ego.at(np.array(span_us))[:, :3, 3]
     return {
         "seed": plan.seed,
         "split": plan.split,
@@ -205,5 +205,5 @@ def _about(drawing: Drawing, span_us: tuple[int, int]) -> dict[str, str | int | 
         "sky": plan.weather.preset,
         "driven_m": round(float(np.linalg.norm(ends[1] - ends[0])), 2),
         "plan": hashlib.sha256(plan.to_json().encode()).hexdigest()[:12],
-        "drawn_by": drawing.world.backend,
+        "drawn_by": source.world.backend,
     }

@@ -1,6 +1,6 @@
-"""Recorded logs as an evaluation sees them: frames and sweeps that are held out are the truth.
+"""Recorded logs for evaluation: held-out frames and sweeps are the ground truth.
 
-Depth is known where the held-out sweep nearest in time sent a beam, things that can move by the log's boxes.
+Depth comes from the held-out sweep nearest in time, the dynamic region from the log's boxes.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from nurec_sim.reconstruct.feedforward.inputs.frames import choose_cameras
 from nurec_sim.types import MOVABLE_LABELS, CameraModel, Clip, Rig, SensorRequest
 
 STEP_TOLERANCE = 0.25
-"""How far the time between frames may be from the protocol's."""
+"""Tolerance of the frame interval."""
 NEAREST_SWEEP_US = 60_000
-"""A sweep farther in time from a frame says nothing about its depth."""
+"""Maximum time between a frame and the sweep for its depth."""
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
 def front_cameras(clip: Clip, most: int) -> tuple[str, ...]:
-    """Up to so many cameras of a log, the front one first."""
+    """Up to ``most`` cameras of a log, the front one first."""
     from nurec_sim.network import PROFILES
 
     return choose_cameras(clip, PROFILES["tiny"])[:most]
@@ -36,10 +36,10 @@ def front_cameras(clip: Clip, most: int) -> tuple[str, ...]:
 def storm_windows(
     clip: Clip, frames: int, context: Sequence[int], step_us: int, boxes: bool
 ) -> dict[str, Callable[[], Window]]:
-    """Windows of so many frames of the front camera, one after the other, by their names; read when they are called.
+    """Consecutive windows of front camera frames, by name, as functions that read them.
 
     Raises:
-        ReconstructError: the log has no such frames, or not about ``step_us`` apart.
+        ReconstructError: too few frames, or not about ``step_us`` apart.
     """
     (camera,) = front_cameras(clip, 1)
     times = clip.camera_times_us(camera).sum(axis=1) // 2
@@ -61,7 +61,7 @@ def storm_windows(
 
 
 def clip_window(clip: Clip, cameras: int, every: int, boxes: bool) -> dict[str, Callable[[], Window]]:
-    """The whole log as one window, frames ``every - 1``, ``2 every - 1``, ... held out; read when it is called.
+    """The whole log as one window, frames ``every - 1``, ``2 every - 1``, ... held out; as a function that reads it.
 
     Raises:
         ReconstructError: the log has no frame to hold out.
@@ -86,16 +86,16 @@ def recorded_window(
 ) -> Window:
     """A window of a recorded log.
 
-    Sweeps nearest in time to views that are asked for are held out, unless the views themselves are seen.
+    Sweeps nearest in time to target views are held out, unless the views themselves are inputs.
 
     Args:
         clip: the log.
         id: name of the window.
-        cameras: those that the methods see.
-        seen: indices of the frames that they see, of each of these cameras.
-        asked: indices of the frames that they have to show.
+        cameras: input cameras.
+        seen: indices of the input frames of each of these cameras.
+        asked: indices of the target frames.
         boxes: whether the methods get the log's boxes.
-        asked_of: cameras whose frames they have to show; the seen ones if None.
+        asked_of: target cameras; default: the input cameras.
     """
     shown_by = list(cameras if asked_of is None else asked_of)
     frames = sorted({*seen, *asked})
@@ -169,7 +169,7 @@ def _target(clip: Clip, camera_id: str, index: int, sweep: tuple[str, int] | Non
 def projected_depth(
     request: SensorRequest, camera: CameraModel, xyz_world_m: Float64[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Z-depth at the size at which views are compared: of the nearest point in each pixel, 0 where there is none."""
+    """Z-depth at the scored size: of the nearest point in each pixel, 0 without a point."""
     width, height = scored_size(camera.width_px, camera.height_px)
     uv, valid, fraction = sensors.project_rolling(camera, request.world_from_sensor, xyz_world_m)
     valid &= sensors.in_image(camera, uv)
@@ -184,7 +184,7 @@ def projected_depth(
 
 
 def movable_pixels(clip: Clip, request: SensorRequest, camera: CameraModel) -> Bool[np.ndarray, "h w"]:
-    """Pixels inside the outlines of the boxes of things that can move, at the size at which views are compared."""
+    """Mask of the projected boxes of movable objects, at the scored size."""
     width, height = scored_size(camera.width_px, camera.height_px)
     mask = np.zeros((height, width), np.uint8)
     for track in clip.tracks:

@@ -1,4 +1,4 @@
-"""Runs a protocol window by window; what is finished stays on disk, and runs go on where they stopped.
+"""Runs a protocol window by window; finished windows are kept on disk and interrupted runs resumed.
 
 ::
 
@@ -30,7 +30,7 @@ from nurec_sim.files.new_files import write_file
 Progress = Callable[[str, float], None]
 SETTINGS, RESULTS, TABLES, REPORT = "settings.json", "results.json", "tables.md", "report.html"
 DRAWING_SHARE = 0.3
-"""Of a window's time, for the progress bar."""
+"""Fractions of a window's time, for the progress bar."""
 
 
 def run_protocol(
@@ -40,18 +40,17 @@ def run_protocol(
     progress: Progress | None = None,
     device: str = "auto",
 ) -> dict[str, Any]:
-    """Compare methods side by side.
+    """Compares methods on a protocol.
 
     Args:
-        protocol: which windows.
-        methods: what is compared; see ``contenders``.
-        folder: where windows, tables, sheets and the report go, and where finished windows are found again; None writes
-            nothing.
-        progress: called with what is done and the fraction of all that is.
+        protocol: the windows.
+        methods: the methods; see ``contenders``.
+        folder: run folder for windows, tables, sheets and report, also for resuming; None writes nothing.
+        progress: called with stage and fraction done.
         device: that renders; see ``render.choose_device``.
 
     Returns:
-        ``protocol``, ``methods`` (all settings), ``windows`` (every view's figures) and ``summary``
+        ``protocol``, ``methods`` (all settings), ``windows`` (per-view metrics) and ``summary``
         (``summary.summarize``), plain JSON.
 
     Raises:
@@ -74,7 +73,7 @@ def run_protocol(
 
 
 def settings_of(protocol: Protocol, methods: Sequence[Contender]) -> dict[str, Any]:
-    """All that the figures depend on, as JSON gives it back."""
+    """All settings that affect the results, as round-tripped JSON."""
     said = {
         "version": nurec_sim.__version__,
         "protocol": dataclasses.asdict(protocol),
@@ -111,12 +110,12 @@ def _window(
 
 
 def _part(progress: Progress, first: float, share: float) -> Progress:
-    """Progress of a part of something."""
+    """Maps the progress of a part to the whole."""
     return lambda stage, fraction: progress(stage, first + share * fraction)
 
 
 def _scored(method: Contender, window: Window, progress: Progress, device: str) -> Scored | str:
-    """A method's scores, or why it could not make anything of this window."""
+    """A method's scores, or the error text if it failed on this window."""
     try:
         return score_window(method, window, progress, device)
     except ReconstructError as error:
@@ -124,10 +123,10 @@ def _scored(method: Contender, window: Window, progress: Progress, device: str) 
 
 
 def _open_folder(folder: Path, settings: dict[str, Any]) -> None:
-    """Make a folder for these settings, or see that it is one.
+    """Creates a folder for these settings, or checks an existing one.
 
     Raises:
-        RunError: it holds a run with other settings.
+        RunError: it has a run with other settings.
     """
     for part in ("windows", "sheets"):
         (folder / part).mkdir(parents=True, exist_ok=True)
@@ -139,13 +138,13 @@ def _open_folder(folder: Path, settings: dict[str, Any]) -> None:
     if found != settings:
         where, was, now = next(_differences(found, settings))
         raise RunError(
-            f"{folder} holds a run with another setting: {where} was {was}, now it is {now}; "
-            "repeat the old settings, or start a new run without --resume"
+            f"{folder} has a run with other settings: {where} was {was}, now {now}; "
+            "use the old settings, or start a new run without --resume"
         )
 
 
 def _differences(was: Any, now: Any, where: str = "") -> Any:
-    """Where two JSON values differ: (path, old, new)."""
+    """Differences of two JSON values: (path, old, new)."""
     if isinstance(was, dict) and isinstance(now, dict):
         for key in sorted({*was, *now}):
             yield from _differences(was.get(key), now.get(key), f"{where}.{key}" if where else key)
@@ -154,13 +153,13 @@ def _differences(was: Any, now: Any, where: str = "") -> Any:
 
 
 def _finished(folder: Path, name: str, methods: Sequence[Contender]) -> dict[str, Any] | None:
-    """The record of a window that an earlier run finished."""
+    """The record of a finished window."""
     path = folder / "windows" / f"{name}.json"
     if not path.exists():
         return None
     record = _read(path)
     if not isinstance(record, dict) or set(record.get("methods", ())) != {method.name for method in methods}:
-        raise RunError(f"{path} does not hold the figures of these methods; delete it and run again")
+        raise RunError(f"{path} does not have the results of these methods; delete it and run again")
     return record
 
 

@@ -1,4 +1,4 @@
-"""Scores of one method on one window: images and depth, over all pixels, what can move, and what cannot."""
+"""Scores of one method on one window: images and depth, full image, dynamic and static region."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from nurec_sim.evaluate.views import ScoredView, reduced
 from nurec_sim.evaluate.windows import Target, Window
 
 HIGHEST_PSNR_DB = 100.0
-"""Of images that are equal."""
+"""PSNR of identical images."""
 
 Figures = dict[str, float | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A method's record of a window, plain JSON, and its views by the names of the targets."""
+    """A method's record of a window (plain JSON) and its views by target name."""
 
     record: dict[str, Any]
     views: dict[str, ScoredView]
@@ -36,7 +36,7 @@ def score_window(
     progress: Callable[[str, float], None] | None = None,
     device: str = "auto",
 ) -> Scored:
-    """Let a method see a window and compare all that it shows with the truth.
+    """Runs a method on a window and scores its target views.
 
     Args:
         contender: the method.
@@ -69,12 +69,12 @@ def score_window(
 
 
 def score_view(view: ScoredView, target: Target) -> dict[str, Figures | None]:
-    """Figures of one view: ``full``; where the truth knows what can move, ``dynamic`` (its pixels) and ``static``.
+    """Scores of one view: ``full``; with a known dynamic region also ``dynamic`` and ``static``.
 
-    ``static`` are all other pixels; each of the two is None where it has none. Each has ``psnr_db``, ``ssim``, and
-    where depth is known ``abs_rel`` and ``delta1`` after the frame's least-squares scale over all pixels,
-    ``abs_rel_metric`` and ``delta1_metric`` as predicted; ``full`` also ``depth_scale`` and ``depth_coverage``. None
-    stands for what cannot be computed.
+    ``static`` is the complement of ``dynamic``; either is None if empty. Each has ``psnr_db``, ``ssim``, and with known
+    depth ``abs_rel`` and ``delta1`` after the frame's least-squares scale over all pixels, ``abs_rel_metric`` and
+    ``delta1_metric`` as predicted; ``full`` also ``depth_scale`` and ``depth_coverage``. Values that cannot be computed
+    are None.
     """
     true, mask = target.true, target.movable
     full: Figures = {"psnr_db": _capped(psnr(view.rgb, true.rgb)), "ssim": ssim(view.rgb, true.rgb)}
@@ -114,5 +114,5 @@ def _capped(psnr_db: float) -> float:
 
 
 def _known(value: float) -> float | None:
-    """JSON has no NaN: what cannot be computed is null."""
+    """None for NaN, which JSON lacks."""
     return float(value) if np.isfinite(value) else None

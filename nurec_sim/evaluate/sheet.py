@@ -1,4 +1,4 @@
-"""Contact sheets: what is truly there, and beside it what every method shows."""
+"""Contact sheets: ground truth beside every method."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from nurec_sim.files.new_files import new_file
 
 Picture = UInt8[np.ndarray, "h w 3"]
 NEAR_M, FAR_M = 2.0, 80.0
-"""Ends of the depth colours, which follow the logarithm."""
+"""Range of the logarithmic depth colour scale."""
 BAR_PX, GAP_PX = 18, 3
 PAPER, INK, UNKNOWN = (250, 250, 250), (40, 40, 40), (225, 225, 225)
 
 
 def draw_sheet(path: Path, window: Window, shown: Mapping[str, Scored]) -> None:
-    """Write a sheet as PNG: some targets below one another, then the depth of the first; one column per method."""
+    """Writes a sheet as PNG: a row per target, then the depth of the first; one column per method."""
     columns = ["truth", *shown]
     rows = []
     chosen = chosen_targets(window.targets)
@@ -37,7 +37,7 @@ def draw_sheet(path: Path, window: Window, shown: Mapping[str, Scored]) -> None:
     cells = [_cell(_depth(target.true), f"{target.name}  depth, {NEAR_M:g} to {FAR_M:g} m")]
     for name in columns[1:]:
         error = _figures(shown[name], target)["full"]["abs_rel"]
-        caption = f"{name}  depth not known" if error is None else f"{name}  AbsRel {error:.3f}"
+        caption = f"{name}  depth unknown" if error is None else f"{name}  AbsRel {error:.3f}"
         cells.append(_cell(_depth(shown[name].views[target.name]), caption))
     rows.append(_beside(cells))
     sheet = _below(rows)
@@ -46,10 +46,10 @@ def draw_sheet(path: Path, window: Window, shown: Mapping[str, Scored]) -> None:
 
 
 def chosen_targets(targets: Sequence[Target]) -> list[Target]:
-    """What a sheet shows of a window.
+    """The targets on a sheet.
 
-    Beside the path: a view on it, to its left, to its right and far off. Else the middle view between the seen frames
-    of each camera, and the last one after them.
+    With lateral offsets: on the path, left, right and far off. Otherwise the middle interpolated view of each camera,
+    and the last extrapolated one.
     """
     if beside := [target for target in targets if target.left_m]:
         at = sorted(beside, key=lambda target: (target.left_m, target.name))
@@ -75,7 +75,7 @@ def _rgb(view: ScoredView) -> Picture:
 
 
 def _depth(view: ScoredView) -> Picture:
-    """Depth as colours, near things bright; grey where there is none."""
+    """Depth as colours, near is bright; grey if unknown."""
     if view.depth_m is None:
         return np.full(view.rgb.shape, UNKNOWN, np.uint8)
     colours = cv2.applyColorMap(_shade(view.depth_m), cv2.COLORMAP_TURBO)[..., ::-1].copy()
@@ -100,7 +100,7 @@ def _beside(cells: Sequence[Picture]) -> Picture:
 
 
 def _below(rows: Sequence[Picture]) -> Picture:
-    """Rows of any width, the shorter ones with empty space at their right."""
+    """Stacks rows of any width, padded on the right."""
     width = max(row.shape[1] for row in rows)
     return np.vstack(
         [np.pad(row, ((0, GAP_PX), (0, width - row.shape[1]), (0, 0)), constant_values=250) for row in rows]

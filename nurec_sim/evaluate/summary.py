@@ -1,7 +1,7 @@
-"""From the records of single views to the figures of a protocol.
+"""Aggregates the records of single views to the results of a protocol.
 
-Figures are means over views, as in the public protocol; differences between methods are paired by window and have a
-95 % interval of a bootstrap over windows.
+Results are means over views, as in the public protocol; differences between methods are paired by window with a 95 %
+bootstrap interval over windows.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ PAIRS = (
     ("optimized", "lift"),
     ("optimized", "dense"),
 )
-"""Methods whose difference is told, where both took part."""
+"""Pairs of methods whose difference is reported."""
 DRAWS = 2000
 CURVE = ("psnr_db", "ssim", "abs_rel", "abs_rel_metric", "depth_coverage")
 
 
 def summarize(windows: Sequence[Record], methods: Iterable[str]) -> dict[str, Any]:
-    """Figures of every method over all windows, and differences between methods.
+    """Results of every method over all windows, and differences between methods.
 
     Args:
-        windows: records with ``id`` and ``methods``: by name what ``score_window`` gave, or ``error``.
+        windows: records with ``id`` and ``methods``: by name the result of ``score_window``, or ``error``.
         methods: names in the order of the tables.
 
     Returns:
@@ -76,13 +76,13 @@ def _means(rows: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> 
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """The mean of what is known; None where nothing is."""
+    """The mean of known values; None without any."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 
 
 def _curve(rows: Sequence[Record]) -> dict[str, dict[str, float | None]]:
-    """Means by distance from the path, both sides together; empty where all views are on the path."""
+    """Means by distance from the path, both sides combined; empty without lateral offsets."""
     offsets = sorted({abs(row["left_m"]) for row in rows})
     if len(offsets) < 2:
         return {}
@@ -91,9 +91,9 @@ def _curve(rows: Sequence[Record]) -> dict[str, dict[str, float | None]]:
 
 
 def doubling_offset(abs_rel: Mapping[float, float | None]) -> float | None:
-    """Where a curve over the offset first reaches twice its value at 0, between its points by a straight line.
+    """Offset at which a linearly interpolated curve first reaches twice its value at 0.
 
-    None where it does not, or where a value is not known.
+    None if it does not, or if a value is unknown.
     """
     offsets = sorted(abs_rel)
     values = [abs_rel[offset] for offset in offsets]
@@ -110,7 +110,7 @@ def doubling_offset(abs_rel: Mapping[float, float | None]) -> float | None:
 
 
 def _difference(windows: Sequence[Record], one: str, other: str) -> dict[str, Any]:
-    """How much better ``one`` is: mean over windows of the difference of their means, with intervals."""
+    """Advantage of ``one``: mean over windows of the difference of their means, with intervals."""
     both = [w for w in windows if all("error" not in w["methods"][name] for name in (one, other))]
 
     def paired(of: Callable[[Record], Mapping[str, float | None] | None]) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def _difference(windows: Sequence[Record], one: str, other: str) -> dict[str, An
 
 
 def interval(values: Sequence[float]) -> list[float] | None:
-    """95 % interval of the mean by a bootstrap; None of fewer than three values. Same values, same interval."""
+    """Deterministic 95 % bootstrap interval of the mean; None with fewer than three values."""
     if len(values) < 3:
         return None
     draws = np.random.default_rng([len(values), 0xB007]).integers(0, len(values), (DRAWS, len(values)))

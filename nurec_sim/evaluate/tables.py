@@ -1,4 +1,4 @@
-"""The tables of a protocol: the same rows for the screen, Markdown, CSV and the report."""
+"""The tables of a protocol for terminal, Markdown, CSV and report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PAPER_COLUMNS = ("psnr_db", "ssim", "abs_rel", "delta1")
 
 @dataclass(frozen=True)
 class Table:
-    """A heading and rows of text; ``note`` says how to read it."""
+    """Heading and rows of text, with an explanatory ``note``."""
 
     name: str
     title: str
@@ -26,7 +26,7 @@ class Table:
     note: str = ""
 
     def markdown(self) -> str:
-        """As Markdown, with its title and note."""
+        """Markdown with title and note."""
         lines = [self.heading, ["---"] + ["---:"] * (len(self.heading) - 1), *self.rows]
         body = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
         return f"## {self.title}\n\n{body}\n" + (f"\n{self.note}\n" if self.note else "")
@@ -81,11 +81,11 @@ def _paper_table(results: Mapping[str, Any]) -> Table:
     boxes = "with the log's boxes" if protocol["boxes"] else "without boxes, as the paper's network"
     windows = count_of(len(results["windows"]), "window")
     note = (
-        f"{windows}, {views} views a method. Depth after each frame's least-squares scale, as in the paper; true depth "
+        f"{windows}, {views} views per method. Depth after per-frame least-squares scale, as in the paper; true depth "
         f"up to 80 m; a pixel without depth counts as wrong. Methods ran {boxes}."
     )
     if storm:
-        note += " dyn: pixels of vehicles, people and other things that can move, moving or not."
+        note += " dyn: pixels of vehicles, pedestrians and other movable objects, moving or not."
     title = "Protocol storm (columns of the paper's Table 1)" if storm else "Protocol clip (columns of Table 2)"
     return Table("paper", title, tuple(heading), tuple(rows), note)
 
@@ -96,8 +96,8 @@ def _paper_cells(figures: Mapping[str, float | None]) -> list[str]:
 
 def _static(methods: Mapping[str, Any]) -> Table:
     rows = tuple((name, *_paper_cells(row["static"])) for name, row in methods.items())
-    note = "All pixels but those of things that can move; the depth has the scale of the whole frame."
-    return Table("static", "What cannot move", ("method", *PAPER_HEADING), rows, note)
+    note = "All pixels except movable objects; depth with the scale of the whole frame."
+    return Table("static", "Static region", ("method", *PAPER_HEADING), rows, note)
 
 
 def _times(methods: Mapping[str, Any]) -> Table:
@@ -108,8 +108,8 @@ def _times(methods: Mapping[str, Any]) -> Table:
         ]
         rows.append((name, *cells))
     heading = ("method", *PAPER_HEADING, *(f"after {name}" for name in PAPER_HEADING))
-    note = "First between the four frames that the methods see, then after the last of them, by up to 0.4 s."
-    return Table("times", "Between the seen frames, and after them", heading, tuple(rows), note)
+    note = "First interpolated between the four input frames, then extrapolated by up to 0.4 s."
+    return Table("times", "Interpolation and extrapolation in time", heading, tuple(rows), note)
 
 
 def _metric_depth(methods: Mapping[str, Any], where: str) -> Table:
@@ -124,8 +124,8 @@ def _metric_depth(methods: Mapping[str, Any], where: str) -> Table:
         for name, row in methods.items()
     )
     heading = ("method", "AbsRel", "δ1", "dyn AbsRel", "dyn δ1", "scale", "covered")
-    note = "scale: what least squares would multiply the depth by, 1 where metres are right."
-    return Table("metric_depth", f"Depth in metres, not aligned{where}", heading, rows, note)
+    note = "scale: least-squares factor of the depth, 1 if metric."
+    return Table("metric_depth", f"Metric depth, not aligned{where}", heading, rows, note)
 
 
 def _cost(methods: Mapping[str, Any]) -> Table:
@@ -139,7 +139,7 @@ def _cost(methods: Mapping[str, Any]) -> Table:
             number(render_ms, 1),
         )
         rows.append((name, *cells, str(row["windows"]), str(row["failed"])))
-    heading = ("method", "Gaussians (thousand)", "reconstruct (s)", "render (ms a view)", "windows", "failed")
+    heading = ("method", "Gaussians (thousand)", "reconstruct (s)", "render (ms per view)", "windows", "failed")
     return Table("cost", "Cost", heading, tuple(rows), "Means over windows, on this machine.")
 
 
@@ -151,10 +151,8 @@ def _curve(methods: Mapping[str, Any], column: str, title: str, digits: int) -> 
     )
     views = max(methods.values(), key=lambda row: len(row["curve"]))["curve"]
     counts = ", ".join(f"{offset} m: {views[offset]['views']}" for offset in offsets if offset in views)
-    note = (
-        f"Views to the left and to the right of the path together ({counts}); those inside of something are left out."
-    )
-    return Table(f"shift_{column}", f"{title} beside the path", ("method", *(f"{o} m" for o in offsets)), rows, note)
+    note = f"Views left and right of the path combined ({counts}); those inside objects are skipped."
+    return Table(f"shift_{column}", f"{title} by lateral offset", ("method", *(f"{o} m" for o in offsets)), rows, note)
 
 
 def _doubling(methods: Mapping[str, Any]) -> Table:
@@ -165,9 +163,9 @@ def _doubling(methods: Mapping[str, Any]) -> Table:
         text = f"{reached:.2f} m" if reached is not None else f"not reached up to {farthest:g} m"
         psnr_db = [row["curve"].get(offset, {}).get("psnr_db") for offset in ("0", "2")]
         lost = None if None in psnr_db else psnr_db[0] - psnr_db[1]
-        rows.append((name, text if known and None not in known else "depth not known", number(lost, 2)))
-    heading = ("method", "AbsRel is twice that on the path at", "PSNR lost 2 m beside it (dB)")
-    return Table("shift_doubling", "How fast views beside the path get worse", heading, tuple(rows))
+        rows.append((name, text if known and None not in known else "depth unknown", number(lost, 2)))
+    heading = ("method", "AbsRel doubles at", "PSNR loss at 2 m (dB)")
+    return Table("shift_doubling", "Degradation with lateral offset", heading, tuple(rows))
 
 
 def _differences(differences: Sequence[Mapping[str, Any]]) -> Table:
@@ -189,12 +187,12 @@ def _interval(ends: Sequence[float] | None) -> str:
 
 
 def number(value: float | None, digits: int, sign: bool = False) -> str:
-    """A value with so many decimals; a dash where it is not known."""
+    """A value with fixed decimals; a dash if unknown."""
     if value is None:
         return NOT_KNOWN
     return f"{value:+,.{digits}f}" if sign else f"{value:,.{digits}f}"
 
 
 def percent(value: float | None) -> str:
-    """A share in percent; a dash where it is not known."""
+    """A fraction in percent; a dash if unknown."""
     return NOT_KNOWN if value is None else f"{100 * value:.1f} %"

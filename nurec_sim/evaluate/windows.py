@@ -1,4 +1,4 @@
-"""What a protocol gives to every method, and what it asks of them: a log that they may see, and true views."""
+"""Input logs and target views of a protocol."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Image = UInt8[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame of a camera: when and from where it was taken, and how to get it."""
+    """A camera frame: exposure, poses, and a function that loads it."""
 
     start_us: int
     end_us: int
@@ -27,7 +27,7 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Revolution:
-    """A turn of a LiDAR: when it was, and how to get it."""
+    """A LiDAR sweep: time span, and a function that loads it."""
 
     start_us: int
     end_us: int
@@ -36,18 +36,18 @@ class Revolution:
 
 @dataclass(frozen=True, eq=False)
 class ContextClip:
-    """A driving log (``types.Clip``) of some frames and sweeps only, which need no files.
+    """An in-memory driving log (``types.Clip``) with selected frames and sweeps.
 
     Attributes:
         id: name of the log.
         rig: its sensors.
         ego: poses of the rig, also between and after the frames.
-        span_us: [start, end) of all that may be asked of a reconstruction.
+        span_us: [start, end) of all requests to the reconstruction.
         shots: the frames of each camera, in time order.
-        revolutions: the turns of each LiDAR, in time order.
-        tracks: labelled objects; none where the methods shall not have them.
-        time_offset_us: how much later all times are than the log's own.
-        road_map: what is known of the road.
+        revolutions: the sweeps of each LiDAR, in time order.
+        tracks: labelled objects; empty if withheld from the methods.
+        time_offset_us: offset of all times from the log's own.
+        road_map: the road map, if any.
         ego_mask: pixels of a camera in which the car sees itself, or None.
     """
 
@@ -89,15 +89,15 @@ def _times(records: Sequence[Shot] | Sequence[Revolution]) -> Int64[np.ndarray, 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A view that the methods have to show, and what is really there.
+    """A target view with its ground truth.
 
     Attributes:
-        name: tells it from the other targets of its window.
+        name: unique within its window.
         request: camera, exposure and poses.
-        true: what is there, at the size at which it is compared; depth 0 where there is none or it is not known.
-        movable: its pixels of vehicles and other things that can move, whether they do or not; None where not known.
-        left_m: how far beside the driven path it was taken, left positive.
-        beyond: whether it was taken before the first or after the last frame that the methods see.
+        true: ground truth at the scored size; depth 0 where unknown.
+        movable: mask of vehicles and other movable objects, moving or not; None if unknown.
+        left_m: lateral offset from the driven path, left positive.
+        beyond: whether it is before the first or after the last input frame.
     """
 
     name: str
@@ -110,7 +110,7 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """One sample of an evaluation; ``about`` says in plain JSON what it shows."""
+    """One sample of an evaluation; ``about`` describes it in plain JSON."""
 
     id: str
     clip: Clip
@@ -119,5 +119,5 @@ class Window:
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """Ids of the cameras that the methods see."""
+        """Ids of the input cameras."""
         return tuple(name for name in self.clip.rig.cameras if len(self.clip.camera_times_us(name)))

@@ -1,4 +1,4 @@
-"""Run folders: drive policies, keep every rollout on disk, measure, report; interrupted runs go on where they stopped.
+"""Run folders: runs policies, stores rollouts, computes metrics, writes reports; interrupted runs can be resumed.
 
 Public names load on first use, so that importing the package costs nothing.
 """

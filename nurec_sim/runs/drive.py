@@ -1,4 +1,4 @@
-"""Drive policies through scenes into a run folder; whatever is finished there already is kept."""
+"""Runs policies in scenes into a run folder; finished rollouts are kept."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from nurec_sim.types import GaussianScene, Policy, Rollout, Sense
 Progress = Callable[[str, float], None]
 Notice = Callable[[str], None]
 DRIVING_SHARE = 0.6
-"""Share of a rollout's progress that driving takes; its video takes the rest."""
+"""Fraction of a rollout's progress for driving; the rest is its video."""
 
 
 @dataclass(frozen=True)
 class _Job:
-    """One rollout to be driven."""
+    """One rollout to run."""
 
     scene: GaussianScene
     record: SceneRecord
@@ -46,13 +46,13 @@ class _Job:
 
     @property
     def scenario_text(self) -> str:
-        """The scenario as it is run, every key written out; it can be loaded again."""
+        """The fully resolved scenario, as loadable YAML."""
         resolved = self.scenario.model_copy(update={"seeds": (self.seed,), "policies": (self.policy.reference,)})
         return yaml.safe_dump(resolved.model_dump(mode="json"), sort_keys=False)
 
     @property
     def versions_text(self) -> str:
-        """What the rollout depends on."""
+        """Software versions and scene hash."""
         packages = {"nurec-sim": nurec_sim.__version__}
         for name in ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "av", "torch"):
             try:
@@ -64,11 +64,11 @@ class _Job:
 
     @property
     def title(self) -> str:
-        """The rollout in words."""
+        """Display name of the rollout."""
         return f"{self.policy.name} in {self.scene.id} ({self.record.reconstruction}), seed {self.seed}"
 
     def finished(self, notice: Notice) -> Rollout | None:
-        """This very rollout if the folder holds it: it did not fail, same scenario, same scene, and can be read."""
+        """The stored rollout if it is readable, did not fail, and has the same scenario and scene."""
         files = {name: self.target / name for name in (layout.ROLLOUT, layout.SCENARIO, layout.VERSIONS)}
         if not all(path.is_file() for path in files.values()) or (self.target / layout.ERROR).exists():
             return None
@@ -80,7 +80,7 @@ class _Job:
         except (ValueError, KeyError, TypeError):
             return None
         except RunError as error:
-            notice(f"{self.title} is driven again: {error}")
+            notice(f"{self.title} is repeated: {error}")
             return None
 
 
@@ -99,32 +99,32 @@ def execute(
     stamp: str | None = None,
     plan_timeout_s: float = PLAN_TIMEOUT_S,
 ) -> Path:
-    """Drive every policy through every scene with every seed, score all, and write the report.
+    """Runs every policy in every scene with every seed, computes metrics, and writes the report.
 
-    A rollout that fails is kept with its error and is a row of every table; its video is left out. Interrupted at any
-    time, the folder holds complete rollouts only; the same call with ``resume`` drives those that are missing, failed,
-    damaged, or were driven under another scenario or scene.
+    A failed rollout is kept with its error as a row of every table, without a video. The folder contains complete
+    rollouts only, even after an interruption; the same call with ``resume`` runs those that are missing, failed,
+    damaged, or belong to another scenario or scene.
 
     Args:
-        scenes: what to drive through.
-        scenario: how.
-        policies: references as ``plugins.load_policy`` takes them, policies, or what ``load_policies`` gave.
-        sense_for: scene id -> the renderer of that scene; called once per scene, when it is first needed.
-        out_dir: folder that collects run folders.
-        seeds: the scenario's own if None.
-        resume: a run folder to go on with, instead of a new one.
+        scenes: the scenes.
+        scenario: the scenario.
+        policies: references for ``plugins.load_policy``, policies, or results of ``load_policies``.
+        sense_for: scene id -> the renderer of that scene; called once per scene, on first use.
+        out_dir: parent folder of run folders.
+        seeds: default: those of the scenario.
+        resume: run folder to resume.
         video: also record the front camera of every rollout.
-        progress: hears what is being done and the share that is done.
-        notice: hears a line of text for every rollout that fails, and for files that are damaged.
+        progress: called with stage and fraction done.
+        notice: called with a line of text for failed rollouts and damaged files.
         stamp: name of the new run folder; the local date and time if None.
-        plan_timeout_s: for making a policy, and for each of its answers.
+        plan_timeout_s: time limit for creating a policy, and for each plan.
 
     Returns:
         The run folder.
 
     Raises:
-        ScenarioError: nothing to drive, a policy cannot be loaded, or two policies or scenes have the same name.
-        RunError: ``resume`` is no folder, or another run is writing to it.
+        ScenarioError: no policy or scene, a policy cannot be loaded, or two policies or scenes have the same name.
+        RunError: ``resume`` is not a folder, or another run is writing to it.
     """
     say, tell = progress or (lambda stage, share: None), notice or (lambda text: None)
     seeds = tuple(scenario.seeds if seeds is None or len(seeds) == 0 else seeds)
@@ -155,7 +155,7 @@ def _jobs(
     run: Path, scenes: Sequence[GaussianScene], scenario: Scenario, policies: Sequence[LoadedPolicy],
     seeds: Sequence[int], say: Progress,
 ) -> list[_Job]:  # fmt: skip
-    """Every rollout of the run; what is known of the scenes is written."""
+    """All rollouts of the run; also writes the scene records."""
     jobs = []
     for index, scene in enumerate(scenes):
         say(f"reading the road of {scene.id}", 0.05 * index / len(scenes))
@@ -171,7 +171,7 @@ def _jobs(
 def _drive_all(
     jobs: Sequence[_Job], sense_for: Callable[[str], Sense], video: bool, say: Progress, tell: Notice
 ) -> None:
-    """Drive what is not finished."""
+    """Runs all unfinished rollouts."""
     senses: dict[str, Sense] = {}
     for index, job in enumerate(jobs):
 
@@ -192,7 +192,7 @@ def _drive_all(
 
 
 def _drive(job: _Job, sense: Sense, video: bool, driven: Rollout | None, advance: Callable[[float], None]) -> Rollout:
-    """Drive one job (unless it is driven and only its video is missing) and put its folder in place."""
+    """Runs one job (or only renders its missing video) and moves its folder into place."""
     rollout = driven
     if rollout is None:
         rollout = run_rollout(
@@ -211,7 +211,7 @@ def _drive(job: _Job, sense: Sense, video: bool, driven: Rollout | None, advance
 
 
 def _record(job: _Job, rollout: Rollout, sense: Sense, part: Path, advance: Callable[[float], None]) -> None:
-    """Record the front camera; a renderer that fails costs the video, not the rollout."""
+    """Records the front camera; a renderer failure does not fail the rollout."""
     try:
         camera = find_camera(job.scene.rig, "front")
         actors = Actors(job.scene.tracks, job.scenario.actors)
@@ -234,8 +234,8 @@ def _record(job: _Job, rollout: Rollout, sense: Sense, part: Path, advance: Call
 
 def _check_scenes(scenes: Sequence[GaussianScene]) -> None:
     if not scenes:
-        raise ScenarioError("no scene to drive through")
+        raise ScenarioError("no scene to run in")
     names = [layout.folder_name(scene.id) for scene in scenes]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise ScenarioError(f"scenes need different ids, but {twice} come more than once")
+        raise ScenarioError(f"scene ids must be unique; repeated: {twice}")

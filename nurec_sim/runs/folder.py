@@ -1,4 +1,4 @@
-"""Where things lie in a run folder, and how they get there in one step.
+"""Layout of a run folder, with atomic writes.
 
 ::
 
@@ -7,9 +7,9 @@
       <scene>/<reconstruction>/scene.json  road.npz
       <scene>/<reconstruction>/<policy>/<seed>/scenario.yaml  rollout.npz  versions.json  front.mp4  [error.txt]
 
-A rollout's folder is filled under another name and renamed, so a folder that is there is complete. A run owns its
-folder while it writes: by an advisory lock of the system (``flock``) on the folder itself, which ends with its process,
-whatever ends that. So hidden parts in a folder that nobody owns were left by killed writers; the next run removes them.
+A rollout's folder is written under a temporary name and renamed, so existing folders are complete. While writing, a run
+holds an advisory lock (``flock``) on its folder, which the system releases when the process ends. So hidden parts in an
+unlocked folder are leftovers of killed processes; the next run removes them.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from nurec_sim.files.new_files import writing
 ROLLOUT, SCENARIO, VERSIONS, VIDEO, ERROR = "rollout.npz", "scenario.yaml", "versions.json", "front.mp4", "error.txt"
 VIDEO_ERROR = "video_error.txt"
 _LEFTOVER = re.compile(r"\..+\.(part|part\.\d+|old\.\d+)")
-"""Names of ``files.new_files.new_file`` and of ``written_at_once``."""
+"""Temporary names of ``files.new_files.new_file`` and ``written_at_once``."""
 SCENE, ROAD, REPORT = "scene.json", "road.npz", "report.html"
 
 
 def new_run_folder(out_dir: Path, stamp: str) -> Path:
-    """Make ``out_dir/<stamp>`` (numbered if it is taken) and let ``out_dir/latest`` point to it."""
+    """Creates ``out_dir/<stamp>`` (numbered if it exists) and links ``out_dir/latest`` to it."""
     out_dir = Path(out_dir)
     with writing(out_dir):
         out_dir.mkdir(parents=True, exist_ok=True)
@@ -47,36 +47,36 @@ def new_run_folder(out_dir: Path, stamp: str) -> Path:
 
 
 def point_latest(folder: Path) -> None:
-    """Let ``latest`` beside a run folder point to it; left alone where it is a real file or folder."""
+    """Links ``latest`` next to a run folder to it, unless ``latest`` is a real file or folder."""
     link = folder.parent / "latest"
     if link.exists() and not link.is_symlink():
         return
     part = folder.parent / ".latest.part"
     with contextlib.suppress(FileNotFoundError):
         part.unlink()
-    with contextlib.suppress(OSError):  # a file system without links goes without
+    with contextlib.suppress(OSError):  # file system without links
         part.symlink_to(folder.name, target_is_directory=True)
         os.replace(part, link)
 
 
 def existing_run_folder(path: Path) -> Path:
-    """A run folder to read or to go on with; links are followed.
+    """An existing run folder to read or resume; follows links.
 
     Raises:
         RunError: there is no such folder.
     """
     path = Path(path)
     if not path.is_dir():
-        raise RunError(f"run folder {path} does not exist; give a folder that `nurec-sim run` made")
+        raise RunError(f"run folder {path} does not exist; give a folder written by `nurec-sim run`")
     return path.resolve()
 
 
 @contextlib.contextmanager
 def owned(run: Path) -> Iterator[None]:
-    """Own a run folder for the time of the block; what killed writers left in it is removed first.
+    """Locks a run folder for the block, after removing leftovers of killed processes.
 
     Raises:
-        RunError: another process owns it.
+        RunError: another process holds the lock.
     """
     handle = os.open(run, os.O_RDONLY)
     try:
@@ -84,9 +84,9 @@ def owned(run: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise RunError(
-                f"another run is writing to {run}; wait for its end, or begin a new one without --resume"
+                f"another run is writing to {run}; wait until it ends, or start a new run without --resume"
             ) from None
-        except OSError:  # a file system without locks: whose the parts are is not known
+        except OSError:  # file system without locks: leftovers cannot be identified
             pass
         else:
             _remove_leftovers(run)
@@ -96,7 +96,7 @@ def owned(run: Path) -> Iterator[None]:
 
 
 def tidy(run: Path) -> None:
-    """Remove what killed writers left in a run folder, unless somebody owns it."""
+    """Removes leftovers of killed processes in a run folder, unless it is locked."""
     if run.is_dir():
         with contextlib.suppress(RunError, OSError), owned(run):
             pass
@@ -122,7 +122,7 @@ def rollout_folder(run: Path, scene_id: str, reconstruction: str, policy: str, s
 
 
 def folder_name(text: str) -> str:
-    """A name that every file system takes: other characters than letters, digits and ``._-`` become ``_``."""
+    """A portable file name: characters other than letters, digits and ``._-`` become ``_``."""
     name = re.sub(r"[^A-Za-z0-9._-]", "_", text).strip(".")
     return name or "_"
 
@@ -139,7 +139,7 @@ def scene_folders(run: Path) -> list[Path]:
 
 @contextlib.contextmanager
 def written_at_once(target: Path) -> Iterator[Path]:
-    """Fill a hidden folder that becomes ``target`` at the end; whatever goes wrong leaves ``target`` as it was."""
+    """Yields a hidden folder that is renamed to ``target`` on success; on failure ``target`` is unchanged."""
     part, old = (target.with_name(f".{target.name}.{kind}.{os.getpid()}") for kind in ("part", "old"))
     with writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -156,7 +156,7 @@ def written_at_once(target: Path) -> Iterator[Path]:
                 if old.exists():
                     os.rename(old, target)
                 raise
-        except WriteError as error:  # of a file in the folder, which nobody knows by its hidden name
+        except WriteError as error:  # report the final name instead of the hidden one
             raise WriteError(error.errno, error.strerror, error.filename.replace(str(part), str(target))) from error
         finally:
             shutil.rmtree(part, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""The policies of a run: found, made, and each kept in a thread of its own."""
+"""Loads the policies of a run, each in its own thread."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nurec_sim.types import Policy
 
 @dataclass(frozen=True)
 class LoadedPolicy:
-    """A policy in its thread, and what it was asked for by."""
+    """A policy in its thread, and its reference."""
 
     reference: str
     name: str
@@ -25,24 +25,24 @@ class LoadedPolicy:
 def load_policies(
     policies: Sequence[str | Policy | LoadedPolicy], plan_timeout_s: float = PLAN_TIMEOUT_S
 ) -> list[LoadedPolicy]:
-    """Make every policy, in a thread of its own.
+    """Creates every policy in its own thread.
 
     Args:
-        policies: references as ``plugins.load_policy`` takes them, or policies; those that are loaded stay as they are.
-        plan_timeout_s: for making a policy, and for each of its answers.
+        policies: references for ``plugins.load_policy``, or policies; loaded ones are returned unchanged.
+        plan_timeout_s: time limit for creating a policy, and for each plan.
 
     Raises:
-        ScenarioError: none, one cannot be made, or two have the same name.
+        ScenarioError: none, one cannot be created, or two have the same name.
     """
     if not policies:
-        raise ScenarioError("no policy to drive: name one, or let the scenario list some under 'policies'")
+        raise ScenarioError("no policy to run: give one, or list some under 'policies' in the scenario")
     if not 0 < plan_timeout_s < float("inf"):
         raise ScenarioError(f"the time limit of a plan must be finite and above 0 s, got {plan_timeout_s:g}")
     loaded = [each if isinstance(each, LoadedPolicy) else _load(each, plan_timeout_s) for each in policies]
     names = [folder_name(each.name) for each in loaded]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise ScenarioError(f"policies need different names, but {twice} come more than once")
+        raise ScenarioError(f"policy names must be unique; repeated: {twice}")
     odd = [each.name for each in loaded if not re.search(r"[A-Za-z0-9]", each.name)]
     if odd:
         raise ScenarioError(f"a policy's name needs a letter or a digit, got {odd}")
@@ -54,5 +54,5 @@ def _load(policy: str | Policy, plan_timeout_s: float) -> LoadedPolicy:
     try:
         host = PolicyHost(lambda: load_policy(policy) if isinstance(policy, str) else policy, plan_timeout_s)
     except PolicyError as error:
-        raise ScenarioError(f"policy '{reference}' cannot be made: {error}") from error
+        raise ScenarioError(f"policy '{reference}' cannot be created: {error}") from error
     return LoadedPolicy(reference, host.name, host)

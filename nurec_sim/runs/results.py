@@ -1,4 +1,4 @@
-"""Score everything that a run folder holds; write its tables and its report."""
+"""Computes the metrics of a run folder; writes its tables and its report."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def write_report(run: Path | str, progress: Callable[[str, float], None] | None 
     run = layout.existing_run_folder(Path(run))
     places = layout.rollout_folders(run)
     if not places:
-        raise RunError(f"run folder {run} holds no rollout")
+        raise RunError(f"run folder {run} has no rollout")
     records = {place: load_scene_record(place) for place in layout.scene_folders(run)}
     scored, entries = [], []
     for index, place in enumerate(places):
@@ -65,7 +65,7 @@ def write_report(run: Path | str, progress: Callable[[str, float], None] | None 
 
 
 def headline(run: Path | str) -> list[tuple[str, ...]]:
-    """The headline table of a finished run as rows of text, headings first."""
+    """The headline table of a finished run as rows of text, header first."""
     run = layout.existing_run_folder(Path(run))
     path = run / "metrics.parquet"
     if not path.exists():
@@ -110,7 +110,7 @@ def _report_scene(record: SceneRecord) -> ReportScene:
 
 
 def _versions(places: list[Path]) -> tuple[dict[str, object], ...]:
-    """The different sets of versions that the rollouts were driven with."""
+    """The distinct software versions of the rollouts."""
     found = []
     for place in places:
         path = place / layout.VERSIONS

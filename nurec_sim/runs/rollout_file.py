@@ -1,4 +1,4 @@
-"""A rollout as one ``.npz`` file and back, bit for bit; plain arrays and JSON, never pickle."""
+"""Lossless ``.npz`` files of rollouts; plain arrays and JSON, no pickle."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ARRAYS: dict[str, tuple[type, tuple[int, ...]]] = {
 
 
 def save_rollout(rollout: Rollout, path: Path | str) -> Path:
-    """Write a rollout in one step; the same rollout gives the same bytes."""
+    """Writes a rollout atomically; the same rollout gives the same bytes."""
     plans = [plan for _, plan in rollout.plans]
     count, ids = len(rollout.states), list(rollout.actors)
     header = {
@@ -71,15 +71,15 @@ def load_rollout(path: Path | str) -> Rollout:
     """Read a rollout.
 
     Raises:
-        RunError: the file is missing, is no rollout, or contradicts itself.
+        RunError: the file is missing, not a rollout, or inconsistent.
     """
     path = Path(path)
     try:
-        # numpy leaves a file that it opened itself open when it turns out to be broken
+        # numpy does not close a damaged file that it opened itself
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             missing = [name for name in ("header", *_ARRAYS) if name not in file.files]
             if missing:
-                raise RunError(f"{path} is no rollout file: it lacks {missing}")
+                raise RunError(f"{path} is not a rollout file: missing {missing}")
             header_bytes = bytes(file["header"].astype(np.uint8).tobytes())
             arrays = {name: _checked(path, name, file[name]) for name in _ARRAYS}
         header = json.loads(header_bytes.decode("utf-8"))
@@ -89,9 +89,9 @@ def load_rollout(path: Path | str) -> Rollout:
     except RunError:
         raise
     except codec.ArchiveError as error:
-        raise RunError(f"{path} is no readable rollout file: {error}") from error
-    except Exception as error:  # a damaged file makes zipfile, zlib, numpy and json raise whatever they like
-        raise RunError(f"{path} is no readable rollout file: {type(error).__name__}: {error}") from error
+        raise RunError(f"{path} is not a readable rollout file: {error}") from error
+    except Exception as error:  # zipfile, zlib, numpy and json raise various exceptions for damaged files
+        raise RunError(f"{path} is not a readable rollout file: {type(error).__name__}: {error}") from error
 
 
 def _checked(path: Path, name: str, array: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a run keeps of each scene: facts for the report (``scene.json``) and the road grid (``road.npz``)."""
+"""Scene records of a run: facts for the report (``scene.json``) and the road grid (``road.npz``)."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ MOST_LISTED = 50
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """A scene as the metrics and the report see it.
+    """Scene data for metrics and report.
 
-    ``unknown`` lists in words what the log or the reconstruction does not tell; ``road_error`` says why there is no
-    grid. ``sha256`` is the fingerprint of the whole scene.
+    ``unknown`` lists missing information of log or reconstruction; ``road_error`` is the reason for a missing grid.
+    ``sha256`` is the hash of the whole scene.
     """
 
     id: str
@@ -41,12 +41,12 @@ class SceneRecord:
 
 
 def reconstruction_of(scene: GaussianScene) -> str:
-    """Name of the method that made a scene."""
+    """Name of the method that created a scene."""
     return str(scene.provenance.get("method", "unknown"))
 
 
 def record_scene(scene: GaussianScene) -> SceneRecord:
-    """Fingerprint a scene, count what it holds and find its road."""
+    """Hashes a scene, counts its contents and builds its road grid."""
     listed = scene.provenance.get("unknown", ())
     unknown = tuple(str(text) for text in listed) if isinstance(listed, (list, tuple)) else (str(listed),)
     no_boxes = any(word in text.lower() for text in unknown for word in ("box", "actor", "track"))
@@ -59,12 +59,12 @@ def record_scene(scene: GaussianScene) -> SceneRecord:
         unknown += ("the scene has no road map: off-road is measured on the road-class Gaussians only",)
     if movers:
         unknown += (
-            f"{len(movers)} unlabelled movers, which no box of the log names, are in the picture but are no actors: "
-            f"nothing is measured against them, and policies are not told of them: {_listed(movers, scene)}",
+            f"{len(movers)} unlabelled movers without a box in the log are rendered but are not actors: "
+            f"metrics and privileged policies ignore them: {_listed(movers, scene)}",
         )
     if found:
         unknown += (
-            f"{len(found)} actors were found by how they move and nobody has labelled them; what is measured against "
+            f"{len(found)} actors were detected by motion and are unlabelled; metrics against "
             f"them may be wrong: {_listed(found, scene)}",
         )
     labels = np.bincount(scene.static.label, minlength=len(Label))
@@ -85,7 +85,7 @@ def record_scene(scene: GaussianScene) -> SceneRecord:
 
 
 def _listed(tracks: Sequence[Track], scene: GaussianScene) -> str:
-    """Ids, what each looks like, and when it is there."""
+    """Id, label and time span of each track."""
     said = [
         f"{track.id} (like {track.label}, {(track.path.start_us - scene.span_us[0]) / 1e6:.1f} to "
         f"{(track.path.end_us - scene.span_us[0]) / 1e6:.1f} s)"
@@ -95,7 +95,7 @@ def _listed(tracks: Sequence[Track], scene: GaussianScene) -> str:
 
 
 def save_scene_record(record: SceneRecord, folder: Path) -> None:
-    """Write ``scene.json`` and, where there is a grid, ``road.npz``."""
+    """Writes ``scene.json`` and, if there is a grid, ``road.npz``."""
     folder.mkdir(parents=True, exist_ok=True)
     road = folder / ROAD
     if record.grid is None:
@@ -110,7 +110,7 @@ def save_scene_record(record: SceneRecord, folder: Path) -> None:
 
 
 def load_scene_record(folder: Path) -> SceneRecord:
-    """Read what ``save_scene_record`` wrote.
+    """Reads the files of ``save_scene_record``.
 
     Raises:
         RunError: a file is missing or broken.
@@ -126,7 +126,7 @@ def load_scene_record(folder: Path) -> SceneRecord:
     except FileNotFoundError:
         raise RunError(f"{path} does not exist: the run folder is incomplete; run again with --resume") from None
     except (OSError, TypeError, ValueError, KeyError, zipfile.BadZipFile, ArchiveError) as error:
-        raise RunError(f"{path} is no readable scene record: {type(error).__name__}: {error}") from error
+        raise RunError(f"{path} is not a readable scene record: {type(error).__name__}: {error}") from error
 
 
 def _load_grid(path: Path) -> OffroadGrid:

@@ -1,6 +1,6 @@
-"""Driving in the truth: the same scene, but sensed by the town that its log was drawn in.
+"""Driving in the original world: the same scene, but rendered by the town in which its log was recorded.
 
-What a policy does there is what its rollouts in reconstructions of that log are to be compared with.
+It is the reference for rollouts in reconstructions of that log.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from nurec_sim.types import GaussianScene, Sense
 from nurec_sim.world import TownPlan, TrueWorld
 
 TRUTH = "truth"
-"""The true world's name among the reconstructions of a run."""
+"""Name of the original world among the reconstructions of a run."""
 SAME_PLACE_M = 0.01
 
 
@@ -25,24 +25,24 @@ SAME_PLACE_M = 0.01
 def true_world(
     plan_file: str | Path, scene: GaussianScene, backend: str | None = None
 ) -> Iterator[tuple[GaussianScene, Sense]]:
-    """The town of a plan, as a scene to be driven through.
+    """The town of a plan as a scene.
 
     Args:
-        plan_file: ``plan.json`` of a truth folder (docs/world.md).
-        scene: any reconstruction of the log of that town: its sensors, tracks, map and road stay what metrics measure
-            against, so that only what policies see differs.
+        plan_file: ``plan.json`` of a ground truth folder (docs/world.md).
+        scene: any reconstruction of that town's log; metrics use its sensors, tracks, map and road, so that only the
+            rendering differs.
         backend: see ``world.TrueWorld``.
 
     Yields:
-        The scene under the name ``truth``, and what senses in the town.
+        The scene with reconstruction name ``truth``, and the town's ``sense``.
 
     Raises:
-        RunError: the file cannot be read or is no plan, or the scene is not from the log of that town.
+        RunError: the file cannot be read or is not a plan, or the scene is not from that town's log.
     """
     try:
         plan = TownPlan.from_json(Path(plan_file).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, ClipError) as error:
-        raise RunError(f"{plan_file} is no plan of a town: {error}") from None
+        raise RunError(f"{plan_file} is not a town plan: {error}") from None
     _check_same_town(plan, scene)
     with TrueWorld(plan, backend) as world:
         provenance = {**scene.provenance, "method": TRUTH}

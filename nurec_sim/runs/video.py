@@ -1,4 +1,4 @@
-"""The front camera of a rollout as an H.264 video with a caption: what the renderer shows from where the ego went."""
+"""H.264 videos of a rollout's front camera with captions."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ def record_video(
     width_px: int = 480,
     progress: Callable[[float], None] | None = None,
 ) -> Path:
-    """Render a camera at every state of a rollout and encode it; the same frames give the same bytes.
+    """Renders a camera at every state of a rollout and encodes the video deterministically.
 
     Args:
-        rollout: what happened.
-        sense: renders.
-        camera: a camera of the rig; drawn at ``width_px``, both sides even.
+        rollout: the rollout.
+        sense: the renderer.
+        camera: a camera of the rig, rendered at ``width_px`` with even sides.
         path: the ``.mp4`` to write.
-        grid: names off-road states in the caption.
-        overrides: actors to re-pose at (start_us, end_us); those present in the rollout if None.
+        grid: for off-road captions.
+        overrides: actor poses at (start_us, end_us); default: actors of the rollout.
         width_px: width of the video.
-        progress: hears fractions.
+        progress: called with the fraction done.
 
     Raises:
-        RequestError: the rollout has no states, or the renderer answers with something else than was asked.
+        RequestError: the rollout has no states, or the renderer returns unexpected frames.
     """
     import av
 
@@ -68,7 +68,7 @@ def record_video(
                 raise RequestError(f"the renderer returned {len(frames)} frames for {len(requests)} requests")
             for index, frame in zip(indices, frames, strict=True):
                 if not isinstance(frame, CameraFrame) or frame.rgb.shape != (height, width, 3):
-                    raise RequestError(f"wanted an image of {width}x{height}, got {_described(frame)}")
+                    raise RequestError(f"expected an image of {width}x{height}, got {_described(frame)}")
                 picture = av.VideoFrame.from_ndarray(_captioned(frame.rgb, *captions[index]), format="rgb24")
                 picture.pts = index
                 container.mux(stream.encode(picture))
@@ -94,7 +94,7 @@ def _request(rollout: Rollout, index: int, camera: CameraModel, overrides: Overr
 
 
 def _captions(rollout: Rollout, grid: OffroadGrid | None) -> list[tuple[str, str]]:
-    """For every state the plain caption and the alarm, which may be empty."""
+    """Caption and alarm text (possibly empty) per state."""
     t_us = rollout.t_us
     alarms: list[list[str]] = [[] for _ in t_us]
     for contact in find_contacts(rollout):
@@ -114,7 +114,7 @@ def _captions(rollout: Rollout, grid: OffroadGrid | None) -> list[tuple[str, str
 
 
 def _captioned(rgb: UInt8[np.ndarray, "h w 3"], text: str, alarm: str) -> UInt8[np.ndarray, "h w 3"]:
-    """The image with a dark bar at its foot: caption to the left, alarm to the right."""
+    """The image with a dark bar at the bottom: caption on the left, alarm on the right."""
     import cv2
 
     picture = np.ascontiguousarray(rgb).copy()

@@ -1,8 +1,8 @@
-"""The scene archive: a ``.usdz`` that holds a GaussianScene without loss, opens in USD tools and feeds AlpaSim.
+"""The scene archive: a ``.usdz`` that stores a GaussianScene losslessly and opens in USD tools and AlpaSim.
 
-Layout, see ``docs/scene_format.md``: USD layers are the truth for geometry and appearance; ``nurec_sim/`` holds what
-USD cannot say exactly; JSON, YAML, PLY and XODR files at the root are for other simulators. Nothing is pickled. The
-same scene gives the same bytes.
+Layout, see ``docs/scene_format.md``: USD layers are authoritative for geometry and appearance; ``nurec_sim/`` has data
+that USD cannot represent exactly; JSON, YAML, PLY and XODR files at the root are for other simulators. Nothing is
+pickled. The same scene gives the same bytes.
 """
 
 from __future__ import annotations
@@ -47,26 +47,26 @@ KNOT_TIMES, KNOTS, OWNERS, IN_BOX = (
     f"nurec_sim/dynamic_{name}.npy" for name in ("knot_t_us", "knot_m", "track", "in_box")
 )
 TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY, KNOT_TIMES, KNOTS, OWNERS)
-"""The members that a scene is read from, with ``IN_BOX`` and ``EXPOSURES`` where it has such; all others are for other
+"""Members required by ``read_archive``, besides optional ``IN_BOX`` and ``EXPOSURES``; others are for other
 programs."""
 
 
 def write_scene(
     scene: GaussianScene, path: Path | str, *, overwrite: bool = False, derived_map: RoadMap | None = None
 ) -> Path:
-    """Writes a scene archive; the file appears complete or not at all.
+    """Writes a scene archive atomically.
 
     Args:
-        scene: what to write; checked first.
-        path: ends in ``.usdz``; its folder is made if need be.
+        scene: the scene; validated first.
+        path: ends in ``.usdz``; missing folders are created.
         overwrite: whether an existing file may be replaced.
-        derived_map: a map for other simulators (``map.xodr``) that is no part of the scene, for one without a map.
+        derived_map: a map for other simulators (``map.xodr``) that is not part of the scene, for a scene without a map.
 
     Returns:
         The path.
 
     Raises:
-        ArchiveError: the file exists, the name does not end in ``.usdz``, or the scene is not sound.
+        ArchiveError: the file exists, the name does not end in ``.usdz``, or the scene is invalid.
     """
     path = Path(path)
     if path.suffix != ".usdz":
@@ -100,12 +100,12 @@ def write_scene(
 
 
 def read_archive(path: Path | str) -> GaussianScene:
-    """Reads a scene archive written by ``write_scene``, every value exactly.
+    """Reads a scene archive written by ``write_scene`` losslessly.
 
-    Nothing is extracted, unpickled or run, and no file outside of the archive is opened.
+    Nothing is extracted, unpickled or executed, and no file outside the archive is opened.
 
     Raises:
-        ArchiveError: not such an archive, damaged, changed since it was written, unsafe, or not a sound scene.
+        ArchiveError: not such an archive, damaged, modified, unsafe, or an invalid scene.
     """
     path = Path(path)
     with Package(path) as package:
@@ -146,7 +146,7 @@ def read_archive(path: Path | str) -> GaussianScene:
 
 
 def archive_faults(path: Path | str) -> list[str]:
-    """Everything wrong with an archive, as texts; empty if it reads well and no member was changed."""
+    """All faults of an archive as texts; empty if it is readable and unmodified."""
     try:
         with Package(Path(path)) as package:
             manifest = _read_manifest(package)
@@ -234,7 +234,7 @@ def _read_fields(layer, paths: list[str], count: int, what: str) -> Gaussians:
 
 
 def _exposures(package: Package, manifest: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Responses of single frames, where the archive has some."""
+    """Per-frame responses, if any."""
     if EXPOSURES not in manifest["sha256"]:
         return {}
     _check_hashes(package, manifest, (EXPOSURES,))

@@ -1,4 +1,4 @@
-"""What must hold of every scene, checked before it is written and after it is read."""
+"""Validation of scenes before writing and after reading."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from nurec_sim import sensors
 from nurec_sim.errors import ArchiveError
 from nurec_sim.types import GAUSSIAN_FIELDS, DynamicGaussians, Gaussians, GaussianScene, Label, Rig, Trajectory
 
-MIN_START_US = 1_000_000  # AlpaSim asks for times up to half a second before the start, as unsigned integers
+MIN_START_US = 1_000_000  # AlpaSim requests times up to half a second before the start, as unsigned integers
 _GAUSSIAN_SHAPES = {
     "mean_m": (3,),
     "quat_wxyz": (4,),
@@ -26,7 +26,7 @@ def check_scene(scene: GaussianScene) -> None:
     """Checks shapes, types, ranges and references of a scene.
 
     Raises:
-        ArchiveError: what is wrong, what was given, what is allowed.
+        ArchiveError: with the fault, the given and the allowed values.
     """
     if not scene.id or not scene.id.isprintable():
         raise ArchiveError(f"a scene needs a printable id, got {scene.id!r}")

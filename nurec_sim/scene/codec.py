@@ -1,7 +1,7 @@
-"""Rigs, tracks, trajectories and road maps as plain JSON and back, losing nothing.
+"""Lossless JSON encoding of rigs, tracks, trajectories and road maps.
 
-A dataclass becomes an object of its fields plus ``"type"``; arrays become nested lists. JSON keeps every float64
-exactly (shortest text that reads back as the same number). NaN and infinity are refused.
+A dataclass becomes an object of its fields plus ``"type"``; arrays become nested lists. Float64 values are exact
+(shortest round-trip representation). NaN and infinity are refused.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Decoder = Callable[[Any], Any]
 
 
 def to_json(value: Any) -> Any:
-    """Plain JSON of a value made of the types of this module, numbers, strings, arrays, sequences and mappings."""
+    """Plain JSON of a value of this module's types, numbers, strings, arrays, sequences and mappings."""
     if dataclasses.is_dataclass(value):
         fields = {field.name: to_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
         for name, default in _ADDED.get(type(value), {}).items():
@@ -60,7 +60,7 @@ def dump(value: Any, what: str, indent: int | None = None) -> bytes:
     """JSON text in UTF-8, keys in the given order.
 
     Raises:
-        ArchiveError: NaN, infinity, a key that is no text, something that JSON does not know, or too much of it.
+        ArchiveError: NaN, infinity, a key that is not text, an unsupported type, or too much data.
     """
     try:
         separators = (",", ": ") if indent else (",", ":")
@@ -78,7 +78,7 @@ def load(text: bytes, what: str) -> Any:
     """The value of a JSON text; duplicate keys, NaN and infinity are refused.
 
     Raises:
-        ArchiveError: not JSON, or too much of it.
+        ArchiveError: not JSON, or too much data.
     """
 
     def refuse(constant: str) -> None:
@@ -163,7 +163,7 @@ def choice(kind: type[enum.Enum]) -> Decoder:
 
 
 def optional(decoder: Decoder) -> Decoder:
-    """None or what ``decoder`` reads."""
+    """None or a value for ``decoder``."""
     return lambda value: None if value is None else decoder(value)
 
 
@@ -190,7 +190,7 @@ def mapping(decoder: Decoder) -> Decoder:
 
 
 def record(*kinds: type) -> Decoder:
-    """One of the dataclasses ``kinds``, told apart by ``"type"``; fields must match exactly."""
+    """One of the dataclasses ``kinds``, selected by ``"type"``; fields must match exactly."""
 
     def decode(value: Any) -> Any:
         allowed = {kind.__name__: kind for kind in kinds}
@@ -216,7 +216,7 @@ def lens(value: Any) -> Lens:
 
 
 def _within(name: str, decoder: Decoder, value: Any) -> Any:
-    """Decodes a part and puts its name before the text of an error."""
+    """Decodes a part and prefixes error texts with its name."""
     try:
         return decoder(value)
     except ValueError as error:
@@ -252,14 +252,14 @@ _FIELDS: dict[type, dict[str, Decoder]] = {
 
 
 _ADDED: dict[type, dict[str, Any]] = {Track: {"labelled": True, "actor": True}}
-"""Fields that older archives lack, and their values there; they are written only where they differ from these."""
+"""Fields missing in older archives, with defaults; written only if different."""
 
 
 def from_json(decoder: Decoder, value: Any, what: str) -> Any:
     """Decodes a value.
 
     Raises:
-        ArchiveError: a field is missing, unknown or of the wrong kind; the text names its place.
+        ArchiveError: a field is missing, unknown or of the wrong type; the text gives its location.
     """
     try:
         return decoder(value)

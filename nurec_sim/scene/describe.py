@@ -1,4 +1,4 @@
-"""A scene's fingerprint and a table of what it holds."""
+"""Hash and summary of a scene."""
 
 from __future__ import annotations
 
@@ -37,13 +37,15 @@ def scene_hash(scene: GaussianScene) -> str:
     digest.update(codec.dump(given, "the scene"))
     for name, array in scene_arrays(scene).items():
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        canonical = array + array.dtype.type(0)  # -0 is 0: OpenUSD merges equal arrays, whatever their zeros' signs
+        canonical = array + array.dtype.type(
+            0
+        )  # -0 becomes 0: OpenUSD merges equal arrays regardless of the sign of zero
         digest.update(np.ascontiguousarray(canonical).data.cast("B") if array.size else b"")
     return digest.hexdigest()
 
 
 def summary(scene: GaussianScene) -> list[tuple[str, str]]:
-    """(name, text) rows for a person: counts, sizes, sensors, times."""
+    """Human-readable (name, text) rows: counts, sizes, sensors, times."""
     start_us, end_us = scene.span_us
     arrays = scene_arrays(scene)
     counts = np.bincount(scene.static.label, minlength=len(Label))
@@ -73,9 +75,9 @@ def summary(scene: GaussianScene) -> list[tuple[str, str]]:
 
 
 def _tracks(scene: GaussianScene) -> str:
-    """How many actors there are, and how many of them, or beside them, nobody has labelled."""
+    """Numbers of actors, unlabelled actors and unlabelled movers."""
     actors = [track for track in scene.tracks if track.actor]
     found, movers = sum(not track.labelled for track in actors), len(scene.tracks) - len(actors)
-    notes = [f"{found} of them found by how they move, not labelled"] * (found > 0)
-    notes += [f"{movers} unlabelled movers beside them"] * (movers > 0)
+    notes = [f"{found} of them detected by motion, unlabelled"] * (found > 0)
+    notes += [f"{movers} additional unlabelled movers"] * (movers > 0)
     return ", ".join([f"{len(actors)} actors" if notes else f"{len(actors)}", *notes])

@@ -1,7 +1,7 @@
-"""Edited copies of a scene: its actors taken out, put in, or given the looks of others.
+"""Edited copies of a scene: actors removed, inserted, or replaced.
 
-Nothing here changes a scene in place. An asset is what an actor looks like, in the frame of its box (origin at the
-centre, x forward, y left, z up).
+Scenes are never modified in place. An asset is the appearance of an actor in its box frame (origin at the centre, x
+forward, y left, z up).
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from nurec_sim.scene.transform import joined, transformed
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, Track, Trajectory
 
 MAX_DYNAMIC = 20_000_000
-"""Gaussians that the dynamic layer of an edited scene may have."""
+"""Maximum number of Gaussians in the dynamic layer of an edited scene."""
 
 MAX_BEYOND_US = 86_400_000_000
-"""How long before and after the scene an actor may live."""
+"""Maximum time that an actor may exist before and after the scene."""
 MIN_SIZE_M = 0.01
 
 Size = tuple[float, float, float]
 
 MAX_PLACE_M = 1e6
-"""How far from the world's origin an actor may be."""
+"""Maximum distance of an actor from the world origin."""
 
 _STANDS_M = 0.5
 _FAINT = 1 / 255
-_LOOKS = 64  # instants at which an actor is looked at, at most
+_LOOKS = 64  # maximum number of sampled instants
 
 
 @dataclass(frozen=True)
 class Asset:
-    """What an actor looks like: Gaussians in its box frame, the box's size in metres, and its semantic class."""
+    """The appearance of an actor: Gaussians in its box frame, the box size in metres, and its semantic class."""
 
     gaussians: Gaussians
     size_m: Size
@@ -44,12 +44,12 @@ class Asset:
 
 
 def asset_of(scene: GaussianScene, track_id: str) -> Asset:
-    """The looks of a scene's track: its rigid parts, and the others as they are at an instant when most can be seen.
+    """The appearance of a track: its rigid parts, and its other Gaussians at an instant when most are visible.
 
-    A track that stands and has no Gaussians of its own gets the movable ones of the static layer in its box.
+    A static track without its own Gaussians gets the movable ones of the static layer in its box.
 
     Raises:
-        RequestError: there is no such track, or nothing of it was reconstructed.
+        RequestError: unknown track, or it has no Gaussians.
     """
     number = _number_of(scene, track_id)
     track, dynamic = scene.tracks[number], scene.dynamic
@@ -68,18 +68,18 @@ def asset_of(scene: GaussianScene, track_id: str) -> Asset:
 
 
 def resized(asset: Asset, size_m: Size) -> Asset:
-    """The asset stretched along the axes of its box to another size."""
+    """The asset scaled along its box axes to another size."""
     factor = np.array(size_m) / np.maximum(asset.size_m, MIN_SIZE_M)
     return Asset(transformed(asset.gaussians, np.diag([*factor, 1.0])), size_m, asset.label)
 
 
 def with_track(scene: GaussianScene, track: Track, asset: Asset) -> GaussianScene:
-    """A copy of the scene with one track more, which looks like ``asset`` stretched to the track's size.
+    """A copy of the scene with an additional track with the appearance of ``asset``, scaled to the track's size.
 
-    A path of a single pose is that of a body which stands there for as long as the scene lasts.
+    A path with a single pose is static for the duration of the scene.
 
     Raises:
-        RequestError: the id is taken, or the path does not touch the scene's time.
+        RequestError: the id exists, or the path does not overlap the scene in time.
         TooLargeError: the scene would have more than ``MAX_DYNAMIC`` moving Gaussians.
     """
     if any(other.id == track.id for other in scene.tracks):
@@ -90,13 +90,13 @@ def with_track(scene: GaussianScene, track: Track, asset: Asset) -> GaussianScen
 
 
 def replaced_track(scene: GaussianScene, track_id: str, asset: Asset, size_m: Size | None = None) -> GaussianScene:
-    """A copy of the scene in which a track looks like ``asset``, on the same path and still with its own id.
+    """A copy of the scene in which a track has the appearance of ``asset``, with the same path and id.
 
-    The box gets ``size_m``, or the asset's own size, and stands where it stood: its centre moves up or down by half of
-    the difference of the heights.
+    The box gets ``size_m``, or the asset's own size, and keeps its ground contact: its centre moves vertically by half
+    of the height difference.
 
     Raises:
-        RequestError: there is no such track.
+        RequestError: unknown track.
         TooLargeError: see ``with_track``.
     """
     track = scene.tracks[_number_of(scene, track_id)]
@@ -104,7 +104,7 @@ def replaced_track(scene: GaussianScene, track_id: str, asset: Asset, size_m: Si
     rise = geometry.pose(np.eye(3), np.array([0.0, 0.0, (size_m[2] - track.size_m[2]) / 2]))
     path = Trajectory(track.path.t_us, track.path.world_from_body @ rise)
     if not (scene.dynamic.track == _number_of(scene, track_id)).any() and _stands(track):
-        path = _standing(path, scene)  # what the static layer shows is there all the time
+        path = _standing(path, scene)  # static Gaussians exist throughout the scene
     place_in = [other.id for other in scene.tracks].index(track_id)
     bare = without_track(scene, track_id)
     grown = _grown(bare, dataclasses.replace(track, label=asset.label, size_m=size_m, path=path), asset)
@@ -112,10 +112,10 @@ def replaced_track(scene: GaussianScene, track_id: str, asset: Asset, size_m: Si
 
 
 def without_track(scene: GaussianScene, track_id: str) -> GaussianScene:
-    """A copy of the scene without a track and all Gaussians of it.
+    """A copy of the scene without a track and its Gaussians.
 
     Raises:
-        RequestError: there is no such track.
+        RequestError: unknown track.
     """
     number = _number_of(scene, track_id)
     own = scene.dynamic.track == number
@@ -127,7 +127,7 @@ def without_track(scene: GaussianScene, track_id: str) -> GaussianScene:
 
 
 def have(scene: GaussianScene) -> str:
-    """Which tracks a scene has, for an error text."""
+    """The tracks of a scene, for error texts."""
     ids = [track.id for track in scene.tracks]
     return f"have {ids[:20]}" + (f" and {len(ids) - 20} more" if len(ids) > 20 else "")
 
@@ -140,10 +140,10 @@ def _number_of(scene: GaussianScene, track_id: str) -> int:
 
 
 def _snapshot(mine: DynamicGaussians, track: Track) -> tuple[Gaussians, np.ndarray]:
-    """A track's Gaussians in the world at one instant, faded as they are then, and its pose then.
+    """A track's Gaussians in the world at one instant, with their fade, and its pose.
 
-    The upper quartile by opacity of all instants at which a Gaussian is at its middle knot: at the very fullest two
-    windows of time may overlap, and everything would be there twice.
+    Uses the upper quartile by total opacity of all middle knot times: at the maximum two time windows may overlap and
+    duplicate everything.
     """
     times = np.unique(mine.knot_t_us[:, 1])
     times = times[np.linspace(0, len(times) - 1, min(len(times), _LOOKS)).astype(int)]
@@ -163,12 +163,12 @@ def _stands(track: Track) -> bool:
 
 
 def _standing(path: Trajectory, scene: GaussianScene) -> Trajectory:
-    """The first pose of a path for as long as the scene lasts."""
+    """The first pose of a path, held for the duration of the scene."""
     return Trajectory(np.array(scene.span_us), np.repeat(path.world_from_body[:1], 2, axis=0))
 
 
 def _baked_in(scene: GaussianScene, track: Track) -> Bool[np.ndarray, " n"]:
-    """Which static Gaussians are a track that stands: the movable ones in its box, 10 % larger."""
+    """Mask of static Gaussians that belong to a static track: the movable ones in its box, enlarged by 10 %."""
     if not _stands(track):
         return np.zeros(len(scene.static), bool)
     local = geometry.transform_points(geometry.inverse(track.path.world_from_body[0]), scene.static.mean_m)
@@ -177,7 +177,7 @@ def _baked_in(scene: GaussianScene, track: Track) -> Bool[np.ndarray, " n"]:
 
 
 def _grown(scene: GaussianScene, track: Track, asset: Asset) -> GaussianScene:
-    """The scene with a track at the end of its list."""
+    """The scene with a track appended."""
     path, (first, last) = track.path, scene.span_us
     if path.end_us < first or path.start_us > last:
         raise RequestError(
@@ -203,7 +203,7 @@ def _grown(scene: GaussianScene, track: Track, asset: Asset) -> GaussianScene:
 
 
 def _moved_track(scene: GaussianScene, at: int, to: int) -> GaussianScene:
-    """The same scene with the track at one place of the list moved forward to another."""
+    """The same scene with a track moved to another index."""
     tracks = list(scene.tracks)
     tracks.insert(to, tracks.pop(at))
     old = scene.dynamic.track
@@ -226,7 +226,7 @@ def _rows(dynamic: DynamicGaussians, keep: Bool[np.ndarray, " n"]) -> DynamicGau
 
 
 def _joined(one: DynamicGaussians, other: DynamicGaussians) -> DynamicGaussians:
-    """Both, with as many coefficients of harmonics as the richer one has."""
+    """Concatenation, with harmonics padded to the higher degree."""
     count = len(one)
     gaussians = joined([one.gaussians, other.gaussians])
     parts = [

@@ -1,4 +1,4 @@
-"""Everything of a scene but its large arrays, as one JSON object and back."""
+"""JSON encoding of a scene without its large arrays."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def scene_facts(scene: GaussianScene) -> dict[str, Any]:
     """The facts as plain JSON, in a canonical form: equal facts give equal text (4 and 4.0 are equal).
 
     Raises:
-        ArchiveError: a value is of the wrong kind and could not be read back.
+        ArchiveError: a value has the wrong type and could not be read back.
     """
     raw = {name: codec.to_json(getattr(scene, name)) for name in _DECODERS}
     return {name: codec.to_json(value) for name, value in _decode(raw, f"scene {scene.id!r}").items()}
@@ -36,7 +36,7 @@ def facts_from_json(raw: Any, where: str) -> dict[str, Any]:
     """Keyword arguments of GaussianScene from the object that ``scene_facts`` made.
 
     Raises:
-        ArchiveError: a field is missing, unknown or of the wrong kind.
+        ArchiveError: a field is missing, unknown or of the wrong type.
     """
     if not isinstance(raw, dict) or set(raw) != set(_DECODERS):
         given = sorted(raw) if isinstance(raw, dict) else type(raw).__name__

@@ -1,4 +1,4 @@
-"""Which files are scenes, and who reads each."""
+"""Scene file formats and their readers."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from nurec_sim.types import GaussianScene
 
 FOREIGN_SUFFIXES = (".ply", ".spz", ".usd", ".usda", ".usdc", ".nurec", ".ckpt")
 SCENE_SUFFIXES = (".usdz", *FOREIGN_SUFFIXES)
-"""Names of files that ``read_scene`` opens end in one of these, in capitals or not."""
+"""File suffixes that ``read_scene`` supports, case-insensitive."""
 
 
 def read_scene(path: Path | str) -> GaussianScene:
-    """Reads a scene: an archive of ours (``read_archive``), or what another program wrote (``read_foreign``).
+    """Reads a scene: an archive of ours (``read_archive``), or a third-party scene (``read_foreign``).
 
     Raises:
-        ArchiveError: not a scene, damaged, changed since it was written, unsafe, or not sound.
+        ArchiveError: not a scene, damaged, modified, unsafe, or invalid.
     """
     path = Path(path)
     return read_foreign(path) if is_foreign(path) else read_archive(path)
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether another program wrote a file of a scene: it has no manifest of ours.
+    """Whether a scene file is third-party, that is without our manifest.
 
     Raises:
-        ArchiveError: the file is no readable archive.
+        ArchiveError: the file is not a readable archive.
     """
     if path.suffix.lower() in FOREIGN_SUFFIXES:
         return True

@@ -1,7 +1,7 @@
 """The ground as a triangle mesh: a height grid from the road Gaussians, completed under the recorded path.
 
-AlpaSim's physics sets cars on ``mesh_ground.ply``. One height per place: a bridge over a road keeps the level nearer
-to the recorded path.
+AlpaSim's physics places cars on ``mesh_ground.ply``. It has one height per cell: at bridges the level nearest to the
+recorded path.
 """
 
 from __future__ import annotations
@@ -14,16 +14,18 @@ from jaxtyping import Bool, Float32, Float64, Int32
 from nurec_sim.types import GaussianScene, Label
 
 CELL_M = 0.5
-REACH_M = 150.0  # how far from the recorded path the mesh may extend
-LEVEL_M = 4.0  # points higher above or lower below the path than this plus 15 % of their distance are another level
-CORRIDOR_M = 3.0  # ground is always made this far to each side of the path
+REACH_M = 150.0  # maximum distance from the recorded path
+LEVEL_M = (
+    4.0  # points that differ in height from the path by more than this plus 15 % of their distance are on another level
+)
+CORRIDOR_M = 3.0  # half width of the guaranteed ground strip along the path
 HOLE_CELLS = 8  # holes up to this many cells away from a known height are filled
 MAX_CELLS = 4_000_000
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles, counter-clockwise seen from above."""
+    """Triangles, counter-clockwise from above."""
 
     vertices_m: Float64[np.ndarray, "v 3"]
     triangles: Int32[np.ndarray, "t 3"]
@@ -70,7 +72,7 @@ def _near_path(points: Float64[np.ndarray, "n 3"], path: Float64[np.ndarray, "p 
 
 
 def _corridor(scene: GaussianScene, path: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "c 3"]:
-    """A strip of ground points along the path, and around its first and last place, tilted as the rig is."""
+    """A strip of ground points along the path and around its ends, tilted like the rig."""
     first, last = scene.ego.world_from_body[[0, -1]]
     offsets = np.arange(-CORRIDOR_M, CORRIDOR_M + CELL_M / 4, CELL_M / 2)
     heading = np.gradient(path[:, :2], axis=0) if len(path) > 1 else np.zeros((1, 2))
@@ -101,7 +103,7 @@ def _cell_medians(
 
 
 def _fill_holes(height: Float64[np.ndarray, "nx ny"]) -> Float64[np.ndarray, "nx ny"]:
-    """Gives cells enclosed by known ones (morphological closing) a height, smoothly continued from the known ones."""
+    """Fills cells enclosed by known ones (morphological closing) with smoothly extrapolated heights."""
     from scipy import ndimage
 
     known: Bool[np.ndarray, "nx ny"] = ~np.isnan(height)
@@ -110,7 +112,7 @@ def _fill_holes(height: Float64[np.ndarray, "nx ny"]) -> Float64[np.ndarray, "nx
     padded = np.pad(known, HOLE_CELLS)
     closed = ndimage.binary_closing(padded, iterations=HOLE_CELLS)[HOLE_CELLS:-HOLE_CELLS, HOLE_CELLS:-HOLE_CELLS]
     filled = np.where(known, height, 0.0)
-    # Normalised convolution: a weighted mean of the known heights, the nearest ones counting most.
+    # Normalised convolution: a mean of the known heights weighted by nearness.
     weight = ndimage.gaussian_filter(known.astype(np.float64), HOLE_CELLS / 2)
     mean = ndimage.gaussian_filter(filled, HOLE_CELLS / 2) / np.maximum(weight, 1e-12)
     return np.where(known, height, np.where(closed & (weight > 1e-6), mean, np.nan))

@@ -52,8 +52,8 @@ def sh_functions(x: Any, y: Any, z: Any, k: int) -> list[Any]:
 def rotate_harmonics(
     sh_rest: Float32[np.ndarray, "n k 3"], rotation: Float64[np.ndarray, "3 3"]
 ) -> Float32[np.ndarray, "n k 3"]:
-    """Coefficients of the turned colours: what was seen along d is then seen along ``rotation @ d``."""
+    """Rotated coefficients: the colour along d moves to ``rotation @ d``."""
     k = sh_rest.shape[1]
-    direction = released_cubemap_directions(4).reshape(-1, 3)  # any set that spans the functions will do
+    direction = released_cubemap_directions(4).reshape(-1, 3)  # any directions that span the functions
     turned = np.linalg.lstsq(sh_basis(direction, k), sh_basis(direction @ rotation, k))[0]
     return np.einsum("jk,nkc->njc", turned, sh_rest).astype(np.float32)

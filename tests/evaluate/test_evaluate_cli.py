@@ -43,7 +43,7 @@ def test_one_command_prints_the_tables_and_keeps_them(streets, capsys):
 def test_random_weights_are_named_as_such(streets, capsys):
     run_cli("--protocol", "storm", "--worlds", 1, "--methods", "selective", "--random-weights", 2, "--sky-px", 16)
     page = (streets / "evaluations" / "latest" / "report.html").read_text()
-    assert "random weights of seed 2: its figures mean nothing" in page
+    assert "random weights of seed 2: its results are meaningless" in page
     assert "selective" in capsys.readouterr().out
 
 

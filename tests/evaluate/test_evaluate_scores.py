@@ -173,7 +173,7 @@ def test_tables_say_what_is_not_known(name):
     if name == "shift":
         assert made["shift_doubling"].rows == (
             ("dense", "not reached up to 1 m", "-"),
-            ("copy", "depth not known", "-"),
+            ("copy", "depth unknown", "-"),
         )
         assert made["shift_psnr_db"].rows[0] == ("dense", "20.00", "18.00")
     else:

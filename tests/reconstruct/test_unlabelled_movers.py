@@ -83,14 +83,14 @@ def test_the_report_names_what_nobody_labelled():
                                for made in (with_mover(), without_labels(), scene()))  # fmt: skip
     assert movers.counts["tracks"] == 1 and movers.counts["unlabelled movers"] == 1 and movers.actors_known
     (text,) = (text for text in movers.unknown if "unlabelled" in text)
-    assert text.startswith("1 unlabelled movers, which no box of the log names, are in the picture but are no actors")
+    assert text.startswith("1 unlabelled movers without a box in the log are rendered but are not actors")
     assert text.endswith(": moving-1 (like automobile, 0.0 to 2.0 s)")
     shown = _reconstructions([ReportScene("street", "dense", counts=movers.counts)])
     assert "<dt>actors</dt><dd>1</dd>" in shown and "<dt>unlabelled movers</dt><dd>1</dd>" in shown
     (text,) = (text for text in found.unknown if "labelled" in text)
-    assert text.startswith("1 actors were found by how they move and nobody has labelled them")
+    assert text.startswith("1 actors were detected by motion and are unlabelled")
     assert found.counts["tracks"] == 1 and "unlabelled movers" not in found.counts and found.actors_known
     assert not any("labelled" in text for text in labelled.unknown)
-    assert dict(summary(with_mover()))["tracks"] == "1 actors, 1 unlabelled movers beside them"
-    assert dict(summary(without_labels()))["tracks"] == "1 actors, 1 of them found by how they move, not labelled"
+    assert dict(summary(with_mover()))["tracks"] == "1 actors, 1 additional unlabelled movers"
+    assert dict(summary(without_labels()))["tracks"] == "1 actors, 1 of them detected by motion, unlabelled"
     assert dict(summary(scene()))["tracks"] == "2"

@@ -79,10 +79,10 @@ def test_broken_rollout_files_are_refused_with_a_reason(tmp_path):
     with pytest.raises(RunError, match="absent.npz does not exist"):
         load_rollout(tmp_path / "absent.npz")
     (tmp_path / "text.npz").write_text("hello")
-    with pytest.raises(RunError, match="no readable rollout file"):
+    with pytest.raises(RunError, match="not a readable rollout file"):
         load_rollout(tmp_path / "text.npz")
     (tmp_path / "cut.npz").write_bytes(good.read_bytes()[:400])
-    with pytest.raises(RunError, match="no readable rollout file"):
+    with pytest.raises(RunError, match="not a readable rollout file"):
         load_rollout(tmp_path / "cut.npz")
     with np.load(good) as file:
         arrays = dict(file)
@@ -96,7 +96,7 @@ def test_broken_rollout_files_are_refused_with_a_reason(tmp_path):
     with pytest.raises(RunError, match="state_numbers has 20 entries; 19 are needed"):
         load_rollout(tmp_path / "short.npz")
     np.savez(tmp_path / "pickle.npz", **{**arrays, "plan_stops": np.array([{}], object)})
-    with pytest.raises(RunError, match="no readable rollout file"):
+    with pytest.raises(RunError, match="not a readable rollout file"):
         load_rollout(tmp_path / "pickle.npz")
 
 
@@ -111,7 +111,7 @@ def test_a_scene_record_comes_back_with_its_grid(tmp_path):
     assert np.array_equal(again.grid.state, record.grid.state)
     assert np.array_equal(again.grid.beyond_known_m, record.grid.beyond_known_m)
     (tmp_path / "scene.json").write_text("{}")
-    with pytest.raises(RunError, match="scene.json is no readable scene record"):
+    with pytest.raises(RunError, match="scene.json is not a readable scene record"):
         load_scene_record(tmp_path)
 
 
@@ -157,7 +157,7 @@ def test_video_refuses_what_it_cannot_show(tmp_path):
     with pytest.raises(RequestError, match="returned 0 frames for 3 requests"):
         runs.record_video(run, lambda requests: [], camera, tmp_path / "a.mp4")
     small = [dataclasses.replace(frame, rgb=np.zeros((4, 4, 3), np.uint8)) for frame in striped_of(run)]
-    with pytest.raises(RequestError, match=r"wanted an image of 64x36, got one of \(4, 4, 3\)"):
+    with pytest.raises(RequestError, match=r"expected an image of 64x36, got one of \(4, 4, 3\)"):
         runs.record_video(run, lambda requests: small, camera, tmp_path / "a.mp4", width_px=64)
 
 
@@ -274,7 +274,7 @@ def test_a_damaged_rollout_is_driven_again_with_a_line_that_says_so(tmp_path, sp
     assert path.read_bytes() == whole and (run / "report.html").read_bytes() == report
     assert len(heard) == 1
     assert heard[0].startswith(
-        f"log_replay in street (lift), seed 0 is driven again: {path} is no readable rollout file"
+        f"log_replay in street (lift), seed 0 is repeated: {path} is not a readable rollout file"
     )
 
 
@@ -318,7 +318,7 @@ def test_parts_of_killed_writers_are_removed_by_the_next_run_and_live_ones_are_n
         leave()
         go(stamp="b")  # beside a run that is alive: its parts stay
         assert all(path.exists() for path in left)
-        with pytest.raises(RunError, match="another run is writing to .*/a; wait for its end"):
+        with pytest.raises(RunError, match="another run is writing to .*/a; wait until it ends"):
             go(resume=run)
     go(resume=run)
     assert not any(path.exists() for path in left) and all(path.exists() for path in mine)
@@ -362,7 +362,7 @@ def test_an_interrupted_rollout_leaves_nothing(tmp_path):
         runs.execute([scene], SCENARIO, ["log_replay"], lambda scene_id: interrupted, tmp_path, stamp="a")
     left = {path.name for path in (tmp_path / "a").rglob("*") if path.is_file()}
     assert left == {"scene.json", "road.npz"}
-    with pytest.raises(RunError, match="holds no rollout"):
+    with pytest.raises(RunError, match="has no rollout"):
         runs.write_report(tmp_path / "a")
 
 
@@ -389,7 +389,7 @@ def test_bad_orders_are_refused(tmp_path):
     def drive(scenes, policies, **more):
         runs.execute(scenes, SCENARIO, policies, lambda i: striped, tmp_path, **more)
 
-    with pytest.raises(ScenarioError, match="no policy to drive"):
+    with pytest.raises(ScenarioError, match="no policy to run"):
         drive([scene], [])
     with pytest.raises(ScenarioError, match="no scene to drive"):
         drive([], ["log_replay"])

@@ -1,1 +1,1 @@
-"""How right images, depth and LiDAR sweeps are."""
+"""Scores of images, depth and LiDAR sweeps."""

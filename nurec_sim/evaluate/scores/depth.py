@@ -1,7 +1,7 @@
-"""How right a depth image is: AbsRel and delta1, as predicted or after a least-squares scale (paper section 5.1).
+"""Depth scores: AbsRel and delta1, as predicted or after a least-squares scale (paper section 5.1).
 
-Depths are z-depths in metres; 0 means that there is none. A pixel with a true depth for which none was predicted
-counts as predicted 0: its relative error is 1 and it misses delta1.
+Depths are z-depths in metres; 0 means unknown. A pixel with true but no predicted depth has relative error 1 and is
+outside delta1.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 FARTHEST_M = 80.0
-"""True depths beyond are not scored: the LiDARs of the public protocols reach about so far."""
+"""Maximum scored true depth, about the range of the LiDARs of the public protocols."""
 DELTA1 = 1.25
 
 
 @dataclass(frozen=True)
 class DepthScore:
-    """Scores over some pixels; NaN where there are none.
+    """Scores over a set of pixels; NaN if empty.
 
     Attributes:
         abs_rel: mean of abs(d - true) / true.
@@ -34,12 +34,12 @@ class DepthScore:
 
 
 def known_depth(true_m: Float[np.ndarray, "h w"], farthest_m: float = FARTHEST_M) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose true depth is scored."""
+    """Mask of pixels with scored true depth."""
     return (true_m > 0) & (true_m <= farthest_m)
 
 
 def least_squares_scale(depth_m: Float[np.ndarray, "h w"], true_m: Float[np.ndarray, "h w"]) -> float:
-    """The factor s that makes s * depth fit the truth best, over the pixels that have both; 1 where there are none.
+    """The least-squares factor s of s * depth against the truth over pixels with both; 1 if there are none.
 
     s = sum(true * d) / sum(d^2) (metrics of the paper's Table 1, per frame).
     """
@@ -51,7 +51,7 @@ def least_squares_scale(depth_m: Float[np.ndarray, "h w"], true_m: Float[np.ndar
 def depth_score(
     depth_m: Float[np.ndarray, "h w"], true_m: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"] | None = None
 ) -> DepthScore:
-    """Scores of a predicted depth over the pixels whose truth is known, within ``mask`` if it is given.
+    """Scores of a predicted depth over pixels with known truth, within ``mask`` if given.
 
     Raises:
         ValueError: the shapes differ.

@@ -1,4 +1,4 @@
-"""How alike two images are: PSNR and SSIM, over whole images or within a mask.
+"""Image scores: PSNR and SSIM, over whole images or within a mask.
 
 Images are [h, w] or [h, w, channels] of one type; integers count in 0..255, floats in 0..1 unless ``data_range`` says
 otherwise.
@@ -76,9 +76,9 @@ def masked_psnr(image: np.ndarray, reference: np.ndarray, mask: Bool[np.ndarray,
 
 
 def masked_ssim(image: np.ndarray, reference: np.ndarray, mask: Bool[np.ndarray, "h w"]) -> float:
-    """Mean SSIM of the windows whose middle pixel lies in a mask; NaN if there are none.
+    """Mean SSIM of the windows whose centre pixel is in a mask; NaN if there are none.
 
-    Windows reach over the edge of the mask, as in the STORM protocol.
+    Windows extend beyond the mask, as in the STORM protocol.
 
     Raises:
         ValueError: the images or the mask differ in shape, or are smaller than the window.
@@ -102,6 +102,6 @@ def _checked(
             f"two images of one shape [h, w] or [h, w, c] are needed, got {image.shape}, {reference.shape}"
         )
     if (image.dtype.kind == "f") != (reference.dtype.kind == "f"):
-        raise ValueError(f"images of one kind are needed, got {image.dtype}, {reference.dtype}")
+        raise ValueError(f"images must have the same dtype, got {image.dtype}, {reference.dtype}")
     span = data_range if data_range is not None else (1.0 if image.dtype.kind == "f" else 255.0)
     return image.astype(np.float64), reference.astype(np.float64), float(span)

@@ -1,8 +1,8 @@
-"""How alike a simulated and a recorded LiDAR sweep are, beam by beam.
+"""Beam-wise comparison of simulated and recorded LiDAR sweeps.
 
-Every recorded return asks for one beam: the one that left the sensor where and when the return was measured, in its
-direction. Azimuths snap to the nearest column of the scanner; elevations are covered by rows so dense that the range
-at the exact elevation is interpolated between the two rows around it.
+Every recorded return is compared with one beam: from the sensor pose at its firing time, in its direction. Azimuths
+snap to the nearest column of the scanner; the range at the exact elevation is interpolated between two dense rows
+around it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from nurec_sim.types import LidarFrame, LidarModel
 
 ROW_STEP_RAD = np.radians(0.05)
 SAME_SURFACE = 0.05
-"""Two rows of a beam see one surface if their ranges differ by less than this part."""
+"""Maximum relative range difference of two rows on the same surface."""
 
 
 @dataclass(frozen=True)
@@ -91,22 +91,22 @@ class LidarScore:
 
 
 def scanner_along(lidar: LidarModel, xyz_fired_m: Float64[np.ndarray, "n 3"]) -> LidarModel:
-    """The scanner with dense rows over the elevations of recorded returns, given in the frame they were fired in."""
+    """The scanner with dense rows at the elevations of recorded returns, given in the sensor frame at firing time."""
     elevation = _elevation(xyz_fired_m)
     low, high = np.floor(elevation.min() / ROW_STEP_RAD), np.ceil(elevation.max() / ROW_STEP_RAD)
     rows = np.arange(high + 1, low - 2, -1) * ROW_STEP_RAD
-    # Rows that no return lies beside need not be fired; the two around each return must.
+    # Only the two rows around each return are needed.
     index = np.unique(np.floor(elevation / ROW_STEP_RAD).astype(np.int64))
     needed = np.isin(np.round(rows / ROW_STEP_RAD).astype(np.int64), np.concatenate([index, index + 1]))
     return dataclasses.replace(lidar, elevation_rad=rows[needed], row_azimuth_offset_rad=np.zeros(int(needed.sum())))
 
 
 def score_sweep(simulated: LidarFrame, xyz_fired_m: Float64[np.ndarray, "n 3"]) -> LidarScore:
-    """Compare a sweep simulated with ``scanner_along`` with the recorded returns.
+    """Compares a sweep simulated with ``scanner_along`` with the recorded returns.
 
     Args:
         simulated: frame of that scanner, from the recorded poses.
-        xyz_fired_m: recorded returns, each in the frame of the sensor when it was fired.
+        xyz_fired_m: recorded returns, each in the sensor frame at its firing time.
 
     Returns:
         one beam per recorded return within the scanner's range.

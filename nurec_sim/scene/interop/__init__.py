@@ -1,1 +1,1 @@
-"""Scenes of other programs: NuRec archives, OpenUSD particle fields, 3DGS PLY files (docs/foreign_scenes.md)."""
+"""Third-party scenes: NuRec archives, OpenUSD particle fields, 3DGS PLY files (docs/foreign_scenes.md)."""

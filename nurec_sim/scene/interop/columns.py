@@ -1,4 +1,4 @@
-"""Gaussians from the columns of numbers that other programs' files hold: checked, activated, unsound ones left out."""
+"""Gaussians from columns of third-party files: validated, activated, invalid ones dropped."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class Columns:
-    """Gaussians as most formats have them; scales and opacities after activation, colours as harmonics of 3DGS."""
+    """Gaussians in common conventions: scales and opacities after activation, colours as 3DGS harmonics."""
 
     mean_m: np.ndarray  # [n,3]
     quat_wxyz: np.ndarray  # [n,4], of any length
@@ -36,10 +36,10 @@ class Columns:
     rest: np.ndarray | None = None  # [n,k,3]
 
     def check(self, where: str) -> None:
-        """Checks that all columns are as long as the positions and as wide as they must be.
+        """Checks the shapes of all columns.
 
         Raises:
-            ArchiveError: with the column, what was given and what is needed.
+            ArchiveError: with the column, the given and the required shape.
         """
         n = len(self.mean_m)
         wanted = {"mean_m": (n, 3), "quat_wxyz": (n, 4), "scale_m": (n, 3), "opacity": (n,), "dc": (n, 3)}
@@ -56,7 +56,7 @@ class Columns:
         label: Label | UInt8[np.ndarray, " n"] = Label.OTHER,
         normal: Float32[np.ndarray, "n 3"] | None = None,
     ) -> tuple[Gaussians, int]:
-        """The sound ones, in single precision, and how many others there were.
+        """The valid Gaussians in single precision, and the number of dropped ones.
 
         Args:
             label: class of all, or of each.

@@ -24,15 +24,15 @@ _WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
 def is_compressed(table: VertexTable) -> bool:
-    """Whether the vertices of a file are words of this format."""
+    """Whether the vertices of a file have this format."""
     return _WORDS[0] in table.names
 
 
 def read_compressed(table: VertexTable) -> tuple[Gaussians, int]:
-    """The Gaussians of a compressed file, and how many others were dropped because a number is not finite.
+    """The Gaussians of a compressed file, and the number dropped for non-finite values.
 
     Raises:
-        ArchiveError: elements or properties are missing, of another type or number.
+        ArchiveError: elements or properties are missing, or of the wrong type or number.
     """
     if missing := [name for name in _WORDS if name not in table.names]:
         raise ArchiveError(f"{table.path}: a compressed PLY whose vertices lack {missing}")
@@ -73,7 +73,7 @@ def _fields(word: np.ndarray, shifts: tuple[int, ...], bits: tuple[int, ...]) ->
 def _between(
     chunks: VertexTable, chunk: np.ndarray, prefix: str, axes: str, share: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Values that lie so far from the lower to the upper bound of their chunk."""
+    """Linear interpolation between the bounds of the chunk."""
     low, high = (
         chunks.columns([f"{end}_{prefix}{axis}" for axis in axes]).astype(np.float64) for end in ("min", "max")
     )

@@ -1,4 +1,4 @@
-"""A scene as PLY with its sky beside it, for programs that know nothing else; and such files as a scene."""
+"""Export of scenes as PLY with a sky file, and import of third-party files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from nurec_sim.types import Clip, Gaussians, GaussianScene
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export wrote: the files, the Gaussians in the PLY, and how many were left out and why."""
+    """Result of an export: files, number of Gaussians, and numbers of skipped ones by reason."""
 
     paths: tuple[Path, ...]
     written: int
@@ -38,20 +38,20 @@ def export_scene(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Exported:
-    """Writes ``X.ply``, ``X.sky.npz`` and ``X.sky.png``, the PLY last; each appears complete or not at all.
+    """Writes ``X.ply``, ``X.sky.npz`` and ``X.sky.png``, the PLY last, each atomically.
 
     Args:
-        scene: what to write: the static layer, the sky and the colour correction.
+        scene: the scene, of which the static layer, the sky and the colour correction are written.
         path: ends in ``.ply``.
-        layout: which properties a vertex of the PLY has, one of ``LAYOUTS``.
-        up: axis of the files that points up, one of ``UP_AXES``; what is written is turned, the sky too.
-        at_us: also write the moving Gaussians, as they are at this instant; left out if None.
+        layout: vertex layout of the PLY, one of ``LAYOUTS``.
+        up: up axis of the files, one of ``UP_AXES``; Gaussians and sky are rotated.
+        at_us: also write the moving Gaussians at this time; None skips them.
         overwrite: whether existing files may be replaced.
-        progress: hears what is being done and the fraction of it that is.
+        progress: called with stage and fraction done.
 
     Raises:
         ArchiveError: a file exists, the name does not end in ``.ply``, the instant is outside of the scene's span,
-            or there is no such layout or axis.
+            or an unknown layout or axis.
     """
     path = Path(path)
     if path.suffix != ".ply":
@@ -77,19 +77,19 @@ def export_scene(
 def import_scene(
     path: Path | str, *, sky: Path | str | None = None, like: GaussianScene | Clip | None = None, up: str | None = None
 ) -> GaussianScene:
-    """A scene from a file of another program; ``provenance["unknown"]`` says what could not be known.
+    """Imports a third-party file; ``provenance["unknown"]`` lists missing information.
 
     Args:
-        path: a file that ``interop.reader.read_foreign`` reads; an archive of ours stays what it is.
-        sky: a sky file with colour corrections; ``X.sky.npz`` beside ``X.ply`` is taken if None and it is there.
-        like: a scene or a log in the same world, for what the file lacks: sensors with path and times, tracks, the map,
-            and, from a scene, the sky and the colour correction. Else the car stands at the origin for one second,
-            with one camera, 1.5 m up, that looks along x, under a black sky.
-        up: axis of a PLY or SPZ file that points up, one of ``UP_AXES``; the file is turned so that it is z. If
-            None, y for SPZ, and for a PLY what the export noted in it or z. Other files say it themselves.
+        path: a file for ``interop.reader.read_foreign``, or our own archive.
+        sky: a sky file with colour corrections; default: ``X.sky.npz`` beside ``X.ply``, if it exists.
+        like: a scene or a log in the same world that supplies missing data: sensors with path and times, tracks, the
+            map, and, from a scene, the sky and the colour correction. Otherwise the car is at the origin for one
+            second, with one camera, 1.5 m high, facing along x, under a black sky.
+        up: up axis of a PLY or SPZ file, one of ``UP_AXES``, rotated to z. Default: y for SPZ; for PLY the axis
+            recorded by our export, else z. Other formats define it themselves.
 
     Raises:
-        ArchiveError: a file cannot be read, or ``up`` is no axis.
+        ArchiveError: a file cannot be read, or ``up`` is not an axis.
     """
     path = Path(path)
     if path.suffix.lower() != ".usdz" or not path.is_file() or is_foreign(path):

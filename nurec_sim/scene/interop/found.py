@@ -1,4 +1,4 @@
-"""What a foreign file turns out to hold, before it is a scene."""
+"""Contents of a third-party file before conversion to a scene."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from nurec_sim.types import Gaussians
 
 @dataclass
 class Found:
-    """Parts of a foreign scene in the frame of its file, collected while it is read.
+    """Parts of a third-party scene in the frame of its file.
 
     Attributes:
         static: sets of Gaussians that do not move.
-        boxed: sets of Gaussians in the frames of boxes, by the name that the file has for the box.
+        boxed: sets of Gaussians in box frames, by the box name in the file.
         sky: a cubemap, faces as in ``geometry.cubemap_directions``; None if the file has none.
         exposure: factors on the colours of cameras, in the order of the file's cameras.
-        dropped: how many Gaussians were no Gaussians: not finite, without extent, with a quaternion of zero.
-        volumes: where a stage puts the NuRec files that it shows, z up in metres, by their names.
-        unknown: what the file holds but is not read, and what it should hold but does not, one sentence each.
+        dropped: number of invalid Gaussians: not finite, zero scale, or zero quaternion.
+        volumes: transforms of NuRec files referenced by a stage, z up in metres, by name.
+        unknown: ignored and missing parts of the file, one sentence each.
     """
 
     static: list[Gaussians] = field(default_factory=list)

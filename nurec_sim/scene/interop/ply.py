@@ -1,4 +1,4 @@
-"""Gaussians as a 3DGS PLY file: two layouts written, everyone's read.
+"""Gaussians as 3DGS PLY files: writes two layouts, reads all common ones.
 
 In the file scales are logarithms, opacities logits, quaternions ``wxyz``, colours coefficients of spherical harmonics
 (docs/exchange.md).
@@ -28,7 +28,7 @@ Layout = Literal["inria", "release"]
 LAYOUTS = get_args(Layout)
 
 MOST_OPAQUE = 1 - 1e-6
-"""Opacities are kept this far from 0 and 1, whose logits are infinite."""
+"""Distance of clamped opacities from 0 and 1, whose logits are infinite."""
 BLOCK = 1 << 18
 _UP_COMMENT = "3D Gaussians, metres, {up} up"
 POSITION, NORMAL, COLOUR = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -39,8 +39,8 @@ NEEDED = (*POSITION, *ROTATION, *SCALE, "opacity", *COLOUR)
 def vertex_type(k: int = 0, layout: Layout = "inria") -> np.dtype:
     """A vertex with 3 k coefficients of view-dependent colour; 68 bytes, or 77 in the released layout, if k is 0.
 
-    ``inria`` is what the code of Kerbl et al., "3D Gaussian Splatting" (2023) writes, floats only; many viewers take
-    any other property for a float as well. ``release`` is what the released Instant NuRec network writes.
+    ``inria`` is what the code of Kerbl et al., "3D Gaussian Splatting" (2023) writes, floats only; many viewers misread
+    any other property as a float. ``release`` is what the released Instant NuRec network writes.
     """
     if layout == "inria":
         names = (*POSITION, *NORMAL, *COLOUR, *_rest_names(k), "opacity", *SCALE, *ROTATION)
@@ -63,24 +63,24 @@ def write_ply(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> int:
-    """Writes a binary little-endian PLY; the file appears complete or not at all.
+    """Writes a binary little-endian PLY atomically.
 
-    Gaussians that have no finite form in the file are left out: a value that is not finite, a scale of zero.
-    LiDAR intensities and ray drop are not kept; of the labels, road and sky by the layout ``release`` only.
+    Gaussians with non-finite values or zero scale are skipped. LiDAR intensities and ray drop are not stored; of the
+    labels, road and sky in the layout ``release`` only.
 
     Args:
-        gaussians: what to write, world frame.
-        path: the file; its folder is made if need be.
-        layout: which properties a vertex has.
-        up: axis of the file that points up, one of ``UP_AXES``; Gaussians are turned, colours with them.
+        gaussians: Gaussians in the world frame.
+        path: the file; missing folders are created.
+        layout: vertex layout.
+        up: up axis of the file, one of ``UP_AXES``; Gaussians and view-dependent colours are rotated.
         overwrite: whether an existing file may be replaced.
-        progress: hears what is being done and the fraction of it that is.
+        progress: called with stage and fraction done.
 
     Returns:
-        How many were written.
+        Number of written Gaussians.
 
     Raises:
-        ArchiveError: the file exists, or there is no such layout or axis.
+        ArchiveError: the file exists, or an unknown layout or axis.
     """
     path = Path(path)
     if layout not in LAYOUTS:
@@ -102,18 +102,18 @@ def write_ply(
 
 
 def read_ply(path: Path | str) -> tuple[Gaussians, int]:
-    """Reads Gaussians from the PLY file of any 3DGS program.
+    """Reads Gaussians from a 3DGS PLY file.
 
-    Compressed files (``compressed_ply``) are known by their properties. In others these may have any order and type;
-    ``nx ny nz``, ``f_rest_*`` (0, 9, 24 or 45 of them, channel-major), ``road_mask`` and ``sky_mask`` are optional,
-    others are ignored. An infinite opacity means 1 (the released network writes it), a normal that is not finite is
-    unknown; any other value that is not finite, a quaternion of zero or a scale of zero drops its Gaussian.
+    Compressed files (``compressed_ply``) are detected by their properties. In others properties may have any order and
+    type; ``nx ny nz``, ``f_rest_*`` (0, 9, 24 or 45 of them, channel-major), ``road_mask`` and ``sky_mask`` are
+    optional, others are ignored. An infinite opacity means 1 (the released network writes it), a normal that is not
+    finite is unknown; any other value that is not finite, a quaternion of zero or a scale of zero drops its Gaussian.
 
     Returns:
-        The Gaussians, and how many were dropped.
+        The Gaussians, and the number of dropped ones.
 
     Raises:
-        ArchiveError: not a PLY file, damaged, cut short, or without the properties of Gaussians.
+        ArchiveError: not a PLY file, damaged, truncated, or without the properties of Gaussians.
     """
     table = VertexTable(Path(path))
     if is_compressed(table):
@@ -137,7 +137,7 @@ def read_ply(path: Path | str) -> tuple[Gaussians, int]:
 
 
 def ply_up(path: Path | str) -> str:
-    """The axis of a file that points up, as ``write_ply`` notes it in a comment; z for other programs' files.
+    """The up axis recorded by ``write_ply`` in a comment; z for other files.
 
     Raises:
         ArchiveError: as of ``read_ply``.
@@ -200,7 +200,7 @@ def _rest_names(k: int) -> tuple[str, ...]:
 
 
 def _harmonics_of(table: VertexTable) -> int:
-    """How many view-dependent coefficients per channel a file has: 0, 3, 8 or 15."""
+    """Number of view-dependent coefficients per channel: 0, 3, 8 or 15."""
     given = {name for name in table.names if name.startswith("f_rest_")}
     for k in (0, 3, 8, 15):
         if given == set(_rest_names(k)):
@@ -211,7 +211,7 @@ def _harmonics_of(table: VertexTable) -> int:
 
 
 def _normals(table: VertexTable) -> Float32[np.ndarray, "n 3"]:
-    """Unit normals; zero where the file has none, or none that is finite."""
+    """Unit normals; zero where missing or not finite."""
     if not set(NORMAL) <= set(table.names):
         return np.zeros((len(table), 3), np.float32)
     normal = table.columns(NORMAL)

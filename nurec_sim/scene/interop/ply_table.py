@@ -1,4 +1,4 @@
-"""The elements of a PLY file as columns of numbers: ascii or binary of either byte order, read with suspicion.
+"""The elements of a PLY file as columns of numbers: ascii or binary of either byte order, validated on read.
 
 Format: Greg Turk, "The PLY Polygon File Format" (1994).
 """
@@ -24,12 +24,12 @@ TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-"""NumPy's spelling of PLY's types."""
+"""NumPy types of PLY types."""
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 class VertexTable:
-    """An element of a PLY file; a binary one is mapped, so that only the columns asked for take memory.
+    """An element of a PLY file; binary ones are memory-mapped, so that only requested columns take memory.
 
     Attributes:
         path: the file.
@@ -38,8 +38,7 @@ class VertexTable:
         comments: the header's, without the word ``comment``.
 
     Raises:
-        ArchiveError: not a PLY file, a header that is wrong or not supported, no such element, or fewer rows than
-            promised.
+        ArchiveError: not a PLY file, an invalid or unsupported header, no such element, or fewer rows than declared.
     """
 
     def __init__(self, path: Path, element: str = "vertex") -> None:
@@ -67,14 +66,14 @@ class VertexTable:
         return len(self._rows)
 
     def column(self, name: str) -> np.ndarray:
-        """A property of a binary file as it is, ``[n]``."""
+        """A property of a binary file without conversion, ``[n]``."""
         return self._rows[name]
 
     def columns(self, names: Sequence[str]) -> Float32[np.ndarray, "n names"]:
-        """Some properties side by side; numbers too large for a float become infinite.
+        """Several properties as columns; numbers too large for a float become infinite.
 
         Raises:
-            ArchiveError: a property is missing; the text lists all that are.
+            ArchiveError: properties are missing; the text lists them.
         """
         missing = [name for name in names if name not in self.names]
         if missing:
@@ -87,7 +86,7 @@ class VertexTable:
 
 
 def _check_size(path: Path, count: int, least_bytes: int, held_bytes: int, at_least: str) -> None:
-    """Refuses a promise that the file cannot keep, before memory is taken for it."""
+    """Checks the declared size against the file size before allocating memory."""
     if count * least_bytes > held_bytes:
         raise ArchiveError(
             f"{path}: the header promises {count:,} vertices of {at_least}{least_bytes} bytes, but "
@@ -96,7 +95,7 @@ def _check_size(path: Path, count: int, least_bytes: int, held_bytes: int, at_le
 
 
 def _read_text(file: BinaryIO, path: Path, count: int, width: int, held_bytes: int) -> np.ndarray:
-    """Rows of numbers [count, width]; a number takes a digit and a separator at least."""
+    """Rows of numbers [count, width]; each number takes at least a digit and a separator."""
     _check_size(path, count, max(2 * width - 1, 1), held_bytes, "at least ")
     if not count:
         return np.zeros((0, width))

@@ -1,7 +1,7 @@
-"""Opens the files of other programs as scenes; what they do not say gets a default that ``provenance`` names.
+"""Reads third-party scene files; missing data get defaults listed in ``provenance``.
 
-Of an archive with several kinds of Gaussians the first that can be read is taken: particle fields, ``volume.nurec``,
-``checkpoint.ckpt``, PLY files. Nothing is extracted from NuRec files, unpickled or run.
+In archives with several kinds of Gaussians the first readable one is used: particle fields, ``volume.nurec``,
+``checkpoint.ckpt``, PLY files. NuRec files are not extracted, unpickled or executed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SPLAT_FILES: dict[str, tuple[Callable[[Path], tuple[Gaussians, int]], Callable[[
     ".ply": (read_ply, ply_up),
     ".spz": (read_spz, lambda _: "y"),
 }
-"""Files of Gaussians and nothing else: how they are read, and the axis that points up unless somebody says another."""
+"""Formats with Gaussians only: their readers, and default up axes."""
 CONVERTIBLE = (".sog", ".ksplat", ".splat", ".lcc")
 _MESHES = ("mesh.ply", "mesh_ground.ply")
 
@@ -52,22 +52,22 @@ def read_foreign(
     like: GaussianScene | Clip | None = None,
     up: str | None = None,
 ) -> GaussianScene:
-    """Reads a scene that another program wrote.
+    """Reads a third-party scene.
 
     Args:
         path: a ``.usdz`` of NuRec or with particle fields, a USD layer, a ``.ply``, ``.spz``, ``.nurec`` or ``.ckpt``
             file.
-        sky: a sky file, for sky and colour corrections instead of those of the file; ``X.sky.npz`` beside ``X.ply`` is
-            taken if None and it is there.
-        like: a scene or a log in the same world, for what the file lacks.
-        up: axis of the file that points up, one of ``UP_AXES``, for files that do not say it; y for SPZ, and for a PLY
-            what its comment says or z, if None.
+        sky: a sky file that overrides sky and colour corrections; default: ``X.sky.npz`` beside ``X.ply``, if it
+            exists.
+        like: a scene or a log in the same world that supplies missing data.
+        up: up axis, one of ``UP_AXES``, for formats that do not define it; default: y for SPZ; for PLY its comment,
+            else z.
 
     Returns:
-        A sound scene; ``provenance["unknown"]`` lists what the file holds but is not read, and what it lacks.
+        A valid scene; ``provenance["unknown"]`` lists ignored and missing parts.
 
     Raises:
-        ArchiveError: not such a file, damaged, unsafe, or without Gaussians; or ``up`` is no axis, or not needed.
+        ArchiveError: not such a file, damaged, unsafe, or without Gaussians; or ``up`` is invalid or not applicable.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -126,7 +126,7 @@ def read_foreign(
 
 
 def _splats(read: Callable[[Path], tuple[Gaussians, int]], path: Path) -> Found:
-    """The Gaussians of a file that holds nothing else."""
+    """Reads a file that has Gaussians only."""
     gaussians, dropped = read(path)
     unknown = ["no moving Gaussians: the file holds one instant", "no LiDAR intensity: the file holds none"]
     if not (gaussians.label == Label.ROAD).any():
@@ -135,7 +135,7 @@ def _splats(read: Callable[[Path], tuple[Gaussians, int]], path: Path) -> Found:
 
 
 def _find(package: Package, around: Surroundings) -> tuple[Found, str]:
-    """The Gaussians of an archive, and what they come from."""
+    """The Gaussians of an archive, and their source."""
     readers = _readers(package)
     faults: list[str] = []
     volumes: dict[str, np.ndarray] = {}
@@ -161,10 +161,10 @@ def _find(package: Package, around: Surroundings) -> tuple[Found, str]:
 
 
 def _readers(package: Package) -> list[tuple[str, Callable[[], Found]]]:
-    """What may hold the Gaussians, the best first."""
+    """Possible sources of Gaussians, in order of preference."""
     names = package.names
     readers: list[tuple[str, Callable[[], Found]]] = []
-    # Without a rig it is the stage that tells how a volume lies.
+    # Without a rig the stage defines the transform of a volume.
     kinds = (b"ParticleField",) if RIG in names else (b"ParticleField", b"OmniNuRecFieldAsset")
     if may_hold(package, *kinds):
         readers.append((FIELDS, partial(read_particle_fields, package.path)))
@@ -187,7 +187,7 @@ def _checkpoint(package: Package, name: str) -> Found:
 
 
 def _plys(package: Package, names: list[str]) -> Found:
-    """The Gaussians of all PLY members that hold such."""
+    """The Gaussians of all PLY members."""
     found, faults = Found(), []
     for name in names:
         with temporary_folder() as folder:
@@ -207,7 +207,7 @@ def _plys(package: Package, names: list[str]) -> Found:
 
 
 def _name_the_rest(package: Package, found: Found, source: str) -> None:
-    """Names the members that nothing reads, files of one folder by the folder."""
+    """Reports unread members, grouped by folder."""
     read = {RIG, TRACKS, DATA_INFO, MAP, *source.split(", ")}
     ends = (".nurec", ".ckpt", *(LAYER_SUFFIXES if source == FIELDS else ()))
     members = [name for name in package.names if name not in read and not name.lower().endswith(ends)]
@@ -259,7 +259,7 @@ def _assembled(
 
 
 def _exposure(found: Found, around: Surroundings, unknown: list[str]) -> dict[str, Float64[np.ndarray, "3 4"]]:
-    """Gains on the colours of the cameras that are read."""
+    """Colour gains of the cameras."""
     if found.exposure and len(found.exposure) != len(around.camera_order):
         unknown.append(f"colour correction: exposure of {len(found.exposure)} cameras, of {len(around.camera_order)}")
         return {}
@@ -269,7 +269,7 @@ def _exposure(found: Found, around: Surroundings, unknown: list[str]) -> dict[st
 
 
 def _dynamic(found: Found, tracks: list[Track], t_us: int, unknown: list[str]) -> DynamicGaussians:
-    """Rigid parts with the tracks that move them; names may carry the scene's behind an ``@``."""
+    """Rigid parts with their tracks; names may have a scene suffix after ``@``."""
     index_of = {track.id.split("@")[0]: k for k, track in enumerate(tracks)}
     parts: list[Gaussians] = []
     owners: list[np.ndarray] = []
@@ -295,7 +295,7 @@ def _moved(gaussians: Gaussians, a_from_b: Float64[np.ndarray, "4 4"]) -> Gaussi
 
 
 def _turned_sky(sky: np.ndarray, world_from_nre: Float64[np.ndarray, "3 3"]) -> np.ndarray:
-    """The sky in the world's axes; a rotation other than none interpolates it."""
+    """The sky in world axes, interpolated if rotated."""
     if np.array_equal(world_from_nre, np.eye(3)):
         return sky
     directions = geometry.cubemap_directions(sky.shape[1]) @ world_from_nre

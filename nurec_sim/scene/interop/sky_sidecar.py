@@ -1,7 +1,7 @@
 """Sky and colour correction beside a PLY: ``<stem>.sky.npz`` of the released network, and a picture of it.
 
 The cubemap has the faces +X -X -Y +Y +Z -Z of the world (``geometry.released_cubemap_directions``), rows down, columns
-to the right. Turning it into ours and back moves texels and interpolates nothing.
+to the right. Conversion to our layout and back permutes texels without interpolation.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _MAX_CAMERAS = 1024
 
 @dataclass(frozen=True)
 class SkySidecar:
-    """What a sky file holds, in our conventions.
+    """Contents of a sky file, in our conventions.
 
     Attributes:
         sky: colours, faces as in ``geometry.cubemap_directions``; not clamped.
-        seen: how surely each texel was seen, 0..1; None if not known.
-        isp: per camera id, as in ``GaussianScene.isp``; None if the file does not say.
-        source: where the sky comes from, free text.
+        seen: confidence that each texel was observed, 0..1; None if unknown.
+        isp: per camera id, as in ``GaussianScene.isp``; None if the file has none.
+        source: origin of the sky, free text.
     """
 
     sky: Float32[np.ndarray, "6 s s 3"]
@@ -63,12 +63,12 @@ def write_sky(
     cameras: Sequence[str] = (),
     world_from_file: Float64[np.ndarray, "3 3"] | None = None,
 ) -> None:
-    """Writes the sky file and, if asked for, its faces as a picture; files that are there are replaced.
+    """Writes the sky file and optionally a preview image; existing files are replaced.
 
     Args:
-        sidecar: what to write. Colours are stored as half floats; texels are taken for seen if that is not known.
+        sidecar: the contents. Colours are stored as half floats; texels count as observed if unknown.
         npz: the sky file.
-        png: the picture: +X -X -Y above +Y +Z -Z, 8 bits, clamped to 0..1.
+        png: the preview: +X -X -Y above +Y +Z -Z, 8 bits, clamped to 0..1.
         cameras: the order that ``affine_sensor_indices`` counts in; that of ``sidecar.isp`` if not given.
         world_from_file: a rotation by multiples of 90 degrees from the file's axes to the world; none if None.
     """
@@ -127,7 +127,7 @@ def read_sky(path: Path | str, world_from_file: Float64[np.ndarray, "3 3"] | Non
 def our_texels(
     size: int, world_from_file: Float64[np.ndarray, "3 3"] | None = None
 ) -> Int64[np.ndarray, "6 size size"]:
-    """For every texel of the file's cubemap, the flat index of the texel of ours that looks the same way."""
+    """For every texel of the file's cubemap, the flat index of our texel with the same direction."""
     direction = geometry.released_cubemap_directions(size)
     if world_from_file is not None:
         direction = direction @ world_from_file.T
@@ -148,7 +148,7 @@ def _atlas_png(sky: np.ndarray) -> bytes:
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays by name, after the checks of what they mean."""
+    """The validated arrays by name."""
     limits = {
         "format_version": 64, "sky_cubemap": 6 * MAX_FACE_TEXELS**2 * 3 * 4, "affine_matrix": _MAX_CAMERAS * 96,
         "sky_cubemap_mask": 6 * MAX_FACE_TEXELS**2 * 4, "affine_sensor_ids": _MAX_CAMERAS * 1024, "face_order": 4096,

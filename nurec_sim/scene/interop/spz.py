@@ -1,7 +1,7 @@
-"""SPZ files of Niantic (versions 1 to 3): a gzip file of a header and one array after the other.
+"""SPZ files of Niantic (versions 1 to 3): a gzip file with a header and consecutive arrays.
 
-Layout: https://github.com/nianticlabs/spz. Header of 16 bytes: "NGSP", version, count, degree of the harmonics, bits
-behind the point of positions, flags, a reserved byte; numbers are little-endian. y is up, -z ahead.
+Layout: https://github.com/nianticlabs/spz. Header of 16 bytes: "NGSP", version, count, degree of the harmonics,
+fractional bits of positions, flags, a reserved byte; numbers are little-endian. y is up, -z forward.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _COLOUR_SCALE = 0.15
 
 
 def read_spz(path: Path | str) -> tuple[Gaussians, int]:
-    """The Gaussians of a file, in its axes, and how many others were dropped because a number is not finite.
+    """The Gaussians of a file, in its axes, and the number dropped for non-finite values.
 
     Raises:
-        ArchiveError: not such a file, of another version, damaged or cut short.
+        ArchiveError: not such a file, of another version, damaged or truncated.
     """
     path = Path(path)
     try:
@@ -78,13 +78,13 @@ def _halves(position: UInt8[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 3"]:
 
 
 def _fixed_point(position: UInt8[np.ndarray, "n 9"], point_bits: int) -> Float64[np.ndarray, "n 3"]:
-    """Signed integers of 24 bits, so many of which are behind the point."""
+    """Signed 24-bit fixed-point numbers with ``point_bits`` fractional bits."""
     low, middle, high = np.moveaxis(position.reshape(-1, 3, 3).astype(np.int64), -1, 0)
     return (low | middle << 8 | (high ^ 128) - 128 << 16) / 2.0**point_bits
 
 
 def _first_three(rotation: UInt8[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4"]:
-    """x, y, z as bytes over -1..1; w >= 0 follows from the length of 1."""
+    """x, y, z as bytes over -1..1; w >= 0 follows from unit length."""
     xyz = rotation / 127.5 - 1
     w = np.sqrt(np.clip(1 - (xyz**2).sum(axis=1, keepdims=True), 0, None))
     return np.concatenate([w, xyz], axis=1)

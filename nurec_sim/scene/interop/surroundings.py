@@ -1,4 +1,4 @@
-"""What stands for the parts of a scene that a file does not bring: those of a scene of the same place, or defaults."""
+"""Missing parts of an imported scene: from a scene of the same place, or defaults."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Isp = Mapping[str, Float64[np.ndarray, "3 4"]]
 
 
 def surroundings_of(like: GaussianScene | Clip | None) -> dict[str, Any]:
-    """Everything of a scene beside its id, Gaussians, sky and colours, by the names of ``GaussianScene``'s fields.
+    """All ``GaussianScene`` fields except id, Gaussians, sky and colours, by name.
 
     Args:
-        like: what to take it from. If None, a car stands at the origin for ``DEFAULT_SPAN_US``, with one camera,
-            ``CAMERA_HEIGHT_M`` up, that looks along x.
+        like: the source. If None, the car is at the origin for ``DEFAULT_SPAN_US``, with one camera at
+            ``CAMERA_HEIGHT_M`` facing along x.
     """
     if like is None:
         return _default_surroundings()
@@ -36,7 +36,7 @@ def surroundings_of(like: GaussianScene | Clip | None) -> dict[str, Any]:
 
 
 def taken_from(sky: Path | str | None, like: GaussianScene | Clip | None) -> dict[str, str]:
-    """For the provenance: what else than the file a scene was made from."""
+    """Provenance entries for additional sources."""
     taken = {"sky_file": None if sky is None else Path(sky).name, "like": None if like is None else like.id}
     return {name: value for name, value in taken.items() if value is not None}
 
@@ -52,7 +52,7 @@ def colours_of(like: GaussianScene | Clip | None) -> tuple[Sky | None, Isp | Non
 
 
 def first_colours(given: Iterable[tuple[Sky | None, Isp | None]], unknown: list[str]) -> tuple[Sky, Isp]:
-    """The first sky and the first colour corrections that are there; if there is no sky, ``unknown`` is told."""
+    """The first available sky and colour corrections; a missing sky is added to ``unknown``."""
     pairs = list(given)
     sky = next((sky for sky, _ in pairs if sky is not None), None)
     isp: Isp = next((isp for _, isp in pairs if isp is not None), {})

@@ -29,10 +29,10 @@ _TYPES = {
 
 
 def read_checkpoint(file: BinaryIO, where: str) -> NurecState:
-    """Reads the state of a reconstruction; only the arrays that are of use are taken into memory.
+    """Reads the state of a reconstruction; loads only the required arrays.
 
     Raises:
-        ArchiveError: no such file, cut short, damaged, or one that asks for what it must not.
+        ArchiveError: not such a file, truncated, damaged, or unsafe.
     """
     try:
         size = file.seek(0, 2)

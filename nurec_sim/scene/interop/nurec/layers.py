@@ -1,7 +1,7 @@
-"""From a NuRec state to Gaussians, sky and exposure: activations, layers, tracks.
+"""Converts a NuRec state to Gaussians, sky and exposure: activations, layers, tracks.
 
 Conventions of NuRec: rotations are ``wxyz`` of any length, scales are logarithms, densities logits, colours harmonics
-of 3DGS. Layers with ``gaussian_cuboid_ids`` are rigid parts in the frames of boxes, the others stand in the NRE frame.
+of 3DGS. Layers with ``gaussian_cuboid_ids`` are rigid parts in the frames of boxes, the others are in the NRE frame.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _USUAL = {"density_activation": "sigmoid", "scale_activation": "exp", "rotation_
 
 
 def found_in(state: NurecState, where: str) -> Found:
-    """What a state holds, in the NRE frame.
+    """The contents of a state, in the NRE frame.
 
     Raises:
         ArchiveError: no layer of Gaussians, arrays that do not fit each other, or an activation that is not known.
@@ -137,7 +137,7 @@ def _harmonics(arrays: Mapping[str, np.ndarray], n: int, what: str) -> np.ndarra
 
 
 def _settings(found: Found, state: NurecState, layer: str) -> Mapping[str, Any]:
-    """A layer's settings; what is unusual about its kernel is named."""
+    """A layer's settings; unusual kernels are reported."""
     layers = state.config.get("layers")
     settings = layers.get(layer) if isinstance(layers, Mapping) else None
     if not isinstance(settings, Mapping):
@@ -177,7 +177,7 @@ def _add_background(found: Found, state: NurecState, where: str) -> None:
 
 
 def _cubemap(found: Found, textures: np.ndarray, where: str) -> Float32[np.ndarray, "6 h h 3"]:
-    """The faces, which lie in the order and with the axes of ``geometry.cubemap_directions``."""
+    """The faces, in the order and with the axes of ``geometry.cubemap_directions``."""
     size = textures.shape[2] if textures.ndim == 5 else 0
     if textures.shape != (1, 6, size, size, 3) or not 1 <= size <= MAX_FACE_TEXELS or textures.dtype.kind != "f":
         raise ArchiveError(f"{where}: background.textures must be [1, 6, s, s, 3], got {textures.shape}")

@@ -1,4 +1,4 @@
-"""Rig, path, times and tracks of an archive from its JSON files, the counterpart of what ``scene.sidecars`` writes.
+"""Rig, path, times and tracks from an archive's JSON files; the inverse of ``scene.sidecars``.
 
 Conventions there: ``T_a_b`` maps a to b; matrices are row-major; track quaternions are ``xyzw``. Paths and tracks are
 in the world, Gaussians in the NRE frame: ``world_to_nre`` lies between.
@@ -30,10 +30,10 @@ RIG, TRACKS, DATA_INFO, MAP = "rig_trajectories.json", "sequence_tracks.json", "
 
 @dataclass
 class Surroundings:
-    """What the JSON files of an archive say; None where they say nothing.
+    """Contents of an archive's JSON files; None if missing.
 
-    ``camera_order`` are the ids of all cameras, also of those that could not be read, in the order of the file;
-    ``missing`` names what another scene of the same place may stand for.
+    ``camera_order`` are the ids of all cameras, including unreadable ones, in file order; ``missing`` lists what
+    another scene of the same place may supply.
     """
 
     id: str | None = None
@@ -53,7 +53,7 @@ def read_surroundings(package: Package) -> Surroundings:
     """Reads the JSON files that an archive has.
 
     Raises:
-        ArchiveError: one of them is no JSON, or lacks what it is there for.
+        ArchiveError: one of them is not JSON, or lacks required data.
     """
     around = Surroundings()
     if RIG in package.names:
@@ -137,7 +137,7 @@ def _add_map(around: Surroundings, package: Package, world_base: object) -> None
 
 
 def _add_sensors(around: Surroundings, content: dict[str, Any]) -> dict[str, str]:
-    """Fills the rig; gives the sensors' ids by the names that the file has for them."""
+    """Fills the rig; returns the sensors' ids by their names in the file."""
     cameras: dict[str, CameraModel] = {}
     lidars: dict[str, LidarModel] = {}
     names: dict[str, str] = {}
@@ -191,7 +191,7 @@ def _add_times(around: Surroundings, info: dict[str, Any]) -> None:
 
 
 def _shift(around: Surroundings) -> None:
-    """Moves the times of a clip that starts at zero: clients ask for instants before the start, without a sign."""
+    """Shifts the times of a clip that starts at zero: clients request earlier times as unsigned integers."""
     if around.span_us is None and around.ego is not None:
         around.span_us = (around.ego.start_us, max(around.ego.end_us, around.ego.start_us + 1))
     if around.span_us is None or around.span_us[0] >= MIN_START_US:

@@ -27,7 +27,7 @@ class NurecState:
         track_ids: ``obj_track_ids``: for each layer the tracks that ``gaussian_cuboid_ids`` counts.
         config: settings of the layers and of the background, empty where the file has none.
         others: names of the arrays and values that are not read.
-        version: of the program that wrote the file, as it spells it.
+        version: version string of the program that wrote the file.
     """
 
     arrays: Mapping[str, np.ndarray]
@@ -38,12 +38,12 @@ class NurecState:
 
 
 def plain_name(name: str) -> str:
-    """A name without what the two files put before it: ``.`` in volumes, ``model.`` in checkpoints."""
+    """A name without the prefix of its file type: ``.`` in volumes, ``model.`` in checkpoints."""
     return name.removeprefix("model.").removeprefix(".")
 
 
 def is_read(name: str) -> bool:
-    """Whether an array of that plain name is of use here."""
+    """Whether an array of that plain name is required."""
     return _READ.fullmatch(name) is not None
 
 

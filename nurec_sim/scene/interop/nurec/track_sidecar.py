@@ -1,4 +1,4 @@
-"""Tracks from ``sequence_tracks.json``, the counterpart of what ``scene.sidecars`` writes.
+"""Tracks from ``sequence_tracks.json``; the inverse of ``scene.sidecars``.
 
 Poses there are ``x y z qx qy qz qw`` of box centres in the world, sizes length, width, height.
 """
@@ -16,7 +16,7 @@ from nurec_sim.types import Track, Trajectory
 
 
 def tracks_from(content: dict[str, Any], where: str) -> tuple[list[Track], list[str]]:
-    """The tracks of all chunks, and what was wrong with those that are left out or lost samples.
+    """The tracks of all chunks, and the faults of skipped or incomplete ones.
 
     Raises:
         ArchiveError: a chunk lacks one of its lists, or they differ in length.

@@ -1,7 +1,7 @@
 """``volume.nurec``: a gzip file of one msgpack object that holds a reconstruction's arrays as raw bytes.
 
 Each array lies under its name, its shape under the name plus ``.shape``; values are little-endian, half floats unless
-their byte count says otherwise. Nothing in the file can ask for more memory than a fixed multiple of its length.
+their byte count says otherwise. Memory is limited to a fixed multiple of the file size.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def read_volume(data: bytes, where: str) -> NurecState:
     """Reads the bytes of a ``.nurec`` file.
 
     Raises:
-        ArchiveError: no such file, cut short, damaged, or one that unpacks to more than it may.
+        ArchiveError: not such a file, truncated, damaged, or unpacking to more than the limit.
     """
     content = _unpacked(gunzipped(data, where), where)
     nre = content.get("nre_data") if isinstance(content, dict) else None
@@ -55,10 +55,10 @@ def read_volume(data: bytes, where: str) -> NurecState:
 
 
 def gunzipped(data: bytes, where: str) -> bytes:
-    """What a gzip file holds.
+    """Decompresses a gzip file within limits.
 
     Raises:
-        ArchiveError: no such file, cut short, damaged, or one that unpacks to more than it may.
+        ArchiveError: not such a file, truncated, damaged, or unpacking to more than the limit.
     """
     limit = unpacked_limit(len(data))
     unpacker = zlib.decompressobj(wbits=31)
@@ -87,7 +87,7 @@ def _unpacked(content: bytes, where: str) -> Any:
 
 
 def _array(name: str, value: object, shape: object, where: str) -> np.ndarray:
-    """The array of some bytes, its type told from how many there are."""
+    """The array of some bytes; the byte count determines its type."""
     if not isinstance(value, bytes) or not isinstance(shape, list):
         raise ArchiveError(f"{where}: {name} must be bytes with a shape, got {type(value).__name__} and {shape!r:.60}")
     if len(shape) > _MAX_DIMENSIONS or any(type(n) is not int or n < 0 for n in shape):

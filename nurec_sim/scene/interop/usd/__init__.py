@@ -1,1 +1,1 @@
-"""OpenUSD particle fields of other programs, read in a process of their own."""
+"""Third-party OpenUSD particle fields, read in a subprocess."""

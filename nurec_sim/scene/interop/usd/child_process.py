@@ -1,8 +1,8 @@
-"""A process of its own that takes the particle fields out of foreign USD files: OpenUSD may crash on damaged ones.
+"""Subprocess that extracts particle fields from third-party USD files, since OpenUSD may crash on damaged ones.
 
 ``python -m nurec_sim.scene.interop.usd.child_process FILE FOLDER`` writes ``fields.json`` and one
-``<k>.<column>.npy`` per column of field k. No file is opened but FILE and, if it is no package, layers in its folder
-that it refers to.
+``<k>.<column>.npy`` per column of field k. Only FILE is opened and, unless it is a package, referenced layers in its
+folder.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _EXTRA_BYTES, _GROWTH, _CPU_SECONDS = 6 * 2**30, 32, 600
 
 
 def main(path: Path, folder: Path) -> None:
-    """Reads ``path`` and writes what it holds to ``folder``."""
+    """Extracts the contents of ``path`` to ``folder``."""
     _limit(path.stat().st_size)
     from pxr import Usd, UsdGeom
 
@@ -67,7 +67,7 @@ def main(path: Path, folder: Path) -> None:
 
 
 def _limit(size: int) -> None:
-    """Bounds of memory and time, so that a hostile file ends this process and no other."""
+    """Limits memory and time, so that an unsafe file ends only this process."""
     try:
         import resource
     except ImportError:  # not on Windows
@@ -79,7 +79,7 @@ def _limit(size: int) -> None:
 
 
 def _hidden(prim) -> str | None:
-    """Why a field is not to be drawn, or None."""
+    """Reason why a field is invisible, or None."""
     from pxr import UsdGeom
 
     imageable = UsdGeom.Imageable(prim)
@@ -91,7 +91,7 @@ def _hidden(prim) -> str | None:
 
 
 def _nurec_files(prim) -> list[str]:
-    """Names of the NuRec files that a volume shows; none for other prims."""
+    """Names of the NuRec files referenced by a volume; none for other prims."""
     if str(prim.GetTypeName()) != "Volume":
         return []
     assets = [child.GetAttribute("filePath").Get() for child in prim.GetChildren() if child.HasAttribute("filePath")]
@@ -99,7 +99,7 @@ def _nurec_files(prim) -> list[str]:
 
 
 def _take(prim, number: int, folder: Path, notes: list[str]) -> dict[str, Any]:
-    """Writes the columns of a field; gives what else is to know of it."""
+    """Writes the columns of a field; returns its metadata."""
     path = str(prim.GetPath())
     moving: list[str] = []
     for name, half in _COLUMNS.items():
@@ -139,7 +139,7 @@ def _values(prim, name: str, moving: list[str]) -> np.ndarray | None:
 
 
 def _world_from_prim(prim) -> tuple[list[list[float]], list[str]]:
-    """The transform up the hierarchy, as a matrix for column vectors, and whether it moves."""
+    """The world transform as a matrix for column vectors, and whether it is animated."""
     from pxr import Usd, UsdGeom
 
     moving, only_samples = [], []
@@ -157,7 +157,7 @@ def _world_from_prim(prim) -> tuple[list[list[float]], list[str]]:
 
 
 def _is_road(prim) -> bool:
-    """Whether the field, or something above it, is called or labelled road."""
+    """Whether the field or an ancestor is named or labelled road."""
     while prim and not prim.IsPseudoRoot():
         labels = [a.Get() for a in prim.GetAttributes() if a.GetName().startswith("semantics:labels:")]
         if prim.GetName().lower() == "road" or any("road" in [str(x).lower() for x in label or ()] for label in labels):

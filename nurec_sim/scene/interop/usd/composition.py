@@ -1,7 +1,7 @@
-"""Layers of a USD package or folder, tied together so that composing them opens nothing else.
+"""Layers of a USD package or folder, linked so that composition opens no other file.
 
-Each layer is loaded as an anonymous one, and its references are made to point at the other loaded layers. What lies
-outside is taken out, and named.
+Each layer is loaded as an anonymous layer, with its references redirected to the other loaded layers. External
+references are removed and reported.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MAX_LAYERS = 2000
 
 @dataclass(frozen=True)
 class LayerSource:
-    """Where layers are found by name: the members of a package, or the files of a folder."""
+    """Layers by name: the members of a package, or the files of a folder."""
 
     path: Path
     root: str
@@ -28,7 +28,7 @@ class LayerSource:
 
     @classmethod
     def of(cls, path: Path) -> LayerSource:
-        """The layers that belong to a file: of a package its root is the first layer.
+        """The layers of a file; the root of a package is its first layer.
 
         Raises:
             ArchiveError: a package that cannot be read, or has no layers.
@@ -52,7 +52,7 @@ class LayerSource:
         return file.is_file() and file.is_relative_to(folder)
 
     def open(self, name: str) -> Any:
-        """A layer, on its own.
+        """Opens a layer without composition.
 
         Raises:
             ArchiveError: OpenUSD cannot read it.
@@ -71,13 +71,13 @@ class LayerSource:
 
 
 def may_hold(package: Package, *kinds: bytes) -> bool:
-    """Whether a package may hold prims of some kinds; if all of its layers are text, OpenUSD is not needed to tell."""
+    """Whether a package may have prims of some types; text layers are searched without OpenUSD."""
     layers = [package.read(name) for name in package.names if name.lower().endswith(LAYER_SUFFIXES)]
     return any(not layer.startswith(b"#usda") or any(kind in layer for kind in kinds) for layer in layers)
 
 
 def joined_layers(source: LayerSource) -> tuple[Any, list[str]]:
-    """The root layer with all that it refers to, and what of that was taken out.
+    """The root layer with its references, and notes on removed ones.
 
     Raises:
         ArchiveError: a layer cannot be read, or there are too many.
@@ -107,11 +107,11 @@ def joined_layers(source: LayerSource) -> tuple[Any, list[str]]:
 
 
 _KEPT: list[Any] = []
-"""Anonymous layers live only as long as somebody holds them."""
+"""Keeps the anonymous layers alive."""
 
 
 def _references(layer: Any, name: str) -> list[tuple[str, str]]:
-    """What a layer refers to, as it says it, and from the folder of the root."""
+    """References of a layer, as written and relative to the root folder."""
     folder = posixpath.dirname(name)
     return [
         (str(reference), posixpath.normpath(posixpath.join(folder, str(reference))))
@@ -120,7 +120,7 @@ def _references(layer: Any, name: str) -> list[tuple[str, str]]:
 
 
 def _drop_clips(layer: Any, name: str, notes: list[str]) -> None:
-    """Value clips name files that OpenUSD opens by itself."""
+    """Removes value clips, whose files OpenUSD would open."""
     from pxr import Sdf
 
     def drop(path: Any) -> None:

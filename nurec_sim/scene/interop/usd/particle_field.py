@@ -1,4 +1,4 @@
-"""Particle fields of foreign USD files (``.usda``, ``.usdc``, ``.usd``, ``.usdz``): OpenUSD's Gaussians.
+"""Particle fields of third-party USD files (``.usda``, ``.usdc``, ``.usd``, ``.usdz``): OpenUSD's Gaussians.
 
 Conventions of OpenUSD: scales and opacities after activation, quaternions ``x y z w`` in memory, harmonics as in 3DGS
 files, particle-major with the constant term first. Lengths are in the stage's units, y or z is up.
@@ -27,13 +27,13 @@ from nurec_sim.types import Label
 
 MAX_SECONDS = 600
 _FEW_THREADS = {"PXR_WORK_THREAD_LIMIT": "4", "MALLOC_ARENA_MAX": "4"}
-"""On a machine with many cores their reserves alone would pass the bound on memory."""
+"""On machines with many cores thread stacks alone would exceed the memory limit."""
 
 
 def read_particle_fields(path: Path) -> Found:
-    """All visible fields of a stage, and where it puts NuRec volumes, in metres with z up; both may be none.
+    """All visible fields of a stage and the transforms of NuRec volumes, in metres with z up; both may be empty.
 
-    OpenUSD runs in a process of its own, which may die of a hostile file.
+    OpenUSD runs in a subprocess, which may crash on unsafe files.
 
     Raises:
         ArchiveError: the file cannot be read, or a field is damaged.

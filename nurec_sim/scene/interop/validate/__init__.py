@@ -1,4 +1,4 @@
-"""What AlpaSim, CARLA, USD tools and our own reader will miss in a scene archive, whoever wrote it."""
+"""Validation of any scene archive for AlpaSim, CARLA, USD tools and our own reader."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ RULES: Mapping[Consumer, Mapping[str, Rule]] = {
 def validate_archive(
     path: Path | str, consumers: Sequence[Consumer] = CONSUMERS, *, usd_limit_s: float | None = None
 ) -> list[Finding]:
-    """Everything that consumers will miss in an archive; empty if nothing.
+    """All findings for an archive; empty if it satisfies all consumers.
 
     Args:
-        path: the archive; it need not be ours, nor sound. Our own reader also takes other files of scenes.
-        consumers: whom to ask.
-        usd_limit_s: run OpenUSD in a process of its own for so many seconds at most, for archives of unknown origin:
-            damaged layers can crash it or keep it busy. In this process and without a limit if None.
+        path: any archive, possibly damaged. Our own reader also accepts other scene files.
+        consumers: the consumers to check for.
+        usd_limit_s: run OpenUSD in a subprocess with this time limit, for untrusted archives: damaged layers can crash
+            or hang it. None runs it in this process without a limit.
 
     Raises:
-        ArchiveError: a consumer that is not known.
+        ArchiveError: an unknown consumer.
     """
     unknown = sorted(set(consumers) - set(CONSUMERS))
     if unknown:
@@ -73,13 +73,13 @@ def validate_archive(
 
 
 def read_and_validate(path: Path | str) -> tuple[GaussianScene | None, list[Finding]]:
-    """A scene, None if it cannot be read, and what our own reader will miss in it."""
+    """A scene (None if unreadable) and the findings of our own reader."""
     report = Report("own", own.RULES)
     return own.check(report, Path(path)), report.findings
 
 
 def same_scene_ids(paths: Sequence[Path]) -> list[str]:
-    """Texts about archives that share a ``scene_id``: AlpaSim refuses a folder that holds two of one."""
+    """Texts for archives with the same ``scene_id``, which AlpaSim refuses."""
     first: dict[str, Path] = {}
     texts = []
     for path in paths:

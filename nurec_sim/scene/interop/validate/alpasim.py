@@ -1,6 +1,6 @@
-"""What AlpaSim's runtime reads of an archive: metadata, rig, tracks, maps and the ground mesh.
+"""Rules for AlpaSim's runtime: metadata, rig, tracks, maps and the ground mesh.
 
-It never looks at USD structure, alignment or the Gaussians: those stay with the server.
+It ignores USD structure, alignment and Gaussians, which only the server uses.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ RULES = {
 
 
 def check(report: Report, contents: Contents) -> None:
-    """Adds what AlpaSim will miss."""
+    """Adds the findings for AlpaSim."""
     if contents.path.suffix != ".usdz":
         report.add("name", f"the file is called {contents.path.name}")
     rig = shared.rig_document(report, contents)

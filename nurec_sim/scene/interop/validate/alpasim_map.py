@@ -1,4 +1,4 @@
-"""A road map as AlpaSim's loader takes it, and its off-road rule: written down from what it was seen to do.
+"""AlpaSim's road map loader and off-road rule, reimplemented from its observed behaviour.
 
 The rules, in the order in which they are applied (docs/scene_format.md has them as a table):
 
@@ -35,12 +35,12 @@ STRAIGHT_PER_M = 1e-6
 ARTIFICIAL_M = 0.01
 CENTRE_GAP_M = 0.20
 TWIN_EDGES_M = 2.0
-TWIN_EDGES_RAD = math.radians(15.0)  # "nearly parallel" is not told more exactly
+TWIN_EDGES_RAD = math.radians(15.0)  # our value for "nearly parallel"
 NEAR_M = 6.0
 CENTRE_STEP_M = 2.0
 TOUCH_M = 1e-3
 CLIP_M = 1.0
-"""Lanes farther from the outline than this cannot help to contain it; they are cut off to save time."""
+"""Lanes farther from the outline than this cannot contain it and are skipped."""
 MAX_POINTS = 1_000_000
 MAX_PLACE_M = 1e7
 GEOMETRIES = ("line", "arc")
@@ -62,7 +62,7 @@ class AlpasimMap:
 
     Attributes:
         lanes: of all types but sidewalks.
-        edges: [k,2] each, those that are left of ``edges_made`` after rule 6.
+        edges: [k,2] each, those that remain after rule 6.
         edges_made: how many edges there were before.
     """
 
@@ -95,7 +95,7 @@ class AlpasimMap:
 
     @cached_property
     def polygons(self) -> np.ndarray:
-        """Outlines of the lanes as shapely polygons; those that cross themselves are mended."""
+        """Outlines of the lanes as shapely polygons; self-intersections are repaired."""
         import shapely
 
         polygons = np.array([shapely.Polygon(lane.outline) for lane in self.lanes], dtype=object)
@@ -123,7 +123,7 @@ class AlpasimMap:
         return np.repeat(np.arange(len(self.edges)), [len(edge) for edge in self.edges])
 
     def on_lane(self, xyz: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Whether a lane lies under each place."""
+        """Whether a lane is under each point."""
         import shapely
 
         found = shapely.STRtree(self.polygons).query(shapely.points(xyz[:, :2]), predicate="intersects")[0]

@@ -1,4 +1,4 @@
-"""What AlpaSim will make of ``map.xodr``: its lanes under the recorded path, and its off-road verdicts."""
+"""AlpaSim's interpretation of ``map.xodr``: lanes under the recorded path, and off-road results."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def check_roads(
     document: dict[str, Any],
     world_from_rig: Float64[np.ndarray, "t 4 4"],
 ) -> None:
-    """Adds what is wrong with the lanes and edges, as AlpaSim reads them, along the recorded path."""
+    """Adds findings on lanes and edges along the recorded path, as AlpaSim reads them."""
     import shapely
 
     with report.rule("xodr-lanes"):

@@ -1,4 +1,4 @@
-"""What CARLA's NuRec client reads of an archive: times, rig, F-theta cameras, tracks and the map."""
+"""Rules for CARLA's NuRec client: times, rig, F-theta cameras, tracks and the map."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ RULES = {
 
 
 def check(report: Report, contents: Contents) -> None:
-    """Adds what CARLA will miss."""
+    """Adds the findings for CARLA."""
     rig = shared.rig_document(report, contents)
     path_us = None
     if rig is not None:
@@ -188,7 +188,7 @@ def _reach_px(size: np.ndarray, center: np.ndarray) -> float:
 def _check_polynomials(
     report: Report, parameters: dict[str, Any], reach_px: float, max_angle: float, where: str
 ) -> None:
-    """Both polynomials must be there, rise, and undo each other over the image.
+    """Both polynomials must exist, increase, and be inverse to each other over the image.
 
     Raises:
         ArchiveError: one of them is unusable.

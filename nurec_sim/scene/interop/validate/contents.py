@@ -1,6 +1,6 @@
-"""The members of any ZIP, whoever wrote it, and the values in its texts; every fault is an ArchiveError.
+"""Members of any ZIP and the values in its text files; every fault is an ArchiveError.
 
-Unlike ``zip_package.Package`` this accepts what other programs accept: compressed and unaligned members, unknown names.
+More lenient than ``zip_package.Package``, like other programs: compressed and unaligned members, unknown names.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _short.maxlevel, _short.maxdict, _short.maxlist, _short.maxstring, _short.maxoth
 
 
 def shown(value: Any) -> str:
-    """A value for an error text; short, however large or nested it is."""
+    """A short representation of a value for error texts."""
     if isinstance(value, int) and abs(value) > 10**30:
         return "an integer of more than 30 digits"
     return _short.repr(value)
 
 
 class Contents:
-    """An opened ZIP; members are read whole, up to a limit.
+    """An open ZIP; members are read completely, up to a limit.
 
     Raises:
         ArchiveError: the file cannot be opened, is no ZIP, or has too many members.
@@ -85,7 +85,7 @@ class Contents:
         return data
 
     def json(self, name: str) -> Any:
-        """The value of a JSON member, as Python's own reader takes it: NaN and repeated keys pass.
+        """The value of a JSON member by Python's lenient reader: NaN and repeated keys are accepted.
 
         Raises:
             ArchiveError: missing, damaged, or not JSON.
@@ -153,7 +153,7 @@ def entry_of(value: Any, key: str, where: str) -> Any:
 
 
 def text_of(value: Any, key: str, where: str) -> str:
-    """``value[key]``, a text that is not empty.
+    """``value[key]``, a non-empty text.
 
     Raises:
         ArchiveError: missing, or something else.

@@ -1,4 +1,4 @@
-"""Rules of a consumer as data, and what breaks them as findings."""
+"""Rules of consumers as data, and findings for violations."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from nurec_sim.errors import ArchiveError
 Severity = Literal["error", "warning"]
 Consumer = Literal["alpasim", "carla", "openusd", "own"]
 NAMES: Mapping[Consumer, str] = {"alpasim": "AlpaSim", "carla": "CARLA", "openusd": "OpenUSD", "own": "nurec-sim"}
-"""Consumers as people call them."""
+"""Display names of consumers."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What a consumer needs; an error is something it cannot run without, a warning something that it will miss."""
+    """A requirement of a consumer; violated errors prevent it from running, warnings do not."""
 
     severity: Severity
     needs: str
@@ -26,7 +26,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class Finding:
-    """One broken rule of one consumer; ``found`` says where and what."""
+    """A violated rule; ``found`` gives location and fault."""
 
     consumer: Consumer
     rule: str
@@ -46,21 +46,21 @@ class Finding:
 
 @dataclass
 class Report:
-    """Collects what breaks the rules of one consumer."""
+    """Collects the findings of one consumer."""
 
     consumer: Consumer
     rules: Mapping[str, Rule]
     findings: list[Finding] = field(default_factory=list)
 
     def add(self, name: str, found: str) -> None:
-        """A finding; line breaks in ``found`` go, so that it stays one line."""
+        """Adds a finding as one line."""
         rule = self.rules[name]
         found = " ".join(found.split())
         self.findings.append(Finding(self.consumer, name, rule.severity, found, rule.needs, rule.loses))
 
     @contextlib.contextmanager
     def rule(self, name: str) -> Iterator[None]:
-        """Turns an ArchiveError that is raised inside into a finding, and goes on after the block."""
+        """Converts an ArchiveError in the block into a finding and continues."""
         try:
             yield
         except ArchiveError as error:

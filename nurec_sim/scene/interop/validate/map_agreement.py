@@ -20,7 +20,7 @@ LEAST_SHARE = 0.98
 
 @dataclass(frozen=True)
 class Agreement:
-    """How often the map gives the area's verdict.
+    """Agreement of map and area.
 
     ``judged`` of ``placements`` have no corner within ``BORDER_M`` of reaching over the border. ``false_alarms`` are
     off-road by the map only, ``misses`` by the area only; ``misses_across`` of those still stand on the area with a
@@ -38,14 +38,14 @@ class Agreement:
 
     @property
     def share(self) -> float:
-        """Share of the judged placements on which both agree; 1 without any."""
+        """Fraction of judged placements on which both agree; 1 without any."""
         return 1 - (self.false_alarms + self.misses) / max(self.judged, 1)
 
 
 def outlines(
     world_from_rig: Float64[np.ndarray, "n 4 4"], centre_m: Float64[np.ndarray, " 3"], size_m: Float64[np.ndarray, " 3"]
 ) -> tuple[Float64[np.ndarray, "n 3"], np.ndarray]:
-    """Middles of the car's box at rig poses, and its outlines seen from above as shapely polygons."""
+    """Centres of the car's box at rig poses, and its outlines as shapely polygons."""
     import shapely
 
     middle = world_from_rig[:, :3, 3] + world_from_rig[:, :3, :3] @ np.asarray(centre_m)
@@ -57,7 +57,7 @@ def outlines(
 def placed(
     world_from_rig: Float64[np.ndarray, "n 4 4"], count: int = PLACEMENTS, seed: int = 0
 ) -> Float64[np.ndarray, "count 4 4"]:
-    """Poses beside and across recorded ones, evenly along the path: up to 8 m aside, turned by up to 6 degrees."""
+    """Poses beside the path, evenly along it: up to 8 m lateral offset, rotated by up to 6 degrees."""
     draw = np.random.default_rng(seed)
     along = geometry.arc_length(world_from_rig[:, :2, 3])
     at = np.interp(draw.uniform(0, along[-1], count), along, np.arange(len(along)))

@@ -26,7 +26,7 @@ MAX_TABLE_BYTES = 256 * 2**20
 def check_alpasim_map(
     report: Report, contents: Contents, rig: dict[str, Any] | None, world_from_rig: Float64[np.ndarray, "t 4 4"] | None
 ) -> None:
-    """Adds what is wrong with the map that AlpaSim takes: the first folder that is there, else ``map.xodr``."""
+    """Adds findings on the map used by AlpaSim: the first existing folder, else ``map.xodr``."""
     folder = next((name for name in MAP_FOLDERS if contents.folder(name)), None)
     if folder == "clipgt":
         with report.rule("clipgt"):
@@ -46,17 +46,17 @@ def check_alpasim_map(
 
 
 def check_base_frame(rig: dict[str, Any]) -> None:
-    """Refuses a missing or malformed ``T_world_base``.
+    """Checks ``T_world_base``.
 
     Raises:
-        ArchiveError: it is.
+        ArchiveError: missing or malformed.
     """
     name = "rig_trajectories.json"
     numbers_of(entry_of(rig, "T_world_base", name), f"{name}: T_world_base", 4, 4)
 
 
 def road_root(contents: Contents) -> ElementTree.Element:
-    """The root of ``map.xodr``, which has a road at least.
+    """The root of ``map.xodr`` with at least one road.
 
     Raises:
         ArchiveError: missing, damaged, no OpenDRIVE, or without roads.
@@ -74,7 +74,7 @@ def georeference(root: ElementTree.Element) -> str | None:
 
 
 def geodetic_origin(text: str | None) -> tuple[float, float] | None:
-    """(latitude, longitude) in degrees from a projection text, None if it does not tell."""
+    """(latitude, longitude) in degrees from a projection text, None if missing."""
     found = [re.search(rf"\+{name}_0=([-+0-9.eE]+)", text or "") for name in ("lat", "lon")]
     try:
         latitude, longitude = (float(match.group(1)) for match in found if match)
@@ -84,7 +84,7 @@ def geodetic_origin(text: str | None) -> tuple[float, float] | None:
 
 
 def _check_clipgt(contents: Contents) -> None:
-    """Refuses a ``clipgt/`` folder that cannot become a map.
+    """Checks that a ``clipgt/`` folder is a usable map.
 
     Raises:
         ArchiveError: a table is missing, unreadable, or has no usable lane.

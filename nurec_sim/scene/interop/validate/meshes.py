@@ -16,7 +16,7 @@ _MAX_HEADER_BYTES = 65536
 
 
 def check_ground(report: Report, contents: Contents, world_from_rig: Float64[np.ndarray, "t 4 4"] | None) -> None:
-    """Adds what is wrong with the meshes; the ground is probed below the path if there is one."""
+    """Adds findings on the meshes; the ground is probed below the path, if any."""
     with report.rule("mesh-ground"):
         vertices, triangles = read_triangles(contents.read("mesh_ground.ply"), "mesh_ground.ply")
         if world_from_rig is not None:
@@ -35,7 +35,7 @@ def check_ground(report: Report, contents: Contents, world_from_rig: Float64[np.
 def _has_ground(
     vertices: Float64[np.ndarray, "v 3"], triangles: Int64[np.ndarray, "f 3"], places: Float64[np.ndarray, "p 3"]
 ) -> Bool[np.ndarray, " p"]:
-    """Whether a triangle lies above or below each place, not farther than ``GROUND_WITHIN_M``."""
+    """Whether a triangle is within ``GROUND_WITHIN_M`` above or below each point."""
     corners = vertices[triangles]
     low, high = corners[:, :, :2].min(axis=1), corners[:, :, :2].max(axis=1)
     found = np.zeros(len(places), bool)

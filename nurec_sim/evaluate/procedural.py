@@ -1,4 +1,4 @@
-"""Held-out drawn worlds as an evaluation sees them: true views of any camera, logs of the rig's sensors in memory."""
+"""Held-out procedural worlds for evaluation: ground-truth views of any camera, in-memory logs of a rig."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from nurec_sim.world.sense.isp import CameraResponse, random_response
 from nurec_sim.world.write import SPIN_US
 
 CAMERAS_DEG = {"camera_front": 0.0, "camera_front_left": 45.0, "camera_front_right": -45.0}
-"""Where the cameras of the evaluated rig look, left positive."""
+"""Camera yaw angles of the evaluation rig, left positive."""
 FIELD_DEG, HEIGHT_M, AHEAD_M = 50.0, 1.8, 1.5
-"""As wide as the front cameras of the public protocol's recordings, on the roof."""
+"""Field of view as for the front cameras of the public protocol; mounted on the roof."""
 
 
 def evaluation_rig(cameras: int = 1, width_px: int = 480, height_px: int = 320) -> Rig:
-    """The front camera, or with it the two beside it, and a LiDAR."""
+    """A front camera, optionally two side cameras, and a LiDAR."""
     focal = width_px / 2 / np.tan(np.deg2rad(FIELD_DEG) / 2)
     lens = Pinhole(focal, focal, width_px / 2, height_px / 2)
     models = {}
@@ -37,14 +37,14 @@ def evaluation_rig(cameras: int = 1, width_px: int = 480, height_px: int = 320) 
 
 
 def camera_responses(rig: Rig, seed: int) -> dict[str, CameraResponse]:
-    """A colour response of its own for every camera, as the cameras of one car differ."""
+    """A random colour response per camera."""
     return {name: random_response(np.random.default_rng([seed, n, 0xCA3])) for n, name in enumerate(rig.cameras)}
 
 
-class Drawing:
-    """A drawn world under evaluation: hands out true views, shots and sweeps along the recorded drive.
+class EvaluationWorld:
+    """A procedural world under evaluation: ground-truth views, frames and sweeps along the recorded drive.
 
-    Shots and sweeps are drawn when they are first asked for; the world must be open then.
+    Frames and sweeps are rendered on first use, while the world must be open.
     """
 
     def __init__(self, world: TrueWorld, rig: Rig) -> None:
@@ -52,7 +52,7 @@ class Drawing:
         self.ego: Trajectory = world.plan.ego_trajectory()
 
     def request(self, camera_id: str, t_us: int, left_m: float = 0.0) -> SensorRequest:
-        """A picture taken in an instant by a camera of the rig, with the car moved to its left."""
+        """A request for an instantaneous camera image, with the car shifted to its left."""
         beside = geometry.pose(np.eye(3), np.array([0.0, left_m, 0.0]))
         camera = self.rig.cameras[camera_id]
         pose = self.ego.at(t_us) @ beside @ camera.rig_from_camera
@@ -67,7 +67,7 @@ class Drawing:
         return Shot(t_us, t_us, request.world_from_sensor, cache(lambda: self.world.view(request).rgb))
 
     def target(self, name: str, camera_id: str, t_us: int, left_m: float = 0.0, beyond: bool = False) -> Target:
-        """A view that methods have to show."""
+        """A target view."""
         request = self.request(camera_id, t_us, left_m)
         seen = self.world.view(request)
         movable = reduced_mask(LABEL_OF_CLASS[seen.surface] == Label.MOVABLE)
@@ -75,7 +75,7 @@ class Drawing:
         return Target(name, request, reduced(seen.rgb, depth_m), movable, left_m, beyond)
 
     def revolutions(self, span_us: tuple[int, int]) -> dict[str, tuple[Revolution, ...]]:
-        """Turns of the LiDARs, one after the other, that lie within a span."""
+        """Consecutive LiDAR sweeps within a time span."""
         starts = range(span_us[0], span_us[1] - SPIN_US + 1, SPIN_US)
         return {name: tuple(self._revolution(name, start) for start in starts) for name in self.rig.lidars}
 
@@ -85,12 +85,12 @@ class Drawing:
         return Revolution(start_us, start_us + SPIN_US, measured)
 
     def clip(self, id: str, times_us: Int64[np.ndarray, " n"], span_us: tuple[int, int], boxes: bool) -> ContextClip:
-        """A log of the frames at these times and of all sweeps of a span, with or without the boxes of what moves."""
+        """A log of the frames at these times and of all sweeps of a span, with or without boxes."""
         tracks = self.world.plan.tracks() if boxes else ()
         shots, turns = self.shots(times_us), self.revolutions(span_us)
         return ContextClip(id, self.rig, self.ego, span_us, shots, turns, tracks)
 
 
 def held_out_plan(seed: int, seconds: float) -> TownPlan:
-    """The town of a seed from the split that training never sees (``world.plan.splits``)."""
+    """The town of a seed from the held-out split ``test`` (``world.plan.splits``)."""
     return town_plan(seed, "test", seconds=seconds)
