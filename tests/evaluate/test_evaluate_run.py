@@ -75,7 +75,7 @@ def test_another_setting_is_refused(tmp_path):
     copy = contenders(("copy",))
     run_protocol(StreetProtocol("storm", (1,)), copy, tmp_path)
     with pytest.raises(
-        RunError, match=r"another setting: ids was \[\"street-1\"\], now it is \[\"street-1\", \"street-2"
+        RunError, match=r"other settings: ids was \[\"street-1\"\], now \[\"street-1\", \"street-2"
     ):
         run_protocol(StreetProtocol("storm", (1, 2)), copy, tmp_path)
     with pytest.raises(RunError, match="methods.lift was null"):
@@ -84,7 +84,7 @@ def test_another_setting_is_refused(tmp_path):
     with pytest.raises(RunError, match=r"cannot read .*street-1.json.*delete it and run again"):
         run_protocol(StreetProtocol("storm", (1,)), copy, tmp_path)
     (tmp_path / "windows" / "street-1.json").write_text('{"methods": {}}')
-    with pytest.raises(RunError, match="does not hold the figures of these methods"):
+    with pytest.raises(RunError, match="does not have the results of these methods"):
         run_protocol(StreetProtocol("storm", (1,)), copy, tmp_path)
 
 

@@ -87,7 +87,7 @@ def test_broken_rollout_files_are_refused_with_a_reason(tmp_path):
     with np.load(good) as file:
         arrays = dict(file)
     np.savez(tmp_path / "few.npz", **{k: v for k, v in arrays.items() if k != "plan_stops"})
-    with pytest.raises(RunError, match=r"lacks \['plan_stops'\]"):
+    with pytest.raises(RunError, match=r"missing \['plan_stops'\]"):
         load_rollout(tmp_path / "few.npz")
     np.savez(tmp_path / "odd.npz", **{**arrays, "state_t_us": arrays["state_t_us"].astype(float)})
     with pytest.raises(RunError, match=r"state_t_us must be int64 \[-1\], got float64 \[20\]"):
@@ -391,7 +391,7 @@ def test_bad_orders_are_refused(tmp_path):
 
     with pytest.raises(ScenarioError, match="no policy to run"):
         drive([scene], [])
-    with pytest.raises(ScenarioError, match="no scene to drive"):
+    with pytest.raises(ScenarioError, match="no scene to run"):
         drive([], ["log_replay"])
     with pytest.raises(ScenarioError, match="policies need different names, but .'crash'"):
         drive([scene], [Crash(), Crash()])
