@@ -79,7 +79,7 @@ def test_clip_holds_out_every_kth_frame_of_all_cameras():
         ({"name": "drive", "seeds": (1,)}, "no protocol 'drive'; have"),
         ({"name": "storm"}, "give seeds or clips"),
         ({"name": "storm", "seeds": (1, 1)}, "each may be given once"),
-        ({"name": "shift", "clips": ("log",)}, "no log recorded what is beside its path"),
+        ({"name": "shift", "clips": ("log",)}, "logs have no views at lateral offsets"),
         ({"name": "clip", "seeds": (1,), "hold_out_every": 1}, "holds out every second frame or fewer"),
         ({"name": "clip", "seeds": (1,), "cameras": 2}, "1 or 3 cameras, got 2"),
     ],

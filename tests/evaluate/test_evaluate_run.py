@@ -74,9 +74,7 @@ def test_finished_windows_are_not_done_again(finished):
 def test_another_setting_is_refused(tmp_path):
     copy = contenders(("copy",))
     run_protocol(StreetProtocol("storm", (1,)), copy, tmp_path)
-    with pytest.raises(
-        RunError, match=r"other settings: ids was \[\"street-1\"\], now \[\"street-1\", \"street-2"
-    ):
+    with pytest.raises(RunError, match=r"other settings: ids was \[\"street-1\"\], now \[\"street-1\", \"street-2"):
         run_protocol(StreetProtocol("storm", (1, 2)), copy, tmp_path)
     with pytest.raises(RunError, match="methods.lift was null"):
         run_protocol(StreetProtocol("storm", (1,)), contenders(("copy", "lift"), lift=LIFT), tmp_path)
