@@ -49,8 +49,8 @@ def evaluate(
     Args:
         clip: the log.
         method: reconstruction method.
-        input_cameras: cameras that the reconstruction may see; all if None, or as many as the method takes.
-        target_cameras: cameras to compare with, at all their frames; the input cameras if None.
+        input_cameras: input cameras of the reconstruction; default: all, or as many as the method supports.
+        target_cameras: cameras to score at all their frames; default: the input cameras.
         hold_out_every: hold out images N-1, 2N-1, ... of the input cameras, and the sweeps taken meanwhile; 0: none.
         hold_out_sweeps_every: hold out sweeps K, 2K, ...; 0: none.
         hold_out_sweeps: further sweeps to hold out, by index.
@@ -110,7 +110,7 @@ def score_scene(
         via_grpc: whether frames come over gRPC or from a renderer directly.
         device: that renders; see ``render.choose_device``.
         images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
-        progress: called with a stage and the fraction of all work that is done, about.
+        progress: called with the stage and the approximate fraction done.
 
     Returns:
         JSON-ready figures.

@@ -60,7 +60,7 @@ class LidarScore:
 
     @property
     def median_abs_error_m(self) -> float:
-        """Median over the beams that returned; NaN if none did."""
+        """Median over the simulated returns; NaN without any."""
         return float(np.median(self.abs_error_m)) if self.returned.any() else float("nan")
 
     def within(self, low_m: float, high_m: float) -> LidarScore:
