@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 from jaxtyping import Bool, Float64
-
-if TYPE_CHECKING:
-    from nurec_sim.lenses.pinhole import Pinhole
 
 Points2 = Float64[np.ndarray, "n 2"]
 Points3 = Float64[np.ndarray, "n 3"]
@@ -58,7 +55,7 @@ class Lens(Protocol):
         """An angle off the optical axis, in (0, pi], beyond which the lens sees nothing."""
 
     @property
-    def ideal_pinhole(self) -> Pinhole | None:
+    def ideal_pinhole(self) -> Lens | None:
         """The same lens as a pinhole without distortion, or None where it is not one: renderers are faster then."""
 
     def project(self, xyz: Points3) -> tuple[Points2, Mask]:
@@ -111,7 +108,7 @@ class BaseLens:
     perspective: ClassVar[bool] = False
 
     @property
-    def ideal_pinhole(self) -> Pinhole | None:
+    def ideal_pinhole(self) -> Lens | None:
         """None: no pinhole."""
         return None
 

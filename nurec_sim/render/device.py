@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import logging
 import os
 import re
-import sys
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
@@ -104,21 +102,10 @@ def choose_device(device: str = "auto") -> ChosenDevice:
     return chosen
 
 
-def check_driver() -> None:
-    """Look for NVIDIA's driver, which takes no time where there is none.
-
-    Raises:
-        GpuError: it is not installed.
-    """
-    library = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        raise GpuError(f"no GPU: there is no {library}; CUDA needs an NVIDIA GPU and its driver") from None
-
-
 def _cuda(name: str) -> ChosenDevice:
     """A CUDA device on which the kernels are loaded."""
+    from nurec_sim.render.gpu.driver import check_driver
+
     check_driver()  # before the imports, which take seconds
     import torch
 

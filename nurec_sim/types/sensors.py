@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float64
@@ -60,7 +61,8 @@ class CameraModel:
     @property
     def ideal_pinhole(self) -> Pinhole | None:
         """The lens as a pinhole without distortion; None where it is none, or behind a windshield."""
-        return None if self.windshield is not None else self.lens.ideal_pinhole
+        # ``Lens`` cannot name the class in its own file: pinholes are lenses.
+        return None if self.windshield is not None else cast("Pinhole | None", self.lens.ideal_pinhole)
 
 
 class Spin(enum.Enum):

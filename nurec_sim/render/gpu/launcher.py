@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from nurec_sim.errors import GpuError
-from nurec_sim.render.device import check_driver
 from nurec_sim.render.gpu.compiler import cached_cubin, import_cuda_core, kernel_names
+from nurec_sim.render.gpu.driver import check_driver
 
 if TYPE_CHECKING:
     import torch
