@@ -1,4 +1,4 @@
-"""A USDZ package: a ZIP of stored, 64-byte aligned members, written reproducibly and read with suspicion.
+"""A USDZ package: a ZIP of stored, 64-byte aligned members, written reproducibly and validated on read.
 
 Format: https://openusd.org/release/spec_usdz.html. OpenUSD has no ZIP64, so a member and the whole file stay below
 4 GiB. Every member carries the same time stamp (1980-01-01) and the padding extra field of OpenUSD (id 0x1986), so
