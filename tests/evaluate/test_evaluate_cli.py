@@ -29,7 +29,7 @@ def test_the_choices_are_those_of_the_package():
 def test_one_command_prints_the_tables_and_keeps_them(streets, capsys):
     run_cli("--protocol", "storm", "--worlds", 2, "--seed", 4, "--methods", "copy")
     text = capsys.readouterr().out
-    for words in ("columns of the paper's Table 1", "dyn PSNR", "Depth in metres", "without boxes", "report.html"):
+    for words in ("columns of the paper's Table 1", "dyn PSNR", "Metric depth", "without boxes", "report.html"):
         assert words in " ".join(text.split())
     folder = streets / "evaluations" / "latest"
     results = json.loads((folder / "results.json").read_text())

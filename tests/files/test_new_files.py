@@ -153,12 +153,16 @@ def test_a_folder_that_does_not_fit_leaves_the_old_one(tmp_path: Path, monkeypat
 SCENARIO = "{name: brief, duration_s: 0.6, warm_up_s: 0.1, replan_s: 0.5, policies: [constant_velocity]}\n"
 
 
+FIGURES = {"much": list(range(1000)), "image": {}, "lidar": None, "free_space": None, "road": None, "seconds": {},
+           "counts": {"static": 1, "dynamic": 0}}  # fmt: skip
+
+
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a scene, a clip and a scenario; what takes long is left out."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(nurec_sim.reconstruct, "reconstruct", lambda *_, **__: scene())
-    monkeypatch.setattr(nurec_sim.evaluate, "evaluate", lambda *_, **__: {"much": list(range(1000))}, raising=False)
+    monkeypatch.setattr(nurec_sim.evaluate, "evaluate", lambda *_, **__: FIGURES, raising=False)
     write_scene(scene(), "street.usdz")
     tiny_clip.write(tmp_path / "clip.zip")
     Path("brief.yaml").write_text(SCENARIO)

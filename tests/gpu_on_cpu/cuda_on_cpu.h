@@ -164,10 +164,12 @@ static inline float inverse_root(float x) { return 1 / sqrtf(x); }
 static inline void sine_cosine_pi(float x, float* sine, float* cosine) {
     *sine = sinf(3.14159265358979f * x), *cosine = cosf(3.14159265358979f * x);
 }
+static inline double sine_pi(double x) { return sin(3.14159265358979323846 * x); }
 // By macro, as some C libraries have functions of these names.
 #define __expf expf
 #define rsqrtf inverse_root
 #define sincospif sine_cosine_pi
+#define sinpi sine_pi
 static inline int __popc(unsigned v) { return __builtin_popcount(v); }
 static inline int __ffs(unsigned v) { return __builtin_ffs(v); }
 

@@ -81,7 +81,7 @@ def test_the_command_writes_a_picture_or_nothing(path, tmp_path, monkeypatch, ca
     drawn = cv2.cvtColor(cv2.imread("out/sheet.png"), cv2.COLOR_BGR2RGB)
     assert np.array_equal(drawn, logs.draw_overlay(logs.open_clip(path), 2_110_000))
     for words, said in (
-        (["--time-s", "1"], "--time-s is the time of the picture that --overlay writes; give both"),
+        (["--time-s", "1"], "--time-s is the time of the --overlay image; give both"),
         (["--overlay", "late.png", "--time-s", "1"], "there is nothing to draw 1.000 s after its start"),
         (["--overlay", "x.png", "--time-s", "nan"], "--time-s must be a number of seconds, got nan"),
     ):

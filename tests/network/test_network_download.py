@@ -252,7 +252,7 @@ def test_list_shows_what_is_here(hub: FakeHub, capsys: pytest.CaptureFixture[str
     assert "fetched" in lines["pa-front"] and "182.5 M" in lines["pa-front"]
     assert "missing" in lines["pq-front"] and "1,141,125,047" in lines["pq-front"]
     assert "946e2f66aca9" in lines["pa-multiview"]
-    assert "none published" in lines["pa-full"]
+    assert "not published" in lines["pa-full"]
 
 
 def test_fetch_says_what_it_gets_and_where_it_is(

@@ -87,7 +87,7 @@ def test_the_command_writes_the_small_file_and_says_what_is_wrong(files, capsys)
 
     full, base, part = (str(files / f"{name}.safetensors") for name in ("full", "base", "part"))
     main(["weights", "share", full, "--other", base, "--to", part])
-    assert "1 tensors are those of base.safetensors" in " ".join(capsys.readouterr().out.split())
+    assert "1 tensors shared with base.safetensors" in " ".join(capsys.readouterr().out.split())
     (files / "broken").write_bytes(b"no weights")
     with pytest.raises(SystemExit) as stopped:
         main(["weights", "share", str(files / "broken"), "--other", base, "--to", part])

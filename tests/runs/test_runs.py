@@ -393,7 +393,7 @@ def test_bad_orders_are_refused(tmp_path):
         drive([scene], [])
     with pytest.raises(ScenarioError, match="no scene to run"):
         drive([], ["log_replay"])
-    with pytest.raises(ScenarioError, match="policies need different names, but .'crash'"):
+    with pytest.raises(ScenarioError, match="policy names must be unique; repeated: .'crash'"):
         drive([scene], [Crash(), Crash()])
     with pytest.raises(ScenarioError, match="scenes need different ids, but .'street'"):
         drive([scene, scene], ["log_replay"])

@@ -289,7 +289,7 @@ def test_the_command_line_uploads(address, archive, folder, tmp_path, capsys):
     assert "uploaded as clipgt-sent" in capsys.readouterr().out and names_in(folder) == ["sent.usdz"]
     for arguments, text in [
         ([str(archive)], "a file 'sent.usdz' was uploaded before"),
-        ([str(archive), "--reconstruct"], "--reconstruct is for clips, sent.usdz is none"),
+        ([str(archive), "--reconstruct"], "--reconstruct is for clips, sent.usdz is not one"),
         ([str(tmp_path / "gone.usdz")], "gone.usdz: No such file or directory"),
         ([str(archive), "--token-file", str(tmp_path / "no.txt")], "the token cannot be read from "),
     ]:

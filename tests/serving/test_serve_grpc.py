@@ -74,7 +74,7 @@ def test_the_launch_line_of_alpasim_serves_and_ends_cleanly(scenes, tmp_path):
     warnings = complaints.splitlines()
     assert len(warnings) == 2, complaints
     assert warnings[0] == "warning: these flags have no effect on this renderer: --no-enable-nrend"
-    assert re.fullmatch(r"warning: anybody who can reach 0.0.0.0:0 may call; .*", warnings[1])
+    assert re.fullmatch(r"warning: any client that can reach 0.0.0.0:0 may call; .*", warnings[1])
 
 
 def test_a_protected_server_with_all_its_ports(scenes, tmp_path):
@@ -211,7 +211,12 @@ def not_served(monkeypatch):
     import nurec_sim.serving.server
 
     taken = []
-    monkeypatch.setattr(nurec_sim.serving.server, "serve", lambda store, **choices: taken.append((store, choices)))
+
+    def server(store, host, port, **choices):
+        return store, {"host": host, "port": port, **choices}
+
+    monkeypatch.setattr(nurec_sim.serving.server, "SensorServer", server)
+    monkeypatch.setattr(nurec_sim.serving.server, "run_until_signal", taken.append)
     monkeypatch.setattr(nurec_sim.serving.server, "set_up_logging", lambda *_: None)
     return taken
 

@@ -197,7 +197,7 @@ def test_the_verb_draws_a_plan_with_the_car_that_was_asked_for(plan, tmp_path, m
         (["--template", "roundabout"], "no template 'roundabout' in split 'train'; have straight"),
         (["--seconds", "1", "--hz", "30"], "--hz must be within 0.1..25, got 30"),
         (["--seconds", "1", "--lidar", "HDL"], "no LiDAR 'HDL'; have"),
-        (["--plan", "there.json", "--seed", "3"], "--plan says everything about the town; leave out --seed"),
+        (["--plan", "there.json", "--seed", "3"], "--plan defines the town; remove --seed"),
         (["--plan", "nowhere.json"], "cannot read the plan nowhere.json"),
         (["--plan", "there.json"], "there.json: not a town plan: the text itself"),
     ],

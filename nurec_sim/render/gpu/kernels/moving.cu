@@ -24,12 +24,19 @@ INLINE void quat_of(const double* m, double* q) {
     double d[4] = {1 + m[0] + m[4] + m[8], 1 + m[0] - m[4] - m[8], 1 - m[0] + m[4] - m[8], 1 - m[0] - m[4] + m[8]};
     double a = m[7] - m[5], b = m[2] - m[6], c = m[3] - m[1], xy = m[3] + m[1], xz = m[2] + m[6], yz = m[7] + m[5];
     double rows[4][4] = {{d[0], a, b, c}, {a, d[1], xy, xz}, {b, xy, d[2], yz}, {c, xz, yz, d[3]}};
-    int best = 0;
-    for (int k = 1; k < 4; ++k) best = d[k] > d[best] ? k : best;
+    // The row with the greatest diagonal, chosen without an index that would put the rows into local memory.
+    double row[4] = {d[0], a, b, c}, top = d[0];
+#pragma unroll
+    for (int k = 1; k < 4; ++k) {
+        bool better = d[k] > top;
+        top = better ? d[k] : top;
+#pragma unroll
+        for (int j = 0; j < 4; ++j) row[j] = better ? rows[k][j] : row[j];
+    }
     double size = 0;
-    for (int k = 0; k < 4; ++k) size += rows[best][k] * rows[best][k];
-    size = rows[best][0] < 0 ? -sqrt(size) : sqrt(size);
-    for (int k = 0; k < 4; ++k) q[k] = rows[best][k] / size;
+    for (int k = 0; k < 4; ++k) size += row[k] * row[k];
+    size = row[0] < 0 ? -sqrt(size) : sqrt(size);
+    for (int k = 0; k < 4; ++k) q[k] = row[k] / size;
 }
 
 // Between two poses [4][4]: positions linear, rotations along the shorter arc (geometry.interpolate_pose_pair).
@@ -44,9 +51,11 @@ INLINE Pose between(const double* from, const double* to, double fraction) {
     for (int k = 0; k < 4; ++k) dot += p[k] * q[k];
     for (int k = 0; k < 4; ++k) q[k] = dot < 0 ? -q[k] : q[k];
     for (int k = 0; k < 4; ++k) gap += (q[k] - p[k]) * (q[k] - p[k]);
-    double half = sqrt(gap) / 2, angle = 2 * asin(half < 1 ? half : 1.0);
+    // Angles in half turns: sinpi needs no reduction of large arguments, for which sin keeps a table in local memory.
+    double half = sqrt(gap) / 2, angle = 2 * asin(half < 1 ? half : 1.0) / 3.14159265358979323846;
     double first = 1 - fraction, second = fraction;
-    if (angle >= 1e-9) first = sin(first * angle) / sin(angle), second = sin(second * angle) / sin(angle);
+    if (angle >= 1e-9 / 3.14159265358979323846)
+        first = sinpi(first * angle) / sinpi(angle), second = sinpi(second * angle) / sinpi(angle);
     for (int k = 0; k < 4; ++k) q[k] = first * p[k] + second * q[k], size += q[k] * q[k];
     size = 1 / sqrt(size);
     double w = q[0] * size, x = q[1] * size, y = q[2] * size, z = q[3] * size;
