@@ -1,4 +1,4 @@
-"""The Instant NuRec network (docs/network.md): profiles, the module, and what goes in and out."""
+"""The Instant NuRec network (docs/network.md): profiles, the module, its inputs and outputs."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def build(profile: str | Profile, *, seed: int | None = 0, precision: Precision 
     """The network of a profile, ready for inference.
 
     Args:
-        profile: a name of ``PROFILES``, or sizes of one's own.
-        seed: of its random parameters. None leaves parameters unset, which is quicker where
+        profile: a name in ``PROFILES``, or custom sizes.
+        seed: of the random parameters. None leaves parameters uninitialised, which is faster if
             ``checkpoints.load_weights`` fills them anyway.
         precision: of matrix products and convolutions.
 
@@ -33,6 +33,8 @@ def build(profile: str | Profile, *, seed: int | None = 0, precision: Precision 
             raise ValueError(f"no network profile {profile!r}; have {list(PROFILES)}")
         profile = PROFILES[profile]
     if seed is None:
+        # Built without storage, then allocated: random initialisation takes longer than reading a file. Constant
+        # buffers are lost on the way and set again.
         with torch.device("meta"):
             model = InstantNuRec(profile)
         model = model.to_empty(device="cpu")

@@ -39,10 +39,10 @@ class Mlp(nn.Module):
 
 
 class Rope:
-    """Rotary positions in two dimensions: half of each head's channels turn with y, the other half with x.
+    """Rotary positions in two dimensions: half of each head's channels encode y, the other half x.
 
     Args:
-        positions: (y, x) of every token.
+        positions: (y, x) of every token, in patches.
         head_width: channels of one head, a multiple of 4.
     """
 
@@ -81,6 +81,8 @@ class SelfAttention(nn.Module):
         """Attended tokens."""
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         if self.normed:
+            # QK-norm (paper section 3.3, "for stability"): logits cannot grow beyond half precision. Norms come before
+            # RoPE, as rotations keep lengths.
             q, k = self.q_norm(q), self.k_norm(k)
         if rope is not None:
             q, k = rope(q), rope(k)
@@ -95,6 +97,7 @@ class KeyValueProjector(nn.Module):
     def __init__(self, width: int, heads: int, normed: bool) -> None:
         super().__init__()
         self.heads, self.normed = heads, normed
+        # One projection for all blocks: keys and values of thousands of patches are computed once, not per block.
         self.to_k = nn.Linear(width, width)
         self.to_v = nn.Linear(width, width)
         if normed:
@@ -107,7 +110,7 @@ class KeyValueProjector(nn.Module):
 
 
 class CrossAttention(nn.Module):
-    """Multi-head attention of queries to keys and values; ``own_keys`` brings the projector that makes them."""
+    """Multi-head attention of queries to keys and values; with ``own_keys`` it holds the projector that makes them."""
 
     def __init__(self, width: int, heads: int, normed: bool, own_keys: bool = False) -> None:
         super().__init__()
@@ -135,6 +138,7 @@ class SelfBlock(nn.Module):
 
     def __init__(self, width: int, heads: int, normed: bool, eps: float, scale: float) -> None:
         super().__init__()
+        # Pre-norm (Xiong et al. 2020): the residual path stays free of norms, which keeps deep stacks stable.
         self.norm1 = nn.LayerNorm(width, eps=eps)
         self.attn = SelfAttention(width, heads, normed)
         self.ls1 = LayerScale(width, scale)
@@ -149,7 +153,7 @@ class SelfBlock(nn.Module):
 
 
 class QueryBlock(nn.Module):
-    """A decoder block: queries look at the features, then at each other, then each at itself."""
+    """A decoder block: queries attend to the features, then to each other, then pass through an MLP."""
 
     def __init__(self, width: int, heads: int, scale: float) -> None:
         super().__init__()
@@ -167,6 +171,7 @@ class QueryBlock(nn.Module):
         self, x: Float[Tensor, "b n c"], k: Float[Tensor, "b heads m d"], v: Float[Tensor, "b heads m d"]
     ) -> Float[Tensor, "b n c"]:
         """Queries after the block."""
+        # The order of the release: cross-attention, self-attention among all queries of all images, MLP.
         x = x + self.ls_ca(self.ca(self.ca_norm(x), k, v))
         x = x + self.ls_sa(self.sa(self.sa_norm(x)))
         return x + self.ls_mlp(self.mlp(self.mlp_norm(x)))

@@ -1,4 +1,4 @@
-"""The context decoders and the two ways to make Gaussians of what they say: dense and selective (paper section 3.3)."""
+"""The context decoders and the two ways to decode Gaussians: dense and selective (paper section 3.3)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from nurec_sim.network.tensors import SCENE_RESCALE, ContextMaps, NetworkInputs,
 
 LARGEST_SCALE = 0.045
 """In the network's unit; 0.30 m."""
-# An output of 0 means a scale of exp(-2.9) times the largest, about 17 mm, and an opacity of sigmoid(-2), about 0.12:
-# training begins with Gaussians that are small and let others through.
+# A head output of 0 means a scale of exp(-2.9) times the largest, about 17 mm, and an opacity of sigmoid(-2), about
+# 0.12: training starts with Gaussians that are small and nearly transparent.
 SCALE_SHIFT = 2.9
 OPACITY_SHIFT = 2.0
 GAUSSIAN_CHANNELS = 8
@@ -30,14 +30,14 @@ GAUSSIAN_CHANNELS = 8
 
 
 class ContextDecoder(nn.Module):
-    """Depth, colour, normals, classes and motion of every input pixel; what both decoders begin with."""
+    """Depth, colour, normals, classes and motion of every input pixel; shared by both decoders."""
 
     cuboids_dims_padding: Tensor
 
     def __init__(self, profile: Profile) -> None:
         super().__init__()
         width = 2 * profile.encoder.width
-        # Margin around cuboids, metres; kept in the released state dicts, read by nothing here.
+        # Margin around cuboids, metres: part of the released state dicts, unused here.
         self.register_buffer("cuboids_dims_padding", torch.ones(3))
         self.depth_head = DptHead(width, profile.head, out=2)
         seen, wide = 3 + CHANNELS, profile.head.fused // 2
@@ -62,11 +62,15 @@ class ContextDecoder(nn.Module):
             depth = chosen_depth(predicted, trust, view[:, MATCHED_DEPTH])
         context = self.context_head(levels, size, self.rgb_fusion, images).float().permute(0, 2, 3, 1)
         rgb, normal, logits = context.split([3, 3, len(SemanticClass)], dim=-1)
+        # Motion has a transformer of its own, so it only runs on request.
         moved = None
         if motion:
             moved = self.context_motion_head(features, size, inputs.time, inputs.time_before, inputs.time_after)
         return ContextMaps(
+            # The head predicts log z-depth in the network's unit (0.15 per metre): always positive, with relative
+            # errors.
             depth_m=(depth.exp() / SCENE_RESCALE).unflatten(0, clips),
+            # The release's activation: sigmoid(2x) = (1 + tanh x) / 2.
             rgb=torch.sigmoid(2 * rgb).unflatten(0, clips),
             normal=functional.normalize(normal, dim=-1).unflatten(0, clips),
             logits=logits.unflatten(0, clips),
@@ -87,18 +91,19 @@ class DenseDecoder(ContextDecoder):
         raw = self.gaussians_head([feature.patches.flatten(0, 1) for feature in features], (h, w))
         raw = raw.float().permute(0, 2, 3, 1).reshape(b, v * h * w, GAUSSIAN_CHANNELS)
         source = torch.arange(v * h * w, device=raw.device).expand(b, -1)
-        # The sky is a cubemap and the own car is no part of the scene: their pixels give Gaussians of opacity 0.
+        # The sky is a cubemap and the own car is no part of the scene: Gaussians of their pixels get opacity 0. A hard
+        # mask, as in the release; it passes no gradient to the logits.
         visible = (outside_probability(context.logits) > 0.5).reshape(b, -1).to(raw.dtype)
         shapes = footprints(inputs, context, source, raw.new_ones(v * h * w)) if self.begins_as_footprints else None
         return gaussians_at(source, raw, visible, lifted_points(context, inputs), context, shapes)
 
 
 class SelectiveDecoder(ContextDecoder):
-    """Clusters of Gaussians around chosen points that look at the features (point queries).
+    """Clusters of Gaussians around chosen points that attend to the features (point queries, paper section 3.3).
 
     Attributes:
-        fill_road_slots: the release's rule instead of ours. It always has ``road_slots`` road tokens per image; those
-            left over hold cells that are not road, are shown to all other tokens, and get opacity 0.
+        fill_road_slots: the release's rule instead of ours. It always has ``road_slots`` road tokens per image; unused
+            ones hold cells that are not road, which still attend and are attended to, with opacity 0.
     """
 
     def __init__(self, profile: Profile) -> None:
@@ -111,6 +116,7 @@ class SelectiveDecoder(ContextDecoder):
         self.ca_kv_projector = KeyValueProjector(width, self.size.heads, normed=True)
         self.ca_blocks = nn.ModuleList(QueryBlock(width, self.size.heads, scale=1e-4) for _ in range(self.size.depth))
         self.ca_kv_proj = nn.Linear(len(profile.encoder.taps) * width, width, bias=False)
+        # Each token decodes all M = p^2 Gaussians of its cell at once (paper section 3.3).
         self.gs_linear = nn.Linear(width, points * GAUSSIAN_CHANNELS)
 
     def gaussians(self, features: Sequence[Features], context: ContextMaps, inputs: NetworkInputs) -> QueryGaussians:
@@ -126,11 +132,12 @@ class SelectiveDecoder(ContextDecoder):
         source = torch.cat([regular, road]).flatten()[None]
         points = lifted_points(context, inputs)
         raw = self.decode(points.gather(1, source[..., None].expand(-1, -1, 3)), features)
-        # The probability itself, where the dense decoder takes a decision: as in the release.
+        # m = 1 - p_ego - p_sky multiplies the opacity itself; the dense decoder thresholds it at 0.5. Both as released.
         visible = outside_probability(context.logits).reshape(1, -1).gather(1, source)
         visible[:, source.shape[1] - road.numel() :] *= filled.repeat_interleave(self.size.cell**2)
         shapes = None
         if self.begins_as_footprints:
+            # Strided points are s pixels apart, so that their footprints must be s times as wide to leave no gaps.
             spacing = raw.new_ones(source.shape[1])
             spacing[: regular.numel()] = self.size.stride
             shapes = footprints(inputs, context, source, spacing)
@@ -138,6 +145,8 @@ class SelectiveDecoder(ContextDecoder):
 
     def decode(self, points: Float[Tensor, "b n 3"], features: Sequence[Features]) -> Float[Tensor, "b n 8"]:
         """Raw attributes of the Gaussians at points, whole clusters of ``cell``**2 after each other."""
+        # Keys and values come from all four taps of all images of the clip, side by side: 4 x 1536 channels in the
+        # release.
         stacked = torch.cat([feature.patches.flatten(1, 3) for feature in features], dim=-1)
         k, v = self.ca_kv_projector(self.ca_feature_norm(self.ca_kv_proj(stacked)))
         # One token per cluster: the points of a whole cell, side by side.
@@ -160,6 +169,7 @@ class SelectiveDecoder(ContextDecoder):
         """
         index = torch.arange(logits[..., 0].numel(), device=logits.device).reshape(logits.shape[:-1])
         cells = _cells(index, self.size.cell)
+        # All pixels, not most (the release's rule): mixed cells are left to the regular tokens.
         road = _cells(logits.argmax(-1) == SemanticClass.ROAD, self.size.cell).all(-1)
         slots = min(self.size.road_slots, cells.shape[1])
         chosen, filled = [], []
@@ -167,6 +177,8 @@ class SelectiveDecoder(ContextDecoder):
             ranked = torch.argsort(~is_road, stable=True)  # road cells first, in their order
             count = int(is_road.sum())
             if count > slots:
+                # Evenly over the image and always the same; the release draws at random, so its results vary from run
+                # to run.
                 ranked = ranked[torch.arange(slots, device=ranked.device) * count // slots]
             taken = ranked[:slots] if self.fill_road_slots else ranked[: min(count, slots)]
             chosen.append(image_cells[taken])
@@ -205,10 +217,17 @@ def gaussians_at(
 ) -> QueryGaussians:
     """Activated Gaussians at source pixels, with the pixels' colour, normal, class and motion.
 
-    Scales and orientations are absolute, as in the release, or changes of ``shapes``.
+    Args:
+        source: flat (v, h, w) index of each Gaussian's pixel.
+        raw: head output: log scale (3), quaternion wxyz (4), opacity logit (1).
+        visible: factor on the opacity, 0..1.
+        points: lifted points of all pixels, scene frame, metres.
+        context: maps to take colour, normal, class and motion from.
+        shapes: footprints that the outputs change relatively; None: they are absolute, as in the release.
     """
     log_scale, quaternion, opacity = raw.split([3, 4, 1], dim=-1)
     if shapes is None:
+        # scale = min(exp(x + ln 0.045 - 2.9), 0.045) / 0.15 metres.
         log_scale = log_scale + (torch.tensor(LARGEST_SCALE).log() - SCALE_SHIFT)
         scale_m = log_scale.exp().clamp(max=LARGEST_SCALE) / SCENE_RESCALE
         quat_wxyz = functional.normalize(quaternion, dim=-1)
@@ -221,6 +240,7 @@ def gaussians_at(
         return flat.gather(1, index)
 
     return QueryGaussians(
+        # No predicted offset: Gaussians lie on the lifted depth, and their colour is that of the pixel (SH degree 0).
         position_m=points.gather(1, source[..., None].expand(-1, -1, 3)),
         quat_wxyz=quat_wxyz,
         scale_m=scale_m,

@@ -1,4 +1,4 @@
-"""Gaussians after the fact that their pixels' depth was found to be another one."""
+"""Gaussians moved along their rays after the depth of their pixels was corrected."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ def with_changed_depth(
 
     Args:
         gaussians: of the network.
-        inputs: what they were made of.
-        factor: what every pixel's depth is multiplied by.
+        inputs: what they were decoded from.
+        factor: multiplies every pixel's depth.
     """
     of_each = factor.reshape(-1)[gaussians.source][..., None]
     origin = inputs.rays.to(of_each.device).reshape(-1, 6)[gaussians.source, :3]
     motion = gaussians.motion_m
+    # Scaling about the ray origin: a Gaussian keeps its size and motion in the image, so the picture does not change.
     return dataclasses.replace(
         gaussians,
         position_m=origin + (gaussians.position_m - origin) * of_each,

@@ -14,7 +14,7 @@ from nurec_sim.network.profiles import HeadSize
 POSITION_WEIGHT = 0.1
 POSITION_BASE = 100.0
 IMAGES_AT_ONCE = 4
-"""How many images go through a head together; what bounds the memory of long clips."""
+"""How many images go through a head together; bounds the memory of long clips."""
 
 
 class Reassemble(nn.Module):
@@ -57,6 +57,8 @@ class Refinement(nn.Module):
     ) -> Float[Tensor, "n d yy xx"]:
         """The fused map at another size."""
         if skip is not None:
+            # RefineNet (Lin et al. 2017): the finer level is refined by a residual unit of its own before and after the
+            # sum.
             x = x + skip + self.res_block(skip)
         x = x + self.main_block(x)
         # The 1 x 1 convolution and the interpolation commute; on the smaller map it costs a quarter.
@@ -116,6 +118,8 @@ class DptHead(nn.Module):
             detail: what adds fine structure, called with some of ``images``.
             images: colours for ``detail``.
         """
+        # Heads run at full resolution and dominate peak memory; images are independent here, so a few at a time
+        # suffice.
         parts = []
         for first in range(0, len(features[0]), IMAGES_AT_ONCE):
             some = slice(first, first + IMAGES_AT_ONCE)
@@ -126,12 +130,12 @@ class DptHead(nn.Module):
 
 
 def position_waves(x: Float[Tensor, "n d h w"], aspect: float) -> Float[Tensor, "d h w"]:
-    """Sines and cosines of a pixel's place, a tenth as strong as the map they are added to.
+    """Sines and cosines of a pixel's position, a tenth as strong as the map they are added to.
 
-    The picture spans the unit diagonal; half of the channels tell the column, half the row.
+    The image's half-diagonal has length 1; half of the channels encode the column, half the row.
     """
     channels, height, width = x.shape[-3:]
-    # Relative to the diagonal, so that a pixel's waves do not change when an image is scaled.
+    # Relative to the diagonal, so that a pixel's waves do not change with the image's resolution.
     diagonal = (aspect**2 + 1) ** 0.5
     columns = _centred(width, aspect / diagonal, x.device)
     rows = _centred(height, 1 / diagonal, x.device)
@@ -147,6 +151,7 @@ def _centred(count: int, span: float, device: torch.device) -> Tensor:
 
 
 def _waves(position: Tensor, channels: int) -> Float[Tensor, "c n"]:
+    # Transformer sinusoids (Vaswani et al. 2017) with base 100.
     power = torch.arange(channels // 2, dtype=torch.float64, device=position.device) / (channels / 2)
     angle = position.double()[None] * (POSITION_BASE**-power)[:, None]
     return torch.cat([angle.sin(), angle.cos()]).float()

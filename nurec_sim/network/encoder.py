@@ -1,7 +1,7 @@
 """The shared encoder: images and cameras in, four levels of features out (paper section 3.2, spec DA3-Base).
 
-A DINOv2-like vision transformer whose later blocks look in turn at one image and at all of them. Each image carries one
-more token: first the class token, then one that codes the image's camera.
+A DINOv2-like vision transformer whose later blocks alternate between attention within an image and across all images.
+Each image carries one extra token: first the class token, then one that encodes the image's camera.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ def normalized(rgb: Float[Tensor, "*n h w 3"]) -> Float[Tensor, "*n h w 3"]:
 class Features:
     """One level of encoder features of every image: patches and the image's own token, each [.., 2c].
 
-    The first half of the channels is the state after the last block that looked at one image, the second half the
-    state after the block that looked at all: normed in ``patches``, as it is in ``token``.
+    The first half of the channels is the state after the last block within images, the second half the state after the
+    block across images: normed in ``patches``, unnormed in ``token``.
     """
 
     patches: Float[Tensor, "b v y x d"]
@@ -42,7 +42,7 @@ class Features:
 
     @property
     def merged(self) -> Features:
-        """The second half of the channels: what the images know together."""
+        """The second half of the channels: the state after attention across images."""
         half = self.patches.shape[-1] // 2
         return Features(self.patches[..., half:], self.token[..., half:])
 
@@ -61,7 +61,7 @@ class PatchEmbedding(nn.Module):
 
 
 class CameraEmbedding(nn.Module):
-    """A token per image from its pose and field of view; the images' tokens exchange what they know."""
+    """A token per image from its pose and field of view; the tokens of all images attend to each other."""
 
     def __init__(self, size: EncoderSize) -> None:
         super().__init__()
@@ -75,6 +75,8 @@ class CameraEmbedding(nn.Module):
 
     def forward(self, c2w: Float[Tensor, "b v 4 4"], fov: Float[Tensor, "b v 2"]) -> Float[Tensor, "b v c"]:
         """Camera tokens; always in float32."""
+        # Half precision would round translations of tens of metres to centimetres; the release runs this in float32
+        # too.
         with torch.autocast(c2w.device.type, enabled=False):
             # Position (3), rotation (4), vertical and horizontal field of view (2): the order of the checkpoints.
             code = torch.cat([c2w[..., :3, 3], quaternion_xyzw(c2w[..., :3, :3]), fov.flip(-1)], dim=-1)
@@ -85,7 +87,7 @@ class CameraEmbedding(nn.Module):
 
 
 class ViewPatches(nn.Module):
-    """What patches see where (``car_view``), added to their tokens: patch means, with sinusoids of the direction.
+    """``car_view`` embedded per patch and added to the image tokens: patch means, with sinusoids of the direction.
 
     Not part of the released network.
     """
@@ -98,13 +100,14 @@ class ViewPatches(nn.Module):
         """Tokens by row and column; always in float32."""
         with torch.autocast(view.device.type, enabled=False):
             mean = functional.avg_pool2d(view.float().permute(0, 3, 1, 2), PATCH_PX).permute(0, 2, 3, 1)
+            # NeRF-like octaves (Mildenhall et al. 2020): an MLP alone resolves only low frequencies of the direction.
             angle = mean[..., 3:6, None] * (math.pi * 2.0 ** torch.arange(RAY_OCTAVES, device=view.device))
             waves = torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2)
             return self.mlp(torch.cat([mean, waves], dim=-1))
 
 
 class AlternatingTransformer(nn.Module):
-    """The vision transformer: first single images, then images and clips in turn."""
+    """The vision transformer: first attention within images, then alternately within images and across the clip."""
 
     def __init__(self, size: EncoderSize) -> None:
         super().__init__()
@@ -112,6 +115,7 @@ class AlternatingTransformer(nn.Module):
         self.cls_tokens = nn.Parameter(torch.zeros(1, size.width))
         self.cls_pos_embed = nn.Parameter(torch.zeros(1, size.width))
         self.img_pos_embed = nn.Parameter(torch.zeros(size.position_grid, size.position_grid, size.width))
+        # Only the second half of each tap goes through this norm; the local half stays raw (spec section 1.2).
         self.norm_layer = nn.LayerNorm(size.width)
         self.blocks = nn.ModuleList(
             SelfBlock(size.width, size.heads, normed=number >= size.alternate_from, eps=1e-6, scale=1.0)
@@ -133,7 +137,8 @@ class AlternatingTransformer(nn.Module):
         taps, local_x = [], x
         for number, block in enumerate(self.blocks):
             if number == self.size.alternate_from:
-                # From here on images are compared, so that each one's token has to say where it was taken.
+                # From here on images are compared, so each one's token must encode where it was taken. It
+                # replaces the class token, as in Depth-Anything-3.
                 x = torch.cat([camera_token.reshape(b * v, 1, width).to(x.dtype), x[:, 1:]], dim=1)
             if number < self.size.alternate_from:
                 x = block(x)
@@ -143,6 +148,7 @@ class AlternatingTransformer(nn.Module):
                 # All tokens of a clip attend to each other: [b, v * n, c].
                 x = block(x.reshape(b, -1, width), everywhere).reshape(b * v, -1, width)
             if number in self.size.taps:
+                # Heads see both: local_x is sharp within the image, x is consistent across images.
                 state = torch.cat([local_x[:, 1:], self.norm_layer(x[:, 1:]).to(x.dtype)], dim=-1)
                 token = torch.cat([local_x[:, 0], x[:, 0]], dim=-1)
                 taps.append(Features(state.reshape(b, v, rows, columns, -1), token.reshape(b, v, -1)))
@@ -166,7 +172,14 @@ class Encoder(nn.Module):
         fov: Float[Tensor, "b v 2"],
         view: Float[Tensor, "b v h w 12"] | None = None,
     ) -> tuple[Features, ...]:
-        """Four levels of features, from early to deep; ``view`` is the ``car_view`` of profiles that have one."""
+        """Four levels of features, from early to deep.
+
+        Args:
+            rgb: colours 0..1; h and w multiples of 14.
+            c2w: scene_from_camera, translation times ``SCENE_RESCALE``.
+            fov: horizontal and vertical field of view, radians.
+            view: the ``car_view`` of profiles that use one.
+        """
         patches = self.patch_embed_img(normalized(rgb.flatten(0, 1)))
         if self.patch_embed_view is not None and view is not None:
             patches = patches + self.patch_embed_view(view.flatten(0, 1)).to(patches.dtype)
@@ -174,14 +187,21 @@ class Encoder(nn.Module):
 
 
 def local_positions(rows: int, columns: int, tokens: int, device: torch.device) -> Int64[Tensor, "n 2"]:
-    """(y, x) of the tokens of one image: its own tokens go down the diagonal from the origin, then come the patches."""
+    """(y, x) of the tokens of one image: extra tokens run down the diagonal from the origin, then come the patches.
+
+    Args:
+        rows: of patches.
+        columns: of patches.
+        tokens: number of extra tokens; patch (y, x) lies at (y + tokens, x + tokens).
+        device: of the result.
+    """
     y, x = torch.meshgrid(torch.arange(rows, device=device), torch.arange(columns, device=device), indexing="ij")
     patches = torch.stack([y, x], dim=-1).reshape(-1, 2) + tokens
     return torch.cat([torch.arange(tokens, device=device)[:, None].expand(tokens, 2), patches])
 
 
 def global_positions(patches: int, images: int, device: torch.device) -> Int64[Tensor, "n 2"]:
-    """(y, x) of the tokens of all images: patches share one place, so that only they and the images' own differ."""
+    """(y, x) of the tokens of all images: patches all share (1, 1), only camera tokens differ with (0, 0)."""
     one_image = torch.ones(1 + patches, 2, dtype=torch.int64, device=device)
     one_image[0] = 0
     return one_image.repeat(images, 1)

@@ -1,7 +1,7 @@
-"""Gaussians that begin as the footprints of their pixels on the surface, for our own profiles.
+"""Gaussians that start as the footprints of their pixels on the surface, for our own profiles.
 
-The released network has to learn from images how wide a pixel is at its depth and how a surface lies; a network that is
-trained for hours is given both, and puts out only how a Gaussian differs from its pixel's footprint.
+The released network has to learn from images how wide a pixel is at its depth and how a surface is oriented; a network
+that is trained for hours is given both, and predicts only how a Gaussian differs from its pixel's footprint.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ class Footprints:
     def changed(
         self, log_scale: Float[Tensor, "b n 3"], turn: Float[Tensor, "b n 4"]
     ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 4"]]:
-        """Axes times these factors' exponentials, and the orientation turned in the footprint's own frame."""
+        """Axes times exp of these log factors, and the orientation turned in the footprint's own frame."""
+        # Relative and bounded: at 0 the footprint itself comes out, and no output can blow a Gaussian up.
         factor = log_scale.clamp(-LARGEST_CHANGE, LARGEST_CHANGE).exp()
         return (self.scale_m * factor).clamp(max=LARGEST_M), product(self.quat_wxyz, functional.normalize(turn, dim=-1))
 
@@ -46,12 +47,12 @@ class Footprints:
 def footprints(
     inputs: NetworkInputs, context: ContextMaps, source: Int64[Tensor, "b n"], spacing: Float[Tensor, " n"]
 ) -> Footprints:
-    """Footprints of pixels on the surfaces that the heads see there; nothing is differentiated.
+    """Footprints of pixels on the surfaces that the heads predict there; nothing is differentiated.
 
     Args:
-        inputs: whose rays tell how far apart pixels are.
+        inputs: their rays tell how far apart pixels are.
         context: depths and normals.
-        source: flat index of each Gaussian's pixel.
+        source: flat (v, h, w) index of each Gaussian's pixel.
         spacing: pixels from one Gaussian to the next.
     """
     direction, distance = inputs.rays[..., 3:], context.depth_m / inputs.distance_to_depth_scale[..., 0]
@@ -64,6 +65,7 @@ def footprints(
         return flat.gather(1, index)
 
     ray, normal = at_source(direction), at_source(context.normal)
+    # A visible surface faces the camera: normals that point away are flipped.
     towards = -(ray * normal).sum(-1, keepdim=True)
     normal, slant = torch.where(towards < 0, -normal, normal), towards.abs()
     # Along the view on the surface; looked at straight on, any direction will do.

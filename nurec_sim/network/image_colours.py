@@ -1,8 +1,8 @@
-"""Canonical colours that are those of the images, for our own profiles: what the first camera shows, or would show.
+"""Canonical colours taken from the images, for our own profiles: what the first camera shows, or would show.
 
-The released network decodes a colour for every pixel. A small one loses by that what the image holds anyway; so colours
-are only taken from camera to camera, by the responses that the network decodes. Every camera's own images come out as
-they went in, and with one camera its response does not matter.
+The released network decodes a colour for every pixel. A small network loses detail that the image holds anyway; so
+colours are only mapped from camera to camera, by the decoded responses. Every camera's own images are reproduced
+exactly, and with a single camera its response does not matter.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ def image_colours(
         isp: responses of the cameras to those.
     """
     first = isp[:, :1].expand_as(isp)
+    # colour = inverse(isp_k)(image_k) is canonical to the network; the first camera's response on top makes that
+    # camera's own map the identity.
     to_first = _after(first, _inverse(isp))
     of_image = to_first.gather(1, inputs.camera_idxs[..., None, None].expand(-1, -1, 3, 4))
     rgb = shown(inputs.rgb, of_image[:, :, None, None]).clamp(0, 1)

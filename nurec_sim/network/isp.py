@@ -10,7 +10,7 @@ from nurec_sim.network.attention import CrossAttention
 
 
 class IspDecoder(nn.Module):
-    """A learned token looks at the deepest features of all frames of one camera."""
+    """A learned token attends to the deepest features of all frames of one camera (paper section 3.3)."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -33,6 +33,8 @@ class IspDecoder(nn.Module):
         query = self.affine_token.expand(len(tokens), 1, -1)
         k, v = self.affine_attention.kv_projector(tokens)
         rows = self.affine_linear(self.affine_attention(query, k, v)).float().reshape(len(patches), cameras, 12)
+        # Residual to the identity: with zero weights the response is neutral, so that training starts there (paper
+        # section 3.3).
         matrix = rows[..., :9].unflatten(-1, (3, 3)) + torch.eye(3, device=rows.device)
         return torch.cat([matrix, rows[..., 9:, None]], dim=-1)
 
@@ -45,6 +47,7 @@ def cameras_of(camera_idxs: Int64[Tensor, "b v"]) -> int:
     """
     images = camera_idxs.shape[1]
     cameras = int(camera_idxs.max()) + 1
+    # The reshape in the decoder relies on this order; a wrong one would silently mix cameras.
     expected = torch.arange(cameras, device=camera_idxs.device).repeat_interleave(max(images // cameras, 1))
     if images % cameras or not bool((camera_idxs == expected[None]).all()):
         raise ValueError(

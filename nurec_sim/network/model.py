@@ -1,4 +1,4 @@
-"""The whole network: a clip of images in, a layered Gaussian world out, in one forward pass."""
+"""The whole network: a clip of images in, a layered Gaussian world out, in a single forward pass."""
 
 from __future__ import annotations
 
@@ -67,22 +67,23 @@ class InstantNuRec(nn.Module):
                 inputs = dataclasses.replace(inputs, matches=plane_sweep(inputs))
             features = self.features(inputs)
             deepest = features[-1].patches
-            # What every pixel shows: depth, colour, normal, class, and where its point moves.
+            # Per pixel: depth, colour, normal, class, and the motion of its point.
             context = self.decoder.context(features, inputs, motion)
+            # Matching works on decoded maps and needs no parameters; the released profiles go without it.
             if self.profile.log_geometry:
                 context = self.refined(context, inputs)
                 if context.motion_m is not None:
                     movable = context.logits.argmax(-1) == SemanticClass.MOVABLE
                     found = searched_motion(inputs, context.depth_m, movable, context.motion_m)
                     context = dataclasses.replace(context, motion_m=found)
-            # What lies behind everything.
+            # The distant background, a cubemap (paper section 3.1).
             directions = inputs.rays[..., 3:]
             if self.sky is None:
                 sky, seen = observed_sky(context.rgb, context.logits, inputs.rays, self.profile.observed_sky_px)
             else:
                 sky = self.sky(deepest, inputs.rgb, directions)
                 seen = torch.ones_like(sky[..., :1])
-            # How each camera shows these colours.
+            # Per-camera affine response, applied after sky compositing.
             isp = self.post_processing(deepest, inputs.camera_idxs)
             if self.profile.image_colours:
                 rgb, sky, isp = image_colours(inputs, sky, isp)
@@ -104,6 +105,7 @@ class InstantNuRec(nn.Module):
     def _half_precision(self, device: torch.device) -> contextlib.AbstractContextManager:
         if self.precision == "float32":
             return contextlib.nullcontext()
+        # Autocast only converts matrix products and convolutions; the rest is computed in float32.
         return torch.autocast(device.type, getattr(torch, self.precision))
 
     def _check(self, inputs: NetworkInputs) -> None:
@@ -131,12 +133,16 @@ def initialize(model: InstantNuRec, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     for name, module in model.named_modules():
         if isinstance(module, (nn.Linear, nn.Conv2d, nn.ConvTranspose2d)):
+            # Transposed convolutions store [in, out, h, w]; with kernel = stride each output has one input place, so
+            # fan-in is the number of input channels.
             inputs = len(module.weight) if isinstance(module, nn.ConvTranspose2d) else module.weight[0].numel()
             widest = 0.02 if "blocks" in name else 1.0
             nn.init.trunc_normal_(module.weight, std=min(widest, inputs**-0.5), generator=generator)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
+    # Parameters outside of linear and convolution layers; norms and LayerScale keep the values of their constructors.
     for name, parameter in model.named_parameters():
         if name.endswith(TOKENS_AND_POSITIONS):
             nn.init.trunc_normal_(parameter, std=0.02, generator=generator)
+    # Zero weights and biases: the response starts as the identity.
     nn.init.zeros_(model.post_processing.affine_linear.weight)

@@ -1,4 +1,4 @@
-"""The motion decoder: where each pixel's point was in the camera's last frame and will be in its next."""
+"""The motion decoder: displacements of every pixel's point to the camera's previous and next frame (section 3.3)."""
 
 from __future__ import annotations
 
@@ -30,12 +30,13 @@ class TimeEmbedding(nn.Module):
         """Embedded times."""
         half = self.channels // 2
         power = torch.arange(half, device=time.device, dtype=torch.float32) / half
+        # The base is a period of 500, although times lie in 0..1: as in the checkpoints, cosines first.
         angle = time.float()[..., None] * LONGEST_PERIOD**-power
         return self.mlp(torch.cat([angle.cos(), angle.sin()], dim=-1))
 
 
 class ModulatedBlock(nn.Module):
-    """A transformer block whose attention is shifted, scaled and gated by a condition (AdaLN)."""
+    """A transformer block whose attention is shifted, scaled and gated by a condition (AdaLN, paper section 3.3)."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -51,6 +52,7 @@ class ModulatedBlock(nn.Module):
         """Tokens after the block."""
         # Peebles and Xie 2023; the feed-forward half stays unconditioned, as in the checkpoints.
         shift, scale, gate = self.modulation(functional.silu(condition))[:, None].chunk(3, dim=-1)
+        # AdaLN: the norm has no affine part of its own; scale and shift come from the target times instead.
         x = x + gate * self.ls1(self.attn(self.norm1(x) * (1 + scale) + shift, rope))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
@@ -85,7 +87,7 @@ class MotionTransformer(nn.Module):
 
 
 class MotionDecoder(nn.Module):
-    """Displacements of every pixel's point to two other times, from what the images know together."""
+    """Displacements of every pixel's point to two other times, from the features shared across images."""
 
     def __init__(self, profile: Profile) -> None:
         super().__init__()
@@ -118,8 +120,11 @@ class MotionDecoder(nn.Module):
         # Half of the condition's channels for each of the two times that displacements lead to.
         targets = self.target_time_embed(torch.stack([time_before.flatten(), time_after.flatten()], dim=-1)).flatten(-2)
         levels = []
+        # Motion shows only between images, so the local half of the features is left out; weights are shared by all
+        # levels.
         for level in (feature.merged for feature in features):
             token = self.cls_token_norm(level.token.flatten(0, 1))
+            # The source time is a token, the target times a condition: together they tell which motion to predict.
             extra = torch.stack([token, source.to(token.dtype)], dim=1)
             levels.append(self.vit(level.patches.flatten(0, 1), extra, targets))
         raw = self.final_motion_head(levels, image_size)

@@ -1,4 +1,4 @@
-"""What the heads of our own profiles see beside features of patches: pixels, and what a log says of their depth.
+"""Full-resolution inputs to the heads of our own profiles: pixels, and the log's geometric priors (``car_view``).
 
 Not part of the released network, whose patches are trained on enough images to do without.
 """
@@ -15,7 +15,7 @@ CHANNELS = (24, 48, 72, 96)
 
 
 class PixelDetail(nn.Module):
-    """Maps of every pixel for a head's last layers: from the pixel and those around it (``pixels``), and from afar.
+    """Full-resolution maps for a head's last layers: local (``pixels``), and from a wide context (``hourglass``).
 
     Args:
         channels: of the images.
@@ -30,12 +30,12 @@ class PixelDetail(nn.Module):
         self.hourglass = Hourglass(channels, out)
 
     def forward(self, images: Float[Tensor, "n c h w"]) -> Float[Tensor, "n out h w"]:
-        """The sum of both."""
+        """The sum of both branches."""
         return self.pixels(images[:, : self.near]) + self.hourglass(images)
 
 
 def pixel_layers(channels: int, out: int) -> nn.Sequential:
-    """Three convolutions that bring pixels to the width of a head's last layers."""
+    """Three convolutions that widen pixels to the channels of a head's last layers."""
     return nn.Sequential(
         nn.Conv2d(channels, out // 4, 3, 1, 1), nn.GELU(),
         nn.Conv2d(out // 4, out // 2, 3, 1, 1), nn.GELU(),
@@ -55,6 +55,7 @@ class Hourglass(nn.Module):
 
     def forward(self, images: Float[Tensor, "n c h w"]) -> Float[Tensor, "n out h w"]:
         """At the images' resolution."""
+        # Strided levels see far at little cost; the sums restore what striding blurs (U-Net, Ronneberger et al. 2015).
         maps = [images]
         for layers in self.down:
             maps.append(layers(maps[-1]))
@@ -74,5 +75,6 @@ def _two_layers(channels: int, out: int, stride: int = 1) -> nn.Sequential:
 def chosen_depth(
     predicted: Float[Tensor, "n h w"], trust: Float[Tensor, "n h w"], matched: Float[Tensor, "n h w"]
 ) -> Float[Tensor, "n h w"]:
-    """The matched logarithm where it is trusted (a logit), the predicted one elsewhere."""
+    """The matched log depth where it is trusted (a logit), the predicted one elsewhere; blended by its sigmoid."""
+    # A blend of logarithms is a weighted geometric mean of depths; unlike a choice it passes gradients to all three.
     return torch.lerp(predicted, matched, trust.sigmoid())

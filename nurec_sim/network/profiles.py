@@ -1,6 +1,6 @@
 """Sizes of the network: the three released profiles, the full training model, and our own small ones.
 
-A profile is data. Every number that the architecture depends on stands here; the modules hold none of their own.
+A profile is data: it holds every number that the architecture depends on; the modules hold none of their own.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ PATCH_PX = 14
 class EncoderSize:
     """The alternating-attention vision transformer (paper section 3.2).
 
-    Blocks before ``alternate_from`` look at one image each; from there on even blocks look at one image, odd ones at
-    all. The features after ``taps`` (all odd) go to the heads, twice as wide as ``width``: last local and global state.
-    ``car_view`` tells every patch where it looks as seen from the car, which the released network does not.
+    Blocks before ``alternate_from`` attend within each image; from there on even blocks attend within images, odd ones
+    across all images. The features after ``taps`` (all odd) go to the heads, twice as wide as ``width``: last local and
+    global state. ``car_view`` adds a per-patch embedding of the ray as seen from the car, which the released network
+    lacks.
     """
 
     width: int = 768
@@ -38,9 +39,9 @@ class EncoderSize:
 class HeadSize:
     """A DPT head: channels of the four levels from fine to coarse, of their fusion, and of the last two layers.
 
-    ``pixel_detail`` shows the image and the ``car_view`` to the last layers of the depth and the context head, as the
-    released network shows the image to those of the context head only: where patches are coarse, the edges of things
-    are in the image alone.
+    ``pixel_detail`` feeds the image and the ``car_view`` to the last layers of the depth and the context head; the
+    released network feeds the image to those of the context head only. Where patches are coarse, only the image holds
+    the edges of objects.
     """
 
     levels: tuple[int, int, int, int] = (96, 192, 384, 768)
@@ -100,9 +101,9 @@ class Profile:
         head: size of each DPT head.
         selective: size of the point-query decoder.
         motion: size of the motion decoder.
-        sky: size of the learned sky; None uses the sky that the images show.
+        sky: size of the learned sky; None uses the sky seen in the images.
         observed_sky_px: edge of the cubemap of the observed sky.
-        log_geometry: whether matching refines the depth and finds the motion of movable things, and Gaussians begin as
+        log_geometry: whether matching refines the depth and finds the motion of movable things, and Gaussians start as
             the footprints of their pixels; the released network has learned all that.
         image_colours: whether canonical colours are those of the images (``network.image_colours``) or decoded ones.
         isp_heads: attention heads of the decoder of camera responses.

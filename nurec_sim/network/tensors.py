@@ -1,4 +1,4 @@
-"""What goes into the network and what comes out.
+"""Inputs and outputs of the network.
 
 b clips, v images (camera-major, the same number for every camera), h x w pixels. The *scene frame* is the first image's
 camera at the end of its exposure: x right, y down, z forward, metres.
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 SCENE_RESCALE = 0.15
-"""Metres to the unit in which the network thinks."""
+"""Metres to the network's internal unit: 0.15 units per metre, in poses, depths, scales and motion."""
 
 
 class SemanticClass(enum.IntEnum):
@@ -40,11 +40,10 @@ class NetworkInputs:
         distance_to_depth_scale: z of the pixel's unit ray in its camera.
         camera_idxs: index of each image's camera, 0.. in the order of the images.
         time: when each image's centre was exposed, as a fraction of the clip's span (0..1).
-        time_before: the time to which the first motion goes: the camera's frame before, as such a fraction.
+        time_before: target time of the first displacement, as such a fraction: the camera's previous frame.
         time_after: the same for the camera's next frame.
-        rig_from_scene: the scene frame as seen from the car, metres; what our own profiles read (``car_view``) and the
-            released ones don't.
-        matches: what ``plane_sweep`` says of these inputs, if it was asked already.
+        rig_from_scene: pose of the scene frame in the rig, metres; read by our own profiles (``car_view``) only.
+        matches: the result of ``plane_sweep`` on these inputs, if it has been computed already.
     """
 
     rgb: Float[Tensor, "b v h w 3"]
@@ -67,14 +66,14 @@ class NetworkInputs:
 
 @dataclass(frozen=True)
 class ContextMaps:
-    """What the heads say of every input pixel.
+    """Predictions of the heads for every input pixel.
 
     Attributes:
         depth_m: z-depth, metres.
         rgb: canonical colour, 0..1.
         normal: unit normal in the scene frame.
         logits: in the order of ``SemanticClass``.
-        motion_m: displacement to ``time_before`` and to ``time_after``, metres; None if not asked for.
+        motion_m: displacement to ``time_before`` and to ``time_after``, metres; None if not requested.
     """
 
     depth_m: Float[Tensor, "b v h w"]
@@ -105,7 +104,7 @@ class QueryGaussians:
 
 @dataclass(frozen=True)
 class NetworkOutputs:
-    """Everything that one forward pass gives.
+    """Everything that one forward pass returns.
 
     Attributes:
         context: maps of the input images.

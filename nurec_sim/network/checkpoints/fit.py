@@ -1,4 +1,4 @@
-"""What a weights file is: which profile it fits, and what is wrong with it."""
+"""Checks of a weights file: which profile it fits, and what is wrong with it."""
 
 from __future__ import annotations
 

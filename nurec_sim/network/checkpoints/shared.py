@@ -36,6 +36,7 @@ def with_shared(path: Path, own: Mapping[str, Tensor]) -> dict[str, Tensor]:
         name, digest, shared = str(said["file"]), str(said["sha256"]), [str(each) for each in said["tensors"]]
     except (ValueError, KeyError, TypeError) as error:
         raise WeightsError(f"{path} says wrongly what it shares with another file: {error!r}") from None
+    # Only a plain file name: a weights file must not make the reader open paths elsewhere.
     other = path.with_name(name) if Path(name).name == name else None
     if other is None or not other.is_file():
         raise WeightsError(f"{path} shares tensors with a file {name!r} beside it, which is not there")
@@ -84,11 +85,12 @@ def _read(path: Path) -> dict[str, Tensor]:
 
 
 def _sorted_metadata(data: bytes, facts: Mapping[str, str]) -> bytes:
-    """The same file with its metadata in one order: the library's changes from run to run."""
+    """The same file with sorted metadata: the library's own order changes from run to run."""
     size = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + size])
     header["__metadata__"] = dict(sorted(facts.items()))
     ordered = {"__metadata__": header["__metadata__"]} | {key: header[key] for key in header if key != "__metadata__"}
     text = json.dumps(ordered, separators=(",", ":")).encode()
+    # The format pads its header with spaces so that tensors begin at a multiple of 8 bytes.
     text += b" " * (-len(text) % 8)
     return len(text).to_bytes(8, "little") + text + data[8 + size :]

@@ -63,6 +63,7 @@ def load_state_dict(path: Path) -> dict[str, Tensor]:
             head = file.read(9)
     except OSError as error:
         raise WeightsError(f"{path} cannot be read: {error.strerror}") from None
+    # torch.save writes a zip archive; safetensors begin with 8 bytes of header length and a JSON object.
     if head.startswith(b"PK\x03\x04"):
         state = read_torch_archive(path)
     elif head[8:] == b"{":
@@ -74,6 +75,7 @@ def load_state_dict(path: Path) -> dict[str, Tensor]:
         )
     else:
         raise WeightsError(f"{path} is neither a file of torch.save nor safetensors")
+    # Lightning prefixes the module's attribute name; the released files have none.
     if all(name.startswith("model.") for name in state):
         state = {name.removeprefix("model."): tensor for name, tensor in state.items()}
     renewed = {_LEGACY_PROJECTOR.sub(r"\1.kv_projector.\2.", name): tensor for name, tensor in state.items()}

@@ -1,7 +1,7 @@
-"""What shows through where Gaussians leave a gap: in every direction the surfaces that the images see there.
+"""The background seen through gaps between Gaussians: in every direction the surfaces that the images show there.
 
-Behind a house nobody sees the sky, and in a gap between its Gaussians a bright sky would flash. So the cubemap behind
-everything holds the sky only where an image shows sky, or where none looks. What can move leaves no trace there.
+Nobody sees the sky behind a house, and in a gap between its Gaussians a bright sky would flash. So the background
+cubemap holds sky only where an image shows sky, or where none looks. Movable things leave no trace there.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ def background(
         size: edge of a face.
     """
     mean, hits = (values.cpu().numpy().astype(np.float32) for values in texture(colour.detach(), direction, size))
+    # Normalised convolution: colours times hits and hits are blurred alike and divided, so empty texels count nothing.
     both = np.concatenate([mean * hits[..., None], hits[..., None]], axis=-1)
     wide = (0, 0), BLUR * size
     soft = np.stack([cv2.GaussianBlur(face, *wide, borderType=cv2.BORDER_REPLICATE) for face in both])

@@ -1,9 +1,9 @@
-"""The network's cubemaps: which way each texel looks, and colours looked up by direction.
+"""The network's cubemaps: the direction of each texel, and colours looked up by direction.
 
-Scene axes x right, y down, z forward. Faces +X, -X, -Y (top), +Y (bottom), +Z, -Z; every face is the picture that
-someone in the middle of the cube sees, u to the right and v down, both 0..1 from edge to edge. The four side faces
-stand upright; the top face has +z at its lower edge, the bottom face at its upper edge. (OpenGL's cube map table with
-the sign of y changed; it is the released model's, by its outputs.)
+Scene axes x right, y down, z forward. Faces +X, -X, -Y (top), +Y (bottom), +Z, -Z; every face is the picture seen from
+the middle of the cube, u to the right and v down, both 0..1 from edge to edge. The four side faces are upright; the top
+face has +z at its lower edge, the bottom face at its upper edge. (OpenGL's cube map table with the sign of y changed;
+it is the released model's, by its outputs.)
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ def sample(cubemap: Float[Tensor, "6 s s c"], direction: Float[Tensor, "*n 3"]) 
     """
     size = cubemap.shape[1]
     face, u, v = coordinates(direction)
+    # Texel centres lie at (k + 0.5) / size.
     column, row = (torch.clamp(c * size - 0.5, 0, size - 1) for c in (u, v))
     return _bilinear(cubemap, face, column, row)
 
@@ -66,6 +67,7 @@ def framed(cubemap: Float[Tensor, "6 s s c"]) -> Float[Tensor, "6 s+2 s+2 c"]:
     size = cubemap.shape[1]
     centre = (2 * torch.arange(-1, size + 1, device=cubemap.device, dtype=torch.float64) + 1) / size - 1
     wider = functional.pad(cubemap, (0, 0, 1, 1, 1, 1))
+    # Places beyond the edge lie in the face's plane; their directions belong to the neighbouring faces.
     rays = _rays(centre)
     for side in (0, -1):
         wider[:, side] = sample(cubemap, rays[:, side])

@@ -1,4 +1,4 @@
-"""The learned sky decoder: cubemap texels look at the features of the images that saw them (section 3.3)."""
+"""The learned sky decoder: cubemap texels attend to the features of the images that saw them (paper section 3.3)."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ class RayEmbedding(nn.Module):
 
     def forward(self, direction: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n y x c"]:
         """Tokens by row and column."""
+        # NeRF octaves 2^0..2^7 times pi, per axis [sin.., cos..]: the order of the checkpoints.
         octave = math.pi * 2.0 ** torch.arange(RAY_OCTAVES, device=direction.device)
         angle = direction[..., None] * octave
         return self.ray_embed(torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2))
 
 
 class SkyUpsampling(nn.Module):
-    """One feature level, taken as four, fused to the cubemap's resolution."""
+    """One feature level, used for all four, fused to the cubemap's resolution."""
 
     def __init__(self, size: SkySize, head: HeadSize) -> None:
         super().__init__()
@@ -46,7 +47,7 @@ class SkyUpsampling(nn.Module):
 
 
 class SkyQueries(nn.Module):
-    """What both sky decoders begin with: the directions of the cubemap, and tokens of the images with their rays."""
+    """Shared by both sky decoders: the directions of the cubemap, and image tokens with their rays."""
 
     query_rays: Tensor
 
@@ -62,7 +63,7 @@ class SkyQueries(nn.Module):
         self.patch_embed_ray = RayEmbedding(size.width)
 
     def set_constants(self) -> None:
-        """Compute the directions again, where the module was made without values."""
+        """Compute the directions again, where the module was built without values."""
         self.query_rays.copy_(cubemap.directions(self.size.cubemap_px, self.query_rays.device))
 
     def seen(
@@ -71,7 +72,7 @@ class SkyQueries(nn.Module):
         rgb: Float[Tensor, "b v h w 3"],
         directions: Float[Tensor, "b v h w 3"],
     ) -> Float[Tensor, "b tokens c"]:
-        """Tokens of all patches of a clip: what the encoder says of them, their colours, and where they look."""
+        """Tokens of all patches of a clip: encoder features, colours and ray directions, added up."""
         tokens = self.feature_transform(patches).flatten(0, 1)
         tokens = tokens + self.patch_embed_img(normalized(rgb.flatten(0, 1)))
         tokens = tokens + self.patch_embed_ray(directions.flatten(0, 1))
@@ -96,10 +97,11 @@ class SkyDecoder(SkyQueries):
         """The sky in the frame of the directions, 0..1."""
         b = len(rgb)
         k, values = self.kv_projector(self.seen(patches, rgb, directions))
-        # Texels and image patches code their directions alike, so that a texel finds the patches that look its way.
+        # Texels and image patches share one ray embedding, so a texel finds the patches that look in its direction.
         query = self.patch_embed_ray(self.query_rays) + self.token
         x = query.reshape(1, -1, self.size.width).expand(b, -1, -1)
         for block in self.blocks:
             x = block(x, k, values)
         faces = self.upsample(x.reshape(b * 6, *query.shape[1:]), self.size.cubemap_px).float()
+        # A clamp, not a sigmoid: a saturated white sky is reached exactly.
         return (faces.clamp(-1, 1) * 0.5 + 0.5).permute(0, 2, 3, 1).unflatten(0, (b, 6))

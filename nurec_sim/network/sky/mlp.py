@@ -1,7 +1,7 @@
-"""A sky without a cubemap decoder, as STORM has it: one token that knows the clip, and an MLP from direction to colour.
+"""A sky without a cubemap decoder, as in STORM: one token per clip, and an MLP from direction to colour.
 
 It replaces ``learned`` in the paper's ablation (section 5.3, Table 2). The token attends to what the sky decoder
-attends to; only how colours are computed differs.
+attends to; only the decoding of colours differs.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The sky without a learned decoder: colours of the pixels called sky, and a gradient where there are none.
+"""The sky without a learned decoder: colours of the pixels classified as sky, and a gradient elsewhere.
 
 This is what the released checkpoints ship with. Every rule and number was recovered from the reference's outputs. The
 gradient runs along the scene's z axis, which is forward and not up; ``reconstruct.feedforward.chunk_sky`` therefore
-takes only the ``texture`` and fills the rest by itself.
+uses only the ``texture`` and fills the rest itself.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ REACH_PX = 15
 BLUR_PX = 8
 """Standard deviation of that blur, which is cut off at three times as much."""
 STEEPEST = 0.5
-"""Largest change of a colour over a unit of z in the gradient."""
+"""Largest slope of the gradient: change of a colour (0..1) per unit of z."""
 NOTHING_SEEN = 0.6
 """Grey of a sky of which no pixel is known."""
 
 _ONE = 2**32
-"""What stands for 1 in fixed-point sums."""
+"""The value of 1 in fixed-point sums."""
 
 
 def observed_sky(
@@ -33,7 +33,11 @@ def observed_sky(
 ) -> tuple[Float[Tensor, "b 6 size size 3"], Float[Tensor, "b 6 size size 1"]]:
     """Sky as in the release: mean colour per texel, elsewhere a line over the ray's z; and how surely it was seen.
 
-    ``rgb`` are the context head's colours in 0..1, before the ISP transform; ``rays`` in the scene frame.
+    Args:
+        rgb: the context head's colours in 0..1, before the ISP transform.
+        logits: semantic logits in the order of ``SemanticClass``.
+        rays: origin and unit direction of every pixel, scene frame.
+        size: edge of a cubemap face, texels.
     """
     skies, seen = [], []
     with torch.autocast(rgb.device.type, enabled=False):
@@ -57,6 +61,7 @@ def texture(
     colour: Float[Tensor, "n 3"], direction: Float[Tensor, "n 3"], size: int
 ) -> tuple[Float[Tensor, "6 size size 3"], Int64[Tensor, "6 size size"]]:
     """Mean colour of the pixels whose rays meet each texel (0 without any), and their number."""
+    # Scatter-adds of floats depend on the order of threads; of integers they do not.
     total = torch.zeros(6 * size * size, 4, dtype=torch.int64, device=colour.device)
     total.index_add_(0, cubemap.texels(direction, size), functional.pad(_fixed(colour), (0, 1), value=1))
     hits = total[:, 3]
@@ -77,6 +82,7 @@ def _gradient(colour: Float[Tensor, "n 3"], z: Float[Tensor, " n"], size: int) -
     away = z - mean_z
     spread = _fixed(away * away).sum().double() / _ONE
     together = _fixed(away[:, None] * (colour - mean)).sum(dim=0).double() / _ONE
+    # slope = cov(z, colour) / var(z), the least-squares line; bounded because sky often covers a narrow range of z.
     slope = (together / spread.clamp(min=1e-9)).clamp(-STEEPEST, STEEPEST)
     everywhere = cubemap.directions(size, colour.device)[..., 2:]
     return (mean + slope * (everywhere - mean_z)).clamp(0, 1).to(colour.dtype)
@@ -85,6 +91,7 @@ def _gradient(colour: Float[Tensor, "n 3"], z: Float[Tensor, " n"], size: int) -
 def _soften(seen: Float[Tensor, "6 s s"]) -> Float[Tensor, "6 s s"]:
     """Grow what was seen by a square of 31 texels, then blur its edge; every face by itself."""
     grown = seen[:, None]
+    # A square maximum is separable: along rows, then along columns; so is the Gaussian below.
     for window, margin in (((1, 2 * REACH_PX + 1), (0, REACH_PX)), ((2 * REACH_PX + 1, 1), (REACH_PX, 0))):
         grown = functional.max_pool2d(grown, window, stride=1, padding=margin)
     reach = 3 * BLUR_PX

@@ -1,7 +1,7 @@
-"""Predicted depth made finer by matching once more, at full resolution, around where the network says that things are.
+"""Predicted depth refined by matching once more, at full resolution, around the network's prediction.
 
-Nothing is learned. The farther a point, the less the network knows of its depth, and the more of it is in how it moves
-by pixels from frame to frame; so far depths follow the matches, near ones the network.
+Nothing is learned. The farther a point, the less certain is the network's depth, and the more its motion in pixels from
+frame to frame tells; so far depths follow the matches, near ones the network.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ NEIGHBOURS, MOST_NEIGHBOURS = (-1, 1, -2, 2, -3, 3), 3
 """Frames of the same camera to compare with, by their places in the order of time; so many of those that there are."""
 WINDOW_PX = 9
 OUTSIDE = 0.3
-"""Badness of a depth whose point the other image does not show."""
+"""Cost of a depth whose point the other image does not show."""
 COLOUR, MOST_COLOUR = 1.0, 0.5
 """Weight of differences of colours, and from which sum of three on nothing gets worse."""
 DOUBT, DOUBT_M, MOST_DOUBT = 0.3, 30.0, (0.05, 20.0)
@@ -35,11 +35,11 @@ SMALL_STEP, LARGE_STEP = 0.02, 0.5
 def depth_factor(
     inputs: NetworkInputs, depth_m: Float[Tensor, "b v h w"], is_static: Bool[Tensor, "b v h w"]
 ) -> Float[Tensor, "b v h w"]:
-    """What to multiply depths by so that the images fit better; 1 where nothing is static or no other frame helps.
+    """Factors on depths that make the images fit better; 1 where nothing is static or no other frame helps.
 
     Args:
         inputs: the images.
-        depth_m: predicted.
+        depth_m: predicted z-depth, metres.
         is_static: pixels of static surfaces: no sky, nothing that can move.
     """
     with torch.autocast(depth_m.device.type, enabled=False):
@@ -51,6 +51,7 @@ def _clip_factor(inputs: NetworkInputs, clip: int, depth_m: Float[Tensor, "v h w
     images = small_images(inputs, clip, shrink=1)
     look = torch.cat([images.local, images.rgb], dim=1)
     change = torch.linspace(-LARGEST, LARGEST, STEPS, device=depth_m.device)
+    # A prior on the change: quadratic, as from a Gaussian error of the log depth whose deviation grows with the depth.
     doubt = DOUBT * (DOUBT_M / depth_m).clamp(*MOST_DOUBT) ** 2
     factors = []
     for k, depth in enumerate(depth_m):
@@ -58,6 +59,8 @@ def _clip_factor(inputs: NetworkInputs, clip: int, depth_m: Float[Tensor, "v h w
         if not others:
             factors.append(torch.ones_like(depth))
             continue
+        # Candidates are equally spaced in log depth, so all pixels share one set of changes and smoothness acts on
+        # factors.
         distance = depth * change.exp()[:, None, None] / images.along[k].clamp(min=1e-3)
         costs = torch.stack([_cost(images, look, k, n, distance) for n in others])
         # Half of the images, those that fit better: the others may not see the point.
@@ -79,6 +82,7 @@ def _cost(
 
 def _best(cost: Float[Tensor, "d h w"], change: Float[Tensor, " d"]) -> Float[Tensor, "h w"]:
     """Mean of the cheapest change and those beside it, weighted by their cost."""
+    # Soft arg-min around the best candidate: sub-step precision without averaging over separate minima.
     weight = (-SHARPNESS * cost).softmax(0)
     near = (torch.arange(len(change), device=cost.device)[:, None, None] - weight.argmax(0, keepdim=True)).abs() <= 1
     around = weight * near

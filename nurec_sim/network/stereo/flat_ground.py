@@ -1,4 +1,4 @@
-"""The depth of flat ground under the car, which a log knows: the rig's origin lies on it."""
+"""The depth of flat ground under the car, known from the log: the rig's origin lies on the ground."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ def flat_ground(inputs: NetworkInputs) -> tuple[Float[Tensor, "b v h w"], Bool[T
     """
     origin, direction = rays_from_car(inputs)
     down = -direction[..., 2]
+    # The ray meets z = 0 at distance height / down; times its z in the camera that is the depth.
     depth_m = origin[..., 2] / down.clamp(min=1e-4) * inputs.distance_to_depth_scale[..., 0]
     there = (down > LEAST_DOWN) & (depth_m > 0) & (depth_m < FARTHEST_GROUND_M)
     return torch.where(there, depth_m.clamp(min=1e-3), FARTHEST_GROUND_M), there

@@ -1,6 +1,6 @@
-"""Comparing a camera's frames with one another: images of normalized brightness, and projection by rays alone.
+"""Comparing a camera's frames with one another: locally normalised brightness, and projection by rays alone.
 
-What ``plane_sweep``, ``motion_search`` and ``depth_refinement`` share. Nothing is learned; any lens will do.
+Shared by ``plane_sweep``, ``motion_search`` and ``depth_refinement``. Nothing is learned; any lens works.
 """
 
 from __future__ import annotations
@@ -51,7 +51,13 @@ class SmallImages:
 
 
 def small_images(inputs: NetworkInputs, clip: int, shrink: int = SHRINK) -> SmallImages:
-    """Those of a clip of the batch, so many times smaller."""
+    """The images of one clip of the batch, reduced.
+
+    Args:
+        inputs: the batch.
+        clip: index of the clip.
+        shrink: factor of the reduction.
+    """
     rgb, rays = inputs.rgb[clip].float(), inputs.rays[clip].float()
     size = (max(1, rgb.shape[1] // shrink), max(1, rgb.shape[2] // shrink))
 
@@ -62,6 +68,7 @@ def small_images(inputs: NetworkInputs, clip: int, shrink: int = SHRINK) -> Smal
     colours = functional.interpolate(rgb.permute(0, 3, 1, 2), size, mode="area")
     grey = colours.mean(1, keepdim=True)
     small = smoothed(rays)
+    # Means of unit vectors are shorter than 1.
     small = torch.cat([small[..., :3], functional.normalize(small[..., 3:], dim=-1)], dim=-1)
     along = smoothed(inputs.distance_to_depth_scale[clip].float())[..., 0]
     views = [ImageView(each, pose.float()) for each, pose in zip(small, inputs.c2w[clip], strict=True)]
@@ -69,7 +76,14 @@ def small_images(inputs: NetworkInputs, clip: int, shrink: int = SHRINK) -> Smal
 
 
 def neighbours(camera: Tensor, time: Tensor, image: int, steps: tuple[int, ...]) -> list[int]:
-    """Images of the same camera, so many places before or after one in the order of time."""
+    """Images of the same camera at given offsets from one in the order of time.
+
+    Args:
+        camera: [v] camera index of every image.
+        time: [v] when each was exposed, in any unit.
+        image: index of the image.
+        steps: offsets in places, negative for earlier; those beyond the first or last frame are left out.
+    """
     same = torch.nonzero(camera == camera[image]).flatten().tolist()
     order = sorted(same, key=lambda k: (float(time[k]), k))
     place = order.index(image)
@@ -92,6 +106,7 @@ class ImageView:
             indexing="ij",
         )
         self.lines = [_line(plane[..., k], place) for k, place in enumerate((x, y))]
+        # A pinhole without distortion is linear in x / z and needs no correction steps.
         wrong = [line.wrong * size / 2 for line, size in zip(self.lines, (width, height), strict=True)]
         self.steps = LENS_STEPS if max(wrong) > STRAIGHT_PX else 0
 
@@ -110,6 +125,8 @@ class ImageView:
         nearness = 1 / z.clamp(min=0.1)
         wanted = [x * nearness, y * nearness]
         place = [each * line.slope + line.start for each, line in zip(wanted, self.lines, strict=True)]
+        # Newton steps on "the plane coordinate of the pixel at this place equals the wanted one", with the global slope
+        # as derivative: the lens is only known by the rays of its pixels.
         for _ in range(self.steps):
             reached = sampled(self.plane, torch.stack(place, dim=-1))
             place = [
@@ -151,8 +168,9 @@ def sampled(values: Float[Tensor, "1 c h w"], place: Float[Tensor, "d h w 2"]) -
 
 
 def locally_normalized(grey: Float[Tensor, "v 1 h w"]) -> Float[Tensor, "v 1 h w"]:
-    """Brightness without the mean and the deviation of its window; nearly 0 where there is no texture."""
+    """Brightness minus the mean of its window, over its deviation; nearly 0 where there is no texture."""
     mean = window_mean(grey, CONTRAST_WINDOW_PX)
+    # Var = E[x^2] - E[x]^2; rounding can make it slightly negative where there is no texture.
     deviation = (window_mean(grey**2, CONTRAST_WINDOW_PX) - mean**2).clamp(min=0).sqrt()
     return (grey - mean) / (deviation + LEAST_CONTRAST)
 

@@ -1,7 +1,7 @@
-"""Motion by matching: which way each movable thing went, found where it is seen again in its camera's frames around.
+"""Motion by matching: displacement of each movable thing, from finding it again in its camera's neighbouring frames.
 
-Nothing is learned. Things are pieces of what the network calls movable; each moves over the ground as a whole and at a
-constant velocity from the frame before to the frame after. What is not found again keeps the motion it had.
+Nothing is learned. Things are connected pieces of the pixels classified as movable; each moves over the ground as a
+whole and at a constant velocity from the previous frame to the next. What is not found again keeps its decoded motion.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from nurec_sim.network.stereo.matching import ImageView, neighbours, sampled, sm
 from nurec_sim.network.tensors import NetworkInputs
 
 FARTHEST_M = (12.0, 6.0)
-"""How far things may go from one frame to the next, along the car's axis and across it."""
+"""How far things may move from one frame to the next, along the car's axis and across it."""
 STEP_PX, MOST_STEPS = 2.5, 40
 """Steps across are so wide in the smaller image; their number each way is bounded."""
 STEP_ALONG_M, STEP_ALONG_SHARE = 0.6, 1 / 15
@@ -28,9 +28,9 @@ ROUNDS, FINER = 3, 2.5
 CONTRAST, COLOUR = 2.0, 0.1
 """Differences of normalized brightness, and of colours, from which on nothing gets worse."""
 OUTSIDE = 0.5
-"""Badness of points that the other image does not show."""
+"""Cost of points that the other image does not show."""
 FAR_PENALTY, BETTER = 0.05, 0.06
-"""Cost of going as far as possible; and how much better than standing still a motion must fit."""
+"""Cost of the largest possible motion; and how much better than standing still a motion must fit."""
 EDGE = 0.15
 """Things end where the logarithm of the depth jumps by more."""
 LEAST_PIXELS, MOST_THINGS = 32, 8
@@ -46,10 +46,16 @@ def searched_motion(
     movable: Bool[Tensor, "b v h w"],
     motion_m: Float[Tensor, "b v h w 2 3"],
 ) -> Float[Tensor, "b v h w 2 3"]:
-    """``motion_m`` (metres, to the times before and after) with that of movable things put in where it was found.
+    """``motion_m`` with that of movable things replaced wherever matching found it.
+
+    Args:
+        inputs: the images and their rays; ``rig_from_scene`` must be given.
+        depth_m: z-depth, metres.
+        movable: pixels of things that can move.
+        motion_m: displacements to the times before and after, metres, scene frame.
 
     Raises:
-        ValueError: the inputs do not say where the car is.
+        ValueError: the inputs lack ``rig_from_scene``.
     """
     if inputs.rig_from_scene is None:
         raise ValueError("motion_search needs inputs with rig_from_scene, the scene frame as seen from the car")
@@ -82,6 +88,7 @@ def _search_clip(
         spans = [float(time[n] - time[k]) for n in others]
         if not others or min(abs(span) for span in spans) <= 0:
             continue
+        # Both neighbours test one velocity: shifts are per shortest gap and scale with each frame's own.
         unit = min(abs(span) for span in spans)
         frames = [_Frame(images.views[n], appearance[n], span / unit) for n, span in zip(others, spans, strict=True)]
         thing_of = torch.from_numpy(things(depth_m[k], movable[k])).to(depth_m.device)
@@ -96,6 +103,7 @@ def things(depth_m: Float[Tensor, "h w"], movable: Bool[Tensor, "h w"]) -> Int32
     """Numbers of the largest connected pieces of what is movable, from 1; 0 elsewhere. Pieces end at edges of depth."""
     log_depth, mask = depth_m.clamp(min=1e-3).log().cpu().numpy(), movable.cpu().numpy()
     jump = np.zeros(mask.shape, bool)
+    # Log depth, so that the threshold is a ratio: 15 % separates a near car from the one behind it.
     jump[:, 1:] |= np.abs(np.diff(log_depth, axis=1)) > EDGE
     jump[1:] |= np.abs(np.diff(log_depth, axis=0)) > EDGE
     count, pieces, stats, _ = cv2.connectedComponentsWithStats((mask & ~jump).astype(np.uint8), connectivity=4)
@@ -144,11 +152,14 @@ class _Thing:
         """
         view = frames[0].view
         distance = float((self.points - view.eye).norm(dim=-1).median())
+        # Image width spans 2 in place units, so slope * width / 2 is the focal length in pixels; Z / f is a pixel in
+        # metres.
         pixel_m = 2 / (view.lines[0].slope * width_px) * distance
         along = max(STEP_ALONG_M, STEP_ALONG_SHARE * distance)
         across = max(STEP_PX * pixel_m, FARTHEST_M[1] / MOST_STEPS)
         steps = car_axes.new_tensor([along, across])
         reach = (int(FARTHEST_M[0] / along), int(FARTHEST_M[1] / across))
+        # Coarse to fine: a full grid over a few points, then 5 x 5 grids with ever smaller steps over all of them.
         best = car_axes.new_zeros(2)
         standing = least = self._cost(best[None], frames, car_axes)[0]
         every = max(1, len(self.points) // FIRST_SAMPLES)
@@ -158,6 +169,7 @@ class _Thing:
             cost = self._cost(tried, frames, car_axes, every)
             best, least = tried[cost.argmin()], cost.min()
             reach, steps, every = (2, 2), steps / FINER, 1
+        # Standing still is the prior: texture that repeats must not send parked cars driving.
         return best @ car_axes if least < standing - BETTER else car_axes.new_zeros(3)
 
     def _cost(
@@ -172,6 +184,7 @@ class _Thing:
         total = (tried.abs() / tried.new_tensor(FARTHEST_M)).sum(-1) * FAR_PENALTY
         for view, look, span in frames:
             seen = view.places_of_moved(points, span * (tried @ car_axes))
+            # Truncated at 1 per channel: occluded points cost no more than a clear mismatch.
             difference = (sampled(look[None], seen.place) - own).abs().clamp(max=1).mean(0)
             total = total + torch.where(seen.inside, difference, OUTSIDE).mean((1, 2)) / len(frames)
         return total

@@ -52,10 +52,13 @@ def add_path(cost, jump, small, dy, dx, total):
                 low = before[1]
                 for k in range(2, levels + 1):
                     low = min(low, before[k])
+                # low is min_k L(q, k): jumping to any depth costs the same, so one minimum per pixel replaces a loop
+                # over pairs.
                 least = low + jump[row, column]
                 for k in range(levels):
                     best = min(min(before[k + 1], least), min(before[k], before[k + 2]) + small)
                     here[k + 1] = own[k] + (best - low)
             for k in range(levels):
                 sums[k] += here[k + 1]
+        # Only the previous row is ever read, so two rows of L suffice.
         line, fresh = fresh, line

@@ -1,8 +1,8 @@
 """Depth by matching: how well every pixel fits its camera's other frames, for depths from near to far (a plane sweep).
 
-Nothing is learned. Images are compared where their own brightness has been divided out, in small windows; nothing lies
-below flat ground; and neighbours agree unless there is an edge (``semi_global``). What moves, has no texture or lies
-where the car drives to is found wrongly: three more numbers say how far to trust a depth.
+Nothing is learned. Images are compared in small windows after local normalisation of brightness; nothing lies below
+flat ground; and neighbours agree unless there is an edge (``semi_global``). The result is wrong for what moves, has no
+texture or lies where the car drives to: three more channels measure how far to trust a depth.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ WINDOW_PX = 5
 SHARPNESS = 25.0
 """How strongly the best match is preferred to the others."""
 OUTSIDE = 0.3
-"""Badness of a depth whose point the other image does not show: neither a good match nor a bad one."""
+"""Cost of a depth whose point the other image does not show: neither a good match nor a bad one."""
 BELOW_GROUND, BELOW, WELL_BELOW = 0.5, 0.05, 0.25
 """Cost of points below flat ground: none if their logarithm is up to ``BELOW`` farther, all from ``WELL_BELOW`` on."""
 ON_GROUND, GROUND_WIDTH = 0.05, 0.1
-"""What points on the ground are preferred by, and how far from it in the logarithm."""
+"""Bonus of points on the ground, and its width in the logarithm of depth."""
 AGREEING = 0.15
 """Two images agree on a point if the logarithms of its depth differ by less than about this."""
 
@@ -58,20 +58,24 @@ def _clip_sweep(
     inputs: NetworkInputs, clip: int, ground_m: Float[Tensor, "v h w"], there: Bool[Tensor, "v h w"]
 ) -> Float[Tensor, "v h w 4"]:
     images = small_images(inputs, clip)
+    # Equal steps in log depth: relative errors matter, and one set of planes covers 2 to 120 m.
     log_m = torch.linspace(math.log(NEAREST_M), math.log(FARTHEST_M), DEPTHS, device=ground_m.device)
     maps, compared = [], []
     for k, view_rays in enumerate(images.rays):
         others = neighbours(inputs.camera_idxs[clip], inputs.time[clip], k, NEIGHBOURS)
         ground, meets = _shrunk(ground_m[k], images.size), _shrunk(there[k].float(), images.size)
+        # z-depth over the z of the unit ray is the distance along it.
         distance = log_m.exp()[:, None, None] / images.along[k].clamp(min=1e-3)
         costs = [_cost(images.views[n].places(view_rays, distance), images.local[k], images.local[n]) for n in others]
         fits = _of_the_better_half(costs) if costs else torch.full_like(distance, OUTSIDE)
+        # Priors enter before smoothing, so that texture-free road takes the ground's depth from its surroundings.
         cost = semi_global(fits + _expectation(ground, meets, log_m), images.grey[k, 0])
         maps.append(_chosen(fits, cost, log_m))
         compared.append(others)
     found = torch.stack(maps)
     agreed = [_agreement(found, images, k, others) for k, others in enumerate(compared)]
     found = torch.cat([found, torch.stack(agreed)[..., None]], dim=-1)
+    # log(depth * 0.15): the unit of the depth head, so that the channel can be compared with its output.
     found[..., 0] += math.log(SCENE_RESCALE)
     size = (ground_m.shape[1], ground_m.shape[2])
     return functional.interpolate(found.permute(0, 3, 1, 2), size, mode="nearest").permute(0, 2, 3, 1)
@@ -112,6 +116,8 @@ def _agreement(
     best = torch.zeros_like(distance)
     for n in others:
         seen = images.views[n].places(images.rays[image], distance[None])
+        # Left-right check: the other image's own depth at the projection should be the depth of the point there.
+        # Nearest, as a mean across an edge belongs to neither side.
         theirs = functional.grid_sample(found[n, None, None, ..., 0], seen.place, mode="nearest", align_corners=False)
         apart = theirs[0, 0] - seen.depth_m[0].clamp(min=1e-3).log()
         close = torch.exp(-0.5 * (apart / AGREEING) ** 2)
@@ -128,5 +134,6 @@ def _chosen(
     near = (torch.arange(len(log_m), device=peak.device)[:, None, None] - peak).abs() <= 2
     around = weight * near
     share = around.sum(0)
+    # By the unsmoothed cost: whether the pixel itself supports the depth, or only its neighbours do.
     better = (fits.mean(0) - fits.gather(0, peak)[0]).clamp(min=0)
     return torch.stack([(around * log_m[:, None, None]).sum(0) / share, share, better], dim=-1)

@@ -13,7 +13,7 @@ from torch import Tensor
 from nurec_sim.network.stereo.paths import add_path, brightness_steps
 
 SMALL_STEP, LARGE_STEP = 0.05, 2.0
-"""What it costs to go to the next depth, and to any other, from a pixel to its neighbour; if nothing else is said."""
+"""Default penalties for moving to the adjacent depth, and to any other, from a pixel to its neighbour."""
 EDGE = 40.0
 """How much cheaper a large step is where the brightness (0..1) changes."""
 
@@ -21,13 +21,13 @@ EDGE = 40.0
 def semi_global(
     cost: Float[Tensor, "d h w"], guide: Float[Tensor, "h w"], small: float = SMALL_STEP, large: float = LARGE_STEP
 ) -> Float[Tensor, "d h w"]:
-    """Cost of each pixel's depths with what its neighbours along the row and the column would have to pay.
+    """Cost volume smoothed by semi-global matching along the rows and the columns, both ways.
 
     Args:
         cost: of each pixel alone; about 0..1.
         guide: brightness 0..1, whose edges are likely those of the depth.
-        small: what it costs to go to the next depth, from a pixel to its neighbour.
-        large: what it costs to go to any other.
+        small: penalty for moving to the adjacent depth, from a pixel to its neighbour.
+        large: penalty for moving to any other depth.
     """
     if cost.device.type == "cpu" and cost.dtype == torch.float32:
         return _on_cpu(cost, guide, small, large)
@@ -40,6 +40,7 @@ def _on_cpu(
     cost: Float[Tensor, "d h w"], guide: Float[Tensor, "h w"], small: float, large: float
 ) -> Float[Tensor, "d h w"]:
     """The sums by a compiled kernel; to the bit those of ``_summed_by_torch``."""
+    # Depths innermost: the kernel runs along them, so they should be contiguous.
     volume, brightness = cost.permute(1, 2, 0).contiguous().numpy(), guide.float().numpy()
     across, down = np.zeros_like(volume), np.zeros_like(volume)
     for total, dy, dx in ((across, 0, 1), (across, 0, -1), (down, 1, 0), (down, -1, 0)):
@@ -71,4 +72,5 @@ def _carried(before: Float[Tensor, "d m"], jump: Float[Tensor, " m"], small: flo
     carried = torch.minimum(before, least + jump)
     carried[1:] = torch.minimum(carried[1:], before[:-1] + small)
     carried[:-1] = torch.minimum(carried[:-1], before[1:] + small)
+    # Without subtracting the minimum, sums would grow along the path (Hirschmueller 2008, after equation 13).
     return carried - least

@@ -57,14 +57,22 @@ def observed_world_sky(
     size: int,
     ego: Bool[np.ndarray, "v h w"] | None = None,
 ) -> ObservedSky:
-    """Sky of one chunk over the world.
+    """Sky of one chunk over the world, from the pixels that the network classifies as sky.
 
-    Takes the place of ``NetworkOutputs.sky`` where there is no learned sky: that one grows brighter or darker forwards
-    instead of upwards. ``rays`` are those of the inputs, in the scene frame; pixels where ``ego`` is True show the car
-    and no sky, whatever the network says.
+    It replaces ``NetworkOutputs.sky`` where there is no learned sky: the gradient of the release runs forwards instead
+    of upwards.
+
+    Args:
+        context: colours and semantic logits of the chunk's images (b = 1).
+        rays: those of the inputs, in the scene frame (origin in metres, unit direction).
+        world_from_scene: pose of the scene frame; only its rotation matters, as the sky is infinitely far.
+        size: edge of a cubemap face, texels.
+        ego: True where a pixel shows the recording car: no sky there, whatever the network predicts. None: nowhere.
     """
     shows_sky = context.logits[0].argmax(dim=-1) == SemanticClass.SKY
     near_other = functional.max_pool2d((~shows_sky).float(), 2 * EDGE_PX + 1, stride=1, padding=EDGE_PX) > 0
+    # Near another class the image already mixes its colour in (blur, a depth edge off by a pixel), so such pixels only
+    # count where a texel has no clear one.
     (edge, edge_hits), (clear, clear_hits) = (
         (each.cpu().numpy() for each in texture(*_pixels(chosen, context, rays, world_from_scene, ego), size))
         for chosen in (shows_sky & near_other, shows_sky & ~near_other)
@@ -73,6 +81,7 @@ def observed_world_sky(
     seen = (clear_hits + edge_hits > 0).astype(np.float32)
     # Images may be coarser than the cubemap and leave texels between their pixels: half of them is as good as all.
     surely = np.minimum(2 * _blurred((clear_hits > 0).astype(np.float32), FEATHER_PX), 1)
+    # The square lets the weight vanish smoothly with zero slope; 2 * blurred - 1 falls to 0 at the border itself.
     sure = surely**2 * np.clip(2 * _blurred(surely, SEAM_PX) - 1, LEAST_SURE, 1)
     return ObservedSky(fill_unseen(rgb, seen), np.minimum(2 * _blurred(seen, FEATHER_PX), 1), sure)
 
@@ -88,7 +97,18 @@ def world_background(
     size: int,
     ego: Bool[np.ndarray, "v h w"] | None = None,
 ) -> tuple[Float32[np.ndarray, "6 size size 3"], Float32[np.ndarray, "6 size size"]]:
-    """``network.sky.background`` over the world, of what one chunk shows of all static surfaces."""
+    """``network.sky.background`` over the world: what one chunk shows of all static surfaces.
+
+    Args:
+        context: colours and semantic logits of the chunk's images (b = 1).
+        rays: those of the inputs, in the scene frame.
+        world_from_scene: pose of the scene frame; only its rotation is used.
+        size: edge of a cubemap face, texels.
+        ego: True where a pixel shows the recording car and is ignored; None: nowhere.
+
+    Returns:
+        Blurred mean colours by direction, and where there are any (1, elsewhere 0).
+    """
     return background(*_pixels(is_static(context.logits[0]), context, rays, world_from_scene, ego), size)
 
 
@@ -114,7 +134,17 @@ def world_sky(
     world_from_scene: Float64[np.ndarray, "4 4"],
     size: int,
 ) -> tuple[Float32[np.ndarray, "6 size size 3"], Float32[np.ndarray, "6 size size"]]:
-    """A cubemap of the network (scene frame) as one of ``GaussianScene``: turned, the sky being far, and resampled."""
+    """A cubemap of the network (scene frame) resampled as one of ``GaussianScene`` (world axes).
+
+    Args:
+        sky: colours, faces as in ``network.sky.cubemap``.
+        seen: how surely each texel was seen, 0..1.
+        world_from_scene: pose of the scene frame; only its rotation is used, as the sky is infinitely far.
+        size: edge of the result's faces, texels.
+
+    Returns:
+        Colours and ``seen`` in world axes.
+    """
     faces = torch.from_numpy(np.concatenate([sky, seen[..., None]], axis=-1, dtype=np.float32))
     # Several rays per texel where the scene's sky is the coarser one: averaged, and not skipped through.
     rays = max(1, round(sky.shape[1] / size))

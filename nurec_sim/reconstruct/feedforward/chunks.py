@@ -18,8 +18,8 @@ class ContextImage:
     """One input image as the network sees it.
 
     ``camera`` is the resized and cropped camera, exactly; ``world_from_camera`` its poses at the start and the end of
-    the exposure ``t_us``; ``frame`` its index in the log; ``target_t_us`` the times to which the motion decoder is
-    asked to move its points (the same camera's frames before and after in the chunk).
+    the exposure ``t_us``; ``frame`` its index in the log; ``target_t_us`` the target times of the motion
+    decoder (the same camera's previous and next frames in the chunk).
     """
 
     camera: CameraModel

@@ -1,9 +1,9 @@
-"""What the network says of a chunk, as layers of the world: pruned, moved out of the scene frame, split by motion.
+"""Network outputs of a chunk as layers of the world: pruned, moved out of the scene frame, split by motion.
 
-Movable points are dynamic (paper section 3.3). Their middle knot is where and when their own pixel saw them, the outer
-ones the camera's frames before and after, where the motion head puts them, or the track that they belong to. So at the
-instant of one frame the points of three are there: its own in full, and those of its neighbours as they fade out
-(exp(-1) at their outer knots); displacements that the head got wrong show as doubled edges.
+Movable points are dynamic (paper section 3.3). Their middle knot is where and when their own pixel saw them; the outer
+knots are at the camera's previous and next frame, where the motion head or their track puts them. So at the instant of
+one frame the points of three frames are visible: its own in full, and those of its neighbours as they fade out (exp(-1)
+at their outer knots); wrong displacements show as doubled edges.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Label
 
 COVERED_WEIGHT = 3e-4
-"""What the surfaces that a chunk sees before the sky count in a mean with the sky that another chunk sees there."""
+"""Weight of surfaces that hide the sky from one chunk, in a mean with the sky that another chunk sees there."""
 MIN_DYNAMIC_OPACITY = 0.75
 """Dynamic Gaussians are at least this opaque, as in the released model."""
 _LABELS = {
@@ -61,15 +61,15 @@ class _Points:
 def chunk_layers(clip: Clip, chunk: ChunkInputs, outputs: NetworkOutputs, settings: FeedForwardSettings) -> ChunkLayers:
     """A chunk's contribution to the scene, in the world frame.
 
-    Dropped is what is not more opaque than ``settings.min_opacity`` (sky and ego car are not, by the network's mask),
-    not finite, or on pixels where the log's own mask shows the ego car. Dynamic is every movable point, with or without
-    tracks, and every other point off the road that lies in a track's box. Without a motion head a movable point that no
-    track explains is static between its knots.
+    Dropped are Gaussians that are not more opaque than ``settings.min_opacity`` (sky and ego car by the network's
+    mask), not finite, or on pixels where the log's own mask shows the ego car. Dynamic is every movable point, with or
+    without tracks, and every other point off the road that lies in a track's box. Without a motion head a movable point
+    outside all tracks stays in place between its knots.
 
     Args:
         clip: the driving log; its movable tracks, of any source, carry the points in their boxes.
-        chunk: what went into the network.
-        outputs: what came out (b = 1), on any device.
+        chunk: the network's inputs.
+        outputs: its outputs (b = 1), on any device.
         settings: ``min_opacity``, ``learned_sky`` and ``sky_px`` are used.
 
     Returns:
@@ -110,6 +110,7 @@ def _sky(
         learned, seen = (_float32(values[0]) for values in (outputs.sky, outputs.sky_seen))
         sky, _ = world_sky(learned, seen[..., 0], chunk.world_from_scene, size)
     surfaces, covered = world_background(context, rays, chunk.world_from_scene, size, chunk.ego)
+    # Layered from the weakest evidence to the strongest: extrapolated or learned sky, surfaces, observed sky.
     sky = sky + covered[..., None] * (surfaces - sky)
     covered = np.maximum(covered, observed.shown)
     return sky + observed.shown[..., None] * (observed.rgb - sky), np.maximum(observed.sure, COVERED_WEIGHT * covered)
@@ -197,10 +198,12 @@ def _split(
 ) -> tuple[Gaussians, DynamicGaussians]:
     """Points of image ``number`` that stand, and those that move."""
     image, label = chunk.images[number], points.gaussians.label
+    # With boxes even points that the network does not call movable may belong to one; road never does.
     rows = np.flatnonzero(label != Label.ROAD if actors else label == Label.MOVABLE)
     t_us = pixel_times_us(image, points.pixel[rows])
     movable = label[rows] == Label.MOVABLE
     owner = owners_of_points(actors, points.position_m[rows], t_us, movable)
+    # A wrong depth puts a point outside its box, but its ray still passes through: accepted if the box is unambiguous.
     lost = np.flatnonzero(movable & (owner < 0))
     owner[lost] = owners_of_rays(actors, *_rays(chunk, number, points.pixel[rows[lost]]), t_us[lost])
     moving = movable | (owner >= 0)
@@ -217,6 +220,7 @@ def pixel_times_us(image: ContextImage, pixel: Int64[np.ndarray, " n"]) -> Int64
     """When pixels, given by their flat index, were exposed."""
     row, column = np.divmod(pixel, image.camera.width_px)
     fraction = sensors.shutter_fraction(image.camera, np.stack([column, row], axis=-1) + 0.5)
+    # Integer microseconds: epoch times do not fit into float32, where neighbouring rows would share one instant.
     start_us, end_us = image.t_us
     return start_us + np.rint(fraction * (end_us - start_us)).astype(np.int64)
 
@@ -252,6 +256,7 @@ def _moving_points(
 ) -> DynamicGaussians:
     """Dynamic points of one image with their knots."""
     before, after = image.target_t_us
+    # Knot times must increase strictly, also where a row is exposed at the very time of a neighbouring frame.
     times = np.stack([np.minimum(before, t_us - 1), t_us, np.maximum(after, t_us + 1)], axis=1)
     knots = np.repeat(points.position_m[:, None], 3, axis=1)
     knots[:, [0, 2]] += displacement_m
@@ -268,6 +273,7 @@ def _moving_points(
         times[mine], knots[mine] = knots_along(actor, points.position_m[mine], t_us[mine], image.target_t_us, span_us)
     gaussians = dataclasses.replace(
         points.gaussians,
+        # As in the release: movers are seen for a moment only, and a faint one would let the background show through.
         opacity=np.maximum(points.gaussians.opacity, np.float32(MIN_DYNAMIC_OPACITY)),
         label=np.full(len(owner), Label.MOVABLE, np.uint8),
     )

@@ -135,11 +135,11 @@ def chosen_device(name: str) -> torch.device:
 
 
 def _model(settings: FeedForwardSettings, device: torch.device) -> tuple[InstantNuRec, dict[str, Any]]:
-    """The network with its weights, and what to say of them in the provenance."""
+    """The network with its weights, and their description for the provenance."""
     name = settings.profile or ""
     precision: Precision = settings.precision if settings.precision != "auto" else "float32"
     if settings.precision == "auto" and device.type == "cuda":
-        # What the released weights run with.
+        # The precisions that the release runs these decoders in.
         precision = "float16" if network.PROFILES[name].decoder == "dense" else "bfloat16"
     model = network.build(name, seed=settings.random_weights, precision=precision)
     said: dict[str, Any] = {"precision": precision, "device": device.type}
@@ -174,6 +174,7 @@ def _chunk(
         fit = fit_depth(clip, chunk, depth_m, hold_out, settings.lidar_depth, static)
         gaussians, depth_m = fit.apply(gaussians, chunk), fit.factor * depth_m
     outputs = dataclasses.replace(outputs, gaussians=gaussians)
+    # After the LiDAR fit: images agree more often once their depths have the right scale.
     if settings.consensus:
         progress("consensus", 0.8)
         semantic, rgb = outputs.context.logits[0].argmax(-1).cpu().numpy(), outputs.context.rgb[0].float().cpu().numpy()
@@ -206,7 +207,7 @@ def _tracks(clip: Clip, dynamic: DynamicGaussians) -> tuple[tuple[Track, ...], D
 
 
 def _unknown(clip: Clip, settings: FeedForwardSettings, found: int) -> list[str]:
-    """What the log did not tell, in plain words."""
+    """What the log does not contain, as notes for the provenance."""
     notes = []
     if settings.random_weights is not None:
         notes.append("random weights: nothing in this scene means anything")

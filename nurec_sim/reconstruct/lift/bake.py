@@ -26,7 +26,17 @@ KEPT_SHARE = 0.4
 def camera_isp(
     views: Sequence[WorkingView], pictures: Sequence[DepthPicture], bodies: Sequence[Surfels], cameras: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Affine response of each camera, from the static surfels that several cameras see."""
+    """Affine response of each camera, from the static surfels that several cameras see.
+
+    Args:
+        views: working views of all cameras.
+        pictures: their dense depth, in the same order.
+        bodies: measured surfaces; the first one is the static world.
+        cameras: ids of the cameras to align, the reference first; those without views are left out.
+
+    Returns:
+        As ``colour.solve_isp``: the responses, and the cameras that could not be aligned.
+    """
     cameras = [camera for camera in cameras if any(view.camera_id == camera for view in views)]
     world = bodies[0]
     some = slice(None, None, max(1, len(world.cloud) // 100_000))
@@ -69,7 +79,18 @@ def body_pixels(
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,
 ) -> list[Lifted]:
-    """The pixels of all views that show each body, in its frame, thinned to the budget."""
+    """The pixels of all views that show each body, in its frame, thinned to the budget.
+
+    Args:
+        bodies: the static world, then the actors; the numbers in ``DepthPicture.body`` index it.
+        views: working views.
+        pictures: their dense depth, in the same order.
+        rgb: their canonical colours, 0..255 [h,w,3], in the same order.
+        settings: ``views.budget`` and ``views.max_depth_m`` are used.
+
+    Returns:
+        Lifted points per body, in the order of ``bodies``.
+    """
     parts = [[Lifted.empty()] for _ in bodies]
     pixels = sum(view.rgb.shape[0] * view.rgb.shape[1] for view in views)
     thinning = 2 ** max(0, int(np.ceil(np.log2(max(KEPT_SHARE * pixels / settings.views.budget, 1)))))
@@ -108,7 +129,17 @@ def body_gaussians(
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,
 ) -> tuple[Gaussians, int]:
-    """Gaussians of one body in its frame, and how many of them were lifted from its ``pixels`` (``body_pixels``)."""
+    """Gaussians of one body in its frame, and how many of them were lifted from pixels.
+
+    Args:
+        body: its measured surface.
+        pixels: its lifted pixels (``body_pixels``), before ownership.
+        ground: labels lifted points on the road, and lets footprints on it stretch further.
+        views: working views.
+        pictures: their dense depth, in the same order.
+        rgb: their canonical colours, 0..255 [h,w,3], in the same order.
+        settings: opacity, and the depth levels of the matching.
+    """
     cloud = body.cloud
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
     shown = colour.fill_unseen(cloud.xyz_m, seen_rgb / 255, np.isfinite(pixel), cloud.intensity)

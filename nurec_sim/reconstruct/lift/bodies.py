@@ -42,7 +42,17 @@ class Surfels:
 def surfels_of(
     clip: Clip, actors: Sequence[Actor], gathered: Gathered, settings: LiftSettings
 ) -> tuple[list[Surfels], Ground]:
-    """Surfels of the static world and of each actor; ground within reach is one regular sheet."""
+    """Surfels of the static world and of each actor; ground within reach becomes one regular sheet.
+
+    Args:
+        clip: the driving log; its ego poses are the driven path.
+        actors: movable tracks.
+        gathered: the thinned points of all sweeps.
+        settings: ``ground``, and the carving of ``points``.
+
+    Returns:
+        The static world's surfels first, then one entry per actor; and the ground.
+    """
     feet = [world for _, world in gathered.feet.values()]
     everything = np.concatenate([gathered.static.xyz_m, *feet])
     ground = find_ground(everything, clip.ego.world_from_body, settings.ground)

@@ -19,12 +19,21 @@ ENOUGH_SHARED = 300
 def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, tolerance):
     """Colour of each point as its three best views show it, and how well the best of them resolves it.
 
-    A view counts if it sees the point: inside the picture, and the picture's inverse depth agrees within
-    ``tolerance`` (1/m) plus 8 %. Nearer views and views that face the surface weigh more.
+    A view counts if it sees the point: inside the picture, and the picture's inverse depth agrees within ``tolerance``
+    plus 8 %. Nearer views and views that face the surface weigh more.
+
+    Args:
+        xyz: [n,3] points, metres, in the frame that ``packed`` projects from.
+        normal: [n,3] unit normals in that frame.
+        packed: [k,23] projections into the views (``packed_views``).
+        inverse_depth: [k,h,w] of the views, 1/m; NaN where a pixel is masked.
+        pictures: [k,h,w,3] colours of the views, 0..255.
+        present: [k] whether the body is there at each view's time.
+        tolerance: 1/m, see above.
 
     Returns:
-        rgb [n,3] (0..255); the smallest length of a pixel along the surface in metres [n], infinite if unseen; and
-        the number of views that look through the point [n].
+        rgb [n,3] (0..255); the smallest length of a pixel along the surface in metres [n], infinite if unseen; and the
+            number of views that look through the point [n].
     """
     n = len(xyz)
     rgb, pixel = np.zeros((n, 3), np.float32), np.full(n, np.inf, np.float32)
@@ -49,10 +58,13 @@ def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, toleranc
             facing = 0.0
             for j in range(3):
                 facing += normal[i, j] * (view[5 + j] * rx + view[8 + j] * ry + view[11 + j])
+            # Cosine of the incidence: a pixel covers 1 / cosine as much of a slanted surface. The floor keeps grazing
+            # views finite.
             facing = max(abs(facing) / length, 0.02)
             size = z / view[0] / facing
             if size < pixel[i]:
                 pixel[i] = size
+            # Proportional to the solid angle of the surface, so to the number of pixels that measure it.
             weight = facing / (z * z)
             slot = np.argmin(weights)
             if weight > weights[slot]:
@@ -73,7 +85,15 @@ def fill_unseen(
     intensity: Float32[np.ndarray, " n"],
     reach_m: float = 2.0,
 ) -> Float32[np.ndarray, "n 3"]:
-    """Give unseen points the mean colour of the seen ones within reach, else grey by their LiDAR intensity."""
+    """Give unseen points the mean colour of the nearest seen ones, else grey by their LiDAR intensity.
+
+    Args:
+        xyz_m: points, metres.
+        rgb: colours 0..1; those of unseen points are replaced.
+        seen: whether a view saw the point.
+        intensity: LiDAR intensity in any unit; NaN where unknown.
+        reach_m: how near the nearest seen point must be for its colour to be used.
+    """
     from scipy.spatial import cKDTree
 
     result = rgb.copy()
@@ -82,6 +102,7 @@ def fill_unseen(
         return result
     known = np.isfinite(intensity)
     level = np.nanpercentile(intensity[known], 90) if known.any() else 1.0
+    # LiDAR intensity tells bright paint from dark asphalt, but has no absolute scale: relative to its 90th percentile.
     grey = 0.2 + 0.4 * np.clip(np.where(known, intensity, 0.5 * level) / max(level, 1e-6), 0, 1)
     result[unseen] = grey[unseen, None]
     if seen.any():
@@ -120,6 +141,7 @@ def solve_isp(
         if joined:
             both = seen & (count > 0)
             isp[camera] = _affine(total[both] / count[both, None], rgb[both].astype(np.float64))
+        # canonical = M^-1 (shown - b): a joined camera adds its canonical colours to the reference of the next one.
         inverse = np.linalg.inv(isp[camera][:, :3])
         total[seen] += (rgb[seen] - isp[camera][:, 3]) @ inverse.T
         count[seen] += 1
@@ -131,6 +153,7 @@ def solve_isp(
 def _affine(canonical: np.ndarray, shown: np.ndarray, rounds: int = 6) -> np.ndarray:
     weight = np.ones(len(canonical))
     basis = np.column_stack([canonical, np.ones(len(canonical))])
+    # Ridge towards the identity: points of few colours (asphalt) leave directions of the matrix undetermined.
     pull = 0.02 * len(canonical)
     target = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
     result = target
@@ -139,6 +162,7 @@ def _affine(canonical: np.ndarray, shown: np.ndarray, rounds: int = 6) -> np.nda
         right = (basis * weight[:, None]).T @ shown + pull * target.T
         result = np.linalg.solve(left, right).T
         error = np.linalg.norm(shown - basis @ result.T, axis=1)
+        # Cauchy weights (iteratively reweighted least squares): highlights and wrong matches count little.
         weight = 1 / (1 + (error / 0.08) ** 2)
     # A camera that turned colours inside out would be a failed fit, not a camera.
     if np.linalg.det(result[:, :3]) < 0.1:

@@ -41,11 +41,22 @@ def _popcount(x):
 
 @kernel
 def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, other_codes, step, levels, cost):
-    """Fill ``cost[h, w, levels]`` (0..100): mean of the two best neighbours of census and colour differences.
+    """Fill ``cost`` (0..100): mean of the two best neighbours of census and colour differences.
 
     Pixels with a prior are left alone.
 
-    ``others`` stacks packed views, ``other_rgb``/``other_codes`` their pictures, padded to one size.
+    Args:
+        view: [23] packed projection of the view (``WorkingView.packed``).
+        world_from_view: [4,4] its pose.
+        prior: [h,w] measured inverse depth, 1/m; 0 where there is none.
+        others: [n,23] packed projections from the world into the neighbours.
+        rgb: [h,w,3] the view's colours, 0..255.
+        codes: [h,w] its ``census``.
+        other_rgb: [n,h',w',3] the neighbours' colours, padded to one size.
+        other_codes: [n,h',w'] their ``census``, padded likewise.
+        step: 1/m from one level of inverse depth to the next; level 0 is infinitely far.
+        levels: how many.
+        cost: [h,w,levels] output.
     """
     height, width, _ = rgb.shape
     count = len(others)
@@ -55,6 +66,8 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
             if prior[row, column] > 0:
                 continue
             rx, ry = (column + 0.5 - view[1]) / focal, (row + 0.5 - view[2]) / focal
+            # Rolling shutter: the pixel was exposed f of the exposure off its middle, when the camera was drift * f
+            # further. So its ray starts at o = drift * f.
             f = min(max(view[20] * (column + 0.5) + view[21] * (row + 0.5) + view[22], -0.5), 0.5)
             ox, oy, oz = view[17] * f, view[18] * f, view[19] * f
             m = world_from_view
@@ -65,6 +78,8 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
             pz = m[2, 0] * ox + m[2, 1] * oy + m[2, 2] * oz + m[2, 3]
             total, number = 0.0, 0
             for level in range(levels):
+                # X = o + r / w, scaled by w: r + w o. It stays finite at infinity (w = 0), and projection does not
+                # depend on the scale of X.
                 w = level * step
                 first, second, seen = 1e9, 1e9, 0
                 for n in range(count):
@@ -76,6 +91,8 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
                         continue
                     u, v = o[0] * a / c + o[1], o[0] * b / c + o[2]
                     if o[17] != 0.0 or o[18] != 0.0 or o[19] != 0.0:
+                        # One fixed-point step for the other view's own shutter: the drift at the row where the point
+                        # was first projected (times w, as X is).
                         g = w * min(max(o[20] * u + o[21] * v + o[22], -0.5), 0.5)
                         d = max(c - o[19] * g, 1e-6)
                         u, v = o[0] * (a - o[17] * g) / d + o[1], o[0] * (b - o[18] * g) / d + o[2]
@@ -90,8 +107,11 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
                         low = other_rgb[n, iv + 1, iu, k] * (1 - fu) + other_rgb[n, iv + 1, iu + 1, k] * fu
                         difference += abs(top * (1 - fv) + low * fv - rgb[row, column, k])
                     bits = _popcount(codes[row, column] ^ other_codes[n, int(v + 0.5), int(u + 0.5)])
+                    # Both terms saturate, so that an occlusion costs no more than a clear mismatch. Census compares the
+                    # order of brightness and survives exposure changes; colour tells where there is no texture.
                     value = min(difference * 0.6, 50.0) + min(bits * 2.0, 50.0)
                     seen += 1
+                    # The best two of all neighbours: the others may have the point hidden.
                     if value < first:
                         first, second = value, first
                     elif value < second:
@@ -110,18 +130,28 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
 
 @kernel
 def add_prior(cost, prior, sky, step):
-    """Bend the costs towards the measured inverse depth where there is one, and towards infinity in the sky."""
+    """Bend the costs towards the measured inverse depth where there is one, and towards infinity in the sky.
+
+    Args:
+        cost: [h,w,levels] changed; replaced where there is a prior.
+        prior: [h,w] measured inverse depth, 1/m; 0 where there is none.
+        sky: [h,w] pixels that look like sky.
+        step: 1/m from one level of inverse depth to the next.
+    """
     height, width, levels = cost.shape
     for row in range(height):
         for column in range(width):
             w = prior[row, column]
             if w > 0:
                 for level in range(levels):
+                    # Truncated linear: a wrong measurement (a splat over a silhouette) can be outvoted by its
+                    # surroundings.
                     cost[row, column, level] = min(PRIOR_COST * abs(level - w / step), PRIOR_CAP)
             elif sky[row, column]:
                 for level in range(1, levels):
                     cost[row, column, level] += SKY_COST
             else:
+                # Infinity fits any pixel without texture; without this charge plain walls would become sky.
                 cost[row, column, 0] += NOT_SKY_COST
 
 
@@ -147,6 +177,8 @@ def _least(total, step):
             best = np.argmin(total[row, column])
             shift = 0.0
             if 0 < best < levels - 1:
+                # Vertex of the parabola through three equally spaced values: (a - c) / (2 (a - 2 b + c)) from the
+                # middle one.
                 a, b, c = total[row, column, best - 1], total[row, column, best], total[row, column, best + 1]
                 curve = a - 2 * b + c
                 if curve > 1e-6:
@@ -167,7 +199,15 @@ def dense_inverse_depth(
 ) -> Float32[np.ndarray, "h w"]:
     """Inverse depth of every pixel: the prior where it holds, matching and smoothness elsewhere, 0 in the sky.
 
-    ``neighbours`` are (packed view, rgb, census) of the views to match against.
+    Args:
+        packed: the view's projection (``WorkingView.packed``).
+        world_from_view: its pose.
+        rgb: its colours, 0..255.
+        prior: measured inverse depth, 1/m; 0 where there is none.
+        sky: pixels that look like sky.
+        neighbours: (packed view, rgb, census) of the views to match against; empty leaves only priors and smoothness.
+        levels: number of inverse-depth hypotheses, the first one infinitely far.
+        step: 1/m from one to the next.
     """
     height, width = prior.shape
     cost = np.full((height, width, levels), NEUTRAL_COST, np.float32)
@@ -183,5 +223,6 @@ def dense_inverse_depth(
         matching_cost(packed, world_from_view, prior, others, rgb, census(gray), pictures, codes, step, levels, cost)
     add_prior(cost, prior, sky, step)
     result = smooth_depth(cost, gray, step)
+    # The prior is exact where smoothing agrees with it; nearer than the nearest level, smoothing cannot express it.
     trusted = (prior > 0) & ((np.abs(result - prior) < 1.5 * step + 0.1 * prior) | (prior > (levels - 2) * step))
     return np.where(trusted, prior, result).astype(np.float32)

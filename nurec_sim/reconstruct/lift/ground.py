@@ -118,6 +118,7 @@ def find_ground(
     inside = np.all((index >= 0) & (index < (columns, rows)), axis=1)
     points, flat = xyz_m[inside], index[inside, 1] * columns + index[inside, 0]
     offset = points[:, 2] - expected.reshape(-1)[flat]
+    # The band widens with the distance: the ground may slope away from the path.
     band = np.abs(offset) < BAND_M + BAND_SLOPE * distance.reshape(-1)[flat]
     height, known = _low_heights(points[band, 2], flat[band], rows, columns)
     for x, y, z in path:
@@ -160,6 +161,7 @@ def _low_heights(z: np.ndarray, flat: np.ndarray, rows: int, columns: int) -> tu
         z, flat = z[order], flat[order]
         first = np.flatnonzero(np.concatenate([[True], flat[1:] != flat[:-1]]))
         count = np.diff(np.append(first, len(flat)))
+        # The lowest fifth is skipped: stray returns below the road.
         low = z[first + count // 5]
         close = np.abs(z - np.repeat(low, count)) < 0.06
         total, number = np.add.reduceat(np.where(close, z, 0.0), first), np.add.reduceat(close.astype(float), first)
@@ -170,6 +172,7 @@ def _low_heights(z: np.ndarray, flat: np.ndarray, rows: int, columns: int) -> tu
 def _drop_raised(height: np.ndarray, known: np.ndarray, cell_m: float) -> np.ndarray:
     """Cells far above the lowest ground around them are tops of things, not ground."""
     low = np.where(known, height, 1e6).astype(np.float32)
+    # First small things, then larger ones, whose middle the small window cannot see past.
     for edge_m, rise_m in ((1.0, 0.3), (4.0, 0.5)):
         size = 2 * int(edge_m / cell_m / 2) + 1
         low = np.where(known, low, 1e6).astype(np.float32)
@@ -232,6 +235,7 @@ def _grow(
     reached = driven.copy()
     ring = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(round(0.4 / cell_m), 1) + 1,) * 2)
     for _ in range(round(settings.road_reach_m / 0.4)):
+        # Compared with the road already reached beside it, not with the path: roads have crowns and ramps.
         level = _beside(height, reached, 0.5 / cell_m)
         grown = wide & (cv2.dilate(reached.astype(np.uint8), ring) > 0) & (np.abs(height - level) < settings.step_m)
         if not (grown & ~reached).any():

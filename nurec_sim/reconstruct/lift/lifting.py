@@ -91,10 +91,12 @@ def normals_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> 
     def shifted(dy: int, dx: int) -> np.ndarray:
         return pad[2 + dy : 2 + dy + height, 2 + dx : 2 + dx + width]
 
+    # Central differences over four pixels: a shorter baseline would show the noise of matched depth.
     slope_u = (shifted(0, 2) - shifted(0, -2)) / 4 * tile.focal_px
     slope_v = (shifted(2, 0) - shifted(-2, 0)) / 4 * tile.focal_px
     rays = rays_of(view)
     normal = np.stack([slope_u, slope_v, w - slope_u * rays[..., 0] - slope_v * rays[..., 1]], axis=-1)
+    # The second difference is zero on a plane and large across an edge of depth.
     bend = np.maximum(np.abs(shifted(0, 2) + shifted(0, -2) - 2 * w), np.abs(shifted(2, 0) + shifted(-2, 0) - 2 * w))
     size = np.linalg.norm(normal, axis=-1, keepdims=True)
     unit_ray = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -108,18 +110,32 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
     """Which points no other view owns, and that few views look through.
 
     The owner of a surface is the view in the nearest ring of distance, rings growing by the factor ``exp(ring)``, and
-    the first of these; a strict order, so that exactly one view owns it. ``rgb`` (0..255) of the points that stay is
-    mixed with the colours that the agreeing views show, weighted by their nearness: exposure drifts and reflections
-    even out.
+    the first of these; a strict order, so that exactly one view owns it. A view agrees with a point that projects well
+    inside it if its inverse depth there is the same within ``tolerance`` plus 10 %; it looks through the point if it is
+    clearly smaller. Points are dropped if more than half as many views look through them as agree.
 
-    A view agrees with a point that projects well inside it if its inverse depth there is the same within ``tolerance``
-    (1/m) plus 10 %; it looks through the point if it is clearly smaller. Points go if more than half as many views look
-    through them as agree.
-    ``packed[k]`` projects from the points' frame into view k.
+    Args:
+        xyz: [n,3] points in the body's frame, metres.
+        depth: [n] depth in their own view, metres.
+        own_view: [n] index of that view.
+        rgb: [n,3] colours 0..255; changed: those of kept points are mixed with the colours that agreeing views show,
+            weighted by nearness, which evens out exposure drift and reflections.
+        packed: [k,23] projections from the points' frame into the views.
+        inverse_depth: [k,h,w] of the views, 1/m; NaN where a pixel is masked.
+        pictures: [k,h,w,3] colours of the views, 0..255.
+        present: [k] whether the body is there at each view's time.
+        tolerance: 1/m, see above.
+        ring: logarithm of the factor between rings of distance.
+        border: share of a view's width at its border in which it owns nothing.
+
+    Returns:
+        [n] True where the point stays.
     """
     keep = np.ones(len(xyz), np.bool_)
     for i in range(len(xyz)):
         agree, through, total = 0, 0, 1.0
+        # Rings instead of plain distance: neighbouring pixels then share one owner, and the surface does not become a
+        # patchwork of views with slightly different depth.
         own_ring = np.floor(np.log(depth[i]) / ring)
         mixed = rgb[i].copy()
         for k in range(len(packed)):
@@ -137,6 +153,7 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
                 if inside and (np.floor(np.log(z) / ring), k) < (own_ring, own_view[i]):
                     keep[i] = False
                     break
+                # Views from farther resolve the surface less: by the area of their pixels on it.
                 share = MIXING * (depth[i] / max(z, depth[i])) ** 2
                 total += share
                 for c in range(3):

@@ -3,7 +3,7 @@
 Sweeps give the geometry: they are gathered in the world (or in the box frame of their actor), thinned, and get normals.
 Images give the detail: each frame gets a dense depth, measured where surfels lie in it and matched against its
 neighbours elsewhere, and its pixels are lifted. Every surface is owned by the view that saw it from nearest; surfels
-stay where no view saw them. What nothing covers is sky.
+remain where no view saw them. Directions that nothing covers are sky.
 """
 
 from __future__ import annotations
@@ -33,6 +33,13 @@ def lift(
 ) -> GaussianScene:
     """Reconstruct a clip from its sweeps and the frames of the given cameras.
 
+    Args:
+        clip: the driving log.
+        cameras: ids of the cameras whose frames are used; may be empty.
+        hold_out: sweeps that must not be read, by index, of every LiDAR.
+        progress: called with the stage's name and the fraction of all work done, about.
+        settings: all settings of the method.
+
     Raises:
         ReconstructError: the clip has no LiDAR sweep to build from.
     """
@@ -54,6 +61,7 @@ def lift(
     views = [view for view in views if view.key]
     stages.start("colours")
     isp, unaligned_cameras = camera_isp(views, pictures, bodies, cameras)
+    # Responses first: colours of different cameras are mixed from here on.
     canonical = [colour.to_canonical(view.rgb, isp[view.camera_id]).astype(np.uint8) for view in views]
     stages.start("lifting")
     static, moving, lifted = Gaussians.empty(), [], 0
@@ -104,7 +112,7 @@ def lift(
 
 
 def _sky_weight(picture: DepthPicture, view: WorkingView, settings: LiftSettings) -> np.ndarray:
-    """How much each pixel tells of the sky: 1 if it is far and looks like sky, little if it is merely far."""
+    """Weight of each pixel in the sky: 1 if it is far and looks like sky, little if it is merely far."""
     far = (picture.inverse_depth < 1 / settings.views.max_depth_m) & view.tile.valid
     return np.where(far, np.where(picture.sky, 1.0, 0.02), 0.0)
 
@@ -122,7 +130,7 @@ _ENDS = {
 
 
 class _Stages:
-    """Tells the caller which stage runs. Times are the caller's business: a scene must not depend on the clock."""
+    """Reports the running stage. Timing is up to the caller: a scene must not depend on the clock."""
 
     def __init__(self, progress: Progress) -> None:
         self.progress, self.stage, self.begun = progress, "", 0.0
@@ -148,7 +156,7 @@ def _unknown(
     gathered: points.Gathered,
     unaligned_cameras: Sequence[str],
 ) -> list[str]:
-    """What the log did not tell, in plain words."""
+    """What the log does not contain, as notes for the provenance."""
     notes = []
     if clip.road_map is None:
         notes.append("no map: the road is grown from the driven path up to height steps")

@@ -31,10 +31,18 @@ class DepthPicture:
 def depth_pictures(
     views: Sequence[WorkingView], bodies: Sequence[Surfels], settings: LiftSettings, progress: Callable[[float], None]
 ) -> list[DepthPicture]:
-    """Dense depth of the key views, matched against all views."""
+    """Dense depth of the key views, matched against all views.
+
+    Args:
+        views: working views; those with ``key`` get a picture.
+        bodies: measured surfaces, the static world first.
+        settings: ``views``: depth levels and number of neighbours.
+        progress: called with the fraction of the key views that is done.
+    """
     keys = [k for k, view in enumerate(views) if view.key]
     options = settings.views
     step = 1 / options.min_depth_m / (options.levels - 1)
+    # The sky is judged against the brightest parts of this log: exposure differs between logs.
     bright = (
         float(np.percentile(np.concatenate([v.rgb[::8, ::8].mean(axis=-1).ravel() for v in views]), 98)) if views else 0
     )
@@ -53,6 +61,7 @@ def depth_pictures(
             )
             # Pixels that show nothing of the world neither agree with a point nor look through it.
             dense[~view.tile.valid] = np.nan
+            # Where smoothing overruled the splatted surfel, the pixel does not show that surfel.
             index[dense != prior] = -1
             drawn = np.where(index >= 0, body, STATIC)
             body = _bodies_of_pixels(view, bodies, dense, drawn)
@@ -96,6 +105,7 @@ def _bodies_of_pixels(view: WorkingView, bodies: Sequence[Surfels], dense: np.nd
                 continue
             box = geometry.transform_points(geometry.inverse(surfels.world_from_body(view.t_us)), xyz)
             size = surfels.box_size_m
+            # The lowest 15 cm of a box are road more often than tyre.
             upper = box[:, 2] > -size[2] / 2 + 0.15
             inside = geometry.points_in_box(box, size, 0.1) & upper
             found[inside & (found <= 0)] = number
@@ -116,6 +126,8 @@ def neighbours_of(views: Sequence[WorkingView], k: int, count: int) -> list[int]
         if n == k or not 0.25 < base < 8.0 or facing < 0.9:
             continue
         ahead = float(move @ mine.world_from_view[:3, 2])
+        # A short baseline does not resolve depth, a long one changes the appearance; ties go to views from farther
+        # back, whose images contain this one's surroundings.
         score = abs(np.log(base / 1.5)) + 2 * (1 - facing) + 0.3 * abs(other.t_us - mine.t_us) / 1e6
         scored.append((score + (0.05 if ahead > 0 else 0.0), n))
     return [n for _, n in sorted(scored)[:count]]

@@ -97,16 +97,25 @@ class _Voxels:
         self.pending = 0
 
     def add(self, xyz: np.ndarray, eye: np.ndarray, edge: np.ndarray, intensity: np.ndarray) -> None:
-        """Add the points of one sweep; ``edge`` is the voxel edge of each, a power of two times a constant."""
+        """Add the points of one sweep.
+
+        Args:
+            xyz: [n,3] points, metres.
+            eye: [n,3] where the sensor was, in the same frame.
+            edge: [n] voxel edge of each point in metres, a power of two times a constant.
+            intensity: [n] NaN where unknown.
+        """
         if not len(xyz):
             return
         cell = np.floor(xyz / edge[:, None]).astype(np.int64) + (1 << 18)
         level = np.clip(np.round(np.log2(edge / 0.001)).astype(np.int64), 0, 31)
+        # One int64 per voxel (5 bits of level, 19 per axis) sorts far faster than rows of four columns.
         key = ((level << 57) | (cell[:, 0] << 38) | (cell[:, 1] << 19) | cell[:, 2]).astype(np.int64)
         known = np.isfinite(intensity)
         ones = np.ones(len(xyz))
         rows = np.column_stack([xyz, eye, edge, np.where(known, intensity, 0.0), known, ones, np.zeros(len(xyz))])
         key, sums = _sum_by_key(key, rows)
+        # The last column counts sweeps, not points: carving compares it with the sweeps that look through.
         sums[:, -1] = 1
         self.keys.append(key)
         self.sums.append(sums)
@@ -186,7 +195,15 @@ def gather(
     settings: PointSettings,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Gathered:
-    """Read all sweeps but the held out ones, take out the ego car and the boxes, and thin the rest."""
+    """Read all sweeps but the held-out ones, remove the ego car, split off the boxes, and thin the rest.
+
+    Args:
+        clip: the driving log.
+        actors: movable tracks, whose points go to clouds of their own.
+        hold_out: sweeps that must not be read, by index, of every LiDAR.
+        settings: ranges, box margin and voxel sizes.
+        progress: called with the fraction of the sweeps that is done.
+    """
     path = clip.ego.position_m
     static, clouds = _Voxels(), {actor.index: _Voxels() for actor in actors}
     feet: dict[int, list[Cloud]] = {actor.index: [] for actor in actors}
@@ -217,6 +234,7 @@ def gather(
             inside, box_xyz, box_eye, foot = _inside(actor, xyz, eye, t_us, free, settings.box_margin_m)
             if not len(inside):
                 continue
+            # Every point belongs to one actor at most: to the first whose box holds it.
             free[inside] = False
             edge = np.full(len(inside), settings.min_voxel_m)
             up = ~foot
@@ -240,6 +258,7 @@ def _inside(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Indices of the points in an actor's box at their own times; the points and eyes in the box; which are feet."""
     size = np.asarray(actor.track.size_m)
+    # A cheap world-aligned test first: poses at the points' own times are only evaluated near the path.
     radius = np.linalg.norm(size) / 2 + margin_m
     low, high = actor.path.position_m.min(axis=0) - radius, actor.path.position_m.max(axis=0) + radius
     near = np.flatnonzero(free & np.all((xyz > low) & (xyz < high), axis=1) & actor.present(t_us))
@@ -277,6 +296,8 @@ def seen_through(cloud: Cloud, range_images: list[tuple[np.ndarray, np.ndarray]]
     """
     through = np.zeros(len(cloud), np.int32)
     for lidar_from_world, image in range_images:
+        # Minimum over 3 x 3 bins: a return at the rim of a bin, or on an edge beside the point, must not count as
+        # looking through.
         nearest = np.minimum(image, np.minimum(np.roll(image, 1, 0), np.roll(image, -1, 0)))
         nearest = np.minimum(nearest, np.minimum(np.roll(nearest, 1, 1), np.roll(nearest, -1, 1)))
         _count_through(cloud.xyz_m, lidar_from_world, nearest, through)
@@ -297,4 +318,5 @@ def _count_through(xyz, lidar_from_world, nearest, through):
         column = int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * AZIMUTHS) % AZIMUTHS
         if 1 <= row < ELEVATIONS - 1:
             seen = nearest[row, column]
+            # Behind by 5 % and 0.7 m: range noise and grazing ground must not carve what is there.
             through[i] += np.isfinite(seen) and seen > 1.05 * distance + 0.7

@@ -1,4 +1,4 @@
-"""The sky cubemap: colours of the pixels that no surface covers, and where there are none the sky goes on."""
+"""The sky cubemap: colours of the pixels that no surface covers, extrapolated where there are none."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ def make_sky(
 ) -> Float32[np.ndarray, "6 size size 3"]:
     """Average the far pixels of all views per cubemap texel and fill the rest as ``sky_fill`` does.
 
-    ``colours`` are canonical, 0..255; ``weights`` say how surely each pixel is sky, 0 if it is not.
+    Args:
+        views: working views.
+        colours: their canonical colours, 0..255, in the same order.
+        weights: how surely each pixel is sky; 0 if it is not.
+        size: edge of a cubemap face, texels.
     """
     total, count = np.zeros((6 * size * size, 3)), np.zeros(6 * size * size)
     for view, rgb, weight in zip(views, colours, weights, strict=True):

@@ -16,7 +16,14 @@ SPLAT_RADIUS = 0.5
 
 @inner
 def project_point(view, x, y, z):
-    """Pixel and depth of a point: (u, v, depth); depth <= 0 if behind. ``view`` is ``View.packed``."""
+    """Pixel and depth of a point: (u, v, depth); depth <= 0 if behind.
+
+    Args:
+        view: [23] packed projection (``WorkingView.packed``).
+        x: of the point, metres, in the frame that ``view`` projects from.
+        y: likewise.
+        z: likewise.
+    """
     a = view[5] * x + view[6] * y + view[7] * z + view[14]
     b = view[8] * x + view[9] * y + view[10] * z + view[15]
     c = view[11] * x + view[12] * y + view[13] * z + view[16]
@@ -24,6 +31,8 @@ def project_point(view, x, y, z):
         return 0.0, 0.0, -1.0
     u, v = view[0] * a / c + view[1], view[0] * b / c + view[2]
     if view[17] != 0.0 or view[18] != 0.0 or view[19] != 0.0:
+        # Where a point is shown depends on when its row was exposed, and the other way round: a fixed point, which
+        # contracts fast because the drift is small against the depth.
         for _ in range(3):
             f = min(max(view[20] * u + view[21] * v + view[22], -0.5), 0.5)
             d = c - view[19] * f
@@ -36,24 +45,38 @@ def project_point(view, x, y, z):
 
 @kernel
 def splat(view, xyz, normal, spacing, offset, front, total, weight, nearest, index, second):
-    """Draw surfels: in the first pass keep the smallest depth in ``front``, in the second average near it.
+    """Splat surfels: the first pass keeps the smallest depth in ``front``, the second averages near it.
 
     Each surfel covers a disc of its spacing and takes at every pixel the depth of its tangent plane, bounded so that a
     grazing plane does not run away. The second pass sums inverse depths within 4 % of the front, weighted by the
-    distance from the pixel's centre, so that noise does not pull surfaces forward; ``index`` gets ``offset`` + the row
-    of the surfel whose centre is nearest.
+    distance from the pixel's centre, so that noise does not pull surfaces forward.
+
+    Args:
+        view: [23] packed projection from the surfels' frame.
+        xyz: [n,3] centres, metres.
+        normal: [n,3] unit normals.
+        spacing: [n] distance between surfels, metres.
+        offset: added to row numbers in ``index``.
+        front: [h,w] largest inverse depth so far, 1/m; written in the first pass, read in the second.
+        total: [h,w] weighted sum of inverse depths; added to in the second pass.
+        weight: [h,w] sum of the weights; likewise.
+        nearest: [h,w] squared distance of the nearest surfel centre in radii; lowered in the second pass.
+        index: [h,w] ``offset`` + row of that surfel; written in the second pass.
+        second: whether this is the second pass.
     """
     width, height, focal = int(view[3]), int(view[4]), view[0]
     for i in range(len(xyz)):
         u, v, depth = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
         if depth < 0.3 or u < -8 or v < -8 or u > width + 8 or v > height + 8:
             continue
+        # Distant surfels should still hit a pixel; the upper bound limits the cost of surfels close to the camera.
         radius = min(max(SPLAT_RADIUS * spacing[i] * focal / depth, 0.6), 8.0)
         n0 = view[5] * normal[i, 0] + view[6] * normal[i, 1] + view[7] * normal[i, 2]
         n1 = view[8] * normal[i, 0] + view[9] * normal[i, 1] + view[10] * normal[i, 2]
         n2 = view[11] * normal[i, 0] + view[12] * normal[i, 1] + view[13] * normal[i, 2]
         along = n0 * (u - view[1]) / focal + n1 * (v - view[2]) / focal + n2
         w = 1.0 / depth
+        # dw = w^2 dz: the tangent plane may deviate by 1.5 spacings over the slope, and by 10 % at most.
         limit = min(1.5 * spacing[i] * w * w / max(abs(along), 0.05), 0.1 * w)
         for row in range(max(int(v - radius), 0), min(int(v + radius) + 1, height)):
             for column in range(max(int(u - radius), 0), min(int(u + radius) + 1, width)):
@@ -63,6 +86,7 @@ def splat(view, xyz, normal, spacing, offset, front, total, weight, nearest, ind
                     continue
                 here = w
                 if abs(along) > 1e-6:
+                    # On a plane w is linear in the pixel: w = n.ray / d, so dw / w = n.(du, dv, 0) / (f n.ray).
                     slant = w * (n0 * du + n1 * dv) / (focal * along)
                     here = w + min(max(slant, -limit), limit)
                 if not second:

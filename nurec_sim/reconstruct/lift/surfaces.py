@@ -55,18 +55,22 @@ def surface_of(cloud: Cloud, chunk: int = 200_000) -> tuple[Cloud, np.ndarray, n
         mean = np.einsum("nk,nkd->nd", weight, offset)
         centred = offset - mean[:, None]
         covariance = np.einsum("nk,nki,nkj->nij", weight, centred, centred)
+        # Principal axes of the neighbourhood, variances ascending: the first axis is the normal of a plane.
         variance, axes = np.linalg.eigh(covariance)
         normal = axes[:, :, 0]
         line = variance[:, 1] < LINE_RATIO * variance[:, 2]
         along = axes[:, :, 2]
+        # The direction to the sensor without its part along the line.
         facing = to_eye[part] - np.sum(to_eye[part] * along, axis=1, keepdims=True) * along
         facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
         normal = np.where(line[:, None], facing, normal)
         plane = ~line & (variance[:, 0] < PLANE_RATIO * variance[:, 1])
         height = np.where(plane, np.sum(normal * mean, axis=1), 0.0)
+        # Projection onto the local plane through the neighbours' mean; only where they are clearly flat.
         xyz[part] += height[:, None] * normal
         flip = np.sum(normal * to_eye[part], axis=1) < 0
         normals[part] = np.where(flip[:, None], -normal, normal)
+        # The fourth neighbour, not the first: its distance is steadier where sampling is uneven.
         spacing[part] = np.clip(distance[:, min(4, k)] * 0.7, cloud.spacing_m[part], 3 * cloud.spacing_m[part])
     return dataclasses.replace(cloud, xyz_m=xyz), normals, spacing
 
@@ -89,7 +93,17 @@ def discs(
     label: UInt8[np.ndarray, " n"],
     opacity: float,
 ) -> Gaussians:
-    """Gaussians as round discs in the surface, one per point, thin along the normal."""
+    """Gaussians as round discs in the surface, one per point, thin along the normal.
+
+    Args:
+        xyz_m: centres, metres.
+        normal: unit normals.
+        spacing_m: distance between points; the discs' standard deviation is ``DISC_SIGMA`` of it.
+        rgb: colours 0..1; clipped.
+        intensity: LiDAR intensity; NaN where unknown.
+        label: ``Label`` of each point.
+        opacity: of all of them.
+    """
     across = np.asarray(spacing_m, np.float64) * DISC_SIGMA
     scale = np.column_stack([across, across, np.maximum(0.05 * across, THINNEST_M)])
     return _gaussians(xyz_m, rotation_onto(normal), scale, normal, rgb, intensity, label, opacity)
@@ -106,10 +120,19 @@ def footprints(
     opacity: float,
     stretch_limit: float | Float64[np.ndarray, " n"] = MOST_STRETCH,
 ) -> Gaussians:
-    """Gaussians as the shadows of pixels on the surface: ``pixel_m`` wide across ``ray``, stretched along its slope.
+    """Gaussians as the shadows of pixels on the surface: one pixel wide across the ray, stretched along its slope.
 
-    ``stretch_limit`` bounds the stretch, which is 1 / cosine of the incidence: a surface whose slope is not sure would
-    reach far into free space.
+    Args:
+        xyz_m: points, metres.
+        normal: unit normals.
+        ray: unit directions from the camera.
+        pixel_m: width of a pixel at the point's depth, metres.
+        rgb: colours 0..1; clipped.
+        intensity: LiDAR intensity; NaN where unknown.
+        label: ``Label`` of each point.
+        opacity: of all of them.
+        stretch_limit: bound of the stretch, which is 1 / cosine of the incidence: a surface of uncertain slope would
+            reach far into free space.
     """
     facing = np.abs(np.sum(normal * ray, axis=1))
     # First axis: along the slope, where the footprint is stretched; second: across it.

@@ -115,6 +115,7 @@ def without_ego(tile: Tile, camera: CameraModel, body: Box) -> Tile:
     u, v = np.meshgrid(np.arange(tile.width) + 0.5, np.arange(tile.height) + 0.5)
     rays = np.stack([(u - tile.center_px[0]) / tile.focal_px, (v - tile.center_px[1]) / tile.focal_px, u * 0 + 1], -1)
     rays = rays @ (camera.rig_from_camera[:3, :3] @ tile.camera_from_tile).T
+    # Slab test against the box; no division by zero for rays along a face.
     rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
     near, far = (low - origin) / rays, (high - origin) / rays
     enter, leave = np.minimum(near, far).max(axis=-1), np.maximum(near, far).min(axis=-1)
@@ -142,6 +143,7 @@ def _resampled_tile(
     rays = np.stack([(u - center[0]) / focal, (v - center[1]) / focal, np.ones_like(u)], axis=-1).reshape(-1, 3)
     uv, seen = sensors.project(camera, rays @ camera_from_tile.T)
     seen &= sensors.in_image(camera, uv)
+    # cv2 counts pixel centres from 0, the lenses from 0.5.
     uv = np.where(seen[:, None], uv, -1e4) / reduction - 0.5
     maps = uv[:, 0].reshape(height, width).astype(np.float32), uv[:, 1].reshape(height, width).astype(np.float32)
     tile = Tile(
@@ -162,6 +164,7 @@ def _with_fraction(tile: Tile, camera: CameraModel) -> Tile:
     seen &= sensors.in_image(camera, uv)
     target = sensors.shutter_fraction(camera, uv[seen]) - 0.5
     basis = np.column_stack([u, v, np.ones_like(u)])[seen]
+    # Linear in the pixel is enough for kernels: exact for a pinhole tile along its rows, close to it for turned tiles.
     solution = np.linalg.lstsq(basis, target, rcond=None)[0]
     return dataclasses.replace(tile, fraction=solution)
 
@@ -169,7 +172,14 @@ def _with_fraction(tile: Tile, camera: CameraModel) -> Tile:
 def choose_frames(
     clip: Clip, cameras: Sequence[str], tiles: int, settings: ViewSettings
 ) -> list[tuple[str, int, bool]]:
-    """(camera, frame, whether it is a key frame) in order of time, thinned evenly to the limits of the settings."""
+    """(camera, frame, whether it is a key frame) in order of time, thinned evenly to the limits of the settings.
+
+    Args:
+        clip: the driving log.
+        cameras: ids of the cameras.
+        tiles: number of tiles of all cameras together; every frame gives one view per tile.
+        settings: ``max_frames`` and ``max_views``.
+    """
     counts = {camera: len(clip.camera_times_us(camera)) for camera in cameras}
     total = sum(counts.values()) * tiles / max(len(cameras), 1)
     skip = max(1, int(np.ceil(total / settings.max_frames)))
@@ -186,7 +196,14 @@ def read_views(
     settings: ViewSettings,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[WorkingView]:
-    """Read and resample the chosen frames of the cameras."""
+    """Read and resample the chosen frames of the cameras.
+
+    Args:
+        clip: the driving log.
+        cameras: ids of the cameras.
+        settings: size of the views and how many.
+        progress: called with the fraction of the frames that is read.
+    """
     tiles = {}
     for camera in cameras:
         model = clip.rig.cameras[camera]
@@ -199,6 +216,7 @@ def read_views(
         start_us, end_us = (int(t) for t in clip.camera_times_us(camera)[frame])
         pair = np.asarray(clip.world_from_camera(camera, frame), np.float64)
         world_from_camera = geometry.interpolate_pose_pair(pair, np.array(0.5))
+        # Rotation during the exposure is neglected: kernels know one pose per view and a shift.
         travel = world_from_camera[:3, :3].T @ (pair[1, :3, 3] - pair[0, :3, 3])
         for tile in tiles[camera]:
             pose = world_from_camera @ geometry.pose(tile.camera_from_tile, np.zeros(3))

@@ -37,7 +37,15 @@ class NetworkMethod:
         hold_out_sweeps: Collection[int],
         progress: Progress,
     ) -> GaussianScene:
-        """The scene of a log (``types.Method``)."""
+        """The scene of a log (``types.Method``).
+
+        Args:
+            clip: the driving log.
+            settings: of this method.
+            cameras: ids of the cameras to use; None: as many as the profile takes.
+            hold_out_sweeps: LiDAR sweeps that must not be read, by index.
+            progress: called with the stage's name and the fraction of all work done.
+        """
         from nurec_sim.reconstruct.feedforward.method import feedforward
 
         return feedforward(clip, self.name, cameras, set(hold_out_sweeps), progress, settings)

@@ -28,6 +28,14 @@ class Optimized:
         hold_out_sweeps: Collection[int],
         progress: Progress,
     ) -> GaussianScene:
-        """The scene of a log (``types.Method``)."""
+        """The scene of a log (``types.Method``).
+
+        Args:
+            clip: the driving log.
+            settings: of this method.
+            cameras: ids of the cameras to use; None: all of the rig.
+            hold_out_sweeps: LiDAR sweeps that must not be read, by index.
+            progress: called with the stage's name and the fraction of all work done.
+        """
         held = sorted(hold_out_sweeps)
         return reconstruct(clip, "lift", cameras=cameras, hold_out_sweeps=held, progress=progress, refine=settings)

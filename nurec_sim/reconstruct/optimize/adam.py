@@ -48,6 +48,7 @@ def adam_step(
         i = rows[row]
         for k in range(3):
             gradient[MEAN + k] = by_mean[i, k]
+            # Chain rule of the activations: d exp(x) / dx = exp(x), d sigmoid(x) / dx = s (1 - s).
             gradient[SCALE + k] = by_scale[i, k] * scale[i, k]
             gradient[RGB + k] = by_rgb[i, k]
         for k in range(4):
@@ -74,8 +75,10 @@ def adam_step(
             second[i, k] = BETA2 * second[i, k] + (1 - BETA2) * g * g
             step = first[i, k] / correction1 / (np.sqrt(second[i, k] / correction2) + EPSILON)
             values[i, k] -= rates[k] * step
+        # Bounds: a scale near 0 makes the covariance singular, a huge one covers the view from inside.
         for k in range(SCALE, SCALE + 3):
             values[i, k] = min(max(values[i, k], low), high)
+        # The renderer takes unit quaternions, and a step leaves the unit sphere.
         norm = 0.0
         for k in range(QUAT, QUAT + 4):
             norm += values[i, k] * values[i, k]
@@ -86,7 +89,17 @@ def adam_step(
 
 @kernel
 def activate(rows, values, mean, quat, scale, opacity, rgb):
-    """What is drawn, [n,...], of the values of some Gaussians, in their own frames."""
+    """Write what is rendered of some Gaussians, in their own frames: activations of the optimised values.
+
+    Args:
+        rows: [k] which ones.
+        values: [n,14] what is optimised, see ``MEAN`` and the others.
+        mean: [n,3] output, metres.
+        quat: [n,4] output, (w, x, y, z), unit.
+        scale: [n,3] output, standard deviations in metres: exp of the log scales.
+        opacity: [n] output: sigmoid of the logits.
+        rgb: [n,3] output.
+    """
     for row in range(rows.shape[0]):
         i = rows[row]
         for k in range(3):
@@ -100,7 +113,16 @@ def activate(rows, values, mean, quat, scale, opacity, rgb):
 
 @kernel
 def adam_cells(values, first, second, visits, gradient, rate):
-    """One step on the cells [n,c] of a table that have a gradient, and those only; values stay within 0..1."""
+    """One step of Adam on the cells of a table that have a gradient, and those only; values stay within 0..1.
+
+    Args:
+        values: [n,c] what is optimised; changed.
+        first: [n,c] first moments; changed.
+        second: [n,c] second moments; changed.
+        visits: [n] steps so far; changed.
+        gradient: [n,c] cells whose row is all 0 are skipped.
+        rate: learning rate.
+    """
     for i in range(values.shape[0]):
         touched = False
         for k in range(values.shape[1]):

@@ -1,4 +1,4 @@
-"""The loss at LiDAR returns: relative error of the rendered inverse depth, and what of the ray goes on behind."""
+"""The loss at LiDAR returns: relative error of the rendered inverse depth, and transparency of what was hit."""
 
 from __future__ import annotations
 
@@ -60,12 +60,15 @@ def _depth_loss(uv, depth, alpha, distance, ray_z, depth_weight, solid_weight, b
                 a = alpha[top + i, left + j]
                 z = ray_z[top + i, left + j] if ray_z.size > 1 else 1.0
                 d = distance[top + i, left + j] * z
+                # Rendered distance is the alpha-weighted sum, so distance / alpha is the mean distance and alpha /
+                # distance its inverse.
                 inverse[i, j] = a / d if d > 1e-6 else 0.0
                 seen += weight[i, j] * inverse[i, j]
                 least = min(least, a)
                 total += solid_weight * weight[i, j] * (1 - a)
                 by_alpha[top + i, left + j] -= solid_weight * weight[i, j]
         error = depth[n] * seen - 1
+        # Transparent pixels have no meaningful depth, outliers lie on another surface: constant loss, no gradient.
         if least < 0.3 or abs(error) >= OUTLIER:
             total += depth_weight * min(abs(error), OUTLIER)
             continue
@@ -74,6 +77,7 @@ def _depth_loss(uv, depth, alpha, distance, ray_z, depth_weight, solid_weight, b
         for i in range(2):
             for j in range(2):
                 a, d = alpha[top + i, left + j], distance[top + i, left + j]
+                # d(a / d) / da = (a / d) / a and d(a / d) / dd = -(a / d) / d.
                 share = by_inverse * weight[i, j] * inverse[i, j]
                 by_alpha[top + i, left + j] += share / a
                 by_distance[top + i, left + j] -= share / d

@@ -28,6 +28,7 @@ def colour_loss(
     difference = shown - recorded
     absolute = float(np.abs(difference).mean())
     similarity, by_shown = _mean_ssim(shown, recorded)
+    # d|x| / dx = sign(x); each mean divides by the number of values.
     gradient = np.sign(difference) * np.float32((1 - dssim) / shown.size) - np.float32(dssim) * by_shown
     return (1 - dssim) * absolute + dssim * (1 - similarity), gradient
 
@@ -35,6 +36,7 @@ def colour_loss(
 def _mean_ssim(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
     """Mean SSIM over pixels and channels, and its gradient by x."""
     mean_x, mean_y = _blur(x), _blur(y)
+    # Var = E[x^2] - E[x]^2 with the Gaussian window as weights.
     variance_x, variance_y = _blur(x * x) - mean_x * mean_x, _blur(y * y) - mean_y * mean_y
     covariance = _blur(x * y) - mean_x * mean_y
     a1, a2 = 2 * mean_x * mean_y + C1, 2 * covariance + C2

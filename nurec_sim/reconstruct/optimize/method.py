@@ -105,11 +105,13 @@ class Optimization:
         shown = self._shown(view, frame, colour)
         loss, by_shown = colour_loss(shown, recorded, weights.dssim)
 
+        # Back through shown = R (c + (1 - alpha) sky) + b: to the composited colour, from there to alpha and the sky.
         by_colour = np.einsum("ij,hwi->jhw", response[:, :3], by_shown)
         by_alpha = -(by_colour * behind).sum(axis=0)
         by_distance = np.zeros_like(alpha)
         loss += depth_loss(view.returns, alpha, planes[4], frame.ray_z, weights.depth, weights.solid, by_alpha,
                            by_distance)  # fmt: skip
+        # The sky mask is fixed at a view's first step: taken anew, it would follow what it is meant to hold.
         sky = self._clear.setdefault(number, np.flatnonzero(alpha < SEEN_SKY))
         if len(sky):
             by_alpha.reshape(-1)[sky] += weights.sky / len(sky)
@@ -157,4 +159,5 @@ class Optimization:
         """Numbers of views: every one once, in random order, again and again."""
         random = np.random.default_rng(self.settings.seed)
         while True:
+            # Without replacement: every view counts once per round.
             yield from random.permutation(len(self.views)).tolist()

@@ -92,6 +92,7 @@ class Parameters:
             shown[alive] = fade
             place = values[:, MEAN : MEAN + 3].copy()
             free = ~self._rigid[alive]
+            # The trajectory keeps its shape: the optimised middle knot shifts all knots alike.
             place[alive[free]] += knot_m[free] - self._start_m[alive[free]]
             turned = values[:, QUAT : QUAT + 4].copy()
             for index in np.unique(dynamic.track[self._rigid]):
@@ -148,7 +149,15 @@ class Parameters:
 
 
 def rate_columns(mean_m: float, quat: float, log_scale: float, logit_opacity: float, rgb: float) -> np.ndarray:
-    """Learning rates per value, [14]."""
+    """Learning rates per value, [14], in the order of ``adam.MEAN`` and the others.
+
+    Args:
+        mean_m: of means.
+        quat: of quaternions.
+        log_scale: of log standard deviations.
+        logit_opacity: of opacity logits.
+        rgb: of colours.
+    """
     return np.repeat([mean_m, quat, log_scale, logit_opacity, rgb], [3, 4, 3, 1, 3]).astype(np.float64)
 
 
@@ -167,8 +176,10 @@ def _values(gaussians: Gaussians) -> Float32[np.ndarray, "n 14"]:
 def _with_values(gaussians: Gaussians, values: Float32[np.ndarray, "n 14"]) -> Gaussians:
     """A layer with new values; quaternions have w >= 0, and normals turn with the Gaussians."""
     quat = values[:, QUAT : QUAT + 4].astype(np.float64)
+    # q and -q are one rotation; layers hold the one with w >= 0.
     quat = np.where(quat[:, :1] < 0, -quat, quat)
     was = geometry.quat_normalize(gaussians.quat_wxyz.astype(np.float64))
+    # q_new q_old^-1 (the conjugate of a unit quaternion) takes the old normal to the new one.
     turn = geometry.quat_multiply(quat, was * np.array([1.0, -1.0, -1.0, -1.0]))
     normal = np.einsum("nij,nj->ni", geometry.matrix_from_quat(turn), gaussians.normal.astype(np.float64))
     return dataclasses.replace(

@@ -36,7 +36,14 @@ class FrameResponses:
     def start(
         self, camera: str, frame: int, shown: Float32[np.ndarray, "h w 3"], recorded: Float32[np.ndarray, "h w 3"]
     ) -> None:
-        """Set the gains of a frame to the ratio of the images' mean colours."""
+        """Set the gains of a frame to the ratio of the images' mean colours.
+
+        Args:
+            camera: id of the camera.
+            frame: index among its images.
+            shown: the rendered image.
+            recorded: the image of the log.
+        """
         ratio = recorded.mean(axis=(0, 1), dtype=np.float64) / np.maximum(shown.mean(axis=(0, 1)), 1e-3)
         self._values[camera][frame, 0] = np.log(np.clip(ratio, *GAINS))
 
@@ -53,8 +60,18 @@ class FrameResponses:
         rate: float,
         weight: float,
     ) -> None:
-        """One step of Adam on one frame, of an image and the gradient of the loss by its colours."""
+        """One step of Adam on the gains and offsets of one frame.
+
+        Args:
+            camera: id of the camera.
+            frame: index among its images.
+            shown: the rendered image after this response.
+            by_shown: gradient of the loss by ``shown``.
+            rate: learning rate.
+            weight: of the squares of log gains and offsets in the loss.
+        """
         values = self._values[camera][frame]
+        # shown = exp(gain) x + offset, so d shown / d gain = shown - offset, and d shown / d offset = 1.
         by_offset = by_shown.sum(axis=(0, 1), dtype=np.float64)
         by_gain = np.einsum("hwc,hwc->c", by_shown, shown, dtype=np.float64) - by_offset * values[1]
         self._adam[camera, frame].step(values, np.stack([by_gain, by_offset]) + 2 * weight * values, rate)
@@ -70,10 +87,16 @@ def borrowed_responses(
     rig: Rig,
     cameras: Sequence[str],
 ) -> dict[str, Float64[np.ndarray, "frames 3 4"]]:
-    """Responses of cameras that were not seen: those of the camera that is most like them, at the same instants.
+    """Responses of cameras that were not fitted: those of the most similar fitted camera, at the same instants.
 
-    A pair of cameras of one kind on one car is exposed alike. Alike are lenses and sizes; of several such cameras the
-    one that looks most nearly in the same direction counts. A camera like no other gets none.
+    A pair of cameras of one kind on one car is exposed alike. Similar means equal lens type and image size; of several
+    such cameras the one closest in viewing direction counts. A camera unlike all others gets none.
+
+    Args:
+        responses: of the fitted cameras, by frame.
+        times_us: start and end of the exposures of every camera, [frames,2].
+        rig: the cameras.
+        cameras: ids of the cameras that need a response.
     """
     borrowed = {}
     for name in cameras:

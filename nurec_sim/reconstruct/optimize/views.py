@@ -60,7 +60,14 @@ class TrainingView:
 def training_views(
     clip: Clip, scene: GaussianScene, cameras: Sequence[str], hold_out_sweeps: set[int]
 ) -> list[TrainingView]:
-    """All images of some cameras, in the order of cameras and frames."""
+    """All images of some cameras, in the order of cameras and frames.
+
+    Args:
+        clip: the driving log.
+        scene: its tracks tell which returns belong to something that moves.
+        cameras: ids of the cameras.
+        hold_out_sweeps: sweeps that must not be read, by index, of every LiDAR.
+    """
     sweeps = _Sweeps(clip, scene, hold_out_sweeps)
     views = []
     for name in cameras:
@@ -133,6 +140,7 @@ def _hidden(uv: np.ndarray, depth: np.ndarray, shape: tuple[int, int]) -> Bool[n
     """Returns that lie behind another one in the same cell or in one beside it."""
     rows, columns = shape[0] // CELL_PX + 1, shape[1] // CELL_PX + 1
     row, column = (uv[:, 1] / CELL_PX).astype(np.int64), (uv[:, 0] / CELL_PX).astype(np.int64)
+    # A coarse z-buffer, with a rim of one cell so that the 3 x 3 minimum needs no special case at the border.
     nearest = np.full((rows + 2, columns + 2), np.inf)
     np.minimum.at(nearest, (row + 1, column + 1), depth)
     around = np.min([nearest[1 + i : rows + 1 + i, 1 + j : columns + 1 + j] for i in (-1, 0, 1) for j in (-1, 0, 1)], 0)

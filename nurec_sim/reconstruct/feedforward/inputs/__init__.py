@@ -1,1 +1,1 @@
-"""From a window of a clip to what the network takes."""
+"""From a window of a clip to the network's inputs."""

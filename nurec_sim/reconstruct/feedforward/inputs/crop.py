@@ -101,6 +101,15 @@ def crop_exposure(
 
     A crop across a rolling shutter sees only a part of the exposure. With these two ends, ``sensors.shutter_fraction``
     of the cropped camera gives every line the pose that it had in the whole image; resizing alone changes nothing.
+
+    Args:
+        camera: the camera before the crop.
+        crop: the resize and crop.
+        t_us: start and end of the whole image's exposure, microseconds.
+        world_from_camera: poses at those two instants.
+
+    Returns:
+        Times and poses in the same form, of the crop.
     """
     if camera.shutter is Shutter.GLOBAL:
         return t_us, world_from_camera

@@ -1,4 +1,4 @@
-"""Which cameras of a clip go through the network, how the clip is cut into chunks, and which frames each chunk sees.
+"""Choice of the cameras of a clip, of its chunks, and of the frames in each chunk.
 
 A reference time takes the frame of each camera whose exposure ends nearest to it. Everything is int64 microseconds.
 """
@@ -111,6 +111,8 @@ def _by_geometry(cameras: Sequence[CameraModel]) -> list[CameraModel]:
         for one, other in itertools.product(left, right):
             a, b = azimuth[one.id], -azimuth[other.id]
             if abs(a - b) <= PAIR_ASYMMETRY_DEG:
+                # Pairs should be where surround rigs have them, symmetric, and with the field of view of the training
+                # data.
                 cost = abs((a + b) / 2 - wanted) + abs(a - b) + width[one.id] + width[other.id]
                 costs.append((round(cost), (one, other)))
         if not costs:
@@ -140,11 +142,18 @@ def chunk_windows(
     """Cut a clip into chunks and choose their frames.
 
     ``overlapping`` (paper section 3.4): reference times from the first to the last frame that all cameras have, evenly
-    at 2 to 4 Hz; a chunk holds as many as the profile takes and repeats the share ``settings.overlap`` of the one
-    before. A single camera may show more frames (``profile.frames_alone``), not for longer but as much more often.
-    ``non-overlapping`` (the release): equal chunks of at most 750 ms per frame, sampled without a half step,
-    over the interval that lies within 0.1 s of every camera's frames. No frame occurs twice in a chunk: where a log has
-    fewer frames than asked for, the chunk has fewer, always as many for every camera.
+    at 2 to 4 Hz; a chunk holds as many as the profile takes and repeats the share ``settings.overlap`` of the previous
+    one. A single camera may contribute more frames (``profile.frames_alone``), denser in time over the same span.
+
+    ``non-overlapping`` (the release): equal chunks of at most 750 ms per frame, sampled without a half step, over the
+    interval that lies within 0.1 s of every camera's frames. No frame occurs twice in a chunk: where a log has fewer
+    frames than requested, the chunk has fewer, always equally many per camera.
+
+    Args:
+        clip: the driving log.
+        cameras: ids in the network's order (``choose_cameras``).
+        profile: bounds the number of frames per camera.
+        settings: ``chunking``, ``overlap``, ``frames`` and ``max_chunks`` are used.
 
     Raises:
         ReconstructError: cameras that do not record at the same time, more than ``settings.max_chunks`` chunks, or a
@@ -196,6 +205,7 @@ def _usable_interval(
 
 def _separate_times(span: int, count: int) -> tuple[int, list[Int64[np.ndarray, " n"]]]:
     """Number of chunks, and the release's times of each from the start of the interval."""
+    # ceil(span / (frames * 750 ms)) in integers; reference times at start + k * span / (frames * chunks), no half step.
     chunks = max(1, -(-span // (count * RELEASE_STEP_US)))
     times = np.arange(count * chunks, dtype=np.int64) * span // (count * chunks)
     return chunks, np.split(times, chunks)
@@ -208,6 +218,7 @@ def _shared_times(span: int, count: int, overlap: float, usual: int) -> tuple[in
     """
     slowest, fastest = (step * usual // max(count, usual) for step in (SLOWEST_STEP_US, FASTEST_STEP_US))
     advance = max(1, count - round(count * overlap))
+    # A chunk covers (count - 1) steps, each further one adds ``advance`` steps: as few chunks as 2 Hz allows.
     beyond = span - (count - 1) * slowest
     if beyond > 0:
         chunks = 1 - (-beyond // (advance * slowest))
@@ -226,6 +237,7 @@ def _nearest_frames(
     nearest = np.stack([np.abs(e[:, 1] - times[:, None]).argmin(axis=1) for e in exposures.values()], axis=1)
     kept = [nearest[0]]
     for frames in nearest[1:]:
+        # Camera by camera as many frames: a time is dropped for all of them as soon as one camera would repeat.
         if (frames > kept[-1]).all():
             kept.append(frames)
     return {camera: tuple(int(row[k]) for row in kept) for k, camera in enumerate(exposures)}

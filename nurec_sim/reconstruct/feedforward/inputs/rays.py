@@ -1,4 +1,4 @@
-"""Where every pixel of a context image looks, and the pinhole that stands for its camera in the encoder."""
+"""Rays of every pixel of a context image, and the pinhole that represents its camera in the encoder."""
 
 from __future__ import annotations
 
@@ -48,6 +48,7 @@ def scene_rays(
     by_columns = camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
     if by_columns:
         rays = rays.swapaxes(0, 1)
+    # The exposure time depends on the line only: one pose per line instead of one per pixel.
     lines = np.arange(len(rays)) + 0.5
     fractions = sensors.shutter_fraction(camera, np.stack([lines, lines], axis=1))
     poses = geometry.interpolate_pose_pair(scene_from_camera, fractions)  # [lines, 4, 4]

@@ -1,4 +1,4 @@
-"""From a window of a clip to what the network takes."""
+"""From a window of a clip to the network's inputs."""
 
 from __future__ import annotations
 
@@ -49,10 +49,16 @@ class _View:
 
 
 def chunk_inputs(clip: Clip, profile: Profile, window: ChunkWindow, settings: FeedForwardSettings) -> ChunkInputs:
-    """Read, resize and crop the frames of a window, and work out their geometry in its scene frame.
+    """Read, resize and crop the frames of a window, and compute their geometry in its scene frame.
 
     Poses stay float64 and times integers up to the scene frame; the same input gives the same bits. ``ego`` of the
-    result also holds the pixels that the lens does not reach: they show no world either.
+    result also covers the pixels outside the lens's field: they show no world either.
+
+    Args:
+        clip: the driving log.
+        profile: size of the input images.
+        window: frame indices per camera, and the chunk's time span.
+        settings: ``image_pixels`` and ``ego_masks`` are used.
 
     Raises:
         ReconstructError: an ego mask or a lens cannot be used, or the profile has no images of the wanted size.
@@ -68,6 +74,8 @@ def chunk_inputs(clip: Clip, profile: Profile, window: ChunkWindow, settings: Fe
     shown = [views[k] for k in camera_idxs]
 
     ends = [clip.world_from_camera(image.camera.id, image.frame)[1] for image in images]
+    # Scene frame: the first context camera at the end of its first exposure, as in the release. World coordinates may
+    # be large; relative to the scene they fit into float32.
     world_from_scene = np.asarray(ends[0], np.float64)
     scene_from_world = geometry.inverse(world_from_scene)
 
@@ -128,13 +136,13 @@ def span_fractions(times: Int64[np.ndarray, "*n"], window: ChunkWindow) -> Float
     """Times as fractions of the chunk, which may lie outside of 0..1; differences are taken in integers."""
     length = window.span_us[1] - window.span_us[0]
     if all(len(frames) == 1 for frames in window.frames.values()):
-        # One exposure has no length to speak of: targets half a second away would lie far outside of it.
+        # A single exposure lasts milliseconds: as fractions of it, targets half a second away would be huge.
         length = max(length, LONE_FRAME_GAP_US)
     return (times - window.span_us[0]) / max(length, 1)
 
 
 def _rescaled(scene_from_camera: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-    """A pose in the unit in which the network thinks."""
+    """A pose in the network's unit of length."""
     pose = scene_from_camera.copy()
     pose[:3, 3] *= SCENE_RESCALE
     return pose

@@ -1,8 +1,8 @@
 """Predicted depth, image by image, fitted to the log's LiDAR sweeps.
 
-The network knows distances only as well as its training did; sweeps know them to centimetres, at a few pixels. One
+The network's distances are only as accurate as its training; sweeps measure them to centimetres, at a few pixels. One
 factor per image takes the prediction to the measurements, optionally with a slope over inverse depth, or with a field
-of factors (``lidar_field``) that follows them from place to place.
+of factors (``lidar.field``) that follows them across the image.
 """
 
 from __future__ import annotations
@@ -135,6 +135,7 @@ def fit_depth(
         if is_static is None:
             factor *= _local_factors(rough_m, use, seen)
         else:
+            # Static surfaces stay where they are, so sweeps from farther in time measure them too.
             more = visible_points(clip, chunk, hold_out_sweeps, STANDING_TIME_US, STANDING_SWEEPS)
             static = _local_factors(rough_m, use & is_static, more)
             factor *= np.where(is_static, static, _local_factors(rough_m, use & ~is_static, seen))
@@ -188,6 +189,7 @@ def _fit_images(images: Sequence[ContextImage], pairs: Sequence[tuple[Values, Va
                 scale, slope, range_m = _affine(predicted, measured, scale)
         elif own:
             taken_from = "camera" if same else "chunk"
+            # The camera's other images share its calibration errors, so they are the better guess than other cameras.
             scale = float(np.exp(np.median(np.log(same or list(own.values())))))
         fits.append(
             ImageFit(image.camera.id, image.frame, len(predicted), taken_from, scale, slope, range_m, None, None)
@@ -203,6 +205,7 @@ def _error(pairs: Sequence[tuple[Values, Values]]) -> float | None:
 
 def _scale(predicted: Values, measured: Values) -> float:
     """The factor from predicted to measured depth: the median ratio, then the mean of those that agree with it."""
+    # Log ratios: a factor of 2 and one of 1/2 are equally wrong.
     ratio = np.log(measured / predicted)
     centre = float(np.median(ratio))
     for _ in range(TUKEY_STEPS):
@@ -224,11 +227,15 @@ def _affine(predicted: Values, measured: Values, scale: float) -> tuple[float, f
     ratio = measured / predicted
     inverse, slope = 1 / scale, 0.0
     for step in range(ABSOLUTE_STEPS + TUKEY_STEPS):
+        # 1 / measured = inverse / predicted + slope, multiplied by measured: linear in both unknowns, with relative
+        # errors.
         error = inverse * ratio + slope * measured - 1
+        # Weights 1 / |e| turn least squares into least absolute errors, step by step.
         weight = 1 / np.maximum(np.abs(error), 1e-4) if step < ABSOLUTE_STEPS else _tukey(error)
         # Plain sums instead of a matrix product: the same bytes at any number of threads.
         a, b, c = (float(np.sum(weight * term)) for term in (ratio * ratio, ratio * measured, measured * measured))
         x, y = float(np.sum(weight * ratio)), float(np.sum(weight * measured))
+        # The 2 x 2 normal equations by Cramer's rule; nearly singular if all points have about one depth.
         determinant = a * c - b * b
         if determinant <= 1e-9 * a * c:
             return plain

@@ -1,7 +1,7 @@
-"""Factors on an image's depth that follow LiDAR points from place to place, and from surface to surface.
+"""Factors on an image's depth that follow LiDAR points across the image and across depth.
 
-A factor belongs to a cell of the image and of depth (a bilateral grid), so that points on a car say nothing of the
-house behind it. Grids are refined step by step: where points are few, only coarse ones know something.
+A factor belongs to a cell of the image and of log depth (a bilateral grid, Chen et al. 2007), so that points on a car
+do not change the house behind it. Grids are refined step by step: where points are sparse, only coarse ones have data.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def field_factor(
     uv: Float64[np.ndarray, "n 2"],
     measured_m: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "h w"]:
-    """What to multiply an image's depth by; 1 where no point is near.
+    """Factors on an image's depth; 1 where no point is near.
 
     Args:
         depth_m: predicted depth, already right on the whole.
@@ -46,7 +46,9 @@ def field_factor(
         residual = measured - log_depth[row, column]
         if not len(residual):
             break
+        # 1.4826 * MAD estimates the standard deviation of a normal distribution, unmoved by outliers.
         deviation = max(1.4826 * float(np.median(np.abs(residual))), LEAST_DEVIATION)
+        # Cauchy weights from three deviations on; they shrink as the field fits better from level to level.
         weight = (np.abs(residual) < LARGEST_LOG) / (1 + (residual / (3 * deviation)) ** 2)
         # Where each pixel lies in the grid.
         lowest = log_depth.min()
@@ -56,6 +58,10 @@ def field_factor(
         total, known = np.zeros(shape), np.zeros(shape)
         np.add.at(total, cell, weight * residual)
         np.add.at(known, cell, weight)
+        # Normalised convolution: blurred residuals over blurred weights; DOUBT pulls towards no change where there are
+        # few.
         total, known = (gaussian_filter(each, SPREAD_CELLS, mode="constant") for each in (total, known))
+        # Trilinear slicing at each pixel's own depth: the factor is smooth within a surface and may jump between
+        # surfaces.
         log_depth = log_depth + map_coordinates(total / (known + DOUBT), grid, order=1, mode="nearest")
     return np.exp(log_depth - first)

@@ -1,4 +1,4 @@
-"""Points of the log's LiDAR sweeps that context images see: where in the image, and how deep."""
+"""LiDAR points visible in context images: where in the image, and at what depth."""
 
 from __future__ import annotations
 

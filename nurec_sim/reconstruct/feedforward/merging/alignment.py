@@ -42,7 +42,7 @@ class ColourMap:
         return bool(np.array_equal(self.matrix, np.eye(3)) and not self.offset.any())
 
     def __call__(self, rgb: Float32[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
-        """Colours of the chunk in those of the reference, cut to 0..1."""
+        """Colours of the chunk in those of the reference, clipped to 0..1."""
         if self.is_identity:
             return rgb
         mapped = rgb.astype(np.float64) @ self.matrix.T + self.offset
@@ -119,6 +119,7 @@ def _mapped(chunk: ChunkLayers, colour: ColourMap) -> ChunkLayers:
     back = np.linalg.inv(colour.matrix)
     isp = {}
     for camera, row in chunk.isp.items():
+        # shown = A c + b with c = M^-1 (c' - m): the row for the new colours is [A M^-1, b - A M^-1 m].
         matrix = row[:, :3] @ back
         isp[camera] = np.concatenate([matrix, (row[:, 3] - matrix @ colour.offset)[:, None]], axis=1)
     return dataclasses.replace(

@@ -1,4 +1,4 @@
-"""What the other images of a chunk say of each pixel of one image: the kernel of ``consensus``."""
+"""Comparison of each pixel of an image with the other images of its chunk: the kernel of ``consensus``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nurec_sim.network.stereo.matching import ImageView
 from nurec_sim.network.tensors import NetworkInputs
 
 SURFACE, MOVABLE, SKY, UNKNOWN = 0, 1, 2, 3
-"""Kinds of pixels: static surfaces, what can move, sky, and the own car, which says nothing."""
+"""Kinds of pixels: static surfaces, what can move, sky, and the own car, which is ignored."""
 
 AGREEMENT = 0.1
 """Depths agree up to this difference of their logarithms."""
@@ -34,7 +34,7 @@ SHARED_COLOUR = 0.3
 MOST_COLOUR = 4.0
 """How much more an image counts that sees it from nearer, at most."""
 EXPOSED = (0.03, 0.95)
-"""Colours between which cameras are compared; others may have been cut."""
+"""Colours between which cameras are compared; others may be clipped."""
 MOST_OTHERS = 24
 """An image is compared with at most so many others, evenly taken."""
 NEAREST_M = 0.3
@@ -65,7 +65,7 @@ class Views(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """What all images say of all pixels.
+    """The comparison of all pixels with all images.
 
     Attributes:
         depth_m: depth, that of the owner where one was found.
@@ -136,6 +136,7 @@ def _projected(k, px, py, pz, z, views):
     a = (px * turn[0, 0] + py * turn[1, 0] + pz * turn[2, 0]) / z
     b = (px * turn[0, 1] + py * turn[1, 1] + pz * turn[2, 1]) / z
     x, y = a * line[0, 0] + line[0, 1], b * line[1, 0] + line[1, 1]
+    # As ``ImageView``: a pinhole first, then corrected by the rays of the pixels, so any lens works.
     for _ in range(views.steps[k]):
         in_x, in_y = _plane_at(plane[0], x, y), _plane_at(plane[1], x, y)
         x, y = x + (a - in_x) * line[0, 0], y + (b - in_y) * line[1, 0]
@@ -145,12 +146,13 @@ def _projected(k, px, py, pz, z, views):
 @inner
 def _ring(distance, x, y):
     """From how near a surface is seen, in rings, what is off the axis counting as farther."""
+    # Logarithmic rings: ownership changes with the ratio of distances, as resolution does.
     return (np.log(distance) + OFF_AXIS * (x * x + y * y)) / OWNER_RING
 
 
 @inner
 def _exposed(rgb):
-    """Whether no channel may have been cut."""
+    """Whether no channel may be clipped."""
     return min(rgb[0], rgb[1], rgb[2]) > EXPOSED[0] and max(rgb[0], rgb[1], rgb[2]) < EXPOSED[1]
 
 
@@ -179,7 +181,7 @@ def _place_in(k, ray, distance, farthest_z, views):
 
 @inner
 def _add_pair(pair, own, other):
-    """Add the colours [3] of one surface in two cameras to ``Compared.pairs`` [7], unless either may have been cut."""
+    """Add the colours [3] of one surface in two cameras to ``Compared.pairs`` [7], unless either may be clipped."""
     if _exposed(own) and _exposed(other):
         for channel in range(3):
             pair[channel] += own[channel]
@@ -198,7 +200,7 @@ def _add_colour(mixed, other, nearness):
 
 @inner
 def _compare_pixel(image, row, column, others, pictures, views, mixed, pairs):
-    """What the other images say of one pixel.
+    """Compare one pixel with the other images.
 
     Args:
         image: the pixel's image, then its row and column.
@@ -231,6 +233,7 @@ def _compare_pixel(image, row, column, others, pictures, views, mixed, pairs):
             continue
         nearness = here / z
         inside = abs(x) < 1 - 2 * BORDER and abs(y) < 1 - BORDER
+        # Log ratio of the depth seen there and the point's: positive where the other image looks past the point.
         difference = np.inf if its == SKY else np.log(depth[k, v, u] / z)
         if difference >= AGREEMENT:
             through += inside * nearness**2  # it sees something behind: there should be nothing here
@@ -248,6 +251,7 @@ def _compare_pixel(image, row, column, others, pictures, views, mixed, pairs):
         if not inside:
             continue
         colours += _add_colour(mixed, rgb[k, v, u], nearness)
+        # Tuples compare ring first, then image number: a strict order, apart from OVERLAP.
         its_claim = (np.floor(_ring(away, x, y) + OVERLAP / OWNER_RING), k)
         if may_own[k, v, u] and its_claim < claim:
             claim = its_claim
@@ -258,6 +262,7 @@ def _compare_pixel(image, row, column, others, pictures, views, mixed, pairs):
     if mine == SURFACE:
         for channel in range(3):
             mixed[channel] /= colours
+    # shift is a distance along the pixel's own ray; its z per distance makes it a depth.
     moved = here + shift * views.along[image, row, column]
     return moved, claim[1] == image, through <= agree, moves / (moves + rests)
 

@@ -1,13 +1,13 @@
-"""One world from the images of a chunk: a surface that several see lies in one place, and one of them shows it.
+"""One world from the images of a chunk: a surface seen by several lies in one place and is shown by one of them.
 
 The network predicts depth, class and colour image by image. Put into one world, the surfaces of many images lie in
-front of one another, and the wrong ones hide the right ones. So:
+front of one another, and wrong ones hide right ones. So:
 
-- what enough of the images that see a place call movable is movable for all of them;
-- among the points that stand still, an image owns what it sees from nearest, by rings of distance, as in ``lift``;
-  others move their points to the depth that the owner gives them, and then leave the surface to it;
-- a point that more images look through than agree with is dropped, and those count more that see it from nearer;
-- images that agree mix their colours, and cameras are made as bright as each other (``exposures``).
+- a place that enough of the images seeing it classify as movable is movable for all of them;
+- among static points, an image owns what it sees from nearest, by rings of distance, as in ``lift``; others move their
+  points to the owner's depth, and then leave the surface to it;
+- a point that more images look through than agree with is dropped; images count more the nearer they are;
+- images that agree mix their colours, and cameras are brought to the same brightness (``exposures``).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from nurec_sim.reconstruct.feedforward.merging.exposures import camera_gains
 MOVES = 2
 """How often points are moved to their owner's depth, which moves too."""
 MOVABLE_SHARE = 0.2
-"""From this share of those that see it on, a place is movable: what moves and is taken to stand is seen doubled, the
-other way round it is but shown by fewer images."""
+"""From this share of those that see it on, a place is movable. Below one half, as errors differ in cost: a mover taken
+as static is seen doubled, a static thing taken as movable is only shown by fewer images."""
 _KIND_OF_CLASS = np.full(len(SemanticClass), SURFACE, np.uint8)
 _KIND_OF_CLASS[SemanticClass.MOVABLE] = MOVABLE
 _KIND_OF_CLASS[SemanticClass.SKY] = SKY
@@ -62,7 +62,7 @@ class Consensus:
     gain: Float32[np.ndarray, "cameras 3"]
 
     def apply(self, gaussians: QueryGaussians, inputs: NetworkInputs) -> QueryGaussians:
-        """Gaussians where, and as what, the images agree that they are; those that are not shown get opacity 0."""
+        """Gaussians with the agreed positions and classes; those that are not shown get opacity 0."""
         device, source = gaussians.source.device, gaussians.source
         moved = with_changed_depth(gaussians, inputs, torch.from_numpy(self.factor).to(device))
         shown = torch.from_numpy(self.shown).to(device).reshape(-1)[source]
@@ -70,7 +70,7 @@ class Consensus:
         return dataclasses.replace(moved, opacity=moved.opacity * shown, semantic=semantic)
 
     def coloured(self, outputs: NetworkOutputs, inputs: NetworkInputs) -> NetworkOutputs:
-        """Outputs in colours that all cameras share; responses turn them into what each camera showed before."""
+        """Outputs in colours that all cameras share; adjusted responses show them as each camera did before."""
         device = outputs.isp.device
         gain = torch.from_numpy(self.gain).to(device)
         rgb = torch.from_numpy(self.rgb).to(device).reshape(-1, 3)[outputs.gaussians.source]
@@ -80,6 +80,7 @@ class Consensus:
             context=dataclasses.replace(outputs.context, rgb=outputs.context.rgb * of_image),
             gaussians=dataclasses.replace(outputs.gaussians, rgb=rgb.to(outputs.gaussians.rgb.dtype)),
             sky=outputs.sky * gain[0],
+            # A (c g) / g + b: the shown colour is unchanged.
             isp=torch.cat([outputs.isp[..., :3] / gain[None, :, None], outputs.isp[..., 3:]], dim=-1),
         )
 
@@ -100,8 +101,8 @@ def find_consensus(
         semantic: their ``SemanticClass``; what can move, sky and the own car keep their depth and are always shown.
         rgb: their canonical colours.
         ego: pixels known to show the own car, whatever their class.
-        stands: movable pixels that seem to show what stands; those on which the images agree become ``OTHERS``, the
-            rest stay as they are.
+        stands: movable pixels that seem to show something static; those on which the images agree become ``OTHERS``,
+            the rest remain movable.
     """
     views, camera = views_of(inputs), inputs.camera_idxs[0].cpu().numpy()
     stands = np.zeros(semantic.shape, np.bool_) if stands is None else stands
@@ -114,11 +115,14 @@ def find_consensus(
 
     first = compare(pictures, views)
     voted = _voted(kind, first.movable)
+    # From the first comparison, before colours are mixed: mixing would average the difference away.
     gain = camera_gains(camera, first.pairs)
     pictures = pictures._replace(kind=voted, rgb=rgb * gain[camera][:, None, None])
+    # Owners move too (to the owner of their own place), so one pass does not settle; two nearly do.
     for _ in range(MOVES):
         compared = compare(pictures, views)
         pictures = pictures._replace(depth_m=compared.depth_m)
+    # Points that were voted down must not own: their surface would be dropped, and nobody else would show it.
     last = compare(pictures._replace(may_own=compared.agreed), views)
 
     semantic = np.where((kind == MOVABLE) & (voted == SURFACE), int(SemanticClass.OTHERS), semantic)

@@ -1,7 +1,7 @@
-"""How bright cameras are beside each other, measured on surfaces that several of them see.
+"""Relative brightness of cameras, measured on surfaces that several of them see.
 
-The network decodes each camera's response from its images alone. On cameras unlike those that it was trained with it
-can be wrong by a factor of two and more, and a seam shows wherever their images meet.
+The network decodes each camera's response from its images alone. On cameras unlike those of its training it can be
+wrong by a factor of two and more, and a seam shows wherever their images meet.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ def camera_gains(
     both = weight > 0
     gains = np.ones((count, 3))
     if both.any():
+        # Minimises sum w_ij (g_i - g_j + r_ij)^2 over log gains g: normal equations with the graph Laplacian of the
+        # pairs. Its null space (all gains alike) is held by STAY.
         laplacian = np.diag(weight.sum(axis=1)) - weight + STAY * weight.sum() * np.eye(count)
         for channel in range(3):
             mine = total[..., channel] + total[..., 3 + channel].T

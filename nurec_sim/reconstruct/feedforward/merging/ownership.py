@@ -1,14 +1,14 @@
 """Which chunk owns a static Gaussian: the one whose cameras saw its place from nearest (paper section 3.4).
 
 A Gaussian g of chunk i stays iff ``D_gi <= min_j D_gj + tolerance``. D_gi is the distance of its centre to the nearest
-camera of chunk i that sees it, infinite where none does; a camera stands where it was at the end of its exposure. To
-see means here what it means everywhere else: the lens, whatever its kind and its field of view, projects the point into
-the image, in the row that is exposed just then. Nothing occludes and nothing is too far.
+camera of chunk i that sees it, infinite where none does; a camera's position is the one at the end of its exposure.
+"Sees" means that the lens, whatever its kind and its field of view, projects the point into the image, in the row that
+is exposed just then; without occlusion and without a range limit.
 
 This is the paper's rule. The release tests a pyramid through two corners of the image, which has no meaning for fields
 of view of 180 degrees and more; it gives points outside of all pyramids a finite distance, smaller for their own chunk;
-and it asks that the own chunk be nearest or second nearest. With infinite distances the first comes by itself: what no
-chunk sees stays in its own, and what only others see goes.
+and it requires the own chunk to be nearest or second nearest. With infinite distances the first comes by itself:
+what no chunk sees stays in its own, and what only others see is dropped.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ def owned(
         if others and len(mean_m):
             own_m = nearest_view_m(chunk.images, mean_m)
             # Only who is nearer by more than the tolerance counts, so no other view needs to be looked at.
+            # D_gi <= min_j D_gj + delta fails iff some other chunk has D_gj < D_gi - delta (paper, equation of section
+            # 3.4).
             nearer_m = nearest_view_m(others, mean_m, own_m - tolerance_m)
             masks.append(~np.isfinite(nearer_m))
         else:
@@ -88,6 +90,7 @@ def nearest_view_m(
         return result
     cones = _Cones.around(images)
     order = morton_order(points)
+    # Morton order makes blocks compact, so that one cone test excludes an image for thousands of points.
     blocks = [order[first : first + BLOCK] for first in range(0, len(order), BLOCK)]
 
     def search(rows: np.ndarray) -> None:

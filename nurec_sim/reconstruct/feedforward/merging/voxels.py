@@ -1,11 +1,11 @@
 """Fewer Gaussians: those that share a voxel become one with their moments, in voxels just large enough for a budget.
 
 Each Gaussian counts with its *mass*, opacity times area (the product of its two largest standard deviations), so that
-what covers much says most; the release counts all alike. A merged Gaussian has the mean and the covariance of what it
-stands for. Its opacity conserves the optical depth that they lay over the plane, ``2 pi area Li2(opacity)`` each (the
-integral of ``-ln(1 - opacity exp(-r^2 / 2))``; Li2 is the dilogarithm). What it cannot hold where surfaces are opaque
-makes it wider, or gaps would open between it and its neighbours; but only so much, as layers seen again by frame after
-frame hide each other. Labels never mix. What is alone in its voxel stays as it is.
+large opaque ones dominate; the release weights all equally. A merged Gaussian has its members' mean and covariance. Its
+opacity conserves the optical depth that they lay over the plane, ``2 pi area Li2(opacity)`` each (the integral of
+``-ln(1 - opacity exp(-r^2 / 2))``; Li2 is the dilogarithm). What it cannot hold where surfaces are opaque makes it
+wider, or gaps would open between it and its neighbours; but only so much, as layers seen again by frame after frame
+hide each other. Labels never mix. What is alone in its voxel stays as it is.
 """
 
 from __future__ import annotations
@@ -89,6 +89,7 @@ def voxel_for_budget(gaussians: Gaussians, budget: int) -> float:
         elif large_enough < CLOSE_ENOUGH * too_small:
             break
         else:
+            # Bisection in the logarithm: counts fall about as a power of the voxel size.
             voxel_m = float(np.sqrt(too_small * large_enough))
     if not large_enough:
         raise ValueError(f"a budget of {budget} is less than the number of labels, {len(np.unique(gaussians.label))}")
@@ -99,6 +100,7 @@ def voxel_keys(gaussians: Gaussians, voxel_m: float) -> Int64[np.ndarray, " n"]:
     """A number per Gaussian, equal for those of one label in one voxel: ``round(mean / voxel_m)``, packed."""
     cells = np.rint(gaussians.mean_m / np.float64(voxel_m))
     half = 1 << (AXIS_BITS - 1)
+    # Centred on the scene: world coordinates may be far from the origin, and 19 bits per axis must cover the middle.
     middle = np.rint(np.median(gaussians.mean_m[::64], axis=0) / np.float64(voxel_m))
     cells = np.clip(cells - middle, -half, half - 1).astype(np.int64) + half
     key = gaussians.label.astype(np.int64)
@@ -157,12 +159,17 @@ def _merged(part: Gaussians, inside: Int64[np.ndarray, " m"], begins: Int64[np.n
     shift = mean(centre - origin[inside])
     offset = centre - (origin + shift)[inside]
     spread = geometry.matrix_from_quat(part.quat_wxyz) * scale[:, None]
+    # Moment matching: E[Sigma_i + d d^T], the Gaussian of least KL divergence from the mixture.
     covariance = mean(spread @ spread.transpose(0, 2, 1) + offset[:, :, None] * offset[:, None, :])
     variance, axes = np.linalg.eigh(covariance)
+    # eigh may return a reflection; flipping one axis makes it a rotation.
     axes[:, :, 0] *= np.where(np.linalg.det(axes) < 0, -1, 1)[:, None]
     sigma = np.sqrt(np.maximum(variance, MIN_SCALE_M**2))
 
+    # scipy's spence(z) is Li2(1 - z); the common factor 2 pi cancels against the merged Gaussian's own area.
     depth = total(spence(1 - opacity) * area) / (sigma[:, 1] * sigma[:, 2])
+    # DEPTHS[-1] is the most that one Gaussian of this area can hold; more needs area in proportion, so width by its
+    # root.
     growth = np.sqrt(np.clip(depth / DEPTHS[-1], 1.0, MAX_GROWTH**2))
     sigma[:, 1:] *= growth[:, None]
     direction = mean(np.nan_to_num(part.normal))

@@ -1,7 +1,7 @@
 """From the points of a moving thing over time to a track: its box, its label and the path of its centre.
 
-A thing is seen from one side. Its box is as large as what was seen of it at best, or as its kind is at least, and it
-stands behind the surface that faces the recording car.
+A thing is seen from one side. Its box has the largest extent that was seen, or the least size of its kind, and lies
+behind the surface that faces the recording car.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from nurec_sim import geometry
 from nurec_sim.types import Track, Trajectory
 
 STANDING_MPS = 0.5
-"""What is slower stands; its heading is the longer side of what was seen."""
+"""Slower things are static; their heading is the longer side of what was seen."""
 EXTENT = (0.05, 0.95)
 """Quantiles of the points that count as the ends of a thing."""
 BEST_VIEW = 0.8
@@ -58,6 +58,7 @@ def track_of(name: str, sightings: Sequence[Sighting], ego: Trajectory) -> Track
         yaw, clouds, velocity = np.array([_long_side(everything[:, :2])]), [everything], np.zeros((1, 3))
         times, count = np.array([(times[0] + times[-1]) // 2]), np.array([len(everything)])
     else:
+        # Velocity gives the heading; a box that turned with the visible points would swing as the view of it changes.
         yaw, clouds = _headings(velocity, speed), [sighting.position_m for sighting in sightings]
     box_from_world = [geometry.rotation_from_yaw(-angle) for angle in yaw]
     seen = [np.quantile(xyz @ turn.T, EXTENT, axis=0) for xyz, turn in zip(clouds, box_from_world, strict=True)]
@@ -65,6 +66,8 @@ def track_of(name: str, sightings: Sequence[Sighting], ego: Trajectory) -> Track
     extent = np.quantile(high - low, BEST_VIEW, axis=0)
     label = _label(extent, float(np.median(speed)))
     size = np.maximum(extent, LEAST_M[label])
+    # Only the side that faces the car is seen, and its extent is too small: the box begins at the visible face and
+    # extends away from the car.
     eye = np.stack([turn @ at for turn, at in zip(box_from_world, ego.at(times)[:, :3, 3], strict=True)])
     middle = np.where(eye < low, low + size / 2, np.where(eye > high, high - size / 2, (low + high) / 2))
     middle[:, 2] = low[:, 2] + size[2] / 2  # nothing floats over the road because its roof was seen best
@@ -76,7 +79,7 @@ def track_of(name: str, sightings: Sequence[Sighting], ego: Trajectory) -> Track
 
 
 def lengthened(path: Trajectory, life_us: tuple[int, int]) -> Trajectory:
-    """The path, going straight on to the first and the last time of a life where these lie beyond its ends."""
+    """The path, extrapolated straight to the first and the last time of a life where these lie beyond its ends."""
     times, poses = path.t_us, path.world_from_body
     first, last = min(life_us[0], times[0]), max(life_us[1], times[-1])
     keep = np.concatenate([[first < times[0]], np.ones(len(times), bool), [last > times[-1]]])

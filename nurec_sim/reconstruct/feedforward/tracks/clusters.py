@@ -25,7 +25,7 @@ from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.types import DynamicGaussians, Track, Trajectory
 
 REACH_M = 120.0
-"""What is farther from the ego car is too coarse to be told apart."""
+"""Gaussians farther from the ego car are too coarse to separate into objects."""
 CELL_M = 0.5
 """Gaussians of one instant are first averaged over cells of this edge."""
 LINK_M = 0.8
@@ -41,7 +41,7 @@ ALIKE_MPS = 1.0
 MOMENT_US = 100_000
 """The velocity of a path is taken over this long before and after."""
 MOST_MISSED = 2
-"""A chain goes on after so many instants at which the thing was hidden..."""
+"""A chain resumes after at most so many instants at which the thing was hidden..."""
 BRIDGE_M = 2.0
 """...if it is then this close to where it was heading, as alike in velocity as ``METRES_PER_MPS`` counts."""
 LARGEST_M = 20.0
@@ -219,6 +219,7 @@ def _components(pairs: Int64[np.ndarray, "k 2"], nodes: int) -> tuple[int, Int32
 def _chains(blobs: _Blobs, step_us: int) -> Int64[np.ndarray, " blobs"]:
     """The chain of each blob: it and a blob of the next instant are linked if each shares most with the other."""
     number = len(blobs.instant)
+    # A Gaussian lies in a blob of each of its two instants: it votes for them being one thing.
     both = blobs.of_gaussian[:, (blobs.of_gaussian >= 0).all(axis=0)]
     pair, shared = np.unique(both[0] * number + both[1], return_counts=True)
     earlier, later = np.divmod(pair, number)
@@ -235,6 +236,7 @@ def _bridges(
     """Links over instants at which a thing was hidden: from ends of chains to beginnings where they were heading."""
     everything = np.arange(len(blobs.instant))
     ends, beginnings = np.setdiff1d(everything, links[:, 0]), np.setdiff1d(everything, links[:, 1])
+    # Constant velocity over the hidden instants; velocities are stored times METRES_PER_MPS.
     expected = blobs.like[ends].copy()
     expected[:, :2] += expected[:, 2:] / METRES_PER_MPS * ((missed + 1) * step_us / 1e6)
     apart = 10 * BRIDGE_M

@@ -31,7 +31,7 @@ def scene_actors(clip: Clip) -> list[Actor]:
     """The movable tracks of a clip; ``Actor.index`` is the place in ``clip.tracks``.
 
     One that stands (moves less than 0.3 m) has one pose and is there over the whole clip. The path of one that moves
-    goes on for one more step at both ends, by the twist of the step beside it: labels come at 2 to 10 Hz, and the
+    is extended by one step at both ends, by the twist of the step beside it: labels come at 2 to 10 Hz, and the
     object does not vanish between the last one and the next frame.
     """
     actors = actors_of(clip, PointSettings())
@@ -44,8 +44,8 @@ def owners_of_points(
     """The actor in whose box each point lies at the point's own time.
 
     Movable points count within the padded box, others only within the box itself, so that the ground around a car does
-    not drive off with it. Of several boxes the one wins in which the point lies deepest, as a share of the way from the
-    border to the middle: a person beside a car stays a person. (The release takes every class within the padding, and
+    not move along with it. Of several boxes the one wins in which the point lies deepest, as a share of the way from
+    border to middle: a person beside a car stays a person. (The release takes every class within the padding, and
     the last box.)
 
     Args:
@@ -63,6 +63,7 @@ def owners_of_points(
         low, high = _reach(actor, t_us)
         near = np.flatnonzero((x > low[0]) & (x < high[0]))
         near = near[(y[near] > low[1]) & (y[near] < high[1]) & (z[near] > low[2]) & (z[near] < high[2])]
+        # Int64 times throughout: float32 epoch times would associate hardly any point (the release's defect).
         near = near[actor.present(t_us[near])]
         if not len(near):
             continue
@@ -95,6 +96,7 @@ def owners_of_rays(
         low, high = _reach(actor, t_us)
         to_middle = (low + high) / 2 - origin_m
         along = np.einsum("ni,ni->n", to_middle, direction)
+        # Sphere test first: squared distance of the ray from the middle of the swept box.
         aside = np.einsum("ni,ni->n", to_middle, to_middle) - np.square(along)
         radius = np.linalg.norm(high - low) / 2
         near = np.flatnonzero((along > -radius) & (aside < radius**2) & actor.present(t_us))
@@ -106,6 +108,7 @@ def owners_of_rays(
         # A ray along a face never crosses it; a tiny step instead of none keeps 0 / 0 out of the slabs.
         step = np.where(np.abs(step) < 1e-12, 1e-12, step)
         first, second = (-half - start) / step, (half - start) / step
+        # Slab test (Kay and Kajiya 1986): the ray is inside while it is between all three pairs of faces.
         enter, leave = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
         met = near[(enter < leave) & (enter > 0)]
         owner[met] = number
@@ -167,6 +170,7 @@ def _longer(path: Trajectory, span_us: tuple[int, int]) -> Trajectory:
     if len(times) == 1:
         around = times[0] + np.array([-LONE_LABEL_US, 0, LONE_LABEL_US])
         return Trajectory(around, np.repeat(poses, 3, axis=0))
+    # T_0 T_1^-1 is the last step backwards in the world: applying it once more continues the same twist.
     before = poses[0] @ geometry.inverse(poses[1]) @ poses[0]
     after = poses[-1] @ geometry.inverse(poses[-2]) @ poses[-1]
     longer = Trajectory(

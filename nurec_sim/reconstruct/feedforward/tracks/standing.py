@@ -54,6 +54,8 @@ def standing_pixels(
         stands = still[owner]
         if motion_m is not None:
             before_us, after_us = image.target_t_us
+            # From the previous to the next frame: the longer baseline halves the effect of errors of a single
+            # displacement.
             step_m = np.diff(motion_m[0, number].reshape(-1, 2, 3).float().cpu().numpy()[pixel], axis=1)[:, 0]
             slow = np.linalg.norm(step_m, axis=1) < STANDING_MPS * (after_us - before_us) / 1e6
             stands |= (owner < 0) & slow
