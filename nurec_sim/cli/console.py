@@ -31,7 +31,14 @@ def progress(title: str) -> AbstractContextManager[Report]:
 
 
 def part_of(advance: Report, index: int, count: int, name: str) -> Report:
-    """Progress callback for one of ``count`` equal parts."""
+    """Progress callback for one of ``count`` equal parts.
+
+    Args:
+        advance: callback of the whole, with (stage, fraction 0..1).
+        index: the part, from 0.
+        count: number of parts.
+        name: name of the part; shown with the stage if there are several.
+    """
     start = f"{name} ({index + 1} of {count}), " if count > 1 else ""
     return lambda stage, fraction: advance(start + stage, (index + fraction) / count)
 

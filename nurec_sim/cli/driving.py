@@ -141,7 +141,22 @@ def drive(
     plan_timeout_s: float = 60.0,
     device: str = "auto",
 ) -> None:
-    """Policies, scenes, server, rollouts and report, for `run` and `demo`."""
+    """Policies, scenes, server, rollouts and report, for `run` and `demo`.
+
+    Args:
+        sources: clips or scenes; default: the scenario's clip.
+        scenario_name: a scenario file, or the name of a bundled scenario.
+        policy_names: policies to drive; default: the scenario's.
+        seeds: seeds of the rollouts; default: the scenario's.
+        out_dir: folder in which a run folder is created.
+        resume: an existing run folder to complete instead.
+        address: host:port of a sensor server; None starts one in this process.
+        cache: folder of cached reconstructions.
+        video: whether to write videos.
+        true_world: ``plan.json`` of the procedural town behind the only scene, to drive in it as well.
+        plan_timeout_s: time limit of each call of a policy.
+        device: rendering device of the server in this process.
+    """
     from nurec_sim import runs, sim
     from nurec_sim.serving.client import RemoteSensors
     from nurec_sim.serving.server import SensorServer

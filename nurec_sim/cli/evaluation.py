@@ -137,7 +137,14 @@ def _refuse(names: list[str], where: str) -> None:
 
 
 def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: FeedForwardSettings) -> None:
-    """Score one method, or one finished scene, on one log."""
+    """Scores one method, or one finished scene, on one log.
+
+    Args:
+        path: a clip folder, or a .zip of one.
+        flags: options for one log.
+        hold_out_every: hold out every N-th image; 0: none.
+        network: network settings; its device also renders.
+    """
     from nurec_sim import logs
     from nurec_sim.evaluate import evaluate as run_evaluation
     from nurec_sim.evaluate import figure_rows
@@ -205,7 +212,14 @@ def _score_archive(log: Clip, flags: LogFlags, hold_out_every: int, device: str,
 def evaluate_protocol(
     name: ProtocolName, flags: ProtocolFlags, hold_out_every: int, network: FeedForwardSettings
 ) -> None:
-    """Compare methods, print the tables and write a run folder."""
+    """Compares methods, prints the tables and writes a run folder.
+
+    Args:
+        name: the protocol.
+        flags: options for protocols.
+        hold_out_every: hold out every N-th frame in protocol ``clip``.
+        network: network settings; its device also renders.
+    """
     if flags.clips and (flags.worlds is not None or flags.seed):
         raise NurecSimError("--worlds and --seed select procedural worlds, --clips recorded logs; give one of the two")
     from nurec_sim.evaluate import Protocol, contenders, run_protocol

@@ -1,4 +1,4 @@
-"""Scenes of one log compared: the same figures for each, the worst frames, and a video with maps of the differences."""
+"""Comparison of scenes of one log: the same figures for each, the worst frames, and a video with difference maps."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Comparison:
-    """What a comparison found.
+    """Result of a comparison.
 
     Attributes:
         clip: id of the log.
-        figures: by name of the scene, see ``log.score_scene``.
-        worst: captions and pictures of the frames that some scene shows worst: recorded and every scene above, maps of
-            the differences (FLIP) below.
+        figures: scores by scene name, see ``log.score_scene``.
+        worst: captions and pictures of the worst frames of each scene: recorded image and all scenes in the upper row,
+            FLIP difference maps in the lower one.
         video: the same for all frames of the first target camera, as MP4.
     """
 
@@ -57,15 +57,15 @@ def compare_scenes(
     device: str = "auto",
     progress: Progress | None = None,
 ) -> Comparison:
-    """Scores scenes of a log one after the other, and draws them side by side.
+    """Scores scenes of a log one after the other, and renders them side by side.
 
     Args:
         clip: the log.
-        scenes: two or more by name, loaded when their turn comes and let go after it.
-        held: images and sweeps that none of them was made from.
+        scenes: loaders of two or more scenes by name; only one scene is in memory at a time.
+        held: images and sweeps held out from all reconstructions.
         target_cameras: cameras to compare with; the first scene's input cameras if None.
-        device: that renders.
-        progress: called with a stage and the fraction of all work that is done.
+        device: rendering device.
+        progress: called with a stage and the fraction of all work done.
 
     Raises:
         ReconstructError: fewer than two scenes, an unknown camera, a scene of another log.
@@ -78,6 +78,14 @@ def compare_scenes(
     for done, (name, load) in enumerate(scenes.items()):
 
         def part(stage: str, fraction: float, name: str = name, done: int = done) -> None:
+            """Reports the progress of one scene as part of the whole.
+
+            Args:
+                stage: what is being done.
+                fraction: share of this scene's work done.
+                name: the scene; bound here, since the loop variable changes.
+                done: number of scenes finished before it.
+            """
             report(f"{name}: {stage}", (done + fraction) / len(scenes))
 
         scene = load()
@@ -85,6 +93,7 @@ def compare_scenes(
             clip, scene, held, target_cameras=target_cameras, via_grpc=False, device=device,
             progress=lambda stage, fraction: part(stage, 0.9 * fraction),
         )  # fmt: skip
+        # All scenes must be scored on the cameras of the first one, otherwise their figures are not comparable.
         target_cameras = figures[name]["target_cameras"]
         with sensing(scene, False, device) as sense:
             shown[name] = _pictures(clip, target_cameras, sense)
@@ -100,7 +109,7 @@ def compare_scenes(
 
 
 def _pictures(clip: Clip, cameras: Sequence[str], sense: Sense) -> dict[tuple[str, int], Picture]:
-    """Every frame of some cameras, made small."""
+    """All frames of some cameras, downsampled."""
     pictures = {}
     for camera in cameras:
         for index in range(len(clip.camera_times_us(camera))):
@@ -111,13 +120,13 @@ def _pictures(clip: Clip, cameras: Sequence[str], sense: Sense) -> dict[tuple[st
 
 
 def _small(picture: Picture) -> Picture:
-    """Both sides even, as video needs them."""
+    """Downsampled to even sides, as chroma subsampling (yuv420p) requires."""
     height = max(round(picture.shape[0] * WIDTH_PX / picture.shape[1] / 2) * 2, 2)
     return cv2.resize(picture, (WIDTH_PX, height), interpolation=cv2.INTER_AREA)
 
 
 def _worst_frames(figures: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, int]]:
-    """The frames of which some scene is worst, by the PSNR of that scene; one of each scene in turn."""
+    """Frames with the lowest PSNR of each scene, taken from the scenes in turn, without repetition."""
     ranked = []
     for each in figures.values():
         rows = [
@@ -131,7 +140,7 @@ def _worst_frames(figures: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, i
 
 
 def _row(clip: Clip, frame: tuple[str, int], shown: Mapping[str, Mapping[tuple[str, int], Picture]]) -> Picture:
-    """Recorded and every scene side by side; below each scene where it differs, dark where it does not."""
+    """Recorded image and all scenes side by side; below each scene its FLIP map, dark where it agrees."""
     recorded = _small(clip.image(*frame))
     upper, lower = [_captioned(recorded, "recorded")], [np.full_like(recorded, 250)]
     for name, pictures in shown.items():
@@ -149,7 +158,7 @@ def _captioned(picture: Picture, text: str) -> Picture:
 
 
 def _video(pictures: Sequence[Picture]) -> bytes:
-    """An H.264 video in MP4; no bytes without pictures."""
+    """An H.264 video in MP4; empty without pictures."""
     import av
 
     if not pictures:

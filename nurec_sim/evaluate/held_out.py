@@ -1,4 +1,4 @@
-"""What of a log a reconstruction must not see: every N-th image, sweeps, and cameras that are not its input."""
+"""Held-out data of a log: every N-th image, sweeps, and cameras that are not inputs of the reconstruction."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nurec_sim.types import Clip
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Indices of images by camera, and of sweeps (of every LiDAR), that are compared with and never shown."""
+    """Indices of held-out images by camera, and of held-out sweeps (of every LiDAR)."""
 
     images: Mapping[str, frozenset[int]] = field(default_factory=dict)
     sweeps: frozenset[int] = frozenset()
@@ -28,9 +28,9 @@ def hold_out(
 
     Args:
         clip: the log.
-        cameras: input cameras, of which images are held out.
-        images_every: images N-1, 2N-1, ... of each camera; 0 holds out none. Sweeps taken while such an image was
-            exposed are held out too: their points are its depth.
+        cameras: input cameras whose images are held out.
+        images_every: images N-1, 2N-1, ... of each camera; 0 holds out none. Sweeps that overlap the exposure of such
+            an image are held out too: their points are its depth.
         sweeps_every: sweeps K, 2K, ...; 0 holds out none.
         sweeps: further sweeps by index.
 
@@ -63,7 +63,7 @@ def every(clip: Clip, step: int) -> range:
 
 
 def without_images(clip: Clip, held: HeldOut) -> Clip:
-    """The log without the images held out; sweeps stay, and keep their indices."""
+    """The log without the held-out images; all sweeps remain, with their indices."""
     if not any(held.images.values()):
         return clip
     shots = {

@@ -1,4 +1,4 @@
-"""Rendered images of a scene beside the recorded ones: whole, by region, how sharp, and where there are holes."""
+"""Scores of rendered against recorded images: whole image, by region, sharpness, and holes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nurec_sim.files.new_files import write_file
 from nurec_sim.types import CameraFrame, Clip, Sense, SensorRequest
 
 HOLE_ALPHA = 0.5
-"""Where a beam met a surface and less than this covers the sky behind it, there is a hole."""
+"""A rendered alpha below this at a LiDAR return is a hole."""
 BEST_DB = 100.0
 """PSNR of equal images."""
 
@@ -60,13 +60,13 @@ def score_images(
 
     Args:
         clip: the log.
-        inputs: cameras whose images the reconstruction saw, but for those held out.
+        inputs: input cameras of the reconstruction.
         targets: cameras to compare with.
         held: what was held out.
         sense: renders the scene.
         probe: renders one request with alpha.
         images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
-        report: called with a stage and the share of it that is done.
+        report: called with a stage and the share of it done.
     """
     frames: list[FrameScore] = []
     floors: dict[str, list[FrameScore]] = {}
@@ -83,6 +83,7 @@ def score_images(
             score.flip, score.sharpness = flip(frame.rgb, recorded), sharpness(frame.rgb, recorded)
             _add_regions(score, clip, request, frame.rgb, recorded, probe)
             frames.append(score)
+            # The floor that any reconstruction should beat.
             copied = _nearest_input(clip, camera, index, inputs, held)
             if copied is not None:
                 floors[camera].append(_score(camera, index, seen, copied, recorded))
@@ -181,7 +182,7 @@ def _psnr_of(squared: float, values: int) -> float | None:
 
 
 def _nearest_input(clip: Clip, camera: str, index: int, inputs: Sequence[str], held: HeldOut) -> Image | None:
-    """What copying would show: the image seen nearest in time, of the camera that looks most alike; never itself."""
+    """Copy baseline: the input image nearest in time, of the camera with the most similar direction; never itself."""
     model, t_us = clip.rig.cameras[camera], int(clip.camera_times_us(camera)[index].sum()) // 2
     best: tuple[float, float, str, int] | None = None
     for other in inputs:
@@ -193,6 +194,7 @@ def _nearest_input(clip: Clip, camera: str, index: int, inputs: Sequence[str], h
         if not len(gap) or not np.isfinite(gap[nearest]):
             continue
         facing = float(clip.rig.cameras[other].rig_from_camera[:3, 2] @ model.rig_from_camera[:3, 2])
+        # Ordered by direction (cosine, rounded so that a stereo pair ties), then by time.
         candidate = (round(-facing, 2), float(gap[nearest]), other, nearest)
         best = candidate if best is None or candidate < best else best
     if best is None or best[0] > 0:

@@ -1,4 +1,4 @@
-"""Simulated sweeps of a scene beside recorded ones, and beside the path against space that is known to be free."""
+"""LiDAR scores of a scene: simulated against held-out recorded sweeps, and false obstacles in known free space."""
 
 from __future__ import annotations
 
@@ -15,18 +15,25 @@ from nurec_sim.sensors.lidar_tables import lidar_model
 from nurec_sim.types import Clip, LidarFrame, Sense, SensorRequest, Sweep
 
 LEFT_M = (0.0, 1.0, 2.0, 3.0)
-"""How far beside the path false obstacles are looked for, on both sides."""
+"""Lateral offsets from the path at which false obstacles are counted, on both sides."""
 SCANNER, SCANNER_COLUMNS = "HDL-64", 1200
 SCANS = 5
-"""Instants of a log at which they are looked for."""
+"""Number of instants of a log at which they are counted."""
 MOST_BEAM_SWEEPS = 60
-"""Recorded sweeps that tell which space is free; evenly chosen of longer logs."""
+"""Maximum number of recorded sweeps that define free space; sampled evenly from longer logs."""
 
 Report = Callable[[str, float], None]
 
 
 def score_sweeps(clip: Clip, held: Sequence[int], sense: Sense, report: Report) -> dict[str, object]:
-    """Scores of the sweeps with these indices, of every LiDAR: ranges, by range too, and Chamfer distances."""
+    """Scores of held-out sweeps: range errors, also by range bin, and Chamfer distances.
+
+    Args:
+        clip: the log.
+        held: indices of the sweeps of every LiDAR to score.
+        sense: renders the scene.
+        report: called with a stage and the share of it done.
+    """
     scores, names = [], []
     jobs = [(lidar, i) for lidar in clip.rig.lidars for i in held if i < len(clip.sweep_times_us(lidar))]
     for done, (lidar, index) in enumerate(jobs):
@@ -34,6 +41,7 @@ def score_sweeps(clip: Clip, held: Sequence[int], sense: Sense, report: Report) 
         sweep = clip.sweep(lidar, index)
         fired, poses = as_fired(clip, lidar, sweep)
         scanner = scanner_along(clip.rig.lidars[lidar], fired)
+        # Simulated beam by beam: from the same moving sensor, at the elevations of the recorded returns.
         request = SensorRequest(clip.id, scanner, sweep.start_us, max(sweep.end_us, sweep.start_us + 1), poses)
         frame = sense([request])[0]
         assert isinstance(frame, LidarFrame)
@@ -71,19 +79,19 @@ def _figures(score: LidarScore) -> dict[str, object]:
 
 
 def _within(score: LidarScore, limit_m: float) -> float | None:
-    """Share of the beams with a recorded return whose simulated return exists and is as near as this."""
+    """Share of beams with a recorded return whose simulated return exists with a range error below the limit."""
     return float((score.abs_error_m < limit_m).sum() / score.beams) if score.beams else None
 
 
 def _known(value: float) -> float | None:
-    """JSON has no NaN: what cannot be computed is null."""
+    """JSON has no NaN: undefined values become null."""
     return float(value) if np.isfinite(value) else None
 
 
 def score_free_space(clip: Clip, sense: Sense, report: Report) -> dict[str, object] | None:
     """Share of simulated returns within 40 m in space known to be free, on the path and beside it; None without LiDAR.
 
-    A sweep of a ``SCANNER`` where the log's first LiDAR sits, at a few instants, as if the car stood still there.
+    A ``SCANNER`` at the mounting of the log's first LiDAR is simulated at a few instants, with the car stationary.
     """
     lidar = next((name for name in clip.rig.lidars if len(clip.sweep_times_us(name))), None)
     if lidar is None:
@@ -135,9 +143,9 @@ def _fraction(sweep: Sweep) -> Float64[np.ndarray, " n"]:
 
 
 def as_fired(clip: Clip, lidar: str, sweep: Sweep) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "2 4 4"]]:
-    """Returns in the frame of the sensor when each was fired, and the sensor's poses at the sweep's start and end."""
+    """Undoes motion compensation: returns in the sensor frame at firing time, and the poses at sweep start and end."""
     rig_from_lidar = clip.rig.lidars[lidar].rig_from_lidar
-    # The log's own pose of the sweep counts; the ego trajectory gives the motion around it.
+    # The sweep's own pose in the log is the reference; the ego trajectory only contributes the motion around it.
     fix = sweep.world_from_lidar @ geometry.inverse(clip.ego.at(sweep.t_us) @ rig_from_lidar)
     times = np.array([sweep.start_us, sweep.end_us])
     poses = np.einsum("ij,njk->nik", fix, clip.ego.at(times) @ rig_from_lidar)

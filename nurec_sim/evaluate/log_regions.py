@@ -1,7 +1,7 @@
-"""Regions of a recorded image that the log itself tells apart, the same for every reconstruction.
+"""Regions of a recorded image defined by the log alone, hence the same for every reconstruction.
 
-Actors are the outlines of labelled boxes of things that can move. Range is known around the points of the sweep
-nearest in time.
+Actors are the outlines of labelled boxes of movable objects. Range is known around the points of the sweep nearest in
+time.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from nurec_sim.types import MOVABLE_LABELS, CameraModel, Clip, SensorRequest
 RANGES_M = (0.0, 10.0, 20.0, 40.0, 80.0)
 """Borders of the range bins."""
 NEAREST_SWEEP_US = 100_000
-"""A sweep farther in time from an image says nothing of it."""
+"""Maximum time between an image and a sweep."""
 AROUND_PX = 2
-"""Pixels around a LiDAR point that count as at its range."""
+"""Neighbourhood of a LiDAR point, in pixels, that counts as at its range."""
 HIDDEN = 1.15
-"""A point this much farther than another one within ``CELL_PX`` was seen from the LiDAR past what hides it here."""
+"""A point farther by this factor than another within ``CELL_PX`` is visible to the LiDAR but occluded in the camera."""
 CELL_PX = 12
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
@@ -42,7 +42,7 @@ class SeenPoints:
 
 
 def actor_mask(clip: Clip, request: SensorRequest) -> Bool[np.ndarray, "h w"]:
-    """Pixels inside the outlines of labelled boxes of things that can move."""
+    """Pixels inside the outlines of labelled boxes of movable objects."""
     camera = _camera(request)
     mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
     for outline in box_outlines(clip, request):
@@ -51,7 +51,7 @@ def actor_mask(clip: Clip, request: SensorRequest) -> Bool[np.ndarray, "h w"]:
 
 
 def box_outlines(clip: Clip, request: SensorRequest) -> Iterator[Float64[np.ndarray, "k 2"]]:
-    """Convex outlines, in pixels, of the boxes that are wholly before the camera."""
+    """Convex outlines, in pixels, of the boxes that are entirely in front of the camera."""
     camera = _camera(request)
     for track in clip.tracks:
         if track.label not in MOVABLE_LABELS or not track.path.covers(request.start_us):
@@ -63,7 +63,7 @@ def box_outlines(clip: Clip, request: SensorRequest) -> Iterator[Float64[np.ndar
 
 
 def seen_points(clip: Clip, request: SensorRequest) -> SeenPoints:
-    """Points of the nearest sweeps that the camera sees too: not behind others, and on nothing that can move."""
+    """Points of the nearest sweeps visible in the camera: not occluded, and not on movable objects."""
     camera = _camera(request)
     clouds = [cloud for lidar in clip.rig.lidars if (cloud := _nearest_cloud(clip, lidar, request)) is not None]
     xyz = np.concatenate(clouds) if clouds else np.zeros((0, 3))
@@ -93,7 +93,7 @@ def _nearest_cloud(clip: Clip, lidar: str, request: SensorRequest) -> Float64[np
 def _hidden(
     pixel: Int64[np.ndarray, "n 2"], distance_m: Float64[np.ndarray, " n"], camera: CameraModel
 ) -> Bool[np.ndarray, " n"]:
-    """Camera and LiDAR sit apart, so beams pass beside what hides their points from the camera."""
+    """Points occluded in the camera: with a baseline between the sensors, beams pass beside the occluder."""
     nearest = np.full((camera.height_px // CELL_PX + 1, camera.width_px // CELL_PX + 1), np.inf)
     cell = pixel // CELL_PX
     np.minimum.at(nearest, (cell[:, 1], cell[:, 0]), distance_m)

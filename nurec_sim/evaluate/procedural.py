@@ -64,10 +64,19 @@ class EvaluationWorld:
 
     def _shot(self, camera_id: str, t_us: int) -> Shot:
         request = self.request(camera_id, t_us)
+        # Rendered at most once: methods under comparison read the same frames.
         return Shot(t_us, t_us, request.world_from_sensor, cache(lambda: self.world.view(request).rgb))
 
     def target(self, name: str, camera_id: str, t_us: int, left_m: float = 0.0, beyond: bool = False) -> Target:
-        """A target view."""
+        """A target view with its ground truth.
+
+        Args:
+            name: unique within its window.
+            camera_id: a camera of the rig.
+            t_us: instant of the exposure, microseconds.
+            left_m: lateral offset of the car from the recorded drive, left positive.
+            beyond: whether the instant is before the first or after the last input frame.
+        """
         request = self.request(camera_id, t_us, left_m)
         seen = self.world.view(request)
         movable = reduced_mask(LABEL_OF_CLASS[seen.surface] == Label.MOVABLE)
@@ -85,7 +94,14 @@ class EvaluationWorld:
         return Revolution(start_us, start_us + SPIN_US, measured)
 
     def clip(self, id: str, times_us: Int64[np.ndarray, " n"], span_us: tuple[int, int], boxes: bool) -> ContextClip:
-        """A log of the frames at these times and of all sweeps of a span, with or without boxes."""
+        """A log of frames at given times and of all sweeps of a span.
+
+        Args:
+            id: name of the log.
+            times_us: instants of the frames of every camera, microseconds.
+            span_us: [start, end) of the log and of its sweeps.
+            boxes: whether the log has labelled boxes.
+        """
         tracks = self.world.plan.tracks() if boxes else ()
         shots, turns = self.shots(times_us), self.revolutions(span_us)
         return ContextClip(id, self.rig, self.ego, span_us, shots, turns, tracks)

@@ -38,6 +38,13 @@ def storm_windows(
 ) -> dict[str, Callable[[], Window]]:
     """Consecutive windows of front camera frames, by name, as functions that read them.
 
+    Args:
+        clip: the log.
+        frames: length of a window in frames.
+        context: indices of the input frames within a window; the others are targets.
+        step_us: expected frame interval, microseconds, within ``STEP_TOLERANCE``.
+        boxes: whether the methods get the log's boxes.
+
     Raises:
         ReconstructError: too few frames, or not about ``step_us`` apart.
     """
@@ -62,6 +69,12 @@ def storm_windows(
 
 def clip_window(clip: Clip, cameras: int, every: int, boxes: bool) -> dict[str, Callable[[], Window]]:
     """The whole log as one window, frames ``every - 1``, ``2 every - 1``, ... held out; as a function that reads it.
+
+    Args:
+        clip: the log.
+        cameras: maximum number of cameras.
+        every: every such frame is held out.
+        boxes: whether the methods get the log's boxes.
 
     Raises:
         ReconstructError: the log has no frame to hold out.
@@ -104,6 +117,7 @@ def recorded_window(
     exposures = np.concatenate([clip.camera_times_us(camera)[frames] for camera in {*cameras, *shown_by}])
     span_us = (int(exposures.min()), int(exposures.max()) + 1)
     nearest = {view: _nearest_sweep(clip, clip.camera_times_us(view[0])[view[1]]) for view in views}
+    # A sweep that is the depth truth of a held-out view must not be an input, otherwise methods could copy it.
     held = {sweep for view, sweep in nearest.items() if view not in given}
     shots = {camera: tuple(_shot(clip, camera, index) for index in seen) for camera in cameras}
     turns = {
@@ -175,6 +189,7 @@ def projected_depth(
     valid &= sensors.in_image(camera, uv)
     uv, xyz, fraction = uv[valid], xyz_world_m[valid], fraction[valid]
     poses = geometry.inverse(geometry.interpolate_pose_pair(request.world_from_sensor, fraction))
+    # Only the third row is needed: z in the camera at the instant at which its pixel was exposed.
     z = np.einsum("ni,ni->n", poses[:, 2, :3], xyz) + poses[:, 2, 3]
     column = (uv[:, 0] * width / camera.width_px).astype(int).clip(0, width - 1)
     row = (uv[:, 1] * height / camera.height_px).astype(int).clip(0, height - 1)
@@ -192,6 +207,7 @@ def movable_pixels(clip: Clip, request: SensorRequest, camera: CameraModel) -> B
             continue
         corners = geometry.transform_points(track.path.at(request.start_us), CORNERS * np.asarray(track.size_m))
         uv, valid, _ = sensors.project_rolling(camera, request.world_from_sensor, corners)
+        # A box with a corner behind the camera or outside the lens's valid field has no convex image outline.
         if valid.all():
             outline = cv2.convexHull((uv * (width / camera.width_px, height / camera.height_px)).astype(np.int32))
             cv2.fillConvexPoly(mask, outline, 1)

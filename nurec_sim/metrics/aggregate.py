@@ -75,6 +75,8 @@ def summarize(values: pl.DataFrame, seed: int = 0) -> pl.DataFrame:
     import polars as pl
 
     scenes = sorted(values["clipgt_id"].unique().to_list())
+    # Resampling n scenes with replacement is multinomial: counts per scene instead of indices, so that one matrix
+    # product gives all resampled means. The scene is the unit because trials of one scene are not independent.
     draws = np.random.default_rng(seed).multinomial(
         len(scenes), np.full(len(scenes), 1 / max(len(scenes), 1)), BOOTSTRAP
     )
@@ -84,6 +86,7 @@ def summarize(values: pl.DataFrame, seed: int = 0) -> pl.DataFrame:
     ):
         means = np.full(len(scenes), np.nan)
         for (scene,), trials in part.filter(pl.col("valid")).group_by("clipgt_id"):
+            # Sorted, because the rounding of a float sum depends on the order of its terms.
             means[scenes.index(scene)] = trials["value"].sort().mean()
         low, high = _interval(means, draws)
         known = np.isfinite(means)
@@ -112,6 +115,7 @@ def _interval(means: np.ndarray, draws: np.ndarray) -> tuple[float | None, float
     known = np.isfinite(means)
     if known.sum() < 2:
         return None, None
+    # Scenes without a valid value get no weight; the others share the resample's remaining counts.
     weight = draws[:, known]
     total = weight.sum(axis=1)
     drawn = (weight @ means[known])[total > 0] / total[total > 0]
@@ -121,6 +125,7 @@ def _interval(means: np.ndarray, draws: np.ndarray) -> tuple[float | None, float
 
 def _rollout_numbers(series: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]], profile: str) -> dict[str, float]:
     """Every metric of one rollout as a number, NaN where it has none."""
+    # Truncation at the first event (competing risks), in the profile ``alpasim`` also at 4 m from the recorded path.
     event_us = min(_first_us(series.get("collision_any"), 0.5), _first_us(series.get("offroad"), 0.5))
     censor_us = _first_us(series.get("dist_to_gt_trajectory"), CENSOR_M)
     end_us = min(event_us, censor_us) if profile == "alpasim" else event_us
@@ -128,6 +133,7 @@ def _rollout_numbers(series: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]
     collision, offroad = numbers["collision_any"], numbers["offroad"]
     numbers["collision_offroad_mean"] = (collision + offroad) / 2
     numbers["offroad_or_collision"] = np.nan
+    # Three-valued OR: one certain event decides even if the other is unknown.
     if collision == 1 or offroad == 1:
         numbers["offroad_or_collision"] = 1.0
     elif np.isfinite(collision) and np.isfinite(offroad):
@@ -148,6 +154,7 @@ def _scene_score(numbers: dict[str, float]) -> float:
         return 0.0
     if not np.isfinite([at_fault, offroad, numbers["gt_dist_traveled_m"]]).all():
         return float("nan")
+    # Progress along a path of less than 5 m is mostly noise: full score, as in AlpaSim.
     if numbers["gt_dist_traveled_m"] < 5:
         return 1.0
     return float(min(np.clip(numbers["progress"], 0, 1) / 0.8, 1))

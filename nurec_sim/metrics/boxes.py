@@ -102,10 +102,20 @@ def rectangle_distance(
 
     Disjoint convex polygons are closest at a corner of one of them, and rectangles are disjoint if and only if an axis
     of one of them separates them (separating axis theorem).
+
+    Args:
+        world_from_a: poses of the centres of A; only x, y and yaw are used.
+        size_a_m: length and width of A.
+        world_from_b: poses of the centres of B.
+        size_b_m: length and width of B.
+
+    Returns:
+        metres; NaN where a pose is NaN.
     """
     distance_a, apart_a = _corners_to_rectangle(world_from_a, size_a_m, world_from_b, size_b_m)
     distance_b, apart_b = _corners_to_rectangle(world_from_b, size_b_m, world_from_a, size_a_m)
     distance = np.minimum(distance_a, distance_b)
+    # Corners may all lie outside although the rectangles overlap (a cross), hence the test for a separating axis.
     return np.where(np.isnan(distance) | apart_a | apart_b, distance, 0.0)
 
 
@@ -117,6 +127,7 @@ def _corners_to_rectangle(world_from_a, size_a_m, world_from_b, size_b_m):
     along = offset[..., 0] * np.cos(yaw) + offset[..., 1] * np.sin(yaw)
     across = offset[..., 1] * np.cos(yaw) - offset[..., 0] * np.sin(yaw)
     half_length, half_width = size_b_m[0] / 2, size_b_m[1] / 2
+    # Distance from a point to an axis-aligned rectangle in its own frame: excess over the half extents, per axis.
     outside = np.hypot(np.maximum(np.abs(along) - half_length, 0), np.maximum(np.abs(across) - half_width, 0))
     apart = (along.min(-1) > half_length) | (along.max(-1) < -half_length)
     apart |= (across.min(-1) > half_width) | (across.max(-1) < -half_width)

@@ -67,6 +67,7 @@ def collision_series(rollout: Rollout, profile: str = "strict", actors_known: bo
     known = bool(rollout.actors) if actors_known is None else actors_known
     if not known or not rollout.states:
         return [unknown_series(name, t_us) for name in (*names, "collision_delta_v_mps")]
+    # The per-side flags may combine several actors; delta-v is per contact, so it comes from ``find_contacts``.
     sides = _side_flags(rollout, profile)
     flags = {f"collision_{side}": sides[side] for side in SIDES}
     flags["collision_any"] = np.logical_or.reduce([sides[side] for side in SIDES])
@@ -93,6 +94,7 @@ def find_contacts(rollout: Rollout, profile: str = "strict") -> list[Contact]:
             continue
         index = int(counted[0])
         side = _first_side(ego, box, index, profile)
+        # Plastic impact of equal masses: both leave with the mean velocity, so each changes by half the difference.
         relative = ego_velocity[index] - speed_of(box.world_from_box, t_us)[index]
         found.append(
             Contact(
@@ -143,6 +145,7 @@ def _counted(ego: BoxPath, actor: BoxPath, profile: str, relevant: np.ndarray) -
     touches = touching(ego, actor)
     if profile == "alpasim":
         return touches & relevant
+    # ``armed`` becomes true at a state without contact and stays so while the actor is present and the policy drives.
     present, counted, armed = actor.present, np.zeros(len(touches), bool), False
     for index in range(len(touches)):
         armed = bool(present[index]) and ((armed and bool(relevant[index])) or not touches[index])

@@ -47,6 +47,8 @@ def motion_signals(rollout: Rollout) -> dict[str, Float64[np.ndarray, " t"]] | N
     """The six smoothed signals while the policy drives, NaN before; None if they cannot be computed."""
     from scipy.signal import savgol_filter
 
+    # Only policy-driven states enter the filter: its window must not mix in the log replay. Savitzky-Golay filters need
+    # even spacing and at least one full window.
     driven = np.flatnonzero(times_of(rollout) >= rollout.first_closed_loop_us)
     if len(rollout.states) == 0 or len(driven) < ACCEL_WINDOW:
         return None
@@ -89,10 +91,13 @@ def infeasible_steps(
     heading = np.stack([np.cos(yaw_rad[:-1]), np.sin(yaw_rad[:-1])], axis=1)
     step = np.diff(xy_m, axis=0)
     moved = np.linalg.norm(step, axis=1)
+    # Inverse bicycle model: speed from displacement (signed by the heading), acceleration from successive speeds at
+    # the middles of their steps, curvature as turned angle over distance.
     speed = np.sign(np.sum(step * heading, axis=1)) * moved / np.diff(t_s)
     middle = (t_s[1:] + t_s[:-1]) / 2
     bad = np.zeros(len(t_s), bool)
     turned = np.abs(geometry.wrap_angle(np.diff(yaw_rad)))
+    # Multiplied out, with a margin, so that a standing car with a noisy yaw is not infeasible.
     bad[1:] |= turned > MAX_CURVATURE_PER_M * moved + _STILL_M
     bad[2:] |= np.abs(np.diff(speed) / np.diff(middle)) > MAX_ACCEL_MPS2
     return bad

@@ -63,6 +63,8 @@ def fit_ground(
     path_cells = cell_of(path_m[:, :2])
     seeds, inverse, counts = np.unique(path_cells, return_inverse=True, return_counts=True)
     wheels = np.bincount(inverse, path_m[:, 2]) / counts
+    # Wheel contacts seed the growth. Where Gaussians lie near them these take precedence, since the recorded pose may
+    # be off relative to the reconstruction.
     found = heights.low_quantile(seeds, wheels, SEED_STEP_M)
     flat_level[seeds] = np.where(np.isnan(found), wheels, found)
 
@@ -77,6 +79,7 @@ class _CellHeights:
     """Heights sorted within cells, so that a quantile inside a gate takes two binary searches."""
 
     def __init__(self, cell: np.ndarray, height_m: np.ndarray) -> None:
+        # One sorted key for both: cell index times a span larger than all heights, plus the height.
         order = np.lexsort((height_m, cell))
         self.base = float(height_m.min()) - 1.0
         self.span = float(height_m.max()) - self.base + 1.0
@@ -95,6 +98,7 @@ class _CellHeights:
 def _grow(level: np.ndarray, heights: _CellHeights) -> bool:
     """Accepts neighbours of accepted cells with matching heights; False if nothing was added."""
     rows, columns = level.shape
+    # Mean height of the accepted cells among the eight neighbours; the cell itself is still unknown where it matters.
     total, count = np.zeros_like(level), np.zeros(level.shape, np.int64)
     padded = np.pad(level, 1, constant_values=np.nan)
     for dy in (0, 1, 2):
@@ -123,6 +127,8 @@ def _extrapolate(level: np.ndarray, observed: np.ndarray) -> np.ndarray:
     def smooth(values: np.ndarray) -> np.ndarray:
         return gaussian_filter(values * weight, PLANE_SIGMA_M / PITCH_M, mode="constant", truncate=2.0)
 
+    # Weighted least-squares plane around every cell from smoothed first and second moments. Heights are taken relative
+    # to their mean ``base`` to limit cancellation.
     mass = np.maximum(smooth(np.ones_like(z)), 1e-12)
     mean_x, mean_y, mean_z = smooth(x) / mass, smooth(y) / mass, smooth(z) / mass
     xx, yy = smooth(x * x) / mass - mean_x**2, smooth(y * y) / mass - mean_y**2

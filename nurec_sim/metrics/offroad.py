@@ -48,7 +48,14 @@ def judge_footprints(
     body: Box,
     tolerance_m: float = TOLERANCE_M,
 ) -> Footprints:
-    """Classifies the body's footprint, sampled every 0.1 m, at n rig poses."""
+    """Classifies the body's footprint, sampled every 0.1 m, at n rig poses.
+
+    Args:
+        grid: road grid of the scene.
+        world_from_rig: rig poses.
+        body: the car's body in the rig frame.
+        tolerance_m: excursion beyond the road that is still accepted.
+    """
     centre = body_boxes(world_from_rig, body).world_from_box
     along, across = (
         np.linspace(-size / 2, size / 2, int(np.ceil(size / SAMPLE_STEP_M)) + 1) for size in body.size_m[:2]
@@ -58,7 +65,10 @@ def judge_footprints(
     x = centre[:, None, 0, 3] + offsets[:, 0] * np.cos(yaw) - offsets[:, 1] * np.sin(yaw)
     y = centre[:, None, 1, 3] + offsets[:, 0] * np.sin(yaw) + offsets[:, 1] * np.cos(yaw)
     possible, known, inside = grid.look_up(np.stack([x, y], axis=-1))
+    # Points off the grid are neither off nor on; they count through their share of the footprint only.
     possible, known = np.where(inside, possible, 0.0), np.where(inside, known, 0.0)
+    # Beyond all cells that *may* be road: off whatever the unknown cells are. Only beyond those that *are* road:
+    # undecidable.
     off = (possible > tolerance_m).any(axis=1)
     unsure = (known > tolerance_m).any(axis=1) | ((~inside).mean(axis=1) > MAX_OUTSIDE_FRAC)
     verdict = np.where(off, Verdict.OFF, np.where(unsure, Verdict.UNKNOWN, Verdict.ON)).astype(np.uint8)
@@ -70,6 +80,7 @@ def debounced(verdict: UInt8[np.ndarray, " t"]) -> tuple[Float64[np.ndarray, " t
     verdict = np.asarray(verdict)
     before = np.concatenate([[Verdict.ON], verdict[:-1]])
     off = verdict == Verdict.OFF
+    # An OFF after an UNKNOWN may be the first or the second in a row, so it is undecidable too.
     values = (off & (before == Verdict.OFF)).astype(np.float64)
     valid = (verdict != Verdict.UNKNOWN) & ~(off & (before == Verdict.UNKNOWN))
     return values, valid
@@ -154,7 +165,16 @@ def offroad_agreement(
 ) -> Agreement:
     """Compares the grid with the true drivable area at footprints beside the recorded path.
 
-    Placements are uniform along the path and within ``max_offset_m`` to either side, heading along it.
+    Placements are uniform along the path and to either side, heading along it.
+
+    Args:
+        grid: road grid of the reconstruction.
+        road_map: the true map.
+        ego: the recorded path.
+        body: the car's body in the rig frame.
+        placements: number of random footprints.
+        seed: of the placements.
+        max_offset_m: largest lateral offset from the path, metres.
 
     Raises:
         ValueError: the map has no drivable area, or the path is shorter than a metre.

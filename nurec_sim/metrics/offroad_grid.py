@@ -78,7 +78,15 @@ class OffroadGrid:
     def from_state(
         cls, origin_m: tuple[float, float], cell_m: float, state: np.ndarray, bandwidth_m: float, overruled: float
     ) -> OffroadGrid:
-        """A grid from its cells; computes the distance fields."""
+        """A grid from its cells; computes the distance fields.
+
+        Args:
+            origin_m: lower corner (x, y) of the grid in the world.
+            cell_m: side length of a cell.
+            state: ``Cell`` values [rows, columns].
+            bandwidth_m: bandwidth of the evidence that the cells were decided with.
+            overruled: fraction of the driven corridor that was labelled non-road.
+        """
         possible = distance_to(state != Cell.NONROAD, cell_m)
         known = distance_to(state == Cell.ROAD, cell_m)
         return cls(origin_m, cell_m, state.astype(np.uint8), possible, known, bandwidth_m, overruled)
@@ -90,6 +98,7 @@ class OffroadGrid:
         rows, columns = self.state.shape
         place = (np.asarray(xy_m, np.float64) - np.asarray(self.origin_m)) / self.cell_m
         inside = np.all((place >= 0) & (place < np.array([columns, rows])), axis=-1)
+        # Cell k is sampled at its centre k + 0.5; within half a cell of the border the value is constant.
         column = np.clip(place[..., 0] - 0.5, 0, columns - 1)
         row = np.clip(place[..., 1] - 0.5, 0, rows - 1)
         column0, row0 = np.minimum(column.astype(np.int64), columns - 2), np.minimum(row.astype(np.int64), rows - 2)
@@ -144,16 +153,20 @@ def build_offroad_grid(
         np.bincount(flat[chosen], opacity[chosen], rows * columns).reshape(rows, columns).astype(np.float32)
         for chosen in (is_road, ~is_road)
     ]
+    # The driven path is road by definition: the recorded car was there.
     path_cells = np.floor((path[:, :2] - low) / cell).astype(np.int64)
     on_path = np.zeros((rows, columns), bool)
     on_path[path_cells[:, 1], path_cells[:, 0]] = True
     from_path = distance_to(on_path, cell)
 
+    # Mean spacing of the Gaussians near the path is 1 / sqrt(density). The bandwidth must span it, otherwise gaps
+    # between Gaussians become unknown cells; a larger one blurs the road edge.
     band = from_path < settings.density_band_m
     density = int(np.count_nonzero(band.reshape(-1)[flat])) / (int(np.count_nonzero(band)) * cell**2)
     bandwidth = float(np.clip(settings.bandwidth_factor / np.sqrt(max(float(density), 1e-6)), *settings.bandwidth_m))
     state = _decide(evidence[0], evidence[1], cell, bandwidth, settings)
     _drop_specks(state, cell, settings)
+    # Measured before the corridor is overwritten, as a diagnostic of the labels.
     corridor = from_path <= settings.corridor_m
     overruled = float(np.mean(state[corridor] == Cell.NONROAD))
     state[corridor] = Cell.ROAD
@@ -172,12 +185,14 @@ def road_map_of_grid(grid: OffroadGrid, smooth_m: float = 0.2) -> RoadMap:
     """The road cells as drivable polygons with smoothed outlines, without lanes; unknown cells are not drivable."""
     import shapely
 
+    # Runs of road cells along each row as rectangles: far fewer polygons to unite than cells.
     road = np.pad((grid.state == Cell.ROAD).astype(np.int8), ((0, 0), (1, 1)))
     row, start = np.nonzero(np.diff(road, axis=1) == 1)
     _, stop = np.nonzero(np.diff(road, axis=1) == -1)
     x0, y0 = grid.origin_m
     cell = grid.cell_m
     area = shapely.union_all(shapely.box(x0 + start * cell, y0 + row * cell, x0 + stop * cell, y0 + (row + 1) * cell))
+    # Morphological opening rounds the staircase of cells and removes slivers thinner than 2 smooth_m.
     area = shapely.buffer(shapely.buffer(area, -smooth_m), smooth_m).simplify(cell / 2)
     polygons = [polygon for polygon in shapely.get_parts(area) if polygon.geom_type == "Polygon"]
     rings = [(polygon.exterior, *polygon.interiors) for polygon in polygons]
@@ -192,6 +207,7 @@ def driven_path(ego: Trajectory, body: Box, step_m: float = 0.05) -> Float64[np.
     ends = [poses[0] @ np.array([tail, 0, 0, 1.0]), poses[-1] @ np.array([nose, 0, 0, 1.0])]
     points = np.concatenate([[ends[0][:3]], poses[:, :3, 3], [ends[1][:3]]])
     length = geometry.arc_length(points)
+    # Interpolation over arc length needs strictly increasing stations; repeated poses of a standing car are dropped.
     moved = np.concatenate([[True], np.diff(length) > 1e-9])
     points, length = points[moved], length[moved]
     at = np.linspace(0.0, length[-1], max(int(np.ceil(length[-1] / step_m)), 1) + 1)
@@ -255,6 +271,7 @@ def _fill_holes(state: np.ndarray, cell: float, settings: GridSettings) -> None:
     holes, count = label(state == Cell.UNKNOWN)
     fill = np.bincount(holes.reshape(-1), minlength=count + 1) * cell**2 < settings.hole_m2
     fill[0] = False
+    # A hole that touches non-road or the grid's border may continue beyond what was seen, so it stays unknown.
     fill[np.unique(holes[binary_dilation(state == Cell.NONROAD)])] = False
     for border in (holes[0], holes[-1], holes[:, 0], holes[:, -1]):
         fill[np.unique(border)] = False

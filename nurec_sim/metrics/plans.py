@@ -56,7 +56,10 @@ def _deviation(old: Plan, old_line: np.ndarray, new: Plan, new_line: np.ndarray)
 
 
 def _tracking_error(rollout: Rollout, now_us: int, pose: np.ndarray, plan: Plan, line: np.ndarray) -> float:
-    """Distance 0.5 s after a plan; NaN if the plan or the rollout ends before."""
+    """Distance 0.5 s after a plan; NaN if the plan or the rollout ends before.
+
+    A plan that starts in the future is completed by the car's pose at planning time, the anchor of the controller.
+    """
     later = now_us + TRACKING_AHEAD_US
     if len(plan.t_us) < 1 or later > plan.t_us[-1] or later > rollout.states[-1].t_us:
         return float("nan")

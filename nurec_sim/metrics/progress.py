@@ -55,6 +55,8 @@ def progress_series(rollout: Rollout) -> list[Series]:
         series.append(make_series("dist_to_gt_trajectory", t_us, away))
         return [*series, unknown_series("progress", t_us), unknown_series("progress_rel", t_us)]
     reached, away = _follow(centre, line, length)
+    # Relative to the recording at the same time, at most 1: being ahead of it earns nothing. Within the first 0.1 m the
+    # quotient is undefined.
     by_now = np.interp(t_us, rollout.recorded.t_us, length)
     relative = np.where(by_now > 0.1, np.minimum(reached, by_now) / np.maximum(by_now, 0.1), 1.0)
     return [
@@ -114,6 +116,7 @@ def _time_to_contact(
     ahead = offset[:, 0] * np.cos(yaw) + offset[:, 1] * np.sin(yaw) > 0
     closing = np.linalg.norm(ego_velocity - actor_velocity, axis=1)
     moving = np.linalg.norm(ego_velocity, axis=1) > 0.005
+    # A gap larger than the relative motion within the horizon cannot close; this skips most of the box tests.
     near = np.flatnonzero(ahead & moving & (gap_m > 0) & (gap_m <= closing * TTC_HORIZON_S))
     ttc = np.full(len(gap_m), np.inf)
     if len(near) == 0:

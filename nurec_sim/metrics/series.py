@@ -57,7 +57,14 @@ METRICS: dict[str, Metric] = {
 
 
 def make_series(name: str, t_us: np.ndarray, values: np.ndarray, valid: np.ndarray | bool = True) -> Series:
-    """A registered metric over time; non-finite values are invalid."""
+    """A registered metric over time.
+
+    Args:
+        name: a key of ``METRICS``.
+        t_us: times [t], microseconds.
+        values: values [t] in the metric's unit; non-finite ones are invalid.
+        valid: validity [t], or one for all times.
+    """
     metric = METRICS[name]
     values = np.asarray(values, np.float64)
     known = np.broadcast_to(np.asarray(valid, bool), values.shape) & np.isfinite(values)

@@ -56,6 +56,7 @@ def metric_table(
             f"scenario '{twice.scenario}': each may occur only once in a run"
         )
     order = sorted(range(len(ids)), key=lambda i: (*_place(scored[i][0]), ids[i]))
+    # The run's id depends on its content in sorted order, not on the time or the order of the rollouts.
     run_uuid = str(uuid.uuid5(NAMESPACE, _digest((ids[i], scored[i][1]) for i in order)))
     trials = _trials([scored[i][0] for i in order])
     frames = []
@@ -142,6 +143,7 @@ def _digest(parts: Iterable[tuple[str, Sequence[Series]]]) -> str:
         for one in series:
             digest.update(one.name.encode())
             digest.update(np.ascontiguousarray(one.t_us, np.int64).tobytes())
+            # NaN has many bit patterns; invalid values are hashed as 0.
             digest.update(np.where(one.valid, one.values, 0.0).astype(np.float64).tobytes())
             digest.update(np.asarray(one.valid, bool).tobytes())
     return digest.hexdigest()

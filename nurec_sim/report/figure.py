@@ -33,7 +33,15 @@ def rounded(values: Sequence[float] | np.ndarray) -> list[float | None]:
 
 
 def line_trace(name: str, points: np.ndarray, colour: str, width: float = 2, dash: str = "solid") -> dict[str, Any]:
-    """A polyline through points [n, 2]; NaN breaks it."""
+    """A polyline as a plotly trace.
+
+    Args:
+        name: name in the legend.
+        points: points [n, 2]; NaN breaks the line.
+        colour: CSS colour.
+        width: line width, pixels.
+        dash: plotly dash style.
+    """
     return {
         "type": "scatter", "mode": "lines", "name": plain(name), "x": rounded(points[:, 0]), "y": rounded(points[:, 1]),
         "line": {"color": colour, "width": width, "dash": dash}, "hoverinfo": "name",

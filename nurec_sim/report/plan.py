@@ -1,6 +1,6 @@
 """Bird's-eye view of a rollout.
 
-The recorded drive goes to the right: x is metres along its chord, y metres to the left.
+The recorded drive points to the right: x is metres along its chord, y metres to the left.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ EVERY_STATES = 10
 
 
 class PlanAxes:
-    """Turns the world so that a recorded drive goes to the right."""
+    """Rotates the world so that a recorded drive points to the right."""
 
     def __init__(self, recorded: Trajectory) -> None:
         line = recorded.position_m[:, :2]
         chord = line[-1] - line[0]
+        # The chord of a (nearly) stationary recording has no meaningful direction: its first heading is used.
         far = np.linalg.norm(chord) > 1.0
         self.yaw = float(np.arctan2(chord[1], chord[0]) if far else geometry.yaw_of(recorded.world_from_body[0]))
         self.origin = line[0]
@@ -47,6 +48,7 @@ class PlanAxes:
 
         low, high = self.low - MARGIN_M, self.high + MARGIN_M
         columns, rows = np.ceil((high - low) / PIXEL_M).astype(int)
+        # Inverse mapping: every pixel of the rotated view looks up its cell, so that there are no gaps.
         x, y = np.meshgrid(low[0] + (np.arange(columns) + 0.5) * PIXEL_M, high[1] - (np.arange(rows) + 0.5) * PIXEL_M)
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         world = np.stack([x * c - y * s, x * s + y * c], axis=-1) + self.origin
@@ -63,7 +65,14 @@ class PlanAxes:
 
 
 def plan_view(entry: ReportRollout, view: PlanAxes, image_key: str | None, road_map: RoadMap | None) -> dict[str, Any]:
-    """Road grid, recorded and driven path, ego and actor boxes every second, events."""
+    """Road grid, recorded and driven path, ego and actor boxes every second, events, as a plotly figure.
+
+    Args:
+        entry: the rollout with its metrics and contacts.
+        view: axes of the recorded drive.
+        image_key: key of the shared image of the road grid; None without a grid.
+        road_map: the true map; its road edges are added if given.
+    """
     rollout = entry.rollout
     ego, boxes = ego_boxes(rollout), actor_boxes(rollout)
     data: list[dict[str, Any]] = []

@@ -14,7 +14,14 @@ OPEN_ROLLOUTS = 1
 
 
 def rollout_card(index: int, entry: ReportRollout, report: RunReport, embed: bool) -> str:
-    """The card of one rollout; figures ``plan<index>`` and ``time<index>`` are rendered when it is opened."""
+    """The HTML card of one rollout; figures ``plan<index>`` and ``time<index>`` are rendered when it is opened.
+
+    Args:
+        index: position in the report; the first card is open.
+        entry: the rollout with its metrics, contacts, video and scenario.
+        report: the whole report, for the metric values.
+        embed: whether the video is embedded as base64 instead of linked.
+    """
     rollout = entry.rollout
     summary = (
         f"<summary>{escape(rollout.policy)} <span class='where'>· {escape(rollout.scene_id)} · "

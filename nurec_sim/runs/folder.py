@@ -78,6 +78,7 @@ def owned(run: Path) -> Iterator[None]:
     Raises:
         RunError: another process holds the lock.
     """
+    # The kernel releases a flock when its process ends, however it ends: there are no stale lock files.
     handle = os.open(run, os.O_RDONLY)
     try:
         try:
@@ -117,7 +118,15 @@ def scene_folder(run: Path, scene_id: str, reconstruction: str) -> Path:
 
 
 def rollout_folder(run: Path, scene_id: str, reconstruction: str, policy: str, seed: int) -> Path:
-    """Folder of one rollout."""
+    """Folder of one rollout.
+
+    Args:
+        run: the run folder.
+        scene_id: id of the scene.
+        reconstruction: name of the reconstruction.
+        policy: name of the policy.
+        seed: seed of the rollout.
+    """
     return scene_folder(run, scene_id, reconstruction) / folder_name(policy) / str(seed)
 
 
@@ -140,6 +149,8 @@ def scene_folders(run: Path) -> list[Path]:
 @contextlib.contextmanager
 def written_at_once(target: Path) -> Iterator[Path]:
     """Yields a hidden folder that is renamed to ``target`` on success; on failure ``target`` is unchanged."""
+    # On the same file system, so that both renames are atomic. An existing target is moved aside first, since a
+    # non-empty folder cannot be replaced, and is restored if the second rename fails.
     part, old = (target.with_name(f".{target.name}.{kind}.{os.getpid()}") for kind in ("part", "old"))
     with writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)

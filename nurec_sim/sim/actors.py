@@ -53,6 +53,7 @@ class Actors:
                 continue
             asked = np.array([start_us, end_us]) - int(round(edit.delay_s * 1e6))
             pair = self._moved(track, edit, asked)
+            # A request can only override poses, not remove an actor: it is placed out of sight instead.
             if edit.hide or not track.path.covers(int(asked[1])):
                 pair[:, 2, 3] -= HIDDEN_BELOW_M
             result[track_id] = pair
@@ -63,6 +64,7 @@ class Actors:
         rig_from_world = geometry.inverse(world_from_rig)
         result = []
         for track_id, track in self.tracks.items():
+            # Central differences over 0.2 s, one-sided where the actor has just appeared or is about to vanish.
             times = np.array([t_us - VELOCITY_WINDOW_US, t_us, t_us + VELOCITY_WINDOW_US])
             before, now, after = self.poses(track_id, times)
             if np.isnan(now[0, 0]):
@@ -76,5 +78,6 @@ class Actors:
 
     @staticmethod
     def _moved(track: Track, edit: ActorEdit, t_us: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 4 4"]:
+        # Right-multiplied: the shift is along the box's own axes, so it follows the actor through curves.
         shift = geometry.pose(np.eye(3), np.array([*edit.shift_m, 0.0]))
         return track.path.at(t_us) @ shift

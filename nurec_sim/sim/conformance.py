@@ -36,6 +36,7 @@ def check_policy(policy: Policy) -> list[str]:
             faults.append(f"{world.id}: {first.error}")
             continue
         faults += [f"{world.id}: {text}" for text in watched.faults]
+        # Bitwise equality is possible because the loop itself is deterministic: any difference is the policy's.
         second = run_rollout(scenario, policy, world.sense, world, seed=1)
         if _bytes(first.plans) != _bytes(second.plans):
             faults.append(

@@ -96,6 +96,7 @@ class FlatWorld:
         actors: Mapping[str, Float64[np.ndarray, "2 4 4"]],
     ) -> tuple[Float64[np.ndarray, " n"], np.ndarray]:
         """Distance along each unit ray and the object hit: an index of ``tracks``, -1 the ground, -2 nothing."""
+        # Rays within 1e-6 of horizontal or above it never reach the ground plane z = 0.
         with np.errstate(divide="ignore"):
             distance = np.where(directions[:, 2] < -1e-6, -origin[2] / directions[:, 2], np.inf)
         hit = np.where(np.isfinite(distance), -1, -2)
@@ -106,6 +107,8 @@ class FlatWorld:
             start = geometry.transform_points(box_from_world, origin)
             along = directions @ box_from_world[:3, :3].T
             half = np.asarray(track.size_m) / 2
+            # Slab method: a ray is inside a box between its last entry into and its first exit from the three slabs.
+            # Rays parallel to a slab give +-inf, or NaN in one of its planes, which restricts nothing.
             with np.errstate(divide="ignore", invalid="ignore"):
                 sides = np.stack([(-half - start) / along, (half - start) / along])
             enter = np.nan_to_num(sides.min(axis=0), nan=-np.inf).max(axis=1)
@@ -120,6 +123,7 @@ class FlatWorld:
         station, lateral = geometry.project_to_polyline(xy_m, self.road_m)
         rgb = np.where((np.abs(lateral) < self.road_width_m / 2)[:, None], ROAD_RGB, VERGE_RGB).astype(np.float64)
         rgb[(np.abs(lateral) < 0.08) & (station % 9 < 3)] = MARK_RGB
+        # Spatial hash (Teschner et al. 2003): noise that depends on the cell only, so it is the same in every view.
         cells = np.floor(np.clip(xy_m, -1e6, 1e6) * 4).astype(np.int64)
         grain = ((cells[:, 0] * 73_856_093) ^ (cells[:, 1] * 19_349_663)) % 17 - 8
         return np.clip(rgb + grain[:, None], 0, 255).astype(np.uint8)
@@ -135,8 +139,13 @@ def flat_world(
 ) -> FlatWorld:
     """A world whose ego drove along ``line_m`` on a parallel road.
 
-    ``speed_mps`` is one speed or one per 0.1 s. ``lane_offset_m`` is the ego's lateral position on the road, left
-    positive.
+    Args:
+        world_id: id of the scene.
+        line_m: path of the rig origin, k points (x, y), metres.
+        speed_mps: one speed, or one per 0.1 s of the log including both ends.
+        duration_s: length of the log.
+        tracks: actors.
+        lane_offset_m: lateral position of the ego on the road, left positive.
     """
     steps = int(round(duration_s * 1e6)) // LOG_STEP_US + 1
     speeds = np.broadcast_to(np.asarray(speed_mps, np.float64), (steps,))

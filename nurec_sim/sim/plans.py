@@ -25,6 +25,7 @@ def check_plan(plan: object, now_us: int) -> Plan:
         raise PlanError(f"the policy must return a nurec_sim.types.Plan, got {type(plan).__name__}")
     if plan.stop_session:
         return _last(plan)
+    # Copies: a policy may keep and later overwrite its arrays.
     try:
         t_raw, pose = np.array(plan.t_us), np.array(plan.pose, np.float64)
     except (TypeError, ValueError) as error:

@@ -77,6 +77,8 @@ class PolicyHost:
         self._thread.stop()
 
     def _make_anew(self) -> None:
+        # ``make`` may return one and the same object each time. If the abandoned call still runs in it, a second thread
+        # must not enter it.
         busy, before = self._thread.alive, self._policy
         thread, policy, _, needs = self._made()
         if busy and policy is before:

@@ -93,6 +93,13 @@ class SensorSuite:
     ) -> dict[str, SensorFrame]:
         """All frames that end at ``t_us``, by name, in at most one call of ``sense``.
 
+        Args:
+            sense: the renderer.
+            t_us: planning time, microseconds.
+            pose_at: world-from-rig pose [4, 4] at a time up to ``t_us``.
+            actors: poses [2, 4, 4] of edited actors by track id, at the start and the end of an exposure (``start_us``,
+                ``end_us``).
+
         Raises:
             RequestError: the renderer returned frames other than those requested.
         """
@@ -122,6 +129,7 @@ class SensorSuite:
             rig_from_sensor, lasts_us = sensor.rig_from_lidar, int(round(1e6 / sensor.frequency_hz))
         else:
             rig_from_sensor, lasts_us = sensor.rig_from_camera, self._exposure_us[name]
+        # An exposure cannot begin before the recording, which has no poses there.
         start_us = max(t_us - lasts_us, self._span_us[0])
         # An instant is [t, t + 1), as in NuRec clients; both ends lie inside the half-open span.
         end_us = max(t_us, start_us + 1)
@@ -144,6 +152,7 @@ def find_camera(rig: Rig, name: str) -> CameraModel:
         off_axis = {c.id: math.acos(min(1.0, float(c.rig_from_camera[0, 2]))) for c in rig.cameras.values()}
         best = min(off_axis.values())
         forward = [c for c in rig.cameras.values() if off_axis[c.id] <= best + FRONT_TOLERANCE_RAD]
+        # Rounded to 1 mrad: the two cameras of a stereo pair count as equal, and ``max`` returns the first of equals.
         return max(forward, key=lambda c: round(horizontal_fov_rad(c), 3))
     raise ScenarioError(f"camera '{name}' is needed but the rig has no such camera; have {list(rig.cameras)}")
 
@@ -165,6 +174,7 @@ def horizontal_fov_rad(camera: CameraModel) -> float:
     """Angle between the rays at the centres of the left and right image borders, limited to the lens's valid range."""
     from nurec_sim.sensors import unproject
 
+    # 33 columns instead of the two borders: the projection of a fisheye or F-theta lens may end inside the image.
     columns = np.linspace(0.0, camera.width_px, 33)
     rays, valid = unproject(camera, np.column_stack([columns, np.full(33, camera.height_px / 2)]))
     if np.count_nonzero(valid) < 2:

@@ -56,12 +56,14 @@ class PolicyThread:
         _abandoned.append(self._thread)
         ident = self._thread.ident
         if ident is not None:
+            # The exception is raised at the thread's next bytecode, hence only once a native call has returned.
             # SystemExit ends a thread without a message.
             ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), ctypes.py_object(SystemExit))
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
             future, function = job
+            # A call whose caller timed out before its turn must not run: its result would have no recipient.
             if not future.set_running_or_notify_cancel():
                 continue
             try:
@@ -70,6 +72,7 @@ class PolicyThread:
                 future.set_exception(error)
             else:
                 future.set_result(result)
+            # Otherwise the last observation would stay in memory while the thread waits for the next job.
             del job, future, function
 
 

@@ -21,6 +21,8 @@ class RecordedDrive:
 
     def __init__(self, ego: Trajectory) -> None:
         self.ego = ego
+        # Vertices less than 0.1 m apart are dropped: at a standstill, localisation noise would add arc length and
+        # random tangents.
         keep, last = [0], ego.position_m[0, :2]
         for i, place in enumerate(ego.position_m[:, :2]):
             if np.linalg.norm(place - last) >= VERTEX_SPACING_M:
@@ -42,6 +44,7 @@ class RecordedDrive:
             return 0.0
         low, high = 0, len(self.line_m)
         if near_m is not None:
+            # One vertex more on either side, so that the segments containing both ends of the range take part.
             low = max(0, int(np.searchsorted(self.station_m, near_m - SEARCH_M[0])) - 1)
             high = max(low + 2, int(np.searchsorted(self.station_m, near_m + SEARCH_M[1])) + 1)
             low = min(low, len(self.line_m) - 2)
@@ -64,6 +67,15 @@ class RecordedDrive:
 
         Cameras thus keep their height above a sloping road. Across the path the ground is assumed level: a car 3 m
         beside the recorded path of a road banked by 2 degrees is 0.1 m too high or too low.
+
+        Args:
+            x_m: position of the rig origin in the world.
+            y_m: position of the rig origin in the world.
+            yaw_rad: heading in the world.
+            station_m: arc length on the recorded path whose ground is used.
+
+        Returns:
+            the world-from-rig pose.
         """
         recorded = self.ego.at(self.time_at(station_m))
         turn = geometry.rotation_from_yaw(yaw_rad - float(geometry.yaw_of(recorded)))
@@ -89,6 +101,8 @@ class RecordedDrive:
 
     def _speeds(self, t_us: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
         low, high = self._window(t_us)
+        # Differences over 0.5 s average localisation noise; projected on the heading, sideways noise at a standstill
+        # is no speed.
         moved = self.ego.at(high)[:, :2, 3] - self.ego.at(low)[:, :2, 3]
         forward = self.ego.at(t_us)[:, :2, 0]
         forward = forward / np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
@@ -101,6 +115,15 @@ class RecordedDrive:
         """Up to 20 waypoints every 4 m of the recorded path ahead, in the rig frame, and the recorded speed at each.
 
         The end of the recording is the last one; beyond it, and for a stationary recording, there are none.
+
+        Args:
+            x_m: position of the car in the world.
+            y_m: position of the car in the world.
+            yaw_rad: heading of the car in the world.
+            station_m: arc length of the car on the recorded path.
+
+        Returns:
+            waypoints (x, y) in metres, and speeds in m/s.
         """
         wanted = station_m + ROUTE_SPACING_M * np.arange(1, ROUTE_POINTS + 1)
         ahead = wanted[wanted < self.length_m]
@@ -114,7 +137,17 @@ class RecordedDrive:
     def future(
         self, t_us: int, x_m: float, y_m: float, yaw_rad: float
     ) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
-        """The log's next 5 s every 0.1 s as (x, y, yaw) in the rig frame; shorter at the end of the recording."""
+        """The log's next 5 s every 0.1 s as (x, y, yaw) in the rig frame; shorter at the end of the recording.
+
+        Args:
+            t_us: the present, microseconds.
+            x_m: position of the car in the world.
+            y_m: position of the car in the world.
+            yaw_rad: heading of the car in the world.
+
+        Returns:
+            times in microseconds, and poses in metres and radians.
+        """
         times = t_us + FUTURE_STEP_US * np.arange(1, FUTURE_POINTS + 1, dtype=np.int64)
         times = times[times <= self.ego.end_us]
         poses = self.ego.at(times)
@@ -124,6 +157,14 @@ class RecordedDrive:
 
 
 def to_local(world_m: Float64[np.ndarray, "k 2"], x_m: float, y_m: float, yaw_rad: float) -> Float64[np.ndarray, "k 2"]:
-    """World points (x, y) in the frame of a car at (x, y, yaw)."""
+    """World points in the frame of a car.
+
+    Args:
+        world_m: k points (x, y).
+        x_m: position of the car in the world.
+        y_m: position of the car in the world.
+        yaw_rad: heading of the car in the world.
+    """
+    # Row vectors times R(yaw) equal column vectors under its transpose, the rotation from world to car axes.
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return (world_m - [x_m, y_m]) @ np.array([[c, -s], [s, c]])

@@ -53,11 +53,18 @@ def run_rollout(
 
     Every fault (a policy that raises, exits, hangs or returns an invalid plan, a failing renderer, a missing sensor, a
     scenario that does not fit the scene) gives a rollout of status ``failed`` with the error text and all states so
-    far; only a real Ctrl-C raises. ``progress`` gets the fraction of the scenario; ``on_frames`` gets time and frames
-    by sensor name after each rendering.
+    far; only a real Ctrl-C raises.
 
-    The policy runs in its own thread, with ``plan_timeout_s`` per call, unless it is a ``PolicyHost``, which has its
-    own thread and limit. It gets read-only copies.
+    Args:
+        scenario: what is driven.
+        policy: runs in its own thread and gets read-only copies.
+        sense: the renderer.
+        facts: rig, recorded drive, tracks and time span of the scene.
+        reconstruction: name of the reconstruction, copied into the rollout.
+        seed: of the initial state, and passed to the policy's ``reset``.
+        progress: called with the fraction of the scenario done.
+        on_frames: called with time (microseconds) and frames by sensor name after each rendering.
+        plan_timeout_s: time limit of each call of the policy; a ``PolicyHost`` has its own limit instead.
     """
     if not isinstance(policy, PolicyHost):
         host = PolicyHost(lambda: policy, plan_timeout_s)
@@ -112,6 +119,7 @@ def timeline(scenario: Scenario, facts: SceneFacts) -> Timeline:
     Raises:
         ScenarioError: the scenario starts after the end of the recording.
     """
+    # ``span_us`` is half-open, while a state at the last microsecond of the ego trajectory still has a pose.
     begin = max(facts.span_us[0], facts.ego.start_us)
     last = min(facts.span_us[1] - 1, facts.ego.end_us)
     start = begin + _us(scenario.start_s)
@@ -128,6 +136,7 @@ def timeline(scenario: Scenario, facts: SceneFacts) -> Timeline:
 
 def start_offset(perturbation: Perturbation, scene_id: str, seed: int) -> tuple[float, float, float]:
     """Lateral offset (m), yaw offset (rad) and speed factor of the initial state, from scene and seed only."""
+    # Philox is counter-based and keyed by (scene, seed), so the sample does not depend on the order of the rollouts.
     key = int.from_bytes(hashlib.sha256(f"{scene_id}/start".encode()).digest()[:8], "little")
     lateral, yaw, speed = np.random.Generator(np.random.Philox(key=[key, seed])).standard_normal(3)
     return (
@@ -193,6 +202,8 @@ class _Drive:
         except ScenarioError as error:
             self.states.append(self.logged_state(self.facts.ego.start_us))
             raise _Failure("scenario_error", str(error)) from None
+        # The offset is in the rig frame (right-multiplied), so the whole warm-up runs beside the log, without a jump
+        # when the policy takes over.
         lateral, yaw, speed_factor = start_offset(self.scenario.perturbation, self.facts.id, self.seed)
         self.offset = geometry.pose_from_xyyaw(0.0, lateral, yaw)
         self.first_closed_us = times.first_closed_us
@@ -215,6 +226,7 @@ class _Drive:
         """Sense, plan and track until the end, or until the policy requests a stop."""
         car = self.car_at_start(speed_factor)
         if speed_factor != 1.0:
+            # The policy must observe the perturbed speed, so the last logged state is replaced.
             self.states[-1] = self.state_of(times.first_closed_us, car)
         self.trace.append((times.first_closed_us, car))
         track = CONTROLLERS[self.scenario.controller]
@@ -235,6 +247,7 @@ class _Drive:
                     return
                 path, planned_us, driven_m = PlannedPath(plan, car, t_us), t_us, 0.0
             assert path is not None
+            # Arc length actually driven, for the integral part of the speed control.
             car, before = track(path, car, t_us - planned_us, driven_m, self.limits), car
             driven_m += math.hypot(car.x_m - before.x_m, car.y_m - before.y_m)
             self.trace.append((t_us + TICK_US, car))
@@ -277,6 +290,7 @@ class _Drive:
     def logged_state(self, t_us: int) -> EgoState:
         """The recorded ego state, with the initial offset applied."""
         speed, accel, yaw_rate = self.recorded.motion(t_us)
+        # Inverse bicycle model; below 0.5 m/s the yaw rate is mostly noise and the quotient meaningless.
         steering = math.atan(yaw_rate * self.limits.wheelbase_m / speed) if speed > 0.5 else 0.0
         steering = min(max(steering, -self.limits.steering_rad), self.limits.steering_rad)
         return EgoState(t_us, self.facts.ego.at(t_us) @ self.offset, speed, accel, yaw_rate, steering)
@@ -304,6 +318,7 @@ class _Drive:
             return self.states[-1].world_from_rig
         if t_us < self.first_closed_us:
             return self.facts.ego.at(t_us) @ self.offset
+        # Linear between ticks of 10 ms: the deviation from the arc, a_lat dt^2 / 8, is below 0.2 mm at 10 m/s^2.
         index, rest_us = divmod(t_us - self.first_closed_us, TICK_US)
         before = self.trace[index][1]
         after = self.trace[min(index + 1, len(self.trace) - 1)][1]

@@ -44,11 +44,13 @@ def advance(state: VehicleState, dt_s: float, limits: Limits) -> VehicleState:
     """
     speed, accel = state.speed_mps, state.accel_mps2
     moving_s = dt_s
+    # A negative final speed implies braking (accel < 0), so the car stops after speed / -accel.
     if speed + accel * dt_s < 0:
         moving_s = speed / -accel
     distance = speed * moving_s + 0.5 * accel * moving_s**2
     turn = distance * math.tan(state.steering_rad) / limits.wheelbase_m
     half = turn / 2
+    # The displacement along a circular arc is its chord, at the mean heading of start and end.
     # Chord of the arc; sin(x)/x by its series near 0, where the quotient loses precision.
     chord = distance * (math.sin(half) / half if abs(half) > 1e-4 else 1 - half**2 / 6)
     return VehicleState(
@@ -62,7 +64,16 @@ def advance(state: VehicleState, dt_s: float, limits: Limits) -> VehicleState:
 
 
 def actuate(state: VehicleState, steering_rad: float, accel_mps2: float, dt_s: float, limits: Limits) -> VehicleState:
-    """Actuator response to commands over ``dt_s``: limits, first-order lag, bounded steering rate."""
+    """Actuator response to commands: limits, first-order lag, bounded steering rate.
+
+    Args:
+        state: the car; pose and speed are kept.
+        steering_rad: commanded steering angle of the front wheels, left positive.
+        accel_mps2: commanded longitudinal acceleration.
+        dt_s: duration of the command.
+        limits: vehicle limits and lag.
+    """
+    # Exact solution of the lag x' = (target - x) / lag over the step, so the response is independent of its length.
     follow = 1 - math.exp(-dt_s / limits.lag_s)
     target = _clip(steering_rad, -limits.steering_rad, limits.steering_rad)
     most = limits.steering_rate_radps * dt_s
@@ -75,7 +86,15 @@ def actuate(state: VehicleState, steering_rad: float, accel_mps2: float, dt_s: f
 def step(
     state: VehicleState, steering_rad: float, accel_mps2: float, limits: Limits, dt_s: float = TICK_US / 1e6
 ) -> VehicleState:
-    """One step of the car under commands: actuators first, then the exact arc."""
+    """One step of the car under commands: actuators first, then the exact arc.
+
+    Args:
+        state: the car at the start of the step.
+        steering_rad: commanded steering angle of the front wheels, left positive.
+        accel_mps2: commanded longitudinal acceleration.
+        limits: vehicle limits.
+        dt_s: length of the step.
+    """
     return advance(actuate(state, steering_rad, accel_mps2, dt_s, limits), dt_s, limits)
 
 

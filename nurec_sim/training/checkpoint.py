@@ -1,7 +1,7 @@
-"""Where a training run stands, in one safetensors file that appears complete or not at all.
+"""Checkpoints of a training run: one safetensors file, written atomically.
 
-It holds the network, its moving average, and the optimiser's two moments; the position in the recipe is the file's
-metadata. Nothing random needs saving: what step k sees depends on the seed and k only.
+It holds the network, its moving average, and the optimiser's two moments; the position in the recipe is in the file's
+metadata. No random state is saved, because the sample of step k depends on the seed and k only.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 @dataclass(frozen=True)
 class Position:
-    """How far a run is: ``step`` steps done over all stages, ``seconds`` spent, under the recipe of ``digest``."""
+    """Progress of a run: ``step`` steps done over all stages, ``seconds`` spent, under the recipe of ``digest``."""
 
     step: int
     seconds: float
@@ -41,7 +41,18 @@ def save_checkpoint(
     optimiser: torch.optim.AdamW | None,
     position: Position,
 ) -> Path:
-    """Write the state of a run; ``optimiser`` is None between two stages."""
+    """Writes the state of a run.
+
+    Args:
+        folder: the run folder.
+        model: the network.
+        average: its moving average.
+        optimiser: its moments are saved; None between two stages, since each stage starts with fresh moments.
+        position: progress of the run, stored as metadata.
+
+    Returns:
+        the file.
+    """
     tensors = {f"model/{name}": value for name, value in model.state_dict().items()}
     tensors |= {f"average/{name}": value for name, value in average.state_dict().items()}
     if optimiser is not None:
@@ -50,6 +61,7 @@ def save_checkpoint(
             if state:
                 tensors |= {f"{moment}/{name}": state[moment] for moment in _MOMENTS}
                 tensors[f"count/{name}"] = state["step"]
+    # ``clone``: safetensors refuses tensors that share memory.
     contiguous = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     data = safetensors.torch.save(contiguous, {_KEY: json.dumps(asdict(position), sort_keys=True)})
     path = folder / CHECKPOINT
@@ -58,10 +70,10 @@ def save_checkpoint(
 
 
 def read_position(folder: Path) -> Position | None:
-    """Where the run in a folder stands, None if it has no checkpoint.
+    """Position of the run in a folder, None without a checkpoint.
 
     Raises:
-        TrainingError: the checkpoint is damaged or of something else.
+        TrainingError: the checkpoint is damaged or not one of a training run.
     """
     path = folder / CHECKPOINT
     if not path.is_file():
@@ -74,7 +86,7 @@ def read_position(folder: Path) -> Position | None:
 
 
 def load_networks(folder: Path, model: nn.Module, average: nn.Module) -> dict[str, Tensor]:
-    """Fill the network and its average; what is left are the optimiser's tensors (``restore_optimiser``).
+    """Loads the network and its average; returns the optimiser's tensors (for ``restore_optimiser``).
 
     Raises:
         TrainingError: the checkpoint is damaged, or of another network.
@@ -96,7 +108,7 @@ def load_networks(folder: Path, model: nn.Module, average: nn.Module) -> dict[st
 def restore_optimiser(
     optimiser: torch.optim.AdamW, trained: Mapping[str, nn.Parameter], tensors: Mapping[str, Tensor]
 ) -> None:
-    """Give the optimiser the moments that it had."""
+    """Restores the optimiser's moments."""
     for name, parameter in trained.items():
         if f"count/{name}" in tensors:
             optimiser.state[parameter] = {moment: tensors[f"{moment}/{name}"].clone() for moment in _MOMENTS}

@@ -1,6 +1,6 @@
-"""The losses on rendered views (paper section 4.1): what the Gaussians of a pass look like from somewhere else.
+"""Losses on rendered views (paper section 4.1): the Gaussians of a pass rendered from held-out viewpoints.
 
-Static and moving Gaussians are drawn at the view's own time, the sky behind them, and the camera's response applied.
+Static and moving Gaussians are rendered at the view's time in front of the sky, then the camera response is applied.
 """
 
 from __future__ import annotations
@@ -42,21 +42,23 @@ def render_view(
     view: TargetView,
     threads: int | None = None,
 ) -> Rendering:
-    """A view of one pass; gradients reach the Gaussians, the sky and the response.
+    """A view of one pass, differentiable in the Gaussians, the sky and the response.
 
     Args:
         query: Gaussians in the scene frame, b = 1.
         sky: the network's cubemap, in the scene frame.
-        isp: response of the view's camera: shown = ``isp[:, :3] @ colour + isp[:, 3]``.
-        inputs: of the pass, for the times of the moving Gaussians.
-        view: where and when to look.
-        threads: of the renderer.
+        isp: affine response of the view's camera: shown = ``isp[:, :3] @ colour + isp[:, 3]``.
+        inputs: inputs of the pass; give the times of the moving Gaussians.
+        view: camera, poses and time.
+        threads: threads of the renderer.
     """
     gaussians = gaussians_at(query, inputs, view.time)
     drawn = render_camera(gaussians, view.camera, torch.from_numpy(view.scene_from_camera), None, threads)
     rays, _ = camera_rays(view.camera)
     direction = scene_rays(view.camera, rays, view.scene_from_camera)[..., 3:].astype(np.float32)
     behind = cubemap.sample(sky, torch.from_numpy(direction))
+    # Premultiplied colours: the sky shows through the remaining transmittance. The response comes last, as in a camera,
+    # so that Gaussians and sky share one canonical colour space.
     canonical = drawn.rgb + (1 - drawn.alpha)[..., None] * behind
     shown = canonical @ isp[:, :3].T + isp[:, 3]
     return Rendering(shown.clamp(0, 1), drawn.depth, drawn.alpha)
@@ -65,7 +67,17 @@ def render_view(
 def render_losses(
     rendering: Rendering, view: TargetView, weights: LossWeights, perceptual: PerceptualLoss
 ) -> dict[str, Tensor]:
-    """Colour (L1), perceptual, opacity where there is sky, and depth (L1 of its logarithm) where both know one."""
+    """Loss terms of one view before weighting; terms of weight 0 are not computed.
+
+    ``colour``: L1. ``perceptual``. ``opacity``: mean alpha over sky pixels. ``rendered_depth``: L1 of the logarithm
+    where both depths exist.
+
+    Args:
+        rendering: the rendered view.
+        view: its ground truth.
+        weights: weights of the terms.
+        perceptual: the perceptual distance.
+    """
     losses = {}
     if weights.colour:
         losses["colour"] = (rendering.rgb - view.rgb).abs().mean()
@@ -73,9 +85,11 @@ def render_losses(
         losses["perceptual"] = perceptual(rendering.rgb, view.rgb)
     if weights.opacity:
         sky = view.semantic == SemanticClass.SKY
+        # Otherwise sky could be explained by Gaussians at arbitrary depth.
         losses["opacity"] = torch.where(sky, rendering.alpha, 0).sum() / sky.sum().clamp(min=1)
     if weights.rendered_depth:
         both = (view.depth_m > 0) & (rendering.depth_m > 0.1)
+        # Clamped before the logarithm: ``where`` alone does not keep NaN gradients of masked pixels out.
         error = rendering.depth_m.clamp(min=0.1).log() - view.depth_m.clamp(min=0.1).log()
         losses["rendered_depth"] = torch.where(both, error.abs(), 0).sum() / both.sum().clamp(min=1)
     return losses

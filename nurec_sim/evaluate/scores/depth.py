@@ -63,5 +63,6 @@ def depth_score(
     d, true = depth_m[valid].astype(np.float64), true_m[valid].astype(np.float64)
     if not len(d):
         return DepthScore(np.nan, np.nan, np.nan, 0)
+    # max(d / t, t / d) < 1.25 without a division: a missing depth (0) is outside.
     near = np.maximum(d, true) < DELTA1 * np.minimum(d, true)
     return DepthScore(float(np.mean(np.abs(d - true) / true)), float(near.mean()), float((d > 0).mean()), len(d))

@@ -1,8 +1,8 @@
-"""FLIP: how different two images look to a person who flips between them, 0 (equal) to 1.
+"""FLIP: perceived difference when alternating between two images, 0 (equal) to 1.
 
-Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", HPG 2020, for images of a standard display:
-colours are blurred as the eye blurs them at a distance (contrast sensitivity), compared in L*a*b* with the Hunt
-effect, and the difference is raised where edges or points appear in one image only.
+Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", HPG 2020, for low dynamic range images:
+colours are filtered with the contrast sensitivity functions of the eye, compared in L*a*b* with the Hunt effect, and
+the difference is amplified where edges or points appear in one image only.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def flip_map(
 
     Args:
         image: sRGB.
-        reference: of the same size.
-        pixels_per_degree: how fine the pixels are to the observer.
+        reference: sRGB of the same size.
+        pixels_per_degree: pixels per degree of visual angle of the observer.
 
     Raises:
         ValueError: the images differ in shape or are not 8-bit RGB.
@@ -57,6 +57,7 @@ def flip_map(
     first, second = _opponent(_linear(image)), _opponent(_linear(reference))
     colour = _colour_difference(_seen(first, pixels_per_degree), _seen(second, pixels_per_degree))
     feature = _feature_difference(first[..., 0], second[..., 0], pixels_per_degree)
+    # The paper's combination: a feature difference of 1 makes any colour difference maximal, one of 0 leaves it as is.
     return colour ** (1 - feature)
 
 
@@ -66,22 +67,23 @@ def flip(image: Image, reference: Image, pixels_per_degree: float = PIXELS_PER_D
 
 
 def _linear(rgb: Image) -> Planes:
+    # Inverse sRGB transfer function; a table, since 8-bit images have only 256 levels.
     levels = np.arange(256) / 255.0
     table = np.where(levels > 0.04045, ((levels + 0.055) / 1.055) ** 2.4, levels / 12.92).astype(np.float32)
     return table[rgb]
 
 
 def _opponent(rgb: Planes) -> Planes:
-    """Linear RGB as Y, Cx, Cz: achromatic, red-green, blue-yellow; linear in the light, so that it may be blurred."""
+    """Linear RGB as Y, Cx, Cz: achromatic, red-green, blue-yellow; linear in radiance, hence valid to filter."""
     x, y, z = np.moveaxis(rgb @ (_XYZ_FROM_RGB.T / _WHITE).astype(np.float32), -1, 0)
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
 
 
 def _seen(opponent: Planes, pixels_per_degree: float) -> Planes:
-    """What the eye resolves of an image, in L*a*b* with the Hunt effect (colours of dark things differ less)."""
+    """The image filtered by contrast sensitivity, in L*a*b* with the Hunt effect (chroma scales with lightness)."""
     blurred = np.empty_like(opponent)
     for channel, kernel in enumerate(_blur_kernels(pixels_per_degree)):
-        # Sums of Gaussians are not separable, each Gaussian of a sum is.
+        # A sum of Gaussians is not separable, but each of its Gaussians is.
         plane = np.ascontiguousarray(opponent[..., channel])
         blurred[..., channel] = sum(
             weight * cv2.sepFilter2D(plane, -1, line, line, borderType=cv2.BORDER_REPLICATE) for weight, line in kernel
@@ -94,6 +96,7 @@ def _seen(opponent: Planes, pixels_per_degree: float) -> Planes:
 
 def _hunt(rgb: Planes) -> Planes:
     ratio = rgb @ (_XYZ_FROM_RGB.T / _WHITE).astype(np.float32)
+    # CIE L*a*b*: the cube root is replaced by its tangent below (6/29)^3, where its slope would diverge.
     delta = 6 / 29
     root = np.where(ratio > delta**3, np.cbrt(ratio), ratio / (3 * delta**2) + 4 / 29)
     lightness = 116 * root[..., 1] - 16
@@ -103,8 +106,9 @@ def _hunt(rgb: Planes) -> Planes:
 
 @functools.cache
 def _blur_kernels(pixels_per_degree: float) -> tuple[tuple[tuple[float, Float32[np.ndarray, " k"]], ...], ...]:
-    """Per channel: Gaussians along a line with their weights in the sum, which has the volume 1."""
+    """Per channel: 1D Gaussians and their weights; their weighted sum of 2D Gaussians has volume 1."""
     widest = max(b for pairs in _SENSITIVITY for _, b in pairs)
+    # exp(-pi^2 x^2 / b) has the standard deviation sqrt(b / (2 pi^2)); the kernel reaches three of the widest.
     radius = int(np.ceil(3 * np.sqrt(widest / (2 * np.pi**2)) * pixels_per_degree))
     x = np.arange(-radius, radius + 1) / pixels_per_degree
     channels = []
@@ -116,20 +120,20 @@ def _blur_kernels(pixels_per_degree: float) -> tuple[tuple[tuple[float, Float32[
 
 
 def _distance(first: Planes, second: Planes) -> Float32[np.ndarray, "h w"]:
-    """HyAB: city-block in lightness, Euclidean in colour."""
+    """HyAB distance (Abasi et al. 2020): city-block between lightness and chroma, Euclidean within chroma."""
     apart = first - second
     return np.abs(apart[..., 0]) + np.hypot(apart[..., 1], apart[..., 2])
 
 
 @functools.cache
 def _greatest() -> float:
-    """The difference of green and blue, the greatest there is."""
+    """Distance between pure green and pure blue, the largest in sRGB."""
     green, blue = np.eye(3, dtype=np.float32)[1:, None, None]
     return float(_distance(_hunt(green), _hunt(blue))[0, 0]) ** _COLOUR_EXPONENT
 
 
 def _colour_difference(first: Planes, second: Planes) -> Float32[np.ndarray, "h w"]:
-    """0 to 1; the lower 40 % of differences take 95 % of the range, for larger ones hardly look larger."""
+    """0 to 1; the lower 40 % of differences map to 95 % of the range, since larger ones look almost alike."""
     difference = _distance(first, second) ** _COLOUR_EXPONENT
     knee, top = _KNEE * _greatest(), _greatest()
     low = _KNEE_VALUE / knee * difference
@@ -140,7 +144,7 @@ def _colour_difference(first: Planes, second: Planes) -> Float32[np.ndarray, "h 
 def _feature_difference(
     first: Float32[np.ndarray, "h w"], second: Float32[np.ndarray, "h w"], pixels_per_degree: float
 ) -> Float32[np.ndarray, "h w"]:
-    """The greater of the differences in edges and in points, as strong as the eye finds them."""
+    """The larger of the differences in edge and in point strength."""
     changes = []
     for kernel in _feature_kernels(pixels_per_degree):
         strength = []
@@ -149,6 +153,7 @@ def _feature_difference(
             along = [_filtered(grey, *lines) for lines in (kernel, kernel[::-1])]
             strength.append(np.hypot(*along))
         changes.append(np.abs(strength[0] - strength[1]))
+    # Each strength is a norm over two directions, at most sqrt(2).
     return (np.maximum(*changes) / np.sqrt(2)).astype(np.float32) ** np.float32(_FEATURE_EXPONENT)
 
 
@@ -162,13 +167,14 @@ def _filtered(
 def _feature_kernels(
     pixels_per_degree: float,
 ) -> tuple[tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]], ...]:
-    """First (edges) and second (points) derivative of a Gaussian, along and across; lobes of weight 1 and -1."""
+    """First (edges) and second (points) derivative of a Gaussian, and the Gaussian across; lobes sum to 1 and -1."""
     width = 0.5 * _FEATURE_WIDTH_DEG * pixels_per_degree
     x = np.arange(-int(np.ceil(3 * width)), int(np.ceil(3 * width)) + 1)
     bell = np.exp(-(x**2) / (2 * width**2))
     across = bell / bell.sum()
     kernels = []
     for line in (-x * bell, (x**2 / width**2 - 1) * bell):
+        # Normalised lobes: a unit step gives an edge response of at most 1, whatever the width of the kernel.
         lobes = np.where(line < 0, line / -line[line < 0].sum(), line / line[line > 0].sum())
         kernels.append((lobes, across))
     return tuple(kernels)

@@ -1,8 +1,8 @@
 """False obstacles: simulated LiDAR returns where recorded beams passed freely.
 
-Beside the driven path nothing was recorded that images could be compared with, but space that beams crossed is known
-to be empty. A return in it is a surface that is not there: a splinter before which a policy would brake. Beams that
-graze a surface pass close to it, so a return counts only away from all that was recorded.
+Beside the driven path there are no recorded images to compare with, but space that beams crossed is known to be empty.
+A return in it is a surface that does not exist: a floater for which a policy would brake. Grazing beams pass close to
+surfaces, so a return counts only at a distance from all recorded returns.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from nurec_sim import geometry
 from nurec_sim.types import MOVABLE_LABELS, Track
 
 BEAMS = 3
-"""So many recorded beams must have passed."""
+"""Minimum number of recorded sweeps with a beam that passed the point."""
 AWAY_M = 0.4
-"""A return this near to a recorded one may lie on the surface that it shows."""
+"""A simulated return closer than this to a recorded one may lie on the same surface."""
 COLUMNS = 1440
 STEP_RAD = 2 * np.pi / COLUMNS
-"""Cells of a recorded sweep seen from its sensor."""
+"""Angular cells of the range image of a recorded sweep."""
 BESIDE_M = 0.1
-"""A beam passes a point if it passes it as near as this, or through the point's cell."""
+"""A beam passes a point if it passes within this distance, or through the point's cell."""
 RADII = (0, 1, 2, 4)
-"""Cells around a point's own whose beams pass it; 4 of them are 0.1 m at 5.7 m."""
+"""Neighbourhood radii in cells whose beams pass a point; 4 cells are 0.1 m at 5.7 m."""
 MARGIN_M, MARGIN_SHARE = 0.5, 0.03
-"""A beam passes a point if it ends so much farther; grazing beams and poses are not more exact."""
+"""A beam passes a point if it ends farther by this margin, the accuracy of poses and of grazing beams."""
 BOX_MARGIN_M = 0.3
 FARTHEST_M = 40.0
-"""Farther off recorded points lie too far apart to tell."""
+"""Beyond this range recorded points are too sparse."""
 _THINNED_M = 0.1
 
 
@@ -40,9 +40,9 @@ class FiredSweep:
     """A recorded sweep as its sensor fired it.
 
     Attributes:
-        xyz_fired_m: returns, each in the sensor's frame when its beam was fired.
-        fraction: when, from 0 at the sweep's start to 1 at its end.
-        world_from_lidar: poses at the start and the end.
+        xyz_fired_m: returns, each in the sensor frame at its firing time.
+        fraction: firing times, from 0 at the sweep's start to 1 at its end.
+        world_from_lidar: sensor poses at the start and the end.
     """
 
     xyz_fired_m: Float64[np.ndarray, "n 3"]
@@ -51,10 +51,10 @@ class FiredSweep:
 
 
 class RecordedBeams:
-    """Recorded sweeps as images of how far beams went, and as one cloud of where they ended.
+    """Recorded sweeps as range images, and their returns as one point cloud.
 
     Args:
-        sweeps: of one log.
+        sweeps: sweeps of one log.
         ends_world_m: their returns in the world.
     """
 
@@ -66,18 +66,18 @@ class RecordedBeams:
         self._ends = cKDTree(ends_world_m[first])
 
     def free(self, xyz_world_m: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Points that ``BEAMS`` beams passed, away from everything that beams met."""
+        """Points that beams of ``BEAMS`` sweeps passed, away from all recorded returns."""
         free = ~np.isfinite(self._ends.query(xyz_world_m, distance_upper_bound=AWAY_M)[0])
         free[free] = self.passed(xyz_world_m[free]) >= BEAMS
         return free
 
     def passed(self, xyz_world_m: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-        """How many sweeps have a beam that passed each point by and ended beyond it."""
+        """Number of sweeps with a beam that passed each point and ended beyond it."""
         return sum((sweep.passed(xyz_world_m) for sweep in self._sweeps), np.zeros(len(xyz_world_m), np.int64))
 
 
 class _RangeImage:
-    """The longest beam around each cell of directions, 0 where there is none, and when each column was fired."""
+    """Longest beam in the neighbourhood of each angular cell, 0 without any, and the firing time of each column."""
 
     def __init__(self, sweep: FiredSweep) -> None:
         distance, row, column = _cells(sweep.xyz_fired_m)
@@ -90,8 +90,8 @@ class _RangeImage:
         self.fraction = np.where(beams > 0, fired, 0.5)
 
     def passed(self, xyz_world_m: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        # The sensor moves while it turns: where a point lies from it depends on when it looked there, and the other way
-        # round. From the middle of the sweep two steps come close enough.
+        # The sensor moves while it spins: the direction to a point depends on the firing time, which depends on the
+        # direction. Fixed-point iteration: from the middle of the sweep, two steps are accurate enough.
         fraction = np.full(len(xyz_world_m), 0.5)
         for _ in range(3):
             lidar_from_world = geometry.inverse(geometry.interpolate_pose_pair(self.poses, fraction))
@@ -100,6 +100,7 @@ class _RangeImage:
             fraction = self.fraction[column]
         row = row - self.low
         inside = (row >= 0) & (row < self.around.shape[1]) & (distance < FARTHEST_M)
+        # The radius grows with the angle that BESIDE_M subtends at the point's distance.
         wide = np.searchsorted(RADII, BESIDE_M / np.maximum(distance, BESIDE_M) / STEP_RAD, side="right") - 1
         reach = np.zeros(len(xyz_world_m))
         reach[inside] = self.around[wide[inside], row[inside], column[inside]]
@@ -107,7 +108,7 @@ class _RangeImage:
 
 
 def _longest_around(image: Float32[np.ndarray, "rows columns"], radius: int) -> Float32[np.ndarray, "rows columns"]:
-    """The longest beam within so many rows and columns, all the way round."""
+    """Maximum filter over rows and columns; azimuth wraps around."""
     import cv2
 
     wide = np.pad(image, ((0, 0), (radius, radius)), mode="wrap")
@@ -118,13 +119,13 @@ def _longest_around(image: Float32[np.ndarray, "rows columns"], radius: int) -> 
 def false_obstacles(
     xyz_world_m: Float64[np.ndarray, "n 3"], beams: RecordedBeams, tracks: Sequence[Track], t_us: int
 ) -> tuple[int, int]:
-    """Returns in space that is known to be free, and all returns that count: those outside of movers' boxes.
+    """Number of returns in space known to be free, and number of counted returns (outside the boxes of movable actors).
 
     Args:
         xyz_world_m: simulated returns.
-        beams: what was recorded.
-        tracks: labelled actors, in whose boxes nothing counts.
-        t_us: when the sweep was simulated.
+        beams: recorded beams.
+        tracks: labelled actors; returns in their boxes are not counted, since free space there changes over time.
+        t_us: time of the simulated sweep.
     """
     counted = ~_in_boxes(xyz_world_m, tracks, t_us)
     return int(beams.free(xyz_world_m[counted]).sum()), int(counted.sum())
@@ -133,7 +134,7 @@ def false_obstacles(
 def _cells(
     xyz_m: Float64[np.ndarray, "n 3"],
 ) -> tuple[Float64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
-    """Distance, and row and column of the cell that a direction lies in."""
+    """Distance, and row (elevation) and column (azimuth) of the angular cell of each point."""
     elevation = np.arctan2(xyz_m[:, 2], np.hypot(xyz_m[:, 0], xyz_m[:, 1]))
     azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
     column = np.floor((azimuth + np.pi) / STEP_RAD).astype(np.int64) % COLUMNS

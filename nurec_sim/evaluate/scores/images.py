@@ -53,6 +53,7 @@ def ssim_map(image: np.ndarray, reference: np.ndarray, data_range: float | None 
     unbiased = count / (count - 1)
     border = SSIM_WINDOW // 2
 
+    # float64 throughout: E[x^2] - E[x]^2 cancels in flat regions.
     def mean(values: np.ndarray) -> np.ndarray:
         full = cv2.boxFilter(values, cv2.CV_64F, (SSIM_WINDOW, SSIM_WINDOW), borderType=cv2.BORDER_REFLECT)
         return full[border:-border, border:-border]
@@ -61,6 +62,8 @@ def ssim_map(image: np.ndarray, reference: np.ndarray, data_range: float | None 
     var_a = unbiased * (mean(a * a) - mean_a**2)
     var_b = unbiased * (mean(b * b) - mean_b**2)
     covariance = unbiased * (mean(a * b) - mean_a * mean_b)
+    # Wang et al. 2004, eq. 13: product of luminance and contrast-structure terms. c1 and c2 keep both finite in black
+    # and in flat regions.
     alike = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
     return alike / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
 

@@ -26,8 +26,8 @@ class LidarScore:
     """Beams with a recorded return, and what the simulation measured along them.
 
     Attributes:
-        xyz_m: recorded returns, each in the sensor's frame when its beam was fired.
-        simulated_m: simulated range of each beam, NaN where none came back.
+        xyz_m: recorded returns, each in the sensor frame at its firing time.
+        simulated_m: simulated range of each beam, NaN without a return.
     """
 
     xyz_m: Float64[np.ndarray, "beams 3"]
@@ -45,12 +45,12 @@ class LidarScore:
 
     @property
     def returned(self) -> Bool[np.ndarray, " beams"]:
-        """Which beams came back in the simulation."""
+        """Mask of beams with a simulated return."""
         return np.isfinite(self.simulated_m)
 
     @property
     def abs_error_m(self) -> Float64[np.ndarray, " returned"]:
-        """Errors of the ranges of those that came back."""
+        """Absolute range errors of beams with a simulated return."""
         return np.abs(self.simulated_m - self.recorded_m)[self.returned]
 
     @property
@@ -95,7 +95,7 @@ def scanner_along(lidar: LidarModel, xyz_fired_m: Float64[np.ndarray, "n 3"]) ->
     elevation = _elevation(xyz_fired_m)
     low, high = np.floor(elevation.min() / ROW_STEP_RAD), np.ceil(elevation.max() / ROW_STEP_RAD)
     rows = np.arange(high + 1, low - 2, -1) * ROW_STEP_RAD
-    # Only the two rows around each return are needed.
+    # Interpolation needs only the two rows around each return; a full dense scanner would cost many times the beams.
     index = np.unique(np.floor(elevation / ROW_STEP_RAD).astype(np.int64))
     needed = np.isin(np.round(rows / ROW_STEP_RAD).astype(np.int64), np.concatenate([index, index + 1]))
     return dataclasses.replace(lidar, elevation_rad=rows[needed], row_azimuth_offset_rad=np.zeros(int(needed.sum())))
@@ -121,10 +121,13 @@ def score_sweep(simulated: LidarFrame, xyz_fired_m: Float64[np.ndarray, "n 3"]) 
     xyz = xyz_fired_m[usable]
     _, column, _ = sensors.beam_coordinates(lidar, xyz)
     column = np.round(np.nan_to_num(column)).astype(np.int64) % columns
+    # Elevations descend with the row, hence the negation for the search.
     upper = np.clip(np.searchsorted(-lidar.elevation_rad, -_elevation(xyz), side="right") - 1, 0, rows - 2)
     above, below = lidar.elevation_rad[upper], lidar.elevation_rad[upper + 1]
     fraction = np.clip((above - _elevation(xyz)) / (above - below), 0, 1)
     first, second = image[upper, column], image[upper + 1, column]
+    # Across a depth edge the mean of two surfaces lies on neither: interpolate on one surface only, otherwise take the
+    # nearer row, and the other one if that has no return.
     nearest = np.where(fraction < 0.5, first, second)
     other = np.where(fraction < 0.5, second, first)
     same = np.abs(first - second) < SAME_SURFACE * np.minimum(first, second)

@@ -1,4 +1,4 @@
-"""How much detail an image holds beside another of the same view: spectral energy by octave."""
+"""Sharpness of an image relative to another of the same view: spectral energy by octave."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LUMA = (0.299, 0.587, 0.114)
 def octave_energy(image: UInt8[np.ndarray, "h w 3"]) -> dict[str, float]:
     """Spectral energy of an image's luma in each band of ``OCTAVES``; NaN for images under 32 pixels.
 
-    A Hann window keeps the image's borders from counting as edges.
+    A Hann window suppresses the step between opposite borders, which the periodic transform would see as an edge.
     """
     height, width = image.shape[:2]
     if min(height, width) < 32:
@@ -26,6 +26,6 @@ def octave_energy(image: UInt8[np.ndarray, "h w 3"]) -> dict[str, float]:
 
 
 def sharpness(image: UInt8[np.ndarray, "h w 3"], reference: UInt8[np.ndarray, "h w 3"]) -> dict[str, float]:
-    """Energy of an image by octave as a part of the reference's: 1 as sharp, below blurred, above noisy."""
+    """Energy of an image by octave relative to the reference's: 1 equally sharp, below blurred, above noisy."""
     shown, there = octave_energy(image), octave_energy(reference)
     return {name: shown[name] / there[name] if there[name] > 0 else float("nan") for name in OCTAVES}

@@ -1,8 +1,8 @@
-"""How cameras see the same light differently: colours of a sample changed, its geometry kept.
+"""Photometric augmentation: the colours of a sample change, its geometry does not.
 
-The world's own look (light, saturation, hue) changes for all images alike. Every camera then has a response of its
-own (white balance, exposure, gamma, vignette, softness), which its targets share. Noise and JPEG spoil single context
-images only: what is rendered should be free of them.
+The appearance of the world (light, saturation, hue) changes for all images alike. Each camera then has its own response
+(white balance, exposure, gamma, vignette, blur), which its targets share. Noise and JPEG artefacts are added to context
+images only: renderings should be free of them.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ from nurec_sim.training.data.sample import TargetView, TrainingSample
 
 Image = Float32[np.ndarray, "h w 3"]
 
-# NTSC's luminance and two axes of colour.
+# NTSC's luminance and two chrominance axes: hue is a rotation, saturation a scaling of the plane (I, Q).
 _YIQ = np.array([[0.299, 0.587, 0.114], [0.596, -0.274, -0.322], [0.211, -0.523, 0.312]])
 
 
 @dataclass(frozen=True)
 class AugmentSettings:
-    """How much colours change: standard deviations (of logarithms for factors), or shares of samples.
+    """Strength of the augmentation: standard deviations (of logarithms for factors), or shares of samples.
 
     Attributes:
-        clean: share of samples that stay as they are.
-        brightness: mean of all images, 0..1, towards which exposure goes half of the way.
-        light: brightness of the world beside that.
-        tint: of each colour channel of the world.
-        saturation: of the world.
-        hue_rad: of the world.
-        exposure: of each camera.
-        white_balance: of each colour channel of each camera.
-        gamma: of each camera's tone curve.
-        vignette: most that a camera's corners lose.
+        clean: share of samples that are not changed.
+        brightness: target mean of all images, 0..1; the exposure is corrected halfway (in stops) towards it.
+        light: brightness of the world in addition.
+        tint: gain of each colour channel of the world.
+        saturation: saturation of the world.
+        hue_rad: hue rotation of the world.
+        exposure: gain of each camera.
+        white_balance: gain of each colour channel of each camera.
+        gamma: exponent of each camera's tone curve.
+        vignette: maximum loss of brightness in a camera's corners.
         blurred: share of cameras that are out of focus.
-        blur_px: most of their blur, standard deviation.
+        blur_px: maximum standard deviation of their blur.
         noisy: share of samples with noise.
-        noise: most of it at full brightness, in 0..1.
+        noise: maximum standard deviation of the noise at full brightness, in 0..1.
         jpeg: share of samples with JPEG artefacts.
-        jpeg_quality: least and most of their quality.
+        jpeg_quality: range of their quality.
     """
 
     clean: float = 0.1
@@ -67,7 +67,7 @@ class AugmentSettings:
 
 @dataclass(frozen=True)
 class _Response:
-    """What one camera does to colours: matrix and gain, then tone curve, then softness."""
+    """Response of one camera: colour matrix, vignette, tone curve, blur, in this order."""
 
     matrix: Float64[np.ndarray, "3 3"]
     gamma: float
@@ -84,7 +84,7 @@ class _Response:
 
 
 def augmented(rng: np.random.Generator, sample: TrainingSample, settings: AugmentSettings) -> TrainingSample:
-    """The sample in other colours; shapes and geometry stay."""
+    """The sample with other colours and the same geometry."""
     if rng.random() < settings.clean:
         return sample
     cameras = sample.inputs.camera_idxs[0].tolist()
@@ -106,6 +106,7 @@ def _world_look(rng: np.random.Generator, mean: float, settings: AugmentSettings
     saturation, hue = np.exp(rng.normal(0, settings.saturation)), rng.normal(0, settings.hue_rad)
     c, s = saturation * np.cos(hue), saturation * np.sin(hue)
     colours = np.linalg.inv(_YIQ) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ _YIQ
+    # The square root corrects half of the deviation in stops, so that dark scenes remain darker than bright ones.
     exposed = np.sqrt(settings.brightness / max(mean, 0.05))
     gain = exposed * np.exp(rng.normal(0, settings.light) + rng.normal(0, settings.tint, 3))
     return gain[:, None] * colours
@@ -121,7 +122,7 @@ def _response(
 
 
 def _spoilt(rng: np.random.Generator, image: Image, noise: float, quality: int | None) -> Image:
-    """An image with noise that grows with the light, and pressed into a JPEG."""
+    """An image with noise and JPEG artefacts; shot noise grows with the square root of the signal."""
     if noise:
         spread = noise * np.sqrt(0.1 + 0.9 * image)
         image = np.clip(image + spread * rng.standard_normal(image.shape, np.float32), 0, 1).astype(np.float32)

@@ -1,7 +1,7 @@
-"""A folder of training clips that worker processes fill, and keep filling, while a training runs.
+"""A folder of training clips that worker processes fill and refresh in the background of a training run.
 
-Towns are drawn by spawned processes, a few towns each: MuJoCo and OpenGL stay out of the process that trains, a
-crash costs one of them, and what they leak ends with them. Clips lie in ``<folder>/<hash of the settings>/``.
+Towns are rendered by spawned processes, a few towns each: MuJoCo and OpenGL stay out of the training process, a crash
+ends only one worker, and leaked memory is freed with it. Clips are in ``<folder>/<hash of the settings>/``.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ from nurec_sim.training.data.generate import ClipSettings, clip_ids, generate_to
 from nurec_sim.training.workers import work_in_background
 
 Progress = Callable[[int, int], None]
-"""Called with (clips that are ready, clips wanted)."""
+"""Called with (complete clips, requested clips)."""
 Report = Callable[[str], None]
-"""Called with a line about what went wrong; the work goes on."""
+"""Called with a message about an error that does not stop the work."""
 
 TOWNS_PER_PROCESS = 3
-"""Starting a process costs about two seconds of computing."""
+"""Starting a process costs about two seconds of CPU time."""
 TRIALS = 3
-"""How often the towns of a process that failed are tried."""
+"""Attempts per batch of towns if its process fails."""
 POLL_S = 0.5
 
 
 class ClipCache:
-    """The clips of one folder and one kind; ``start`` keeps worker processes filling it.
+    """The clips of one folder and one settings hash, filled by worker processes after ``start``.
 
-    A second run goes on with what is there. Clips that cannot be read are deleted when the cache is opened. Towns are
-    drawn whole, so that there may be a few clips more than asked for.
+    A later run reuses existing clips. Unreadable clips are deleted when the cache is opened. Towns are generated as a
+    whole, so there may be a few clips more than requested.
 
     Args:
-        folder: for clips of all settings.
-        settings: what clips are like.
-        size: how many clips to keep.
-        first_town: drawn first; then the following numbers.
-        report: is told about damaged clips and failing workers.
+        folder: parent folder of the clips of all settings.
+        settings: settings of the clips.
+        size: number of clips to keep.
+        first_town: number of the first town; the following numbers come next.
+        report: called with messages about damaged clips and failing workers.
 
     Raises:
         ValueError: ``size`` is not positive or ``first_town`` negative.
@@ -86,21 +86,21 @@ class ClipCache:
         """One of them.
 
         Raises:
-            ClipError: it is not there (any more), or damaged.
+            ClipError: it does not exist (any more), or is damaged.
         """
         return CachedClip(self.clips / clip_id)
 
     def check(self) -> None:
-        """Raises why drawing has ended for good, if it has.
+        """Raises the error that ended the generation of clips, if any.
 
         Raises:
-            WriteError: the disk does not take clips.
+            WriteError: clips cannot be written.
         """
         if self._fault is not None:
             raise self._fault
 
     def data_hash(self) -> str:
-        """SHA-256 over the sorted ids of the clips and the plans that they were drawn from."""
+        """SHA-256 over the sorted ids of the clips and the hashes of their town plans."""
         digest = hashlib.sha256()
         for clip_id in self.clip_ids():
             if clip_id not in self._plans:
@@ -109,16 +109,16 @@ class ClipCache:
         return digest.hexdigest()
 
     def start(self, workers: int = 1, refresh: bool = False, backend: str | None = None, niceness: int = 10) -> None:
-        """Fill the cache in the background.
+        """Fills the cache in the background.
 
         Args:
-            workers: processes at a time.
-            refresh: go on when it is full: every new clip takes the place of the one written first.
+            workers: number of concurrent processes.
+            refresh: continue when it is full: each new clip replaces the oldest one.
             backend: see ``world.TrueWorld``.
-            niceness: added to the priority value of the workers, so that they take the time that training leaves.
+            niceness: niceness of the workers, so that training takes precedence.
 
         Raises:
-            RuntimeError: it was started already, or ``backend`` does not work here.
+            RuntimeError: already started, or ``backend`` does not work here.
         """
         from nurec_sim.world import pick_backend
 
@@ -132,11 +132,11 @@ class ClipCache:
             thread.start()
 
     def fill(self, workers: int = 1, progress: Progress | None = None, backend: str | None = None) -> None:
-        """Draw clips until the cache is full, and wait for that.
+        """Generates clips until the cache is full, and blocks until then.
 
         Raises:
             ClipError: the workers gave up before.
-            WriteError: the disk does not take clips.
+            WriteError: clips cannot be written.
         """
         try:
             self.start(workers, backend=backend, niceness=0)
@@ -151,7 +151,7 @@ class ClipCache:
             raise ClipError(f"{self.clips} holds {len(self.clip_ids())} of {self.size} clips; its workers failed")
 
     def close(self) -> None:
-        """Ends the workers; the clips that they were drawing are lost, all others stay."""
+        """Ends the workers; their unfinished clips are lost, all others remain."""
         self._stop.set()
         for thread in self._threads:
             thread.join()
@@ -159,7 +159,7 @@ class ClipCache:
         self._drop_unfinished()
 
     def _wanted_towns(self, refresh: bool) -> Iterator[tuple[int, ...]]:
-        """Numbers of the towns to draw, a few for every process."""
+        """Numbers of the towns to generate, in batches for one process each."""
         ready = self.clip_ids()
         first, end = self._first_town, self._first_town - -self.size // self.settings.clips_per_town
         numbers: Iterable[int] = range(first, end)
@@ -171,7 +171,7 @@ class ClipCache:
             yield batch
 
     def _work(self, towns: Iterator[tuple[int, ...]], refresh: bool, backend: str, niceness: int) -> None:
-        """One worker process after the other, until nothing is left to do."""
+        """Runs worker processes one after the other until no towns are left."""
         while not self._stop.is_set():
             with self._lock:
                 batch = next(towns, None)
@@ -187,7 +187,7 @@ class ClipCache:
                 self._report(f"drawing the towns {list(batch)} ended with status {status}, trial {trial} of {TRIALS}")
 
     def _run(self, batch: tuple[int, ...], backend: str, niceness: int, refresh: bool) -> int | None:
-        """The exit status of a process that draws a few towns."""
+        """Runs a process that generates a few towns; returns its exit status."""
         context = multiprocessing.get_context("spawn")
         faults, theirs = context.Pipe(duplex=False)
         process = context.Process(
@@ -212,7 +212,7 @@ class ClipCache:
                 shutil.rmtree(self.clips / name, ignore_errors=True)
 
     def _drop_unfinished(self) -> None:
-        """Deletes what dead workers left half done."""
+        """Deletes unfinished clips of dead workers."""
         for path in self.clips.glob(f"{UNFINISHED_PREFIX}*"):
             owner = path.name.removeprefix(UNFINISHED_PREFIX).partition("-")[0]
             if not owner.isdigit() or not is_alive(int(owner)):
@@ -237,7 +237,7 @@ def _ended(process: BaseProcess) -> int | None:
 
 
 def is_alive(process_id: int) -> bool:
-    """Whether a process of this machine runs."""
+    """Whether a process exists on this machine."""
     try:
         os.kill(process_id, 0)
     except ProcessLookupError:
@@ -250,7 +250,7 @@ def is_alive(process_id: int) -> bool:
 def _draw_towns(
     towns: tuple[int, ...], settings: ClipSettings, folder: Path, backend: str, niceness: int, faults: Connection
 ) -> None:
-    """What a worker process does; it sends the error of a disk that takes no more."""
+    """Main function of a worker process; sends write errors through ``faults``."""
     work_in_background(niceness)
     try:
         for town in towns:

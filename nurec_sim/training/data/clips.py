@@ -1,8 +1,8 @@
-"""Training clips on disk: what the cameras of a rig saw in the true world, and the truth behind every pixel.
+"""Training clips on disk: images of a rig's cameras in a procedural world, with ground truth for every pixel.
 
-A clip is a folder that is complete as soon as it has its name::
+A clip is a folder that is renamed to its final name when complete::
 
-    meta.json                       rig, tracks, exposures, where it comes from
+    meta.json                       rig, tracks, exposures, provenance
     ego_t_us.npy   ego_pose.npy     int64 [k], float64 [k,4,4] world_from_rig
     track_t_us.npy track_pose.npy   the knots of all tracks one after the other
     <n>_t_us.npy   <n>_pose.npy     camera n: int64 [frames,2], float64 [frames,2,4,4] world_from_camera
@@ -10,7 +10,7 @@ A clip is a folder that is complete as soon as it has its name::
     <n>_depth.npy  <n>_normal.npy   float16 [frames,h,w] z-depth (0 unknown), int8 [frames,h,w,3] camera frame times 127
     <n>_instance.npy                uint16 [frames,h,w]: 0 static, i + 1 the i-th track
 
-Arrays are plain ``.npy``, so that single frames are read from a memory map.
+Arrays are plain ``.npy``, so that single frames can be read from a memory map.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ META_FILE = "meta.json"
 UNFINISHED_PREFIX = ".unfinished-"
 NORMAL_SCALE = 127
 FARTHEST_M = 300.0
-"""Depths beyond are not kept: half precision and the losses have no use for them."""
+"""Larger depths are stored as unknown: half precision is too coarse, and the losses do not need them."""
 
 _FRAME_ARRAYS = {"rgb": (np.uint8, 3), "label": (np.uint8, 0), "depth": (np.float16, 0), "normal": (np.int8, 3),
                  "instance": (np.uint16, 0)}  # fmt: skip
@@ -44,10 +44,10 @@ _FRAME_ARRAYS = {"rgb": (np.uint8, 3), "label": (np.uint8, 0), "depth": (np.floa
 
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
-    """What one image really shows.
+    """Ground truth of one image.
 
-    ``depth_m`` is z-depth (0: sky or not known), ``normal`` in the camera frame of the pixel's own instant (zeros: not
-    known), ``label`` a ``types.Label``, ``instance`` 0 for what stands and i + 1 for the clip's i-th track.
+    ``depth_m`` is z-depth (0: sky or unknown), ``normal`` in the camera frame at the pixel's exposure time (zeros:
+    unknown), ``label`` a ``types.Label``, ``instance`` 0 for static surfaces and i + 1 for the clip's i-th track.
     """
 
     depth_m: Float32[np.ndarray, "h w"]
@@ -57,10 +57,10 @@ class FrameTruth:
 
 
 class TrueClip(Clip, Protocol):
-    """A driving log of which the truth is known."""
+    """A driving log with ground truth."""
 
     def truth(self, camera_id: str, index: int) -> FrameTruth:
-        """The truth behind one frame."""
+        """Ground truth of one frame."""
         ...
 
 
@@ -80,15 +80,15 @@ class CameraRecord:
 def write_training_clip(
     folder: Path, rig: Rig, ego: Trajectory, tracks: Sequence[Track], records: Sequence[CameraRecord], facts: Mapping
 ) -> Path:
-    """Write a clip; nobody ever sees half of one. A clip that is there already stays.
+    """Writes a clip atomically; an existing clip is kept.
 
     Args:
-        folder: where; its last part is the clip's id.
+        folder: the clip's folder; its last part is the clip's id.
         rig: cameras in the order of ``records``.
-        ego: poses of the rig, over the time of the clip at least.
-        tracks: all that moves or could; ``instance`` counts them from 1.
+        ego: poses of the rig, at least over the time of the clip.
+        tracks: all movable objects; ``instance`` counts them from 1.
         records: the frames.
-        facts: what else to remember, plain JSON.
+        facts: further metadata, plain JSON.
     """
     unfinished = folder.with_name(f"{UNFINISHED_PREFIX}{os.getpid()}-{folder.name}")
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -120,7 +120,7 @@ def write_training_clip(
             unfinished.rename(folder)
         except OSError:
             shutil.rmtree(unfinished, ignore_errors=True)
-            if not folder.is_dir():  # else somebody else wrote the same clip in the meantime
+            if not folder.is_dir():  # otherwise another process wrote the same clip in the meantime
                 raise
     return folder
 
@@ -136,7 +136,7 @@ class CachedClip:
     """A training clip, read lazily (``TrueClip``).
 
     Raises:
-        ClipError: a file is missing, cut off, or of another shape than the others say.
+        ClipError: a file is missing, truncated, or inconsistent in shape with the others.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -159,7 +159,7 @@ class CachedClip:
 
     @property
     def plan_hash(self) -> str:
-        """SHA-256 of the plan that it was drawn from."""
+        """SHA-256 of the town plan that it was generated from."""
         return str(self.facts["plan_sha256"])
 
     @property
@@ -191,7 +191,7 @@ class CachedClip:
         return np.array(self._frames[camera_id]["rgb"][index])
 
     def truth(self, camera_id: str, index: int) -> FrameTruth:
-        """The truth behind one frame."""
+        """Ground truth of one frame."""
         stored = self._frames[camera_id]
         return FrameTruth(
             stored["depth"][index].astype(np.float32),
@@ -221,7 +221,7 @@ class CachedClip:
         return meta
 
     def _array(self, name: str, kind: type, shape: tuple[int | None, ...] | None = None) -> np.ndarray:
-        """An array, checked; frames stay on disk. ``np.load`` itself finds files that were cut off."""
+        """A validated array; frames are memory-mapped. ``np.load`` itself detects truncated files."""
         frames = name.partition("_")[2] in _FRAME_ARRAYS
         try:
             array = np.load(self._folder / f"{name}.npy", mmap_mode="r" if frames else None, allow_pickle=False)

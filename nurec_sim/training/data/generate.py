@@ -1,6 +1,6 @@
-"""Drawing training clips: a town by its seed, driven through several times with random rigs.
+"""Generation of training clips: a procedural town by its seed, driven through several times with random rigs.
 
-Everything follows from the town's number and the settings; the same two give the same clips on the same machine.
+Clips are determined by the town's number and the settings, and reproducible on the same machine.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ if TYPE_CHECKING:
     from nurec_sim.world import TrueWorld
 
 GENERATOR = 3
-"""To be raised when the same settings would give other clips, so that old ones are not mixed with new ones."""
+"""Version, to be raised when the same settings would give different clips, so that old and new ones are not mixed."""
 CAMERAS = {1: 0.4, 3: 0.5, 5: 0.1}
-"""How often a rig has so many cameras."""
+"""Probability of each number of cameras of a rig."""
 PLAIN_LENS, GLOBAL_SHUTTER = 0.6, 0.85
-"""How often a rig gets pinholes without distortion, and a global shutter, whatever it would have otherwise: other
-lenses cost twice, rolling shutters about four times as much to draw."""
+"""Probabilities that a rig is given pinholes without distortion, and a global shutter: other lenses cost twice,
+rolling shutters about four times as much to render."""
 SAMPLES_AND_SHADOW = 2, 1024
-"""Colour samples per pixel and pixels of the shadow map, half of what logs are drawn with."""
+"""Colour samples per pixel and size of the shadow map, half of what logs are rendered with."""
 TOGETHER = 0.5
-"""How often all cameras of a rig expose at the same time; otherwise each has its own delay."""
+"""Probability that all cameras of a rig expose simultaneously; otherwise each has its own delay."""
 MOST_DELAY_US, LONGEST_READOUT_US = 90_000, 33_000
-"""How much later than the first camera another one may end its exposure; how long a rolling shutter may take."""
+"""Maximum delay between the ends of exposure of two cameras; maximum readout time of a rolling shutter."""
 KNOT_MARGIN_US = 2_000_000
-"""Tracks are kept for so long before and after a clip: motion decoders are asked about times outside of it."""
+"""Time before and after a clip for which tracks are kept: motion decoders are evaluated outside of it."""
 
 
 @dataclass(frozen=True)
 class ClipSettings:
-    """What training clips are like.
+    """Settings of training clips.
 
     Attributes:
-        split: towns to train in (``train``), or those that training never sees (``test``).
-        frames: of every camera.
-        period_us: from one frame to the next.
-        pixels: of every image, about; somewhat more than the network takes, so that there is something to cut away.
-        clips_per_town: drives through each town; building one costs as much as some twenty images.
-        seconds: of traffic in each town.
+        split: towns for training (``train``), or held-out ones (``test``).
+        frames: frames of every camera.
+        period_us: frame interval.
+        pixels: approximate number of pixels per image; more than the network takes, to leave room for random crops.
+        clips_per_town: drives through each town; building a town costs as much as about twenty images.
+        seconds: simulated traffic in each town.
     """
 
     split: Literal["train", "test"] = "train"
@@ -75,7 +75,7 @@ class ClipSettings:
 
     @property
     def hash(self) -> str:
-        """Names these settings and this generator in 12 hexadecimal digits."""
+        """12 hexadecimal digits that identify these settings and the version of the generator."""
         text = json.dumps({"generator": GENERATOR, **dataclasses.asdict(self)}, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -86,16 +86,25 @@ def clip_ids(town: int, settings: ClipSettings) -> list[str]:
 
 
 def town_of(clip_id: str) -> int:
-    """The town that a clip was drawn in.
+    """The town that a clip was generated in.
 
     Raises:
-        ValueError: it is no name of a clip.
+        ValueError: not the name of a clip.
     """
     return int(clip_id.split("-")[1])
 
 
 def generate_town(town: int, settings: ClipSettings, folder: Path, backend: str | None = None) -> Iterator[Path]:
-    """Draw the clips of a town that are not in ``folder`` yet, one after the other.
+    """Generates the missing clips of a town, one after the other.
+
+    Args:
+        town: number (seed) of the town.
+        settings: settings of the clips.
+        folder: folder of the clips; those that exist already are skipped.
+        backend: rendering back end, see ``world.pick_backend``.
+
+    Yields:
+        the folder of each new clip.
 
     Raises:
         ValueError: ``town`` is negative.
@@ -127,7 +136,7 @@ def _draw_clip(world: TrueWorld, drive: int, settings: ClipSettings, folder: Pat
     rig, readout_us = random_rig(car, count, settings.pixels, lens, None), random_readout_us(car)
     at_once = rng.random() < GLOBAL_SHUTTER
     ego = plan.ego_trajectory()
-    # The drives of a town share its time evenly.
+    # The drives share the town's time evenly, each starting at a random instant of its part.
     free_us = plan.span_us[1] - plan.span_us[0] - settings.frames * settings.period_us - MOST_DELAY_US
     start_us = plan.span_us[0] + int(free_us * (drive + rng.random()) / settings.clips_per_town)
     together = rng.random() < TOGETHER
@@ -163,7 +172,7 @@ def _record(world: TrueWorld, camera: CameraModel, ego: Trajectory, exposures: n
 
 
 def _cut(track: Track, span_us: tuple[int, int]) -> Trajectory:
-    """The part of a track's path around a clip, knots as they are."""
+    """The part of a track's path around a clip; knots are kept unchanged."""
     times = track.path.t_us
     low = max(int(np.searchsorted(times, span_us[0] - KNOT_MARGIN_US, side="right")) - 1, 0)
     high = int(np.searchsorted(times, span_us[1] + KNOT_MARGIN_US, side="left")) + 1

@@ -1,7 +1,7 @@
-"""The same clip seen otherwise, with exact geometry: images cut to a part of themselves, the whole world mirrored.
+"""Geometric augmentation of a clip, exact: images are cropped, the whole world is mirrored.
 
-A cut changes focal length, aspect and principal point. Mirroring turns left into right: in the mirrored world y is
--y, in mirrored images x is -x, so that every camera stays a right-handed one.
+A crop changes field of view, aspect ratio and principal point. Mirroring swaps left and right: y is negated in the
+world and x in the camera; two reflections make a rotation, so every camera frame stays right-handed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _MIRRORED_SHUTTER = {Shutter.LEFT_TO_RIGHT: Shutter.RIGHT_TO_LEFT, Shutter.RIGHT
 
 @dataclasses.dataclass(frozen=True)
 class Cut:
-    """The part of an image that is kept: its left upper corner and its size, whole pixels."""
+    """The part of an image that is kept: upper left corner and size, integer pixels."""
 
     x_px: int
     y_px: int
@@ -40,12 +40,12 @@ class Cut:
 
 
 class ReframedClip:
-    """A clip of which every camera in ``cuts`` keeps that part of its images, mirrored if so wanted (``TrueClip``).
+    """A clip whose cameras are cropped to ``cuts`` and optionally mirrored (``TrueClip``).
 
     Cameras keep their ids, so after mirroring the one called left looks to the right.
 
     Raises:
-        ValueError: a cut reaches out of the image, or a camera behind a windshield is to be mirrored.
+        ValueError: a cut exceeds the image, or a camera behind a windshield is to be mirrored.
     """
 
     def __init__(self, clip: TrueClip, cuts: Mapping[str, Cut], mirrored: bool = False) -> None:
@@ -87,7 +87,7 @@ class ReframedClip:
         return self._clip.time_offset_us
 
     def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:
-        """Exposure start and end of every frame; a cut across a rolling shutter shortens it."""
+        """Exposure start and end of every frame; cropping lines of a rolling shutter shortens the exposure."""
         whole = self._clip.camera_times_us(camera_id)
         return np.array([self._exposure(camera_id, index)[0] for index in range(len(whole))], np.int64)
 
@@ -101,7 +101,7 @@ class ReframedClip:
         return self._part(camera_id, self._clip.image(camera_id, index))
 
     def truth(self, camera_id: str, index: int) -> FrameTruth:
-        """The truth behind one frame."""
+        """Ground truth of one frame."""
         whole = self._clip.truth(camera_id, index)
         parts = {name: self._part(camera_id, array) for name, array in vars(whole).items()}
         if self._mirrored:
@@ -132,11 +132,12 @@ class ReframedClip:
     def _path(self, path: Trajectory) -> Trajectory:
         if not self._mirrored:
             return path
+        # Conjugation: the body frame is mirrored too, so that rotations stay proper (determinant 1).
         return Trajectory(path.t_us, _WORLD_MIRROR @ path.world_from_body @ _WORLD_MIRROR)
 
 
 def mirrored_camera(camera: CameraModel) -> CameraModel:
-    """The camera that takes the mirrored images of a mirrored world.
+    """The camera that takes mirrored images in the mirrored world.
 
     Raises:
         ValueError: it is behind a windshield, whose polynomials have no simple mirror image.

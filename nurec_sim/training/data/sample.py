@@ -1,4 +1,4 @@
-"""What one step of training sees: inputs of the network, the truth about them, and other views to be rendered.
+"""One training sample: inputs of the network, their ground truth, and target views to render.
 
 b clips (1), v context images (camera-major), h x w pixels. The *scene frame* is that of ``network.tensors``: the first
 image's camera at the end of its exposure, metres. Times are fractions of the sample's span, as in ``NetworkInputs``.
@@ -18,14 +18,14 @@ from nurec_sim.types import CameraModel
 
 @dataclass(frozen=True)
 class TrueMaps:
-    """What the context images really show.
+    """Ground truth of the context images.
 
     Attributes:
-        depth_m: z-depth in the camera, 0 where there is none (sky) or it is not known.
-        normal: unit surface normals in the scene frame, towards the camera; zeros where not known.
-        semantic: ``network.tensors.SemanticClass``, -1 where not known.
-        motion_m: displacement of the pixel's point to ``time_before`` and ``time_after``; zeros on what stands.
-        motion_known: where ``motion_m`` may be compared.
+        depth_m: z-depth in the camera, 0 for sky or unknown.
+        normal: unit surface normals in the scene frame, towards the camera; zeros where unknown.
+        semantic: ``network.tensors.SemanticClass``, -1 where unknown.
+        motion_m: displacement of the pixel's point to ``time_before`` and ``time_after``; zeros on static surfaces.
+        motion_known: mask of valid ``motion_m``.
     """
 
     depth_m: Float[Tensor, "b v h w"]
@@ -37,16 +37,16 @@ class TrueMaps:
 
 @dataclass(frozen=True, eq=False)
 class TargetView:
-    """A view to be rendered and compared.
+    """A target view to render and compare with.
 
     Attributes:
-        camera: exactly what took the image, resized and cropped.
-        camera_idx: whose camera response it has, as in ``NetworkInputs.camera_idxs``.
+        camera: camera model of the resized and cropped image.
+        camera_idx: index of its camera response, as in ``NetworkInputs.camera_idxs``.
         scene_from_camera: poses at the start and the end of the exposure.
-        time: when it was exposed.
+        time: time of the exposure.
         rgb: colours in 0..1, with the same camera response as the context images of this camera.
-        depth_m: z-depth, 0 where there is none or it is not known.
-        semantic: ``SemanticClass``, -1 where not known.
+        depth_m: z-depth, 0 for sky or unknown.
+        semantic: ``SemanticClass``, -1 where unknown.
     """
 
     camera: CameraModel
@@ -60,7 +60,7 @@ class TargetView:
 
 @dataclass(frozen=True, eq=False)
 class TrainingSample:
-    """One clip of a step; ``id`` names the clip and the window that it came from."""
+    """One sample of a step; ``id`` names its clip and window."""
 
     id: str
     inputs: NetworkInputs

@@ -1,4 +1,4 @@
-"""Where a training run's samples come from: clips drawn in the background, and a stream of samples for each stage."""
+"""Source of a training run's samples: clips generated in the background, and a stream of samples for each stage."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from nurec_sim.training.processes import Processes
 
 
 class Samples(Protocol):
-    """Samples for a trainer: sample k of a run is the same whoever asks, and whenever."""
+    """Samples for a trainer; sample k of a run does not depend on the process or the time of the request."""
 
     def stream(self, stage: Stage, step: int, processes: Processes) -> AbstractContextManager[Iterator[TrainingSample]]:
-        """Samples of a stage, from a step (counted over all stages) on."""
+        """Samples of a stage, starting at a step (counted over all stages)."""
 
     def data_hash(self) -> str:
-        """What stands for the data in the facts about the weights."""
+        """Identifies the data in the metadata of the weights."""
 
 
 class TownSamples:
-    """Samples of towns; use it as a context manager, which draws clips meanwhile.
+    """Samples of procedural towns generated on the fly; use it as a context manager.
 
     Args:
         config: the recipe.
-        folder: for clips; runs of the same data settings share them.
-        drawers: processes that draw clips, in the first process of a run.
-        loaders: processes that prepare samples; 0 is a thread.
+        folder: folder of clips, shared by runs with the same data settings.
+        drawers: processes that generate clips, started by the first process of a run only.
+        loaders: processes that prepare samples; 0 uses a thread.
         processes: this process among those of the run.
-        report: is told what goes wrong in the background.
+        report: called with messages about background errors.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class TownSamples:
         self._open.close()
 
     def stream(self, stage: Stage, step: int, processes: Processes) -> SampleStream:
-        """Samples of a stage, from a step on."""
+        """Samples of a stage, starting at a step."""
         profile = PROFILES[self.config.profile]
         settings = self.config.data.window_settings(profile, stage.pixels, stage.targets)
         return SampleStream(
@@ -77,5 +77,5 @@ class TownSamples:
         )
 
     def data_hash(self) -> str:
-        """SHA-256 of the clips that are there."""
+        """SHA-256 of the existing clips."""
         return self.cache.data_hash()

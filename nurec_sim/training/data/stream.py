@@ -1,8 +1,8 @@
-"""Training samples one after the other, prepared ahead in worker processes.
+"""Stream of training samples, prefetched by worker processes.
 
-Sample k of run seed s follows from s, k and the clips on disk alone. The clip is the one with the largest hash of
-(s, k, clip), so a clip that joins or leaves changes only the samples that it wins or held: once the cache is full and
-is not refreshed, a resumed run sees exactly what an uninterrupted one would have.
+Sample k of a run with seed s is determined by s, k and the clips on disk. Its clip is the one with the largest hash of
+(s, k, clip) (rendezvous hashing), so adding or removing a clip changes only the samples of that clip: once the cache is
+full and is not refreshed, a resumed run gets exactly the samples of an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from nurec_sim.training.data.windows import WindowSettings, sample_window
 from nurec_sim.training.workers import work_in_background
 
 AHEAD = 3
-"""Samples prepared ahead by each worker."""
+"""Samples prefetched per worker."""
 LOADER_NICENESS = 5
 EMPTY_PAUSE_S = 1.0
 GIVEN_UP_AFTER = 8
-"""Clips of one sample that may turn out damaged or gone."""
+"""Maximum number of unreadable clips tried for one sample."""
 
 
 def clip_order(seed: int, index: int, clips: Sequence[str]) -> list[str]:
-    """Clips in the order in which a sample would take them."""
+    """Clips in the order of preference of a sample."""
 
     def rank(clip: str) -> bytes:
         return hashlib.blake2b(f"{seed}/{index}/{clip}".encode(), digest_size=8).digest()
@@ -41,7 +41,13 @@ def clip_order(seed: int, index: int, clips: Sequence[str]) -> list[str]:
 
 
 def draw_sample(folder: Path, settings: WindowSettings, seed: int, index: int) -> TrainingSample:
-    """Sample ``index`` of a run; clips that cannot be read are passed over.
+    """Sample ``index`` of a run; unreadable clips are skipped.
+
+    Args:
+        folder: folder of complete clips.
+        settings: how samples are taken from clips.
+        seed: seed of the run.
+        index: number of the sample, counted over all ranks.
 
     Raises:
         ClipError: there are no clips, or none of the first few can be read.
@@ -56,18 +62,18 @@ def draw_sample(folder: Path, settings: WindowSettings, seed: int, index: int) -
 
 
 class SampleStream:
-    """Endless samples ``start``, ``start + 1``, ... of one rank; use it as a context manager or call ``close``.
+    """Endless samples of steps ``start``, ``start + 1``, ... of one rank; a context manager, or call ``close``.
 
     Args:
-        folder: of complete clips (``ClipCache.clips``).
-        settings: how samples are taken.
-        seed: of the run.
+        folder: folder of complete clips (``ClipCache.clips``).
+        settings: how samples are taken from clips.
+        seed: seed of the run.
         start: first step; step n of rank r is sample ``n * world_size + r``.
-        workers: spawned processes that prepare samples ahead; 0 uses one thread of this process.
-        rank: of this process in a run of several.
-        world_size: how many there are.
-        wait_s: how long to wait for a first clip.
-        check: called again and again meanwhile; what it raises ends the wait.
+        workers: spawned processes that prefetch samples; 0 uses one thread of this process.
+        rank: rank of this process.
+        world_size: number of processes.
+        wait_s: time limit for the first clip.
+        check: polled while waiting; an exception ends the wait.
 
     Raises:
         ValueError: a number is out of range.
@@ -106,7 +112,7 @@ class SampleStream:
         """The next sample.
 
         Raises:
-            ClipError: no clip came within ``wait_s``, or those that came cannot be read.
+            ClipError: no clip appeared within ``wait_s``, or the clips cannot be read.
         """
         deadline = time.monotonic() + self._wait_s
         while not self._ahead and not ready_clips(self._folder) and time.monotonic() < deadline:
@@ -125,7 +131,7 @@ class SampleStream:
         self.close()
 
     def close(self) -> None:
-        """Ends the workers; what they prepared is dropped."""
+        """Ends the workers and discards prefetched samples."""
         self._ahead.clear()
         self._workers.shutdown(wait=True, cancel_futures=True)
 

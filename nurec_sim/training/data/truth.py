@@ -1,7 +1,7 @@
-"""The truth about the images that the network gets: cropped and resized as they are, in the scene frame of the sample.
+"""Ground truth of the network's input images: cropped and resized like them, in the scene frame of the sample.
 
-Labels and instances are those of the nearest stored pixel. Depth is carried from the stored pixel's ray to the new
-one's along the surface's tangent plane, so that it stays exact on planes.
+Labels and instances are sampled at the nearest stored pixel. Depth is transferred from the stored pixel's ray to the
+new one along the tangent plane of the surface, so it stays exact on planes.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ SEMANTIC_OF_LABEL[Label.EGO] = SemanticClass.EGO
 UNKNOWN = -1
 
 MOST_DEPTH_CHANGE = 1.25
-"""By at most this factor depth changes within one stored pixel; on surfaces seen from the side the plane says more."""
+"""Maximum change of depth within a stored pixel; at grazing angles the tangent plane extrapolates beyond it."""
 
 
 def true_maps(clip: TrueClip, profile: Profile, chunk: ChunkInputs) -> TrueMaps:
-    """What the context images of a chunk really show."""
+    """Ground truth of the context images of a chunk."""
     size = input_size(profile, clip.rig.cameras[chunk.camera_ids[0]])
     depth, normal, semantic, motion, known = [], [], [], [], []
     scene_from_world = geometry.inverse(chunk.world_from_scene)
@@ -72,7 +72,16 @@ def true_maps(clip: TrueClip, profile: Profile, chunk: ChunkInputs) -> TrueMaps:
 def target_view(
     clip: TrueClip, profile: Profile, window: ChunkWindow, chunk: ChunkInputs, camera_id: str, frame: int
 ) -> TargetView:
-    """Another frame of one of the chunk's cameras, in the chunk's scene frame and time."""
+    """A frame of one of the chunk's cameras as a target, in the chunk's scene frame and time.
+
+    Args:
+        clip: the clip.
+        profile: network profile; gives the input size and the crop.
+        window: the window of the chunk; gives the span that ``time`` is a fraction of.
+        chunk: inputs of the chunk; give the scene frame.
+        camera_id: one of the chunk's cameras.
+        frame: index of the frame.
+    """
     original = clip.rig.cameras[camera_id]
     crop = plan_crop(profile, original, input_size(profile, clip.rig.cameras[chunk.camera_ids[0]]))
     start_us, end_us = (int(t) for t in clip.camera_times_us(camera_id)[frame])
@@ -92,7 +101,7 @@ def target_view(
 
 
 def _cropped(truth: FrameTruth, original: CameraModel, cropped: CameraModel, crop: Crop) -> FrameTruth:
-    """The truth at the pixels of a cropped image."""
+    """Ground truth at the pixels of a cropped and resized image."""
     columns, rows = (
         np.clip(((np.arange(count) + 0.5 + offset) * whole / resized).astype(np.int64), 0, whole - 1)
         for count, offset, whole, resized in zip(
@@ -104,7 +113,7 @@ def _cropped(truth: FrameTruth, original: CameraModel, cropped: CameraModel, cro
     stored_rays, stored_valid = sensors.pixel_rays(original)
     rays, valid = camera_rays(cropped)
     with np.errstate(invalid="ignore", divide="ignore"):
-        # Planes: n . (z r / r_z) is the same for both rays.
+        # A point on a ray r at z-depth z is z r / r_z. Both points lie on one plane: n . (z r / r_z) is equal for both.
         stored, new = stored_rays[cells], rays
         ratio = (normal * stored).sum(-1) * new[..., 2] / ((normal * new).sum(-1) * stored[..., 2])
     tame = stored_valid[cells] & valid & (ratio > 1 / MOST_DEPTH_CHANGE) & (ratio < MOST_DEPTH_CHANGE)
@@ -119,12 +128,14 @@ def _motion(
     scene_points: Float64[np.ndarray, "h w 3"],
     world_from_scene: Float64[np.ndarray, "4 4"],
 ) -> tuple[Float32[np.ndarray, "h w 2 3"], Bool[np.ndarray, "h w"]]:
-    """Displacement of every pixel's point with the box that it belongs to, and where that box is known."""
+    """Displacement of every pixel's point with the rigid motion of its box, and where the box's path is known."""
     motion, known = np.zeros((*instance.shape, 2, 3)), np.ones(instance.shape, bool)
     taken_us = _pixel_times_us(image)
     scene_from_world = geometry.inverse(world_from_scene)
     for number in np.unique(instance[instance > 0]):
         path, pixels = clip.tracks[int(number) - 1].path, instance == number
+        # Rolling shutter: pixels of one object have different exposure times, hence different box poses; one inverse
+        # per distinct time.
         times, which = np.unique(taken_us[pixels], return_inverse=True)
         box_from_scene = geometry.inverse(path.at(times)) @ world_from_scene
         points = scene_points[pixels]
@@ -137,7 +148,7 @@ def _motion(
 
 
 def _pixel_times_us(image: ContextImage) -> Int64[np.ndarray, "h w"]:
-    """When each pixel was exposed."""
+    """Exposure time of each pixel."""
     camera, (start_us, end_us) = image.camera, image.t_us
     by_columns = camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
     lines = np.arange(camera.width_px if by_columns else camera.height_px) + 0.5

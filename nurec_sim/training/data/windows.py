@@ -1,4 +1,4 @@
-"""From a clip to one training sample: which cameras, which frames, which other frames as targets, and how they look."""
+"""Sampling of training samples from clips: cameras, context frames, target frames, and augmentation."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ class WindowSettings:
     """How samples are taken from clips.
 
     Attributes:
-        profile: size of the images and of the network that they are for (``tiny`` keeps the aspect of the cameras and
-            takes about ``width_px * height_px`` pixels).
-        cameras: weight of each number of cameras; those that a rig does not have are left out.
-        frames: weight of each number of context frames per camera.
-        usual_share: how often context frames lie ``usual_spacing_s`` apart.
+        profile: network profile and image size (``tiny`` keeps the aspect ratio of the cameras at about
+            ``width_px * height_px`` pixels).
+        cameras: sampling weight of each number of cameras; numbers that a rig does not have are skipped.
+        frames: sampling weight of each number of context frames per camera.
+        usual_share: probability of a context frame interval of ``usual_spacing_s``.
         usual_spacing_s: as in the protocol ``storm``, with four frames in two seconds.
-        spacing_s: otherwise, least and most time from one context frame to the next.
-        most_images: of all cameras together; samples of more get fewer frames per camera.
-        targets: held-out frames to be rendered.
-        zoom: most that images are magnified by cutting away their border; 1 keeps them whole.
-        mirror: how often left and right change places.
-        augment: how colours are changed; None leaves them clean.
+        spacing_s: range of the interval otherwise.
+        most_images: maximum number of images over all cameras; limits the frames per camera.
+        targets: number of held-out frames to render.
+        zoom: maximum magnification by random crops; 1 keeps images whole.
+        mirror: probability of mirroring left and right.
+        augment: photometric augmentation; None for clean colours.
     """
 
     profile: Profile = PROFILES["tiny"]
@@ -71,7 +71,7 @@ def sample_window(rng: np.random.Generator, clip: TrueClip, settings: WindowSett
     """One sample of a clip; the same generator state gives the same sample.
 
     Context frames are evenly spaced. Targets are other frames of the same cameras, from the first context frame until
-    one spacing after the last (then ``time`` exceeds 1); where the spacing leaves none, they are context frames.
+    one interval after the last (then ``time`` exceeds 1); if there are none, context frames are targets.
     """
     names = _cameras(rng, clip, settings.cameras)
     taken = len(clip.camera_times_us(names[0]))
@@ -95,12 +95,12 @@ def sample_window(rng: np.random.Generator, clip: TrueClip, settings: WindowSett
         sample = augmented(rng, sample, settings.augment)
     if not settings.profile.encoder.car_view:
         return sample
-    # Here, in a worker, matching does not hold up the training.
+    # Plane sweeping is done here, in a worker process, so that it does not delay the training step.
     return dataclasses.replace(sample, inputs=dataclasses.replace(sample.inputs, matches=plane_sweep(sample.inputs)))
 
 
 def _cameras(rng: np.random.Generator, clip: TrueClip, weights: Mapping[int, float]) -> tuple[str, ...]:
-    """The first cameras of the rig, which lists them as the network wants them: front, sides, rear sides."""
+    """The first cameras of the rig, which lists them in the network's order: front, sides, rear sides."""
     names = tuple(clip.rig.cameras)
     possible = {number: weight for number, weight in weights.items() if number <= len(names)} or {1: 1.0}
     return names[: _drawn(rng, possible)]
@@ -109,7 +109,7 @@ def _cameras(rng: np.random.Generator, clip: TrueClip, weights: Mapping[int, flo
 def _rhythm(
     rng: np.random.Generator, clip: TrueClip, names: tuple[str, ...], settings: WindowSettings
 ) -> tuple[int, int]:
-    """Number of context frames, and how many frames of the clip lie from one to the next."""
+    """Number of context frames, and their interval in frames of the clip."""
     times = clip.camera_times_us(names[0])[:, 0]
     count = max(1, min(_drawn(rng, settings.frames), settings.most_images // len(names), len(times)))
     usual = rng.random() < settings.usual_share
@@ -132,7 +132,8 @@ def _targets(
 def _reframed(
     rng: np.random.Generator, clip: TrueClip, names: tuple[str, ...], settings: WindowSettings
 ) -> tuple[TrueClip, str]:
-    """The clip cut and mirrored, and what to add to the sample's name for it."""
+    """The cropped and mirrored clip, and a suffix for the sample's name."""
+    # Log-uniform: magnifications by equal factors are equally likely.
     zoom = float(np.exp(rng.uniform(0, np.log(settings.zoom))))
     cuts = {}
     for name in names:

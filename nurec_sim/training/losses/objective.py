@@ -1,4 +1,4 @@
-"""One step of a stage: a forward pass through the parts that it needs, and the weighted sum of its losses."""
+"""One step of a stage: a forward pass through the required parts, and the weighted sum of its losses."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ PREFIXES: Mapping[Part, tuple[str, ...]] = {
     "gaussians": ("decoder.gaussians_head.", "decoder.xyz_embed.", "decoder.ca_", "decoder.gs_linear."),
     "isp": ("post_processing.",),
 }
-"""Which parameters belong to which part."""
+"""Prefixes of the parameter names of each part."""
 
 
 @dataclass(frozen=True)
 class StepOutputs:
-    """What a step computed; None is what its stage does not need."""
+    """Results of a step; None if its stage does not need them."""
 
     context: ContextMaps
     gaussians: QueryGaussians | None
@@ -43,14 +43,14 @@ class StepOutputs:
 
 
 class Objective(nn.Module):
-    """A network with a stage's losses; ``forward`` gives the loss of one sample, so that DDP can wrap it.
+    """A network with a stage's losses; ``forward`` returns the loss of one sample, so that DDP can wrap it.
 
     Args:
-        model: the network; parameters of the parts that the stage does not train are frozen here.
-        stage: what is trained, and the weights.
+        model: the network; parameters of parts that the stage does not train are frozen here.
+        stage: the parts to train and the loss weights.
         perceptual: the perceptual term.
-        precision: of matrix products and convolutions.
-        threads: of the renderer.
+        precision: data type of matrix products and convolutions.
+        threads: threads of the renderer.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Objective(nn.Module):
         return {name: each for name, each in self.model.named_parameters() if each.requires_grad}
 
     def forward(self, sample: TrainingSample) -> tuple[Tensor, dict[str, float], StepOutputs]:
-        """The loss, its terms before weighting (and ``psnr`` of rendered views), and what was computed."""
+        """The loss, its terms before weighting (with ``psnr`` of rendered views and ``abs_rel``), and the outputs."""
         outputs = self.run(sample)
         losses = self._losses(sample, outputs)
         weights = self.stage.losses
@@ -87,6 +87,7 @@ class Objective(nn.Module):
         inputs, stage, model = sample.inputs, self.stage, self.model
         gaussians = sky = isp = None
         with torch.autocast(inputs.rgb.device.type, self.precision, enabled=self.precision is not torch.float32):
+            # No activations are kept for a frozen encoder.
             frozen = "encoder" not in stage.trains
             with torch.no_grad() if frozen else contextlib.nullcontext():
                 features = model.features(inputs)
@@ -98,6 +99,7 @@ class Objective(nn.Module):
                 isp = model.post_processing(features[-1].patches, inputs.camera_idxs)
                 shown, behind, isp = self._shown(sample, context, sky, isp)
                 gaussians = self._agreed(model.decoder.gaussians(features, shown, inputs), shown, inputs)
+        # Outside autocast: projection and blending need float32.
         renderings: tuple[Rendering, ...] = ()
         if gaussians is not None and behind is not None and isp is not None:
             renderings = tuple(
@@ -109,11 +111,11 @@ class Objective(nn.Module):
     def _shown(
         self, sample: TrainingSample, context: ContextMaps, sky: Tensor, isp: Tensor
     ) -> tuple[ContextMaps, Tensor, Tensor]:
-        """Context as a reconstruction takes it, what is behind everything, and the responses to its colours."""
+        """Context as a reconstruction uses it, the background cubemap, and the matching camera responses."""
         inputs, profile = sample.inputs, self.model.profile
         shown = self.model.refined(context, inputs) if profile.log_geometry else context
         if shown.motion_m is None:
-            # Shapes and opacities are learned where things are, not where they are thought to be.
+            # Shapes and opacities are learned at the true positions, independent of errors of the motion head.
             shown = dataclasses.replace(shown, motion_m=sample.truth.motion_m)
         if profile.image_colours:
             rgb, sky, isp = image_colours(inputs, sky, isp)
@@ -124,7 +126,7 @@ class Objective(nn.Module):
         return shown, torch.lerp(sky[0], colour, covered[..., None]), isp
 
     def _agreed(self, gaussians: QueryGaussians, context: ContextMaps, inputs: NetworkInputs) -> QueryGaussians:
-        """The Gaussians that a reconstruction would show."""
+        """The Gaussians that a reconstruction would keep."""
         semantic = context.logits[0].argmax(-1).cpu().numpy()
         depth_m, rgb = (each[0].detach().float().cpu().numpy() for each in (context.depth_m, context.rgb))
         return find_consensus(inputs, depth_m, semantic, rgb).apply(gaussians, inputs)

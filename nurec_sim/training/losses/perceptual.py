@@ -1,12 +1,12 @@
-"""A perceptual distance of two images without trained weights: are the same edges there, as sharp, at about the place.
+"""A perceptual distance between images without trained weights: presence, sharpness and approximate position of edges.
 
-At four scales, pairs of Gabor filters give every place a complex number per orientation: how strong an edge is, and
-where exactly it lies (phase). Cells of 4 x 4 places are compared by 1 - 2 |sum(a b*)| / sum(|a|^2 + |b|^2), as in
-complex wavelet SSIM (Sampat et al. 2009). A small shift turns all phases of a cell alike and costs little; blur and
-lost contrast make one side weaker, noise and double edges turn phases apart. What is flat in both images counts
-nothing. Colours are compared at the coarser scales only, for eyes see them less sharply.
+At four scales, quadrature pairs of Gabor filters give a complex response per pixel and orientation: edge strength
+(magnitude) and exact position (phase). Cells of 4 x 4 pixels are compared by 1 - 2 |sum(a b*)| / sum(|a|^2 + |b|^2), as
+in complex wavelet SSIM (Sampat et al. 2009). A small shift rotates all phases of a cell alike and costs little; blur
+and lost contrast reduce one magnitude, noise and double edges decorrelate the phases. Regions that are flat in both
+images contribute nothing. Colours are compared at the coarser scales only, where the eye resolves them.
 
-An L1 loss is least in the middle of all images that are possible, which is a blur; this one is not.
+An L1 loss is minimised by the median of all plausible images, which is blurred; this one is not.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from torch import Tensor
 from torch.nn import functional
 
 SCALES = 4
-"""Of these the finest is that of the image, each next one half as fine."""
+"""Pyramid levels; the first is the image itself, each further one has half its resolution."""
 FILTER_PX, WAVELENGTH_PX, SIGMA_PX, ORIENTATIONS = 5, 4.0, 1.2, 4
 CELL = 4
-"""Places along the side of the cells in which phases are compared."""
+"""Side length, in pixels, of the cells in which phases are compared."""
 UNSEEN = 0.02
-"""Edges of this strength, a fiftieth of the range from black to white, count half."""
+"""Edges of this strength, a fiftieth of the range from black to white, have half the weight of strong ones."""
 PLACED = 0.1
-"""How much the exact place of edges counts beside their being there; what forbids to turn edges inside out."""
+"""Weight of the exact position of edges relative to their presence; penalises inverted edges."""
 FIRST_COLOUR_SCALE, COLOUR_SHARE = 2, 0.2
-"""Colour differences count from this scale on, and so much of it."""
+"""First scale at which colour differences count, and their share of a scale's distance."""
 TONE_WEIGHT = 2.0
 """Weight of the mean difference of tones and colours at the coarsest scale."""
 SMALLEST_PX = FILTER_PX - 1 + CELL
-"""Images must be so wide and high; scales that become smaller are left out."""
+"""Minimum width and height of an image; smaller pyramid levels are omitted."""
 
 _OPPONENT = ((0.299, 0.587, 0.114), (-0.169, -0.331, 0.5), (0.5, -0.419, -0.081))
 
 
 def perceptual_distance(image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """How different two images look: 0 if they are equal, about 0.05 to 0.1 for a clear blur, about 1 at most.
+    """Perceived difference of two images: 0 if equal, about 0.05 to 0.1 for a clear blur, about 1 at most.
 
     Args:
-        image: colours in 0..1; gradients go here.
-        reference: colours in 0..1; no gradients go here.
+        image: colours in 0..1; receives gradients.
+        reference: colours in 0..1; receives no gradients.
 
     Raises:
         ValueError: the images differ in shape, are no [h, w, 3], or are smaller than 8 px.
@@ -75,7 +75,7 @@ def _planes(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 1 h w"]:
 
 @functools.cache
 def _gabor_bank() -> Float[Tensor, "filters 1 5 5"]:
-    """Even filters of all orientations, then the odd ones; a wave of amplitude 1 and their length answers with 1."""
+    """Even filters of all orientations, then the odd ones; the response to a wave of amplitude 1 is 1."""
     place = torch.arange(FILTER_PX, dtype=torch.float64) - FILTER_PX // 2
     y, x = torch.meshgrid(place, place, indexing="ij")
     window = torch.exp(-(x**2 + y**2) / (2 * SIGMA_PX**2))
@@ -84,7 +84,7 @@ def _gabor_bank() -> Float[Tensor, "filters 1 5 5"]:
         angle = math.pi * k / ORIENTATIONS
         phase = 2 * math.pi / WAVELENGTH_PX * (x * math.cos(angle) + y * math.sin(angle))
         wave = window * phase.cos()
-        wave = wave - window * wave.sum() / window.sum()  # no answer to what is flat
+        wave = wave - window * wave.sum() / window.sum()  # zero mean: no response to flat regions
         even.append(wave / (wave * phase.cos()).sum())
         wave = window * phase.sin()
         odd.append(wave / (wave * phase.sin()).sum())
@@ -99,10 +99,12 @@ def _edge_distance(
     with torch.no_grad():
         true = functional.conv2d(reference, bank)
         even, odd = true.chunk(2, dim=1)
+        # Rotated by 90 degrees (times i), so that real products with it give the imaginary part.
         turned = torch.cat([-odd, even], dim=1)
     strength = _cells((seen.square() + true.square()).sum(dim=1, keepdim=True))[:, 0]
     alike = _cells((seen * true).unflatten(1, (2, -1)).sum(dim=1))  # real part of sum(a b*), per orientation
     aside = _cells((seen * turned).unflatten(1, (2, -1)).sum(dim=1))  # its imaginary part
+    # |sum(a b*)| is invariant to a common phase, that is to a small shift; its real part alone is not.
     anywhere = (alike.square() + aside.square()).clamp(min=1e-24).sqrt()  # without a gradient at 0, not an infinite one
     shared = (PLACED * alike + (1 - PLACED) * anywhere).sum(dim=1)
     return ((strength - 2 * shared) / (strength + UNSEEN**2)).mean(dim=(1, 2))

@@ -1,6 +1,6 @@
-"""The losses on what the heads say of the input images (paper section 4.1): context, motion and sky.
+"""Losses on the predictions of the heads for the input images (paper section 4.1): context, motion and sky.
 
-Every loss is a mean over the pixels whose truth is known, 0 where there are none.
+Every loss is a mean over the pixels with known truth, 0 without any.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from nurec_sim.training.config import LossWeights
 from nurec_sim.training.data.sample import TrueMaps
 
 EDGE_SCALES = (1, 2, 4)
-"""Pixels between the neighbours whose depths are compared."""
+"""Distances, in pixels, between the neighbours whose depth errors are compared."""
 CLASS_WEIGHTS = {SemanticClass.MOVABLE: 3.0}
-"""Weights of the classes; 1 where not named. Movable pixels are few, and what is missed stands still as a ghost."""
+"""Class weights, 1 if not listed. Movable pixels are few, and missed ones remain in the scene as static ghosts."""
 MOVABLE_DEPTH_WEIGHT = 4.0
-"""Of movable pixels' depth: matching says little of what moves, so that all of it has to be learned."""
+"""Weight of the depth of movable pixels: stereo matching fails on moving objects, so it must be learned entirely."""
 MOVED_M = 0.05
-"""Points that go farther count as moving."""
+"""Points displaced by more than this count as moving."""
 STANDING_SHARE = 0.3
-"""Weight of the points that stand beside those that move."""
+"""Weight of static points relative to moving ones."""
 SKY_PIXELS = 8192
-"""So many pixels of the sky are compared, evenly taken."""
+"""Approximate number of sky pixels compared, evenly sampled."""
 
 
 def context_losses(
@@ -34,7 +34,16 @@ def context_losses(
 ) -> dict[str, Tensor]:
     """Depth (L1 and slopes of its logarithm), normals (1 - cosine), classes (cross entropy), colours (L1).
 
-    The logarithm is what the head puts out, and makes an error count as what it is a share of the depth.
+    The depth head predicts the logarithm; differences of logarithms are relative errors.
+
+    Args:
+        context: predictions of the heads.
+        inputs: input images, the truth of the colours.
+        truth: ground truth of the input images.
+        weights: weights of the terms; terms of weight 0 are not computed.
+
+    Returns:
+        terms before weighting, by name.
     """
     losses = {}
     known = truth.depth_m > 0
@@ -55,7 +64,10 @@ def context_losses(
 
 
 def motion_loss(motion_m: Float[Tensor, "b v h w 2 3"], truth: TrueMaps) -> Tensor:
-    """L1 of the displacements, metres; points that move and that stand are averaged apart (paper section 4.1)."""
+    """L1 of the displacements, metres; moving and static points are averaged separately (paper section 4.1).
+
+    A common mean would be dominated by the static majority, for which predicting no motion is right.
+    """
     error = (motion_m - truth.motion_m).abs().sum(-1)
     moves = truth.motion_m.norm(dim=-1) > MOVED_M
     known = truth.motion_known[..., None].expand_as(moves)
@@ -63,11 +75,11 @@ def motion_loss(motion_m: Float[Tensor, "b v h w 2 3"], truth: TrueMaps) -> Tens
 
 
 def sky_loss(sky: Float[Tensor, "6 s s 3"], inputs: NetworkInputs, truth: TrueMaps) -> Tensor:
-    """L1 between the sky decoder's cubemap and the pixels of the input images that show sky."""
+    """L1 between the sky decoder's cubemap and the sky pixels of the input images."""
     shown = truth.semantic == SemanticClass.SKY
     colour, direction = inputs.rgb[shown], inputs.rays[shown][:, 3:]
     if len(colour) == 0:
-        return sky.sum() * 0
+        return sky.sum() * 0  # zero, but part of the graph
     step = max(1, len(colour) // SKY_PIXELS)
     return (cubemap.sample(sky, direction[::step]) - colour[::step]).abs().mean()
 
@@ -77,7 +89,10 @@ def _mean(values: Float[Tensor, "*n"], known: Bool[Tensor, "*n"]) -> Tensor:
 
 
 def _slope_error(error: Float[Tensor, "b v h w"], known: Bool[Tensor, "b v h w"]) -> Tensor:
-    """How much the error changes between neighbours, where both are known: wrong and blurred edges of the depth."""
+    """Mean change of the error between neighbours with known depth; penalises wrong and blurred depth edges.
+
+    A constant offset costs nothing here, as in the multi-scale gradient loss of MegaDepth (Li and Snavely 2018).
+    """
     total = error.new_zeros(())
     for step in EDGE_SCALES:
         for axis in (-1, -2):
