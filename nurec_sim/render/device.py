@@ -1,4 +1,4 @@
-"""The device that draws a scene: what every renderer can do, and which one is made."""
+"""The device that renders a scene: what every renderer offers, and which one is chosen."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from nurec_sim.types import CameraFrame, GaussianScene, LidarFilter, LidarFrame,
 log = logging.getLogger(__name__)
 
 DEVICE_VARIABLE = "NUREC_SIM_DEVICE"
-"""Environment variable with the device that ``auto`` stands for."""
+"""Environment variable that sets the device for ``auto``."""
 
 
 class Renderer(Protocol):
-    """Draws one scene, on any device; all methods can be called from many threads."""
+    """Renders one scene, on any device; all methods can be called from many threads."""
 
     scene: GaussianScene
 
@@ -51,18 +51,18 @@ def make_renderer(
     apply_isp: bool = True,
     detail_px: float = 0.0,
 ) -> Renderer:
-    """A scene made ready for rendering.
+    """A scene prepared for rendering.
 
     Args:
         scene: the world.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``; see ``choose_device``.
         threads: CPU threads that work on a frame; as many as the process may use if None. Of no effect on a GPU.
         apply_isp: whether ``scene.isp`` of the request's sensor id is applied to requests that ask for it.
-        detail_px: level of detail: distant static Gaussians are drawn merged where that changes no more than about a
-            square of this side, in pixels or beams; 0 draws all of them (``render.lod``).
+        detail_px: level of detail: distant static Gaussians are rendered merged where that changes no more than about a
+            square of this side, in pixels or beams; 0 renders all of them (``render.lod``).
 
     Raises:
-        GpuError: the device cannot be used; the text says what is missing.
+        GpuError: the device cannot be used; the message names what is missing.
         ValueError: less than one thread, or a negative or infinite ``detail_px``.
     """
     chosen = choose_device(device).name
@@ -85,7 +85,7 @@ def choose_device(device: str = "auto") -> ChosenDevice:
             GPU if the driver, a CUDA build of torch and the extra ``gpu`` are there, else the CPU.
 
     Raises:
-        GpuError: an unknown name, or a GPU that cannot be used; the text says what is missing.
+        GpuError: an unknown name, or a GPU that cannot be used; the message names what is missing.
     """
     wanted = os.environ.get(DEVICE_VARIABLE, "auto") if device == "auto" else device
     if wanted == "cpu":

@@ -1,4 +1,4 @@
-"""What of a scene is there at an instant: the moving Gaussians in place, and colours seen from a view point."""
+"""The content of a scene at an instant: moving Gaussians in place, and colours seen from a view point."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from nurec_sim.scene.harmonics import sh_basis
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, SensorRequest, Track
 
 MIN_ALPHA = 1 / 255
-"""What is less opaque is not drawn."""
+"""Gaussians that are less opaque are not rendered."""
 LARGEST = 1e12
-"""Positions, scales and colours beyond this are taken for broken."""
+"""Positions, scales and colours beyond this are treated as invalid."""
 
 
 def visible_gaussians(
     scene: GaussianScene, request: SensorRequest, grid: RayGrid
 ) -> tuple[Gaussians, Int64[np.ndarray, " k"]]:
-    """Both layers at the reference instant, coloured for the view, and the order of those that can be drawn."""
+    """Both layers at the reference instant, coloured for the view, and the order of those that can be rendered."""
     world_from_sensor, t_us = reference_pose(request, grid.reference)
     actors = actors_at(request, grid.reference, {track.id for track in scene.tracks})
     eye = world_from_sensor[:3, 3]
@@ -40,7 +40,7 @@ def visible_gaussians(
 
 
 def drawable(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians can be drawn at all: finite, with extent, at least 1/255 opaque."""
+    """Which Gaussians can be rendered at all: finite, with extent, at least 1/255 opaque."""
     columns = (gaussians.mean_m, gaussians.quat_wxyz, gaussians.scale_m, gaussians.rgb, gaussians.opacity[:, None])
     sound = np.all([(np.abs(column) <= LARGEST).all(axis=1) for column in columns], axis=0)  # NaN is not
     sound &= np.linalg.norm(gaussians.quat_wxyz.astype(np.float64), axis=1) > 1e-12
@@ -85,6 +85,7 @@ def moving_gaussians(
     seen &= np.isfinite(dynamic.knot_m[alive]).all(axis=(1, 2))
     boxed = np.zeros(len(dynamic), bool) if dynamic.in_box is None else dynamic.in_box
     requested = {k: actors[track.id] for k, track in enumerate(tracks) if track.id in actors}
+    # A box without a pose at the instant: its Gaussians have no place.
     gone = [k for k, track in enumerate(tracks) if k not in requested and not track.path.covers(t_us)]
     seen &= ~(boxed[alive] & np.isin(dynamic.track[alive], gone))
     seen &= ~np.isin(dynamic.track[alive], [k for k, track in enumerate(tracks) if track.id in hidden])
@@ -97,6 +98,8 @@ def moving_gaussians(
     for index in sorted(requested.keys() | set(owner[in_box].tolist())):
         recorded = tracks[index].path.at(t_us)
         world_from_box = requested.get(index, recorded)
+        # Loose Gaussians are recorded in the world, so a new pose applies relative to the recorded one; those in the
+        # box are given in its frame.
         for rigid, new_from_given in ((False, world_from_box @ geometry.inverse(recorded)), (True, world_from_box)):
             mine = np.flatnonzero((owner == index) & (in_box == rigid))
             if len(mine) == 0 or not (rigid or index in requested):
@@ -105,6 +108,7 @@ def moving_gaussians(
             mean[mine] = geometry.transform_points(new_from_given, mean[mine])
             quat[mine] = geometry.quat_multiply(np.broadcast_to(turn, (len(mine), 4)), quat[mine])
             normal[mine] = normal[mine] @ new_from_given[:3, :3].T
+            # Colours belong to the recorded frame: the eye is moved back with the inverse motion.
             eye[mine] = geometry.transform_points(geometry.inverse(new_from_given), eye[mine])
     rgb = gaussians.rgb
     if gaussians.sh_rest is not None:

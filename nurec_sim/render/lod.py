@@ -1,8 +1,8 @@
-"""Levels of detail of static Gaussians: blocks merged four to one, and which of them will do for a view.
+"""Levels of detail of static Gaussians: blocks merged four to one, and the choice among them for a view.
 
 ``merge_levels`` is done once per scene, ``choose_blocks`` for every frame. Blocks are those of ``render.cpu.pack``:
-block k of a level stands for blocks 4 k to 4 k + 3 of the level below, so a choice from the top down draws everything
-exactly once. What a merged Gaussian draws differently is measured when it is made and compared with the size of a
+block k of a level stands for blocks 4 k to 4 k + 3 of the level below, so a choice from the top down renders
+everything exactly once. The error of a merged Gaussian is measured when it is made and compared with the size of a
 pixel when it is chosen.
 """
 
@@ -22,7 +22,7 @@ from nurec_sim.types import Gaussians
 
 LEVELS = 3
 NEAREST_M = 0.5
-"""Blocks nearer than this are taken to be this far away."""
+"""Blocks nearer than this are treated as this far away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class Level:
     """One level of detail.
 
     ``gaussians`` are ordered in blocks of ``BLOCK`` rows. ``error_m`` is, per block, the root mean square over its
-    Gaussians of the side of a square that drawing one of them instead of what it stands for paints wrong, seen from in
-    front; 0 in the lowest level.
+    Gaussians of the side of the square that is wrong when one of them is rendered instead of those it replaces, seen
+    from in front; 0 in the lowest level.
     """
 
     gaussians: Gaussians
@@ -39,13 +39,13 @@ class Level:
 
     @cached_property
     def packed(self) -> PackedGaussians:
-        """The level as kernels read it: all its Gaussians can be drawn, so its blocks stay what they are."""
+        """The level as kernels read it: all its Gaussians can be rendered, so its blocks stay unchanged."""
         return pack(self.gaussians, sort=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Detail:
-    """A layer in levels, drawn as coarsely as ``tolerance_px`` allows (``choose_blocks``)."""
+    """A layer in levels, rendered as coarsely as ``tolerance_px`` allows (``choose_blocks``)."""
 
     levels: Sequence[Level]
     tolerance_px: float
@@ -71,17 +71,19 @@ class Detail:
 
 
 def merge_levels(gaussians: Gaussians, levels: int = LEVELS) -> list[Level]:
-    """Level 0, all of ``gaussians`` that can be drawn in another order, and ``levels`` ever coarser ones above it.
+    """Level 0, all of ``gaussians`` that can be rendered, reordered, and ``levels`` ever coarser ones above it.
 
-    Groups of four are ordered by the error of merging them, in octaves, then by place: those that merge well are not
-    held back by others in their block.
+    Groups of four are ordered by the error of merging them, in octaves, then by place, so that groups that merge well
+    share blocks.
     """
     gaussians = gaussians[np.flatnonzero(drawable(gaussians))]
     gaussians = gaussians[morton_order(gaussians.mean_m)] if len(gaussians) else gaussians
     surfels = as_surfels(gaussians, local_contrast(gaussians))
     groups = grouped(surfels, GROUP * BLOCK)
     merged = merge(surfels, groups)
+    # Half the logarithm of an area: octaves of length.
     octave = np.floor(np.log2(np.maximum(merged.error_m2, 1e-12)) / 2)
+    # Incomplete groups last, so that block k of a level always stands for blocks 4 k to 4 k + 3.
     order = np.lexsort((octave, (groups < 0).any(axis=1)))
     rows = groups[order].reshape(-1)
     result = [Level(gaussians[rows[rows >= 0]], np.zeros(-(-len(gaussians) // BLOCK)))]
@@ -109,13 +111,13 @@ def choose_blocks(
     tolerance_px: float,
     in_view: Sequence[Int64[np.ndarray, " b"]] | None = None,
 ) -> list[Int64[np.ndarray, " b"]]:
-    """The coarsest blocks whose error looks no larger than ``tolerance_px``: numbers of the blocks to draw per level.
+    """The coarsest blocks whose error looks no larger than ``tolerance_px``: numbers of the blocks to render per level.
 
     Args:
         levels: from ``merge_levels``.
         eye_m: view point in the world.
         angle_per_pixel: radians between neighbouring rays; see ``ray_spacing``.
-        tolerance_px: side of the square, in pixels or beams, that a merged Gaussian may paint wrong. 0.15 draws
+        tolerance_px: side of the square, in pixels or beams, that a merged Gaussian may render wrong. 0.15 renders
             surfaces of several layers within 50 dB of their full detail, 0.3 within 45; 0 chooses level 0.
         in_view: per level the blocks that can be seen at all; others are left out.
     """
@@ -128,10 +130,12 @@ def choose_blocks(
         if number > 0:
             offset = level.packed.block_centre - eye_m
             nearest = np.sqrt((offset * offset).sum(axis=1)) - level.packed.block_radius
+            # The size that the tolerance covers at the block's nearest point.
             allowed_m = np.maximum(nearest, NEAREST_M) * (angle_per_pixel * tolerance_px)
             taken &= (level.error_m <= allowed_m) & (tolerance_px > 0)
         seen = np.arange(len(taken)) if in_view is None else in_view[number]
         chosen.append(seen[taken[seen]])
+        # A block that is not taken passes its four parts on to the level below.
         wanted = np.repeat(wanted & ~taken, GROUP)
     return chosen[::-1]
 

@@ -1,6 +1,6 @@
-"""Merging Gaussians four to one by their moments, and how wrong the result looks; float64 NumPy.
+"""Merging Gaussians four to one by their moments, and the visible error of the result; float64 NumPy.
 
-A merged Gaussian has the mean and the covariance of what it stands for, weighted with their *mass*: opacity times area,
+A merged Gaussian has the mean and the covariance of those it replaces, weighted with their *mass*: opacity times area,
 the product of the two largest standard deviations. Its opacity is such that, seen along its smallest axis, it covers
 as much as they do together; where that takes more than ``MAX_OPACITY`` it becomes wider instead.
 """
@@ -19,13 +19,13 @@ from nurec_sim.types import Gaussians
 GROUP = 4
 MIN_OPACITY = 1.001 / 255
 CHUNK = 2048
-"""Groups that are handled at once: their temporary arrays stay in the cache."""
+"""Groups that are processed at once: their temporary arrays stay in the cache."""
 
 COLOUR_WEIGHT, NORMAL_WEIGHT, LABEL_WEIGHT = 12.0, 1.5, 4.0
 """What differences of colour (0..1), normal and label weigh in grouping, against one standard deviation of distance."""
 
 MOST_DIFFERENT = 1e6
-"""Features beyond this are cut off; their squares must fit float32."""
+"""Features are clipped to this; their squares must fit float32."""
 
 NEIGHBOURS = 64
 BASE_CONTRAST = 0.05
@@ -44,10 +44,10 @@ UNIT_FALL = np.exp(-(GRID_X**2 + GRID_Y**2) / 2)
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """Gaussians, and what merging needs to know of them.
+    """Gaussians, and the quantities that merging needs.
 
-    ``contrast2`` is the squared contrast to their neighbours, ``error_m2`` the area in square metres that drawing them
-    instead of what they stand for paints wrong.
+    ``contrast2`` is the squared contrast to their neighbours, ``error_m2`` the area in square
+    metres that is wrong when they are rendered instead of those they replace.
     """
 
     gaussians: Gaussians
@@ -66,7 +66,7 @@ _ARRAYS = ("covariance", "axis", "area", "contrast2", "error_m2")
 
 
 def as_surfels(gaussians: Gaussians, contrast2: Float64[np.ndarray, " n"]) -> Surfels:
-    """Gaussians that stand for themselves."""
+    """Surfels of unmerged Gaussians, without error."""
     scale = gaussians.scale_m.astype(np.float64)
     rotation = geometry.matrix_from_quat(gaussians.quat_wxyz)
     spread = rotation * scale[:, None]
@@ -89,8 +89,10 @@ def local_contrast(gaussians: Gaussians) -> Float64[np.ndarray, " n"]:
     colour, place = gaussians.rgb[rows].astype(np.float64), gaussians.mean_m[rows].astype(np.float64)
     colour -= np.einsum("rk,rkc->rc", weight, colour)[:, None]
     place -= place.mean(axis=1, keepdims=True)
+    # The two larger variances: neighbours lie on a surface, whose thickness does not count.
     spread = np.linalg.eigvalsh(np.einsum("rki,rkj->rij", place, place) / NEIGHBOURS)[:, 1:].clip(min=0)
     patch = 12 * np.sqrt(spread.prod(axis=1))  # area of an even rectangle of this spread
+    # An unnormalised 2D Gaussian of unit opacity has the integral 2 pi times its area.
     layers = 2 * np.pi * total / np.maximum(patch, 1e-30)
     contrast2 = np.einsum("rk,rkc->r", weight, colour**2) / 3 + (BACKDROP * np.exp(-layers)) ** 2
     return np.repeat(contrast2, NEIGHBOURS)[:n]
@@ -118,8 +120,10 @@ def _features(
     """What Gaussians are grouped by; infinite where there is none."""
     g, axis = surfels.gaussians, surfels.axis
     size = np.sqrt(surfels.area)
+    # Distances in units of the neighbourhood's typical standard deviation.
     typical = np.median(size[rows], axis=1)
     mean = (g.mean_m[rows] - g.mean_m[rows[:, :1]].astype(np.float64)) / typical[:, None, None]
+    # Products of the axis with itself: the same for an axis and its opposite. Five of the six; the trace is 1.
     turned = NORMAL_WEIGHT * np.stack(
         [axis[:, i] * axis[:, j] for i, j in ((0, 1), (1, 2), (2, 0), (0, 0), (2, 2))], -1
     )
@@ -140,6 +144,7 @@ def _halved(features: Float32[np.ndarray, "s k f"], rows: Int64[np.ndarray, "s k
         number = np.maximum(real.sum(axis=1), 1)
         present = np.where(real, parts, 0)
         mean = present.sum(axis=1) / number
+        # Variance per feature of the rows that are there.
         spread = np.einsum("skf,skf->sf", present, present) / number - mean**2
         key = np.take_along_axis(parts, spread.argmax(axis=1)[:, None, None], axis=2)[..., 0]
         order = (np.argsort(key, axis=1, kind="stable") + np.arange(len(parts))[:, None] * count).reshape(-1)
@@ -168,15 +173,19 @@ def _merge_chunk(surfels: Surfels, groups: Int64[np.ndarray, "g 4"]) -> Surfels:
     mean = np.einsum("gk,gkc->gc", weight, centre)
     offset = centre - mean[:, None]
     child = surfels.covariance[rows]
+    # Law of total covariance: mean of the covariances plus covariance of the means.
     covariance = np.einsum("gk,gkij->gij", weight, child) + np.einsum("gk,gki,gkj->gij", weight, offset, offset)
     variance, axes = np.linalg.eigh(covariance)
     sigma = np.sqrt(np.maximum(variance, 1e-12))
+    # A rotation, not a reflection: the sign of an eigenvector is free.
     axes[:, :, 0] *= np.where(np.linalg.det(axes) < 0, -1, 1)[:, None]
 
     alphas = _profiles(opacity, offset, child, sigma, axes)
+    # Layers in any order let through the product of their transmittances.
     alpha = 1 - (1 - alphas).prod(axis=1)
     wanted = alpha.sum(axis=1) / UNIT_FALL.sum()
     covered = np.clip(wanted, MIN_OPACITY, MAX_OPACITY)
+    # Coverage is proportional to opacity times area, so each side grows by the square root.
     growth = np.sqrt(np.maximum(wanted / MAX_OPACITY, 1))
     drawn = covered[:, None] * UNIT_FALL ** (1 / growth[:, None] ** 2)
 
@@ -190,7 +199,9 @@ def _merge_chunk(surfels: Surfels, groups: Int64[np.ndarray, "g 4"]) -> Surfels:
         contrast2[:, None] + BASE_CONTRAST**2
     )
     wrong += alpha**2 * (ORDER_SHARE * contrast2 + (1 - same_label) ** 2)[:, None]
+    # Squared colour error integrated over the plane; the grid is in standard deviations.
     error_m2 = wrong.sum(axis=1) * (GRID_CELL * sigma[:, 1] * sigma[:, 2])
+    # Errors of earlier levels add up.
     error_m2 += np.where(present, surfels.error_m2[rows], 0).sum(axis=1)
 
     sigma[:, 1:] *= growth[:, None]
@@ -246,7 +257,7 @@ def _heaviest(label: np.ndarray, mass: Float64[np.ndarray, "g 4"]) -> tuple[np.n
 def _mean_normal(
     normal: Float32[np.ndarray, "g 4 3"], weight: Float64[np.ndarray, "g 4"]
 ) -> Float32[np.ndarray, "g 3"]:
-    """Weighted mean direction of what is known; zero where nothing is."""
+    """Weighted mean direction of the known normals; zero where there are none."""
     total = np.einsum("gk,gkc->gc", weight, np.nan_to_num(normal.astype(np.float64)))
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 1e-6, total / np.maximum(length, 1e-6), 0).astype(np.float32)
@@ -255,7 +266,7 @@ def _mean_normal(
 def _mean_intensity(
     intensity: Float32[np.ndarray, "g 4"], weight: Float64[np.ndarray, "g 4"]
 ) -> Float32[np.ndarray, " g"]:
-    """Weighted mean of what is known; NaN where nothing is."""
+    """Weighted mean of the known intensities; NaN where there are none."""
     known = np.isfinite(intensity) * weight
     total = known.sum(axis=1)
     mean = (known * np.where(np.isfinite(intensity), intensity, 0)).sum(axis=1) / np.maximum(total, 1e-30)

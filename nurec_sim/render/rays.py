@@ -1,7 +1,7 @@
 """The ray grid of any sensor: one unit ray, one firing time and one validity per pixel or beam; float64 NumPy.
 
-A camera's grid has a ray per pixel centre; a spinning LiDAR's has rows of beams by columns of firings. Everything a
-renderer does afterwards is the same for both.
+A camera's grid has a ray per pixel centre; a spinning LiDAR's has rows of beams by columns of firings. From there
+on, a renderer treats both alike.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from nurec_sim import geometry, sensors
 from nurec_sim.types import CameraModel, LidarModel, SensorRequest, Shutter
 
 NEAR_M = 0.2
-"""Gaussians whose centre, and hits that, lie closer than this are not drawn (LiDARs: their own minimal range)."""
+"""Gaussians whose centre lies closer than this, and closer hits, are not rendered (LiDARs: their own minimal range)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class RayGrid:
 
     ``fraction`` is the place of each ray's instant in the exposure, 0 at its start and 1 at its end; ``reference``
     the fraction at which Gaussians are sorted, culled and, where they move, placed: the middle, or the one instant of
-    all rays (a global shutter, a LiDAR of one column). ``by_range`` says whether Gaussians are ordered by the distance
+    all rays (a global shutter, a LiDAR of one column). ``by_range`` is whether Gaussians are ordered by the distance
     of their centre (LiDARs, and lenses that see sideways) or by its z (``Lens.perspective``).
     """
 
@@ -83,6 +83,7 @@ def world_rays(
 ) -> tuple[Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w 3"]]:
     """Origins and directions in the world, each ray from the pose at its own instant."""
     shape = grid.fraction.shape
+    # Few instants, many rays: a pose per instant, then one per ray.
     fractions, index = np.unique(grid.fraction, return_inverse=True)
     poses = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), fractions)
     poses = poses[index.reshape(-1)]

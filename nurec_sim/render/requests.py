@@ -15,10 +15,10 @@ from nurec_sim.types import CameraModel, GaussianScene, LidarModel, SensorReques
 MAX_SIDE_PX = 8192
 MAX_RAYS = 7680 * 4320
 MOST_KNOWN = 1024
-"""Sensors that need no second check, at most."""
+"""How many checked sensors are remembered, at most."""
 CAMERA_OUTPUTS = ("rgb", "depth", "alpha", "label", "normal")
 SENSED_OUTPUTS = ("rgb", "depth", "alpha", "label")
-"""What ``sense`` asks of cameras."""
+"""What ``sense`` requests of cameras by default."""
 
 
 def ray_count(request: SensorRequest) -> int:
@@ -101,9 +101,9 @@ def check_requests(
     """``check_request`` of many, their poses all at once.
 
     Args:
-        requests: what is asked for.
-        scene: of what.
-        known: keys of sensors that were checked before (``sensor_key``); gets those that are checked now.
+        requests: requests for frames.
+        scene: the scene they are for.
+        known: keys of sensors that were checked before (``sensor_key``); those checked now are added.
 
     Returns:
         Poses of the sensors, and of all actors, request after request.
@@ -118,6 +118,7 @@ def check_requests(
     first, end = scene.span_us
     sound = all(first <= r.start_us < r.end_us <= end + 1 for r in requests)
     keys = {sensor_key(request.sensor) for request in requests}
+    # Something is wrong or new: the full check names the first fault, or finds none.
     if poses is None or not sound or not keys <= known:
         for request in requests:
             check_request(request, scene)
@@ -131,6 +132,7 @@ def check_requests(
 def _stacked(pairs: Sequence[np.ndarray]) -> Float64[np.ndarray, "n 2 4 4"] | None:
     """Pairs of poses in one array; None if one of them is not [2,4,4], not finite, or not rigid."""
     try:
+        # Cheap tests in bulk; what exactly is wrong is found by ``check_pose_pair``.
         if not {2}.issuperset(map(len, pairs)):
             return None
         poses = np.concatenate(pairs)
@@ -145,7 +147,7 @@ def _stacked(pairs: Sequence[np.ndarray]) -> Float64[np.ndarray, "n 2 4 4"] | No
 
 
 def check_outputs(outputs: Sequence[str]) -> None:
-    """Check that there are such outputs of a camera.
+    """Check that a camera has such outputs.
 
     Raises:
         RequestError: one is unknown.
@@ -156,7 +158,7 @@ def check_outputs(outputs: Sequence[str]) -> None:
 
 
 def check_camera_call(request: SensorRequest, outputs: Sequence[str]) -> None:
-    """Check that a camera is asked for, and for outputs that there are.
+    """Check that the sensor is a camera and that its outputs exist.
 
     Raises:
         RequestError: it is a LiDAR, or an output is unknown.
@@ -167,7 +169,7 @@ def check_camera_call(request: SensorRequest, outputs: Sequence[str]) -> None:
 
 
 def check_lidar_call(request: SensorRequest) -> None:
-    """Check that a LiDAR is asked for.
+    """Check that the sensor is a LiDAR.
 
     Raises:
         RequestError: it is a camera.

@@ -8,11 +8,11 @@ ray (unit direction d from o) meets a Gaussian (mean m, rotation R, standard dev
 at the distance t = -(d' . o') / |S^-1 R^T d| where the response along the ray is largest (3DGUT). There is no blur, so
 a Gaussian smaller than a pixel can fall between rays. A hit counts when alpha >= 1/255 and t >= near. Gaussians whose
 centre lies nearer than the near plane are culled; those with values that are not finite or beyond 1e12, or without
-extent, are not drawn; standard deviations below 1e-5 m count as that. Order: front to back by centre at the reference
-instant (``rays.RayGrid.by_range``); back ends may swap centres whose depths differ by less than float32 resolves. Each
-hit weighs alpha times the transmittance before it. A ray ends with the hit that brings its transmittance to 1e-4 or
-below, back ends may go on, what follows weighs 1e-4 at most; a LiDAR's beam, which only reports what it meets first,
-ends at 1e-2.
+extent, are not rendered; standard deviations below 1e-5 m count as that. Order: front to back by centre at the
+reference instant (``rays.RayGrid.by_range``); back ends may swap centres whose depths differ by less than float32
+resolves. Each hit weighs alpha times the transmittance before it. A ray ends with the hit that brings its
+transmittance to 1e-4 or below, back ends may continue, what follows weighs 1e-4 at most; a LiDAR's beam, which only
+reports what it meets first, ends at 1e-2.
 
 Outputs of a ray: ``alpha`` is the sum of the weights; ``depth`` the weighted mean of t, times the ray's z in the
 camera; ``half`` the t at which the transmittance first falls to a half or below, 0 where it does not: the range of a
@@ -20,7 +20,7 @@ LiDAR, which reports the surface it meets and no mean of two; ``label`` that of 
 take another that is within 1/16384 of it); ``normal`` the weighted mean of the Gaussians' normals, each turned to face
 the eye at the reference instant, in the world, of unit length. Where alpha < 0.5 there is no surface: depth and normal
 are 0 and the label is ``SKY``. The colour gets (1 - alpha) of the sky, then the camera's affine correction, is clipped
-to 0..1 and rounded half up to 8 bits. Pixels without a valid ray are black. A moving actor stands still during an
+to 0..1 and rounded half up to 8 bits. Pixels without a valid ray are black. A moving actor is static during an
 exposure, where it is at the reference instant; its Gaussians fade at the ends of their lives (``layers``).
 
 Where a Gaussian lies in the image is needed to skip what a ray cannot meet, never for its response;
@@ -55,7 +55,7 @@ MIN_SCALE_M = 1e-5
 SURFACE_ALPHA = 0.5
 """Below this alpha a pixel has no depth and no normal and is labelled SKY."""
 PAIRS_AT_ONCE = 1 << 22
-"""Pairs of a ray and a Gaussian that are looked at together; bounds the memory, changes no result."""
+"""Pairs of a ray and a Gaussian that are evaluated together; bounds the memory, changes no result."""
 
 Values = Float64[np.ndarray, " n"]
 Vectors = Float64[np.ndarray, "n 3"]
@@ -84,7 +84,7 @@ def render_camera(
         scene: the world.
         request: a camera's.
         apply_isp: whether ``scene.isp`` of the camera is applied to a request that asks for it.
-        pixels: flat indices (row * width + column) of the pixels to draw; the frame is then one row of them.
+        pixels: flat indices (row * width + column) of the pixels to render; the frame is then one row of them.
     """
     assert isinstance(request.sensor, CameraModel)
     grid = ray_grid(request.sensor)
@@ -160,6 +160,13 @@ def sweep_frame(
     weighted mean of all. A beam returns if its alpha exceeds the opacity threshold, its drop probability does not
     exceed its threshold, its range lies within the sensor's, and is not farther from the weighted mean than the
     distance threshold.
+
+    Args:
+        request: a LiDAR's.
+        sums: of its beams, features as above.
+        origin: where the beams start, in the world (m).
+        direction: their unit directions in the world.
+        filter: which beams return.
     """
     assert isinstance(request.sensor, LidarModel)
     mean = sums.distance / np.maximum(sums.alpha, MIN_ALPHA)
@@ -219,6 +226,7 @@ def blend_rays(
     for start in range(0, len(chosen), step):
         rays = chosen[start : start + step]
         o, d = origin.reshape(-1, 3)[rays], direction.reshape(-1, 3)[rays]
+        # A cheap exact bound first: the full response only for pairs that can reach 1/255.
         ray, row = np.nonzero(lines_near(o, d, mean, reach_m))
         alpha, t = response(o[ray], d[ray], mean[row], canonical[row], opacity[row])
         hit = (alpha >= MIN_ALPHA) & (t >= near_m)
@@ -226,10 +234,12 @@ def blend_rays(
             continue
         ray, row, alpha, t = ray[hit], order[row[hit]], alpha[hit], t[hit]
         weight, before, after = composite(ray, alpha, min_transmittance)
+        # The hit that takes the transmittance through one half; at most one per ray.
         half = np.where((before > 0.5) & (after <= 0.5), t, 0)
         columns = np.column_stack([weight[:, None] * features[row], weight, weight * t, half])
         for c, column in enumerate(columns.T):
             sums[rays, c] = np.bincount(ray, column, minlength=len(rays))
+        # The largest weight of each ray; ties go to the nearer one, because lexsort is stable.
         first = np.unique(ray, return_index=True)[1]
         heaviest = np.lexsort((-weight, ray))[first]
         label[rays[ray[first]]] = gaussians.label[row[heaviest]]
@@ -246,6 +256,7 @@ def composite(ray: Int64[np.ndarray, " n"], alpha: Values, min_transmittance: fl
         min_transmittance: hits behind this weigh nothing.
     """
     place = np.arange(len(ray)) - np.searchsorted(ray, ray)
+    # A table of rays by hits: the running product along a row is the transmittance after each hit.
     clear = np.ones((ray[-1] + 1, place.max() + 2))
     clear[ray, place + 1] = 1 - alpha
     transmittance = np.cumprod(clear, axis=1)
@@ -256,7 +267,18 @@ def composite(ray: Int64[np.ndarray, " n"], alpha: Values, min_transmittance: fl
 def response(
     origin: Vectors, direction: Vectors, mean: Vectors, canonical: Float64[np.ndarray, "n 3 3"], opacity: Values
 ) -> tuple[Values, Values]:
-    """Alpha and distance at which rays meet Gaussians, pair by pair; the formula at the top of the module."""
+    """Alpha and distance at which rays meet Gaussians, pair by pair; the formula at the top of the module.
+
+    Args:
+        origin: where the rays start (m).
+        direction: their unit directions.
+        mean: centres of the Gaussians (m).
+        canonical: S^-1 R^T of the Gaussians (1/m).
+        opacity: 0..0.99.
+
+    Returns:
+        Alpha, and the distance of the largest response (m), negative behind the origin.
+    """
     o = np.einsum("nij,nj->ni", canonical, origin - mean)
     d = np.einsum("nij,nj->ni", canonical, direction)
     length = np.linalg.norm(d, axis=-1)
@@ -271,10 +293,18 @@ def lines_near(
     mean: Float64[np.ndarray, "n 3"],
     reach_m: Float64[np.ndarray, " n"],
 ) -> Bool[np.ndarray, "r n"]:
-    """Which lines pass a Gaussian within its reach, the distance at which its largest axis has faded to 1/255."""
+    """Which lines pass a Gaussian within its reach.
+
+    Args:
+        origin: points on the lines (m).
+        direction: their unit directions.
+        mean: centres of the Gaussians (m).
+        reach_m: distance at which a Gaussian's largest axis has faded to 1/255.
+    """
     middle = origin.mean(axis=0)  # squares of large coordinates would lose the small distances between them
     o, m = origin - middle, mean - middle
     along = direction @ m.T - np.sum(direction * o, axis=1, keepdims=True)
+    # |o - m|^2 less the square of its part along the line is the squared distance of the line.
     squared = np.sum(o**2, axis=1, keepdims=True) - 2 * o @ m.T + np.sum(m**2, axis=1)
     return squared - along**2 <= reach_m**2 + 1e-9 * (squared + 1)
 
@@ -306,7 +336,14 @@ def finish_colour(
     sky: Float64[np.ndarray, "*n 3"],
     isp: Float64[np.ndarray, "3 4"] | None,
 ) -> Float64[np.ndarray, "*n 3"]:
-    """The sky behind the Gaussians, then the camera's affine colour correction."""
+    """The sky behind the Gaussians, then the camera's affine colour correction.
+
+    Args:
+        colour: blended colours.
+        alpha: opacity of what has been blended.
+        sky: colours of the sky behind.
+        isp: matrix and offset, columns 0 to 2 and 3; none if None.
+    """
     colour = colour + (1 - alpha)[..., None] * sky
     return colour if isp is None else colour @ isp[:, :3].T + isp[:, 3]
 

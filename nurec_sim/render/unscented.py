@@ -12,7 +12,7 @@ are the parameters of the 3DGUT authors' code. With gsplat's alpha = 0.1 the poi
 weights of -99 and +17 must cancel: fine on a smooth lens, but with the steps from row to row of a rolling shutter the
 mean can be many pixels off.
 
-No pixel depends on it: responses are those of ``spec``. It tells where to look for a Gaussian.
+No pixel depends on it: responses are those of ``spec``. It only locates Gaussians.
 """
 
 from __future__ import annotations
@@ -49,12 +49,14 @@ def unscented_projection(
     mean_m = np.asarray(mean_m, np.float64)
     variance, axes = np.linalg.eigh(np.asarray(covariance_m2, np.float64))
     steps = np.sqrt((DIMENSIONS + LAMBDA) * np.maximum(variance, 0))[:, None] * axes
+    # Square root of the covariance by its eigenvectors: one step along each axis.
     steps = np.moveaxis(steps, 2, 0)
     points = mean_m + np.concatenate([np.zeros((1, *mean_m.shape)), steps, -steps])
     on_axis = 1 / (2 * (DIMENSIONS + LAMBDA))
     weight = np.full(len(points), on_axis)
     weight[0] = LAMBDA / (DIMENSIONS + LAMBDA)
     weight_of_square = weight.copy()
+    # beta = 2 is optimal for Gaussian distributions; it enters the covariance only.
     weight_of_square[0] += 1 - ALPHA**2 + BETA
 
     uv, seen, _ = sensors.project_rolling(camera, world_from_camera, points.reshape(-1, 3))

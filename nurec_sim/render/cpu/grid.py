@@ -1,4 +1,4 @@
-"""A sensor's ray grid as the kernels want it: float32 rays, lines of equal time, a chart from direction to place.
+"""A sensor's ray grid as the kernels read it: float32 rays, lines of equal time, a chart from direction to place.
 
 A place is (column, row) with cell centres at +0.5. A *line* is a set of rays fired at one instant (an image row or
 column, a LiDAR column). Charts are only used to bound where a Gaussian can be seen, never to weigh it.
@@ -64,6 +64,7 @@ def _camera_grid(camera: CameraModel) -> Grid:
     direction, valid = np.empty((height, width, 3), np.float32), np.empty((height, width), np.uint8)
     field_cos = 1.0
     for place, rays, seen in sensors.pixel_ray_strips(camera):
+        # Pixels without a ray look along z: finite values that are never shown.
         direction[place], valid[place] = np.where(seen[..., None], rays, (0.0, 0.0, 1.0)), seen
         field_cos = min(field_cos, float(direction[place][..., 2].min()))  # 1 where a pixel has no ray
     fraction, by_column = line_fractions(camera)
@@ -73,6 +74,7 @@ def _camera_grid(camera: CameraModel) -> Grid:
         number = np.arange(len(fraction), dtype=np.int32)
         line = np.ascontiguousarray(np.broadcast_to(number if by_column else number[:, None], (height, width)))
     ideal = camera.ideal_pinhole
+    # An ideal pinhole at one pose is bounded in closed form (``project.pinhole``).
     chart = NO_CHART if ideal and len(fraction) == 1 else lens_chart(camera, field_cos, direction, valid > 0)
     kind, intrinsics = LENS, np.zeros(4, np.float32)
     if ideal:
@@ -87,9 +89,12 @@ def _lidar_grid(lidar: LidarModel) -> Grid:
     sign = -1.0 if lidar.spin is Spin.CLOCKWISE else 1.0
     azimuth = sign * (np.asarray(lidar.azimuth_rad, np.float64) - lidar.azimuth_rad[0])
     steps = np.diff(azimuth) if columns > 1 else np.array([np.radians(0.2)])
+    # A full circle has about one step between its last and its first column.
     gap = max(2 * np.pi - azimuth[-1], 0.0)
     full_circle = gap < 1.5 * steps.mean() and columns > 1
     offset = sign * np.asarray(lidar.row_azimuth_offset_rad, np.float64) / steps.mean()
+    # Rows fire at azimuth offsets of their own; rolling them aligns each grid column with one azimuth. Only a full
+    # circle can be rolled: elsewhere beams would wrap around to the other end.
     shift = np.rint(offset).astype(np.int32) if full_circle else np.zeros(rows, np.int32)
     fired = (np.arange(columns)[None, :] - shift[:, None]) % columns
     row = np.arange(rows)[:, None]

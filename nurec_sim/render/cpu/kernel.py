@@ -15,6 +15,8 @@ from nurec_sim.render.cpu.simd import INSTRUCTION_SET
 f4 = np.float32
 """Wraps constants in kernels: a bare Python number would make the expression float64."""
 
+# NumPy's error model divides without a test for zero; no "nnan" or "ninf" among the fast-math flags, because NaN and
+# infinity must compare as usual.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp"}}
 # Arrays cost a dozen words each as arguments; where Numba can, small kernels become part of large ones.
 _INLINE: dict[str, Any] = {"forceinline": True} if hasattr(DefaultOptions, "forceinline") else {}

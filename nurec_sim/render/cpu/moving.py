@@ -1,7 +1,7 @@
-"""The moving layer made ready for kernels: packed once per scene, put in place for every frame in a millisecond or two.
+"""The moving layer prepared for kernels: packed once per scene, posed for every frame in a millisecond or two.
 
-What it draws is ``layers.moving_gaussians``. A block holds Gaussians of one track that live at about the same time,
-so most blocks are passed over at any instant, and a re-posed actor turns whole blocks.
+It renders ``layers.moving_gaussians``. A block holds Gaussians of one track that live at about the same time, so most
+blocks are skipped at any instant, and a re-posed actor turns whole blocks.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class MovingBlocks(NamedTuple):
 
 
 class PlacedBlocks(NamedTuple):
-    """Blocks at an instant, and the spheres that hold what is alive of them."""
+    """Blocks at an instant, and spheres around their live Gaussians."""
 
     fields: Float32[np.ndarray, "b 21 256"]
     centre_m: Float64[np.ndarray, "b 3"]
@@ -100,7 +100,7 @@ class PackedMoving:
 
     @classmethod
     def of(cls, dynamic: DynamicGaussians, tracks: Sequence[Track]) -> PackedMoving:
-        """Pack a layer; Gaussians that can never be drawn are left out.
+        """Pack a layer; Gaussians that can never be rendered are left out.
 
         Args:
             dynamic: the layer.
@@ -129,6 +129,7 @@ class PackedMoving:
         knots = dynamic.knot_t_us[chosen]
         base_us = int(knots.min()) if len(knots) else 0
         knot_us = blocked(knots - base_us, np.float64, fill=np.nan)
+        # All paths share one time axis, track k shifted by k strides, so one search finds the poses of all tracks.
         span_us = np.array([(track.path.start_us, track.path.end_us) for track in tracks], np.int64).reshape(-1, 2)
         stride_us = int((span_us[:, 1] - span_us[:, 0]).max(initial=0)) + 1
         return cls(
@@ -139,6 +140,8 @@ class PackedMoving:
             knot_m=blocked(dynamic.knot_m[chosen].reshape(-1, 9), np.float32),
             track=owner[rows[:, 0]],
             boxed=np.unique(owner[chosen][owner[chosen] >= len(tracks)]) - len(tracks),
+            # NaN in rows that only fill up: ignored here, and every comparison with it is false, so they are never
+            # alive.
             life_us=np.stack([np.nanmin(knot_us[:, 0], axis=1), np.nanmax(knot_us[:, 2], axis=1)], axis=-1),
             reach_m=fields[:, SCALE : SCALE + 3].max(axis=(1, 2), where=filled[:, None], initial=0) * REACH,
             base_us=base_us,
@@ -173,10 +176,11 @@ class PackedMoving:
             hidden: ids of tracks that are left out.
             eye_m: view point in the world.
             workers: threads to run on.
-            scratch: gives the frame's scratch arrays (``workers.Scratch``); the result lives as long as they do.
+            scratch: returns the frame's scratch arrays (``workers.Scratch``); the result lives as long as they do.
         """
         instant = float(t_us - self.base_us)
         motions, gone = self._motions(t_us, actors, np.asarray(eye_m, np.float64))
+        # A hidden track hides both its loose Gaussians and those in its box.
         left_out = np.array([k for name, k in self.track_of.items() if name in hidden], np.int64)
         gone = np.concatenate([gone, left_out, left_out + len(self.span_us)])
         lives = (self.life_us[:, 0] <= instant) & (instant <= self.life_us[:, 1])
@@ -214,22 +218,25 @@ class PackedMoving:
                 shown[np.searchsorted(tracks, self.track_of[name])] = actors[name]
         is_asked = np.isin(tracks, asked)
         rows = np.concatenate([tracks[is_asked], tracks + count])
+        # Loose Gaussians are recorded in the world: undo the recorded pose first. Those in a box are given in the box.
         moved = np.concatenate([shown[is_asked] @ geometry.inverse(recorded[is_asked]), shown])
         back = geometry.inverse(moved)
         motions[rows, ROTATION : ROTATION + 9] = moved[:, :3, :3].reshape(-1, 9)
         motions[rows, TRANSLATION : TRANSLATION + 3] = moved[:, :3, 3]
         motions[rows, TURN : TURN + 4] = geometry.quat_from_matrix(moved[:, :3, :3])
+        # View-dependent colours are evaluated in the recorded frame: the eye is moved back instead of the Gaussians.
         motions[rows, EYE : EYE + 3] = back[:, :3, :3] @ eye_m + back[:, :3, 3]
         motions[rows, MOVED] = 1
         return motions, tracks[~is_asked & ((t_us < start) | (end < t_us))] + count
 
 
 def _grouped_rows(dynamic: DynamicGaussians, owner: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, "blocks 256"]:
-    """Rows of the layer's Gaussians that can be drawn, by track, time and place; -1 fills up each track."""
+    """Rows of the layer's Gaussians that can be rendered, by track, time and place; -1 fills up each track."""
     keep = drawable(dynamic.gaussians) & (np.abs(dynamic.knot_m) <= LARGEST).all(axis=(1, 2))
     rows = np.flatnonzero(keep)
     if len(rows) == 0:
         return np.zeros((0, BLOCK), np.int64)
+    # Stable sorts: by place, then by track and time, so neighbours stay together within a group.
     rows = rows[morton_order(dynamic.gaussians.mean_m[rows])]
     rows = rows[np.lexsort((dynamic.knot_t_us[rows, 1] // AGE_US, owner[rows]))]
     cuts = np.flatnonzero(np.diff(owner[rows])) + 1
@@ -267,6 +274,7 @@ def _interpolate(fields, knot_us, knot_m, block, instant, out, alive):
 def _evaluate_colours(sh_rest, block, motion, out, view, scratch):
     """Replace a block's colours by those seen from the motion's eye; centres are still where they were recorded."""
     for k in range(3):
+        # High and low part of the eye, as in ``records.view_parameters``.
         view[EYE_HIGH + k] = f4(motion[EYE + k])
         view[EYE_LOW + k] = f4(motion[EYE + k] - np.float64(view[EYE_HIGH + k]))
     for lane in range(0, BLOCK, LANES):
@@ -306,15 +314,15 @@ def _move(motion, out):
 
 @kernel
 def put_in_place(moving, blocks, first, last, instant, motions, placed):
-    """Write blocks of a ``PackedMoving`` as they are at an instant, and the spheres that hold what is alive of them.
+    """Write blocks of a ``PackedMoving`` as they are at an instant, and spheres around their live Gaussians.
 
     Args:
         moving: see ``PackedMoving``.
         blocks: numbers of the blocks to write.
         first: first entry of ``blocks`` to take.
         last: one behind the last.
-        instant: time since the layer's base.
-        motions: [2 tracks + 1,20].
+        instant: time since the layer's base (us).
+        motions: [2 tracks + 1,20] see the columns above; the last is for Gaussians of no track.
         placed: output, an entry per entry of ``blocks``.
     """
     fields, sh_rest, knot_us, knot_m, track, reach_m = moving
@@ -341,4 +349,5 @@ def put_in_place(moving, blocks, first, last, instant, motions, placed):
                 high = max(high, out[MEAN + k, i] if alive[i] > f4(0) else f4(-np.inf))
             placed.centre_m[n, k] = (np.float64(low) + np.float64(high)) / 2.0 if count > 0 else 0.0
             diagonal += (np.float64(high) - np.float64(low)) ** 2 if count > 0 else 0.0
+        # Half the diagonal of the centres' box plus the farthest that a Gaussian reaches from its centre.
         placed.radius_m[n] = np.sqrt(diagonal) / 2.0 + reach_m[block] if count > 0 else 0.0

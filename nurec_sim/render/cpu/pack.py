@@ -31,7 +31,7 @@ class LayerBlocks(NamedTuple):
     sh_rest: Float32[np.ndarray, "blocks k3 256"]
     """[0,0,0] without view-dependent colours."""
     chosen: Int64[np.ndarray, " b"]
-    """Numbers of the blocks to look at."""
+    """Numbers of the blocks to project."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class PackedGaussians:
 
 
 def pack(gaussians: Gaussians, sort: bool = True) -> PackedGaussians:
-    """Pack Gaussians; those that can never be drawn (not finite, opacity below 1/255) are left out.
+    """Pack Gaussians; those that can never be rendered (not finite, opacity below 1/255) are left out.
 
     ``sort`` groups neighbours in space into blocks, which changes the order of Gaussians of exactly equal depth only.
     """
@@ -82,6 +82,7 @@ def gaussian_columns(gaussians: Gaussians, chosen: Int64[np.ndarray, " n"]) -> F
     columns[:, QUAT : QUAT + 4] = quat / np.maximum(np.linalg.norm(quat, axis=1, keepdims=True), 1e-12)
     columns[:, SCALE : SCALE + 3] = np.maximum(gaussians.scale_m[chosen], MIN_SCALE_M)
     opacity = gaussians.opacity[chosen].astype(np.float64)
+    # The logarithm: alpha = exp(log p - q / 2) needs one exponential and no product. Capped as in ``spec``.
     columns[:, LOG_OPACITY] = np.log(np.clip(opacity, 1e-6, MAX_OPACITY))
     columns[:, COLOUR : COLOUR + 3] = gaussians.rgb[chosen]
     columns[:, LABEL] = gaussians.label[chosen]
@@ -103,6 +104,7 @@ def to_blocks(
     rows = np.zeros((blocks * BLOCK, columns.shape[1]), np.float32)
     if fill is not None:
         rows[:, fill] = NEVER_SEEN
+        # Unit rotation and extent, so that no kernel divides by zero.
         rows[:, [QUAT, SCALE, SCALE + 1, SCALE + 2]] = 1
     rows[: len(columns)] = columns
     return np.ascontiguousarray(rows.reshape(blocks, BLOCK, columns.shape[1]).transpose(0, 2, 1))
@@ -110,6 +112,7 @@ def to_blocks(
 
 def morton_order(points: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
     """Order of points along a Z-order curve of 2^21 cells a side over all but the most distant of them."""
+    # Quantiles: a few Gaussians far away (sky, outliers) would otherwise take all of the curve's resolution.
     low, high = np.quantile(points, 0.001, axis=0), np.quantile(points, 0.999, axis=0)
     cells = np.clip((points - low) / max(float((high - low).max()), 1e-9), 0, 1) * (2**21 - 1)
     code = np.zeros(len(points), np.uint64)
@@ -130,6 +133,7 @@ def block_spheres(
     if len(fields) == 0:
         return np.zeros((0, 3)), np.zeros(0)
     mean = fields[:, MEAN : MEAN + 3].astype(np.float64)
+    # The largest axis, times the standard deviations at which an opaque Gaussian has faded to 1/255.
     reach = fields[:, SCALE : SCALE + 3].max(axis=1).astype(np.float64)[:, None] * REACH
     seen = fields[:, None, LOG_OPACITY] > NEVER_SEEN
     low = np.where(seen, mean - reach, np.inf).min(axis=2)

@@ -1,4 +1,4 @@
-"""The stages of frames on the CPU: cull, project, sort, bin, blend; the same for cameras and LiDARs.
+"""The stages of frames on the CPU: cull, project, sort, bin, blend; identical for cameras and LiDARs.
 
 Several frames go through each stage together, so that all threads have work until the last tile. Kernels release the
 interpreter lock. Every stage splits its work into ranges whose results do not depend on how many there are, so frames
@@ -54,7 +54,7 @@ class FrameStats:
 class Picture:
     """One frame on its way through the stages.
 
-    ``layers`` are Gaussians and the numbers of their blocks to look at; ``output_kind`` is CAMERA, NORMALS or LIDAR.
+    ``layers`` are Gaussians and the numbers of their blocks to project; ``output_kind`` is CAMERA, NORMALS or LIDAR.
     What follows ``scratch`` is filled in by ``bin_pictures``: ``runs`` are the first row and the number of records that
     each layer has written, by range.
     """
@@ -89,7 +89,7 @@ class Picture:
 
     @property
     def capacity(self) -> int:
-        """Records that there is room for: around the seam of a LiDAR's turn a Gaussian has two."""
+        """Capacity in records: around the seam of a LiDAR's turn a Gaussian has two."""
         most = BLOCK * (2 if self.view.grid.kind == LIDAR_GRID else 1)
         return most * sum(len(blocks) for _, blocks in self.layers) + LANES
 
@@ -132,6 +132,7 @@ def bin_pictures(pictures: Sequence[Picture], workers: Workers) -> None:
 
 def tile_ranges(picture: Picture, threads: int) -> list[Int64[np.ndarray, " t"]]:
     """Runs of neighbouring macro tiles, which share records, of about equal work."""
+    # What a tile costs besides its pairs counts as 8 of them.
     work = np.cumsum(np.diff(picture.binned.starts) + 8)
     parts = max(threads * SPLIT if threads > 1 else 1, int(-(-work[-1] // SLICE_PAIRS)))
     cuts = np.searchsorted(work, np.linspace(0, work[-1], parts + 1)[1:-1])
@@ -146,7 +147,7 @@ def sensor_rays(picture: Picture) -> SensorRays:
 
 
 def _record_normals(picture: Picture) -> Float32[np.ndarray, "n 4"]:
-    """Room for a normal per record; a single one where they are not wanted."""
+    """Room for a normal per record; a single one where normals are not requested."""
     if picture.output_kind == NORMALS:
         return picture.scratch("normals", (picture.capacity, 4), np.float32)
     return picture.scratch("no normals", (1, 4), np.float32)
@@ -181,6 +182,7 @@ def _project(pictures: Sequence[Picture], workers: Workers) -> None:
                     is_lidar = picture.output_kind == LIDAR
                     calls.append((project_general, *what, is_lidar, grid.chart, path, output, base))
                 owners.append((picture, number, base))
+                # A range writes into rows of its own, whatever it finds; ``runs`` records how many of them it used.
                 base += most * (last - first)
     for (picture, number, base), count in zip(owners, workers.run_calls(calls), strict=True):
         picture.runs.append((number, base, int(count)))
@@ -209,6 +211,7 @@ def _sort(pictures: Sequence[Picture], workers: Workers) -> None:
         picture.sorted_spans = picture.scratch("sorted spans", (total, 4), np.int16)
         spare = picture.scratch("sorting", (2, total), np.uint64)
         near, made = np.float32(picture.view.grid.near_m), picture.projected
+        # With fewer frames than threads, each frame's sort is divided as well.
         cuts = depth_cuts(
             picture.projected.keys, starts, counts, workers.threads if len(pictures) < workers.threads else 1
         )
@@ -232,6 +235,8 @@ def _bin(pictures: Sequence[Picture], workers: Workers) -> None:
     )  # fmt: skip
     calls = []
     for picture, ranges, count in zip(pictures, splits, counts, strict=True):
+        # Each range fills its own part of every tile's list, after those of earlier ranges: the order is that of one
+        # thread.
         starts = np.zeros(picture.tiles + 1, np.int64)
         np.cumsum(count.sum(axis=0), out=starts[1:])
         position = starts[:-1] + np.cumsum(count, axis=0) - count

@@ -1,6 +1,6 @@
 """Vector code that turns Gaussians into records: what a ray needs to weigh them exactly, 64 bytes each.
 
-Everything is in the sensor's reference frame (its axes at the reference instant, origin at the reference point). With
+All values are in the sensor's reference frame (its axes at the reference instant, origin at the reference point). With
 R the rotation and S the standard deviations of a Gaussian, A = S^-1 R^T, centre m, b = A m, n = |b|, and e1, e2 unit
 vectors perpendicular to b, a record holds the rows e1^T A / 4, e2^T A / 4 and b^T A / n^2. A ray d of any length from
 the reference point, (X, Y, W) = rows d, has
@@ -97,7 +97,14 @@ def view_parameters(
 
 
 def rotation_of(w: Vector, x: Vector, y: Vector, z: Vector) -> list[list[Vector]]:
-    """Matrix of unit quaternions."""
+    """Matrices of unit quaternions.
+
+    Args:
+        w: real parts.
+        x: first imaginary parts.
+        y: second imaginary parts.
+        z: third imaginary parts.
+    """
     return [
         [1 - (y * y + z * z) * 2, (x * y - w * z) * 2, (x * z + w * y) * 2],
         [(x * y + w * z) * 2, 1 - (x * x + z * z) * 2, (y * z - w * x) * 2],
@@ -112,9 +119,16 @@ def dot(a: list[Vector], b: list[Vector]) -> Vector:
 
 @vector_kernel("iii")
 def place(v: Lanes, block: ir.Value, view: ir.Value, scratch: ir.Value) -> ir.Value:
-    """Centre, rotation and depth of Gaussians in the reference frame; the mask of those worth looking at.
+    """Centre, rotation and depth of Gaussians in the reference frame.
 
-    ``block`` is the address of the group's first Gaussian in its block, ``view`` that of ``view_parameters``.
+    Args:
+        v: vectors.
+        block: address of the group's first Gaussian in its block.
+        view: address of ``view_parameters``.
+        scratch: address of the group's [SCRATCH,LANES] output, all but FEATURES.
+
+    Returns:
+        The mask of the Gaussians behind the near plane that are at least 1/255 opaque.
     """
     field = [v.load(block, 4 * BLOCK * k) for k in range(LABEL + 1)]
     turn = [[v.broadcast(view, 4 * (TURN + 3 * row + column)) for column in range(3)] for row in range(3)]
@@ -155,15 +169,24 @@ def lidar_features(v: Lanes, block: ir.Value, scratch: ir.Value) -> None:
 
 @vector_kernel("iii")
 def build_records(v: Lanes, scratch: ir.Value, rows: ir.Value, view: ir.Value) -> None:
-    """Records of a group, row after row."""
+    """Records of a group, row after row.
+
+    Args:
+        v: vectors.
+        scratch: address of the group's [SCRATCH,LANES], with features.
+        rows: address of [LANES,RECORD] output.
+        view: address of ``view_parameters``.
+    """
 
     def part(k: int) -> Vector:
         return v.load(scratch, STEP * k)
 
     centre = [part(CENTRE + k) for k in range(3)]
     inverse = [part(SIGMA + k).reciprocal() for k in range(3)]
+    # A = S^-1 R^T.
     canonical = [[part(ROTATION + 3 * column + row) * inverse[row] for column in range(3)] for row in range(3)]
     ball = [dot(row, centre) for row in canonical]
+    # 1 / n; the floor keeps a Gaussian centred on the eye finite.
     away = 1 / dot(ball, ball).max(1e-30).sqrt()
     x, y, z = (component * away for component in ball)
     # Two unit vectors perpendicular to the centre and to each other (Duff et al. 2017).
@@ -173,6 +196,7 @@ def build_records(v: Lanes, scratch: ir.Value, rows: ir.Value, view: ir.Value) -
     e2 = [x * y * a, sign + y * y * a, -y]
     across, along = [], []
     for e in (e1, e2):
+        # A quarter, so that exp(-q / 2) = exp(-8 Q1 / Q2): ``responses.fading`` squares three times.
         across += [(e[0] * canonical[0][k] + e[1] * canonical[1][k] + e[2] * canonical[2][k]) * 0.25 for k in range(3)]
     along = [(x * canonical[0][k] + y * canonical[1][k] + z * canonical[2][k]) * away for k in range(3)]
     # With |A d|^2 = 16 Q1 + n^2 W^2, q = 16 n^2 Q1 / |A d|^2 = 16 Q1 / (FLAT Q1 + W^2) for FLAT = 16 / n^2.
@@ -184,6 +208,8 @@ def build_records(v: Lanes, scratch: ir.Value, rows: ir.Value, view: ir.Value) -
     room = 1 - rim * flat
     lim = (room > 1e-4).where(rim / room.max(1e-4), INSIDE)
     # Where it reaches the plane of the camera, rays may meet it too near or, mirrored, behind.
+    # Standard deviation along z is the norm of the last row of R S; the ellipsoid of 1/255 has the squared radius 16
+    # rim.
     depths = [part(ROTATION + 6 + k) * part(SIGMA + k) for k in range(3)]
     lowest = centre[2] - (rim * dot(depths, depths) * 16).sqrt()
     lowest = lowest - dot(centre, centre).sqrt() * v.broadcast(view, 4 * SWING) - v.broadcast(view, 4 * TRAVEL)
@@ -192,8 +218,10 @@ def build_records(v: Lanes, scratch: ir.Value, rows: ir.Value, view: ir.Value) -
     close = b.select(
         (lowest < v.broadcast(view, 4 * NEAR)).value, spread(b, I32(CLOSE_BIT), ints), spread(b, I32(0), ints)
     )
+    # Label and flag are bits of an integer, carried in a float32 column.
     tag = v.from_bits(b.or_(part(CLASS).integers(), close))
     columns = [*across, *along, flat, log_opacity * -0.125, lim, tag, *(part(FEATURES + k) for k in range(3))]
+    # Structure of arrays to records of 64 bytes, one cache line each.
     for first in range(0, RECORD, LANES):
         for lane, row in enumerate(v.transpose(columns[first : first + LANES])):
             v.store(row, rows, 4 * (RECORD * lane + first))

@@ -1,4 +1,4 @@
-"""Renders requests for one Gaussian scene on the CPU; what it draws is defined in ``render.spec``."""
+"""Renders requests for one Gaussian scene on the CPU; images are defined in ``render.spec``."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ class _Begun:
 
 
 class CpuRenderer:
-    """A scene made ready for rendering. Immutable but for caches; all methods can be called from many threads.
+    """A scene prepared for rendering. Immutable but for caches; all methods can be called from many threads.
 
     Args:
         scene: the world.
-        threads: that work on a frame, the caller's own among them; as many as the process may use if None.
+        threads: number of threads that work on a frame, including the caller's; as many as the process may use if None.
         apply_isp: whether ``scene.isp`` of the request's sensor id is applied to requests that ask for it.
-        detail_px: level of detail: distant static Gaussians are drawn merged where that paints no more than about a
-            square of this side wrong, in pixels or beams; 0 draws all of them. 0.15 keeps 50 dB where surfaces have
+        detail_px: level of detail: distant static Gaussians are rendered merged where the error is no more than about a
+            square of this side, in pixels or beams; 0 renders all of them. 0.15 keeps 50 dB where surfaces have
             several layers and 45 where they have one (``lod``). Merging takes seconds per million Gaussians.
 
     Raises:
@@ -132,9 +132,11 @@ class CpuRenderer:
             group: list[_Begun] = []
             for number, request in enumerate(requests):
                 rest()
+                # One set of scratch arrays per frame of a group, reused by the next group.
                 if len(group) == len(scratches):
                     scratches.append(loans.enter_context(self._buffers.lend()))
                 group.append(self._begin(request, outputs, scratches[len(group)]))
+                # Frames of a group are held in memory together until their last stage.
                 held = sum(begun.picture.scratch_bytes for begun in group)
                 if held >= GROUP_BYTES or number == len(requests) - 1:
                     frames += self._finish(group, outputs, filter or LidarFilter())
@@ -178,10 +180,12 @@ class CpuRenderer:
             label=np.empty((height, width), np.uint8),
             normal=np.empty((height, width, 3) if picture.output_kind == NORMALS else (0, 0, 3), np.float32),
         )
+        # The correction may vary over time: the one at the middle of the exposure applies.
         corrected = self.apply_isp and request.apply_isp
         response = self.scene.response(request.sensor.id, request.middle_us) if corrected else None
         isp = IDENTITY_ISP if response is None else np.ascontiguousarray(response, np.float32)
         turn = view.world_from_line[:, :3, :3].astype(np.float32)
+        # Distances of directions with z = 1 are depths already.
         linear = view.projection_mode in (AFFINE, ROLLING)
         ray_z = np.zeros((0, 0), np.float32) if linear else sensor.ray_z
         rays = CameraRays(ray_z, grid.direction, grid.valid, grid.line, turn)
@@ -208,6 +212,7 @@ class CpuRenderer:
         grid = picture.view.grid
         assert grid.beam is not None
         rows, columns = grid.beam.shape
+        # Points are reported in the sensor's frame at the end of the sweep.
         end_from_line = (
             geometry.inverse(np.asarray(request.world_from_sensor[1], np.float64)) @ picture.view.world_from_line
         )
@@ -243,6 +248,7 @@ class CpuRenderer:
         if len(self.scene.dynamic):
             _, t_us = reference_pose(request, view.grid.reference)
             actors = actors_at(request, view.grid.reference, self._moving.track_of)
+            # Actors hold still during an exposure, at the reference instant (``spec``).
             moving = self._moving.at(t_us, actors, request.hidden, eye, self._workers, scratch)
             layers.append((moving, blocks_in_view(view, moving)))
         return layers

@@ -23,7 +23,7 @@ KEPT_RAYS = 50_000_000
 
 @dataclass(frozen=True, eq=False)
 class SensorTables:
-    """Tables of a sensor, each made when it is first asked for: a pinhole that stands still needs few of them."""
+    """Tables of a sensor, each computed on first use: a static pinhole needs few of them."""
 
     grid: Grid
 

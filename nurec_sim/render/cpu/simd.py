@@ -55,6 +55,7 @@ F32, I1, I8, I16, I32, I64 = (
     ir.IntType(64),
 )
 FLOATS, INTS, BITS = ir.VectorType(F32, LANES), ir.VectorType(I32, LANES), ir.VectorType(I1, LANES)
+# Fused multiply-add, reordered sums and reciprocals, but no "nnan" or "ninf": masks rely on comparisons with NaN.
 _FAST = ("contract", "reassoc", "nsz", "arcp")
 _POINTER = ir.PointerType()
 
@@ -62,7 +63,7 @@ Number = float | int
 
 
 class Vector:
-    """``LANES`` float32 values; numbers in expressions stand for all lanes."""
+    """``LANES`` float32 values; numbers in expressions apply to all lanes."""
 
     __slots__ = ("b", "value")
 
@@ -143,6 +144,7 @@ class Vector:
         if INSTRUCTION_SET != "avx512":
             return 1 / self
         f = declare(self.b, "llvm.x86.avx512.rcp14.ps.512", FLOATS, [FLOATS, FLOATS, I16])
+        # 14 bits from the table instruction; a Newton step doubles them.
         r = Vector(self.b, self.b.call(f, [self.value, constant(0), ir.Constant(I16, -1)]))
         return r * (2 - self * r) if refined else r
 
@@ -224,7 +226,14 @@ class Lanes:
         return Vector(self.b, self.b.load(self.pointer(base, offset), typ=FLOATS, align=align))
 
     def store(self, x: Vector, base: ir.Value, offset: ir.Value | int = 0, align: int = 4) -> None:
-        """``LANES`` floats to memory; ``offset`` in bytes."""
+        """``LANES`` floats to memory.
+
+        Args:
+            x: what to store.
+            base: address.
+            offset: added to the address, in bytes.
+            align: alignment of the result in bytes.
+        """
         self.b.store(x.value, self.pointer(base, offset), align=align)
 
     def broadcast(self, base: ir.Value, offset: ir.Value | int = 0) -> Vector:
@@ -234,6 +243,7 @@ class Lanes:
     def gather(self, base: ir.Value, index: ir.Value) -> Vector:
         """``base[index]`` for int32 lanes ``index`` (in floats)."""
         wide, pointers = ir.VectorType(I64, LANES), ir.VectorType(_POINTER, LANES)
+        # Byte offsets of float32 entries.
         offsets = self.b.shl(self.b.sext(index, wide), ir.Constant(wide, [2] * LANES))
         where = self.b.inttoptr(self.b.add(spread(self.b, base, wide), offsets), pointers)
         f = declare(self.b, f"llvm.masked.gather.v{LANES}f32.v{LANES}p0", FLOATS, [pointers, I32, BITS, FLOATS])
@@ -272,6 +282,8 @@ class Lanes:
         assert len(vectors) == LANES
         now, width = [x.value for x in vectors], LANES
         while width > 1:
+            # Each round adds the two halves of every pair of vectors, so LANES vectors become one after log2(LANES)
+            # rounds; the order of the sum is fixed.
             half, groups = width // 2, LANES // width
             starts = [side + group * width for side in (0, LANES) for group in range(groups)]
             parts = [[start + h * half + k for start in starts for k in range(half)] for h in range(2)]
@@ -292,10 +304,12 @@ class Lanes:
         b.position_at_end(start)
         i = b.phi(I64)
         i.add_incoming(ir.Constant(I64, 0), before)
+        # A phi node per value is what keeps the state in registers across iterations.
         phis = [b.phi(FLOATS) for _ in state]
         for phi, value in zip(phis, state, strict=True):
             phi.add_incoming(value.value, before)
         after = body(i, [Vector(b, phi) for phi in phis])
+        # b.block, not ``start``: the body may itself have added blocks.
         following = b.add(i, ir.Constant(I64, 1))
         i.add_incoming(following, b.block)
         for phi, value in zip(phis, after, strict=True):
@@ -318,7 +332,14 @@ def spread(b: ir.IRBuilder, scalar: ir.Value, vector_type: ir.VectorType) -> ir.
 
 
 def declare(b: ir.IRBuilder, name: str, result: ir.Type, arguments: Sequence[ir.Type]) -> ir.Function:
-    """An LLVM intrinsic by name."""
+    """An LLVM intrinsic by name.
+
+    Args:
+        b: builder, whose module declares it.
+        name: such as ``llvm.sqrt.v8f32``; an intrinsic declared before is reused.
+        result: type of its result.
+        arguments: types of its arguments.
+    """
     return b.module.globals.get(name) or ir.Function(b.module, ir.FunctionType(result, arguments), name)
 
 
@@ -337,6 +358,14 @@ def vector_kernel(arguments: str) -> Callable[[Callable[..., Any]], Any]:
         signature = types.int64(*[_SCALARS[letter] for letter in arguments])
 
         def generate(context: Any, b: ir.IRBuilder, sig: Any, values: Sequence[ir.Value]) -> ir.Value:
+            """Emit the call in place.
+
+            Args:
+                context: Numba's target context.
+                b: builder at the call.
+                sig: signature of the call.
+                values: LLVM values of the arguments.
+            """
             result = function(Lanes(b), *values)
             return ir.Constant(I64, 0) if result is None else result
 

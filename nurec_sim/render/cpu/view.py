@@ -1,4 +1,4 @@
-"""Where a grid looks from during one exposure, as the kernels want it."""
+"""Where a grid looks from during one exposure, as the kernels read it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nurec_sim.render.cpu.records import MACRO, view_parameters
 
 GENTLE_TRAVEL_M = 0.03
 GENTLE_TURN_RAD = 2e-3
-"""Up to how much motion over half a macro tile a rolling shutter is drawn to first order about the tile's middle."""
+"""Up to this motion over half a macro tile, a rolling shutter is rendered to first order about the tile's middle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class ExposureView:
         """The view of a grid whose sensor moves from the first to the second pose."""
         pair = np.asarray(pair, np.float64)
         reference = geometry.interpolate_pose_pair(pair, np.array(grid.reference))
-        # A sensor whose two poses are equal is drawn from one, which is faster and exact.
+        # A sensor whose two poses are equal is rendered from one, which is faster and exact.
         still = len(grid.line_fraction) == 1 or np.array_equal(pair[0], pair[1])
         fractions = np.array([grid.reference]) if still else np.asarray(grid.line_fraction, np.float64)
         poses = reference[None] if still else geometry.interpolate_pose_pair(pair, fractions)
@@ -54,9 +54,11 @@ class ExposureView:
         motion = np.zeros(8)
         if not still:
             turn = reference[:3, :3].T
+            # Motion of the whole exposure in the reference frame: constant speed and turn rate between the two poses.
             motion[:3] = turn @ (pair[1, :3, 3] - pair[0, :3, 3])
             motion[3:6] = _rotation_vector(turn @ (pair[1, :3, :3] @ pair[0, :3, :3].T) @ turn.T)
             motion[6:] = places[0], places[1] - places[0]
+        # From the reference, the sensor gets at most this fraction of its motion away.
         far = float(np.abs(places).max())
         return cls(
             grid,
@@ -82,6 +84,7 @@ class ExposureView:
             return AFFINE if self.grid.kind == PINHOLE else TABLE
         if self.grid.kind != PINHOLE or self.grid.line_axis != 0:
             return MOVING
+        # The error of the first order grows with the square of the motion within a tile, so it is judged per tile.
         over_half_a_tile = abs(float(self.motion[7])) * MACRO / 2
         travel, turn = (float(np.linalg.norm(self.motion[k : k + 3])) * over_half_a_tile for k in (0, 3))
         return ROLLING if travel <= GENTLE_TRAVEL_M and turn <= GENTLE_TURN_RAD else MOVING

@@ -18,7 +18,7 @@ KEPT = 4
 """Sets of scratch arrays that are kept for later frames."""
 
 Scratch = Callable[[str, tuple[int, ...], type], np.ndarray]
-"""Gives an uninitialised array of a name, a shape and a type."""
+"""Returns an uninitialised array of a name, a shape and a type."""
 
 
 class Workers:
@@ -42,6 +42,7 @@ class Workers:
 
         def work() -> None:
             nonlocal begun_all
+            # Threads take the next call when free, so calls of uneven cost balance; each writes its own result.
             while turn is None or not turn.is_over:
                 if (number := next(numbers)) >= len(calls):
                     begun_all = True
@@ -90,13 +91,14 @@ class Buffers:
 
     @contextlib.contextmanager
     def lend(self) -> Iterator[Scratch]:
-        """A function that gives an uninitialised array of a name, a shape and a type, the caller's until the end."""
+        """A function that returns an uninitialised array of a name, a shape and a type, the caller's until the end."""
         with self._lock:
             arrays = self._free.pop() if self._free else {}
 
         def array(name: str, shape: tuple[int, ...], dtype: type) -> np.ndarray:
             size = int(np.prod(shape))
             if name not in arrays or arrays[name].size < size or arrays[name].dtype != dtype:
+                # A fifth more than needed: the next frame rarely needs a new array.
                 arrays[name] = np.empty(int(size * 1.2) + 64, dtype)
             return arrays[name][:size].reshape(shape)
 

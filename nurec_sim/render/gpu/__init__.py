@@ -1,4 +1,4 @@
-"""The CUDA back end: the frames of ``render.spec`` drawn by a GPU, forward and backward; needs the extra ``gpu``.
+"""The CUDA back end: the frames of ``render.spec`` rendered by a GPU, forward and backward; needs the extra ``gpu``.
 
 Nothing outside of this folder imports it, and it imports torch and CUDA's packages only where they are used.
 """

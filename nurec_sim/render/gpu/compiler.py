@@ -37,7 +37,7 @@ def translation_unit() -> str:
 
 
 def compile_cubin(architecture: str) -> tuple[bytes, str]:
-    """Machine code of all kernels, and what the compiler had to say.
+    """Machine code of all kernels, and the compiler's log.
 
     Args:
         architecture: such as ``sm_90``.
@@ -69,7 +69,7 @@ def cached_cubin(architecture: str, folder: Path | None = None) -> bytes:
     cubin, _ = compile_cubin(architecture)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Written beside it and moved, so that nobody ever reads half a file.
+        # Written beside it and moved, so that no reader sees an incomplete file.
         with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
             file.write(cubin)
         os.replace(file.name, path)

@@ -1,4 +1,4 @@
-"""Is there a GPU driver, asked before anything heavy is imported."""
+"""Whether there is a GPU driver, checked before anything heavy is imported."""
 
 from __future__ import annotations
 

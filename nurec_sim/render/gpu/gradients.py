@@ -34,10 +34,10 @@ DIFFERENTIABLE = 6
 
 
 class DifferentiableRenderer:
-    """Draws what some sensors see of Gaussians, with gradients.
+    """Renders Gaussians for a set of sensors, with gradients.
 
     Args:
-        sensors: cameras, or LiDARs; all of them are drawn in one launch.
+        sensors: cameras, or LiDARs; all of them are rendered in one launch.
         device: a CUDA device, or a ``Launcher``.
 
     Raises:
@@ -65,7 +65,7 @@ class DifferentiableRenderer:
 
         Args:
             gaussians: the world, on this device. Colours that depend on the view are evaluated for the first sensor's
-                eye, so give sensors of one place only where there are any.
+                eye, so all sensors must be in one place where there are any.
             world_from_sensor: per sensor one pose, or those at the start and the end of its exposure.
             sky: cubemap or a single colour behind the Gaussians; black if None. Not for LiDARs.
 
@@ -114,6 +114,7 @@ def _image(
     if sky is not None:
         direction, instant = tensors.rays[..., :3], tensors.rays[..., 3:]
         swing = torch.as_tensor(rotation_vector(pair[0, :3, :3].T @ pair[1, :3, :3]), device=planes.device)
+        # A moving sensor's rays turn about the sensor's own axes before the reference pose applies.
         turned = _turned(direction.double(), instant.double() * swing) @ reference[:3, :3].T.to(planes.device)
         behind = sky if sky.ndim == 1 else sky_colour(sky, turned.to(sky.dtype))
         lit = (direction != 0).any(dim=-1)
@@ -124,6 +125,7 @@ def _image(
 
 def _sweep(planes: Tensor, tensors: GridTensors) -> LidarImages:
     cell_of_beam = torch.argsort(tensors.beam.reshape(-1))
+    # From grid cells, whose rows may be rolled, to beams.
     planes = planes[:, cell_of_beam].reshape(DIFFERENTIABLE, *tensors.grid.valid.shape)
     half, alpha = planes[HALF], planes[ALPHA]
     mean = planes[DISTANCE] / alpha.clamp(min=MIN_ALPHA)
@@ -169,6 +171,20 @@ class _Blend(torch.autograd.Function):
         features: Tensor,
         *references: Tensor,
     ) -> Tensor:
+        """Render the batch, again with more room until it fits.
+
+        Args:
+            ctx: autograd's context.
+            launcher: runs the kernels.
+            batch: the sensors.
+            rooms: room that earlier batches needed.
+            mean: see ``GaussianTensors``, like the next three.
+            quat: see mean.
+            scale: see mean.
+            opacity: see mean.
+            features: [n,3] what is summed along a ray.
+            references: [4,4] reference pose of each sensor; only their gradients are used, the batch has the poses.
+        """
         static = blocks_of(mean, quat, scale, opacity, features, launcher.device)
 
         def attempt(room: Room) -> tuple[np.ndarray, Drawn]:
@@ -192,8 +208,10 @@ class _Blend(torch.autograd.Function):
         rows = rows[:, : len(opacity)]
         length = quat.float().norm(dim=1, keepdim=True).clamp(min=1e-12)
         unit = quat.float() / length
+        # The kernels see unit quaternions: project out the part along q, divide by the norm.
         turn = (rows[3:7].T - unit * (unit * rows[3:7].T).sum(dim=1, keepdim=True)) / length
         chance = opacity.float()
+        # The kernels' gradient is by the logarithm; the cap at MAX_OPACITY has none.
         by_opacity = torch.where((chance <= MAX_OPACITY) & (rows[10] != 0), rows[10] / chance, 0)
         results = (
             rows[0:3].T.to(mean.dtype),

@@ -1,7 +1,7 @@
-"""Who runs the kernels: a GPU through ``cuda-core``, or anything else that follows ``Launcher``.
+"""What runs the kernels: a GPU through ``cuda-core``, or anything else that implements ``Launcher``.
 
-The rest of this folder only sees tensors on ``Launcher.device`` and kernels by name, so that tests run all of it on a
-machine without a GPU (``tests/gpu_on_cpu``).
+The rest of this folder only sees tensors on ``Launcher.device`` and kernels by name, so tests run all of it without a
+GPU (``tests/gpu_on_cpu``).
 """
 
 from __future__ import annotations
@@ -97,6 +97,7 @@ class CudaLauncher(TorchOperations):
         self._core = core
         self._device = core.Device(self.device.index)
         self._device.set_current()
+        # One cubin holds all kernels of an architecture, so nothing is compiled on later starts.
         cubin = cached_cubin(architecture_of(self.device))
         try:
             code = core.ObjectCode.from_cubin(cubin)
@@ -131,7 +132,7 @@ def shared_launcher(device: str) -> CudaLauncher:
 
 
 class _TorchStream:
-    """Torch's current stream of a device, as ``cuda-core`` asks for it."""
+    """Torch's current stream of a device, by the protocol of ``cuda-core``."""
 
     def __init__(self, device: torch.device) -> None:
         import torch

@@ -1,4 +1,4 @@
-"""The moving layer on the device: uploaded once, put in place for the sensors of each batch by a kernel."""
+"""The moving layer on the device: uploaded once, posed for the sensors of each batch by a kernel."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class MovingLayer:
 
     @classmethod
     def of(cls, dynamic: DynamicGaussians, tracks: Sequence[Track], device: torch.device) -> MovingLayer:
-        """A layer, copied to a device; what can never be drawn is left out."""
+        """A layer, copied to a device; Gaussians that can never be rendered are left out."""
         import torch
 
         gaussians = dynamic.gaussians
@@ -62,6 +62,7 @@ class MovingLayer:
         sh_rest = np.zeros((0, 0, 0), np.float32)
         if rest is not None and blocks:
             sh_rest = to_blocks(np.nan_to_num(rest[chosen].reshape(len(chosen), -1)).astype(np.float32), blocks)
+        # Rows that only fill a block up have no track and are never seen.
         times, track = np.zeros((blocks * BLOCK, 3), np.int64), np.full(blocks * BLOCK, -1, np.int32)
         owner = dynamic.track.copy()
         if dynamic.in_box is not None:
@@ -83,7 +84,14 @@ class MovingLayer:
         return cls(fields, sh, knot_m, knot_us, of_track, path_first, path_us, path, number_of)
 
     def asked(self, requests: Sequence[SensorRequest]) -> Int32[np.ndarray, "views tracks"]:
-        """Which of all actors' pairs, request after request, poses each track anew; NOT_ASKED, or HIDDEN."""
+        """Which pair of poses re-poses each track.
+
+        Args:
+            requests: the requests of a batch.
+
+        Returns:
+            Numbers of pairs, counted over the actors of all requests in their order; NOT_ASKED, or HIDDEN.
+        """
         table = np.full((len(requests), len(self.number_of)), NOT_ASKED, np.int32)
         number, first = self.number_of, 0
         for row, request in zip(table, requests, strict=True):
@@ -102,7 +110,7 @@ class MovingLayer:
         Args:
             launcher: runs the kernels.
             batch: the sensors.
-            asked: see there; on the device.
+            asked: result of the method ``asked``, on the device.
             pairs: [n,2,4,4] float64 on the device.
         """
         import torch

@@ -35,7 +35,7 @@ MOST_NARROW = 0xFFFF
 """Up to so many tiles, pairs are sorted by 16 bits."""
 MOST_KINDS = 64
 FIRST_RECORDS, PAIRS_PER_RECORD = 1 << 18, 4
-"""How much room there is at first, at most, and for how many pairs per record."""
+"""Room for records at first, at most, and for how many pairs per record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class Blocks:
 class Room:
     """For how many records and pairs of a record and a tile a batch has memory.
 
-    The host does not wait to learn how many there are: what does not fit is left out, and the batch drawn once more.
+    The host does not wait for the numbers: what does not fit is left out, and the batch is then rendered again.
     """
 
     records: int
@@ -108,7 +108,7 @@ class Room:
         return bool(totals[0] <= self.records and totals[1] <= self.pairs)
 
     def grown(self, totals: np.ndarray) -> Room:
-        """With a quarter more room than was needed, where it did not suffice."""
+        """A quarter more than was needed, where the room did not suffice."""
         records, pairs = (int(total) * 5 // 4 + 1024 for total in totals)
         return Room(max(self.records, records) if totals[0] > self.records else self.records,
                     max(self.pairs, pairs) if totals[1] > self.pairs else self.pairs)  # fmt: skip
@@ -121,7 +121,13 @@ class Rooms:
         self._known: dict[Hashable, Room] = {}
 
     def until_it_fits(self, kind: Hashable, first: Room, attempt: Callable[[Room], tuple[np.ndarray, T]]) -> T:
-        """What ``attempt`` draws; it gets the room, and gives the numbers of records and pairs beside its result."""
+        """The result of the first attempt that fits.
+
+        Args:
+            kind: what batches of about the same needs have in common.
+            first: room for the first batch of its kind.
+            attempt: takes the room, and returns the numbers of records and pairs beside its result.
+        """
         room = self._known.get(kind, first)
         while True:
             totals, result = attempt(room)
@@ -134,12 +140,13 @@ class Rooms:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """What drawing leaves: ``planes`` [10,rays] (features, distance, alpha, half, normal, label) and the way there.
+    """The results of a batch and its intermediate arrays.
 
-    ``row_records`` [views,rows] (if asked for) is the record of each Gaussian in each view, -1 where it has none.
-    ``order`` gives the records front to back; ``tile_counts`` and ``tile_ends`` are, in that order, their numbers of
-    tiles and the running sum; ``slots`` says which of these pairs each entry of ``lists`` is. The list of tile k begins
-    at ``starts[k]``. ``totals`` are the numbers of records and of pairs.
+    ``planes`` [10,rays] are features, distance, alpha, half, normal and label. ``row_records``
+    [views,rows] (with ``keep_rows``) is the record of each Gaussian in each view, -1 where it has none. ``order`` lists
+    the records front to back; ``tile_counts`` and ``tile_ends`` are, in that order, their numbers of tiles and the
+    running sum; ``slots`` is the number of the pair in that order for each entry of ``lists``. The list of tile k
+    begins at ``starts[k]``. ``totals`` are the numbers of records and of pairs.
     """
 
     planes: torch.Tensor
@@ -185,6 +192,7 @@ def draw(
     layers = (batch.views, len(static), static.fields, moving.fields, static.spheres)
     counts = empty(slots, dtype=torch.int32)
     launcher.launch("count_visible", (blocks, views), *layers, counts)
+    # Counting first gives every block a fixed range of rows: no atomics, and the same bytes every time.
     ends = launcher.running_sum(counts)
     records, spans = empty(room.records, RECORD), empty(room.records, SPAN, dtype=torch.int32)
     depths = empty(room.records, dtype=torch.int32)
@@ -202,6 +210,7 @@ def draw(
     grid = (-(-room.records // WARPS), 1)
     launcher.launch("count_tiles", grid, *found)
     tile_ends = launcher.running_sum(tile_counts)
+    # Radix sorts cost by the bits of their keys.
     narrow = int(tiles <= MOST_NARROW)
     keys = empty(room.pairs, dtype=torch.int16 if narrow else torch.int32)
     owners = empty(room.pairs, dtype=torch.int32)
@@ -236,11 +245,11 @@ def draw_backward(
         static: of the forward pass.
         drawn: what it left, with ``keep_rows``.
         plane_grads: [6,rays], the loss' gradients of features, distance, alpha and half.
-        each_view: whether to give what each view adds, too.
+        each_view: whether to return the share of each view, too.
 
     Returns:
         [14,rows]: of mean (world), unit quaternion, scale, log opacity and the three features. Then the same of each
-        view alone, if asked for.
+        view alone, with ``each_view``.
     """
     import torch
 
@@ -253,6 +262,7 @@ def draw_backward(
     )  # fmt: skip
 
     place_of_record = torch.empty_like(drawn.order)
+    # Inverse of the permutation by depth.
     place_of_record[drawn.order] = torch.arange(len(drawn.order), device=device)
 
     def of_views(first: int, last: int) -> torch.Tensor:
@@ -263,5 +273,6 @@ def draw_backward(
         )  # fmt: skip
         return gradients
 
+    # Pose gradients need each view's share; with a single view it is also the total.
     by_view = [of_views(k, k + 1) for k in range(views)] if each_view else []
     return by_view[0] if each_view and views == 1 else of_views(0, views), by_view

@@ -1,4 +1,4 @@
-"""Renders requests for one Gaussian scene on a GPU; what it draws is defined in ``render.spec``."""
+"""Renders requests for one Gaussian scene on a GPU; images are defined in ``render.spec``."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _Places = dict[str, tuple[int, int]]
 
 GROUP_RAYS = 1 << 24
-"""Pixels and beams that are drawn together, or of a single larger frame; some hundred bytes each."""
+"""Pixels and beams that are rendered together, or of a single larger frame; some hundred bytes each."""
 
 
 TOTALS_BYTES = 16
@@ -65,8 +65,8 @@ class Images:
 
     Of cameras: ``rgb`` [rays,3] uint8, ``depth`` and ``alpha`` [rays], ``label`` [rays] uint8, ``normal`` [rays,3]. Of
     LiDARs, in the order of the beams: ``returns`` [rays,6] with x, y, z in the sensor at the end of the sweep, range,
-    intensity, and 1 where the beam returns. Rays of the other kind of sensor are not initialised. None where nobody
-    asked for it, or a batch has no sensor of a kind.
+    intensity, and 1 where the beam returns. Rays of the other kind of sensor are not initialised. None where it was
+    not requested, or a batch has no sensor of the kind.
     """
 
     first_ray: np.ndarray
@@ -79,7 +79,7 @@ class Images:
 
 
 class GpuRenderer:
-    """A scene made ready for rendering on a GPU, a ``render.Renderer``.
+    """A scene prepared for rendering on a GPU, a ``render.Renderer``.
 
     Immutable but for caches; all methods can be called from many threads. Work is queued on torch's current stream.
 
@@ -122,7 +122,7 @@ class GpuRenderer:
     def sense(self, requests: Sequence[SensorRequest], outputs: Sequence[str] = SENSED_OUTPUTS) -> list[SensorFrame]:
         """One frame per request, in order: ``types.Sense``; cameras with ``rgb`` and what else ``outputs`` names.
 
-        They are drawn together, in groups of up to ``GROUP_RAYS``.
+        They are rendered together, in groups of up to ``GROUP_RAYS``.
 
         Raises:
             RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or an unknown output.
@@ -161,7 +161,7 @@ class GpuRenderer:
         return frame
 
     def draw(self, requests: Sequence[SensorRequest], filter: LidarFilter | None = None) -> Images:
-        """What ``sense`` draws, all outputs, left on the device; at least one request.
+        """The frames of ``sense`` with all outputs, left on the device; at least one request.
 
         Raises:
             RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or the GPU's memory is full.
@@ -171,7 +171,7 @@ class GpuRenderer:
     def _drawn(
         self, requests: Sequence[SensorRequest], outputs: Sequence[str], filter: LidarFilter, on_host: bool
     ) -> tuple[Images, dict[str, np.ndarray]]:
-        """The images on the device and, if asked for, on the host; waits for the device once."""
+        """The images on the device and, with ``on_host``, on the host; waits for the device once."""
         import torch
 
         world_from_sensor, pairs = check_requests(requests, self.scene, self._checked)
@@ -184,6 +184,7 @@ class GpuRenderer:
             def attempt(room: Room) -> tuple[np.ndarray, tuple[torch.Tensor, np.ndarray]]:
                 drawn = draw(self._launcher, batch, self._static, moving, room)
                 shared = self._finish(batch, drawn, places, filter)
+                # One copy carries the totals, which tell whether everything fitted, and the images.
                 host = self._launcher.read(shared if on_host else shared[:TOTALS_BYTES])
                 return host[:TOTALS_BYTES].view(np.int64), (shared, host)
 
@@ -219,6 +220,7 @@ class GpuRenderer:
         asked = self._moving.asked(requests)
         parts = [part.reshape(-1).view(np.uint8) for part in (rows, pairs, asked)]
         ends = np.cumsum([len(part) for part in parts]).tolist()
+        # One upload of everything that depends on the requests; the parts are addressed by their bytes.
         uploaded = self._launcher.upload(np.concatenate(parts))
         batch = make_batch(tensors, rows, uploaded[: ends[0]], self._sky, blocks)
         placed = self._moving.placed(self._launcher, batch, uploaded[ends[1] :], uploaded[ends[0] : ends[1]])
@@ -255,6 +257,7 @@ class GpuRenderer:
             shown = [plane.get(name) for name in ("rgb", "depth", "alpha", "label", "normal")]
             self._launcher.launch("finish_images", grid, *common, *shown)
         if "returns" in places:
+            # Negative: no distance threshold.
             farthest = -1.0 if filter.distance_threshold_m is None else float(filter.distance_threshold_m)
             thresholds = (float(filter.opacity_threshold), float(filter.raydrop_threshold), farthest)
             self._launcher.launch("finish_beams", grid, *common, *thresholds, plane["returns"])

@@ -12,6 +12,7 @@ def sky_colour(sky: Float[Tensor, "6 s s 3"], direction: Float[Tensor, "h w 3"])
     face, s, t = cubemap_coordinates(direction)
     size = sky.shape[1]
     x, y = ((part * size - 0.5).clamp(0, size - 1) for part in (s, t))
+    # The choice of texels has no gradient; the weights fx and fy carry it.
     x0, y0 = x.detach().long(), y.detach().long()
     x1, y1 = (x0 + 1).clamp(max=size - 1), (y0 + 1).clamp(max=size - 1)
     fx, fy = (x - x0)[..., None], (y - y0)[..., None]

@@ -49,6 +49,7 @@ def blocks_of(
     length = given[:, 3:7].norm(dim=1)
     sound = torch.isfinite(given).all(dim=1) & (length > 1e-12)
     sound &= (given[:, 7:10] > 0).all(dim=1) & (given[:, 13] >= 1 / 255)
+    # Rows that are never seen still pass through the kernels' arithmetic: finite values, opacity NEVER_SEEN.
     given = torch.where(sound[:, None], given, 1.0)
     columns = torch.zeros((blocks * BLOCK, FIELDS), device=device)
     columns[:, LOG_OPACITY] = NEVER_SEEN
@@ -62,6 +63,7 @@ def blocks_of(
     rows[:, LOG_OPACITY] = torch.where(sound, given[:, 13].clamp(max=MAX_OPACITY).log(), NEVER_SEEN)
     fields = columns.reshape(blocks, BLOCK, FIELDS).transpose(1, 2).contiguous()
     spheres = torch.zeros((blocks, SPHERE), device=device)
+    # Unbounded, so no block is culled; parent -1: a single level of detail.
     spheres[:, 3] = EVERYWHERE_M
     spheres.view(torch.int32)[:, 5] = -1
     return Blocks(fields, torch.zeros((0, 0, 0), device=device), spheres)

@@ -1,7 +1,7 @@
 """The sensors of a batch as the kernels read them: one ``View`` each (``kernels/view.cuh``), one list of tiles for all.
 
 A sensor that moves during its exposure does so at constant speed and turn rate, so six numbers and an instant per ray
-say where each ray starts and points; nothing is approximated.
+determine where each ray starts and points; nothing is approximated.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class GridTensors:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Sensors that are drawn together; their rays and tiles are numbered on.
+    """Sensors that are rendered together; their rays and tiles are numbered consecutively.
 
     ``views`` holds the bytes of one ``VIEW`` each; the rays of sensor k begin at ``first_ray[k]``, the last entry is
     ``ray_count``. Each sensor has ``moving_blocks`` of the moving layer. ``largest_grid`` are the cells of the largest
@@ -135,12 +135,14 @@ def view_rows(tensors: Sequence[GridTensors], world_from_sensor: Float64[np.ndar
     reference = geometry.interpolate_pose_pairs(world_from_sensor, rows["reference"])
     turn = reference[:, :3, :3].transpose(0, 2, 1)
     rows["eye"], rows["turn"] = reference[:, :3, 3], turn.reshape(-1, 9)
+    # Sweeps report points in the sensor's frame at the end of the exposure.
     rows["end_from_reference"] = (geometry.inverse(end) @ reference)[:, :3].reshape(-1, 12)
     moving = np.array([sensor.timed for sensor in tensors]) & (start != end).any(axis=(1, 2))
     rows["moving"] = moving
     if moving.any():
         shift = (end - start)[moving, :3, 3]
         rows["travel"][moving] = (turn[moving] @ shift[:, :, None])[:, :, 0]
+        # In the sensor's own frame, in which the axis of a constant turn is fixed.
         rows["swing"][moving] = rotation_vector(start[moving, :3, :3].transpose(0, 2, 1) @ end[moving, :3, :3])
     cells, tiles = rows["rows"] * rows["columns"], rows["tile_rows"] * rows["tile_columns"]
     rows["first_ray"], rows["first_tile"] = np.cumsum(cells) - cells, np.cumsum(tiles) - tiles

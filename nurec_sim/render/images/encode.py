@@ -1,4 +1,4 @@
-"""Rendered images as bytes: PNG, JPEG, JPEG 2000, raw planes, or a video frame that stands alone."""
+"""Rendered images as bytes: PNG, JPEG, JPEG 2000, raw planes, or a self-contained video frame."""
 
 from __future__ import annotations
 

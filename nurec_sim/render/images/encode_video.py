@@ -1,4 +1,4 @@
-"""Single images as video frames that a decoder can show alone: H.264 access units and AV1 temporal units."""
+"""Single images as self-contained video key frames: H.264 access units and AV1 temporal units."""
 
 from __future__ import annotations
 

@@ -43,10 +43,10 @@ def render_still(
         renderer: of the world.
         path: the PNG to write.
         camera_id: a camera of the scene's rig; the first if None.
-        frame: which of the camera's recorded times to take; the ego stands where it was then.
+        frame: index of the camera's recorded time; the ego pose is that of the recording.
         left_m: the car moved to its left.
         yaw_deg: the car turned to its left.
-        layer: what to draw; depth is grey from near to ``FAR_M``, normals are coloured by x, y and z in the world.
+        layer: what to show; depth is grey from near to ``FAR_M``, normals are coloured by x, y and z in the world.
         width_px: image width, height follows; the camera's own size if None.
 
     Raises:
@@ -68,13 +68,14 @@ def render_still(
     start_us, end_us = int(times[frame, 0]), int(times[frame, 1])
     moved = geometry.pose_from_xyyaw(0.0, left_m, np.radians(yaw_deg))
     poses = scene.ego.at(np.array([start_us, end_us])) @ moved @ camera.rig_from_camera
+    # An exposure must end after it starts; an instant becomes a microsecond.
     request = SensorRequest(scene.id, camera, start_us, max(end_us, start_us + 1), poses)
     shown = picture(renderer.render_camera(request, ("rgb", layer)), layer)
     write_file(path, encode_image(shown))
 
 
 def picture(frame: CameraFrame, layer: Layer) -> UInt8[np.ndarray, "h w 3"]:
-    """One layer of a frame as an image for people."""
+    """One layer of a frame as a viewable RGB image."""
     if layer == "rgb":
         return frame.rgb
     plane = getattr(frame, {"depth": "depth_m"}.get(layer, layer))
@@ -86,5 +87,6 @@ def picture(frame: CameraFrame, layer: Layer) -> UInt8[np.ndarray, "h w 3"]:
     if layer == "normal":
         known = np.any(plane != 0, axis=-1, keepdims=True)
         return np.where(known, (plane + 1) * 127.5 + 0.5, 0).astype(np.uint8)
+    # The square root spreads near depths, where most of an image lies.
     shade = np.clip(plane / FAR_M, 0, 1) ** 0.5 if layer == "depth" else np.clip(plane, 0, 1)
     return np.repeat((255 * shade + 0.5).astype(np.uint8)[..., None], 3, axis=2)

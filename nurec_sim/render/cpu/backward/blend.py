@@ -1,12 +1,12 @@
-"""Vector code that carries gradients of a block's 8 x 4 rays back to a list of records, front to back once more.
+"""Vector code that carries gradients of a block's 8 x 4 rays back to a list of records, in a second pass front to back.
 
 A block's state is [STATE_PLANES,32] float32. With q = sum of (gradient of a sum times what the record adds to it per
 weight) and G = the sum of all weights times q, which the forward's sums give, one pass suffices:
 
     gradient of alpha = T q - (G - what has been added so far) / (1 - alpha)
 
-Everything a record gives along a ray d depends on (X, Y, W) = rows d, and only their products are needed afterwards
-(``backward_project``), so that no coordinate of a ray or pixel enters the sums.
+Everything a record contributes along a ray d depends on (X, Y, W) = rows d, and only their products are needed
+afterwards (``backward.project``), so no coordinate of a ray or pixel enters the sums.
 """
 
 from __future__ import annotations
@@ -82,6 +82,17 @@ def _carrying_back(mode: int, output_kind: int, check_near: bool) -> Callable[..
             group: RayGroup, number: ir.Value, coefficient: Callable[[int], Vector], values: list[Bundle]
         ) -> list[Bundle]:
             # Forwards once more: the same responses, so the same rays are hit and T is what it was.
+            """One more record: adds its gradients to ``sums``.
+
+            Args:
+                group: the rays.
+                number: the record's number in the batch.
+                coefficient: gives a row of the record's coefficients in all lanes.
+                values: transmittance before the record, and G less what has been added so far.
+
+            Returns:
+                The same after the record.
+            """
             meeting, exponent = meeting_of(mode, group, coefficient, rays, output_kind == LIDAR)
             hit = exponent < CUT
             if check_near:
@@ -100,15 +111,20 @@ def _carrying_back(mode: int, output_kind: int, check_near: bool) -> Callable[..
             for c in range(3):
                 q = q + group.plane(state, G_FEATURE + c) * coefficient(C_FEATURE + c)
             rest = left - weight * q
+            # A change of alpha changes this record's weight, and scales all weights behind it by 1 / (1 - alpha);
+            # opacities are capped at 0.99, so the division is safe.
             by_alpha = before * q - rest * (1 - alpha).reciprocal(False)
             by_exponent, by_distance = alpha * by_alpha * -8, weight * by_mean  # alpha = exp(-8 exponent)
             if output_kind == LIDAR:
+                # The half distance is the distance of one hit; which hit it is has no gradient.
                 crossing = (before > 0.5) & (after <= 0.5)
                 by_distance = by_distance + crossing.where(group.plane(state, G_HALF), 0)
             sums_of = [*meeting.sums(by_exponent, by_distance), by_exponent]
             sums_of += [weight * group.plane(state, G_FEATURE + c) for c in range(3)]
+            # Lane k of the result is sum k over the group's rays: one store of SUMS floats per record.
             totals = [bundle.total() for bundle in sums_of]
             totals += [v.number(0)] * (SUMS - len(totals))
+            # 64 bytes a record: SUMS float32.
             place_of_sums = v.address(sums, b.shl(number, ir.Constant(I64, 6)))
             for first in range(0, SUMS, LANES):
                 old = v.load(place_of_sums, 4 * first)
@@ -138,9 +154,16 @@ def open_gradients(
     row_bytes: ir.Value,
     plane_bytes: ir.Value,
 ) -> None:
-    """Start a block from the blended image and its gradients, both [IMAGE_PLANES,h,w] at the block's first cell.
+    """Start a block from the blended image and its gradients.
 
-    Rays that are not valid need gradients of 0. ``rays`` is the address of the block's rays, 0 where all are valid.
+    Args:
+        v: vectors.
+        state: address of the block's [STATE_PLANES,32], written.
+        planes: address of the block's first cell in the blended image [IMAGE_PLANES,h,w].
+        gradients: the same in the image's gradients, which must be 0 where a ray is not valid.
+        rays: address of the block's [RAY_PLANES,32]; 0 where all rays are valid.
+        row_bytes: distance of rows.
+        plane_bytes: distance of planes.
     """
     b = v.b
     half = ir.VectorType(F32, WIDE)
@@ -164,6 +187,8 @@ def open_gradients(
         offset = 4 * LANES * k
         image = [cells(planes, plane, k) for plane in range(IMAGE_PLANES)]
         gradient = [cells(gradients, plane, k) for plane in range(IMAGE_PLANES)]
+        # G: the blended sums are linear in the weights, so G is the image times its gradients, without the half
+        # distance.
         total = v.number(0)
         for plane in range(IMAGE_PLANES - 1):
             total = total + image[plane] * gradient[plane]

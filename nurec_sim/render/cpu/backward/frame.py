@@ -1,4 +1,4 @@
-"""One frame forwards and backwards: what ``gradients`` runs on the CPU, with NumPy arrays for tensors."""
+"""One frame forwards and backwards: what ``gradients`` runs on the CPU, on NumPy arrays instead of tensors."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.cpu.workers import Buffers, Workers
 
 SENSORS = SensorCache(SensorTables)
-"""Shared by all frames of the process: an optimisation draws the same few cameras again and again."""
+"""Shared by all frames of the process: an optimisation renders the same few cameras again and again."""
 _BUFFERS = Buffers()
 
 
 @functools.cache
 def shared_workers(threads: int | None) -> Workers:
-    """Threads shared by all frames that ask for as many; as many as the process may use if None."""
+    """Threads shared by all frames with the same ``threads``; as many as the process may use if None."""
     if threads is not None and threads < 1:
         raise ValueError(f"rendering needs at least 1 thread, got {threads}")
     return Workers(threads or usable_cores())
 
 
 class ExactView(ExposureView):
-    """A view whose rays start where they do; a rolling shutter is not drawn to first order."""
+    """A view whose rays start exactly where they do; a rolling shutter is not rendered to first order."""
 
     @cached_property
     def projection_mode(self) -> int:
@@ -48,7 +48,7 @@ class ExactView(ExposureView):
 
 
 class Frame:
-    """A frame from its drawing until its gradients are no longer needed; it owns its scratch memory.
+    """A frame from its forward pass until its gradients are no longer needed; it owns its scratch memory.
 
     Args:
         sensor: tables of the sensor.
@@ -63,6 +63,7 @@ class Frame:
         self.sensor, self.lidar = sensor, lidar
         self.view = ExactView.of(sensor.grid, pair)
         self._workers = shared_workers(threads)
+        # Scratch memory is returned when the frame is collected: autograd decides how long a frame is needed.
         loan = ExitStack()
         weakref.finalize(self, loan.close)
         self._scratch = loan.enter_context(_BUFFERS.lend())
@@ -100,7 +101,18 @@ class Frame:
         opacity: Float32[np.ndarray, " n"],
         features: Float32[np.ndarray, "n 3"],
     ) -> Float32[np.ndarray, "6 h w"]:
-        """Blended planes: alpha, three features, distance, half distance; sides are rounded up to whole macro tiles."""
+        """Render Gaussians.
+
+        Args:
+            mean: centres in the world (m).
+            quat: rotations (wxyz), of any norm.
+            scale: standard deviations (m).
+            opacity: 0..1.
+            features: colours, or of LiDARs intensity, whether it is known, and drop probability.
+
+        Returns:
+            Blended planes: alpha, three features, distance, half distance; sides are rounded up to whole macro tiles.
+        """
         gaussians = RawGaussians(mean, quat, scale, opacity, features)
         blocks = -(-len(mean) // BLOCK)
         packed = self._scratch("fields", (blocks, FIELDS, BLOCK), np.float32)
@@ -134,7 +146,7 @@ class Frame:
         """Gradients by mean, quaternion, scale, opacity, features and ``world_from_sensor`` [4,4] at the reference.
 
         Args:
-            mean: what has been drawn, like the following three.
+            mean: what has been rendered, like the following three.
             quat: see mean.
             scale: see mean.
             opacity: see mean.
@@ -143,10 +155,12 @@ class Frame:
         picture, grid = self._picture, self.sensor.grid
         height, width = grid.valid.shape
         gradients = self._scratch("gradients", self.planes.shape, np.float32)
+        # Scratch holds another frame's values; cells without a valid ray need zeros.
         gradients[:] = 0
         for plane, values in by_planes.items():
             gradients[plane : plane + (len(values) if values.ndim == 3 else 1), :height, :width] = values
         assert len(gradients) == IMAGE_PLANES
+        # A slot per record and tile: each is written by one tile only, whatever the number of threads.
         starts = np.array([first for _, first, _ in picture.runs], np.int64)
         counts = np.array([count for _, _, count in picture.runs], np.int64)
         first_slot = self._scratch("first slot", (picture.capacity,), np.int64)
@@ -160,7 +174,7 @@ class Frame:
         )  # fmt: skip
         pose, count = self.view.world_from_reference, len(mean)
         shares = RawGaussians(*(np.zeros((count, *width), np.float32) for width in ((3,), (4,), (3,), (), (3,))))
-        # The features are not needed: what is drawn is linear in them.
+        # The features are not needed: the image is linear in them.
         gaussians = RawGaussians(mean, quat, scale, opacity, shares.features)
         forces = np.zeros((-(-count // BLOCK), 6))
         self._workers.run(
@@ -178,6 +192,7 @@ def pose_gradient(
 
     Of all matrices with this torque it is the one along rotations; a change that is no rigid motion has no meaning.
     """
+    # A turn w changes R by [w] R, so the gradient 0.5 [torque] R has the inner product torque . w with it.
     x, y, z = torque
     gradient = np.zeros((4, 4))
     gradient[:3, :3] = 0.5 * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose[:3, :3]

@@ -1,6 +1,6 @@
 """Differentiable rendering for torch: images and LiDAR sweeps with gradients by Gaussians, sensor and actor poses.
 
-What is drawn is ``render.spec`` before rounding; ``docs/gradients.md`` says what the gradients are and are not.
+Images are those of ``render.spec`` before rounding; ``docs/gradients.md`` defines the gradients and their limits.
 """
 
 from __future__ import annotations
@@ -138,6 +138,7 @@ def render_camera(
     _check(gaussians, sky)
     sensor = _sensor(camera, sensors.check_camera)
     reference, pair = _poses(world_from_camera, sensor)
+    # View-dependent colours are evaluated in torch, so gradients reach their coefficients and the eye.
     colour = gaussians.rgb
     if gaussians.sh_rest is not None:
         offset = gaussians.mean_m.double() - reference[:3, 3]
@@ -148,6 +149,7 @@ def render_camera(
     if sky is not None:
         behind = sky[:, None, None] if sky.ndim == 1 else _Sky.apply(sky, reference, frame)
         clear = 1 - alpha if sensor.all_valid else torch.from_numpy(sensor.grid.valid > 0) * (1 - alpha)
+        # Multiplied and added in one pass over the image.
         rgb = torch.addcmul(rgb, clear, behind.to(rgb.dtype))
     depth = distance / alpha.clamp(min=MIN_ALPHA)
     if frame.ray_z is not None:
@@ -184,6 +186,7 @@ def render_lidar(
     known = torch.isfinite(value)
     features = torch.stack([torch.where(known, value, 0), known.to(value.dtype), torch.zeros_like(value)], dim=-1)
     planes = _draw(gaussians, features, reference, Frame(sensor, pair, True, threads))
+    # From grid cells, whose rows may be rolled, to beams.
     cells = torch.from_numpy(sensor.cell_of_beam)
     sums, alpha, distance, half = (plane.flatten(-2)[..., cells].reshape(plane.shape) for plane in planes)
     mean = distance / alpha.clamp(min=MIN_ALPHA)
@@ -195,6 +198,19 @@ class _Draw(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, mean, quat, scale, opacity, features, world_from_sensor, frame: Frame):
+        """Render a frame.
+
+        Args:
+            ctx: autograd's context.
+            mean: see ``GaussianTensors``, like the next three.
+            quat: see mean.
+            scale: see mean.
+            opacity: see mean.
+            features: [n,3] what is summed along a ray.
+            world_from_sensor: [4,4] reference pose; only its gradient is used, the frame has the poses.
+            frame: the frame.
+        """
+        # The rendered planes stay in the frame: ``draw_back`` reads them again.
         frame.draw(*(_array(tensor) for tensor in (mean, quat, scale, opacity, features)))
         ctx.save_for_backward(mean, quat, scale, opacity)
         ctx.frame, ctx.dtypes = frame, [t.dtype for t in (mean, quat, scale, opacity, features, world_from_sensor)]
@@ -206,6 +222,15 @@ class _Draw(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, by_features, by_alpha, by_distance, by_half):
+        """Gradients of the inputs.
+
+        Args:
+            ctx: autograd's context.
+            by_features: [3,h,w] gradients of the loss; None where an output is not used, as for the next three.
+            by_alpha: [h,w].
+            by_distance: [h,w].
+            by_half: [h,w].
+        """
         parts = {1: by_features, 0: by_alpha, 4: by_distance, 5: by_half}
         by_planes = {plane: part.numpy() for plane, part in parts.items() if part is not None}
         results = ctx.frame.draw_back(*(_array(tensor) for tensor in ctx.saved_tensors), by_planes)
@@ -217,6 +242,14 @@ class _Sky(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, sky, world_from_sensor, frame: Frame):
+        """Look the sky up.
+
+        Args:
+            ctx: autograd's context.
+            sky: [6,s,s,3] cubemap.
+            world_from_sensor: [4,4] reference pose; only its gradient is used, the frame has the poses.
+            frame: the frame.
+        """
         ctx.save_for_backward(sky)
         ctx.frame, ctx.dtypes = frame, (sky.dtype, world_from_sensor.dtype)
         return torch.from_numpy(frame.draw_sky(_array(sky)))
@@ -239,6 +272,7 @@ def _draw(
                          reference, frame)  # fmt: skip
     if frame.sensor.all_valid:
         return planes
+    # Cells without a ray must not pass a gradient on, either.
     valid = torch.from_numpy(frame.sensor.grid.valid > 0)
     return tuple(torch.where(valid, plane, 0) for plane in planes)
 

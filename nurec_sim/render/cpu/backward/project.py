@@ -67,6 +67,7 @@ def _frame(axes, scale, ball, records, i, world_from_sensor, frame):
     for k in range(3):
         frame[0, k] -= along * frame[2, k]
         length += frame[0, k] ** 2
+    # Orthogonalised against b in float64: the record's rows are float32.
     inverse = 1 / math.sqrt(max(length, 1e-300))
     for k in range(3):
         frame[0, k] *= inverse
@@ -137,6 +138,7 @@ def project_back(first, count, projected, slots, gaussians, world_from_sensor, b
         n = _frame(axes, s, ball, projected.records, i, world_from_sensor, frame)
         inverse_n = 1 / n
         inverse = inverse_n * inverse_n
+        # g of the module's text, in the axes e1, e2, b / n, divided by the scales: S^-1 g.
         across = 4 * sums[S_WX] * inverse - sums[S_XW] / 4
         down = 4 * sums[S_WY] * inverse - sums[S_YW] / 4
         along = -(sums[S_WW] + 32 * sums[S_FLAT] * inverse) * inverse_n
@@ -145,18 +147,23 @@ def project_back(first, count, projected, slots, gaussians, world_from_sensor, b
         for k in range(3):
             force[k] = axes[k, 0] * by_ball[0] + axes[k, 1] * by_ball[1] + axes[k, 2] * by_ball[2]
         _kernel_matrix(sums, inverse_n, frame, k_)
+        # Torque about the Gaussian's own axes; spheres (equal scales) have none.
         tx = k_[1, 2] * (s[2] * inverse_s[1] - s[1] * inverse_s[2])
         ty = k_[2, 0] * (s[0] * inverse_s[2] - s[2] * inverse_s[0])
         tz = k_[0, 1] * (s[1] * inverse_s[0] - s[0] * inverse_s[1])
+        # A turn w in the Gaussian's axes changes a unit quaternion by q (0, w) / 2, so a torque t has the gradient
+        # 2 q (0, t), divided by the given norm.
         by.quat[g, 0] += (-q[1] * tx - q[2] * ty - q[3] * tz) * 2 * shrink
         by.quat[g, 1] += (q[0] * tx + q[2] * tz - q[3] * ty) * 2 * shrink
         by.quat[g, 2] += (q[0] * ty + q[3] * tx - q[1] * tz) * 2 * shrink
         by.quat[g, 3] += (q[0] * tz + q[1] * ty - q[2] * tx) * 2 * shrink
         for k in range(3):
             by.mean[g, k] += force[k]
+            # By the logarithm of the scale it is -Kii; where a value is clamped it has no gradient.
             if scale[g, k] >= MIN_SCALE_M:
                 by.scale[g, k] -= k_[k, k] * inverse_s[k]
             by.features[g, k] += sums[S_FEATURE + k]
+        # FADE = -log(p) / 8.
         if opacity[g] < MAX_OPACITY:
             by.opacity[g] -= sums[S_FADE] / (8 * np.float64(opacity[g]))
         # By blocks of Gaussians, so that neither threads nor their number change the sum.

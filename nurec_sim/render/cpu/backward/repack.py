@@ -67,6 +67,7 @@ def repack(first, last, gaussians, lidar, fields):
     mean, quat, scale, opacity, features = gaussians
     for block in range(first, last):
         out = fields[block]
+        # Frames with gradients have no labels.
         out[LABEL] = f4(0)
         for k in range(BLOCK):
             i = block * BLOCK + k

@@ -92,6 +92,7 @@ def _keep_sums(sums, lists, first, last, spans, slots, row, column):
     for j in range(first, last):
         i = np.uint64(lists[j])
         across = np.int64(spans[i, 1]) - spans[i, 0] + 1
+        # Slots of a record are numbered row by row over its span of tiles.
         slot = np.uint64(slots.first[i] + (row - spans[i, 2]) * across + column - spans[i, 0])
         entry = np.uint64(j - first)
         for k in range(SUMS):
@@ -136,9 +137,11 @@ def draw_tiles_back(rays, projected, binned, output_kind, tiles, planes, gradien
                     rays_at + block * RAY_BYTES if rays_at else 0, row_bytes, plane_bytes,
                 )  # fmt: skip
         first, end = np.int64(binned.starts[tile]), np.int64(binned.starts[tile + 1])
-        # To the list's end, even when all rays are opaque: slots that are not written hold another frame's sums.
+        # Continue to the list's end even when all rays are opaque: slots that are not written hold another frame's
+        # sums.
         while first < end:
             last = min(end, first + batch)
+            # Sums of a batch are gathered over the tile's blocks and stored once per record.
             sums[:] = f4(0)
             if alive != 0:
                 close = prepare_batch(

@@ -9,7 +9,8 @@ from nurec_sim.render.cpu.kernel import inner, kernel
 from nurec_sim.render.cpu.workers import Workers
 
 PARTS = 4
-"""Parts of an image whose shares of the sky's gradient are added up; fixed, so that threads do not change the sum."""
+"""Parts of an image whose shares of the sky's gradient are summed; a fixed number, so that threads do not change
+the sum."""
 
 # Per face of ``geometry.cubemap_coordinates``: axis and sign of its direction, of s and of t, in the world.
 FACES = np.array(
@@ -20,6 +21,7 @@ FACES = np.array(
 
 @inner
 def _face(d):
+    # Ties are resolved as in ``composite.sky_lookup``, so that both find the same texel.
     x, y, z = abs(d[0]), abs(d[1]), abs(d[2])
     if x > y and x > z:
         return 5 if d[0] > 0 else 4
@@ -126,7 +128,14 @@ def draw_sky(
     sky: Float32[np.ndarray, "6 s s 3"],
     workers: Workers,
 ) -> Float32[np.ndarray, "3 h w"]:
-    """Colours of the sky behind every ray; arguments as of ``look_up``."""
+    """Colours of the sky behind every ray.
+
+    Args:
+        direction: unit rays in the reference frame.
+        turn: world_from_reference rotation.
+        sky: cubemap, faces as in ``geometry.cubemap_coordinates``.
+        workers: threads to run on.
+    """
     height, width = direction.shape[:2]
     behind = np.empty((3, height, width), np.float32)
     workers.run(look_up, [(*rows, direction, turn, sky, behind) for rows in workers.ranges(height, 16)])
@@ -140,9 +149,21 @@ def draw_sky_back(
     by_behind: Float32[np.ndarray, "3 h w"],
     workers: Workers,
 ) -> tuple[Float64[np.ndarray, "6 s s 3"], Float64[np.ndarray, " 3"]]:
-    """Gradients by the sky and by a small turn about the world's axes."""
+    """Gradients of ``draw_sky``.
+
+    Args:
+        direction: see ``draw_sky``, as the next two.
+        turn: see direction.
+        sky: see direction.
+        by_behind: gradients of the loss by the colours.
+        workers: threads to run on.
+
+    Returns:
+        Gradients by the sky and by a small turn about the world's axes.
+    """
     height = len(direction)
     by_sky, torque = np.zeros((PARTS, *sky.shape)), np.empty((height, 3))
+    # Each part has a gradient of its own: texels are shared by rays of all rows.
     edges = np.linspace(0, height, PARTS + 1).astype(np.int64)
     workers.run(
         look_back,

@@ -8,13 +8,24 @@ from nurec_sim.render.cpu.kernel import kernel
 
 RADIX_BITS = 11
 DROPPED_BITS = 5
-"""Low bits that the radix sort leaves to the final pass: 22 bits hold depths from 1e-3 to 1e4 times the nearest."""
+"""Low bits that the radix sort leaves to the final pass. The 22 bits above them cover depths from the nearest possible
+to 2^16 times that."""
 SAMPLE = 64
-"""Of how many keys one is looked at to divide the depths among threads."""
+"""One key in this many is sampled to divide the depths among threads."""
 
 
 def depth_cuts(keys, starts, counts, parts):
-    """Depths, as bits, that divide records into ``parts`` of about equal number: [parts + 1] uint64."""
+    """Depths that divide records into parts of about equal number, estimated from every ``SAMPLE``-th record.
+
+    Args:
+        keys: [n] positive float32 depths.
+        starts: [runs] first row of each run of valid rows.
+        counts: [runs] their lengths.
+        parts: number of parts.
+
+    Returns:
+        [parts + 1] uint64: the cuts as bit patterns of float32, from 0 to 2^32.
+    """
     runs = [keys[first : first + count : SAMPLE] for first, count in zip(starts, counts, strict=True)]
     some = np.sort(np.concatenate(runs)).view(np.uint32)
     cuts = np.zeros(parts + 1, np.uint64)
@@ -48,6 +59,7 @@ def sort_by_depth(keys, starts, counts, nearest, low_cut, high_cut, spans, order
     size = 1 << RADIX_BITS
     top = np.uint64((1 << (2 * RADIX_BITS)) - 1)
     mask = np.uint64(size - 1)
+    # Positive float32 values sort as their bit patterns do, so the keys are treated as integers throughout.
     before = 0
     n = 0
     for run in range(len(starts)):
@@ -70,6 +82,7 @@ def sort_by_depth(keys, starts, counts, nearest, low_cut, high_cut, spans, order
                 first[np.int64(value & mask) + 1] += 1
                 second[np.int64(value >> np.uint64(RADIX_BITS)) + 1] += 1
                 n += 1
+    # Counts of digits become the first place of each digit.
     for d in range(size):
         first[d + 1] += first[d]
         second[d + 1] += second[d]
@@ -83,6 +96,7 @@ def sort_by_depth(keys, starts, counts, nearest, low_cut, high_cut, spans, order
         digit = np.int64(min(value - low if value > low else np.uint64(0), top) >> np.uint64(RADIX_BITS))
         now[second[digit]] = other[i]
         second[digit] += 1
+    # Whole keys with their rows: nearly sorted, so the insertion sort is close to linear.
     for i in range(1, n):
         item = now[i]
         j = i
@@ -99,7 +113,15 @@ def sort_by_depth(keys, starts, counts, nearest, low_cut, high_cut, spans, order
 
 @kernel
 def count_tiles(spans, first, last, columns, counts):
-    """Add to ``counts`` [tiles] how many of the sorted records ``first`` .. ``last`` - 1 touch each macro tile."""
+    """Count the sorted records that touch each macro tile.
+
+    Args:
+        spans: [n,4] first and last column, first and last row of the records' macro tiles, front to back.
+        first: first record to count.
+        last: one behind the last.
+        columns: macro tiles per row of them.
+        counts: [tiles] int64, added to.
+    """
     for j in range(first, last):
         for ty in range(spans[j, 2], spans[j, 3] + 1):
             for tx in range(spans[j, 0], spans[j, 1] + 1):
@@ -108,7 +130,17 @@ def count_tiles(spans, first, last, columns, counts):
 
 @kernel
 def fill_tiles(spans, order, first, last, columns, position, lists):
-    """Append the records of ``order[first:last]`` to their tiles' lists at ``position`` [tiles], which moves on."""
+    """Append sorted records to the lists of their macro tiles.
+
+    Args:
+        spans: see ``count_tiles``.
+        order: [n] record numbers, front to back.
+        first: first entry of ``order`` to append.
+        last: one behind the last.
+        columns: macro tiles per row of them.
+        position: [tiles] int64: where in ``lists`` the next record of each tile goes; advanced.
+        lists: [pairs] int32 output.
+    """
     for j in range(first, last):
         record = order[j]
         for ty in range(spans[j, 2], spans[j, 3] + 1):

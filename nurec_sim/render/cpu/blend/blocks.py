@@ -74,6 +74,14 @@ def _blending(mode: int, output_kind: int, check_near: bool) -> Callable[..., An
         def step(
             group: RayGroup, number: ir.Value, coefficient: Callable[[int], Vector], sums: list[Bundle]
         ) -> list[Bundle]:
+            """The rays' sums after one more record.
+
+            Args:
+                group: the rays.
+                number: the record's number in the batch; not used.
+                coefficient: gives a row of the record's coefficients in all lanes.
+                sums: planes of the block's state.
+            """
             meeting, exponent = meeting_of(mode, group, coefficient, rays, output_kind == LIDAR)
             hit = exponent < CUT
             if check_near:
@@ -81,6 +89,8 @@ def _blending(mode: int, output_kind: int, check_near: bool) -> Callable[..., An
             distance = hit.where(meeting.distance, 0)  # no NaN from a miss
             alpha, before = Bundle(fading(exponent.parts)), sums[T]
             if output_kind == LIDAR:
+                # A LiDAR's rays end one by one, as in ``spec``; a camera's rays continue until the whole block is
+                # opaque, which adds at most 1e-4 to a ray.
                 hit = hit & (before > LIDAR_MIN_TRANSMITTANCE)
             # Front to back: a record's weight is its alpha times what the nearer ones have let through.
             weight = hit.where(alpha * before, 0)
@@ -90,11 +100,13 @@ def _blending(mode: int, output_kind: int, check_near: bool) -> Callable[..., An
                 result.append(plane + weight * coefficient(feature))
             result.append(sums[-2] + weight * distance)
             if output_kind == LIDAR:
+                # An echo comes from the surface that stops half of the beam, not from the mean of several.
                 crossing = (before > 0.5) & (after <= 0.5)
                 result.append(crossing.where(distance, sums[-1]))
             else:
                 # The label replaces the lowest bits of the weight, so that one maximum finds weight and label.
                 label = b.and_(coefficient(C_TAG).bits(), ir.Constant(INTS, [LABEL_BITS] * LANES))
+                # 8 of 23 mantissa bits: weights are compared to 1 part in 2^15.
                 keep = ir.Constant(INTS, [~LABEL_BITS] * LANES)
                 tagged = [v.from_bits(b.or_(b.and_(w.bits(), keep), label)) for w in weight.parts]
                 result.append(Bundle(p.max(w) for p, w in zip(sums[-1].parts, tagged, strict=True)))
@@ -118,9 +130,17 @@ blend_moving_lidar = _blending(MOVING, LIDAR, True)
 
 @vector_kernel("iii")
 def open_block(v: Lanes, state: ir.Value, planes: ir.Value, rays: ir.Value) -> None:
-    """Start a block: full transmittance where there is a ray (everywhere if ``rays`` is 0), all sums zero."""
+    """Start a block: full transmittance where there is a ray, all sums zero.
+
+    Args:
+        v: vectors.
+        state: address of the block's [planes,32].
+        planes: how many planes it has.
+        rays: address of the block's [RAY_PLANES,32]; 0 where every cell has a ray.
+    """
     b = v.b
     table = b.icmp_signed("!=", rays, ir.Constant(I64, 0))
+    # Without a table any readable address will do: the values are not used.
     source = b.select(table, b.add(rays, ir.Constant(I64, 4 * RAYS * VALID)), state)
     for k in range(VECTORS):
         valid = v.load(source, 4 * LANES * k)
@@ -137,7 +157,15 @@ def open_block(v: Lanes, state: ir.Value, planes: ir.Value, rays: ir.Value) -> N
 def _writing(count: int) -> Callable[..., Any]:
     @vector_kernel("iiii")
     def write_block(v: Lanes, state: ir.Value, target: ir.Value, row_bytes: ir.Value, plane_bytes: ir.Value) -> None:
-        """Copy a block's state to image planes [planes,h,w] whose sides are multiples of a block's; T becomes alpha."""
+        """Copy a block's state to image planes [planes,h,w] whose sides are multiples of a block's; T becomes alpha.
+
+        Args:
+            v: vectors.
+            state: address of the block's [planes,32].
+            target: address of the block's first cell in the first plane.
+            row_bytes: distance of rows.
+            plane_bytes: distance of planes.
+        """
         b = v.b
         half = ir.VectorType(ir.FloatType(), WIDE)
         for plane in range(count):
@@ -148,6 +176,7 @@ def _writing(count: int) -> Callable[..., Any]:
                 for part in range(LANES // WIDE):
                     lanes = ir.Constant(ir.VectorType(I32, WIDE), list(range(WIDE * part, WIDE * part + WIDE)))
                     row = k * (LANES // WIDE) + part
+                    # A vector holds one or two rows of 8 cells, which lie apart in the image.
                     piece = b.shuffle_vector(x.value, x.value, lanes)
                     assert piece.type == half
                     b.store(piece, v.pointer(base, b.mul(row_bytes, ir.Constant(I64, row))), align=4)

@@ -43,12 +43,22 @@ class CameraPixels(NamedTuple):
     alpha: Float32[np.ndarray, "h w"]
     label: UInt8[np.ndarray, "h w"]
     normal: Float32[np.ndarray, "h w 3"]
-    """[0,0,3] where it is not wanted."""
+    """[0,0,3] where it is not requested."""
 
 
 @inner
 def sky_lookup(sky, x, y, z, behind, lane):
-    """Bilinear colour of a world direction (``geometry.cubemap_coordinates``), clamped within a face."""
+    """Write the bilinear colour of a world direction (``geometry.cubemap_coordinates``), clamped within a face.
+
+    Args:
+        sky: [6,s,s,3] cubemap.
+        x: direction in the world, of any length.
+        y: see x.
+        z: see x.
+        behind: [3,LANES] output.
+        lane: column of ``behind`` to write.
+    """
+    # The cubemap has OpenGL axes (y up, -z ahead), the world x ahead, y left, z up.
     gx, gy, gz = -y, z, -x
     ax, ay, az = abs(gx), abs(gy), abs(gz)
     if az > ax and az > ay:
@@ -117,6 +127,7 @@ def finish_pixels(
     rays = b.load(v.pointer(valid), typ=ir.VectorType(I8, LANES), align=1)
     there = b.icmp_unsigned("!=", rays, ir.Constant(rays.type, [0] * LANES))
     alpha = Vector(b, b.select(there, v.load(at).value, v.number(0).value))
+    # Pixels without a ray count as transparent here and become black below.
     left = 1 - alpha
     colour = []
     for c in range(3):
@@ -126,10 +137,11 @@ def finish_pixels(
     # The colour correction comes after the sky, because the camera sees both through the same optics.
     for c in range(3):
         row = [v.broadcast(isp, 4 * (4 * c + k)) for k in range(4)]
+        # Clipped to 0..1; adding 0.5 before truncation rounds half up, as in ``spec``.
         shown = (row[0] * colour[0] + row[1] * colour[1] + row[2] * colour[2] + row[3]).max(0).min(1)
         shown = Vector(b, b.select(there, (shown * 255 + 0.5).value, v.number(0).value))
         channels.append(_bytes(v, shown))
-    # Interleave three bytes a pixel: first two channels side by side, then the third put between.
+    # Interleave three bytes a pixel: first two channels side by side, then the third between them.
     red_green = b.shuffle_vector(
         channels[0], channels[1], ir.Constant(ir.VectorType(I32, 2 * LANES), list(range(2 * LANES)))
     )
@@ -137,6 +149,7 @@ def finish_pixels(
         channels[2], channels[2], ir.Constant(ir.VectorType(I32, 2 * LANES), list(range(2 * LANES)))
     )
     order = [k // 3 + (k % 3) * LANES for k in range(3 * LANES)]
+    # Lane order R0 G0 B0 R1 ..: one store of 3 LANES bytes.
     mixed = b.shuffle_vector(red_green, blue, ir.Constant(ir.VectorType(I32, 3 * LANES), order))
     b.store(mixed, v.pointer(rgb), align=1)
 
@@ -150,6 +163,7 @@ def finish_pixels(
     v.store(surface.where((far * Vector(b, one)).max(0), 0), depth)
     tagged = v.load(b.add(distance_at, plane_bytes)).bits()
     seen = b.and_(tagged, ir.Constant(INTS, [LABEL_BITS] * LANES))
+    # The low bits of the heaviest weight are the label it came with (``blocks``).
     kept = b.select(surface.value, seen, ir.Constant(INTS, [SKY] * LANES))
     b.store(b.trunc(kept, ir.VectorType(I8, LANES)), v.pointer(label), align=1)
 
@@ -182,6 +196,8 @@ def composite(first, last, planes, rays, sky, isp, pixels):
     rgb, depth, alpha, label, normal = pixels
     width = valid.shape[1]
     behind = np.zeros((3, LANES), np.float32)
+    # The last pixels of a row may be fewer than LANES: they pass through arrays of their own, so nothing is written
+    # past the row.
     colours, labels, depths = np.empty(3 * LANES, np.uint8), np.empty(LANES, np.uint8), np.empty(LANES, np.float32)
     rays, heights = np.zeros(LANES, np.uint8), np.zeros(LANES, np.float32)
     plane_bytes, row_bytes = 4 * planes.shape[1] * planes.shape[2], 4 * planes.shape[2]
@@ -201,8 +217,9 @@ def composite(first, last, planes, rays, sky, isp, pixels):
                     heights[k] = ray_z[y, x + k] if inside and table else f4(1)
                 valid_at = rays.ctypes.data
                 z_at = heights.ctypes.data if table else np.int64(0)
+            # Most pixels are opaque: the lookup is done only where some of the sky shows.
             shown = sky_mask(at, valid_at)
-            behind[:] = f4(0)  # what is left of other pixels would make a frame depend on the rows done before
+            behind[:] = f4(0)  # leftovers of other pixels would make a frame depend on the rows done before
             if shown != 0:
                 for k in range(min(LANES, width - x)):
                     if (shown >> k) & 1:

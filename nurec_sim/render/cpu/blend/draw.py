@@ -88,7 +88,7 @@ def _prepare(mode, ids, records, count, alive, basis, coefficients, lists, count
 
 @inner
 def prepare_batch(mode, lists, first, last, end, records_at, alive, basis_at, coefficients, chosen, listed):
-    """Prepare the records ``lists[first:last]`` for the blocks that still want some; 1 if any is close, else 0.
+    """Prepare the records ``lists[first:last]`` for the blocks that are still open; 1 if any is close, else 0.
 
     Args:
         mode: projection mode.
@@ -97,7 +97,7 @@ def prepare_batch(mode, lists, first, last, end, records_at, alive, basis_at, co
         last: one behind its last.
         end: one behind the tile's last.
         records_at: address of the records.
-        alive: bit k is set while block k still wants records.
+        alive: bit k is set while block k is still open (not all of its rays are opaque).
         basis_at: address of the tile's basis.
         coefficients: [COEFFICIENTS,BATCH] output.
         chosen: [BLOCKS,LIST] output: numbers within the batch of the records that each block sees.
@@ -108,6 +108,8 @@ def prepare_batch(mode, lists, first, last, end, records_at, alive, basis_at, co
     close = np.int64(0)
     for j in range(first, last, LANES):
         for ahead in range(j + LANES, min(j + 2 * LANES, end)):
+            # Records are read in the order of depth, which is random in memory: fetch the next group while this one is
+            # prepared.
             prefetch(records_at + np.int64(lists[ahead]) * (4 * RECORD))
         close |= _prepare(mode, lists.ctypes.data + 4 * j, records_at, min(last - j, LANES), alive, basis_at,
                           coefficients.ctypes.data, chosen.ctypes.data, listed.ctypes.data, j - first)  # fmt: skip
@@ -143,6 +145,7 @@ def tile_geometry(rays, tile, turned, basis):
         pinhole_basis(rays.intrinsics, column, row, basis[0])
         if rays.mode == ROLLING:
             rolling_basis(rays.motion, row, basis[0])
+    # Blocks that lie wholly outside of the grid are never blended.
     inside = 0
     for block in range(BLOCKS):
         if block % ACROSS * WIDE < wide and block // ACROSS * HIGH < high:
@@ -213,6 +216,7 @@ def draw_tiles(rays, projected, binned, normals, output_kind, tiles, planes, cou
                 rays.mode, lists, first, last, end, records_at, alive, basis_at, coefficients, chosen, listed
             )
             if output_kind == NORMALS:
+                # Normals are per record and view, so they are not part of a record; they become coefficients here.
                 for k in range(first, last):
                     for c in range(3):
                         coefficients[C_NORMAL + c, k - first] = normals[np.uint64(lists[k]), c]
@@ -226,6 +230,7 @@ def draw_tiles(rays, projected, binned, normals, output_kind, tiles, planes, cou
                         f4(block % ACROSS * WIDE) - f4(15.5), f4(block // ACROSS * HIGH) - f4(15.5), rays.near,
                     )  # fmt: skip
                     if more == 0:
+                        # All rays of the block are opaque: later batches are not prepared for it.
                         alive &= ~(1 << block)
             first = last
         for block in range(BLOCKS):
@@ -246,9 +251,19 @@ def draw_tiles(rays, projected, binned, normals, output_kind, tiles, planes, cou
 
 @kernel
 def record_normals(fields, sources, first, count, eye, normals):
-    """Write the normals of records ``first`` .. ``first + count - 1``, turned to the eye (float64 [3])."""
+    """Write the normals of a run of records, turned to face the eye.
+
+    Args:
+        fields: [blocks,21,256] the layer's Gaussians, see ``pack``.
+        sources: [n] packed row of each record.
+        first: first record of the run.
+        count: how many.
+        eye: [3] float64, the reference point in the world.
+        normals: [n,4] output; the first three columns are written.
+    """
     for n in range(first, first + count):
         block, lane = sources[n] // BLOCK, sources[n] % BLOCK
+        # ``spec``: each normal is turned by the eye at the reference instant, the same for all rays.
         towards = 0.0
         for k in range(3):
             towards += fields[block, NORMAL + k, lane] * (fields[block, MEAN + k, lane] - eye[k])

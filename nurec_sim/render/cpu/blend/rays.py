@@ -52,7 +52,10 @@ class RayTiles:
 
 
 class SensorRays(NamedTuple):
-    """How the blending kernels find the rays of a macro tile; what is not named for a mode is not read in it."""
+    """How the blending kernels find the rays of a macro tile.
+
+    Fields followed by modes in parentheses are only read in those.
+    """
 
     mode: int
     """AFFINE, ROLLING (pinholes), TABLE or MOVING (everything else, at one pose or several), see ``tiles``."""
@@ -111,11 +114,19 @@ def _ray(rays, x, y, plane):
 
 @inner
 def table_basis(rays, wide, high, band, basis):
-    """The basis of 8 rows of a macro tile whose first ``wide`` x ``high`` cells belong to the grid.
+    """The basis of 8 rows of a macro tile: a linear fit to their directions, and how far it is off.
 
-    Directions are fitted to the corners; ``bend`` is the largest deviation. Where rays are missing, the fit is a
-    constant.
+    Directions are fitted to the corners; ``bend`` is the largest deviation. Where rays are missing, the fit is
+    a constant.
+
+    Args:
+        rays: [BLOCKS,RAY_PLANES,RAYS] the tile's rays.
+        wide: columns of the tile that belong to the grid.
+        high: its rows.
+        band: number of the band of ``BAND`` rows, 0 to ``BANDS`` - 1.
+        basis: [BASIS] output.
     """
+    # First pass: count the valid rays, sum their directions, and find the range of their places.
     low_s, high_s = f4(1e30), f4(-1e30)
     first, last_y = band * BAND, min(high, (band + 1) * BAND) - 1
     last_x = wide - 1
@@ -138,6 +149,7 @@ def table_basis(rays, wide, high, band, basis):
         if not whole:
             basis[B_D0 + k] /= f4(count)
             continue
+        # Averages of the slopes along both pairs of opposite sides.
         d00, d10 = _ray(rays, 0, first, DX + k), _ray(rays, last_x, first, DX + k)
         d01, d11 = _ray(rays, 0, last_y, DX + k), _ray(rays, last_x, last_y, DX + k)
         dx = f4(0.5) * (d10 - d00 + d11 - d01) / f4(max(last_x, 1))
@@ -155,6 +167,7 @@ def table_basis(rays, wide, high, band, basis):
                     fit = basis[B_D0 + k] + px * basis[B_DX + k] + py * basis[B_DY + k]
                     off += (_ray(rays, x, y, DX + k) - fit) ** 2
                 worst = max(worst, off)
+    # Rounded up: a bound, from float32 sums.
     basis[B_BEND] = f4(1.01) * math.sqrt(worst) + f4(1e-7)
 
 
@@ -169,7 +182,14 @@ def _all_bases(table, columns, width, height, basis):
 
 @inner
 def turn_rays(rays, line, line_poses, out):
-    """Rays of a macro tile in the reference frame, each by the rotation and with the place of its own line."""
+    """Turn the rays of a macro tile into the reference frame, each by the rotation of its own line.
+
+    Args:
+        rays: [BLOCKS,RAY_PLANES,RAYS] the tile's rays in the sensor's own frame.
+        line: [BLOCKS,RAYS] the line of each ray.
+        line_poses: ``turns`` and ``places`` of the lines, see ``SensorRays``.
+        out: output, as ``rays``, with the place of each ray's line on the sensor's way.
+    """
     turns, places = line_poses
     for block in range(BLOCKS):
         for k in range(RAYS):
@@ -205,7 +225,14 @@ def moving_tile(rays, line, line_poses, wide, high, motion, out, bases):
 
 @inner
 def pinhole_basis(intrinsics, column, row, basis):
-    """The basis of a pinhole's macro tile, exact: directions with z = 1."""
+    """The basis of a pinhole's macro tile, exact: directions with z = 1.
+
+    Args:
+        intrinsics: fx, fy, cx, cy in pixels.
+        column: column of the macro tile.
+        row: row of the macro tile.
+        basis: [BASIS] output.
+    """
     for k in range(BASIS):
         basis[k] = f4(0)
     basis[B_D0] = (f4(column * MACRO + MACRO // 2) - intrinsics[2]) / intrinsics[0]
@@ -217,6 +244,7 @@ def pinhole_basis(intrinsics, column, row, basis):
 @inner
 def _rotate(turn, basis, start):
     """Turn three numbers of a basis by a rotation vector (Rodrigues)."""
+    # A shutter's turn is small: two terms of sin(a) / a and (1 - cos a) / a^2 suffice, without trigonometric functions.
     x, y, z = turn
     angle2 = x * x + y * y + z * z
     sine, versine = f4(1) - angle2 / f4(6), f4(0.5) - angle2 / f4(24)  # of small angles, over angle and its square
@@ -241,6 +269,7 @@ def rolling_basis(motion, row, basis):
     _rotate(turn, basis, B_DY)
     rate = motion[7]
     x, y, z = rate * motion[3], rate * motion[4], rate * motion[5]
+    # From row to row the rays also turn by omega x d0, which adds to dy: first order about the tile's middle row.
     a, b, c = basis[B_D0], basis[B_D0 + 1], basis[B_D0 + 2]
     basis[B_DY] += y * c - z * b
     basis[B_DY + 1] += z * a - x * c

@@ -1,7 +1,7 @@
 """What both passes of blending share: how a record meets rays, and the loop over the records and rays of a block.
 
-Forwards (``blocks``) and backwards (``backward.blend``) alike take a list of records through the 8 x 4 rays of a block,
-``AT_ONCE`` vectors at a time, and keep the rays' sums in registers until the list ends.
+The forward (``blocks``) and the backward pass (``backward.blend``) take a list of records through the 8 x 4 rays of a
+block, ``AT_ONCE`` vectors at a time, and keep the rays' sums in registers until the list ends.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ DX, DY, DZ, VALID, PLACE = 0, 1, 2, 3, 4
 RAY_PLANES = 5
 
 CUT = math.log(255.0) / 8
+"""Exponent at which a response has faded to 1/255: alpha = exp(-8 x)."""
 MIN_TRANSMITTANCE, LIDAR_MIN_TRANSMITTANCE = 1e-4, 1e-2
 VECTORS = RAYS // LANES
 """Vectors that cover a block."""
@@ -56,6 +57,7 @@ AT_ONCE = 2
 def _exponential() -> list[float]:
     """Coefficients of the quartic nearest to exp(-x) on 0..CUT in relative terms (Chebyshev nodes)."""
     x = (1 - np.cos((np.arange(64) + 0.5) * np.pi / 64)) / 2 * CUT
+    # Weights exp(x) turn the least squares of the absolute error into those of the relative one.
     basis = np.stack([x**k for k in range(5)], axis=1) * np.exp(x)[:, None]
     return [float(c) for c in np.linalg.lstsq(basis, np.ones(64), rcond=None)[0]]
 
@@ -65,6 +67,7 @@ EXPONENTIAL = _exponential()
 
 def fading(x: list[Vector]) -> list[Vector]:
     """exp(-8 x) for x in 0..CUT to 2e-5: the quartic, three times squared."""
+    # exp(-8 x) = exp(-x)^8, and x stays below CUT = 0.69, where a quartic suffices.
     e = [xi * EXPONENTIAL[4] + EXPONENTIAL[3] for xi in x]
     for c in EXPONENTIAL[2::-1]:
         e = [ei * xi + c for ei, xi in zip(e, x, strict=True)]
@@ -168,6 +171,8 @@ class StillMeeting:
 
     def sums(self, by_exponent: Bundle, by_distance: Bundle) -> list[Bundle]:
         """S_XX to S_FLAT of the gradients by exponent and distance."""
+        # d(Q1 / Q2) / dQ2 = -exponent / Q2 and d(W / Q2) / dQ2 = -distance / Q2; then the chain rule through
+        # Q2 = FLAT Q1 + W^2 and Q1 = X^2 + Y^2.
         by_q2 = -(by_exponent * self.exponent + by_distance * self.distance) * self.inverse
         twice_q1 = (by_exponent * self.inverse + self.flat * by_q2) * 2
         by_x, by_y = twice_q1 * self.x, twice_q1 * self.y
@@ -201,9 +206,11 @@ class MovingMeeting(StillMeeting):
         x, y, w, flat, s = self.x, self.y, self.w, self.flat, self.s
         xv, yv, wv = self.drift
         by_along = by_distance * self.inverse
+        # As without motion, with the numerators a^2 + b^2 + FLAT c^2 and ``along`` in place of Q1 and W.
         by_q2 = -(by_exponent * self.exponent + by_distance * self.distance) * self.inverse
         twice = by_exponent * self.inverse * 2
         by_a, by_b, by_c = twice * self.a, twice * self.b, twice * flat * self.c * s
+        # ``distance`` is along / Q2 with along = W (1 - s wv) - s FLAT (X xv + Y yv).
         across, spread = by_along * s * flat, by_q2 * flat * 2
         by_left = by_a * x + by_b * y + by_along * w
         by_x = by_a * self.left + by_c * yv - across * xv + spread * x
@@ -211,6 +218,7 @@ class MovingMeeting(StillMeeting):
         by_w = (by_a * xv + by_b * yv) * s + by_along * self.left + by_q2 * w * 2
         by_xv = by_a * s * w - by_c * y - across * x
         by_yv = by_b * s * w + by_c * x - across * y
+        # wv enters through left = 1 - s wv alone.
         by_wv = -(by_left * s)
         by_flat = (by_exponent * self.c * self.c - by_distance * s * (x * xv + y * yv)) * self.inverse
         return [
@@ -241,11 +249,14 @@ def meeting_of(
     rows = [[coefficient(start + k) for k in range(3)] for start in (C_X, C_Y, C_W)]
     flat, fade = Bundle([coefficient(C_FLAT)] * AT_ONCE), coefficient(C_FADE)
     if mode == AFFINE:
+        # Values at the tile's centre, per cell along x, and per cell along y. The part along x is shared by the group's
+        # vectors, whose cells differ in y only.
         x, y, w = (group.y * row[2] + (row[0] + row[1] * group.x) for row in rows)
     else:
         d = [group.plane(rays, plane) for plane in (DX, DY, DZ)]
         x, y, w = (d[0] * row[0] + d[1] * row[1] + d[2] * row[2] for row in rows)
     if mode == MOVING:
+        # The rows of the record times the sensor's velocity: the same for all rays of a tile, hence a coefficient.
         drift = [Bundle([coefficient(C_DRIFT + c)] * AT_ONCE) for c in range(3)]
         meeting: StillMeeting = MovingMeeting(x, y, w, flat, group.plane(rays, PLACE), drift, refined)
     else:
@@ -256,18 +267,27 @@ def meeting_of(
 def behind_near_plane(
     v: Lanes, mode: int, basis: ir.Value, group: RayGroup, distance: Bundle, near: ir.Value
 ) -> Bundle:
-    """Whether hits lie no nearer than the near plane."""
+    """Whether hits lie no nearer than the near plane.
+
+    Args:
+        v: vectors.
+        mode: AFFINE, TABLE or MOVING.
+        basis: address of the tile's basis; only read for AFFINE.
+        group: the rays.
+        distance: place of each hit along its ray, in lengths of the ray's direction.
+        near: near plane (m, float32).
+    """
     if mode != AFFINE:
         return distance >= v.spread(near)
     d = [[v.broadcast(basis, 4 * (start + c)) for start in (B_D0, B_DX, B_DY)] for c in range(3)]
-    # A pinhole's rays are not of unit length, so that t is no distance yet.
+    # A pinhole's rays have z = 1 and not unit length, so t is not yet a distance.
     lengths = [group.y * c[2] + (c[0] + c[1] * group.x) for c in d]
     length = (lengths[0] * lengths[0] + lengths[1] * lengths[1] + lengths[2] * lengths[2]).sqrt()
     return distance * length >= v.spread(near)
 
 
 def still_open(transmittance: list[Vector], output_kind: int) -> ir.Value:
-    """An int64: 1 while any of the rays of a CAMERA or LIDAR goes on, else 0."""
+    """An int64: 1 while any of the rays is not yet opaque, by the limit of the output kind, else 0."""
     most = functools.reduce(Vector.max, transmittance)
     return (most > (LIDAR_MIN_TRANSMITTANCE if output_kind == LIDAR else MIN_TRANSMITTANCE)).any()
 
@@ -301,6 +321,7 @@ def run_records(
         step: what a record does to the sums.
     """
     b = v.b
+    # 32 rays are two (AVX-512) or four vectors; AT_ONCE of them go through the whole list, then the next ones.
     alive: ir.Value | None = None
     for part in range(0, VECTORS, AT_ONCE):
         group = RayGroup(
@@ -314,6 +335,7 @@ def run_records(
         )
 
         def body(i: ir.Value, values: list[Vector], group: RayGroup = group) -> list[Vector]:
+            # Coefficients are stored by rows of BATCH records, so a record's are one broadcast each.
             number = b.zext(b.load(v.pointer(numbers, i), typ=I8, align=1), I64)
             where = v.address(coefficients, b.shl(number, ir.Constant(I64, 2)))
             sums = [Bundle(values[k : k + AT_ONCE]) for k in range(0, len(values), AT_ONCE)]
@@ -325,6 +347,7 @@ def run_records(
         for plane in range(planes):
             for k, offset in enumerate(group.offsets):
                 v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset)
+        # A block stays open until the most transparent of its rays is opaque.
         left = still_open(final[:AT_ONCE], output_kind)
         alive = left if alive is None else b.or_(alive, left)
     assert alive is not None

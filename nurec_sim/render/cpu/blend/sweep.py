@@ -64,6 +64,7 @@ def sweep_returns(first, last, planes, rays, limits, returns):
     Returns:
         Number of returns, written one after the other from row ``first``'s place on.
     """
+    # A row's range of output is its own, so rows can be finished in any order and by any thread.
     direction, beam, line, end_from_line = rays
     columns = beam.shape[1]
     moving = end_from_line.shape[0] > 1
@@ -79,6 +80,7 @@ def sweep_returns(first, last, planes, rays, limits, returns):
             alpha = np.float64(planes[ALPHA, y, x])
             if not alpha > limits.least_opacity:
                 continue
+            # The planes hold weighted sums; float64 from here on, as in ``spec``.
             mean = np.float64(planes[DISTANCE, y, x]) / max(alpha, MIN_ALPHA)
             half = np.float64(planes[HALF, y, x])
             # An echo comes from one surface: where half of the beam has been stopped, not a mean between surfaces.
@@ -91,6 +93,7 @@ def sweep_returns(first, last, planes, rays, limits, returns):
             # The mean over the Gaussians whose intensity is known; the others have added to neither sum.
             intensity = np.float64(planes[INTENSITY, y, x]) / max(np.float64(planes[KNOWN, y, x]), 1e-12)
             returns.intensity[n] = np.float32(min(max(intensity, 0.0), 1.0))
+            # Points of a sweep are given in the frame of its end, whatever column they were fired in.
             m = end_from_line[line[y, x] if moving else 0]
             a, b, c = direction[y, x, 0] * distance, direction[y, x, 1] * distance, direction[y, x, 2] * distance
             for row in range(3):

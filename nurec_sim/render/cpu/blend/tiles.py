@@ -1,9 +1,9 @@
 """Vector code that prepares the records of a macro tile for its 8 x 4 blocks of rays, LANES records at a time.
 
 In a macro tile of 32 x 32 cells of a pinhole a ray's direction is d0 + x dx + y dy for cells x, y from the tile's
-centre. A record's X, Y and W are then linear in (x, y), and the least Q1 over a block is that of a parabola over a
-square: an exact test of which blocks see it. Other grids read their rays from a table; for the test, each band of 8
-rows of a macro tile has a linear fit of its own, which is right up to ``bend``.
+centre. A record's X, Y and W are then linear in (x, y), and the least Q1 over a block is that of a paraboloid over a
+rectangle: an exact test of which blocks see it. Other grids read their rays from a table; for the test, each band of 8
+rows of a macro tile has a linear fit of its own, which holds up to ``bend``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ BANDS = MACRO // BAND
 BATCH = 128
 """Most records that are prepared at once; their coefficients stay in the first-level cache."""
 CAMERA_BATCH = 64
-"""How many for cameras, whose blocks see more of a batch: the sooner they are found to be opaque."""
+"""The same for cameras, whose blocks see more of a batch: with smaller batches, opaque blocks are noticed sooner."""
 LIST = BATCH + LANES
 """Room for the numbers of a batch's records that a block sees, a byte each."""
 
@@ -88,10 +88,12 @@ def _turned(
     In the frame of the record a ray is D = (4 X, 4 Y, n W) and the centre b = (0, 0, n) - s (4 xv, 4 yv, n wv); the
     frame is turned by the smallest rotation that brings b back to the third axis.
     """
+    # FLAT = 16 / n^2.
     quarter = 1 / flat.sqrt()  # n / 4
     bx, by, bz = -(drift[0] * place), -(drift[1] * place), quarter * (1 - drift[2] * place)
     inverse = 1 / (bx * bx + by * by + bz * bz).max(1e-30).sqrt()
     bx, by, bz = bx * inverse, by * inverse, bz * inverse
+    # Smallest rotation from b to the third axis; it divides by 1 + bz, which is kept away from zero.
     bend = 1 / (1 + bz.max(-0.9))
     e1 = [1 - bx * bx * bend, -(bx * by * bend), -bx]
     e2 = [-(bx * by * bend), 1 - by * by * bend, -by]
@@ -116,6 +118,7 @@ def _rolled(
     the centre is outside; from there the sensor moves on by ``rate`` v per row, which shears the picture.
     """
     (centre, along_x, along_y), _, _ = _turned(at, drift, flat, middle)
+    # The row at which X = Y = 0, by Cramer's rule.
     det = along_x[0] * along_y[1] - along_y[0] * along_x[1]
     row = (centre[0] * along_x[1] - centre[1] * along_x[0]) / (det.abs() > 1e-20).where(det, 1.0)
     row = row.max(-MACRO / 2).min(MACRO / 2)
@@ -130,8 +133,10 @@ def _rolled(
 def _least_over_blocks(at: list[list[Vector]], rows: int, v: Lanes) -> tuple[list[Vector], Mask]:
     """The least X^2 + Y^2 over each block of ``rows`` rows of them, and where it could not be found."""
     (x0, y0, _), (xx, yx, _), (xy, yy, _) = at
+    # Q1 = a (x - mx)^2 + b2 (x - mx)(y - my) + c (y - my)^2 about the centre (mx, my), where X = Y = 0.
     a, c, b2 = xx * xx + yx * yx, xy * xy + yy * yy, (xx * xy + yx * yy) * 2
     det = xx * yy - xy * yx
+    # Nearly parallel gradients of X and Y: a needle, whose centre is ill-conditioned. Written so that NaN is unsure.
     unsure = ~(det.abs() > (a + c) * NEEDLE)
     inverse = 1 / unsure.where(1.0, det)
     mx, my = (y0 * xy - x0 * yy) * inverse, (x0 * yx - y0 * xx) * inverse
@@ -153,6 +158,8 @@ def _least_over_blocks(at: list[list[Vector]], rows: int, v: Lanes) -> tuple[lis
     least = []
     for row in range(rows):
         for column in range(ACROSS):
+            # A convex quadratic over a rectangle that does not hold its centre has its least value on one of the two
+            # sides that face the centre: the better of both candidates. Where the centre is inside, both are zero.
             y = best_y[column].max(span_y[row][0]).min(span_y[row][1])
             x = best_x[row].max(span_x[column][0]).min(span_x[column][1])
             first = ax2[column] + (bx[column] + c * y) * y
@@ -169,10 +176,12 @@ def _widened(
     From elsewhere on the way the ball of a Gaussian is nearer: allow for it.
     """
     sideways = (drift[0] * drift[0] + drift[1] * drift[1]).sqrt()
+    # The distance of the centre after ``reach`` of the way, relative to that from the reference point, at least.
     shrink = 1 - reach * (drift[2].abs() + sideways * column[FLAT].sqrt())
     nearer = shrink.max(0.05)
     rim = LOG_255 / 8 - column[FADE]
     room = 1 - rim * flat / (nearer * nearer)
+    # As LIM in ``records.build_records``, with FLAT of the nearer point.
     limit = ((room > 1e-4) & (shrink > 0.05)).where(rim / (room.max(1e-4) * nearer * nearer), INSIDE)
     return limit, sideways
 
@@ -183,6 +192,8 @@ def _append(v: Lanes, mask: ir.Value, numbers: ir.Value, lists: ir.Value, counts
     compress = declare(b, f"llvm.experimental.vector.compress.v{LANES}i32", INTS, [INTS, BITS, INTS])
     bits = ir.IntType(LANES)
     count_bits = declare(b, f"llvm.ctpop.i{LANES}", bits, [bits])
+    # Compress moves the chosen lanes to the front; the whole vector is stored and the count decides what is valid,
+    # which is why a list has LANES entries of spare room.
     small = b.trunc(b.call(compress, [numbers, mask, ir.Constant(INTS, ir.Undefined)]), ir.VectorType(I8, LANES))
     counter = v.pointer(counts, 8 * block)
     count = b.load(counter, typ=I64, align=8)
@@ -208,19 +219,20 @@ def _preparation(mode: int) -> Callable[..., Any]:
     ) -> ir.Value:
         """Coefficients of up to LANES records, and their numbers appended to the lists of the blocks that see them.
 
-        Returns 1 if any of them is close (TAG), else 0.
-
         Args:
             v: vectors.
             ids: address of their record numbers (int32).
             records: address of the records.
             count: how many there are, at least 1.
-            alive: bit k is set while block k still wants records.
+            alive: bit k is set while block k is still open (not all of its rays are opaque).
             basis: address of the tile's basis, or of those of its bands.
             coefficients: address of [COEFFICIENTS,BATCH].
             lists: address of [BLOCKS,LIST] bytes.
             counts: address of [BLOCKS] int64.
             entry: number of the first record within the batch.
+
+        Returns:
+            1 if any of them is close (TAG), else 0.
         """
         b = v.b
         column = _load_records(v, ids, records, count)
@@ -239,22 +251,29 @@ def _preparation(mode: int) -> Callable[..., Any]:
             if mode == ROLLING:
                 at, flat = _rolled(at, drift, flat, base[B_MIDDLE], base[B_RATE])
                 limit, _ = _widened(column, drift, base, flat, base[B_HALF])
+            # The largest W in the tile or band: the cone Q1 < LIM W^2 is tested at its widest.
             height = MACRO / 2 / bands
             widest = at[0][2] + at[1][2].abs() * (MACRO / 2) + at[2][2].abs() * height
             if not linear:
+                # |(X, Y)| changes by at most the norm of the rows times the fit's largest error; likewise W by its
+                # row's.
                 slope = (sum((x * x for x in rows[0] + rows[1]), start=v.number(0))).sqrt()
                 slack = slope * base[B_BEND]
                 depth = (rows[2][0] * rows[2][0] + rows[2][1] * rows[2][1] + rows[2][2] * rows[2][2]).sqrt()
                 widest = widest + depth * base[B_BEND]
             if mode == MOVING:
+                # Records hold the reference point; rays of this band start up to ``reach`` of the way from it.
                 reach = base[B_HALF] + base[B_MIDDLE].abs()
                 limit, sideways = _widened(column, drift, base, flat, reach)
+                # Shifted by the band's middle place; the spread about it becomes slack.
                 middle = at[0][2] * base[B_MIDDLE]
                 at[0] = [at[0][0] + middle * drift[0], at[0][1] + middle * drift[1], at[0][2]]
                 slack = slack + base[B_HALF] * sideways * widest.max(0)
                 slack = slack + reach * drift[2].abs() * (limit.min(1e6).sqrt() * widest.max(0))
+            # 1 % for float32: a block too many costs time, one too few would be a hole.
             room = limit.min(INSIDE).sqrt() * widest.max(0) * 1.01 + slack
             least, unsure = _least_over_blocks(at, DOWN // bands, v)
+            # Around the eye (INSIDE) every ray meets it.
             always = unsure | (limit >= INSIDE)
             seen = widest > 0
             for k, value in enumerate(least):
@@ -271,6 +290,7 @@ def _preparation(mode: int) -> Callable[..., Any]:
             for k in range(3):
                 v.store(drift[k], where, 4 * BATCH * (C_DRIFT + k))
 
+        # CLOSE_BIT is the sign bit of TAG.
         near = b.icmp_signed("<", column[TAG].bits(), ir.Constant(INTS, [0] * LANES))
         return Mask(b, b.and_(near, given)).any()
 

@@ -33,13 +33,23 @@ def _basis(x: Vector, y: Vector, z: Vector, k: int) -> list[Vector]:
             z * (xx - yy) * 1.445305721320277,
             x * (xx - yy * 3) * -0.5900435899266435,
         ]
+    # Constants, signs and order are those of 3D Gaussian splatting (Kerbl et al. 2023).
     return basis
 
 
 def _harmonics(k: int) -> Callable[..., Any]:
     @vector_kernel("iiii")
     def features(v: Lanes, block: ir.Value, rest: ir.Value, view: ir.Value, scratch: ir.Value) -> None:
-        """Take the colours seen from the eye as features, not below 0; ``rest`` is the group's place in sh_rest."""
+        """Take the colours seen from the eye as features, not below 0.
+
+        Args:
+            v: vectors.
+            block: address of the group's first Gaussian in its block.
+            rest: address of the group's first coefficient in ``sh_rest`` [k3,256].
+            view: address of ``records.view_parameters``.
+            scratch: address of the group's [SCRATCH,LANES]; its FEATURES are written.
+        """
+        # The eye as a sum of two float32 values, as in ``records.place``: world coordinates are large, offsets are not.
         offset = [
             (v.load(block, 4 * BLOCK * (MEAN + c)) - v.broadcast(view, 4 * (EYE_HIGH + c)))
             - v.broadcast(view, 4 * (EYE_LOW + c))

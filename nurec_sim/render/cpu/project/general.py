@@ -39,7 +39,19 @@ from nurec_sim.render.cpu.simd import LANES, Lanes, Vector, vector_kernel
 def lens_boxes(
     v: Lanes, scratch: ir.Value, params: ir.Value, places: ir.Value, bends: ir.Value, box: ir.Value
 ) -> ir.Value:
-    """Cells that a lens at one pose may see Gaussians in; the mask of those in its field."""
+    """Cells in which a lens at one pose may see Gaussians.
+
+    Args:
+        v: vectors.
+        scratch: address of the group that ``records.place`` left.
+        params: address of the chart's parameters, like the next two of ``charts.Chart``.
+        places: address of the chart's places.
+        bends: address of the chart's bends.
+        box: address of [4,LANES] output, see ``outlines.CellBox``.
+
+    Returns:
+        The mask of the Gaussians in the lens's field.
+    """
     cone = LensCone(LensChart(v, params, places, bends), Outline(v, scratch))
     cone.box()[0].store(v, box)
     return (~cone.outside()).integer()
@@ -47,7 +59,17 @@ def lens_boxes(
 
 @vector_kernel("iiiii")
 def lidar_boxes(v: Lanes, scratch: ir.Value, params: ir.Value, rows: ir.Value, view: ir.Value, box: ir.Value) -> None:
-    """Cells that a LiDAR at one pose may see Gaussians in."""
+    """Cells in which a LiDAR at one pose may see Gaussians.
+
+    Args:
+        v: vectors.
+        scratch: address of the group that ``records.place`` left.
+        params: address of the chart's parameters.
+        rows: address of the chart's rows by sine of elevation.
+        view: address of ``records.view_parameters``.
+        box: address of [4,LANES] output, see ``outlines.CellBox``.
+    """
+    # Columns within half a turn of the grid's middle; ``lidar_tiles`` adds what a full turn shifts back into the grid.
     cone = LidarCone(LidarChart(v, params, rows), Outline(v, scratch), v.broadcast(view, 4 * CELLS) * 0.5)
     CellBox(cone.columns, cone.rows(0.0)).store(v, box)
 
@@ -68,7 +90,17 @@ def _tile(cell: Vector) -> Vector:
 
 @vector_kernel("iii")
 def lens_tiles(v: Lanes, box: ir.Value, view: ir.Value, tiles: ir.Value) -> ir.Value:
-    """Macro tiles of boxes; the mask of those that hold the centre of a cell."""
+    """Macro tiles of boxes.
+
+    Args:
+        v: vectors.
+        box: address of [4,LANES], see ``outlines.CellBox``.
+        view: address of ``records.view_parameters``.
+        tiles: address of [4,LANES] output: first and last column, first and last row of macro tiles.
+
+    Returns:
+        The mask of the boxes that hold the centre of a cell.
+    """
     ends = [v.load(box, STEP * k) for k in range(4)]
     x0, x1 = _cells(ends[0], ends[1], v.broadcast(view, 4 * CELLS))
     y0, y1 = _cells(ends[2], ends[3], v.broadcast(view, 4 * (CELLS + 1)))
@@ -80,12 +112,24 @@ def lens_tiles(v: Lanes, box: ir.Value, view: ir.Value, tiles: ir.Value) -> ir.V
 def lidar_tiles(
     v: Lanes, box: ir.Value, view: ir.Value, params: ir.Value, tiles: ir.Value, others: ir.Value
 ) -> ir.Value:
-    """Macro tiles of boxes, and (``others``, mask ``APART`` bits on) of what a full turn brings back.
+    """Macro tiles of boxes, and of the same boxes a full turn away.
 
     What leaves one side of the grid enters at the other. The two never share a tile.
+
+    Args:
+        v: vectors.
+        box: address of [4,LANES], see ``outlines.CellBox``.
+        view: address of ``records.view_parameters``.
+        params: address of the chart's parameters.
+        tiles: address of [4,LANES] output: first and last column, first and last row of macro tiles.
+        others: address of the same for the boxes a full turn away.
+
+    Returns:
+        The mask of boxes that hold the centre of a cell, and, from bit ``APART`` on, of those that do a full turn away.
     """
     left, right, top, bottom = (v.load(box, STEP * k) for k in range(4))
     width, period = v.broadcast(view, 4 * CELLS), v.broadcast(params, 4 * PERIOD)
+    # At least a full turn wide, or NaN: the whole grid. Written so that NaN is true.
     whole = ~(right - left < period)
     y0, y1 = _cells(top, bottom, v.broadcast(view, 4 * (CELLS + 1)))
     x0, x1 = _cells(whole.where(0, left), whole.where(width, right), width)
@@ -94,6 +138,7 @@ def lidar_tiles(
     rows = y0 <= y1
     first, second = (x0 <= x1) & rows, (p0 <= p1) & rows & ~whole
     x0, x1, p0, p1 = _tile(x0), _tile(x1), _tile(p0), _tile(p1)
+    # Both parts of a Gaussian in one tile would be blended twice: join them to one record.
     touch = first & second & (p0 <= x1) & (x0 <= p1)
     _store_tiles(v, (touch.where(x0.min(p0), x0), touch.where(x1.max(p1), x1), _tile(y0), _tile(y1)), tiles)
     _store_tiles(v, (p0, p1, _tile(y0), _tile(y1)), others)
@@ -126,6 +171,7 @@ def project_general(layer, first, last, view, is_lidar, chart, path, output, bas
     params, table, bend = chart.params.ctypes.data, chart.places.ctypes.data, chart.bends.ctypes.data
     motion, poses = path.motion.ctypes.data, path.lines.ctypes.data
     cells, other_cells = box.ctypes.data, other_box.ctypes.data
+    # Kernels read the path only when the sensor moves; at one pose the line poses are those of the reference frame.
     moving = path.lines.shape[0] > 1
     n = base
     for k in range(first, last):
@@ -138,9 +184,11 @@ def project_general(layer, first, last, view, is_lidar, chart, path, output, bas
             again = 0
             if is_lidar:
                 if moving:
+                    # The line that sees the centre from the reference pose, then a box from that line's own pose.
                     lidar_lines(here, params, around, motion, there)
                     to_lines(here, poses, motion, there)
                     found = moving_lidar_boxes(there, params, table, around, motion, cells)
+                    # Too fast for one box: bounded part by part below.
                     fast = mask & (found >> APART)
                     # Fired at opposite ends of a turn, the columns beside the seam see it from different places.
                     seam = mask & found & ~fast
@@ -163,6 +211,8 @@ def project_general(layer, first, last, view, is_lidar, chart, path, output, bas
                 mask &= both
             else:
                 if moving:
+                    # The line that sees the centre depends on the pose, which depends on the line: two fixed-point
+                    # steps.
                     lens_lines(here, params, table, motion, there)
                     to_lines(here, poses, motion, there)
                     lens_lines(there, params, table, motion, there)
@@ -185,6 +235,7 @@ def project_general(layer, first, last, view, is_lidar, chart, path, output, bas
             source = number * BLOCK + lane
             n = emit(mask, rows, scratch, tiles, source, n, output)
             n = emit(again, rows, scratch, other_tiles, source, n, output)
+    # The kernels above only see addresses; Numba must not free the arrays before the last call.
     keep_alive(local)
     keep_alive(box)
     keep_alive(other_box)

@@ -1,9 +1,9 @@
 """Vector code for sensors that move while they look: the line that sees a Gaussian, and boxes that hold for all lines.
 
 A *line* is a set of rays fired at one instant. A box seen from the pose of one line, the one that sees the centre,
-holds for others once it is widened by how far places move in between: the turn of directions times the rate of the
-chart. Places move more slowly than lines go by, so that only lines near the box see it at all. Taken for granted:
-what moves past less than half as fast as the lines near its box is not seen again by lines far away.
+holds for other lines once it is widened by how far places move in between: the turn of directions times the rate of
+the chart. Places move more slowly than lines pass, so only lines near the box see it at all. Assumption: what moves
+past at less than half the pace of the lines near its box is not seen again by distant lines.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ LINES, BY_COLUMN, TURN_RATE, TRAVEL_RATE, SPEED = 0, 1, 2, 3, 6
 MOTION = 7
 
 TO_LINE = 12
-"""Column of ``ExposureView.lines`` from which on line_from_reference stands: rotation, translation."""
+"""First column of line_from_reference in ``ExposureView.lines``: rotation, translation."""
 LINE_COLUMNS = 24
 MOST = 1e3
-"""Radians that stand for any turn."""
+"""Radians that represent any turn."""
 APART = 16
 """Bits between masks in one integer."""
 
@@ -60,10 +60,20 @@ def motion_parameters(lines: Float32[np.ndarray, "l 24"], line_axis: int) -> Flo
 def lens_lines(
     v: Lanes, scratch: ir.Value, params: ir.Value, places: ir.Value, motion: ir.Value, local: ir.Value
 ) -> None:
-    """The image row (or column) that the centres in ``scratch`` are seen in, to ``local``."""
+    """The image row (or column) in which the centres are seen from their current poses.
+
+    Args:
+        v: vectors.
+        scratch: address of the group, laid out as by ``records``.
+        params: address of the lens chart's parameters.
+        places: address of the lens chart's places.
+        motion: address of ``motion_parameters``.
+        local: address of the scratch whose LINE is written.
+    """
     centre = [v.load(scratch, STEP * (CENTRE + k)) for k in range(3)]
     away = 1 / dot(centre, centre).max(1e-20).sqrt()
     texels = Texels(LensChart(v, params, places, places), [component * away for component in centre])
+    # The place along the axis of the lines: entry 0 with slopes 2, 3 for columns, entry 1 with slopes 4, 5 for rows.
     axis = 1 - v.broadcast(motion, 4 * BY_COLUMN)
     place = texels.entry(axis) + texels.entry(axis * 2 + 2) * texels.ds + texels.entry(axis * 2 + 3) * texels.dt
     v.store(place.floor().max(0).min(v.broadcast(motion, 4 * LINES) - 1), local, STEP * LINE)
@@ -73,7 +83,16 @@ def lens_lines(
 def lidar_lines(
     v: Lanes, scratch: ir.Value, params: ir.Value, view: ir.Value, motion: ir.Value, local: ir.Value
 ) -> None:
-    """The column that the centres in ``scratch`` are seen in, to ``local``."""
+    """The column in which the centres are seen from their current poses.
+
+    Args:
+        v: vectors.
+        scratch: address of the group, laid out as by ``records``.
+        params: address of the LiDAR chart's parameters.
+        view: address of ``records.view_parameters``.
+        motion: address of ``motion_parameters``.
+        local: address of the scratch whose LINE is written.
+    """
     centre = [v.load(scratch, STEP * (CENTRE + k)) for k in range(3)]
     place = LidarChart(v, params, params).column(centre, v.broadcast(view, 4 * CELLS) * 0.5)
     v.store(place.floor().max(0).min(v.broadcast(motion, 4 * LINES) - 1), local, STEP * LINE)
@@ -88,7 +107,16 @@ def other_ends(v: Lanes, motion: ir.Value, local: ir.Value) -> None:
 
 @vector_kernel("iiii")
 def to_lines(v: Lanes, scratch: ir.Value, lines: ir.Value, motion: ir.Value, local: ir.Value) -> None:
-    """The Gaussians of ``scratch``, and the sensor's velocity, as seen from the poses of their lines, to ``local``."""
+    """The Gaussians and the sensor's velocity as seen from the poses of their lines.
+
+    Args:
+        v: vectors.
+        scratch: address of the group in the reference frame, as ``records.place`` left it.
+        lines: address of ``LinePath.lines``.
+        motion: address of ``motion_parameters``.
+        local: address of the scratch that holds LINE; centre, rotation, scale, velocity and log opacity are written.
+    """
+    # Each lane has a line, hence a pose, of its own.
     row = v.load(local, STEP * LINE) * LINE_COLUMNS
     pose = [v.gather(lines, (row + (TO_LINE + k)).integers()) for k in range(12)]
     turn = [pose[3 * k : 3 * k + 3] for k in range(3)]
@@ -112,6 +140,8 @@ class Motion:
         speed, self.outline = v.broadcast(motion, 4 * SPEED), outline
         ahead = dot(velocity, outline.f)
         # Sideways speed relative to any direction of the cone.
+        # Component perpendicular to f, plus what tilting by the cone's radius adds from the component along it; never
+        # more than the speed.
         self.sideways = ((speed * speed - ahead * ahead).max(0).sqrt() + ahead.abs() * outline.reach).min(speed)
         self.speed, self.turn_rate = speed, v.broadcast(motion, 4 * TURN_RATE)
         self.shifted = v.number(0) + shifted
@@ -124,7 +154,9 @@ class Motion:
         # Seen from s metres aside, a point at the distance d lies at most asin(s / d) elsewhere.
         aside = (travel < nearest).where(math.pi / 2, math.pi) * travel / nearest
         little = (self.sideways * lines / (nearest - travel)).min(travel * 1.05 / nearest)
+        # asin(x) is at most 1.05 x up to x = 1/2, and pi x / 2 up to x = 1.
         turn = (travel < nearest * 0.5).where(little, aside)
+        # A sensor inside the ellipsoid may see it anywhere.
         return (nearest > 0).where(turn + self.turn_rate * lines, MOST).min(MOST)
 
     def guess(self, low: Vector, high: Vector) -> Vector:
@@ -132,12 +164,22 @@ class Motion:
         return (self._beyond(low, high) * 2 + (8 + 2 * self.shifted)).min(self.all_lines)
 
     def lines_away(self, low: Vector, high: Vector, rate: Vector, lines: Vector) -> tuple[Vector, Mask]:
-        """How far away from ``line`` are the lines that see a box; and where the box moves too fast to tell.
+        """How far from ``line`` the lines lie that see a box, and which boxes move too fast for a bound.
 
-        ``rate`` holds for ``lines`` of them.
+        Args:
+            low: lower end of the box along the lines (cells).
+            high: its upper end.
+            rate: most cells per radian, valid within ``lines`` lines.
+            lines: how many lines away ``rate`` and the box are known to hold.
+
+        Returns:
+            Lines away, at most ``lines``, and the mask of boxes that move too fast.
         """
+        # A box at ``_beyond`` cells that recedes by ``pace`` cells per line is met after x = beyond + pace x lines, so
+        # x = beyond / (1 - pace); near 1 the box keeps up with the lines.
         pace = rate * self.turned(lines) / lines
         away = (self._beyond(low, high) + pace * self.shifted) / (1 - pace).max(0.1) + self.shifted
+        # Written so that NaN counts as too fast.
         told = (pace < 0.9) & (away <= lines)
         return told.where(away, lines), ~told
 
@@ -167,7 +209,20 @@ def mask_of(v: Lanes, integer: ir.Value) -> Mask:
 def moving_lens_boxes(
     v: Lanes, local: ir.Value, params: ir.Value, places: ir.Value, bends: ir.Value, motion: ir.Value, target: ir.Value
 ) -> ir.Value:
-    """Cells that any line of a lens may see Gaussians in; masks of those in its field and of the too fast."""
+    """Cells in which any line of a lens may see Gaussians.
+
+    Args:
+        v: vectors.
+        local: address of the group seen from the poses of its lines (``to_lines``).
+        params: address of the chart's parameters, like the next two of ``charts.Chart``.
+        places: address of the chart's places.
+        bends: address of the chart's bends.
+        motion: address of ``motion_parameters``.
+        target: address of [4,LANES] output, see ``outlines.CellBox``.
+
+    Returns:
+        Masks of those in the lens's field and of those too fast, ``APART`` bits apart.
+    """
     outline = Outline(v, local)
     cone = LensCone(LensChart(v, params, places, bends), outline)
     motions = Motion(v, motion, local, outline, 1.0)
@@ -176,6 +231,7 @@ def moving_lens_boxes(
     def along(column: tuple[Vector, Vector], row: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
         return by_column.where(column[0], row[0]), by_column.where(column[1], row[1])
 
+    # A first guess of the lines involved, rates that hold for them, then the lines that these rates allow.
     still, _ = cone.box()
     lines = motions.guess(*along(still.column, still.row))
     box, (column_rate, row_rate) = cone.box(motions.turned(lines))
@@ -189,9 +245,18 @@ def moving_lens_boxes(
 def moving_lidar_boxes(
     v: Lanes, local: ir.Value, params: ir.Value, rows: ir.Value, view: ir.Value, motion: ir.Value, target: ir.Value
 ) -> ir.Value:
-    """Cells that any column of a LiDAR may see Gaussians in, were there no seam.
+    """Cells in which any column of a LiDAR may see Gaussians, were there no seam.
 
     The seam is where the last column of a sweep meets the first one, fired from elsewhere.
+
+    Args:
+        v: vectors.
+        local: address of the group seen from the poses of its lines (``to_lines``).
+        params: address of the chart's parameters.
+        rows: address of the chart's rows by sine of elevation.
+        view: address of ``records.view_parameters``.
+        motion: address of ``motion_parameters``.
+        target: address of [4,LANES] output, see ``outlines.CellBox``.
 
     Returns:
         Masks of those that may cross the seam, of those that are too fast, and of those whose box holds columns.
@@ -216,10 +281,19 @@ def moving_lidar_boxes(
 
 @vector_kernel("iiii")
 def join_ends(v: Lanes, chosen: ir.Value, params: ir.Value, box: ir.Value, other: ir.Value) -> None:
-    """Let the boxes in the mask ``chosen`` hold what is seen from the other end of the sweep as well."""
+    """Extend boxes by what is seen from the other end of the sweep.
+
+    Args:
+        v: vectors.
+        chosen: mask of the boxes to extend.
+        params: address of the LiDAR chart's parameters.
+        box: address of [4,LANES] boxes, changed in place.
+        other: address of [4,LANES] boxes from the other end.
+    """
     period = v.broadcast(params, 4 * PERIOD)
     left, right, top, bottom = (v.load(box, STEP * k) for k in range(4))
     left2, right2, top2, bottom2 = (v.load(other, STEP * k) for k in range(4))
+    # Whole turns that bring the other box's middle closest to this one's.
     shift = period * ((left + right - left2 - right2) / (period * 2) + 0.5).floor()
     ends = left.min(left2 + shift), right.max(right2 + shift), top.min(top2), bottom.max(bottom2)
     for k, (own, end) in enumerate(zip((left, right, top, bottom), ends, strict=True)):

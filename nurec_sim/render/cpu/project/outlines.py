@@ -54,11 +54,14 @@ class Outline:
         self.f = [component * inverse for component in centre]
         self.forward = self._canonical(self.f)
         self.scale = k2 * inverse * inverse
+        # f^T Sigma f: the variance along the line of sight.
         ahead = dot(self.forward, self.forward)
         along = self.scale * ahead
+        # k2 Sigma_ff / m^2 - 1: negative while the plane through the eye perpendicular to f misses the ellipsoid.
         self.bottom = along - 1
         self.divisor = 1 / self.bottom.min(-STEEP)
         largest = sigma[0].max(sigma[1]).max(sigma[2])
+        # The variance across it is at most the trace less that along it, and at most the largest axis.
         across = (dot(sigma, sigma) - ahead).max(0).min(largest * largest)
         reach = -(self.scale * across).sqrt() * (1 + along.sqrt()) * self.divisor
         self.reach = (self.bottom < -STEEP).where(reach, EVERYWHERE)
@@ -74,6 +77,7 @@ class Outline:
         """Least and largest (j.d) / (f.d) of the directions d of the cone, for j perpendicular to f."""
         canonical = self._canonical(j)
         half = self.scale * dot(canonical, self.forward)
+        # Roots of bottom t^2 - 2 half t + k2 j^T Sigma j / m^2 = 0.
         root = (half * half - self.scale * dot(canonical, canonical) * self.bottom).max(0).sqrt()
         return (half + root) * self.divisor, (half - root) * self.divisor
 
@@ -125,6 +129,7 @@ class Texels:
         """Column (axis 0) or row (axis 1) of the directions, and its gradient by the direction, perpendicular to it."""
         by_s, by_t = self.entry(2 + 2 * axis), self.entry(3 + 2 * axis)
         inward = by_s * self.s + by_t * self.t
+        # Chain rule through p = (x, y) / (1 + z), projected perpendicular to f.
         gradient = [by_s - inward * self.f[0], by_t - inward * self.f[1], -inward * (1 + self.f[2])]
         return self.entry(axis) + by_s * self.ds + by_t * self.dt, [part * self.inverse for part in gradient]
 
@@ -133,7 +138,10 @@ class Texels:
         v, rho2 = self.lens.v, self.s * self.s + self.t * self.t
         half = tangent * 0.5
         room = 1 - half * rho2.sqrt()
+        # A circle of tangent ``half`` on the sphere is a circle in the plane, displaced outwards: hence the division by
+        # room.
         texels = half * (1 + rho2) / room.max(0.05) * self.lens.param(TEXELS) + 1.75
+        # floor(log2) from the float's exponent bits: which of the windows of 2^k texels is wide enough.
         exponent = v.b.lshr(texels.bits(), spread(v.b, I32(23), INTS))
         window = v.from_integers(exponent) - 127.0  # 2^(window + 1) texels to each side hold all of them
         known = self.inside & (room > 0.05) & (window < WINDOWS) & (tangent < WIDE)
@@ -168,6 +176,7 @@ class LensCone:
         reach = self.outline.reach
         angle = reach if turned is None else reach + turned * 1.25
         bend, known = self.texels.bend(angle)
+        # From the texel, whose gradient is used, to the cone's farthest direction.
         away = reach + self.offset
         ends, rates = [], []
         for place, slope, (low, high) in zip(self.places, self.slopes, self.intervals, strict=True):
@@ -183,9 +192,11 @@ class LensCone:
         if turned is not None:
             most = turned * 1.25
             reach = (reach + most) / (1 - reach * most).max(0.1)
+        # ``reach`` is a tangent; tangents of sums by the addition theorem above.
         cosine = 1 / (reach * reach + 1).sqrt()
         sine = reach * cosine
         cos_field, sin_field = self.lens.param(COS_FIELD), self.lens.param(SIN_FIELD)
+        # f_z < cos(field + reach); valid while their sum is below pi, which the sine's sign tells.
         beyond = self.outline.f[2] < cos_field * cosine - sin_field * sine
         return beyond & (sin_field * cosine + cos_field * sine > 0) & (reach < WIDE)
 
@@ -209,6 +220,7 @@ class LidarChart:
     def row(self, sine: Vector, upper: bool) -> Vector:
         """A row at or beyond (``upper``: above, else below) those of a sine of elevation."""
         entry = (sine + 1) * self.param(SINES)
+        # Rounded to the entry on the safe side; 0.01 of an entry covers float32.
         entry = (entry + 0.01).ceil() if upper else (entry - 0.01).floor()
         return self.v.gather(self.rows, entry.max(0).min(LIDAR_SIZE - 1).integers())
 
@@ -227,6 +239,7 @@ class LidarCone:
         self.known = known = reach < WIDE
 
         # Azimuth: with (u, w) the tangents to the left and up, its tangent is u / (cos e - w sin e).
+        # cos e - w sin e is linear in w, so its least value lies at an end.
         least = flat - (down * z).max(up * z)
         around = ~(least > 1e-3) | ~known  # it reaches over the pole
         wide = lidar.param(PER_RADIAN) / least.max(1e-3)
@@ -254,6 +267,7 @@ class LidarCone:
     def rate(self, turned: Vector) -> Vector:
         """Most columns per radian for directions up to an angle away from the cone."""
         angle = self.outline.reach + turned
+        # cos(e + a) >= cos e (1 - a^2 / 2) - |sin e| a: azimuth changes fastest at the highest elevation reached.
         lowest_cosine = self.flat * (1 - angle * angle * 0.5) - self.outline.f[2].abs() * angle
         return self.lidar.param(PER_RADIAN).abs() / lowest_cosine.max(1e-3)
 
@@ -263,6 +277,7 @@ def atan2(y: Vector, x: Vector) -> Vector:
     ax, ay = x.abs(), y.abs()
     a = ax.min(ay) / ax.max(ay).max(1e-30)
     s = a * a
+    # Minimax polynomial of the arctangent on 0..1 (Abramowitz and Stegun 1964, 4.4.47), then the octants.
     r = a * ((((s * 0.0208351 - 0.0851330) * s + 0.1801410) * s - 0.3302995) * s + 0.9998660)
     r = (ay > ax).where(HALF_PI - r, r)
     r = (x < 0).where(2 * HALF_PI - r, r)

@@ -1,7 +1,7 @@
-"""Vector code for Gaussians that move too fast to tell which lines see them: the exposure is looked at in parts.
+"""Vector code for Gaussians that move too fast to bound the lines that see them: the exposure is handled in parts.
 
-Within a part, a box seen from the pose of its middle line holds for its other lines once it is widened by half of
-what places move in that time; what is kept of it is what lies on the part's own lines.
+Within a part, a box seen from the pose of its middle line holds for its other lines once it is widened by how far
+places move within half of the part; only what lies on the part's own lines is kept of it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,14 @@ def _number(v: Lanes, integer: ir.Value) -> Vector:
 
 @vector_kernel("iii")
 def part_lines(v: Lanes, part: ir.Value, motion: ir.Value, local: ir.Value) -> None:
-    """The middle line of a part of the exposure, to ``local``."""
+    """Write the middle line of a part of the exposure as every lane's LINE.
+
+    Args:
+        v: vectors.
+        part: number of the part, 0 to ``PARTS`` - 1.
+        motion: address of ``motion.motion_parameters``.
+        local: address of the scratch whose LINE is written.
+    """
     line = (_number(v, part) + 0.5) * (1 / PARTS) * v.broadcast(motion, 4 * LINES)
     v.store(line.floor(), local, STEP * LINE)
 
@@ -47,6 +54,7 @@ def _add(
     """Enlarge the boxes of the mask ``chosen`` by those of a part; the first part starts anew."""
     width, height = (v.broadcast(view, 4 * (CELLS + k)) for k in range(2))
     (left, right), (top, bottom) = box.column, box.row
+    # Boxes that miss the grid must not enlarge the union; a LiDAR's may lie a turn to either side.
     seen = (
         seen & (left <= right) & (top <= bottom) & (bottom > 0) & (top < height) & (right > -width) & (left < width * 2)
     )
@@ -64,7 +72,20 @@ def add_lens_part(
     v: Lanes, part: ir.Value, chosen: ir.Value, local: ir.Value, params: ir.Value, places: ir.Value, bends: ir.Value,
     motion: ir.Value, view: ir.Value, target: ir.Value,
 ) -> None:  # fmt: skip
-    """Add the cells that the lines of one part of a lens's exposure may see to the boxes in the mask ``chosen``."""
+    """Extend boxes by the cells that the lines of one part of a lens's exposure may see.
+
+    Args:
+        v: vectors.
+        part: number of the part, 0 to ``PARTS`` - 1; the first part replaces what the boxes held.
+        chosen: mask of the boxes to change.
+        local: address of the group seen from the part's middle line.
+        params: address of the chart's parameters, like the next two of ``charts.Chart``.
+        places: address of the chart's places.
+        bends: address of the chart's bends.
+        motion: address of ``motion.motion_parameters``.
+        view: address of ``records.view_parameters``.
+        target: address of [4,LANES] boxes, changed in place.
+    """
     outline = Outline(v, local)
     cone = LensCone(LensChart(v, params, places, bends), outline)
     motions, half = Motion(v, motion, local, outline, 0.0), _half(v, motion)
@@ -72,6 +93,7 @@ def add_lens_part(
     box, (column_rate, row_rate) = cone.box(turned)
     columns, rows = widened(box.column, column_rate * turned), widened(box.row, row_rate * turned)
     by_column = v.broadcast(motion, 4 * BY_COLUMN) > 0.5
+    # Along the axis of the lines, a part sees nothing but its own lines.
     low, high = motions.line - half, motions.line + half
     columns = by_column.where(columns[0].max(low), columns[0]), by_column.where(columns[1].min(high), columns[1])
     rows = by_column.where(rows[0], rows[0].max(low)), by_column.where(rows[1], rows[1].min(high))
@@ -83,7 +105,19 @@ def add_lidar_part(
     v: Lanes, part: ir.Value, chosen: ir.Value, local: ir.Value, params: ir.Value, rows: ir.Value, motion: ir.Value,
     view: ir.Value, target: ir.Value,
 ) -> None:  # fmt: skip
-    """Add the cells that one part of a LiDAR's sweep may see to the boxes in the mask ``chosen``."""
+    """Extend boxes by the cells that one part of a LiDAR's sweep may see.
+
+    Args:
+        v: vectors.
+        part: number of the part, 0 to ``PARTS`` - 1; the first part replaces what the boxes held.
+        chosen: mask of the boxes to change.
+        local: address of the group seen from the part's middle line.
+        params: address of the chart's parameters.
+        rows: address of the chart's rows by sine of elevation.
+        motion: address of ``motion.motion_parameters``.
+        view: address of ``records.view_parameters``.
+        target: address of [4,LANES] boxes, changed in place.
+    """
     lidar, outline = LidarChart(v, params, rows), Outline(v, local)
     shifted = lidar.param(SHIFTED)
     motions, half = Motion(v, motion, local, outline, shifted), _half(v, motion) + shifted

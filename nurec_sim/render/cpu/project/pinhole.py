@@ -71,10 +71,20 @@ def pinhole_box(v: Lanes, centre: list[Vector], axes: list[list[Vector]], k2: Ve
     scale = k2 * inverse * inverse
     bottom = scale * zz - 1
     crosses = (bottom > -1e-3) | (z <= 0)  # it reaches the plane of the camera
+    # Only used where the ellipsoid lies in front of the camera's plane; elsewhere the box is everything.
     divisor = 1 / bottom.min(-1e-3)
 
     def interval(along: Vector, own: Vector, mixed: Vector, focal: Vector, principal: Vector) -> tuple[Vector, Vector]:
         # With x = u z the discriminant is free of the cancelling m m^T products.
+        """Ends of the image along one axis, in pixels.
+
+        Args:
+            along: the centre's coordinate along the axis (m).
+            own: variance along the axis (m^2).
+            mixed: covariance with the depth (m^2).
+            focal: focal length in pixels.
+            principal: principal point in pixels.
+        """
         tangent = along * inverse
         half = scale * (mixed - tangent * zz)
         spread = scale * (own - tangent * mixed * 2 + tangent * tangent * zz)
@@ -83,7 +93,16 @@ def pinhole_box(v: Lanes, centre: list[Vector], axes: list[list[Vector]], k2: Ve
         return crosses.where(-EVERYWHERE, focal * low + principal), crosses.where(EVERYWHERE, focal * high + principal)
 
     def beyond(edge: Vector, sign: float, along: Vector, own: Vector, mixed: Vector) -> Mask:
-        """Whether an ellipsoid lies wholly outside of one side of the image."""
+        """Whether an ellipsoid lies wholly outside of one side of the image.
+
+        Args:
+            edge: tangent of the side, (pixel - principal point) / focal length.
+            sign: 1 where the image lies above the edge, -1 where below.
+            along: the centre's coordinate along the axis (m).
+            own: variance along the axis (m^2).
+            mixed: covariance with the depth (m^2).
+        """
+        # Distance from the side's plane against the ellipsoid's support along its normal, both unnormalised.
         height_over = (along - edge * z) * sign
         return (height_over < 0) & (height_over * height_over > k2 * (own - edge * mixed * 2 + edge * edge * zz))
 
@@ -91,11 +110,22 @@ def pinhole_box(v: Lanes, centre: list[Vector], axes: list[list[Vector]], k2: Ve
     gone = gone | beyond(-cy / fy, 1.0, y, yy, yz) | beyond((height - cy) / fy, -1.0, y, yy, yz)
     u0, u1 = interval(x, xx, xz, fx, cx)
     v0, v1 = interval(y, yy, yz, fy, cy)
+    # A finite box is clipped to the grid anyway; the sides only help where it is infinite.
     return PixelBox(u0, u1, v0, v1, crosses & gone)
 
 
 def macro_tiles(v: Lanes, box: PixelBox, view: ir.Value, target: ir.Value) -> ir.Value:
-    """Store the macro tiles of boxes; the mask of those that hold the centre of a cell."""
+    """Store the macro tiles of boxes.
+
+    Args:
+        v: vectors.
+        box: the boxes, in pixels.
+        view: address of ``records.view_parameters``.
+        target: address of [4,LANES] output: first and last column, first and last row of macro tiles.
+
+    Returns:
+        The mask of the boxes that hold the centre of a cell.
+    """
 
     def cells(low: Vector, high: Vector, size: Vector) -> tuple[Vector, Vector]:
         return (low - (0.5 + PAD)).ceil().max(0), (high - (0.5 - PAD)).floor().min(size - 1)
@@ -117,7 +147,17 @@ def _ellipsoid(v: Lanes, scratch: ir.Value) -> tuple[list[Vector], list[list[Vec
 
 @vector_kernel("iii")
 def pinhole_boxes(v: Lanes, scratch: ir.Value, view: ir.Value, target: ir.Value) -> ir.Value:
-    """Macro tiles of the group that ``place`` left, seen from the reference pose, and the mask of those seen."""
+    """Macro tiles of Gaussians seen from the reference pose.
+
+    Args:
+        v: vectors.
+        scratch: address of the group that ``place`` left.
+        view: address of ``records.view_parameters``.
+        target: address of [4,LANES] output, see ``macro_tiles``.
+
+    Returns:
+        The mask of those seen.
+    """
     return macro_tiles(v, pinhole_box(v, *_ellipsoid(v, scratch), view), view, target)
 
 
@@ -125,12 +165,22 @@ def pinhole_boxes(v: Lanes, scratch: ir.Value, view: ir.Value, target: ir.Value)
 def rolling_boxes(
     v: Lanes, scratch: ir.Value, view: ir.Value, ends: ir.Value, target: ir.Value, first: ir.Value, step: ir.Value
 ) -> ir.Value:
-    """The same for a shutter that rolls along y.
+    """Macro tiles of Gaussians seen through a shutter that rolls along y.
 
-    Gaussians are boxed from the poses at both ends of the exposure, ``ends`` [2,LINE_POSE]; in between, edges move
-    almost evenly. A Gaussian is seen by the rows of its boxes only, that is during the part of the exposure from
-    row v0 to row v1; ``first`` is the place of row 0 on the way and ``step`` that of a row, places being -0.5 and 0.5
-    at the ends.
+    Gaussians are boxed from the poses at both ends of the exposure; in between, edges move almost evenly. A Gaussian is
+    seen by the rows of its boxes only, that is during the part of the exposure from row v0 to row v1.
+
+    Args:
+        v: vectors.
+        scratch: address of the group that ``place`` left.
+        view: address of ``records.view_parameters``.
+        ends: address of [2,LINE_POSE]: line_from_reference at both ends of the exposure.
+        target: address of [4,LANES] output, see ``macro_tiles``.
+        first: place of row 0 on the sensor's way, which leads from -0.5 to 0.5.
+        step: the same per row.
+
+    Returns:
+        The mask of those seen.
     """
     centre, axes, k2 = _ellipsoid(v, scratch)
     boxes = []
@@ -143,11 +193,14 @@ def rolling_boxes(
     start, stop = boxes
     low, high = start.v0.min(stop.v0), start.v1.max(stop.v1)
     rate, offset = v.spread(step), v.spread(first) + 0.5
+    # As fractions of the way between the ends; one row more to either side.
     places = [(offset + rate * edge).max(0).min(1) for edge in (low - 1, high + 1)]
+    # Where an end has no finite box the rows do not bound the time, so the whole exposure counts.
     wild = (low < -EVERYWHERE / 2) | (high > EVERYWHERE / 2)
 
     def moved(a: Vector, b: Vector, larger: bool) -> Vector:
         between = [a + (b - a) * t for t in places]
+        # Edges move almost, not exactly, evenly.
         slack = (b - a).abs() * 0.02 + 0.1
         whole = a.max(b) if larger else a.min(b)
         part = between[0].max(between[1]) + slack if larger else between[0].min(between[1]) - slack
@@ -165,7 +218,17 @@ def rolling_boxes(
 
 @inner
 def take_features(block, sh_rest, number, lane, view, scratch, lidar):
-    """Fill in what the sensor sums up: colours (seen from the eye) or LiDAR values."""
+    """Write what the sensor sums up: colours (seen from the eye) or LiDAR values.
+
+    Args:
+        block: address of the group's first Gaussian in its block.
+        sh_rest: see ``pack.LayerBlocks``.
+        number: number of the block.
+        lane: place of the group's first Gaussian in the block.
+        view: address of ``records.view_parameters``.
+        scratch: address of the group's scratch; its FEATURES are written.
+        lidar: whether the features are those of a LiDAR.
+    """
     if lidar:
         lidar_features(block, scratch)
     elif sh_rest.shape[1] == 0:
