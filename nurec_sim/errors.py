@@ -1,4 +1,4 @@
-"""Every error that nurec_sim raises on purpose.
+"""All errors that nurec_sim raises deliberately.
 
 ::
 
@@ -12,13 +12,13 @@
     │   ├── OutOfRangeError    a time outside the scene               (gRPC OUT_OF_RANGE)
     │   ├── TooLargeError      more pixels or items than allowed      (gRPC RESOURCE_EXHAUSTED)
     │   ├── UnsupportedError   a procedure that this server lacks      (gRPC UNIMPLEMENTED)
-    │   └── NotAllowedError    what this server was told not to do     (gRPC PERMISSION_DENIED)
-    ├── SceneInUseError  a scene cannot be taken away now             (gRPC FAILED_PRECONDITION)
-    ├── CancelledError   work was cancelled: nobody waits for it      (gRPC CANCELLED)
+    │   └── NotAllowedError    not permitted by the server's options   (gRPC PERMISSION_DENIED)
+    ├── SceneInUseError  a scene cannot be removed while in use       (gRPC FAILED_PRECONDITION)
+    ├── CancelledError   work was cancelled, its result is not needed (gRPC CANCELLED)
     ├── DeadlinePassedError  the client's deadline passed before the answer  (gRPC DEADLINE_EXCEEDED)
-    ├── PlanError        a policy failed, or answered what cannot be driven  (gRPC ABORTED)
+    ├── PlanError        a policy failed, or its plan cannot be driven  (gRPC ABORTED)
     │   └── PolicyError        it raised, tried to end the process, or did not answer in time
-    ├── SessionError     a driving session lacks what it is asked for (gRPC FAILED_PRECONDITION)
+    ├── SessionError     a driving session lacks what was requested   (gRPC FAILED_PRECONDITION)
     │   ├── UnknownSessionError  no such session                      (gRPC NOT_FOUND)
     │   └── SessionExistsError   a session of that id is open         (gRPC ALREADY_EXISTS)
     ├── ScenarioError    a scenario file is wrong
@@ -28,12 +28,12 @@
     ├── TrainingError    a recipe, its data or its checkpoints are wrong
     └── WriteError       a file or a folder cannot be written (an OSError too)
 
-Texts say what was wrong, what was given and what is allowed.
+Error texts state what was wrong, what was given and what is allowed.
 """
 
 
 class NurecSimError(Exception):
-    """Base of all errors raised on purpose; catch it to tell them from bugs."""
+    """Base of all deliberate errors; catching it separates them from bugs."""
 
 
 class ClipError(NurecSimError):
@@ -57,7 +57,7 @@ class RequestError(NurecSimError):
 
 
 class UnknownSceneError(RequestError):
-    """No scene of that name is served."""
+    """No scene with that name is served."""
 
 
 class OutOfRangeError(RequestError):
@@ -69,27 +69,27 @@ class TooLargeError(RequestError):
 
 
 class UnsupportedError(RequestError):
-    """A procedure that the interface knows and this server does not offer."""
+    """A procedure of the interface that this server does not implement."""
 
 
 class SceneInUseError(NurecSimError):
-    """A scene cannot be taken away while somebody uses it."""
+    """A scene cannot be removed while it is in use."""
 
 
 class CancelledError(NurecSimError):
-    """Work was cancelled: nobody waits for its result any more."""
+    """Work was cancelled: its result is no longer needed."""
 
 
 class DeadlinePassedError(NurecSimError):
-    """The time that a client, or a server, allows passed before there was an answer."""
+    """The deadline of a client or a server passed before the response was ready."""
 
 
 class NotAllowedError(RequestError):
-    """Something that this server could do and was started without permission for."""
+    """An operation that the server implements, but was not started with permission for."""
 
 
 class PlanError(NurecSimError):
-    """A policy failed, or answered something that cannot be driven."""
+    """A policy failed, or returned a plan that cannot be driven."""
 
 
 class PolicyError(PlanError):
@@ -97,15 +97,15 @@ class PolicyError(PlanError):
 
 
 class SessionError(NurecSimError):
-    """A driving session lacks what it is asked for."""
+    """A driving session lacks what was requested."""
 
 
 class UnknownSessionError(SessionError):
-    """No driving session of that id is open."""
+    """No driving session with that id is open."""
 
 
 class SessionExistsError(SessionError):
-    """A driving session of that id is open already."""
+    """A driving session with that id is already open."""
 
 
 class ScenarioError(NurecSimError):

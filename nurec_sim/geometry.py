@@ -19,6 +19,7 @@ def quat_normalize(quat_wxyz: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray
     if not np.isfinite(norm).all() or (norm < 1e-12).any():
         raise ValueError("a quaternion must be finite and not zero")
     quat = quat / norm
+    # q and -q are the same rotation; w >= 0 makes equal rotations compare equal.
     return np.where(quat[..., :1] < 0, -quat, quat)
 
 
@@ -76,9 +77,11 @@ def slerp(
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     fraction = np.asarray(fraction, np.float64)[..., None]
     dot = np.sum(a * b, axis=-1, keepdims=True)
+    # q and -q are one rotation: of both arcs to it, the shorter one.
     b = np.where(dot < 0, -b, b)
     # |b - a| keeps the angle accurate where arccos of the dot product would lose it.
     angle = 2 * np.arcsin(np.clip(np.linalg.norm(b - a, axis=-1, keepdims=True) / 2, 0.0, 1.0))
+    # sin(angle) vanishes for equal rotations; there the weights go over into linear ones.
     small = angle < 1e-9
     sine = np.where(small, 1.0, np.sin(angle))
     wa = np.where(small, 1 - fraction, np.sin((1 - fraction) * angle) / sine)
@@ -112,16 +115,19 @@ def is_rotation(rotation: Float64[np.ndarray, "3 3"], tolerance: float = 1e-3) -
 def are_rotations(rotations: Float64[np.ndarray, "n 3 3"], tolerance: float = 1e-3) -> Bool[np.ndarray, " n"]:
     """``is_rotation`` of many matrices."""
     m = np.asarray(rotations, np.float64)
+    # First the magnitude, so that nothing below overflows.
     sound = np.asarray(
         (np.abs(m) < 2).all(axis=(1, 2))
-    )  # NaN is not; larger entries are none of a rotation, and may overflow
+    )  # false for NaN; entries of a rotation are at most 1, and larger ones may overflow
     m = np.where(sound[:, None, None], m, 0.0)
-    # Entry by entry over all matrices: numpy's product and determinant of many small ones take ten times as long.
+    # Elementwise over all matrices: numpy's matmul and det on many small matrices take ten times as long.
     a, b, c = rows = np.ascontiguousarray(m.transpose(1, 2, 0))
+    # Rows must be orthonormal: m m^T = identity, of which the lower triangle is enough.
     for i in range(3):
         for j in range(i + 1):
             u, v = rows[i], rows[j]
             sound &= np.abs(u[0] * v[0] + u[1] * v[1] + u[2] * v[2] - (i == j)) <= tolerance
+    # An orthonormal matrix with a negative determinant is a reflection.
     determinant = (
         a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
     )
@@ -132,7 +138,7 @@ def are_rotations(rotations: Float64[np.ndarray, "n 3 3"], tolerance: float = 1e
 
 
 def pose(rotation: Float64[np.ndarray, "3 3"], translation: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "4 4"]:
-    """A 4x4 from its parts."""
+    """A 4x4 transform from its rotation and translation."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = translation
@@ -140,12 +146,19 @@ def pose(rotation: Float64[np.ndarray, "3 3"], translation: Float64[np.ndarray, 
 
 
 def pose_from_xyyaw(x: float, y: float, yaw_rad: float, z: float = 0.0) -> Float64[np.ndarray, "4 4"]:
-    """A planar pose."""
+    """The pose of a planar placement: rotated about z only.
+
+    Args:
+        x: position along x, metres.
+        y: position along y, metres.
+        yaw_rad: heading about z, counter-clockwise from x.
+        z: height, metres.
+    """
     return pose(rotation_from_yaw(yaw_rad), np.array([x, y, z]))
 
 
 def inverse(transform: Float64[np.ndarray, "*n 4 4"]) -> Float64[np.ndarray, "*n 4 4"]:
-    """Inverse of rigid transforms."""
+    """Inverse of rigid transforms: the transposed rotation, not a general matrix inverse."""
     m = np.asarray(transform, np.float64)
     rotation = np.swapaxes(m[..., :3, :3], -1, -2)
     result = np.zeros_like(m)
@@ -171,11 +184,13 @@ def interpolate_poses(
     if len(t_us) == 1:
         return np.broadcast_to(poses[0], (*query.shape, 4, 4)).copy()
     clamped = np.clip(flat, t_us[0], t_us[-1])
+    # Index of the pose before each time; the last time belongs to the last interval.
     low = np.clip(np.searchsorted(t_us, clamped, side="right") - 1, 0, len(t_us) - 2)
     fraction = (clamped - t_us[low]) / (t_us[low + 1] - t_us[low])
     before, after = poses[low], poses[low + 1]
     result = before.copy()
     result[:, :3, 3] += fraction[:, None] * (after[:, :3, 3] - before[:, :3, 3])
+    # Slerp only where the rotation changes: it is the expensive part, and the others stay exact.
     turning = np.flatnonzero((before[:, :3, :3] != after[:, :3, :3]).any(axis=(1, 2)) & (fraction > 0))
     if len(turning):
         quats = slerp(
@@ -226,6 +241,7 @@ def box_corners_xy(
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
     left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1)
     signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * 0.5
+    # Length along the heading, width to its left; roll and pitch are ignored.
     offsets = signs[:, :1] * length_m * forward[..., None, :] + signs[:, 1:] * width_m * left[..., None, :]
     return m[..., None, :2, 3] + offsets
 
@@ -246,19 +262,22 @@ def arc_length(points: Float64[np.ndarray, "k d"]) -> Float64[np.ndarray, " k"]:
 def project_to_polyline(
     points: Float64[np.ndarray, "n 2"], line: Float64[np.ndarray, "k 2"]
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Arc length of the nearest place on a polyline, and the signed distance to it (left positive)."""
+    """Arc length of the nearest point on a polyline, and the signed distance to it (left positive)."""
     points, line = np.atleast_2d(np.asarray(points, np.float64)), np.asarray(line, np.float64)
     if len(line) < 2:
         raise ValueError(f"a polyline needs at least 2 points, got {len(line)}")
     start, step = line[:-1], np.diff(line, axis=0)
     length = np.linalg.norm(step, axis=1)
+    # Repeated vertices give segments of length 0, whose nearest point is their start.
     safe = np.where(length > 0, length, 1.0)
     offset = points[:, None] - start[None]
+    # Foot of the perpendicular on each segment, as a fraction of it; clamped to the segment's ends.
     along = np.clip(np.sum(offset * step, axis=2) / safe**2, 0.0, 1.0)
     rest = offset - along[..., None] * step
     distance = np.linalg.norm(rest, axis=2)
     best = np.argmin(distance, axis=1)
     rows = np.arange(len(points))
+    # The sign of the cross product tells the side: positive is left of the direction of travel.
     cross = step[best, 0] * offset[rows, best, 1] - step[best, 1] * offset[rows, best, 0]
     s = arc_length(line)[best] + along[rows, best] * length[best]
     return s, np.where(cross < 0, -1.0, 1.0) * distance[rows, best]
@@ -275,9 +294,10 @@ def cubemap_directions(size: int, rim: int = 0) -> Float64[np.ndarray, "6 n n 3"
 
     Args:
         size: texels along the edge of a face.
-        rim: that many more on each side, in the plane of their face; ``n = size + 2 rim``.
+        rim: additional texels on each side, in the plane of their face; ``n = size + 2 rim``.
     """
     gl = _opengl_texels(size, rim)
+    # Inverse of x = -y_world, y = z_world, z = -x_world.
     world = np.stack([-gl[..., 2], -gl[..., 0], gl[..., 1]], axis=-1)
     return world / np.linalg.norm(world, axis=-1, keepdims=True)
 
@@ -285,8 +305,8 @@ def cubemap_directions(size: int, rim: int = 0) -> Float64[np.ndarray, "6 n n 3"
 def released_cubemap_directions(size: int) -> Float64[np.ndarray, "6 size size 3"]:
     """Directions of the texel centres of a cubemap as the released network and its sky files lay it out.
 
-    Faces +X -X -Y +Y +Z -Z of the frame that the cubemap is in, whatever that is: OpenGL's layout with y turned
-    round, made for camera frames (x right, y down, z forward), in which every face is upright.
+    Faces +X -X -Y +Y +Z -Z of the cubemap's own frame, whichever that is: OpenGL's layout with y flipped, designed
+    for camera frames (x right, y down, z forward), in which every face is upright.
     """
     direction = _opengl_texels(size) * np.array([1.0, -1.0, 1.0])
     return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
@@ -297,6 +317,7 @@ def _opengl_texels(size: int, rim: int = 0) -> Float64[np.ndarray, "6 n n 3"]:
     c = (np.arange(-rim, size + rim) + 0.5) / size * 2 - 1
     t, s = np.meshgrid(c, c, indexing="ij")
     one = np.ones_like(s)
+    # OpenGL specification, cube map face selection: the major axis, then sc and tc solved for the other two.
     faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
     return np.stack([np.stack(face, axis=-1) for face in faces])
 
@@ -306,8 +327,10 @@ def cubemap_coordinates(
 ) -> tuple[Int64[np.ndarray, "*n"], Float64[np.ndarray, "*n"], Float64[np.ndarray, "*n"]]:
     """Face index and coordinates (column s, row t, both 0..1) where world directions meet the cube."""
     d = np.asarray(direction, np.float64)
+    # World to GL axes.
     x, y, z = -d[..., 1], d[..., 2], -d[..., 0]
     ax, ay, az = np.abs(x), np.abs(y), np.abs(z)
+    # The axis of largest magnitude selects the face; strict and weak comparisons settle ties one way.
     face = np.where((ax >= ay) & (ax >= az), np.where(x > 0, 0, 1), 0)
     face = np.where((ay > ax) & (ay >= az), np.where(y > 0, 2, 3), face)
     face = np.where((az > ax) & (az > ay), np.where(z > 0, 4, 5), face)

@@ -27,6 +27,7 @@ def source_digest(module: str, salt: str = "") -> str:
     Kernels import functions and constants from their defining module, not from a re-exporting package (tested), so
     packages themselves are excluded.
     """
+    # Depth-first over the import graph; modules reached twice are hashed once.
     names, seen, digest = [module], set(), hashlib.sha256(salt.encode())
     while names:
         name = names.pop()
@@ -45,6 +46,7 @@ def entry_point(function: Callable, salt: str = "", **options: Any) -> Callable:
 
     ``salt`` is anything else that its machine code depends on.
     """
+    # Numba builds the file name of its cache from the qualified name.
     function.__qualname__ += f"_{source_digest(function.__module__, salt)}"
     try:
         return njit(cache=True, **options)(function)
@@ -53,7 +55,7 @@ def entry_point(function: Callable, salt: str = "", **options: Any) -> Callable:
 
 
 def kernel(function: Callable) -> Callable:
-    """An entry point with default (strict) arithmetic."""
+    """An entry point with default (strict IEEE) arithmetic, releasing the GIL."""
     return entry_point(function, nogil=True)
 
 

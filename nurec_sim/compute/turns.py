@@ -1,8 +1,7 @@
-"""How long work lets others have their turn.
+"""Cooperative scheduling: long computations yield to others at safe points.
 
-Work that takes more than a few milliseconds calls ``rest`` in between. Where somebody shares out the machine
-(``render_queue``), it then waits until it may go on, or ends because nobody wants its result any more; elsewhere the
-call does nothing.
+Work that takes more than a few milliseconds calls ``rest`` at intervals. Under a scheduler (``render_queue``) the call
+blocks until the work may resume, or raises because its result is no longer needed; without one it does nothing.
 """
 
 from __future__ import annotations
@@ -14,55 +13,57 @@ from typing import Protocol
 
 
 class Turn(Protocol):
-    """The turn of one piece of work."""
+    """The time slice of one piece of work."""
 
     @property
     def is_over(self) -> bool:
-        """Whether it should stop soon, to go on later or never; cheap, from any thread."""
+        """Whether the work should yield soon; cheap, callable from any thread."""
         ...
 
     def rest(self) -> None:
-        """Returns when it may go on; from the thread that the work was begun in.
+        """Blocks until the work may resume; must be called from the thread that started it.
 
         Raises:
-            CancelledError: nobody waits for the result any more.
-            DeadlinePassedError: the client has stopped waiting.
+            CancelledError: the result is no longer needed.
+            DeadlinePassedError: the client's deadline has passed.
         """
         ...
 
     def aside(self) -> contextlib.AbstractContextManager[None]:
-        """Lets somebody else have the place while work goes on that cannot rest."""
+        """Releases the slot for the duration of the block, for work that cannot yield."""
         ...
 
 
 turn_of_thread: ContextVar[Turn | None] = ContextVar("turn", default=None)
-"""The turn of the work that runs in this thread, set by whoever shares out the machine; None if nobody does."""
+"""The turn of the work that runs in this thread, set by the scheduler; None without one."""
 
 
 def current_turn() -> Turn | None:
-    """The turn of the work that runs in this thread; None if nobody shares out the machine."""
+    """The turn of the work that runs in this thread; None without a scheduler."""
     return turn_of_thread.get()
 
 
 def rest() -> None:
-    """Lets others have their turn if this one is over.
+    """Yields to other work if this turn is over.
 
     Raises:
         CancelledError, DeadlinePassedError: see ``Turn.rest``.
     """
     turn = turn_of_thread.get()
+    # ``is_over`` is a cheap flag, so that kernels can call this between small strips of work.
     if turn is not None and turn.is_over:
         turn.rest()
 
 
 @contextlib.contextmanager
 def aside() -> Iterator[None]:
-    """See ``Turn.aside``; without effect where nobody shares out the machine. Inside, ``rest`` does nothing."""
+    """See ``Turn.aside``; no effect without a scheduler. Inside the block, ``rest`` does nothing."""
     turn = turn_of_thread.get()
     if turn is None:
         yield
         return
     with turn.aside():
+        # Without a turn, a nested ``rest`` cannot block on the slot that was just released.
         token = turn_of_thread.set(None)
         try:
             yield

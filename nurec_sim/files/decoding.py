@@ -1,7 +1,7 @@
-"""What comes from outside, decoded within limits that are checked before memory is taken.
+"""Decoding of untrusted input within limits that are checked before memory is allocated.
 
-A few bytes can ask for gigabytes: an array by the shape in its header, an archive by deflating zeros, a picture by its
-size, a text by what each of its letters becomes as an object. Here is how much is granted, for every reader.
+A few bytes can request gigabytes: an array by the shape in its header, an archive by compressed zeros, an image by its
+size, a text by the objects that its characters become. The limits here apply to all readers.
 """
 
 from __future__ import annotations
@@ -24,60 +24,62 @@ _CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class Limits:
-    """How much of each kind is decoded; what a driving log or a scene needs is well below."""
+    """Maximum sizes of decoded input; driving logs and scenes stay well below them."""
 
     file_bytes: int = 1 << 30
-    """Of one file of a clip."""
+    """One file of a clip."""
     growth: int = 64
-    """Times its packed length that something may unpack to, beside ``free_bytes``."""
+    """Maximum expansion ratio of compressed data, in addition to ``free_bytes``."""
     free_bytes: int = 64 << 20
     directory_bytes: int = 16 << 20
-    """Of the list of members of a ZIP file: some 150,000 of them, which become ten times that in memory."""
+    """The central directory of a ZIP file: some 150,000 members, which take ten times as much memory."""
     array_bytes: int = 128 << 20
-    """Of all arrays of one ``.npz`` file together."""
+    """All arrays of one ``.npz`` file together."""
     sweep_points: int = 1 << 21
-    """Of one LiDAR sweep; a point takes up to 400 bytes while its motion is compensated."""
+    """Points of one LiDAR sweep; each takes up to 400 bytes during motion compensation."""
     image_pixels: int = 7680 * 4320
-    """Of one picture, as many as the renderer draws; three bytes each."""
+    """Pixels of one image, the renderer's own maximum; three bytes each."""
     json_bytes: int = 128 << 20
     json_values: int = 8_000_000
-    """Numbers, texts, lists and objects of one JSON text; 30 to 70 bytes each."""
+    """Numbers, strings, lists and objects of one JSON text; 30 to 70 bytes each."""
     xml_bytes: int = 128 << 20
     xml_tags: int = 4_000_000
-    """Beginnings and ends of elements of one XML text; 100 to 400 bytes each."""
+    """Start and end tags of one XML text; 100 to 400 bytes each."""
     msgpack_values: int = 1 << 18
-    """Names, settings and shapes; arrays are one value each."""
+    """Names, settings and shapes; an array counts as one value."""
     table_rows: int = 1 << 20
-    """Of one parquet table."""
+    """Rows of one parquet table."""
     yaml_bytes: int = 1 << 18
-    """YAML takes a thousand bytes of memory for some of its letters, and a long time."""
+    """Some characters of YAML take a thousand bytes of memory each to parse, and much time."""
 
 
 LIMITS = Limits()
 
 
 class TooMuchError(ValueError):
-    """More than ``Limits`` allow. The text goes on from the name of what was read: "promises ..., at most ..."."""
+    """More than ``Limits`` allow. The text continues a sentence that begins with the input's name: "promises ..."."""
 
 
 # --------------------------------------------------------------------------------------------------------------- zip
 
 
 def check_directory(file: BinaryIO) -> None:
-    """Whether the list of members of a ZIP file is short enough to be read; the file's position is lost.
+    """Checks that the central directory of a ZIP file is small enough to be read; the file is left at its start.
 
-    What is no ZIP file passes: who opens it next will say so.
+    Files that are not ZIP archives pass: opening them will fail with a proper error.
 
     Raises:
-        TooMuchError: it is not.
+        TooMuchError: it is too large.
     """
     size = file.seek(0, io.SEEK_END)
-    start = max(0, size - _ZIP_END.size - (1 << 16))  # a comment of 64 KiB may follow it
+    start = max(0, size - _ZIP_END.size - (1 << 16))  # a comment of up to 64 KiB may follow it
     file.seek(start)
     tail = file.read()
+    # End-of-central-directory record (APPNOTE 4.3.16), searched backwards as every reader does.
     at = tail.rfind(b"PK\5\6")
     if 0 <= at <= len(tail) - _ZIP_END.size:
         directory = _ZIP_END.unpack_from(tail, at)[5]
+        # A ZIP64 locator (4.3.15) directly before it points to the 64-bit record, whose size field then counts.
         place = at - _ZIP64_PLACE.size
         if place >= 0 and tail[place : place + 4] == b"PK\6\7":
             file.seek(min(_ZIP64_PLACE.unpack_from(tail, place)[2], size))
@@ -90,15 +92,15 @@ def check_directory(file: BinaryIO) -> None:
 
 
 def unpacked_limit(packed_bytes: int) -> int:
-    """Bytes that something packed may unpack to."""
+    """Maximum size that compressed data of a given size may expand to."""
     return LIMITS.growth * packed_bytes + LIMITS.free_bytes
 
 
 def check_member(info: zipfile.ZipInfo, most_bytes: int) -> None:
-    """Whether a member of a ZIP file says that it may be unpacked; ``zipfile`` reads no more than it says.
+    """Checks the declared size of a ZIP member; ``zipfile`` never reads more than the declared size.
 
     Raises:
-        TooMuchError: it is too large, or grows too much.
+        TooMuchError: it is too large, or its expansion ratio is.
     """
     if info.file_size > most_bytes:
         raise TooMuchError(f"unpacks to {info.file_size} bytes; at most {most_bytes} are allowed")
@@ -110,14 +112,14 @@ def check_member(info: zipfile.ZipInfo, most_bytes: int) -> None:
 
 
 def npz_arrays(data: bytes) -> dict[str, np.ndarray]:
-    """The arrays of an ``.npz`` file, packed or not; nothing in it is unpickled.
+    """The arrays of an ``.npz`` file, compressed or stored; nothing in it is unpickled.
 
-    Every header is read and counted before memory is taken for what it promises.
+    Every header is read and counted before memory is allocated for its array.
 
     Raises:
         TooMuchError: the arrays are larger than allowed.
-        ValueError: a member is no array of plain values, or holds less than it promises.
-        zipfile.BadZipFile, zlib.error and whatever else ``zipfile`` raises: the file is damaged.
+        ValueError: a member is not an array of plain values, or holds fewer bytes than declared.
+        zipfile.BadZipFile, zlib.error and other errors of ``zipfile``: the file is damaged.
     """
     arrays: dict[str, np.ndarray] = {}
     total = 0
@@ -128,6 +130,7 @@ def npz_arrays(data: bytes) -> dict[str, np.ndarray]:
             name = info.filename.removesuffix(".npy")
             with package.open(info) as member:
                 shape, fortran_order, dtype = _npy_header(member, name)
+                # At least one byte per element: items of size 0 (``S0``) would allow any shape.
                 total += math.prod(shape) * max(dtype.itemsize, 1)
                 if total > LIMITS.array_bytes:
                     raise TooMuchError(
@@ -154,7 +157,7 @@ def _npy_header(member: Any, name: str) -> tuple[tuple[int, ...], bool, np.dtype
 
 
 def _fill(member: Any, array: np.ndarray, name: str) -> None:
-    """Reads an array's values in pieces, so that only what is there takes memory."""
+    """Reads an array's values in chunks: pages of the array beyond the available data are never touched."""
     if not array.nbytes:
         return
     target, at = array.reshape(-1).view(np.uint8).data, 0
@@ -172,13 +175,14 @@ def _fill(member: Any, array: np.ndarray, name: str) -> None:
 
 
 def image_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a PNG or JPEG file by its header; nothing is decoded.
+    """Width and height of a PNG or JPEG file from its header; no pixels are decoded.
 
     Raises:
-        ValueError: it is neither, or ends early, or has no pixels. The text goes on from the file's name.
+        ValueError: neither format, truncated, or no pixels. The text continues a sentence begun by the file's name.
     """
     size: tuple[int, int] | None
     if data.startswith(_PNG):
+        # IHDR is the first chunk: 8 bytes of signature, 4 of length, its name, then width and height.
         header, complete = data[12:24], b"IEND" in data[-64:]
         size = struct.unpack(">II", header[4:]) if len(header) == 12 and header.startswith(b"IHDR") else None
     elif data.startswith(_JPEG):
@@ -194,7 +198,7 @@ def image_size(data: bytes) -> tuple[int, int]:
 
 
 def check_image(data: bytes, most_pixels: int | None = None) -> tuple[int, int]:
-    """Width and height of a picture that is small enough to be decoded.
+    """Width and height of an image, if it is small enough to be decoded.
 
     Raises:
         TooMuchError: it has more than ``most_pixels``, or ``Limits.image_pixels``.
@@ -214,6 +218,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
         if marker == 0xFF:  # fill byte
             at += 1
             continue
+        # SOFn segment: length (2), precision (1), height (2), width (2), big-endian.
         if 0xC0 <= marker <= 0xCF and marker not in _NO_JPEG_SIZE:
             height, width = struct.unpack_from(">HH", data, at + 5)
             return width, height
@@ -225,13 +230,14 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def check_json(data: bytes) -> None:
-    """Whether a JSON text is short enough to be parsed, or for us to write.
+    """Checks that a JSON text is small enough to be parsed, or to be written by us.
 
     Raises:
-        TooMuchError: it is too long or holds too much.
+        TooMuchError: too many bytes or values.
     """
     if len(data) > LIMITS.json_bytes:
         raise TooMuchError(f"has {len(data):,} bytes; at most {LIMITS.json_bytes:,} are read")
+    # An upper bound without parsing: every value follows one of these characters, or is the root.
     values = 1 + sum(data.count(mark) for mark in (b",", b":", b"[", b"{"))
     if values > LIMITS.json_values:
         raise TooMuchError(f"holds up to {values:,} values; at most {LIMITS.json_values:,} are read")
@@ -242,20 +248,21 @@ def json_value(data: bytes, **hooks: Any) -> Any:
 
     Raises:
         TooMuchError: see ``check_json``.
-        ValueError, RecursionError: it is no JSON, or nested too deeply.
+        ValueError, RecursionError: not JSON, or nested too deeply.
     """
     check_json(data)
     return json.loads(data.decode("utf-8"), **hooks)
 
 
 def check_xml(data: bytes) -> None:
-    """Whether an XML text is short enough to be parsed.
+    """Checks that an XML text is small enough to be parsed.
 
     Raises:
         TooMuchError: it is not.
     """
     if len(data) > LIMITS.xml_bytes:
         raise TooMuchError(f"has {len(data):,} bytes; at most {LIMITS.xml_bytes:,} are read")
+    # Upper bounds without parsing: every tag has a "<", every attribute a "=".
     tags, attributes = data.count(b"<"), data.count(b"=")
     if max(tags, attributes // 4) > LIMITS.xml_tags:
         raise TooMuchError(
@@ -265,11 +272,11 @@ def check_xml(data: bytes) -> None:
 
 
 def msgpack_value(data: bytes) -> Any:
-    """The value of a msgpack object made of plain values, counted while it is read.
+    """The value of a msgpack object of plain values, which are counted while they are read.
 
     Raises:
         TooMuchError: it holds too many values.
-        ValueError, TypeError, RecursionError, msgpack.UnpackException: no such object, or nested too deeply.
+        ValueError, TypeError, RecursionError, msgpack.UnpackException: not such an object, or nested too deeply.
     """
     import msgpack
 
@@ -286,6 +293,7 @@ def msgpack_value(data: bytes) -> Any:
 
     def read() -> Any:
         nonlocal left
+        # fixarray 0x90..0x9f, array16/32 0xdc/0xdd; fixmap 0x80..0x8f, map16/32 0xde/0xdf (msgpack specification).
         kind = data[unpacker.tell()] if unpacker.tell() < size else None
         if kind is not None and (0x90 <= kind <= 0x9F or kind in (0xDC, 0xDD)):
             count = unpacker.read_array_header()

@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all, and errors of the disk as one line that says what could not be written."""
+"""Atomic file writes, and disk errors as one line that names what could not be written."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _ADVICE = {
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.EIO: f"the disk may be damaged; {_ELSEWHERE}",
 }
-"""What to do, by what went wrong; errors of other kinds are not the disk's."""
+"""Advice by errno; other errnos are not disk errors and are not converted."""
 
 
 @contextlib.contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """Errors of the disk in the block become a ``WriteError`` that names ``path``; others pass.
+    """Converts disk errors in the block to a ``WriteError`` that names ``path``; other errors propagate.
 
     Raises:
         WriteError: the disk is full, the place is read-only or not allowed, a file or a folder is in the way.
@@ -44,7 +44,7 @@ def writing(path: Path | str) -> Iterator[None]:
         raise
     except OSError as error:
         number = error.errno
-        if number is None and "requested and" in str(error):  # what numpy's tofile says where a disk is full
+        if number is None and "requested and" in str(error):  # numpy's tofile reports a full disk without an errno
             number = errno.ENOSPC
         if number not in _ADVICE:
             raise
@@ -53,12 +53,12 @@ def writing(path: Path | str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def new_file(path: Path) -> Iterator[BinaryIO]:
-    """Opens a temporary file beside ``path`` that takes its name when the block ends well, and is removed otherwise.
+    """Opens a temporary file beside ``path`` that is renamed to it when the block succeeds, and removed otherwise.
 
-    The folder is made if need be; a file that has the name is replaced. A device, such as ``/dev/null``, is written to.
+    Missing folders are created; an existing file is replaced. A device, such as ``/dev/null``, is written directly.
 
     Raises:
-        WriteError: it cannot be written; a file that had the name is as it was.
+        WriteError: it cannot be written; an existing file is left unchanged.
     """
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,12 +68,15 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
             with path.open("wb") as device:
                 yield device
             return
+        # In the same folder, hence on the same file system: only there is the rename atomic.
         handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
         try:
             with os.fdopen(handle, "wb") as file:
                 yield file
                 file.flush()
+                # Contents before the name: otherwise a crash could leave an empty file under the final name.
                 os.fsync(file.fileno())
+            # mkstemp creates files with mode 0600.
             os.chmod(temporary, 0o644)
             os.replace(temporary, path)
         except BaseException:
@@ -83,7 +86,7 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_file(path: Path, content: bytes | str) -> None:
-    """Writes a whole file in one step; text as UTF-8.
+    """Writes a file atomically; text as UTF-8.
 
     Raises:
         WriteError: see ``new_file``.
@@ -94,10 +97,10 @@ def write_file(path: Path, content: bytes | str) -> None:
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A folder for the time of the block; errors of its disk in the block name ``$TMPDIR``.
+    """A folder that exists for the duration of the block; disk errors in the block name ``$TMPDIR``.
 
     Raises:
-        WriteError: it cannot be made, or takes no more.
+        WriteError: it cannot be created, or its disk is full.
     """
     try:
         place = tempfile.gettempdir()
@@ -109,7 +112,7 @@ def temporary_folder() -> Iterator[Path]:
 
 
 def check_writable(path: Path, *, folder: bool = False) -> None:
-    """Looks whether a file, or a folder, could be written here, so that long work is not in vain; makes nothing.
+    """Checks that a file or a folder could be written here, before long computations start; creates nothing.
 
     Raises:
         WriteError: it could not.
@@ -122,6 +125,7 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
             if place.is_dir():
                 _refuse(errno.EISDIR)
             place = place.parent
+        # The nearest existing folder decides: missing ones below it are created later.
         while not place.exists() and place != place.parent:
             place = place.parent
         if not place.is_dir():
@@ -131,7 +135,7 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes the names of a folder's files survive a loss of power."""
+    """Flushes a folder's directory entries to disk, so that they survive a power failure."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

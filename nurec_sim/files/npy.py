@@ -11,22 +11,22 @@ from nurec_sim.errors import ArchiveError
 
 
 def npy_bytes(array: np.ndarray) -> bytes:
-    """An array in format version 1.0."""
+    """An array encoded as ``.npy``, format version 1.0."""
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, np.asarray(array, order="C"), version=(1, 0), allow_pickle=False)
     return buffer.getvalue()
 
 
 def array_from_npy(data: bytes, where: str, kinds: str = "iuf") -> np.ndarray:
-    """The array; its size is checked against the bytes that are there before memory is taken.
+    """Decodes an array; its declared size is checked against the available bytes before memory is allocated.
 
     Args:
         data: the file, of format version 1.0.
-        where: what to call it in errors.
-        kinds: NumPy's letters of the kinds of values allowed.
+        where: name of the file in error texts.
+        kinds: allowed NumPy dtype kinds, one letter each.
 
     Raises:
-        ArchiveError: no such file, other values, Fortran order, or not as many bytes as promised.
+        ArchiveError: not an array file, a dtype of another kind, Fortran order, or fewer or more bytes than declared.
     """
     buffer = io.BytesIO(data)
     try:
@@ -40,6 +40,7 @@ def array_from_npy(data: bytes, where: str, kinds: str = "iuf") -> np.ndarray:
             f"{where} must hold plain {'numbers' if kinds == 'iuf' else 'values'} in C order, got {dtype}"
         )
     body = data[buffer.tell() :]
+    # In Python integers: a crafted shape would overflow int64 and pass the comparison.
     if int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize != len(body):
         raise ArchiveError(f"{where} promises {dtype} {shape} but holds {len(body):,} bytes")
     return np.frombuffer(body, dtype).reshape(shape).copy()

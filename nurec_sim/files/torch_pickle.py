@@ -1,9 +1,9 @@
-"""What a pickle of tensors says, found without unpickling: nothing is imported, called or built.
+"""Reads a pickle of tensors without unpickling: nothing is imported, called or constructed.
 
-``torch.save`` writes a pickle that names its tensors, and their values beside it. Training files hold objects of other
-programs as well, so that ``torch.load(weights_only=True)`` refuses them, and unpickling would run whatever they say.
-This reader follows the pickle's instructions over plain values only. Lists, dictionaries with text keys and the places
-of tensors survive; every object, class and call turns into ``OTHER``.
+``torch.save`` writes a pickle that names its tensors, and their values beside it. Training files also hold objects of
+other programs, which ``torch.load(weights_only=True)`` refuses and which would run arbitrary code when unpickled.
+This reader interprets the pickle's opcodes over plain values only. Lists, dictionaries with string keys and references
+to tensors survive; every object, class and call becomes ``OTHER``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 OTHER: Final = object()
-"""Stands for everything in a pickle that is neither a plain value nor a tensor."""
+"""Placeholder for everything in a pickle that is neither a plain value nor a tensor."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,14 @@ _OTHER_VALUES = {"EMPTY_SET", "EXT1", "EXT2", "EXT4", "PERSID", "NEXT_BUFFER"}
 
 
 def read_tensor_pickle(data: bytes) -> object:
-    """The pickled value with ``StoredTensor`` for tensors and ``OTHER`` for whatever else is no plain value.
+    """The pickled value, with ``StoredTensor`` for tensors and ``OTHER`` for everything else that is not a plain value.
 
-    Takes time and memory in proportion to the length of ``data``, whatever it says.
+    Time and memory are proportional to the length of ``data``, whatever its contents.
 
     Raises:
-        ValueError: the pickle is cut off or malformed, or its tensors are.
+        ValueError: the pickle is truncated or malformed, or its tensors are.
     """
+    # The pickle machine: a stack, marks on it that delimit argument lists, and a memo of shared values.
     stack: list[Any] = []
     marks: list[int] = []
     memo: dict[Any, Any] = {}
@@ -120,6 +121,7 @@ def read_tensor_pickle(data: bytes) -> object:
                 stack.append(OTHER)
             elif name in _DROP_TO_MARK:
                 from_mark()
+            # BUILD would set the state of an object: the object, ``OTHER``, stays, its state is dropped.
             elif name in ("BUILD", "POP"):
                 stack.pop()
             elif name == "DUP":
@@ -137,17 +139,17 @@ def read_tensor_pickle(data: bytes) -> object:
                 stack.append(OTHER)
             elif name == "BINPERSID":
                 stack.append(_stored_values(stack.pop()))
-            elif code.arg is not None:  # what is left with an argument are numbers, texts and bytes
+            elif code.arg is not None:  # the remaining opcodes with an argument push numbers, strings and bytes
                 stack.append(argument)
             else:
                 raise ValueError(f"unknown instruction {name}")
-    except (IndexError, KeyError, OverflowError, DeprecationWarning) as error:  # the last of texts with odd escapes
+    except (IndexError, KeyError, OverflowError, DeprecationWarning) as error:  # the last: invalid escapes
         raise ValueError(f"malformed: {type(error).__name__}") from error
     raise ValueError("cut off")
 
 
 def _fill(target: object, items: list[Any]) -> object:
-    """Sets ``items`` (key, value, key, ...). Keys that are no texts become ``OTHER``: hashing them could take long."""
+    """Sets ``items`` (key, value, key, ...). Other keys than strings become ``OTHER``: hashing them may be slow."""
     if isinstance(target, dict):
         for key, value in zip(items[::2], items[1::2], strict=True):
             target[key if isinstance(key, str) else OTHER] = value
@@ -155,7 +157,7 @@ def _fill(target: object, items: list[Any]) -> object:
 
 
 def _instead_of_call(called: object, arguments: object) -> object:
-    """What stands for the result of a call: known ways to say "tensor" and "dictionary", or ``OTHER``."""
+    """Substitute for the result of a call: a tensor or a dictionary for known constructors, else ``OTHER``."""
     if not isinstance(called, _Name) or not isinstance(arguments, tuple):
         return OTHER
     if called.path == "collections.OrderedDict" and not arguments:
@@ -176,9 +178,9 @@ def _stored_values(reference: object) -> StoredValues:
 
 
 def _stored_tensor(arguments: tuple[Any, ...]) -> StoredTensor:
-    """(values, offset, shape, stride, ...); refuses tensors that reach outside their values, or show them twice.
+    """(values, offset, shape, stride, ...); refuses tensors that reach outside their storage, or repeat its values.
 
-    The second would let a small file ask for any amount of memory.
+    Repeated values (stride 0) would let a small file request any amount of memory.
     """
     match arguments:
         case (StoredValues() as values, int(offset), tuple(shape), tuple(stride), *_):
@@ -190,8 +192,10 @@ def _stored_tensor(arguments: tuple[Any, ...]) -> StoredTensor:
     count = 1
     for n in shape:
         count *= n
+        # Python integers do not overflow, but grow: stop before many dimensions make them slow.
         if count > 2**62:
             raise ValueError("a tensor with an impossible shape")
+    # Strides are not negative, so the last element has the largest index.
     last = offset + sum((n - 1) * step for n, step in zip(shape, stride, strict=True))
     if count and (last >= values.count or count > values.count):
         raise ValueError(f"a tensor larger than its {values.count} stored values")

@@ -1,6 +1,6 @@
-"""The zip archive that ``torch.save`` writes, taken at its word about nothing.
+"""The zip archive that ``torch.save`` writes, validated before use.
 
-Entries must be stored as they are, lie apart, and be no longer together than the file.
+Entries must be stored uncompressed, must not overlap, and their total size must not exceed the file's.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ MAX_PICKLE_BYTES = 32 << 20
 
 
 class TorchZipError(Exception):
-    """No such archive. The text goes on from the file's name: "is a zip file, but ..."."""
+    """Not such an archive. The text continues a sentence that begins with the file's name: "is a zip file, but ..."."""
 
 
 def stored_entries(package: zipfile.ZipFile, size_bytes: int) -> dict[str, zipfile.ZipInfo]:
-    """Entries by name; compressed ones are refused, for they could grow without bound, and so are overlapping ones.
+    """Entries by name; compressed entries are refused because they could expand without bound, overlapping ones too.
 
     Raises:
         TorchZipError: such entries.
@@ -26,6 +26,7 @@ def stored_entries(package: zipfile.ZipFile, size_bytes: int) -> dict[str, zipfi
         if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1 or info.file_size != info.compress_size:
             raise TorchZipError("has compressed or encrypted entries; torch.save writes none")
     entries = {info.filename: info for info in infos}
+    # Stored entries that do not overlap cannot add up to more than the file.
     if len(entries) != len(infos) or sum(info.file_size for info in infos) > size_bytes:
         raise TorchZipError("is no file of torch.save: its entries overlap")
     return entries
@@ -35,7 +36,7 @@ def root_of(entries: Mapping[str, zipfile.ZipInfo]) -> str:
     """The folder in the archive that holds everything.
 
     Raises:
-        TorchZipError: there is none, or several, or its list of tensors is too long.
+        TorchZipError: there is no such folder, or several, or ``data.pkl`` is too large.
     """
     roots = [name.removesuffix("/data.pkl") for name in entries if name.endswith("/data.pkl") and name.count("/") == 1]
     if len(roots) != 1:

@@ -33,11 +33,12 @@ _END = struct.Struct("<IHHHHIIH")
 
 
 def write_package(path: Path, members: Mapping[str, bytes]) -> None:
-    """Writes members in order, the root layer first; the file appears complete or not at all.
+    """Writes a package atomically, members in the given order; the first one must be the root layer.
 
     Raises:
-        ArchiveError: the package would pass 4 GiB, or a name cannot be stored.
+        ArchiveError: the package would exceed 4 GiB, or a name is not allowed.
     """
+    # A bound: both headers with the name in each take 76 bytes, the padding less than 68.
     total = sum(len(data) + 2 * len(name) + 256 for name, data in members.items())
     if total > MAX_PACKAGE_BYTES:
         raise ArchiveError(f"the archive would take {total:,} bytes; USDZ packages end at {MAX_PACKAGE_BYTES:,}")
@@ -49,14 +50,17 @@ def write_package(path: Path, members: Mapping[str, bytes]) -> None:
 
 
 def _write_member(file, name: str, data: bytes) -> bytes:
-    """Writes one member and gives its entry of the central directory."""
+    """Writes one member and returns its entry of the central directory."""
     fault = name_fault(name)
     if fault:
         raise ArchiveError(f"cannot store {name!r}: {fault}")
     raw_name, crc, offset = name.encode("utf-8"), zlib.crc32(data), file.tell()
+    # Local header (APPNOTE 4.3.7): version 2.0, method 0 (stored), sizes known in advance.
     before_extra = offset + _LOCAL.size + len(raw_name)
+    # The padding goes into the extra field, whose own header takes 4 bytes, so that the data start aligned.
     padding = -(before_extra + 4) % ALIGNMENT
     extra = struct.pack("<HH", _PADDING_ID, padding) + bytes(padding)
+    # Bit 11 of the flags: the name is UTF-8 (APPNOTE 4.4.4).
     utf8_names = 0 if name.isascii() else 0x800
     common = (20, utf8_names, 0, 0, _DOS_DATE, crc, len(data), len(data), len(raw_name))
     file.write(_LOCAL.pack(0x04034B50, *common, len(extra)) + raw_name + extra)
@@ -76,11 +80,11 @@ def name_fault(name: str) -> str | None:
 
 
 class Package:
-    """An opened package; members are views of the mapped file, nothing is ever extracted or decompressed.
+    """An open package; members are views of the memory-mapped file, nothing is extracted or decompressed.
 
     Raises:
-        ArchiveError: the file is no ZIP, is truncated, or holds a compressed, encrypted, duplicate, overlapping or
-            badly named member. That rules out archives that grow when read.
+        ArchiveError: not a ZIP file, truncated, or with a compressed, encrypted, duplicate, overlapping or badly named
+            member. This rules out decompression bombs.
     """
 
     def __init__(self, path: Path) -> None:
@@ -114,6 +118,7 @@ class Package:
             raise ArchiveError(f"{self.path}: {len(entries):,} members; at most {MAX_MEMBERS:,} are allowed")
         for entry in entries:
             where = f"{self.path}: member {entry.filename!r}"
+            # ``zipfile`` cuts names at NUL bytes and converts separators; the name as stored counts too.
             fault = name_fault(entry.orig_filename) or name_fault(entry.filename)
             if fault:
                 raise ArchiveError(f"{where}: {fault}")
@@ -121,6 +126,7 @@ class Package:
                 raise ArchiveError(f"{where} appears twice")
             if entry.flag_bits & 0x1:
                 raise ArchiveError(f"{where} is encrypted")
+            # The upper 16 bits are the Unix mode, whose highest 4 are the file type; 0xA is S_IFLNK.
             if (entry.external_attr >> 28) == 0xA:
                 raise ArchiveError(f"{where} is a symbolic link")
             if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size:
@@ -130,6 +136,7 @@ class Package:
                 )
             self._spans[entry.filename] = self._locate(entry, where)
         ordered = sorted((start, stop, name) for name, (start, stop) in self._spans.items())
+        # Overlapping members would let a small file pretend to hold more data than it has.
         for (_, stop, name), (start, _, after) in zip(ordered, ordered[1:], strict=False):
             if start < stop:
                 raise ArchiveError(f"{self.path}: members {name!r} and {after!r} overlap")
@@ -141,6 +148,7 @@ class Package:
         header = _LOCAL.unpack_from(self._bytes, entry.header_offset)
         if header[0] != 0x04034B50:
             raise ArchiveError(f"{where} has no local header; the archive is damaged")
+        # Lengths of name and extra field from the local header: they may differ from the central directory's.
         start = entry.header_offset + _LOCAL.size + header[9] + header[10]
         if start + entry.file_size > self._size:
             raise ArchiveError(f"{where} lies outside the file; is the archive cut short?")
@@ -152,7 +160,7 @@ class Package:
         return list(self._spans)
 
     def size(self, name: str) -> int:
-        """Bytes of a member."""
+        """Size of a member in bytes."""
         start, stop = self._span(name)
         return stop - start
 
@@ -168,7 +176,7 @@ class Package:
         return self._bytes[start:stop]
 
     def open(self, name: str) -> io.BufferedReader:
-        """A member as a file; good until the package is closed.
+        """A member as a file object, valid until the package is closed.
 
         Raises:
             ArchiveError: no such member.
@@ -200,7 +208,7 @@ class Package:
 
 
 class _Member(io.RawIOBase):
-    """Part of a mapped file as a file."""
+    """A range of a mapped file as a raw file object."""
 
     def __init__(self, source: mmap.mmap, start: int, stop: int) -> None:
         self._source, self._start, self._stop, self._at = source, start, stop, 0

@@ -1,4 +1,4 @@
-"""What a lens must offer, and a base class with what most lenses have in common."""
+"""The interface of lenses, and a base class with the common parts of most of them."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ Mask = Bool[np.ndarray, " n"]
 
 
 class Lens(Protocol):
-    """Where a camera sees a point: the map from the camera frame (x right, y down, z forward) to pixels and back.
+    """The projection of a camera: maps the camera frame (x right, y down, z forward) to pixels and back.
 
-    A lens is a frozen dataclass whose fields are floats, tuples of floats and enumerations. They are its parameters:
-    what JSON, archives and messages hold (``register_lens``), and what caches are keyed by. Pixels have their origin
-    at the corner of the image, centres at +0.5. A lens knows nothing of the size of the image, the shutter and the
-    windshield; those are the camera's (``types.CameraModel``).
+    A lens is a frozen dataclass whose fields are floats, tuples of floats and enumerations. These are its parameters,
+    stored in JSON, archives and messages (``register_lens``) and used as cache keys. Pixel coordinates originate at the
+    corner of the image, pixel centres are at +0.5. Image size, shutter and windshield are properties of the camera
+    (``types.CameraModel``), not of the lens.
 
-    ``BaseLens`` brings everything but ``kind``, the numbers, ``project`` and ``unproject``; ``check_lens`` tests a
-    lens against this text.
+    ``BaseLens`` implements everything except ``kind``, the parameters, ``project`` and ``unproject``; ``check_lens``
+    tests a lens against this specification.
     """
 
     kind: ClassVar[str]
     """Name of this kind of lens in files: lower-case letters, digits and underscores."""
     perspective: ClassVar[bool]
-    """Whether lines stay lines, up to a distortion: then Gaussians are sorted by z, otherwise by distance."""
+    """Whether it is a perspective projection up to distortion: decides if Gaussians are sorted by z or distance."""
 
     def __hash__(self) -> int:
-        """Of all parameters."""
+        """Hash of all parameters."""
 
     @property
     def cx_px(self) -> float:
@@ -44,7 +44,7 @@ class Lens(Protocol):
 
     @property
     def fx_px(self) -> float:
-        """Focal length along the rows; how it is defined is up to the lens, ``fx_px / fy_px`` stretches the image."""
+        """Focal length along the rows, as defined by the lens; ``fx_px / fy_px`` is the aspect ratio."""
 
     @property
     def fy_px(self) -> float:
@@ -52,50 +52,50 @@ class Lens(Protocol):
 
     @property
     def max_angle_rad(self) -> float:
-        """An angle off the optical axis, in (0, pi], beyond which the lens sees nothing."""
+        """An upper bound, in (0, pi], of angles off the optical axis in the field of the lens."""
 
     @property
     def ideal_pinhole(self) -> Lens | None:
-        """The same lens as a pinhole without distortion, or None where it is not one: renderers are faster then."""
+        """The same lens as a pinhole without distortion, which renders faster; None if it is not one."""
 
     def project(self, xyz: Points3) -> tuple[Points2, Mask]:
         """Pixels of points in the camera frame.
 
         Args:
-            xyz: float64 [n,3], finite, of any length; n may be 0. It is not written to.
+            xyz: float64 [n,3], finite, of any magnitude; n may be 0. It is not modified.
 
         Returns:
-            A new float64 array [n,2] of pixels, which the caller may write to, and whether each point is valid: in
-            the field, where no two rays meet in one pixel. Pixels that are not valid are anything, and no warning.
-            The image has no border here.
+            A new float64 array [n,2] of pixels, which the caller may modify, and whether each point is valid: in the
+            field, where no two rays map to one pixel. Invalid pixels have arbitrary values, without warnings. Pixels
+            are not limited to the image.
         """
 
     def unproject(self, uv: Points2) -> tuple[Points3, Mask]:
         """Unit rays of pixels: the inverse of ``project`` to 1e-6 pixels.
 
         Args:
-            uv: float64 [n,2], finite; n may be 0. It is not written to.
+            uv: float64 [n,2], finite; n may be 0. It is not modified.
 
         Returns:
-            A new float64 array [n,3] of unit rays, and whether the lens sees anything at each pixel. Rays that are
-            not valid are anything.
+            A new float64 array [n,3] of unit rays, and whether each pixel is in the field of the lens. Invalid rays
+            have arbitrary values.
         """
 
     def check(self) -> None:
         """Check the parameters, which may come from a file or a request.
 
         Raises:
-            ValueError: which one is wrong, what it is and what is allowed.
+            ValueError: names the wrong parameter, its value and the allowed ones.
         """
 
     def scaled(self, sx: float, sy: float) -> Self:
         """The lens of the image resized by ``sx`` along the rows and ``sy`` along the columns, both positive."""
 
     def cropped(self, left_px: float, top_px: float) -> Self:
-        """The lens of the image after cutting off columns at its left and rows at its top."""
+        """The lens of the image cropped by columns at its left and rows at its top."""
 
     def mirrored(self, width_px: float) -> Self:
-        """The lens of the image, ``width_px`` wide, with left and right swapped, in a world with x negated."""
+        """The lens of the image, ``width_px`` wide, mirrored left to right, in a world with x negated."""
 
 
 class BaseLens:

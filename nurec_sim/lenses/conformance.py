@@ -1,4 +1,4 @@
-"""A kit for authors of lenses: does a lens do what ``Lens`` says?
+"""Conformance test of the ``Lens`` interface, for authors of lenses.
 
 ::
 
@@ -22,17 +22,17 @@ from nurec_sim.lenses.registry import lens_class
 PIXEL_TOLERANCE = 1e-6
 RAY_TOLERANCE = 1e-6
 RIM = 0.01
-"""Share of the points that may fall out of the field by rounding: those at its very rim."""
+"""Fraction of the points that may leave the field by rounding: those at its rim."""
 
 
 def check_lens(lens: Any, width_px: int = 1280, height_px: int = 720) -> list[str]:
-    """Try a lens and list what its author should mend; empty when it conforms to ``Lens``.
+    """Tests a lens and lists its faults; empty if it conforms to ``Lens``.
 
-    Checked, over an image of ``width_px`` x ``height_px`` and over the whole sphere: shapes and types of results;
-    inputs are not written to, and no warning is raised; ``project`` undoes ``unproject`` and the other way round, so
-    that no two rays meet in one pixel; the length of a point does not matter; the axis meets the principal point; the
-    field ends at ``max_angle_rad``; ``scaled``, ``cropped``, ``mirrored``, ``ideal_pinhole``, ``perspective``; the
-    class is registered, and parameters come back from JSON as they were.
+    Checks, over an image of ``width_px`` x ``height_px`` and over the whole sphere: shapes and types of results; that
+    inputs are not modified and no warnings are raised; that ``project`` and ``unproject`` are inverse to each other, so
+    that no two rays map to one pixel; independence of a point's distance; that the axis projects to the principal
+    point; that the field ends at ``max_angle_rad``; ``scaled``, ``cropped``, ``mirrored``, ``ideal_pinhole``,
+    ``perspective``; that the class is registered, and parameters survive a JSON round trip.
     """
     try:
         if missing := missing_members(type(lens)):
@@ -48,7 +48,7 @@ def check_lens(lens: Any, width_px: int = 1280, height_px: int = 720) -> list[st
         for step in (_json, _results, _round_trips, _field, _resized):
             try:
                 faults += list(step(lens, width_px, height_px))
-            except Exception as error:  # an author wants to read it beside the other faults
+            except Exception as error:  # reported beside the other faults
                 faults.append(f"{step.__name__.strip('_').replace('_', ' ')}: {type(error).__name__}: {error}")
     return faults
 
@@ -140,7 +140,7 @@ def _resized(lens: Any, width_px: int, height_px: int) -> Iterator[str]:
 def _same_image(
     name: str, lens: Any, other: Any, moved: Callable[[Points2], Points2], turned: np.ndarray
 ) -> Iterator[str]:
-    """Whether another lens has the image of ``lens``, its pixels ``moved``, of points multiplied by ``turned``."""
+    """Checks that ``other`` projects points times ``turned`` to the pixels of ``lens`` mapped by ``moved``."""
     points = _directions(500)
     (uv, valid), (theirs, seen) = lens.project(points), other.project(points * turned)
     yield from _differ(f"project of {name}", moved(uv[valid]), theirs[valid], seen[valid], "px", 10 * PIXEL_TOLERANCE)
@@ -152,7 +152,7 @@ def _pixels(width_px: int, height_px: int) -> Points2:
 
 
 def _directions(count: int) -> Points3:
-    """Points spread evenly over the unit sphere: a Fibonacci lattice."""
+    """Points distributed evenly over the unit sphere: a Fibonacci lattice (equal areas in z, golden-angle azimuths)."""
     number = np.arange(count) + 0.5
     z, azimuth = 1 - 2 * number / count, np.pi * (1 + np.sqrt(5)) * number
     across = np.sqrt(1 - z * z)

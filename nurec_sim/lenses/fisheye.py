@@ -45,7 +45,7 @@ class Fisheye(BaseLens):
         return direction * distance[:, None] * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px), valid
 
     def unproject(self, uv: Points2) -> tuple[Points3, Mask]:
-        """Unit rays of pixels, and whether the lens sees anything there."""
+        """Unit rays of pixels, and whether each is inside the field of the lens."""
         flat = (uv - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px)
         distance = np.hypot(flat[:, 0], flat[:, 1])
         coefficients, field = _polynomial(self), _field(self)
@@ -61,11 +61,12 @@ def _polynomial(lens: Fisheye) -> np.ndarray:
     """Coefficients of the distance as a function of the angle, from power 0 up."""
     coefficients = np.zeros(10)
     coefficients[1] = 1.0
+    # Odd powers only: theta, k1 theta^3, k2 theta^5, k3 theta^7, k4 theta^9.
     coefficients[3::2] = lens.radial
     return coefficients
 
 
 @functools.lru_cache(maxsize=64)
 def _field(lens: Fisheye) -> float:
-    """Largest angle that the lens sees."""
+    """Largest angle in the field of the lens."""
     return radial.rising_limit(_polynomial(lens), lens.max_angle_rad)

@@ -1,8 +1,8 @@
 """The F-theta camera: pixel distance and angle off the axis are polynomials of each other.
 
-``pixel = [[c, d], [e, 1]] @ (r(theta) * direction) + (cx, cy)``. The reference polynomial is exact and the other one
-only a first guess that formats carry for speed, so it is not read here: the inverse is solved to rounding. Where the
-reference is missing, the other one is the reference.
+``pixel = [[c, d], [e, 1]] @ (r(theta) * direction) + (cx, cy)``. The reference polynomial is exact; the other one is an
+approximate inverse that formats store for speed, and is ignored here: the inverse is solved to rounding error. If the
+reference is missing, the other one is used as the reference.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from nurec_sim.lenses.registry import register_lens
 
 
 class FThetaReference(enum.Enum):
-    """Which of the two F-theta polynomials is exact; the other one is only a first guess."""
+    """Which of the two F-theta polynomials is exact; the other one is its approximate inverse."""
 
     PIXELDIST_TO_ANGLE = "pixeldist_to_angle"
     ANGLE_TO_PIXELDIST = "angle_to_pixeldist"
@@ -81,12 +81,13 @@ class FTheta(BaseLens):
             raise ValueError(f"linear_cde {self.linear_cde} is a matrix without an inverse")
 
     def scaled(self, sx: float, sy: float) -> FTheta:
-        """The corner of the matrix is fixed at 1, so the distance scales with the rows and c, d take up the rest."""
+        """The last matrix entry is fixed at 1, so the distance scales with the rows, and c and d absorb the rest."""
         c, d, e = self.linear_cde
         return dataclasses.replace(
             self,
             cx_px=self.cx_px * sx,
             cy_px=self.cy_px * sy,
+            # theta(r) = sum k_n r^n with r -> r / sy; r(theta) scales by sy itself.
             pixeldist_to_angle=tuple(k / sy**power for power, k in enumerate(self.pixeldist_to_angle)),
             angle_to_pixeldist=tuple(k * sy for k in self.angle_to_pixeldist),
             linear_cde=(c * sx / sy, d * sx / sy, e),
@@ -105,7 +106,7 @@ class FTheta(BaseLens):
         return (direction * distance[:, None]) @ _linear(self).T + (self.cx_px, self.cy_px), valid
 
     def unproject(self, uv: Points2) -> tuple[Points3, Mask]:
-        """Unit rays of pixels, and whether the lens sees anything there."""
+        """Unit rays of pixels, and whether each is inside the field of the lens."""
         flat = (uv - (self.cx_px, self.cy_px)) @ np.linalg.inv(_linear(self)).T
         distance = np.hypot(flat[:, 0], flat[:, 1])
         angle = evaluate(self, FThetaReference.PIXELDIST_TO_ANGLE, distance)
@@ -132,12 +133,12 @@ def exact_polynomial(lens: FTheta) -> tuple[FThetaReference, tuple[float, ...]]:
 
 @functools.lru_cache(maxsize=64)
 def field(lens: FTheta) -> tuple[float, float]:
-    """Largest angle and largest pixel distance that the lens sees."""
+    """Largest angle and largest pixel distance in the field of the lens."""
     reference, coefficients = exact_polynomial(lens)
     if reference is FThetaReference.ANGLE_TO_PIXELDIST:
         angle = radial.rising_limit(coefficients, lens.max_angle_rad)
         return angle, float(polynomial.polyval(angle, coefficients))
-    # Rising at the smallest slope all the way, the angle would reach its maximum here.
+    # An upper bound: the distance at which the angle would reach its maximum at the smallest allowed slope.
     furthest = lens.max_angle_rad / (radial.MINIMUM_SLOPE * coefficients[1])
     rising = radial.rising_limit(coefficients, furthest)
     distance = radial.first_below_zero(lambda x: lens.max_angle_rad - polynomial.polyval(x, coefficients), rising)

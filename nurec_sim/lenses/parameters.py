@@ -1,6 +1,6 @@
-"""The parameters of a lens as plain JSON and back: the fields of its dataclass, by name.
+"""Conversion of a lens's parameters, the fields of its dataclass, to plain JSON and back.
 
-Any frozen dataclass of floats, tuples of floats and enumerations will do: the windshield's is another.
+Works for any frozen dataclass of floats, tuples of floats and enumerations, such as the windshield's.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 LARGEST = 1e60
-"""Larger numbers mean nothing here, and their squares would overflow."""
+"""Larger numbers are meaningless here, and their powers would overflow."""
 
 T = typing.TypeVar("T")
 
 
 def parameter_types(cls: type[Any]) -> dict[str, type[Any] | int | None]:
-    """What the parameters are, in the order of the fields.
+    """The types of the parameters, in the order of the fields.
 
     Returns:
         For each field ``float``, the class of an enumeration, or for a tuple of floats its length, None if any.
@@ -42,7 +42,7 @@ def _parameter_type(cls: type[Any], name: str, hint: Any) -> type[Any] | int | N
 
 
 def encode_parameters(value: Any) -> dict[str, Any]:
-    """The parameters of a lens or windshield as JSON knows them; enumerations by value."""
+    """The parameters of a lens or windshield as plain JSON values; enumerations by value."""
     return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
 
 
@@ -55,12 +55,12 @@ def _plain(value: Any) -> Any:
 
 
 def decode_parameters(cls: type[T], row: Any, complete: bool = False) -> T:
-    """A lens or windshield from its parameters; ``check`` says whether it can be used.
+    """A lens or windshield from its parameters; ``check`` validates them.
 
     Args:
         cls: its class, see ``lens_class``.
-        row: what ``encode_parameters`` made.
-        complete: whether fields that have a default must be there as well.
+        row: output of ``encode_parameters``.
+        complete: whether fields with a default are required as well.
 
     Raises:
         ValueError: a parameter is missing, unknown or of the wrong kind; the text names it.

@@ -20,10 +20,10 @@ from nurec_sim.lenses import radial
 from nurec_sim.lenses.base import BaseLens, Mask, Points2, Points3, check_values
 from nurec_sim.lenses.registry import register_lens
 
-# A distorted lens is not trusted beyond this tangent of the angle off the axis (87 degrees).
+# Distorted lenses are cut off at this tangent of the angle off the axis (87 degrees).
 WIDEST_TANGENT = 20.0
 NEAREST_Z_M = 1e-6
-# Where the denominator of g falls below this, a pole is near and the model means nothing any more.
+# Where the denominator of g falls below this, a pole is near and the model is meaningless.
 FAR_FROM_POLE = 0.1
 
 
@@ -55,7 +55,7 @@ class Pinhole(BaseLens):
 
     @property
     def max_angle_rad(self) -> float:
-        """A right angle: everything in front of the camera; a distorted lens may end before."""
+        """A right angle: everything in front of the camera; the field of a distorted lens may end before."""
         return np.pi / 2
 
     def check(self) -> None:
@@ -70,6 +70,7 @@ class Pinhole(BaseLens):
 
     def mirrored(self, width_px: float) -> Pinhole:
         """Terms that are odd in x change their signs."""
+        # With x -> -x, terms of a' must be odd and those of b' even: p2, s1 and s2 change their signs.
         (p1, p2), (s1, s2, s3, s4) = self.tangential, self.thin_prism
         other_side = super().mirrored(width_px)
         return replace(other_side, tangential=(p1, -p2), thin_prism=(-s1, -s2, s3, s4))
@@ -81,13 +82,14 @@ class Pinhole(BaseLens):
         flat = xyz[:, :2] / np.where(valid, z, 1.0)[:, None]
         if self.distorted:
             inside = np.hypot(flat[:, 0], flat[:, 1]) <= _field(self)
+            # Points outside the field could overflow the polynomials; the axis stands in, they are invalid anyway.
             flat = np.where((valid & inside)[:, None], flat, 0.0)
             flat, jacobian = _distort(self, flat)
             valid = valid & inside & _one_to_one(jacobian)
         return flat * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px), valid
 
     def unproject(self, uv: Points2) -> tuple[Points3, Mask]:
-        """Unit rays of pixels, and whether the lens sees anything there."""
+        """Unit rays of pixels, and whether each is inside the field of the lens."""
         flat = (uv - (self.cx_px, self.cy_px)) / (self.fx_px, self.fy_px)
         valid = np.ones(len(uv), bool)
         if self.distorted:
@@ -135,6 +137,7 @@ def _distort(lens: Pinhole, flat: Points2) -> tuple[Points2, Float64[np.ndarray,
         ],
         axis=1,
     )
+    # d(a g)/db = a g' 2b = d(b g)/da, with g' the derivative by r2.
     cross = 2 * a * b * gain_slope
     jacobian = np.empty((len(flat), 2, 2))
     jacobian[:, 0, 0] = gain + 2 * a * a * gain_slope + 2 * p1 * b + 6 * p2 * a + 2 * a * prism_a
@@ -147,6 +150,7 @@ def _distort(lens: Pinhole, flat: Points2) -> tuple[Points2, Float64[np.ndarray,
 def _one_to_one(jacobian: Float64[np.ndarray, "n 2 2"]) -> Bool[np.ndarray, " n"]:
     """Where the map keeps its orientation with a margin: both stretch factors stay above the smallest slope."""
     determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+    # Frobenius norm s, singular values s1 >= s2: det = s1 s2 and s1 <= s <= 1.42 s1, so the test bounds s2 from below.
     size = np.sqrt(np.sum(jacobian**2, axis=(1, 2)))
     return determinant > 0.5 * radial.MINIMUM_SLOPE * size
 
@@ -157,6 +161,7 @@ def _undistort(lens: Pinhole, target: Points2) -> tuple[Points2, Bool[np.ndarray
     radius = np.hypot(target[:, 0], target[:, 1])
     grid = np.linspace(0.0, limit, radial.TABLE_SIZE)
     top, bottom = (polynomial.polyval(grid * grid, part) for part in _radial_parts(lens))
+    # Initial guess: the radial part alone, inverted by a table.
     guess = np.interp(radius, grid * top / bottom, grid)
     flat = target * (guess / np.where(radius > 0, radius, 1.0))[:, None]
     moving = np.arange(len(target))
@@ -165,19 +170,21 @@ def _undistort(lens: Pinhole, target: Points2) -> tuple[Points2, Bool[np.ndarray
         value, jacobian = _distort(lens, place)
         step = _solve(jacobian, value - target[moving])
         place = place - step
-        # Outside the field the polynomials say nothing: come back to its rim and try on from there.
+        # Outside the field the polynomials are meaningless: continue from its rim.
         place *= np.minimum(1.0, limit / np.maximum(np.hypot(place[:, 0], place[:, 1]), 1e-12))[:, None]
         flat[moving] = place
+        # Converged points leave the iteration.
         moving = moving[np.abs(step).max(axis=1, initial=0.0) > 1e-13]
         if len(moving) == 0:
             break
     value, jacobian = _distort(lens, flat)
+    # Pixels outside the image of the field have no solution; the residual tells.
     found = np.abs(value - target).max(axis=1) < 1e-9 * np.maximum(1.0, radius)
     return flat, found & _one_to_one(jacobian)
 
 
 def _solve(jacobian: Float64[np.ndarray, "n 2 2"], error: Points2) -> Points2:
-    """Newton steps; bounded where the matrix has no inverse, which is never in the field."""
+    """Newton steps (2x2 inverse); bounded for singular matrices, which do not occur inside the field."""
     (a, b), (c, d) = jacobian[:, 0].T, jacobian[:, 1].T
     determinant = a * d - b * c
     determinant = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)

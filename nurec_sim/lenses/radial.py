@@ -1,7 +1,7 @@
 """What radially symmetric lenses share: angles off the optical axis, and inverting an increasing function.
 
-A distorted lens is used only where its radial function still rises at ``MINIMUM_SLOPE`` of its slope at the axis: past
-that, two rays would meet in one pixel and a fold of the polynomial would draw ghosts into the image.
+A distorted lens is used only where the slope of its radial function is at least ``MINIMUM_SLOPE`` of that on the axis:
+beyond, two rays would map to one pixel, and a fold of the polynomial would render ghosts into the image.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ def angle_and_direction(xyz: Float64[np.ndarray, "n 3"]) -> tuple[Values, Float6
     """Angle off the optical axis and unit direction in the image plane; direction zero on the axis."""
     across = np.hypot(xyz[:, 0], xyz[:, 1])
     direction = xyz[:, :2] / np.where(across > 0, across, 1.0)[:, None]
+    # atan2 instead of acos: accurate near the axis, and valid behind the camera, up to pi.
     return np.arctan2(across, xyz[:, 2]), direction
 
 
@@ -34,9 +35,9 @@ def rays_at(angle_rad: Values, direction: Float64[np.ndarray, "n 2"]) -> Float64
 
 
 def first_below_zero(function: Callable[[Values], Values], upper: float) -> float:
-    """Smallest x in [0, upper] from which on a function is negative; ``upper`` where it never is.
+    """Smallest x in [0, upper] at which a function becomes negative; ``upper`` if it never does.
 
-    A scan and a bisection: unlike the roots of a polynomial this does not care for vanishing leading coefficients.
+    A scan and a bisection: unlike polynomial root finding, this is robust to vanishing leading coefficients.
     """
     grid = np.linspace(0.0, upper, SCAN_SIZE)
     below = np.flatnonzero(function(grid) < 0)
@@ -52,8 +53,9 @@ def first_below_zero(function: Callable[[Values], Values], upper: float) -> floa
 
 
 def rising_limit(coefficients: Sequence[float] | np.ndarray, upper: float) -> float:
-    """Up to where, at most ``upper``, a polynomial keeps ``MINIMUM_SLOPE`` of its slope at 0."""
+    """Largest x, at most ``upper``, up to which a polynomial's slope is at least ``MINIMUM_SLOPE`` of that at 0."""
     slope = polynomial.polyder(np.asarray(coefficients, np.float64))
+    # p'(x) - MINIMUM_SLOPE p'(0): only the constant term of the derivative changes.
     slope[0] *= 1 - MINIMUM_SLOPE
     return first_below_zero(lambda x: polynomial.polyval(x, slope), upper)
 
@@ -61,14 +63,25 @@ def rising_limit(coefficients: Sequence[float] | np.ndarray, upper: float) -> fl
 def invert_rising(
     function: Callable[[Values], Values], slope: Callable[[Values], Values], target: Values, upper: float
 ) -> Values:
-    """Solve ``function(x) = target`` for x in [0, upper], where the function rises; targets outside give an end.
+    """Solve ``function(x) = target`` for x in [0, upper], where the function increases.
 
-    A table gives the first guess, Newton steps the rest: quadratic from there on, so eight steps reach rounding.
+    A table gives the initial guess; from there Newton's method converges quadratically, so eight steps reach rounding
+    error.
+
+    Args:
+        function: increasing on [0, upper], vectorised.
+        slope: its derivative, vectorised and positive there.
+        target: [n] function values; those outside the function's range yield 0 or ``upper``.
+        upper: end of the interval.
+
+    Returns:
+        x [n].
     """
     grid = np.linspace(0.0, upper, TABLE_SIZE)
     x = np.interp(target, function(grid), grid)
     for _ in range(NEWTON_STEPS):
         step = (function(x) - target) / slope(x)
+        # Clamped: outside the interval the polynomial may fall, and Newton would diverge.
         x = np.clip(x - step, 0.0, upper)
         if len(x) == 0 or np.abs(step).max() < 1e-14 * upper:
             break

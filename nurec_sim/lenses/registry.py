@@ -1,4 +1,4 @@
-"""Lenses by name: how files and messages find the class whose parameters they hold."""
+"""Registry of lens classes by name, for decoding the parameters in files and messages."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _classes: dict[str, type[Any]] = {}
 
 
 def register_lens(cls: LensClass) -> LensClass:
-    """Make a class of lenses known to files and messages, in this process; usable as a decorator.
+    """Registers a lens class for files and messages in this process; usable as a decorator.
 
-    Other processes (workers, servers) know the lenses that installed packages name in the entry-point group
-    ``nurec_sim.lenses``. A class that is defined again, as in a notebook, replaces the old one.
+    Other processes (workers, servers) know the lenses that installed packages declare in the entry-point group
+    ``nurec_sim.lenses``. A class that is redefined, as in a notebook, replaces the old one.
 
     Raises:
-        TypeError: it is no frozen dataclass, lacks something of ``Lens``, or has fields of other types.
-        ValueError: its ``kind`` is no plain name, or its ``kind`` or its own name is that of another lens.
+        TypeError: it is not a frozen dataclass, lacks a member of ``Lens``, or has fields of unsupported types.
+        ValueError: its ``kind`` is not a plain name, or its ``kind`` or class name is that of another lens.
     """
     name = cls.__name__
     params = getattr(cls, "__dataclass_params__", None)
@@ -47,7 +47,7 @@ def register_lens(cls: LensClass) -> LensClass:
 
 
 def lens_kinds() -> list[str]:
-    """The kinds of lenses that are known so far, sorted."""
+    """The registered kinds of lenses, sorted."""
     return sorted(_classes)
 
 
@@ -55,7 +55,7 @@ def lens_class(name: str) -> type[Any]:
     """The class of a kind of lens, by its ``kind`` or by the name of the class.
 
     Raises:
-        ValueError: there is none; the text says which are known.
+        ValueError: unknown; the text lists the known ones.
     """
     found = _find(name)
     if found is None:

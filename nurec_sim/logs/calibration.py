@@ -1,6 +1,6 @@
-"""Rigs as JSON and back, field for field as in ``types``.
+"""Rigs to JSON and back, with the fields of ``types``.
 
-Poses are written ``T_a_b`` in files: a 4x4 that takes coordinates of b to a.
+Poses in files are named ``T_a_b``: a 4x4 matrix that maps coordinates in b to a.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from nurec_sim.types import (
 
 CALIBRATION_FILE = "calib.json"
 MAX_COLUMNS = 1 << 14
-"""Of a LiDAR; those in use have up to 4,000 in a turn."""
+"""Maximum number of LiDAR columns; real devices have up to 4,000 per revolution."""
 
 
 def rig_to_json(rig: Rig, intensity_scale: int) -> dict[str, Any]:
-    """calib.json of a rig.
+    """The contents of ``calib.json`` for a rig.
 
     Raises:
-        ClipError: the lens of a camera is of no registered kind.
+        ClipError: a camera's lens is not of a registered kind.
     """
     return {
         "ego_frame": "x forward, y left, z up, origin at the rear axle on the ground",
@@ -73,7 +73,7 @@ def _lidar_to_json(lidar: LidarModel) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Dataclasses, enums, tuples and arrays as what JSON knows."""
+    """Converts dataclasses, enums, tuples and arrays to plain JSON values."""
     if dataclasses.is_dataclass(value):
         return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, enum.Enum):
@@ -86,7 +86,7 @@ def _plain(value: Any) -> Any:
 
 
 def rig_from_json(calib: dict[str, Any]) -> tuple[Rig, dict[str, float]]:
-    """A rig on the ground from calib.json, and the intensity scale of each LiDAR.
+    """The rig from ``calib.json``, its frame moved to the ground, and the intensity scale of each LiDAR.
 
     Raises:
         ClipError: a field is missing or wrong.
@@ -109,13 +109,13 @@ def rig_from_json(calib: dict[str, Any]) -> tuple[Rig, dict[str, float]]:
 
 
 def ground_shift(calib: dict[str, Any]) -> np.ndarray:
-    """rig_from_ego: the rig frame lies on the ground, straight below the origin of the log's ego frame."""
+    """rig_from_ego: the rig frame is on the ground, directly below the origin of the log's ego frame."""
     height = fields.number(CALIBRATION_FILE, calib, "ground_z_in_ego_m", default=0.0)
     return geometry.pose(np.eye(3), np.array([0.0, 0.0, -height]))
 
 
 def positive_scale(where: str, row: dict[str, Any]) -> float:
-    """The number by which stored intensities are divided."""
+    """The divisor that maps stored intensities to 0..1."""
     scale = fields.number(where, row, "intensity_scale", default=255.0)
     if scale <= 0:
         raise ClipError(f"{where}: intensity_scale must be positive, got {scale}")
@@ -123,7 +123,7 @@ def positive_scale(where: str, row: dict[str, Any]) -> float:
 
 
 def camera_from_json(name: str, row: Any, rig_from_ego: np.ndarray) -> CameraModel:
-    """One camera of calib.json.
+    """Parses one camera of ``calib.json``.
 
     Raises:
         ClipError: a field is missing or wrong.
@@ -149,10 +149,10 @@ def camera_from_json(name: str, row: Any, rig_from_ego: np.ndarray) -> CameraMod
 
 
 def checked_camera(camera: CameraModel) -> CameraModel:
-    """The camera, if it can be used.
+    """Returns the camera if it is valid.
 
     Raises:
-        ClipError: it cannot.
+        ClipError: it is invalid, or has too many pixels.
     """
     try:
         sensors.check_camera(camera)
@@ -179,7 +179,7 @@ def _member(where: str, kind: type[enum.Enum], value: Any) -> Any:
 
 
 def lidar_from_json(name: str, row: Any, rig_from_ego: np.ndarray) -> LidarModel:
-    """One LiDAR of calib.json: angles of its own, or the name of a ``table`` (and ``columns``).
+    """Parses one LiDAR of ``calib.json``: explicit angles, or the name of a ``table`` (and ``columns``).
 
     Raises:
         ClipError: a field is missing or wrong, or the table is unknown.
@@ -189,7 +189,7 @@ def lidar_from_json(name: str, row: Any, rig_from_ego: np.ndarray) -> LidarModel
     try:
         if "table" in row:
             columns = fields.integer(where, row, "columns") if "columns" in row else None
-            if columns is not None and columns > MAX_COLUMNS:  # each becomes an angle
+            if columns is not None and columns > MAX_COLUMNS:  # an array of that length is allocated
                 raise ClipError(f"{where}: 'columns' must be at most {MAX_COLUMNS}, got {columns}")
             return sensors.lidar_model(fields.of_kind(where, row, "table", str), pose, id=name, columns=columns)
         near_far = fields.array(where, row, "range_m", (2,)) if "range_m" in row else (0.5, 200.0)

@@ -21,10 +21,10 @@ FURTHEST_POINT_M = 10_000.0
 
 
 def check_clip(clip: Clip | str | Path) -> list[str]:
-    """Read everything in a clip and list what is wrong; an empty list means that it is sound.
+    """Reads everything in a clip and lists all faults; an empty list means that it is valid.
 
-    Found are: files that are missing, truncated or broken, images of another size than the calibration's, times that go
-    back, poses that are no rotations, values that are not finite, empty sweeps, and sweeps that no camera sees.
+    Detects missing, truncated or corrupt files, images whose size differs from the calibration, times that do not
+    increase, invalid rotations, non-finite values, empty sweeps, and sweeps that no camera sees.
     """
     if not isinstance(clip, Clip):
         try:
@@ -34,7 +34,7 @@ def check_clip(clip: Clip | str | Path) -> list[str]:
     images = [(clip, name, index) for name in clip.rig.cameras for index in range(clip.frame_count(name))]
     sweeps = [(clip, name, index) for name in clip.rig.lidars for index in range(clip.sweep_count(name))]
     faults = table_faults(clip)
-    # Decoding and unpacking let other threads run.
+    # Decoding and decompression release the GIL.
     with ThreadPoolExecutor(max_workers=min(MOST_THREADS, usable_cores())) as pool:
         for fault, jobs in ((_image_fault, images), (_sweep_fault, sweeps)):
             faults += [text for text in pool.map(fault, *zip(*jobs, strict=True)) if text is not None] if jobs else []

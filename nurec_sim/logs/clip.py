@@ -56,6 +56,7 @@ class _Recent:
             if key in self._values:
                 self._values.move_to_end(key)
                 return self._values[key]
+        # Without the lock: loading is slow, and a duplicate load by another thread does no harm.
         value = make()
         with self._lock:
             self._values[key] = value
@@ -73,15 +74,15 @@ class Clip:
         ego: poses of the rig.
         images: records of each camera's frames, in the order of time.
         sweeps: records of each LiDAR's sweeps, in the order of time.
-        source: loads images and sweeps by sensor and index into these records.
+        source: loads images and sweeps, by sensor id and index into these records.
         tracks: labelled objects; poses are those of box centres in the world.
-        road_map: what the log knows of the road, or None.
-        facts: what else the log says of itself (dataset, licence, source of poses, ...), plain JSON.
-        rig_from_log: the log's own ego frame, in which its calibration is written, in the rig frame; the same if None.
+        road_map: road geometry, or None.
+        facts: other metadata of the log (dataset, licence, source of poses, ...), plain JSON.
+        rig_from_log: pose in the rig frame of the log's ego frame, to which its calibration refers; identity if None.
 
     Attributes:
-        time_offset_us: how much later all times are than the log's own.
-        path: where it was opened; None if it was not.
+        time_offset_us: offset of all times from the recorded ones.
+        path: path it was opened from; None if created in memory.
         format: name of the reader that opened it.
     """
 
@@ -221,10 +222,10 @@ class Clip:
         return self._recent_sweeps.get((lidar_id, index), lambda: self._read_sweep(lidar_id, index, record))
 
     def ego_mask(self, camera_id: str) -> Bool[np.ndarray, "h w"] | None:
-        """Pixels in which the car sees itself; None where the log does not know.
+        """Pixels that show the ego vehicle; None if unknown.
 
         Raises:
-            ClipError: no such camera, or the mask is not as large as its images.
+            ClipError: no such camera, or the mask differs in size from its images.
         """
         camera = self.camera(camera_id)
         with self._reading(f"ego mask of camera {camera_id!r}"):
@@ -261,12 +262,12 @@ class Clip:
 
     @contextlib.contextmanager
     def _reading(self, what: str) -> Iterator[None]:
-        """What a log's source raises or gives in the block becomes an error that names the log and the file."""
+        """Converts exceptions in the block to a ``ClipError`` that names the log and the file."""
         name = self.id if self.path is None else self.path.name
         try:
             yield
         except ClipError as error:
-            # What the reader says may begin with the name already.
+            # The reader's text may begin with the name already.
             raise error if str(error).startswith(f"{name}: ") else ClipError(f"{name}: {what}: {error}") from None
         except Exception as error:
             raise ClipError(f"{name}: {what} cannot be read: {type(error).__name__}: {error}") from error

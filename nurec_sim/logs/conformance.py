@@ -1,4 +1,4 @@
-"""A kit for authors of log readers: does a reader keep the contract, on a log of its format?
+"""Conformance test for authors of log readers, on a log of the reader's format.
 
 ::
 
@@ -25,12 +25,12 @@ from nurec_sim.types import LogReader
 
 
 def check_reader(path: str | Path, reader: LogReader) -> list[str]:
-    """Open a log with a reader and list what its author should mend; empty when it conforms.
+    """Opens a log with a reader and lists violations of the interface; empty if it conforms.
 
-    Checked: the reader has all its parts; it knows the log, and knows no empty folder, no text file and no clip folder;
-    opening an empty folder is a ``ClipError``; the log opens and its tables are sound; every image and sweep can be
-    read, also from several threads, and is the same when read again; ground, cameras, LiDARs and boxes fit together
-    (``measure_clip``, which finds calibrations that are inverted or turned).
+    Checks that the reader has all its members; that it recognises the log, but neither an empty folder nor a text file;
+    that opening an empty folder raises a ``ClipError``; that the log opens and its tables are valid; that every image
+    and sweep can be read, also concurrently, with the same result each time; and that ground, cameras, LiDARs and boxes
+    are consistent (``measure_clip``, which detects inverted or rotated calibrations).
     """
     faults = [f"it lacks {text}" for text in plugins.lacking(plugins.LOG_READERS, reader)]
     if faults:
@@ -48,7 +48,7 @@ def check_reader(path: str | Path, reader: LogReader) -> list[str]:
 
 
 def _answer(call: Callable[[], object]) -> object:
-    """What a call gives, or a text of what it raises."""
+    """The result of a call, or its exception as text."""
     try:
         return call()
     except Exception as error:
@@ -56,7 +56,7 @@ def _answer(call: Callable[[], object]) -> object:
 
 
 def _foreign_faults(reader: LogReader) -> Iterator[str]:
-    """Whether it takes what is not of its format for a log, or fails to say so."""
+    """Faults in the handling of paths that are not logs of its format."""
     with tempfile.TemporaryDirectory() as folder:
         empty, text = Path(folder, "empty"), Path(folder, "file.txt")
         empty.mkdir()
@@ -74,7 +74,7 @@ def _foreign_faults(reader: LogReader) -> Iterator[str]:
 
 
 def _twice_faults(clip: Clip, again: Clip) -> Iterator[str]:
-    """Whether a log that is opened twice, and read from several threads, is the same."""
+    """Differences between a log that is opened twice and read from several threads."""
     if not np.array_equal(clip.ego.world_from_body, again.ego.world_from_body) or clip.span_us != again.span_us:
         yield "opening the log twice gives other poses or times"
     images = [(name, index) for name in clip.rig.cameras for index in range(min(3, clip.frame_count(name)))]

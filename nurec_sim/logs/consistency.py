@@ -1,4 +1,4 @@
-"""Faults of a clip's tables: times that go back, poses that are no rotations; no image or sweep is read."""
+"""Faults of a clip's tables: times that do not increase, poses with invalid rotations; reads no images or sweeps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROTATION_TOLERANCE = 1e-3
 
 
 def table_faults(clip: Clip) -> list[str]:
-    """Faults of the tables alone: times and poses; no image or sweep is read."""
+    """Faults of times and poses only; no image or sweep is read."""
     faults = list(_pose_faults("ego pose", clip.ego.world_from_body))
     for name in clip.rig.cameras:
         records = clip.image_records(name)

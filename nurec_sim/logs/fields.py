@@ -1,4 +1,4 @@
-"""Reading fields of JSON objects: each is checked, and an error names the file, the place and what is allowed."""
+"""Reads and validates fields of JSON objects; errors name the file, the location and the allowed values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LARGEST_INTEGER = 1 << 62
 
 
 def required(where: str, row: Any, key: str) -> Any:
-    """A field that must be there.
+    """A required field.
 
     Raises:
         ClipError: ``row`` is not an object or lacks the field.
@@ -106,7 +106,7 @@ def array(where: str, row: Any, key: str, shape: tuple[int | None, ...]) -> np.n
 
 
 def transform(where: str, row: Any, key: str) -> Matrix4:
-    """A 4x4 whose last row is 0 0 0 1. Whether its rotation is one is checked with all others (``check.py``).
+    """A 4x4 matrix with the last row 0 0 0 1; its rotation is validated later with all others (``consistency``).
 
     Raises:
         ClipError: it is missing, not finite, not 4x4, or ends in another row.

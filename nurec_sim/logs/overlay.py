@@ -1,4 +1,4 @@
-"""A sheet of all cameras at one time with LiDAR points and boxes drawn over their images, for the eye to judge."""
+"""A contact sheet of all cameras at one time, overlaid with LiDAR points and boxes, for visual inspection."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TILE_PX = 960
 COLUMNS = 3
 CAPTION_PX = 28
 NEAR_M, FAR_M = 2.0, 80.0
-"""Colours run from near to far by the logarithm of the depth."""
+"""Range of the colour map, logarithmic in depth."""
 DOT_PX = 2
 EDGE_STEPS = 12
 BOX_RGB = (255, 255, 255)
@@ -30,13 +30,13 @@ Image = UInt8[np.ndarray, "h w 3"]
 
 
 def draw_overlay(clip: Clip, t_us: int) -> Image:
-    """Every camera's image nearest to a time, with the points of each LiDAR's nearest sweep and the boxes of that time.
+    """Every camera's image nearest to a time, overlaid with each LiDAR's nearest sweep and the boxes at that time.
 
-    Points are coloured by their depth, from red at 2 m to blue at 80 m; boxes are white, their front crossed. A camera
-    without images, or whose image cannot be read, gets a black tile that says so.
+    Points are coloured by depth, from red at 2 m to blue at 80 m; boxes are white, with a cross on the front face. A
+    camera without images, or whose image cannot be read, gets a black tile with a note.
 
     Raises:
-        ClipError: the clip has no cameras, or the time lies outside of it.
+        ClipError: the clip has no cameras, or the time is outside the clip.
     """
     start_us, end_us = clip.span_us
     if not clip.rig.cameras:
@@ -57,7 +57,7 @@ def draw_overlay(clip: Clip, t_us: int) -> Image:
 
 
 def _tile(clip: Clip, camera_id: str, t_us: int) -> Image:
-    """A caption above the image with everything drawn over it, ``TILE_PX`` wide."""
+    """One camera's overlaid image below its caption, ``TILE_PX`` wide."""
     import cv2
 
     camera = clip.rig.cameras[camera_id]
@@ -87,7 +87,7 @@ def _tile(clip: Clip, camera_id: str, t_us: int) -> Image:
 
 
 def _sweeps(clip: Clip, t_us: float) -> Iterator[tuple[str, Sweep]]:
-    """Each LiDAR's sweep nearest to a time, if it can be read."""
+    """The sweep of each LiDAR nearest to a time, if it can be read."""
     for name in clip.rig.lidars:
         times = np.array([record.t_us for record in clip.sweep_records(name)])
         if len(times):
@@ -98,10 +98,11 @@ def _sweeps(clip: Clip, t_us: float) -> Iterator[tuple[str, Sweep]]:
 
 
 def _draw_points(image: Image, camera: CameraModel, poses: Float64[np.ndarray, "2 4 4"], sweep: Sweep) -> None:
-    """Dots, the farthest first."""
+    """Draws points as dots, farthest first, so that near ones cover them."""
     points = sweep.xyz_world_m
     uv, valid, _ = sensors.project_rolling(camera, poses, points)
     seen = np.flatnonzero(valid & sensors.in_image(camera, uv))
+    # Depth at the start of the exposure is enough for a colour.
     depth = geometry.transform_points(geometry.inverse(poses[0]), points[seen])[:, 2]
     order = np.argsort(-depth)
     columns, rows = np.floor(uv[seen[order]]).astype(np.int64).T
@@ -114,6 +115,7 @@ def depth_rgb(depth_m: Float64[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
     """Colours of depths: red near, blue far."""
     import cv2
 
+    # Turbo runs from blue to red: reversed, so that near is red. OpenCV returns BGR.
     share = np.log(np.clip(depth_m, NEAR_M, FAR_M) / NEAR_M) / np.log(FAR_M / NEAR_M)
     bgr = cv2.applyColorMap(np.rint(255 * (1 - share)).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO)
     return np.ascontiguousarray(bgr[:, 0, ::-1])
@@ -126,7 +128,7 @@ def _draw_box(
     track: Track,
     world_from_box: Float64[np.ndarray, "4 4"],
 ) -> None:
-    """Twelve edges and a cross on the front, in short pieces: lenses bend straight lines."""
+    """Draws twelve edges and a cross on the front face, in short segments: lenses bend straight lines."""
     import cv2
 
     front = [index for index, corner in enumerate(_CORNERS) if corner[0] > 0]
@@ -137,7 +139,9 @@ def _draw_box(
         camera, poses, geometry.transform_points(world_from_box, lines.reshape(-1, 3))
     )
     seen = (valid & sensors.in_image(camera, uv)).reshape(len(lines), -1)
+    # OpenCV counts pixel centres as whole numbers.
     place = np.rint(np.where(seen[..., None], uv.reshape(len(lines), -1, 2), 0) - 0.5).astype(np.int64)
+    # Only segments with both ends in the image: a point behind the camera has no meaningful pixel.
     for line, step in zip(*np.nonzero(seen[:, 1:] & seen[:, :-1]), strict=True):
         one, two = place[line, step].tolist(), place[line, step + 1].tolist()
         cv2.line(image, one, two, BOX_RGB, 1, cv2.LINE_AA)

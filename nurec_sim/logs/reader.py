@@ -1,4 +1,4 @@
-"""Opening a log: the reader of its format is found, and poses and times are validated."""
+"""Opens logs: finds the reader of their format, and validates poses and times."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _NAMES_SHOWN = 8
 
 
 def open_clip(path: str | Path, reader: LogReader | str | None = None) -> Clip:
-    """Open a driving log. Images and sweeps are read when asked for.
+    """Open a driving log. Images and sweeps are read on demand.
 
-    A log that starts before 1 000 000 us, at 0 for instance, is read with all its times later by whole seconds, so
-    that it starts in the second that begins there; ``Clip.time_offset_us`` says by how much.
+    All times of a log that starts before 1 000 000 us, for instance at 0, are shifted by whole seconds, so that it
+    starts within the second from there; ``Clip.time_offset_us`` is the shift.
 
     Args:
-        path: a file or folder of any format that a reader knows.
-        reader: a reader, or a reference to one as ``plugins.load`` takes it; the first that knows the log if None.
+        path: a file or folder of any supported format.
+        reader: a reader, or a reference to one for ``plugins.load``; None selects the first that recognises the log.
 
     Raises:
-        ClipError: nothing there, a format that no reader knows, a broken file, or poses and times that contradict
-            themselves; the text names the file and the place. ``check_clip`` lists all faults of a clip.
+        ClipError: nothing there, an unknown format, a corrupt file, or inconsistent poses and times; the text names the
+            file and the location. ``check_clip`` lists all faults of a clip.
     """
     clip = read_tables(path, reader)
     if faults := table_faults(clip):
@@ -36,10 +36,10 @@ def open_clip(path: str | Path, reader: LogReader | str | None = None) -> Clip:
 
 
 def read_tables(path: str | Path, reader: LogReader | str | None = None) -> Clip:
-    """A clip whose poses and times are read but not yet checked against each other (arguments of ``open_clip``).
+    """A clip whose poses and times are read but not validated; arguments as for ``open_clip``.
 
     Raises:
-        ClipError: nothing there, a format that no reader knows, or a broken file.
+        ClipError: nothing there, an unknown format, or a corrupt file.
     """
     path = Path(path)
     if not path.exists():
@@ -51,7 +51,7 @@ def read_tables(path: str | Path, reader: LogReader | str | None = None) -> Clip
     try:
         clip = reader.open(path)
     except ClipError as error:
-        # What the reader says may begin with the log's name already.
+        # The reader's text may begin with the log's name already.
         raise error if str(error).startswith(f"{path.name}: ") else ClipError(f"{path.name}: {error}") from None
     except Exception as error:
         raise ClipError(f"{path.name}: log reader {reader.name!r} failed: {type(error).__name__}: {error}") from error
@@ -75,10 +75,10 @@ def is_log(path: Path) -> bool:
 def find_reader(path: Path) -> LogReader:
     """The first reader that can open a log, shipped ones first.
 
-    A reader that cannot be loaded, or fails to look at the log, is passed over with a warning.
+    A reader that cannot be loaded, or whose ``can_open`` fails, is skipped with a warning.
 
     Raises:
-        ClipError: the log is damaged, or in no format that is known; the text lists those that are.
+        ClipError: the log is damaged, or of an unknown format; the text lists the known ones.
     """
     damaged: ClipError | None = None
     known, broken = [], []
@@ -93,6 +93,7 @@ def find_reader(path: Path) -> LogReader:
                     warnings.warn(text, RuntimeWarning, stacklevel=2)
                 return reader
         except ClipError as error:
+            # Another reader may know the log; the error is raised only if none does.
             damaged = damaged or error
         except Exception as error:
             broken.append(f"log reader '{name}' cannot look at {path.name}: {type(error).__name__}: {error}")
@@ -106,7 +107,7 @@ def find_reader(path: Path) -> LogReader:
 
 
 def _looks(path: Path) -> str:
-    """What is at a path, in a few words."""
+    """A short description of what is at a path."""
     if not path.is_dir():
         return f"a file of {path.stat().st_size:,} bytes"
     names = sorted(each.name for each in path.iterdir())
@@ -117,7 +118,7 @@ def _looks(path: Path) -> str:
 def _late_enough(clip: Clip) -> Clip:
     """The clip, shifted to later times by whole seconds if it starts too early.
 
-    Times travel as unsigned integers, and clients ask for frames from half a second before the first.
+    Clients encode times as unsigned integers, and request frames from half a second before the first.
     """
     seconds = -((clip.span_us[0] - EARLIEST_US) // SECOND_US)
     return clip.later(seconds * SECOND_US) if seconds > 0 else clip

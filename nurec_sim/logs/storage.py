@@ -28,7 +28,7 @@ from nurec_sim.files.decoding import (
 )
 
 META_FILE = "meta.json"
-# What the zip and numpy readers raise for broken bytes.
+# Exceptions of the zip and numpy readers on corrupt data.
 _DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, ValueError, EOFError, OSError, KeyError,
            MemoryError, NotImplementedError, RuntimeError, SyntaxError, TokenError)  # fmt: skip
 
@@ -66,7 +66,7 @@ def decode_image(data: bytes) -> UInt8[np.ndarray, "h w 3"]:
     """
     import cv2
 
-    check_image(data)  # decoders fill the missing part of a truncated file with grey, without an error
+    check_image(data)  # decoders silently fill the missing part of a truncated file with grey
     try:
         bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:

@@ -1,4 +1,4 @@
-"""Images and sweeps as our own clip folders store them: JPEG or PNG, and whole millimetres in .npz files."""
+"""Images and sweeps of our own clip folders: JPEG or PNG, and integer millimetres in .npz files."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class StoredFiles:
         storage: the folder or zip file.
         images: records of each camera's frames.
         sweeps: records of each LiDAR's sweeps.
-        intensity_scale: of each LiDAR: what stored intensities are divided by.
-        lidar_from_file: turns the axes of sweep files to ours (x forward).
+        intensity_scale: per LiDAR, the divisor that maps stored intensities to 0..1.
+        lidar_from_file: rotation from the axes of sweep files to ours (x forward).
     """
 
     storage: Storage
@@ -42,6 +42,7 @@ class StoredFiles:
     def sweep(self, lidar_id: str, index: int) -> SweepPoints:
         """The points of one sweep."""
         arrays = _checked_arrays(self.storage, self.sweeps[lidar_id][index].file)
+        # Summed in int64: integers accumulate no rounding error, and int32 could overflow.
         xyz_m = np.cumsum(arrays["dxyz_mm"], axis=1, dtype=np.int64).T / 1000.0
         intensity = arrays.get("intensity")
         if intensity is not None:
@@ -54,8 +55,9 @@ class StoredFiles:
 
 
 def encode_points(xyz_m: Float64[np.ndarray, "n 3"]) -> np.ndarray:
-    """Points as whole millimetres, each coordinate as the difference to the point before (``dxyz_mm``, int32)."""
+    """Points as integer millimetres, delta-encoded per coordinate (``dxyz_mm``, int32)."""
     millimetres = np.rint(np.asarray(xyz_m, np.float64) * 1000.0).astype(np.int64).T
+    # Neighbouring points are close, so differences are small numbers, which deflate compresses well.
     return np.diff(millimetres, axis=1, prepend=0).astype(np.int32)
 
 

@@ -1,4 +1,4 @@
-"""Sweeps of LiDARs: checked as a reader gives them, timed, and the car's motion during a turn undone."""
+"""LiDAR sweeps: validation of a reader's output, point times, and motion compensation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SweepRecord:
         file: where it is stored, for messages.
         t_us: the instant to which its points belong, within ``start_us`` to ``end_us``.
         start_us: start of the turn.
-        end_us: end of the turn; equal to the start where the log knows one time only.
+        end_us: end of the turn; equal to the start if the log has a single time per sweep.
         world_from_lidar: pose of the LiDAR at ``t_us``.
         compensated: whether the points are already where they would be at ``t_us``; if not, they are moved by the ego's
             own motion between their time and ``t_us``.
@@ -43,8 +43,8 @@ def compensated_sweep(record: SweepRecord, stored: SweepPoints, lidar: LidarMode
     Args:
         record: its times and pose.
         stored: its points as the log stores them.
-        lidar: tells in which direction it spins, for points without times of their own.
-        ego: how the car moved.
+        lidar: its sense of rotation gives the times of points that have none.
+        ego: trajectory of the car.
 
     Raises:
         ClipError: the arrays do not fit together, or hold too many points.
@@ -67,7 +67,7 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 def _checked(stored: SweepPoints) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Points [n,3], intensities and times [n] in the types in which they are used."""
+    """Points [n,3], intensities and times [n], validated and converted to the types used here."""
     xyz_m = np.asarray(stored.xyz_m, np.float64)
     if xyz_m.ndim != 2 or xyz_m.shape[1] != 3 or not np.isfinite(xyz_m).all():
         raise ClipError(f"points must be finite numbers [n,3], got {xyz_m.dtype} {xyz_m.shape}")
@@ -86,7 +86,7 @@ def _checked(stored: SweepPoints) -> tuple[np.ndarray, np.ndarray | None, np.nda
 def _point_times(
     lidar: LidarModel, record: SweepRecord, dt_us: Int64[np.ndarray, " n"] | None, xyz: Float64[np.ndarray, "n 3"]
 ) -> Int64[np.ndarray, " n"]:
-    """When each point was measured: as stored, else by its azimuth in a raw turn, else the sweep's one time."""
+    """Time of each point: as stored, else from its azimuth in an uncompensated turn, else the sweep's single time."""
     if dt_us is not None:
         return record.start_us + dt_us
     if record.compensated or record.end_us <= record.start_us:
@@ -100,7 +100,7 @@ def _point_times(
 def _compensated(
     ego: Trajectory, record: SweepRecord, xyz: Float64[np.ndarray, "n 3"], point_t_us: Int64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Points at the reference time, by the ego's own motion; unchanged where the log knows no motion."""
+    """Points at the reference time, compensated by the ego's motion; unchanged if the log has no motion."""
     longer = prolonged(ego, record.end_us - record.start_us)
     if longer is None or (point_t_us == record.t_us).all():
         return xyz
@@ -113,7 +113,7 @@ def _compensated(
 
 
 def prolonged(ego: Trajectory, margin_us: int) -> Trajectory | None:
-    """A trajectory carried on at constant velocity before its first and after its last pose; None of a single pose."""
+    """A trajectory extrapolated at constant velocity at both ends; None for a single pose, which has no velocity."""
     if len(ego.t_us) < 2:
         return None
 

@@ -25,7 +25,7 @@ def track_to_json(track: Track) -> dict[str, Any]:
 
 
 def trajectory_from_json(where: str, row: Any, pose_key: str) -> Trajectory:
-    """Times ``t_us`` and poses as a trajectory.
+    """A trajectory from times ``t_us`` and poses.
 
     Raises:
         ClipError: a field is missing or wrong, or the times do not increase.

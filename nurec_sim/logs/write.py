@@ -37,8 +37,8 @@ _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 class CameraEntry:
     """One image to write: RGB pixels, or a JPEG or PNG file as it is.
 
-    ``world_from_camera`` at the start and end of the exposure is stored where given; without it a reader takes the
-    ego's trajectory times ``rig_from_camera``.
+    ``world_from_camera`` at the start and end of the exposure is optional; without it readers use the ego's trajectory
+    and ``rig_from_camera``.
     """
 
     camera_id: str
@@ -70,20 +70,20 @@ def write_clip(
     attachments: Mapping[str, bytes] | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write a driving log; it appears at ``path`` complete or not at all.
+    """Write a driving log atomically.
 
     Args:
-        path: folder to make, or a ``.zip`` file to make of it.
+        path: folder to create, or a ``.zip`` file of it.
         id: name of the clip.
         rig: sensors and outline of the car; every entry of ``frames`` names one of them.
         ego: poses of the rig, at any rate.
-        frames: images and sweeps, taken one at a time, so a generator may make them on the fly; in any mix of
-            sensors, each sensor's in the order of time.
+        frames: images and sweeps, consumed one at a time, so a generator can create them on the fly; sensors in any
+            order, the frames of each in temporal order.
         tracks: labelled objects, poses of box centres in the world.
         road_map: drivable areas and lanes, if known.
-        facts: anything else to remember, as plain JSON (source, seed, licence, ...).
+        facts: additional metadata, as plain JSON (source, seed, licence, ...).
         jpeg_quality: 1 to 100 for images given as pixels, or None for lossless PNG.
-        attachments: other files to lay beside the log's own, by name (``map.xodr``); readers leave them alone.
+        attachments: additional files beside the log's own, by name (``map.xodr``); readers ignore them.
         overwrite: replace what is at ``path``.
 
     Returns:
@@ -129,7 +129,7 @@ def write_clip(
 
 @contextlib.contextmanager
 def _work_folder(path: Path) -> Iterator[Path]:
-    """A hidden folder beside ``path`` for the time of the block."""
+    """A hidden folder beside ``path`` for the duration of the block, on the same file system as ``path``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
@@ -250,7 +250,7 @@ def _write_json(file: Path, value: dict[str, Any], indent: int | None = None) ->
 
 
 def _move_into_place(folder: Path, path: Path, work: Path) -> None:
-    """Rename the finished clip to ``path``; what was there goes only once the new one is complete."""
+    """Rename the finished clip to ``path``; an existing one is removed only once the new one is complete."""
     ready = folder
     if path.suffix == ".zip":
         ready = work / "clip.zip"
@@ -267,7 +267,7 @@ def _move_into_place(folder: Path, path: Path, work: Path) -> None:
 
 
 def _zip_folder(folder: Path, target: Path) -> None:
-    """Zip a folder so that the same files give the same bytes."""
+    """Zip a folder reproducibly: the same files give the same bytes."""
     with zipfile.ZipFile(target, "w") as archive:
         for file in sorted(item for item in folder.rglob("*") if item.is_file()):
             info = zipfile.ZipInfo(file.relative_to(folder).as_posix(), date_time=_ZIP_DATE)

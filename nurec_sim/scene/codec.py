@@ -144,6 +144,7 @@ def array(dtype: type, *shape: int) -> Decoder:
     """An array of ``dtype``; -1 in ``shape`` stands for any length, in the first place only."""
 
     def decode(value: Any) -> np.ndarray:
+        # NumPy infers the type first, so that texts or booleans among the numbers are noticed.
         raw = np.array(value)
         if raw.size == 0 and shape[0] < 0:
             return np.zeros((0, *shape[1:]), dtype)

@@ -1,4 +1,4 @@
-"""Edited copies of a scene: actors removed, inserted, or replaced.
+"""Edited copies of a scene: actors removed, inserted or replaced.
 
 Scenes are never modified in place. An asset is the appearance of an actor in its box frame (origin at the centre, x
 forward, y left, z up).
@@ -92,8 +92,13 @@ def with_track(scene: GaussianScene, track: Track, asset: Asset) -> GaussianScen
 def replaced_track(scene: GaussianScene, track_id: str, asset: Asset, size_m: Size | None = None) -> GaussianScene:
     """A copy of the scene in which a track has the appearance of ``asset``, with the same path and id.
 
-    The box gets ``size_m``, or the asset's own size, and keeps its ground contact: its centre moves vertically by half
-    of the height difference.
+    The box keeps its ground contact: its centre moves vertically by half of the height difference.
+
+    Args:
+        scene: the scene, which is not modified.
+        track_id: id of the track to replace.
+        asset: the new appearance, which also gives the track's label.
+        size_m: new length, width and height of the box; None takes the asset's own.
 
     Raises:
         RequestError: unknown track.
@@ -121,6 +126,7 @@ def without_track(scene: GaussianScene, track_id: str) -> GaussianScene:
     own = scene.dynamic.track == number
     static = scene.static if own.any() else scene.static[~_baked_in(scene, scene.tracks[number])]
     kept = _rows(scene.dynamic, ~own)
+    # Indices of later tracks move down by one.
     dynamic = dataclasses.replace(kept, track=(kept.track - (kept.track > number)).astype(np.int32))
     tracks = [track for track in scene.tracks if track.id != track_id]
     return dataclasses.replace(scene, static=static, dynamic=dynamic, tracks=tuple(tracks))
@@ -207,6 +213,7 @@ def _moved_track(scene: GaussianScene, at: int, to: int) -> GaussianScene:
     tracks = list(scene.tracks)
     tracks.insert(to, tracks.pop(at))
     old = scene.dynamic.track
+    # Tracks between the two places move up by one.
     number = np.where(old == at, to, np.where((old >= to) & (old < at), old + 1, old)).astype(np.int32)
     return dataclasses.replace(scene, dynamic=dataclasses.replace(scene.dynamic, track=number), tracks=tuple(tracks))
 

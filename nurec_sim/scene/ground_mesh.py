@@ -39,6 +39,7 @@ def ground_mesh(scene: GaussianScene) -> Mesh:
     everything = np.concatenate([road, strip])
     low = np.floor(everything[:, :2].min(axis=0) / CELL_M) * CELL_M - CELL_M
     extent = everything[:, :2].max(axis=0) - low + 2 * CELL_M
+    # Coarser cells bound the memory of very long drives.
     cell_m = max(CELL_M, float(np.sqrt(extent.prod() / MAX_CELLS)))
     shape = int(np.ceil(extent[0] / cell_m)), int(np.ceil(extent[1] / cell_m))
     height = _cell_medians(road, low, cell_m, shape)
@@ -77,6 +78,7 @@ def _corridor(scene: GaussianScene, path: Float64[np.ndarray, "p 3"]) -> Float64
     offsets = np.arange(-CORRIDOR_M, CORRIDOR_M + CELL_M / 4, CELL_M / 2)
     heading = np.gradient(path[:, :2], axis=0) if len(path) > 1 else np.zeros((1, 2))
     length = np.linalg.norm(heading, axis=1, keepdims=True)
+    # A standing car has no direction of motion; its x axis is used.
     heading = np.where(length > 1e-6, heading / np.maximum(length, 1e-6), first[:2, 0])
     left = np.column_stack([-heading[:, 1], heading[:, 0], np.zeros(len(path))])
     strip = (path[:, None] + offsets[None, :, None] * left[:, None]).reshape(-1, 3)
@@ -95,6 +97,7 @@ def _cell_medians(
         return height
     cell = np.floor((points[:, :2] - low) / cell_m).astype(np.int64)
     flat = np.ravel_multi_index((cell[:, 0], cell[:, 1]), shape)
+    # Sorted by cell, then height: each cell's median is the mean of the one or two middle entries.
     order = np.lexsort((points[:, 2], flat))
     cells, start, count = np.unique(flat[order], return_index=True, return_counts=True)
     z = points[order, 2]
@@ -109,6 +112,7 @@ def _fill_holes(height: Float64[np.ndarray, "nx ny"]) -> Float64[np.ndarray, "nx
     known: Bool[np.ndarray, "nx ny"] = ~np.isnan(height)
     if not known.any():
         return height
+    # Padding keeps the erosion from eating into the grid's border.
     padded = np.pad(known, HOLE_CELLS)
     closed = ndimage.binary_closing(padded, iterations=HOLE_CELLS)[HOLE_CELLS:-HOLE_CELLS, HOLE_CELLS:-HOLE_CELLS]
     filled = np.where(known, height, 0.0)

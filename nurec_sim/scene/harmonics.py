@@ -25,7 +25,18 @@ def sh_basis(direction: Float64[np.ndarray, "n 3"], k: int) -> Float64[np.ndarra
 
 
 def sh_functions(x: Any, y: Any, z: Any, k: int) -> list[Any]:
-    """The functions of ``sh_basis`` at unit vectors (x, y, z), which may be arrays or tensors."""
+    """The functions of ``sh_basis``, for arrays or tensors.
+
+    Args:
+        x: first component of unit vectors, of any shape.
+        y: second component.
+        z: third component.
+        k: 3, 8 or 15 functions (degree 1, 2 or 3).
+
+    Returns:
+        k arrays or tensors of the components' shape.
+    """
+    # Real orthonormal spherical harmonics, order m = -l..l within each degree l, with the Condon-Shortley phase.
     xx, yy, zz = x * x, y * y, z * z
     basis = [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if k > 3:
@@ -54,6 +65,7 @@ def rotate_harmonics(
 ) -> Float32[np.ndarray, "n k 3"]:
     """Rotated coefficients: the colour along d moves to ``rotation @ d``."""
     k = sh_rest.shape[1]
-    direction = released_cubemap_directions(4).reshape(-1, 3)  # any directions that span the functions
+    direction = released_cubemap_directions(4).reshape(-1, 3)  # 96 directions, more than the 15 functions
+    # Rotation maps each degree to itself; the matrix follows from new(d) = old(R^T d), by least squares.
     turned = np.linalg.lstsq(sh_basis(direction, k), sh_basis(direction @ rotation, k))[0]
     return np.einsum("jk,nkc->njc", turned, sh_rest).astype(np.float32)

@@ -1,12 +1,12 @@
-"""Files at the archive's root that AlpaSim, CARLA and NuRec tools read; nothing of ours reads them back.
+"""Files at the archive's root for AlpaSim, CARLA and NuRec tools; our own reader ignores them.
 
 Conventions of those tools: ``T_a_b`` maps a to b; track quaternions are ``xyzw``; f-theta principal points count pixel
 centres as whole numbers (ours minus 0.5). ``world_to_nre`` is the identity, so poses mean the same in every reading.
 
-Those tools start a drive at a camera's first frame, which must lie on a path that takes time. AlpaSim's first image
-takes the 30 ms before the end of that frame (its default shutter). So a rig with one pose stands there for the whole
-scene, frames that were exposed outside of the path or end within ``SHUTTER_ROOM_US`` of its start are left out, and a
-camera without any frame gets one.
+Those tools start a drive at a camera's first frame, which must lie within a path of non-zero duration. AlpaSim's first
+image covers the 30 ms before the end of that frame (its default shutter). So a rig with one pose is static for the
+whole scene, frames exposed outside the path or ending within ``SHUTTER_ROOM_US`` of its start are omitted, and a camera
+without any frame gets one.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ def ftheta_fits(scene: GaussianScene) -> dict[str, FTheta]:
 
 
 def fit_error_px(camera: CameraModel, fit: FTheta) -> dict[str, float]:
-    """How far pixels move when the f-theta fit stands for the camera's own lens: root mean square and maximum."""
+    """Pixel error of replacing a camera's lens by its f-theta fit: root mean square and maximum."""
     camera = dataclasses.replace(camera, windshield=None)
     columns, rows = np.linspace(0.0, camera.width_px, 33), np.linspace(0.0, camera.height_px, 25)
     uv = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     rays, seen = sensors.unproject(camera, uv)
-    # The farthest corner lies at the fit's largest angle: rounding must not decide whether it counts.
+    # The farthest corner is at the fit's largest angle: rounding must not decide whether it counts.
     wider = dataclasses.replace(fit, max_angle_rad=min(fit.max_angle_rad * (1 + _ROUNDING), float(np.pi)))
     fitted, inside = sensors.project(dataclasses.replace(camera, lens=wider), rays)
     off = np.linalg.norm(fitted - uv, axis=1)[seen & inside]
@@ -90,7 +90,14 @@ def fit_error_px(camera: CameraModel, fit: FTheta) -> dict[str, float]:
 def sidecars(
     scene: GaussianScene, digest: str, fits: Mapping[str, FTheta], derived_map: RoadMap | None = None
 ) -> dict[str, bytes]:
-    """All root files by name; ``digest`` is the scene's hash, ``derived_map`` stands in where the scene has no map."""
+    """All root files by name.
+
+    Args:
+        scene: the scene.
+        digest: its ``scene_hash``, from which ``metadata.yaml`` gets its hash and UUID.
+        fits: an F-theta lens per camera id, see ``ftheta_fits``.
+        derived_map: the map for ``map.xodr`` if the scene has none; without either the file is omitted.
+    """
     ground = encode_ply(ground_mesh(scene))
     road_map = scene.road_map if scene.road_map is not None else derived_map
     xodr = None if road_map is None else opendrive_map(scene.id, road_map, scene.ego)
@@ -100,7 +107,7 @@ def sidecars(
         "rig_trajectories.json": codec.dump(_rig_trajectories(scene, fits), "rig_trajectories.json"),
         "sequence_tracks.json": codec.dump(_sequence_tracks(scene), "sequence_tracks.json"),
         "mesh_ground.ply": ground,
-        # Physics may ask for either name; walls and vehicles are not meshed.
+        # Physics may request either name; walls and vehicles are not meshed.
         "mesh.ply": ground,
     }
 
@@ -169,7 +176,7 @@ def _uid(scene: GaussianScene, sensor_id: str) -> str:
 
 
 def drive_path(scene: GaussianScene) -> Trajectory:
-    """The recorded path; a single pose is held until the scene ends."""
+    """The recorded path; a single pose is held until the end of the scene."""
     if len(scene.ego.t_us) > 1:
         return scene.ego
     start_us = scene.ego.start_us
@@ -195,6 +202,7 @@ def _on_path(times_us: Int64[np.ndarray, "n 2"], path: Trajectory) -> Int64[np.n
     frames = np.column_stack([times_us[:, 0], np.maximum(times_us[:, 1], times_us[:, 0] + 1)])
     frames = frames[(frames[:, 0] >= path.start_us) & (frames[:, 1] <= path.end_us)]
     frames = frames[frames[:, 1] >= path.start_us + SHUTTER_ROOM_US]
+    # Keep a frame only if both of its times exceed those of all frames before.
     latest = np.maximum.accumulate(frames, axis=0)
     return frames[np.concatenate([np.ones(len(frames[:1]), bool), (frames[1:] > latest[:-1]).all(axis=1)])]
 
@@ -235,6 +243,7 @@ def _ftheta_parameters(fit: FTheta) -> dict[str, Any]:
         return [float(c) for c in polynomial] + [0.0] * (_FTHETA_TERMS - len(polynomial))
 
     return {
+        # NCore's f-theta counts pixel centres as whole numbers.
         "principal_point": [fit.cx_px - 0.5, fit.cy_px - 0.5],
         "reference_poly": fit.reference.name,
         "pixeldist_to_angle_poly": padded(fit.pixeldist_to_angle),
@@ -245,7 +254,7 @@ def _ftheta_parameters(fit: FTheta) -> dict[str, Any]:
 
 
 def _exact_model(camera: CameraModel) -> dict[str, Any]:
-    """The lens itself: in NCore's names those that NCore knows, any other as ``nurec_sim/scene.json`` has it."""
+    """The exact lens: under NCore's names if NCore has the model, else as in ``nurec_sim/scene.json``."""
     lens, common = camera.lens, _common_parameters(camera)
     if lens.kind not in _NCORE_NAMES:
         return {"type": lens.kind, "parameters": common | {"lens": lens}}
@@ -277,7 +286,7 @@ def _lidar_calibration(scene: GaussianScene, index: int, lidar: LidarModel) -> d
 
 
 def _sequence_tracks(scene: GaussianScene) -> dict[str, Any]:
-    tracks = [track for track in scene.tracks if track.actor]  # clients take all that is listed for road users
+    tracks = [track for track in scene.tracks if track.actor]  # clients treat every listed track as a road user
     samples = [_track_samples(track) for track in tracks]
     return {
         CHUNK_ID: {
@@ -294,7 +303,7 @@ def _sequence_tracks(scene: GaussianScene) -> dict[str, Any]:
 
 
 def _track_samples(track: Track) -> tuple[np.ndarray, np.ndarray]:
-    """Times and poses ``x y z qx qy qz qw`` of a track; a single sample is repeated, for the clients' splines."""
+    """Times and poses ``x y z qx qy qz qw`` of a track; a single sample is duplicated, as clients fit splines."""
     t_us, poses = track.path.t_us, track.path.world_from_body
     if len(t_us) == 1:
         t_us, poses = np.array([t_us[0], t_us[0] + 100_000]), np.repeat(poses, 2, axis=0)

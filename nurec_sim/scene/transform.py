@@ -1,4 +1,4 @@
-"""Gaussians taken to another frame: turned, moved, scaled, and joined whatever their harmonics."""
+"""Gaussians transformed to another frame, and concatenated regardless of their harmonics' degrees."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ UP_AXES: Mapping[str, tuple[tuple[int, int, int], ...]] = {
     "x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
     "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
 }
-"""world_from_file by the axis of the file that points up. The world's x is what such files have ahead: +z where y
-points down (COLMAP, most trained 3DGS files), -z where y points up (OpenGL)."""
+"""world_from_file by the up axis of the file. The world's x is the usual forward axis of such files: +z if y points
+down (COLMAP, most trained 3DGS files), -z if y points up (OpenGL)."""
 
 
 def world_from_up(up: str) -> Float64[np.ndarray, "3 3"]:
@@ -37,15 +37,16 @@ def world_from_up(up: str) -> Float64[np.ndarray, "3 3"]:
 
 
 def transformed(gaussians: Gaussians, a_from_b: Float64[np.ndarray, "4 4"]) -> Gaussians:
-    """Gaussians of frame b in frame a, their view-dependent colours with them.
+    """Transforms Gaussians from frame b to frame a, including their view-dependent colours.
 
     Args:
         gaussians: in frame b.
-        a_from_b: affine. Shapes are exact under any of them; view-dependent colours follow the nearest rotation or
-            reflection, which is all there is to know unless ``a_from_b`` stretches unevenly.
+        a_from_b: affine. Shapes are always exact; view-dependent colours follow the nearest rotation or reflection,
+            which is exact unless ``a_from_b`` scales anisotropically.
     """
     matrix = np.asarray(a_from_b, np.float64)
     linear = matrix[:3, :3]
+    # Polar decomposition: of all orthogonal matrices, left @ right is the nearest to ``linear``.
     left, stretch, right = np.linalg.svd(linear)
     turn = left @ right
     mean = geometry.transform_points(matrix, gaussians.mean_m)
@@ -69,15 +70,17 @@ def transformed(gaussians: Gaussians, a_from_b: Float64[np.ndarray, "4 4"]) -> G
 def _stretched(
     gaussians: Gaussians, linear: Float64[np.ndarray, "3 3"]
 ) -> tuple[Float64[np.ndarray, "n 4"], Float64[np.ndarray, "n 3"]]:
-    """Rotations and standard deviations of Gaussians after a linear map: the principal axes of what they become."""
+    """Rotations and standard deviations of Gaussians after a linear map, by principal axes."""
     axes = geometry.matrix_from_quat(gaussians.quat_wxyz) * gaussians.scale_m[:, None].astype(np.float64)
+    # Covariance A S S^T A^T = (A S)(A S)^T: its axes are the left singular vectors of A S, S = R diag(scale).
     rotation, scale, _ = np.linalg.svd(linear @ axes)
+    # Flipping an axis leaves the ellipsoid unchanged and makes a reflection a rotation.
     rotation[:, :, 2] *= np.sign(np.linalg.det(rotation))[:, None]
     return geometry.quat_from_matrix(rotation), scale
 
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
-    """All parts one after the other; missing coefficients of harmonics are zero."""
+    """Concatenates parts; missing coefficients of harmonics are zero."""
     k = max((0 if part.sh_rest is None else part.sh_rest.shape[1] for part in parts), default=0)
     return Gaussians.concatenate([with_harmonics(part, k) if k else part for part in parts])
 

@@ -20,9 +20,9 @@ from nurec_sim.types import CameraModel, Lens, Shutter, Windshield
 
 ROLLING_ITERATIONS = 10
 KEPT_PIXELS = 1 << 22
-"""Rays of images up to this size are kept for the next caller."""
+"""Rays of images up to this size are cached."""
 PIXELS_AT_ONCE = 1 << 14
-"""Of a strip: a few milliseconds of work, and what happens in between fits into the caches."""
+"""Pixels per strip: a few milliseconds of work, with temporaries that fit into the CPU caches."""
 
 Points2 = Float64[np.ndarray, "n 2"]
 Points3 = Float64[np.ndarray, "n 3"]
@@ -38,6 +38,7 @@ def project(camera: CameraModel, xyz_camera: Points3) -> tuple[Points2, Mask]:
     """
     xyz = np.asarray(xyz_camera, np.float64).reshape(-1, 3)
     finite: Mask = np.asarray(np.isfinite(xyz).all(axis=1))
+    # Lenses may assume finite input; the replaced points are marked invalid below.
     xyz = np.where(finite[:, None], xyz, 0.0)
     valid = finite
     if camera.windshield is not None:
@@ -67,7 +68,7 @@ def unproject(camera: CameraModel, uv_px: Points2) -> tuple[Points3, Mask]:
 
 
 def pixel_rays(camera: CameraModel) -> tuple[Float64[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Unit rays through all pixel centres, and which are valid; read-only, the latest few of usual size are kept."""
+    """Unit rays through all pixel centres, and which are valid; read-only, cached for recent cameras of usual size."""
     make = _kept_pixel_rays if _is_usual(camera) else _pixel_rays
     return make(camera.lens, camera.windshield, camera.width_px, camera.height_px)
 
@@ -75,7 +76,7 @@ def pixel_rays(camera: CameraModel) -> tuple[Float64[np.ndarray, "h w 3"], Bool[
 def pixel_ray_strips(
     camera: CameraModel,
 ) -> Iterator[tuple[slice, Float64[np.ndarray, "r w 3"], Bool[np.ndarray, "r w"]]]:
-    """``pixel_rays`` by strips of rows, each with its place, for images that are too large to hold in double precision.
+    """``pixel_rays`` in strips of rows, each with its row slice, for images too large for memory in double precision.
 
     Raises:
         CancelledError, DeadlinePassedError: see ``compute.turns.rest``.
@@ -164,6 +165,7 @@ def project_rolling(
         return uv, valid, fraction
     late, late_valid = project(camera, geometry.transform_points(camera_from_world[1], points))
     only_late = late_valid & ~valid
+    # Start the fixed point where the point is visible at all.
     fraction[only_late] = shutter_fraction(camera, late[only_late])
     moving = np.flatnonzero(valid | late_valid)
     for _ in range(ROLLING_ITERATIONS):
@@ -174,6 +176,7 @@ def project_rolling(
         uv[moving], valid[moving] = project(camera, seen)
         previous = fraction[moving]
         fraction[moving] = shutter_fraction(camera, uv[moving])
+        # Fractions are quantised to rows, so the fixed point is reached exactly.
         moving = moving[valid[moving] & (fraction[moving] != previous)]
     return uv, valid, fraction
 

@@ -21,6 +21,7 @@ def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, ...]:
     scale = float(np.abs(x).max()) or 1.0
     powers = np.arange(1, TERMS)
     solution = np.linalg.lstsq((x[:, None] / scale) ** powers, y, rcond=None)[0]
+    # Undo the scaling of x, which kept the powers comparable and the system well conditioned.
     return (0.0, *(float(value) for value in solution / scale**powers))
 
 
@@ -62,6 +63,7 @@ def fit_ftheta(camera: CameraModel) -> FTheta:
     if not valid.any():
         raise ValueError(f"camera {camera.id!r}: no pixel of the image lies in the field of its lens")
     stretch = lens.fx_px / lens.fy_px
+    # F-theta distances are along the columns; ``linear_cde`` stretches the rows.
     distance = np.hypot((uv[valid, 0] - lens.cx_px) / stretch, uv[valid, 1] - lens.cy_px)
     angle, _ = radial.angle_and_direction(rays[valid])
     return FTheta(

@@ -29,7 +29,7 @@ def column_fraction(lidar: LidarModel) -> Float64[np.ndarray, " columns"]:
 def beam_coordinates(
     lidar: LidarModel, xyz_lidar: Float64[np.ndarray, "n 3"]
 ) -> tuple[Values, Values, Bool[np.ndarray, " n"]]:
-    """Place of points, given in the LiDAR's frame, in its range image.
+    """Coordinates in the range image of points given in the LiDAR's frame.
 
     Returns:
         row [n] and column [n], fractional between neighbouring beams (whole numbers lie on a beam), and valid [n]:
@@ -41,6 +41,7 @@ def beam_coordinates(
     valid = np.isfinite(xyz).all(axis=1) & (across > 0)
     across = np.where(valid, across, 1.0)
     xyz = np.where(valid[:, None], xyz, (1.0, 0.0, 0.0))
+    # Elevations fall from row to row; negated they increase, as the search requires.
     row = _place(-np.arctan2(xyz[:, 2], across), -lidar.elevation_rad)
     rows, columns = len(lidar.elevation_rad), len(lidar.azimuth_rad)
     # The offset jumps from row to row (blocks of lasers), so the nearest row's is taken, not a mean.
@@ -48,7 +49,7 @@ def beam_coordinates(
     sign = -1.0 if lidar.spin is Spin.CLOCKWISE else 1.0
     turned = sign * (np.arctan2(xyz[:, 1], xyz[:, 0]) - offset - lidar.azimuth_rad[0])
     grid = sign * (lidar.azimuth_rad - lidar.azimuth_rad[0])
-    # Angles run from half the unseen gap before the first column to half of it behind the last.
+    # Wrap angles to the interval from half of the unseen gap before the first column to half of it after the last.
     gap = max(2 * np.pi - (grid[-1] - grid[0]), 0.0)
     turned = (turned + gap / 2) % (2 * np.pi) - gap / 2
     column = _place(turned, grid)
@@ -57,7 +58,7 @@ def beam_coordinates(
 
 
 def _place(value: Values, grid: Float64[np.ndarray, " k"]) -> Values:
-    """Fractional index of values in a rising grid, carried on linearly past its ends."""
+    """Fractional index of values in an increasing grid, extrapolated linearly beyond its ends."""
     if len(grid) == 1:
         return np.where(np.abs(value - grid[0]) < 1e-3, 0.0, -1.0)
     low = np.clip(np.searchsorted(grid, value, side="right") - 1, 0, len(grid) - 2)
@@ -74,7 +75,7 @@ def compensate_sweep(
     Args:
         xyz_lidar: points as measured.
         world_from_lidar_fired: pose of the LiDAR when each point was measured.
-        world_from_lidar: pose at the wanted instant.
+        world_from_lidar: pose at the reference instant.
     """
     world = np.einsum("nij,nj->ni", world_from_lidar_fired[:, :3, :3], xyz_lidar) + world_from_lidar_fired[:, :3, 3]
     return geometry.transform_points(geometry.inverse(world_from_lidar), world)

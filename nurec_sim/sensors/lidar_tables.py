@@ -55,7 +55,7 @@ def lidar_model(name: str, rig_from_lidar: Matrix4, id: str | None = None, colum
 
     Args:
         name: a key of ``LIDAR_TABLES``.
-        rig_from_lidar: where it sits.
+        rig_from_lidar: its mounting pose.
         id: its name in the rig; the device's name if None.
         columns: beams per row and sweep; the device's own at 10 Hz if None.
 

@@ -1,4 +1,4 @@
-"""The bivariate windshield: glass in front of a lens bends the two angles of a ray by polynomials in both.
+"""The bivariate windshield: glass in front of a lens refracts the two angles of a ray by polynomials in both.
 
 A ray (x, y, z) has the angles phi = asin(x), theta = asin(y); behind the glass they are P_h(phi, theta) and
 P_v(phi, theta). The polynomials named by ``reference`` are exact; the opposite direction is solved by Newton's method,
@@ -27,6 +27,7 @@ def polynomial_order(count: int) -> int:
     Raises:
         ValueError: the count is not 1, 3, 6, 10, 15, 21, ...
     """
+    # An order n has (n + 1)(n + 2) / 2 coefficients; solved for n.
     order = (math.isqrt(8 * count + 1) - 3) // 2
     if count < 1 or (order + 1) * (order + 2) // 2 != count:
         raise ValueError(f"a bivariate polynomial has 1, 3, 6, 10, 15 or 21 coefficients, got {count}")
@@ -51,7 +52,7 @@ def _bend(pair: tuple[tuple[float, ...], tuple[float, ...]], angles: Angles) -> 
 
 
 def _unbend(pair: tuple[tuple[float, ...], tuple[float, ...]], target: Angles, guess: Angles) -> Angles:
-    """Angles that ``_bend`` takes to ``target``."""
+    """Inverse of ``_bend``: the angles that it maps to ``target``, by Newton's method."""
     grids = [_grid(part) for part in pair]
     slopes = [(polynomial.polyder(grid, axis=0), polynomial.polyder(grid, axis=1)) for grid in grids]
     angles = guess
@@ -60,6 +61,7 @@ def _unbend(pair: tuple[tuple[float, ...], tuple[float, ...]], target: Angles, g
         error = np.stack([polynomial.polyval2d(phi, theta, grid) for grid in grids], axis=1) - target
         (a, b), (c, d) = ([polynomial.polyval2d(phi, theta, part) for part in row] for row in slopes)
         determinant = a * d - b * c
+        # Keeps the step finite where the Jacobian is singular; such rays fail the residual test of the caller.
         safe = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
         step = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], axis=1) / safe[:, None]
         angles = np.clip(angles - step, -np.pi / 2, np.pi / 2)
@@ -76,6 +78,7 @@ def _rays_of(angles: Angles) -> tuple[Rays, Bool[np.ndarray, " n"]]:
     flat = np.sin(angles)
     rest = 1.0 - np.sum(flat**2, axis=1)
     valid = (rest > 0) & (np.abs(angles) < np.pi / 2).all(axis=1)
+    # x = sin(phi), y = sin(theta), z from unit length: only rays ahead (z > 0) have these angles.
     return np.concatenate([flat, np.sqrt(np.maximum(rest, 0.0))[:, None]], axis=1), valid
 
 
@@ -90,6 +93,7 @@ def _apply(glass: Windshield, rays: Rays, inward: bool) -> tuple[Rays, Bool[np.n
         bent = _bend(wanted, angles)
         solved = ahead
     else:
+        # The approximate inverse is the initial guess; glass bends rays little, so their own angles serve as well.
         guess = _bend(wanted, angles) if all(wanted) else angles
         bent = _unbend(other, angles, np.clip(guess, -np.pi / 2, np.pi / 2))
         solved = ahead & (np.abs(_bend(other, bent) - angles).max(axis=1, initial=0.0) < 1e-9)

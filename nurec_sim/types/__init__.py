@@ -1,10 +1,10 @@
-"""Every dataclass that crosses a module border.
+"""All dataclasses that are shared between modules.
 
-Conventions (all modules): transforms are spelt ``a_from_b`` and take ``b`` coordinates to ``a``; metres, radians,
-integer microseconds; intervals are half-open; quaternions are ``wxyz`` with ``w >= 0``. Rig: x forward, y left, z up,
-origin at the rear axle on the ground. Camera: x right, y down, z forward. LiDAR: x forward, y left, z up. Pixels have
-their origin at the image corner, centres at +0.5. Gaussian scales are standard deviations in metres and opacities lie
-in 0..1. World: metres, z up.
+Conventions (all modules): a transform ``a_from_b`` maps coordinates in ``b`` to ``a``; metres, radians, integer
+microseconds; intervals are half-open; quaternions are ``wxyz`` with ``w >= 0``. Rig: x forward, y left, z up, origin at
+the rear axle on the ground. Camera: x right, y down, z forward. LiDAR: x forward, y left, z up. Pixel coordinates
+originate at the image corner, pixel centres are at +0.5. Gaussian scales are standard deviations in metres, opacities
+lie in 0..1. World: metres, z up.
 """
 
 from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Lens, Pinhole

@@ -15,11 +15,11 @@ from nurec_sim.types.sensors import CameraModel, LidarModel
 
 @dataclass(frozen=True)
 class SensorRequest:
-    """Ask for one frame: sensor, exposure [start, end), its poses at both ends, and actors to re-pose.
+    """A request for one frame: sensor, exposure [start, end), sensor poses at both ends, and actors to re-pose.
 
-    ``actors`` maps track ids to ``world_from_box`` at start and end; tracks not named move as recorded. Tracks in
-    ``hidden`` are not drawn, whatever ``actors`` says; ids that the scene does not have are ignored. ``apply_isp`` says
-    whether a camera's image gets the colour correction that the scene has for it.
+    ``actors`` maps track ids to ``world_from_box`` at start and end; all other tracks follow their recorded paths.
+    Tracks in ``hidden`` are not rendered, even if they are in ``actors``; unknown ids are ignored. ``apply_isp``
+    enables the scene's colour correction for the camera.
     """
 
     scene_id: str
@@ -41,8 +41,8 @@ class SensorRequest:
 class CameraFrame:
     """A rendered image.
 
-    ``depth_m`` is the distance along the optical axis of the visible surface, 0 where none; ``normal`` the surface's
-    unit normal in the world, turned to the camera, zero where none is known.
+    ``depth_m`` is the depth of the visible surface along the optical axis, 0 where there is none; ``normal`` is its
+    unit normal in the world, facing the camera, zero where unknown.
     """
 
     camera: CameraModel
@@ -57,16 +57,16 @@ class CameraFrame:
 
 @dataclass(frozen=True)
 class LidarFilter:
-    """Which beams of a simulated LiDAR return.
+    """Criteria by which beams of a simulated LiDAR are dropped.
 
     Args:
-        raydrop_threshold: beams whose drop probability is above it are lost, 0..1.
-        opacity_threshold: beams whose gathered opacity does not exceed it meet nothing, 0..1.
-        distance_threshold_m: beams whose range differs by more than this from the mean range of all that they meet
-            have hit two things (an edge, a floater) and are lost; None keeps them.
+        raydrop_threshold: beams with a higher drop probability are dropped, 0..1.
+        opacity_threshold: beams whose accumulated opacity does not exceed it have no return, 0..1.
+        distance_threshold_m: beams whose range differs by more than this from the mean range of all Gaussians that
+            they hit see two surfaces (an edge, a floater) and are dropped; None keeps them.
 
     Raises:
-        RequestError: a threshold is not finite or out of its range.
+        RequestError: a threshold is not finite or out of range.
     """
 
     raydrop_threshold: float = 0.5
@@ -97,4 +97,4 @@ class LidarFrame:
 
 SensorFrame = CameraFrame | LidarFrame
 Sense = Callable[[Sequence[SensorRequest]], Sequence[SensorFrame]]
-"""Renders requests, one frame each, in order: the loop's only view of a renderer, a server or the true world."""
+"""Renders one frame per request, in order: the loop's only interface to a renderer, a server or the ground truth."""

@@ -1,4 +1,4 @@
-"""What a driving log holds."""
+"""The contents of a driving log."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ MOVABLE_LABELS = ("automobile", "heavy_truck", "bus", "trailer", "train", "other
 class Track:
     """One object over time; ``path`` holds the poses of its box centre (x forward, y left, z up).
 
-    ``labelled`` is False for what a reconstruction found by how it moves, and nobody has labelled. ``actor`` says
-    whether the object counts as one for metrics, privileged policies and clients; where a log has boxes, they alone do,
-    and what else moves is part of the picture only.
+    ``labelled`` is False for objects that a reconstruction detected by their motion, without a label. ``actor`` marks
+    objects that count for metrics, privileged policies and clients; in a log with boxes only those do, and other movers
+    are only rendered.
     """
 
     id: str
@@ -37,7 +37,7 @@ class Track:
 
 @dataclass(frozen=True)
 class RoadMap:
-    """What is known of the road: drivable areas as (outer ring, holes...) of [k,2] metres, lane centre lines [k,3]."""
+    """Road geometry: drivable areas as (outer ring, holes...) of [k,2] metres, lane centre lines [k,3] metres."""
 
     drivable: tuple[tuple[Float64[np.ndarray, "k 2"], ...], ...] = ()
     lanes: tuple[Float64[np.ndarray, "k 3"], ...] = ()
@@ -45,7 +45,7 @@ class RoadMap:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One LiDAR turn, motion-compensated to ``t_us``; ``intensity`` in 0..1 or None, ``point_t_us`` when fired."""
+    """One LiDAR revolution, motion-compensated to ``t_us``; ``intensity`` 0..1 or None, ``point_t_us`` when fired."""
 
     t_us: int
     start_us: int
@@ -86,7 +86,7 @@ class Clip(Protocol):
 
     @property
     def road_map(self) -> RoadMap | None:
-        """What is known of the road."""
+        """Road geometry; None if the log has none."""
         ...
 
     @property
@@ -96,11 +96,11 @@ class Clip(Protocol):
 
     @property
     def time_offset_us(self) -> int:
-        """How much later all times are than those that the log was recorded with; 0 unless it starts too early."""
+        """Offset of all times from the recorded ones; 0 unless the log starts too early."""
         ...
 
     def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:
-        """Exposure start and end of every frame; equal when the log knows one time only."""
+        """Exposure start and end of every frame; equal if the log has a single time per frame."""
         ...
 
     def world_from_camera(self, camera_id: str, index: int) -> Float64[np.ndarray, "2 4 4"]:
@@ -120,7 +120,7 @@ class Clip(Protocol):
         ...
 
     def ego_mask(self, camera_id: str) -> Bool[np.ndarray, "h w"] | None:
-        """Pixels in which the car sees itself; None where the log does not know."""
+        """Pixels that show the ego vehicle; None if unknown."""
         ...
 
 
@@ -138,14 +138,14 @@ class SweepPoints:
 
 
 class LogSource(Protocol):
-    """Loads what is large in a log, one piece at a time: the part of a log reader that a ``logs.Clip`` keeps.
+    """Loads the large data of a log piece by piece: the part of a log reader that a ``logs.Clip`` keeps.
 
-    It is called when an image or a sweep is asked for, from several threads at once, with ids of the clip's rig and
-    indices into its records. What it raises becomes a ``ClipError`` that names the image or the sweep.
+    It is called when an image or a sweep is requested, concurrently from several threads, with sensor ids of the clip's
+    rig and indices into its records. Its exceptions become a ``ClipError`` that names the image or the sweep.
     """
 
     def image(self, camera_id: str, index: int) -> UInt8[np.ndarray, "h w 3"]:
-        """One RGB frame, as large as the calibration says."""
+        """One RGB frame, of the size in the calibration."""
         ...
 
     def sweep(self, lidar_id: str, index: int) -> SweepPoints:
@@ -153,7 +153,7 @@ class LogSource(Protocol):
         ...
 
     def ego_mask(self, camera_id: str) -> Bool[np.ndarray, "h w"] | None:
-        """Pixels in which the car sees itself, as large as the camera's images; None where the log does not know."""
+        """Pixels that show the ego vehicle, of the camera's image size; None if unknown."""
         ...
 
 
@@ -161,12 +161,12 @@ class LogReader(Protocol):
     """Opens driving logs of one format (docs/write_a_log_reader.md)."""
 
     name: str
-    """Of the format, for messages."""
+    """Name of the format, for messages."""
     description: str
-    """What a log of this format looks like, in one line: "a folder with ...". Shown when no reader knows a log."""
+    """One line that describes a log of this format: "a folder with ...". Shown if no reader recognises a log."""
 
     def can_open(self, path: Path) -> bool:
-        """Whether a file or folder that exists is of this format; a quick look at names and headers.
+        """Whether an existing file or folder has this format, from names and headers only.
 
         Raises:
             ClipError: it is of this format, but damaged.
@@ -174,9 +174,9 @@ class LogReader(Protocol):
         ...
 
     def open(self, path: Path) -> Clip:
-        """The log as a ``logs.Clip``; images and sweeps are not read yet.
+        """Opens the log as a ``logs.Clip``; images and sweeps are read on demand.
 
         Raises:
-            ClipError: something is missing or wrong; the text names the file and the place.
+            ClipError: something is missing or wrong; the text names the file and the location in it.
         """
         ...

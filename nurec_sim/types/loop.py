@@ -1,4 +1,4 @@
-"""What the closed loop exchanges with policies and leaves behind."""
+"""Data that the closed loop exchanges with policies, and its results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nurec_sim.types.trajectories import Matrix4, Trajectory
 
 @dataclass(frozen=True)
 class EgoState:
-    """The car at one instant: rig pose, speed along x, acceleration, yaw rate, front-wheel angle."""
+    """The ego vehicle at one instant: rig pose, speed and acceleration along x, yaw rate, front-wheel angle."""
 
     t_us: int
     world_from_rig: Matrix4
@@ -29,7 +29,7 @@ class EgoState:
 
 @dataclass(frozen=True)
 class ActorState:
-    """A true actor around the ego, in the rig frame of now. Only policies that declare ``privileged`` see it."""
+    """Ground truth of an actor, in the current rig frame. Only policies that declare ``privileged`` receive it."""
 
     id: str
     label: str
@@ -40,11 +40,11 @@ class ActorState:
 
 @dataclass(frozen=True)
 class Observation:
-    """What a policy sees at ``t_us``.
+    """The input of a policy at ``t_us``.
 
-    ``route_m`` is up to 20 way points over the next 80 m of the recorded path, in the rig frame;
-    ``route_speed_mps`` the recorded speed at each. ``recorded`` is the recorded future (t_us, x, y, yaw in the rig
-    frame) for log replay. ``actors`` is None unless the policy declared ``privileged``.
+    ``route_m`` has up to 20 waypoints over the next 80 m of the recorded path, in the rig frame; ``route_speed_mps``
+    is the recorded speed at each. ``recorded_t_us`` and ``recorded_pose`` (x, y, yaw in the rig frame) are the recorded
+    future, for log replay. ``actors`` is None unless the policy declared ``privileged``.
     """
 
     t_us: int
@@ -61,9 +61,9 @@ class Observation:
 
 @dataclass(frozen=True)
 class Plan:
-    """A policy's answer: poses (x, y, yaw) in the rig frame of the observation at increasing times after it.
+    """The output of a policy: poses (x, y, yaw) in the observation's rig frame, at increasing times after it.
 
-    At least 2.5 s ahead; return 5 s. ``stop_session`` asks to end the rollout.
+    The horizon must be at least 2.5 s; 5 s are recommended. ``stop_session`` requests the end of the rollout.
     """
 
     t_us: Int64[np.ndarray, " k"]
@@ -73,10 +73,10 @@ class Plan:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a policy reads; the loop renders nothing else.
+    """The sensors that a policy reads; the loop renders no others.
 
-    ``cameras`` and ``lidars`` are sensor ids of the rig, or the aliases ``front`` (the camera that looks most
-    forward) and ``any`` (the first LiDAR). Images are rendered at ``image_width_px``, keeping the field of view.
+    ``cameras`` and ``lidars`` are sensor ids of the rig, or the aliases ``front`` (the camera facing closest to
+    forward) and ``any`` (the first LiDAR). Images are rendered at ``image_width_px`` with the same field of view.
     """
 
     cameras: tuple[str, ...] = ()
@@ -92,17 +92,17 @@ class Policy(Protocol):
     needs: Needs
 
     def reset(self, rig: Rig, seed: int) -> None:
-        """Forget everything; a new rollout begins."""
+        """Clears all state for a new rollout."""
         ...
 
     def plan(self, observation: Observation) -> Plan:
-        """Answer with the poses to drive."""
+        """Returns the trajectory to drive."""
         ...
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened in a rollout: ``kind`` such as ``plan_error`` or ``stop_session``, with a text."""
+    """An event in a rollout: ``kind`` such as ``plan_error`` or ``stop_session``, with a description."""
 
     t_us: int
     kind: str
@@ -111,7 +111,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Rollout:
-    """One policy driven through one scene once.
+    """One run of a policy through a scene.
 
     ``states`` are at 10 Hz; ``actors[id]`` holds ``world_from_box [t,4,4]`` at the same times, NaN while absent.
     ``status`` is ``ok`` or ``failed``; a failed rollout keeps its states up to the failure and its error text.
@@ -156,7 +156,7 @@ class Rollout:
 
 
 class Reduce(enum.Enum):
-    """How a series becomes one number."""
+    """Reduction of a series to one number."""
 
     MEAN = "mean"
     MEDIAN = "median"
@@ -167,7 +167,7 @@ class Reduce(enum.Enum):
 
 @dataclass(frozen=True)
 class Series:
-    """One metric over time. ``valid`` marks the values that could be computed; the others are never counted."""
+    """One metric over time. ``valid`` marks the values that could be computed; the others are ignored."""
 
     name: str
     unit: str
@@ -177,7 +177,7 @@ class Series:
     reduce: Reduce
 
     def value(self) -> float:
-        """The series as one number; NaN where nothing is valid."""
+        """The reduced series; NaN if no value is valid."""
         values = np.asarray(self.values, np.float64)[np.asarray(self.valid, bool)]
         if len(values) == 0:
             return float("nan")

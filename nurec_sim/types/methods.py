@@ -1,4 +1,4 @@
-"""What a reconstruction method is."""
+"""The interface of reconstruction methods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from nurec_sim.types.logs import Clip
 from nurec_sim.types.scenes import GaussianScene
 
 Progress = Callable[[str, float], None]
-"""Called with what is being done and the fraction of all work that is done, about; it may raise to end the work."""
+"""Called with the current stage and the approximate fraction of all work done; may raise to abort the work."""
 
 
 class Method(Protocol):
@@ -22,7 +22,7 @@ class Method(Protocol):
     """A frozen dataclass, documented field by field, every field with a default."""
 
     def files(self, settings: Any) -> Sequence[Path]:
-        """Files beside the log that the result depends on, weights for instance; scenes are kept until they change."""
+        """Files that the result depends on besides the log (weights); cached scenes are valid until they change."""
         ...
 
     def reconstruct(
@@ -34,13 +34,13 @@ class Method(Protocol):
         hold_out_sweeps: Collection[int],
         progress: Progress,
     ) -> GaussianScene:
-        """The scene of a log.
+        """Reconstructs the scene of a log.
 
         Args:
             clip: the driving log.
             settings: an instance of the class ``settings``.
             cameras: ids of the cameras whose images may be read, all of the rig; None leaves the choice to the method.
-            hold_out_sweeps: indices of sweeps that must not be read, of every LiDAR.
+            hold_out_sweeps: indices of the sweeps, of every LiDAR, that must not be read.
             progress: see ``Progress``.
 
         Raises:

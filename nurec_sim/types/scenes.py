@@ -72,9 +72,9 @@ class Gaussians:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Gaussians]) -> Gaussians:
-        """All parts one after the other; every part has ``sh_rest`` of one degree, or none has.
+        """Concatenates Gaussians; either all parts have ``sh_rest`` of the same degree, or none has.
 
-        If some parts have ``ray_drop``, those without get 0.
+        If some parts have ``ray_drop``, the others get 0.
         """
         if not parts:
             return cls.empty()
@@ -97,7 +97,7 @@ class Gaussians:
 GAUSSIAN_FIELDS = ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal", "label", "intensity")
 OPTIONAL_GAUSSIAN_FIELDS = ("sh_rest", "ray_drop")
 RIGID_LIFE_US = 10**12
-"""Knots of rigid Gaussians lie this far apart, so that they do not fade while a log lasts."""
+"""Knot spacing of rigid Gaussians, long enough that they do not fade during a log."""
 
 
 @dataclass(frozen=True)
@@ -106,12 +106,12 @@ class DynamicGaussians:
 
     ``gaussians.mean_m`` is the middle knot. Between knots positions are linear; opacity is multiplied by
     ``exp(-x**10)`` with x = (t - t2) / (t3 - t2) after the middle knot and (t2 - t) / (t2 - t1) before it, so a
-    Gaussian lives from its first to its last knot. ``track`` indexes ``GaussianScene.tracks``, -1 for none. All
+    Gaussian exists from its first to its last knot. ``track`` indexes ``GaussianScene.tracks``, -1 for none. All
     positions and rotations are in the world, as recorded; re-posing an actor applies
     ``world_from_box(requested) @ inverse(track.path.at(t))``.
 
     ``in_box`` marks rigid parts of their track (None: there are none). Their positions, rotations and normals are in
-    the frame of the track's box; they are there while the track's path covers the instant or a request poses the actor.
+    the frame of the track's box; they exist while the track's path covers the instant or a request poses the actor.
     """
 
     gaussians: Gaussians
@@ -128,7 +128,7 @@ class DynamicGaussians:
 
     @classmethod
     def concatenate(cls, parts: Sequence[DynamicGaussians]) -> DynamicGaussians:
-        """All parts one after the other; a single part stays as it is."""
+        """Concatenates dynamic Gaussians; a single part is returned unchanged."""
         if len(parts) <= 1:
             return parts[0] if parts else cls.empty()
         in_box = None
@@ -144,22 +144,24 @@ class DynamicGaussians:
 
     @classmethod
     def rigid(cls, gaussians: Gaussians, track: Int32[np.ndarray, " n"], t_us: int) -> DynamicGaussians:
-        """Rigid parts of tracks, given in the frames of their boxes; they do not fade within days of ``t_us``."""
+        """Rigid parts of tracks, in the frames of their boxes; they do not fade within days of ``t_us``."""
         knot_t_us = np.tile(t_us + np.array([-RIGID_LIFE_US, 0, RIGID_LIFE_US], np.int64), (len(gaussians), 1))
         knot_m = np.repeat(gaussians.mean_m[:, None], 3, axis=1)
         return cls(gaussians, knot_t_us, knot_m, track.astype(np.int32), np.ones(len(gaussians), bool))
 
     def at(self, t_us: int) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 3"], Float64[np.ndarray, " k"]]:
-        """Which Gaussians live at ``t_us``, where they are (metres, world, as recorded), and their fade in 0..1.
+        """Indices of the Gaussians that exist at ``t_us``, their positions (metres, world, as recorded), and fade 0..1.
 
-        Those ``in_box`` stay in the frames of their boxes.
+        Positions of Gaussians ``in_box`` stay in the frames of their boxes.
         """
         rows = np.flatnonzero((self.knot_t_us[:, 0] <= t_us) & (t_us <= self.knot_t_us[:, 2]))
         times, each = self.knot_t_us[rows], np.arange(len(rows))
+        # Two segments meet at the middle knot: before it knots 0 and 1 are interpolated, after it knots 1 and 2.
         after = t_us >= times[:, 1]
         low = np.where(after, 1, 0)
         start_us, end_us = times[each, low], times[each, low + 1]
         fraction = (t_us - start_us) / np.maximum(end_us - start_us, 1)
+        # x of the paper: 0 at the middle knot, 1 at the outer one, where exp(-1) is left before the cut.
         fade = np.exp(-(np.where(after, fraction, 1 - fraction) ** 10))
         before_m, after_m = (self.knot_m[rows, low + k].astype(np.float64) for k in (0, 1))
         with np.errstate(invalid="ignore"):  # knots that are not finite stay so
@@ -174,13 +176,13 @@ class DynamicGaussians:
 
 @dataclass(frozen=True)
 class GaussianScene:
-    """A layered Gaussian world: what a reconstruction gives, an archive holds and a renderer draws.
+    """A layered Gaussian world: the output of a reconstruction, the content of an archive, the input of a renderer.
 
     ``sky`` is a cubemap ``[6,h,h,3]`` of display-space colours, faces and axes as in ``geometry.cubemap_directions``.
     ``isp`` maps a camera id to ``[3,4]``: shown colour = ``isp[:, :3] @ colour + isp[:, 3]``, after sky compositing.
-    ``exposures`` maps a camera id to responses of its single frames, ``[frames,3,4]`` at the middles of
-    ``camera_times_us``; where a camera has them they stand in for ``isp``, between frames linearly in time.
-    ``provenance`` is plain JSON: method, settings, what was not known (no map, no boxes, ...).
+    ``exposures`` maps a camera id to per-frame responses, ``[frames,3,4]`` at the midpoints of ``camera_times_us``;
+    where a camera has them they replace ``isp``, interpolated linearly in time.
+    ``provenance`` is plain JSON: method, settings, missing information (no map, no boxes, ...).
     """
 
     id: str
@@ -198,11 +200,12 @@ class GaussianScene:
     exposures: Mapping[str, Float64[np.ndarray, "frames 3 4"]] = field(default_factory=dict)
 
     def response(self, camera_id: str, t_us: int) -> Float64[np.ndarray, "3 4"] | None:
-        """The colour response of a camera at an instant; None for a camera that the scene doesn't know."""
+        """The colour response of a camera at an instant; None if the scene has none for it."""
         frames = self.exposures.get(camera_id)
         if frames is None:
             return self.isp.get(camera_id)
         middle = np.asarray(self.camera_times_us[camera_id], np.int64).sum(axis=1) // 2
+        # The two frames around the instant; a single frame is both of them, and the ends hold their value.
         after = int(np.clip(np.searchsorted(middle, t_us), 1, max(len(middle) - 1, 1)))
         before = min(after - 1, len(middle) - 1)
         after = min(after, len(middle) - 1)

@@ -1,4 +1,4 @@
-"""Cameras, LiDARs and the rig that carries them."""
+"""Cameras, LiDARs and the sensor rig."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Shutter(enum.Enum):
 
 
 class WindshieldReference(enum.Enum):
-    """Which windshield polynomials are exact."""
+    """The windshield polynomials that are exact; the others are their approximate inverse."""
 
     FORWARD = "forward"
     BACKWARD = "backward"
@@ -33,10 +33,10 @@ class WindshieldReference(enum.Enum):
 
 @dataclass(frozen=True)
 class Windshield:
-    """Bivariate windshield: angles (phi, theta) = asin(x), asin(y) of a ray, each mapped by a polynomial in both.
+    """Bivariate windshield: each ray angle (phi, theta) = (asin(x), asin(y)) is mapped by a polynomial in both.
 
     Coefficients: for y-power 0 all x-powers, then y-power 1 with one x-power fewer, ... (6 of order 2, 15 of order 4).
-    Forward takes the external ray to the one behind the glass (used before projecting); the inverse takes it back.
+    Forward maps an external ray to the ray behind the glass (applied before projection); the inverse maps it back.
     """
 
     reference: WindshieldReference
@@ -48,7 +48,7 @@ class Windshield:
 
 @dataclass(frozen=True, eq=False)
 class CameraModel:
-    """One camera of a rig: size, lens, shutter and where it sits."""
+    """One camera of a rig: image size, lens, shutter and mounting pose."""
 
     id: str
     width_px: int
@@ -60,8 +60,8 @@ class CameraModel:
 
     @property
     def ideal_pinhole(self) -> Pinhole | None:
-        """The lens as a pinhole without distortion; None where it is none, or behind a windshield."""
-        # ``Lens`` cannot name the class in its own file: pinholes are lenses.
+        """The lens as a pinhole without distortion; None if it has distortion, or a windshield bends its rays."""
+        # The protocol ``Lens`` cannot name ``Pinhole``, which is defined on top of it: hence the cast.
         return None if self.windshield is not None else cast("Pinhole | None", self.lens.ideal_pinhole)
 
 
@@ -74,9 +74,9 @@ class Spin(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class LidarModel:
-    """A spinning LiDAR as a grid of beams, rows from high to low, columns in the order they fire.
+    """A spinning LiDAR as a grid of beams: rows from high to low, columns in firing order.
 
-    A beam of row r, column c points to elevation ``elevation_rad[r]``, azimuth
+    The beam of row r and column c has elevation ``elevation_rad[r]`` and azimuth
     ``azimuth_rad[c] + row_azimuth_offset_rad[r]`` (counter-clockwise from x forward). Column c fires at the fraction
     ``c / (columns - 1)`` of the sweep.
     """

@@ -14,7 +14,7 @@ Matrix4 = Float64[np.ndarray, "4 4"]
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A body's poses over time, strictly increasing in time.
+    """Poses of a rigid body over time, strictly increasing in time.
 
     Raises:
         ValueError: shapes differ, times do not increase, or a value is not finite.
@@ -58,5 +58,5 @@ class Trajectory:
         return self.start_us <= t_us <= self.end_us
 
     def at(self, t_us: int | Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "*n 4 4"]:
-        """Poses at ``t_us``: positions interpolated linearly, rotations by slerp; held before and after the ends."""
+        """Poses at ``t_us``: linear in position, slerp in rotation; constant before the first and after the last."""
         return geometry.interpolate_poses(self.t_us, self.world_from_body, t_us)

@@ -1,4 +1,4 @@
-"""Does a log fit together: ground, boxes, LiDAR and images."""
+"""Geometric consistency checks of a log: ground, boxes, LiDAR and images."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ __all__ = ["Measure", "measure_clip"]
 
 
 def measure_clip(clip: Clip) -> list[Measure]:
-    """Whether the sensors, the ground and the boxes of a clip fit together, from some of its sweeps and images.
+    """Checks the consistency of sensors, ground and boxes of a clip on a sample of its sweeps and images.
 
-    Each row says what was measured, the figure, and the faults: the ground that the LiDAR sees against z = 0; borders
-    in the LiDAR against borders in each camera's images, as calibrated and in other readings of the calibration; boxes
-    against the points they hold. A row without faults may say that there is too little to tell by.
+    Each row has the quantity, its value and the faults: the ground seen by the LiDAR against z = 0; depth edges of the
+    LiDAR against edges in each camera's images, for the given calibration and for alternative interpretations of it;
+    boxes against the points inside. A row without faults may report insufficient data.
     """
     sweeps = sample_sweeps(clip)
     return [*check_ground(clip, sweeps), *check_calibration(clip, sweeps), *check_boxes(clip, sweeps)]

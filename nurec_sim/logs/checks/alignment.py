@@ -1,4 +1,4 @@
-"""How well LiDAR points and an image fit together at a pose of the camera."""
+"""Alignment score of LiDAR points and images for a hypothetical camera pose."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ MOST_PAIRS_OF_ALL = 3000
 FEWEST_IN_IMAGE = 10
 FEWEST_PAIRS = 30
 LEAST_GAIN = 0.02
-"""Real images gain 0.1 to 0.7; below are rounding errors of an image without content."""
+"""Smallest meaningful gain: real images gain 0.1 to 0.7, an image without content only rounding errors."""
 SHIFTS = np.array(
     [(x * step, y * step) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y for step in (0.03, 0.05, 0.08)]
 )
-"""Where else the points are looked for, as shares of the image's width."""
+"""Offsets of the control positions, as fractions of the image width."""
 FEWEST_SHIFTS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationView:
-    """An image and the points measured about when it was taken."""
+    """An image and the LiDAR points measured at about the same time."""
 
     camera: CameraModel
     lab: Float32[np.ndarray, "h w 3"]
@@ -40,12 +40,11 @@ class CalibrationView:
 
 @dataclass(frozen=True)
 class Fit:
-    """How much better points fit an image where they fall than around that place.
+    """How much better points fit an image at their projection than at shifted control positions.
 
     Attributes:
-        gain: by how much borders of the LiDAR are borders of the image more than elsewhere, in units of log colour
-            difference.
-        errors: the gain in its standard errors; 0 where there is none, or too few points fall into the images.
+        gain: excess of log colour difference at LiDAR edges over that elsewhere, relative to the control positions.
+        errors: the gain in standard errors; 0 if it is negligible, or too few points project into the images.
     """
 
     gain: float
@@ -53,7 +52,7 @@ class Fit:
 
 
 def comparable_image(rgb: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """An image as CIELAB colours, at most 960 wide; its lightness is equalised, so that shade and glare count alike."""
+    """An image in CIELAB, at most 960 px wide, lightness equalised so that edges in shade and glare weigh alike."""
     import cv2
 
     scale = WIDEST_PX / rgb.shape[1]
@@ -67,12 +66,12 @@ def comparable_image(rgb: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h 
 
 
 def fit(views: Sequence[CalibrationView], rig_from_camera: Matrix4) -> Fit:
-    """How well the views fit if the camera sits at a pose.
+    """Alignment of the views for a camera pose.
 
-    The colour of the image changes where the LiDAR finds a border and stays where it finds none. The figure is the log
-    colour difference over pairs with a border less that over pairs without one, each less its mean over the same pairs
-    moved by a few percent of the image: a picture that is busy everywhere, or busy at the bottom, gains nothing. Pairs
-    of one patch of directions are not independent; the standard error takes patches for single observations.
+    If the pose is right, image colour changes across LiDAR edges and is constant elsewhere. The score is the mean log
+    colour difference over edge pairs minus that over other pairs, each relative to its mean over the same pairs shifted
+    by a few percent of the image: texture that is everywhere, or concentrated at the bottom, gains nothing. Pairs from
+    one patch of directions are not independent; the standard error treats each patch as a single observation.
     """
     most = min(MOST_PAIRS, MOST_PAIRS_OF_ALL // max(len(views), 1))
     found = [values for view in views if (values := _gains(view, rig_from_camera, most)) is not None]
@@ -85,6 +84,8 @@ def fit(views: Sequence[CalibrationView], rig_from_camera: Matrix4) -> Fit:
     if min(border.sum(), (~border).sum()) < FEWEST_PAIRS:
         return Fit(0.0, 0.0)
     means = gain[border].mean(), gain[~border].mean()
+    # Influence of each pair on the difference of both means. Summed within patches, then squared: the cluster-robust
+    # standard error.
     share = np.where(border, (gain - means[0]) / border.sum(), (means[1] - gain) / (~border).sum())
     _, number = np.unique(patch, axis=1, return_inverse=True)
     error = float(np.linalg.norm(np.bincount(number.reshape(-1), share)))
@@ -95,7 +96,7 @@ def fit(views: Sequence[CalibrationView], rig_from_camera: Matrix4) -> Fit:
 def _gains(
     view: CalibrationView, rig_from_camera: Matrix4, most: int
 ) -> tuple[Float64[np.ndarray, " n"], np.ndarray, np.ndarray] | None:
-    """Per pair: its colour difference less that around it, whether it is a border, and its patch."""
+    """Per pair: its colour difference relative to the control positions, whether it is an edge, and its patch."""
     height, width = view.lab.shape[:2]
     points = geometry.transform_points(geometry.inverse(rig_from_camera), view.rig_m)
     uv, seen = sensors.project(view.camera, points)
@@ -107,6 +108,7 @@ def _gains(
     if min(len(kind) for kind in kinds) < FEWEST_IN_IMAGE:
         return None
     draw = np.random.default_rng(0)
+    # Equal limits for both kinds bound the time; a fixed seed makes the result reproducible.
     chosen = np.concatenate([kind if len(kind) <= most else draw.choice(kind, most, replace=False) for kind in kinds])
     ends = np.stack([place[pairs.first[chosen]], place[pairs.second[chosen]]])
     here = _difference(view.lab, ends)
@@ -118,11 +120,11 @@ def _gains(
 
 
 def _difference(lab: Float32[np.ndarray, "h w 3"], ends: Float64[np.ndarray, "2 n 2"]) -> Float64[np.ndarray, " n"]:
-    """Log colour difference between both ends of each pair; NaN where one lies outside of the image."""
+    """Log colour difference between both ends of each pair; NaN if one is outside the image."""
     height, width = lab.shape[:2]
     columns, rows = np.floor(ends).astype(np.int64).transpose(2, 0, 1)
     inside = ((columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)).all(axis=0)
     one, two = lab.reshape(-1, 3)[np.where(inside, rows * width + columns, 0)]
     distance = np.sqrt(np.square(one - two).sum(axis=1))
-    # Differences of 2 and less cannot be seen.
+    # CIELAB differences of about 2 are the threshold of visibility; the offset also keeps the logarithm finite.
     return np.where(inside, np.log(distance + 2.0), np.nan)

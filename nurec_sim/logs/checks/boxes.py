@@ -1,4 +1,4 @@
-"""Do labelled boxes hold LiDAR points, and would they hold more if they were read another way?"""
+"""Checks that labelled boxes contain LiDAR points, and whether another interpretation of them would contain more."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MARGIN_M = 0.1
 AROUND_M = 2.0
 OVER_GROUND_M = 0.25
 LOWEST_SHARE = 0.05
-"""The ground around a box is as high as this share of the points near it reaches; roads rise and fall, so no plane."""
+"""The ground height around a box is this quantile of the nearby points' heights; no plane, as roads rise and fall."""
 FEWEST_POINTS = 3
 ENOUGH_POINTS = 8
 INNER = 0.6
@@ -28,7 +28,7 @@ FEWEST_BOXES = 4
 LEAST_SHARE = 0.5
 CLEAR_GAIN, CLEAR_ERRORS = 0.1, 2.5
 TELLING_SHARE = 0.2
-"""Boxes put anywhere hold something now and then: of all at least this share must speak for another reading."""
+"""Random boxes contain points by chance: at least this fraction of all must support another interpretation."""
 
 Size = tuple[float, float, float]
 Reading = Callable[[Matrix4, Size, Matrix4], tuple[Matrix4, Size]]
@@ -49,12 +49,12 @@ READINGS: dict[str, Reading] = {
     "as poses in the world, to which the ego's pose was applied once more": lambda box, size, ego: (
         geometry.inverse(ego) @ box, size),
 }  # fmt: skip
-"""Other readings of a box (its pose in the rig, its size, the ego's pose), by what they would mean."""
+"""Alternative interpretations of a box (from its pose in the rig, its size, the ego's pose), by their meaning."""
 
 
 @dataclass(frozen=True)
 class _Box:
-    """How many points a box holds as it is and in each other reading, and how many rays cross its middle."""
+    """Number of points in a box as given and in each alternative, and of rays that cross its middle."""
 
     held: int
     crossed: int
@@ -62,10 +62,10 @@ class _Box:
 
 
 def check_boxes(clip: Clip, sweeps: Sequence[SampledSweep]) -> list[Measure]:
-    """Share of the boxes in sight that hold points; empty where a log has no boxes or no LiDAR.
+    """Fraction of the visible boxes that contain points; empty if a log has no boxes or no LiDAR.
 
-    A box counts if it is 3 to 70 m away and holds at least 3 points that do not lie on the ground, or if a ray crosses
-    its middle and comes back from behind: then it is empty. A box that is neither is hidden and does not count.
+    A box counts if it is 3 to 70 m away and contains at least 3 points above the ground, or if a ray passes through its
+    middle and returns from behind: then it is empty. Any other box is occluded and does not count.
     """
     if not clip.tracks or not sweeps:
         return []
@@ -86,13 +86,15 @@ def check_boxes(clip: Clip, sweeps: Sequence[SampledSweep]) -> list[Measure]:
 
 
 def _better(boxes: Sequence[_Box], number: int, name: str) -> tuple[float, str]:
-    """How much more the boxes hold in another reading, -1 to 1, and the fault, empty unless that is clear."""
+    """Relative gain of points in an alternative, -1 to 1, and the fault; empty unless the gain is significant."""
     pairs = np.array([(box.held, box.otherwise[number]) for box in boxes], np.float64).reshape(-1, 2)
     pairs = pairs[pairs.sum(axis=1) >= ENOUGH_POINTS]
     if len(pairs) < max(FEWEST_BOXES, TELLING_SHARE * len(boxes)):
         return -1.0, ""
+    # Per box, so that near boxes with thousands of points do not dominate.
     gains = (pairs[:, 1] - pairs[:, 0]) / pairs.sum(axis=1)
     gain = float(gains.mean())
+    # Both large and significant: the mean must exceed some standard errors of itself.
     if gain < max(CLEAR_GAIN, CLEAR_ERRORS * gains.std(ddof=1) / np.sqrt(len(gains))):
         return -1.0, ""
     given, other = np.median(pairs, axis=0)
@@ -100,7 +102,7 @@ def _better(boxes: Sequence[_Box], number: int, name: str) -> tuple[float, str]:
 
 
 def _looked_at(clip: Clip, each: SampledSweep) -> Iterator[_Box]:
-    """The boxes near enough at the time of a sweep."""
+    """The boxes within range at the time of a sweep."""
     standing = _Standing(each.rig_m)
     origin = point_of_view(clip, clip.rig.lidars[each.lidar_id])
     rig_from_world = geometry.inverse(each.world_from_rig)
@@ -119,14 +121,14 @@ def _looked_at(clip: Clip, each: SampledSweep) -> Iterator[_Box]:
 
 
 class _Standing:
-    """Points that do not lie on the ground, found by where they stand."""
+    """Points above the ground, indexed by their horizontal position."""
 
     def __init__(self, points: Points) -> None:
         self._points = points
         self._tree = cKDTree(points[:, :2])
 
     def held(self, rig_from_box: Matrix4, size: Size) -> int:
-        """How many points a box holds, those on the ground around it left out."""
+        """Number of points in a box, without those on the ground around it."""
         near = self._points[self._tree.query_ball_point(rig_from_box[:2, 3], np.linalg.norm(size) / 2 + AROUND_M)]
         if len(near) == 0:
             return 0
@@ -136,18 +138,20 @@ class _Standing:
 
 
 def _crossing(points: Points, origin: Float64[np.ndarray, " 3"], rig_from_box: Matrix4, size: Size) -> int:
-    """How many rays from the LiDAR to its points pass through the middle of a box and end behind it."""
+    """Number of LiDAR rays that pass through the middle of a box and end behind it."""
     centre = rig_from_box[:3, 3] - origin
     ray = points - origin
     distance = np.linalg.norm(centre)
     cosine = ray @ centre / (np.linalg.norm(ray, axis=1) * distance + 1e-12)
+    # A cone around the box discards most rays before the exact test.
     near = cosine > np.cos(np.arctan(np.linalg.norm(size) / distance))
     box_from_rig = geometry.inverse(rig_from_box)
     start = geometry.transform_points(box_from_rig, origin)
     ray = geometry.transform_points(box_from_rig, points[near]) - start
     half = INNER * np.asarray(size) / 2
-    # Slabs (Kay and Kajiya 1986): a ray is inside between its last entry and its first exit.
+    # Slab test (Kay and Kajiya 1986): a ray is inside between its last entry and its first exit.
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (-half - start) / ray, (half - start) / ray
     enter, leave = np.fmin(first, second).max(axis=1), np.fmax(first, second).min(axis=1)
+    # Parameter 0 is the LiDAR, 1 the measured point: both must be outside, on either side.
     return int(((enter < leave) & (enter > 0) & (leave < 1)).sum())

@@ -1,4 +1,4 @@
-"""Do LiDAR and images meet where the calibration says, better than where a wrong reading of it would have them?"""
+"""Checks that LiDAR and images align better as calibrated than under alternative interpretations of the calibration."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ SEEN_ERRORS = 3.3
 CLEAR_ERRORS = 1.5
 CLEAR_SMALL_ERRORS = 3.0
 LYING_ERRORS = 2.5
-"""How much evidence it takes that an image which does not stand upright does so rightly."""
+"""Additional evidence, in standard errors, required of a pose whose image is not upright."""
 ALLOWED_TURN_DEG, ALLOWED_SHIFT_M = 5.0, 0.5
 FASTEST_MPS, FASTEST_DEG_S = 40.0, 60.0
 
 
 def check_calibration(clip: Clip, sweeps: Sequence[SampledSweep]) -> list[Measure]:
-    """One row per camera: how well LiDAR and images fit, and which other reading of its pose fits clearly better."""
+    """One row per camera: alignment of LiDAR and images, and any alternative pose that aligns significantly better."""
     pairs: dict[int, Pairs] = {}
     rows = []
     for name in clip.rig.cameras:
@@ -45,11 +45,12 @@ def check_calibration(clip: Clip, sweeps: Sequence[SampledSweep]) -> list[Measur
 
 
 def _verdict(name: str, what: str, given: Matrix4, rig_from_log: Matrix4, views: Sequence[CalibrationView]) -> Measure:
-    """Compares the pose as given with every other reading; figures are gains in standard errors."""
+    """Compares the given pose with every alternative; figures are gains in standard errors."""
     as_given = fit(views, given)
     errors = as_given.errors - (0.0 if is_upright(given) else LYING_ERRORS)
     others = [(fit(views, pose), name, CLEAR_ERRORS) for name, pose in wrong_readings(given, rig_from_log)]
     others += [(fit(views, pose), name, CLEAR_SMALL_ERRORS) for name, pose in slightly_turned(given)]
+    # Small turns need a larger margin than gross errors: neighbouring poses are nearly as good by nature.
     clear = [row for row in others if row[0].errors > max(SEEN_ERRORS, errors + row[2])]
     if clear:
         best, meaning, _ = max(clear, key=lambda row: row[0].errors)
@@ -71,7 +72,7 @@ def _figure(given: Fit, other: Fit) -> str:
 def _views(
     clip: Clip, camera_id: str, sweeps: Sequence[SampledSweep], known: dict[int, Pairs]
 ) -> list[CalibrationView]:
-    """The camera's image nearest in time to each sweep, with the sweep's points around the car at that time."""
+    """The camera's image nearest in time to each sweep, with the sweep's points in the rig frame at that time."""
     camera = clip.rig.cameras[camera_id]
     times = clip.camera_times_us(camera_id).mean(axis=1)
     views = []
@@ -87,7 +88,7 @@ def _views(
             origin = point_of_view(clip, clip.rig.lidars[each.lidar_id])
             known[number] = find_pairs(each.rig_m, each.sweep.intensity, origin)
         middle = geometry.interpolate_pose_pair(clip.world_from_camera(camera_id, index), np.array([0.5]))[0]
-        # The rig where the frame's own pose puts it: that pose may know better than the ego's.
+        # The rig pose implied by the frame's own pose, which may be more accurate than the ego's.
         rig_from_world = camera.rig_from_camera @ geometry.inverse(middle)
         points = geometry.transform_points(rig_from_world @ each.sweep.world_from_lidar, each.sweep.xyz_m)
         views.append(CalibrationView(camera, comparable_image(image), points, known[number]))
@@ -95,9 +96,9 @@ def _views(
 
 
 def _frames_apart(clip: Clip, camera_id: str) -> str | None:
-    """The fault, if the poses of a camera's frames are not where the ego and the calibration put them.
+    """The fault, if a camera's per-frame poses deviate from the ego's poses and the calibration.
 
-    The further the ego's poses lie from a frame in time, the more its motion may explain.
+    The tolerance grows with the time between a frame and the nearest ego pose, by the largest plausible motion.
     """
     records = clip.image_records(camera_id)
     turns, shifts = [], []
@@ -106,6 +107,7 @@ def _frames_apart(clip: Clip, camera_id: str) -> str | None:
         gap_s = float(np.abs(clip.ego.t_us - t_us).min()) * 1e-6
         there = clip.ego.at(t_us) @ clip.rig.cameras[camera_id].rig_from_camera
         middle = geometry.interpolate_pose_pair(record.world_from_camera, np.array([0.5]))[0]
+        # trace(R) = 1 + 2 cos(angle) for the relative rotation R.
         cosine = (np.trace(there[:3, :3].T @ middle[:3, :3]) - 1) / 2
         turns.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))) - FASTEST_DEG_S * gap_s)
         shifts.append(np.linalg.norm(there[:3, 3] - middle[:3, 3]) - FASTEST_MPS * gap_s)

@@ -1,4 +1,4 @@
-"""Does the ground that the LiDAR sees lie where the rig frame says, at z = 0 below the rear axle?"""
+"""Checks that the ground seen by the LiDAR is where the rig frame requires it: at z = 0 below the rear axle."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STEEPEST = np.cos(np.radians(20.0))
 TRIPLES = 400
 FEWEST_CELLS = 60
 SHARE_BELOW = 0.1
-"""A floor has nothing below it: of all cells at most this share may lie lower than the ground."""
+"""Nothing is below the ground: at most this fraction of all cells may be lower than the plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +43,14 @@ class Ground:
 
 
 def find_ground(points: Points, body: Box) -> Ground | None:
-    """The ground around the car, or None where no plane stands out.
+    """The ground plane around the car, or None if no plane is dominant.
 
-    Points are thinned to one per cell, so that an area counts and not how densely it was measured. The plane that
-    most cells lie on wins (RANSAC, Fischler and Bolles 1981), if almost nothing lies below it; least squares refine it.
+    Points are thinned to one per cell, so that planes are weighted by area rather than by point density. The plane with
+    the most cells wins (RANSAC, Fischler and Bolles 1981) if almost nothing is below it; least squares refine it.
 
     Args:
         points: [n,3] in the rig frame.
-        body: outline of the car, whose own returns are left out.
+        body: outline of the car, whose own returns are excluded.
     """
     x, y, z = points.T
     own = (np.abs(x - body.center_m[0]) < body.size_m[0] / 2 + 0.2) & (np.abs(y) < body.size_m[1] / 2 + 0.2)
@@ -62,6 +62,7 @@ def find_ground(points: Points, body: Box) -> Ground | None:
         return None
     corners = cells[np.random.default_rng(0).integers(0, len(cells), (TRIPLES, 3))]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # Normals point up; triples that are collinear or too steep for a road are discarded.
     normal *= np.where(normal[:, 2:] < 0, -1.0, 1.0)
     length = np.linalg.norm(normal, axis=1)
     level = (length > 1e-6) & (normal[:, 2] > STEEPEST * length)
@@ -70,6 +71,7 @@ def find_ground(points: Points, body: Box) -> Ground | None:
     normal, corners = normal[level] / length[level, None], corners[level]
     distance = cells @ normal.T - np.sum(normal * corners[:, 0], axis=1)
     on, below = np.abs(distance) < THICKNESS_M, distance < -3 * THICKNESS_M
+    # A plane through car roofs or a raised kerb has many cells below it.
     votes = np.where(below.sum(axis=0) <= SHARE_BELOW * len(cells), on.sum(axis=0), 0)
     best = int(np.argmax(votes))
     if votes[best] < FEWEST_CELLS:
@@ -95,7 +97,7 @@ def check_ground(clip: Clip, sweeps: Sequence[SampledSweep]) -> list[Measure]:
 
 
 def usual_ground(planes: Sequence[Ground | None]) -> Ground | None:
-    """The median of those that were found; None of none."""
+    """Component-wise median of the planes that were found; None if none was."""
     found = [plane for plane in planes if plane is not None]
     if not found:
         return None

@@ -1,4 +1,4 @@
-"""What a check of a clip's geometry answers."""
+"""The result of a geometric check of a clip."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Measure:
-    """One figure taken from a clip's data.
+    """One quantity measured on a clip's data.
 
     Attributes:
         what: what was measured, with the sensor's name.
-        found: the figure, in words; says so where there is too little to judge by.
-        faults: what is wrong, one line each; empty when nothing is, or when nothing can be told.
+        found: its value as text, or a note that there is too little data.
+        faults: faults, one line each; empty if there are none, or too little data to judge.
     """
 
     what: str

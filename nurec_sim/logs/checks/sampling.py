@@ -1,4 +1,4 @@
-"""The sweeps of a clip that the checks look at, and where they lie around the car."""
+"""The sample of a clip's sweeps used by the checks, in the rig frame."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class SampledSweep:
 
 
 def sample_sweeps(clip: Clip) -> list[SampledSweep]:
-    """Some sweeps of every LiDAR, evenly spread in time; what cannot be read is ``check_clip``'s to tell."""
+    """Some sweeps of every LiDAR, evenly spaced; unreadable ones are skipped, as ``check_clip`` reports them."""
     found = []
     for name in clip.rig.lidars:
         for index in spread(clip.sweep_count(name), SWEEPS):
@@ -46,14 +46,14 @@ def sample_sweeps(clip: Clip) -> list[SampledSweep]:
 
 
 def spread(count: int, most: int) -> list[int]:
-    """At most ``most`` of the indices below ``count``, evenly spread, the first and the last among them."""
+    """At most ``most`` of the indices below ``count``, evenly spaced, including the first and the last."""
     return sorted({round(value) for value in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 
 def point_of_view(clip: Clip, lidar: LidarModel) -> Float64[np.ndarray, " 3"]:
-    """Where in the rig frame the LiDAR's rays begin.
+    """Origin of the LiDAR's rays in the rig frame.
 
-    A log that merges several LiDARs gives its clouds in the car's own frame; the middle of the roof stands in.
+    A log that merges several LiDARs has its point clouds in the vehicle frame; the middle of the roof is used then.
     """
     origin = np.asarray(lidar.rig_from_lidar, np.float64)[:3, 3]
     if origin[2] >= LOWEST_LIDAR_M:
@@ -63,7 +63,7 @@ def point_of_view(clip: Clip, lidar: LidarModel) -> Float64[np.ndarray, " 3"]:
 
 
 def pose_at(track: Track, t_us: int) -> Matrix4 | None:
-    """A track's pose at a time that one of its own lies close to; None where there is none."""
+    """A track's pose at a time within its path or close to one of its samples; None otherwise."""
     if np.abs(track.path.t_us - t_us).min() > SAME_TIME_US and not track.path.covers(t_us):
         return None
     return track.path.at(t_us)

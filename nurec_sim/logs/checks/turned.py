@@ -1,4 +1,4 @@
-"""Other poses that a camera's calibration may mean: inverted, turned, its axes taken for others."""
+"""Alternative interpretations of a camera's calibration: inverted, rotated, or with permuted axes."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ AXES = "xyz"
 
 def is_upright(rig_from_camera: Matrix4) -> bool:
     """Whether the top of the image points up rather than to a side or down."""
+    # The camera's y axis points down in the image: minus its z component in the rig is the image's upward tilt.
     return bool(-rig_from_camera[2, 1] > UPRIGHT)
 
 
 def wrong_readings(rig_from_camera: Matrix4, rig_from_log: Matrix4) -> Iterator[tuple[str, Matrix4]]:
-    """Poses of an upright camera that come out if the given one was meant otherwise, and what was.
+    """Alternative interpretations of a camera pose, with descriptions.
 
-    Cars carry their cameras upright: of all turns by quarters only those count that leave the image so.
+    Vehicle cameras are mounted upright: of all quarter turns, only those that result in an upright image count.
 
     Args:
-        rig_from_camera: as given.
-        rig_from_log: the ego frame of the log, in which its calibration is written.
+        rig_from_camera: the given pose.
+        rig_from_log: pose, in the rig frame, of the log's ego frame, to which its calibration refers.
     """
     for name, pose in _readings(rig_from_camera, rig_from_log):
         if is_upright(pose):
@@ -40,13 +41,14 @@ def _readings(given: Matrix4, rig_from_log: Matrix4) -> Iterator[tuple[str, Matr
     yield "with its rotation transposed", geometry.pose(given[:3, :3].T, given[:3, 3])
     for turn in _quarter_turns():
         yield _name(turn), given @ geometry.pose(turn, np.zeros(3))
+        # Turns about z are also applied in the rig frame: a confused mounting direction rather than camera axes.
         if np.count_nonzero(np.diag(turn) == 1) == 1 and turn[2, 2] == 1:
             angle = round(np.degrees(geometry.yaw_of(turn))) % 360
             yield f"turned by {angle} degrees about the car's z axis", geometry.pose(turn, np.zeros(3)) @ given
 
 
 def slightly_turned(rig_from_camera: Matrix4) -> Iterator[tuple[str, Matrix4]]:
-    """The camera turned by 3 degrees to both sides about each of its axes."""
+    """The camera rotated by 3 degrees in both directions about each of its axes."""
     c, s = np.cos(np.radians(SMALL_DEG)), np.sin(np.radians(SMALL_DEG))
     for axis, sign in itertools.product(range(3), (1, -1)):
         turn = np.eye(3)
@@ -57,11 +59,12 @@ def slightly_turned(rig_from_camera: Matrix4) -> Iterator[tuple[str, Matrix4]]:
 
 
 def _quarter_turns() -> Iterator[np.ndarray]:
-    """The 23 rotations that take axes to axes and are not the identity."""
+    """The 23 axis-aligned rotations other than the identity."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             turn = np.zeros((3, 3))
             turn[range(3), order] = signs
+            # Signed permutations: 48, of which the 24 with determinant 1 are rotations.
             if np.linalg.det(turn) > 0 and not np.array_equal(turn, np.eye(3)):
                 yield turn
 

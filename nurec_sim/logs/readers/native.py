@@ -75,7 +75,7 @@ def _read(storage: Storage, meta: dict[str, Any]) -> Clip:
 
 
 def _grouped(frames: dict[str, Any], group: str, known: list[str]) -> dict[str, list[Any]]:
-    """Rows per sensor; a sensor without rows is one that recorded nothing."""
+    """Rows per sensor; a sensor without rows recorded nothing."""
     rows = fields.of_kind("frames.json", frames, group, dict, default={})
     if unknown := sorted(set(rows) - set(known)):
         raise ClipError(f"frames.json: {group} has {unknown[0]!r}, which is not in calib.json; have {known}")

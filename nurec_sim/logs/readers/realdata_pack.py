@@ -1,7 +1,7 @@
 """Reading packs of real driving data (schema ``realdata-pack-1``): one LiDAR, rectified pinhole cameras, boxes.
 
-Their conventions: seconds; ``T_a_b`` takes b to a; the ego frame's height over the road is ``-ground_z_in_ego_m``;
-pixel centres are whole numbers (ours lie at +0.5).
+Their conventions: seconds; ``T_a_b`` maps b to a; the ego frame's height above the road is ``-ground_z_in_ego_m``;
+pixel centres are at integers (ours at +0.5).
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def _camera(name: str, row: Any, rig_from_ego: Matrix4) -> CameraModel:
 
 
 def _lidar(row: Any, rig_from_ego: Matrix4, rate_hz: float) -> tuple[LidarModel, Matrix4, str]:
-    """The LiDAR, the turn that points its x axis forward, and a note on the table that was chosen."""
+    """The LiDAR, the quarter turn that makes its x axis point forward, and a note on the chosen beam table."""
     where = f"{calibration.CALIBRATION_FILE}: lidar"
     model = fields.of_kind(where, row, "model", str)
     rig_from_file = rig_from_ego @ fields.transform(where, row, "T_ego_lidar")
@@ -184,7 +184,7 @@ def _images(frames: list[Any], camera_id: str) -> Iterator[ImageRecord]:
 
 
 def _tracks(frames: list[Any], times: list[int], world_from_ego: list[Matrix4]) -> list[Track]:
-    """Boxes joined by their ``track_id``; a box without one is a track of a single pose."""
+    """Tracks from boxes with the same ``track_id``; a box without one becomes a track of a single pose."""
     seen: dict[str, dict[str, Any]] = {}
     for index, frame in enumerate(frames):
         for number, box in enumerate(fields.of_kind(f"frames.json: frame {index}", frame, "boxes", list, default=[])):

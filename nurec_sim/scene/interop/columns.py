@@ -78,6 +78,7 @@ class Columns:
             quat_wxyz=quat_normalize(kept["quat_wxyz"]).astype(np.float32),
             scale_m=kept["scale_m"],
             opacity=np.clip(kept["opacity"], 0, 1),
+            # Renderers clamp the sum of all terms; without view-dependent ones that is the base colour.
             rgb=(rgb if view_dependent else np.maximum(rgb, 0)).astype(np.float32),
             normal=np.zeros((n, 3), np.float32) if normal is None else normal[sound],
             label=np.broadcast_to(np.asarray(label, np.uint8), sound.shape)[sound],
@@ -99,5 +100,6 @@ class Columns:
 def sigmoid(logit: np.ndarray) -> Float64[np.ndarray, "*n"]:
     """1 / (1 + exp(-logit)) of logits of either sign, infinite ones too; NaN stays."""
     values = np.asarray(logit, np.float64)
+    # exp of a negative argument only, which cannot overflow.
     small = np.exp(-np.abs(values))
     return np.where(values < 0, small, 1.0) / (1 + small)

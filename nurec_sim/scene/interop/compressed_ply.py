@@ -64,7 +64,7 @@ def read_compressed(table: VertexTable) -> tuple[Gaussians, int]:
 
 
 def _fields(word: np.ndarray, shifts: tuple[int, ...], bits: tuple[int, ...]) -> Float64[np.ndarray, "n fields"]:
-    """Some bits of each word, from 0 to 1."""
+    """Bit fields of each word as fractions from 0 to 1."""
     word = word.astype(np.int64)
     most = [(1 << width) - 1 for width in bits]
     return np.stack([(word >> shift & top) / top for shift, top in zip(shifts, most, strict=True)], axis=1)
@@ -82,8 +82,9 @@ def _between(
 
 
 def _quaternions(word: np.ndarray) -> Float64[np.ndarray, "n 4"]:
-    """The largest component follows from the length of 1."""
+    """Quaternions by smallest-three encoding: the largest component follows from unit length."""
     largest = (word >> 30).astype(np.int64)
+    # All but the largest component are at most 1 / sqrt(2) in magnitude, so 10 bits cover -0.707..0.707.
     others = (_fields(word, (20, 10, 0), (10, 10, 10)) - 0.5) * np.sqrt(2)
     rest = np.sqrt(np.clip(1 - (others**2).sum(axis=1), 0, None))
     place = (largest[:, None] + 1 + np.arange(3)) % 4
@@ -95,7 +96,7 @@ def _quaternions(word: np.ndarray) -> Float64[np.ndarray, "n 4"]:
 
 
 def _harmonics(table: VertexTable) -> np.ndarray | None:
-    """Coefficients [n, k, 3]; in the file bytes, all of a channel side by side."""
+    """Coefficients [n, k, 3]; the file stores bytes, channel-major."""
     if "sh" not in table.elements:
         return None
     sh = VertexTable(table.path, "sh")
@@ -106,5 +107,6 @@ def _harmonics(table: VertexTable) -> np.ndarray | None:
             f"vertices, got {count} properties and {len(sh):,} rows"
         )
     bytes_ = sh.columns([f"f_rest_{i}" for i in range(count)])
+    # Bytes 0 and 255 are the exact ends of the range, others the middle of their interval.
     share = np.where(bytes_ == 0, 0.0, np.where(bytes_ == 255, 1.0, (bytes_ + 0.5) / 256))
     return ((share - 0.5) * SH_RANGE).reshape(len(table), 3, count // 3).transpose(0, 2, 1)

@@ -124,6 +124,7 @@ def read_ply(path: Path | str) -> tuple[Gaussians, int]:
     mean, quat, colour = (table.columns(names) for names in (POSITION, ROTATION, COLOUR))
     logit, rest = table.columns(["opacity"]), table.columns(_rest_names(k))
     with np.errstate(over="ignore"):
+        # In float64: exp overflows float32 beyond 88.7, and infinite scales are dropped later.
         scale = np.exp(table.columns(SCALE).astype(np.float64)).astype(np.float32)
     columns = Columns(
         mean_m=mean,
@@ -169,6 +170,7 @@ def _header(dtype: np.dtype, count: int, up: str) -> bytes:
 def _vertices(gaussians: Gaussians, dtype: np.dtype) -> np.ndarray:
     """Gaussians in the file's units, as an array of ``vertex_type``."""
     k = 0 if gaussians.sh_rest is None else gaussians.sh_rest.shape[1]
+    # Opacities of exactly 0 and 1 have infinite logits.
     opacity = np.clip(gaussians.opacity.astype(np.float64), 1 - MOST_OPAQUE, MOST_OPAQUE)
     columns: dict[tuple[str, ...], np.ndarray] = {
         POSITION: gaussians.mean_m,

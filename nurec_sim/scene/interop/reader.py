@@ -239,6 +239,7 @@ def _assembled(
     known["road_map"] = around.road_map or known["road_map"]
     if known["road_map"] is None:
         unknown.append("no road map is read")
+    # Gaussians are in the NRE frame, path and tracks in the world: everything is brought to the world.
     world_from_nre = geometry.inverse(around.nre_from_world)
     static = joined([_moved(part, world_from_nre) for part in found.static])
     dynamic = _dynamic(found, known["tracks"], known["span_us"][0], unknown)
@@ -298,5 +299,6 @@ def _turned_sky(sky: np.ndarray, world_from_nre: Float64[np.ndarray, "3 3"]) -> 
     """The sky in world axes, interpolated if rotated."""
     if np.array_equal(world_from_nre, np.eye(3)):
         return sky
+    # Row vectors: d @ R is R^T d, the direction in the NRE frame of a world direction d.
     directions = geometry.cubemap_directions(sky.shape[1]) @ world_from_nre
     return sample_cubemap(sky, directions).astype(np.float32)

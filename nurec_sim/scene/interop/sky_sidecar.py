@@ -74,6 +74,7 @@ def write_sky(
     """
     size, isp = sidecar.sky.shape[1], sidecar.isp or {}
     ours = our_texels(size, world_from_file)
+    # Stored as half floats, whose largest finite value is 65504.
     sky = np.clip(sidecar.sky.reshape(-1, 3)[ours], -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16)
     seen = np.ones(ours.shape) if sidecar.seen is None else sidecar.seen.reshape(-1)[ours]
     order = {name: k for k, name in enumerate(dict.fromkeys([*cameras, *isp]))}
@@ -115,6 +116,7 @@ def read_sky(path: Path | str, world_from_file: Float64[np.ndarray, "3 3"] | Non
     if not 1 <= size <= MAX_FACE_TEXELS:
         raise ArchiveError(f"{path}: sky_cubemap must be [6, s, s, 3], s in 1..{MAX_FACE_TEXELS}, got {sky.shape}")
     _check_shape(path, "sky_cubemap", sky, (6, size, size, 3))
+    # ``our_texels`` is a permutation; argsort inverts it.
     release = np.argsort(our_texels(size, world_from_file).reshape(-1)).reshape(6, size, size)
     if seen is not None:
         _check_shape(path, "sky_cubemap_mask", seen, (6, size, size, 1))
@@ -166,7 +168,7 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
                     continue
                 if entry.file_size > limit + _MAX_HEADER_BYTES:
                     raise ArchiveError(f"{path}: {name} takes {entry.file_size:,} bytes; at most {limit:,} are read")
-                with package.open(entry) as member:  # what unpacks to more than it says is cut off, and then refused
+                with package.open(entry) as member:  # members that exceed their declared size are cut off, then refused
                     arrays[name] = array_from_npy(member.read(entry.file_size), f"{path}: {name}", kinds="iufU")
     except OSError as error:
         raise ArchiveError(f"{path}: cannot be opened ({error.strerror or error})") from error

@@ -53,6 +53,7 @@ def read_spz(path: Path | str) -> tuple[Gaussians, int]:
             f"versions {list(VERSIONS)} and degrees 0 to 3 are read"
         )
     k = _HARMONICS[degree]
+    # Bytes per Gaussian: position, opacity, colour, scale, rotation, harmonics.
     widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version == 3 else 3, 3 * k)
     needed, held = count * sum(widths), len(content) - HEADER.size
     if held < needed:
@@ -65,6 +66,7 @@ def read_spz(path: Path | str) -> tuple[Gaussians, int]:
     columns = Columns(
         mean_m=_halves(position) if version == 1 else _fixed_point(position, point_bits),
         quat_wxyz=_smallest_three(rotation) if version == 3 else _first_three(rotation),
+        # Logarithmic scales in steps of 1/16 from -10.
         scale_m=np.exp(scale / 16.0 - 10),
         opacity=opacity[:, 0] / 255.0,
         dc=(colour / 255.0 - 0.5) / _COLOUR_SCALE,
@@ -80,6 +82,7 @@ def _halves(position: UInt8[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 3"]:
 def _fixed_point(position: UInt8[np.ndarray, "n 9"], point_bits: int) -> Float64[np.ndarray, "n 3"]:
     """Signed 24-bit fixed-point numbers with ``point_bits`` fractional bits."""
     low, middle, high = np.moveaxis(position.reshape(-1, 3, 3).astype(np.int64), -1, 0)
+    # XOR and subtraction of 128 extend the sign of the highest byte.
     return (low | middle << 8 | (high ^ 128) - 128 << 16) / 2.0**point_bits
 
 
@@ -91,7 +94,7 @@ def _first_three(rotation: UInt8[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4
 
 
 def _smallest_three(rotation: UInt8[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
-    """Of (x, y, z, w) the number of the largest in two bits; the others with a sign and 9 bits, the last one lowest."""
+    """Of (x, y, z, w) the index of the largest in 2 bits, the others with sign and 9 bits each, the last one lowest."""
     word = np.ascontiguousarray(rotation).view("<u4")[:, 0].astype(np.int64)
     largest = word >> 30
     parts = np.stack([word >> 20, word >> 10, word], axis=1)

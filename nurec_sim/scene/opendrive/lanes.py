@@ -29,11 +29,11 @@ NARROW_STRIP_M = 0.5
 
 
 class Outline:
-    """An area and its border.
+    """A drivable area and its border.
 
     Attributes:
-        inside: what is farther than ``CLEAR_M`` from the border.
-        allowed: the area and the tolerance of fitted curves.
+        inside: the area farther than ``CLEAR_M`` from the border.
+        allowed: the area, enlarged by the tolerance of fitted curves.
     """
 
     def __init__(self, area: Any):
@@ -45,16 +45,18 @@ class Outline:
         shapely.prepare(self.allowed)
 
     def inside_at(self, places: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-        """Whether places are farther than ``CLEAR_M`` from the border."""
+        """Whether points are in the area and farther than ``CLEAR_M`` from the border."""
         return shapely.covers(self.inside, shapely.points(places))
 
     def clear_m(self, places: np.ndarray, out: np.ndarray, limit_m: float) -> Float64[np.ndarray, " k"]:
-        """How far from places it is to the border in given directions, infinite beyond the limit."""
+        """Distance from points to the border along unit directions, infinite beyond the limit."""
         rays = shapely.linestrings(np.stack([places, places + limit_m * out], axis=1))
         row, segment = self.tree.query(rays)
         start, step = self.segments[segment, 0] - places[row], np.diff(self.segments[segment], axis=1)[:, 0]
         way = out[row]
         cross = way[:, 0] * step[:, 1] - way[:, 1] * step[:, 0]
+        # Ray p + t d against segment q + u e: t = (q - p) x e / (d x e), u = (q - p) x d / (d x e). Parallel ones give
+        # NaN.
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (start[:, 0] * step[:, 1] - start[:, 1] * step[:, 0]) / cross
             share = (start[:, 0] * way[:, 1] - start[:, 1] * way[:, 0]) / cross
@@ -66,7 +68,7 @@ class Outline:
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane's line, how far it reaches to its left and right, and whether it ends at the border there."""
+    """Centre line of a lane, its extent to the left and right, and whether that side is at the border."""
 
     line: Float64[np.ndarray, "k 2"]
     reach_m: tuple[float, float]
@@ -74,7 +76,7 @@ class Lane:
 
 
 def lanes_of(lines: list[np.ndarray], outline: Outline) -> Iterator[Lane]:
-    """Lanes up to the middle between them and their neighbours, to the border, or half of the usual width."""
+    """Lanes whose sides reach halfway to a neighbour, to the border, or half of the usual width."""
     from scipy.spatial import cKDTree
 
     if not lines:
@@ -82,21 +84,25 @@ def lanes_of(lines: list[np.ndarray], outline: Outline) -> Iterator[Lane]:
     places, ways = np.concatenate(lines), np.concatenate([directions_of(line) for line in lines])
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
     one, other = cKDTree(places).query_pairs(MAX_WIDTH_M + 0.5, output_type="ndarray").T
+    # Each pair in both directions, so that every lane sees its neighbours.
     one, other = np.concatenate([one, other]), np.concatenate([other, one])
     step = places[other] - places[one]
     along, aside = (ways[one] * step).sum(axis=1), ways[one, 0] * step[:, 1] - ways[one, 1] * step[:, 0]
     beside = (owner[one] != owner[other]) & (np.abs(along) < STATION_M) & (np.abs(aside) > 1.5)
+    # Within 14 degrees of parallel, in either driving direction: crossing lanes are not neighbours.
     beside &= np.abs((ways[one] * ways[other]).sum(axis=1)) > 0.97
     for index, line in enumerate(lines):
         reach, kerb = [], []
         for sign in (1.0, -1.0):
             gaps = sign * aside[beside & (owner[one] == index) & (sign * aside > 0)]
             usual = LANE_WIDTH_M / 2
+            # A neighbour along at least a quarter of the lane: the boundary is halfway, with a little overlap.
             if len(gaps) >= len(line) / 4:
                 usual = float(np.median(gaps)) / 2 + OVERLAP_M
             free = outline.clear_m(line, sign * normals_of(line), LANE_WIDTH_M)
             free = free[free > NARROW_STRIP_M] if (free > NARROW_STRIP_M).any() else np.array([np.inf])
             at_border = bool(np.median(free) < usual + CLEAR_M + OVERLAP_M)
+            # The width is constant, so it follows the narrow places; the rest is left to the strips and patches.
             low = float(np.quantile(free, 0.1, method="lower"))
             reach.append(max(NARROW_STRIP_M, min(usual, low - (FIT_M if at_border else CLEAR_M + OVERLAP_M))))
             kerb.append(at_border)
@@ -104,7 +110,7 @@ def lanes_of(lines: list[np.ndarray], outline: Outline) -> Iterator[Lane]:
 
 
 def driving(lane: Lane, outline: Outline) -> Iterator[LaidRoad]:
-    """The lane where it fits into the area, a little longer than its line."""
+    """The parts of a lane that fit into the area, extended slightly beyond its line."""
     way = directions_of(lane.line)
     line = np.concatenate([lane.line[:1] - CLEAR_M * way[:1], lane.line, lane.line[-1:] + CLEAR_M * way[-1:]])
     out = np.concatenate([normals_of(lane.line)[:1], normals_of(lane.line), normals_of(lane.line)[-1:]])
@@ -120,7 +126,7 @@ def driving(lane: Lane, outline: Outline) -> Iterator[LaidRoad]:
 
 
 def parking(lane: Lane, outline: Outline, covered: Any) -> Iterator[LaidRoad]:
-    """Strips on both sides of a driving lane, up to the strips of the border."""
+    """Strips on both sides of a driving lane that fill the gap to the strips along the border."""
     for side, sign in ((0, 1.0), (1, -1.0)):
         beside_m, out = lane.reach_m[side], sign * normals_of(lane.line)
         free = outline.clear_m(lane.line, out, beside_m + MAX_WIDTH_M + STRIP_M)
@@ -138,14 +144,16 @@ def parking(lane: Lane, outline: Outline, covered: Any) -> Iterator[LaidRoad]:
                 for chain in gentle(fitted(line), left_m, right_m):
                     pieces = [piece.aside(left_m) for piece in chain]
                     road = LaidRoad(pieces, "parking", left_m + right_m, (True, True))
+                    # Curve fitting may push a strip beyond the border; patches cover such places instead.
                     if shapely.difference(road.polygon, outline.inside).area < 0.01:
                         yield road
 
 
 def _even(low: Float64[np.ndarray, " n"], high: Float64[np.ndarray, " n"]) -> Iterator[tuple[int, int, float]]:
-    """Start, stop and one value between both limits, as far as there is one; runs share their ends."""
+    """Greedy runs (start, stop, value) in which one value satisfies all limits; neighbours share an end."""
     first = 0
     while first < len(low):
+        # A common value exists as long as the largest lower limit does not exceed the smallest upper one.
         lows, highs = np.maximum.accumulate(low[first:]), np.minimum.accumulate(high[first:])
         count = int(np.argmin(np.append(lows <= highs, False)))
         stop = first + count

@@ -1,19 +1,19 @@
-"""Roads that cover a drivable area, laid out so that readers find the area's border and no edge inside it.
+"""Covers a drivable area with roads such that readers find the area's border, and no edge inside it.
 
-AlpaSim makes an edge at the side of every road and takes lanes of every type for road (``validate.alpasim_map``). Five
-kinds of roads, each with one lane of constant width:
+AlpaSim generates an edge at the side of every road and treats lanes of every type as road (``validate.alpasim_map``).
+There are five kinds of roads, each with one lane of constant width:
 
 * a *driving* lane along every lane line;
-* *shoulders*: strips inside every outline of the area, which they have on their right; their right borders are the
+* *shoulders*: strips inside every outline of the area, with the outline on their right; their right borders are the
   edges that count;
 * *parking* strips between the two, where the area is wider than its lanes;
-* *patches*, shoulders too, over what is left, in junctions mostly;
-* near the path, lanes of type ``none`` outside of the area, half a metre wide: a car that stands wholly beyond the
-  border meets their edges, and none can stand on them.
+* *patches*, also shoulders, over the remaining area, mostly in junctions;
+* near the path, lanes of type ``none`` outside the area, half a metre wide: a car entirely beyond the border touches
+  their edges, and no car fits on them.
 
-Roads overlap by some centimetres, so that no gap is left between them. Sides without a border beside them are closed by
-lanes of type ``none``, ``SEAL_M`` wide: edges within 0.2 m of a lane's centre line do not count. For that reason seals
-keep ``CLEAR_M`` away from the border.
+Roads overlap by some centimetres so that no gaps remain. Sides that are not at the border are closed by lanes of type
+``none``, ``SEAL_M`` wide: edges within 0.2 m of a lane's centre line do not count. Seals therefore keep ``CLEAR_M``
+away from the border.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from nurec_sim.scene.opendrive.road import (
 )
 
 EDGE_M = 200.0
-"""Longest strip along a border: a reader compares a car with one edge, so long edges serve best."""
+"""Maximum length of a strip along a border: readers compare a car with one edge only, so long edges are best."""
 CORNER_RAD = 0.5
 UNCOVERED_M = 0.5
-"""Patches cover what is farther than this from the border."""
+"""Patches cover the area farther than this from the border."""
 BEYOND_M = (1.5, 3.2, 4.9, 6.6)
-"""How far outside the area there are edges: their steps are less than the width of a car."""
+"""Distances of edges outside the area: their spacing is less than the width of a car."""
 BEYOND_WIDTH_M = 0.5
 BEYOND_REACH_M = 12.0
 BEYOND_EDGE_M = 30.0
@@ -58,8 +58,8 @@ def laid_out(area: Any, lanes: Lines, path: Float64[np.ndarray, "p 3"]) -> list[
 
     Args:
         area: the drivable area, shapely polygons.
-        lanes: centre lines of driving lanes in driving direction.
-        path: where the car drove; borders are cut into edges where that is far away.
+        lanes: centre lines of driving lanes, in driving direction.
+        path: the recorded path; borders are cut into edges at points far from it.
     """
     area = _cleaned(area)
     if area.is_empty:
@@ -77,7 +77,7 @@ def laid_out(area: Any, lanes: Lines, path: Float64[np.ndarray, "p 3"]) -> list[
 
 
 def _cleaned(area: Any) -> Any:
-    """Without hairline gaps and specks."""
+    """The area without hairline gaps and specks: a morphological closing, small polygons and holes dropped."""
     area = shapely.buffer(shapely.buffer(area, OVERLAP_M, join_style="mitre"), -OVERLAP_M, join_style="mitre")
     polygons = []
     for polygon in shapely.get_parts(area):
@@ -88,7 +88,7 @@ def _cleaned(area: Any) -> Any:
 
 
 def _covered(roads: list[LaidRoad]) -> Any:
-    """What roads cover, each taken a little smaller, so that roads that merely touch leave a gap."""
+    """The union of roads, each shrunk slightly, so that roads that merely touch leave a gap to be patched."""
     polygons = np.array([road.polygon for road in roads], dtype=object)
     covered = shapely.union_all(shapely.buffer(polygons, -OVERLAP_M / 2, join_style="mitre"))
     shapely.prepare(covered)
@@ -99,7 +99,7 @@ def _covered(roads: list[LaidRoad]) -> Any:
 
 
 def _border(area: Any, path: Float64[np.ndarray, "p 3"]) -> Iterator[LaidRoad]:
-    """Strips inside the outlines, which lie on their right."""
+    """Strips inside the outlines, with the outline on their right."""
     driven = shapely.LineString(path[:, :2]) if len(path) > 1 else shapely.Point(path[0, :2])
     for polygon in shapely.get_parts(area):
         for ring in (polygon.exterior, *polygon.interiors):
@@ -110,14 +110,15 @@ def _border(area: Any, path: Float64[np.ndarray, "p 3"]) -> Iterator[LaidRoad]:
 
 
 def _sides(ring: Float64[np.ndarray, "k 2"], driven: Any) -> Iterator[Float64[np.ndarray, "n 2"]]:
-    """A ring between its corners, which strips may not go round; one that has none begins far from the path."""
+    """Splits a ring at corners, which strips cannot follow; a ring without corners starts far from the path."""
     way = np.diff(np.concatenate([ring[-1:], ring, ring[:1]]), axis=0)
+    # Rings have the area on their left, so a left turn is a convex corner of it.
     turn = np.arctan2(way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0], (way[:-1] * way[1:]).sum(axis=1))
     corners = np.flatnonzero(turn > CORNER_RAD)
     if not len(corners):
         ring = np.roll(ring, -int(np.argmax(shapely.distance(driven, shapely.points(ring)))), axis=0)
         past = 2 * STRIP_M / max(np.hypot(*(ring[1] - ring[0])), 2 * STRIP_M)
-        yield np.concatenate([ring, ring[:1], ring[:1] + past * (ring[1:2] - ring[:1])])  # so that the ring closes
+        yield np.concatenate([ring, ring[:1], ring[:1] + past * (ring[1:2] - ring[:1])])  # its ends overlap
         return
     ring = np.roll(ring, -corners[0], axis=0)
     stops = [*(corners - corners[0]), len(ring)]
@@ -129,7 +130,7 @@ def _sides(ring: Float64[np.ndarray, "k 2"], driven: Any) -> Iterator[Float64[np
 
 
 def _strip(border: list[Piece], polygon: Any) -> LaidRoad:
-    """A strip to the left of a border; a narrow one, and not sealed, where the area's other side is near."""
+    """A strip to the left of a border; narrow and unsealed if the opposite border is near."""
     for width_m in (STRIP_M, NARROW_STRIP_M):
         strip = LaidRoad([piece.aside(width_m) for piece in border], "shoulder", width_m, (True, False))
         inner = shapely.LineString(sampled(strip.reference)[0])
@@ -140,7 +141,7 @@ def _strip(border: list[Piece], polygon: Any) -> LaidRoad:
 
 
 def _beyond(area: Any, path: Float64[np.ndarray, "p 3"]) -> Iterator[LaidRoad]:
-    """Edges outside the area, near the path; too narrow and too far from it to drive on."""
+    """Edges outside the area, near the path; too narrow and too far outside to drive on."""
     driven = shapely.LineString(path[:, :2]) if len(path) > 1 else shapely.Point(path[0, :2])
     reach = shapely.buffer(driven, BEYOND_REACH_M)
     line = resampled(path[:, :2], STATION_M)
@@ -159,8 +160,9 @@ def _beyond(area: Any, path: Float64[np.ndarray, "p 3"]) -> Iterator[LaidRoad]:
 
 
 def _outer_edges(line: Float64[np.ndarray, "k 2"], row: int, path: Any) -> Iterator[LaidRoad]:
-    """Of two parallel edges with near centroids readers drop one, so neighbouring rows are cut at other places."""
+    """Readers drop one of two parallel edges with close centroids, so neighbouring rows are cut at staggered points."""
     along = shapely.line_locate_point(path, shapely.points(line))
+    # Every other row is shifted by half an edge.
     part = np.floor(along / BEYOND_EDGE_M + row / 2)
     cuts = [0, *(np.flatnonzero(np.diff(part)) + 1), len(line) - 1]
     for start, stop in zip(cuts, cuts[1:], strict=False):
@@ -169,7 +171,7 @@ def _outer_edges(line: Float64[np.ndarray, "k 2"], row: int, path: Any) -> Itera
 
 
 def _cut(chain: list[Piece], longest_m: float, driven: Any) -> Iterator[list[Piece]]:
-    """Parts that overlap by a piece, cut where the driven path is far: near a cut, a car meets two edges."""
+    """Parts that overlap by one piece, cut far from the driven path: near a cut, a car touches two edges."""
     ends = np.cumsum([piece.length_m for piece in chain])
     away = shapely.distance(driven, shapely.points([piece.xy for piece in chain]))
     start = 0
@@ -178,6 +180,7 @@ def _cut(chain: list[Piece], longest_m: float, driven: Any) -> Iterator[list[Pie
         stop = len(chain)
         if left_m > longest_m:
             along = ends - ends[-1] + left_m
+            # Not before 30 % of the allowed length, so that the parts do not become too many.
             choice = np.flatnonzero((along > 0.3 * longest_m) & (along <= longest_m))
             choice = choice[choice > start]
             stop = int(choice[np.argmax(away[choice])]) + 1 if len(choice) else start + 2
@@ -189,22 +192,24 @@ def _cut(chain: list[Piece], longest_m: float, driven: Any) -> Iterator[list[Pie
 
 
 def _patches(gaps: Any, inside: Any) -> Iterator[LaidRoad]:
-    """Rectangles that cover the gaps and lie inside."""
+    """Rectangles that cover the gaps and stay inside the area."""
     shapely.prepare(inside)
     for gap in shapely.get_parts(gaps):
         if gap.is_empty or gap.geom_type != "Polygon":
             continue
         corners = np.array(shapely.minimum_rotated_rectangle(gap).exterior.coords)
+        # The long side of the smallest enclosing rectangle gives the roads' direction.
         sides = np.diff(corners, axis=0)[:2]
         axis = sides[int(np.argmax(np.hypot(*sides.T)))]
         u = axis / np.hypot(*axis)
         turn = np.array([[u[0], u[1]], [-u[1], u[0]]])
         turned = shapely.transform(gap, lambda xy, turn=turn: xy @ turn.T)
+        # Recursive: each cut halves an extent, down to a few overlaps in size.
         yield from _rectangles(turned, turn, inside)
 
 
 def _rectangles(gap: Any, turn: Float64[np.ndarray, "2 2"], inside: Any) -> Iterator[LaidRoad]:
-    """Of a gap given in turned axes: one around it, or those of its halves."""
+    """A rectangle around a gap in rotated axes, or, if it does not fit, those of the gap's halves (recursively)."""
     west, south, east, north = shapely.bounds(gap)
     if np.isnan(west):
         return

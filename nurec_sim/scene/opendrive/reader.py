@@ -21,7 +21,7 @@ from nurec_sim.types import RoadMap, Trajectory
 STEP_M = 2.0
 NEAR_M = 20.0
 MAX_ROAD_M = 1e6
-"""All roads together; longer maps are refused."""
+"""Total length of all roads; longer maps are refused."""
 _A_M, _E2 = 6378137.0, 6.69437999014e-3  # WGS84: equatorial radius, eccentricity squared
 Profile = Callable[[np.ndarray], np.ndarray]
 
@@ -29,13 +29,13 @@ Profile = Callable[[np.ndarray], np.ndarray]
 def road_map_from(
     data: bytes, ecef_from_world: Float64[np.ndarray, "4 4"] | None, path: Trajectory, where: str
 ) -> tuple[RoadMap | None, str]:
-    """Lanes in the world's coordinates, and what is to know of them; no map if they do not lie where the car drove.
+    """Lanes in world coordinates, and a note about them; no map if the lanes are not where the car drove.
 
     Args:
-        data: the file.
-        ecef_from_world: ``T_world_base``; without it, or without the map's own place, the map is in the world's frame.
-        path: of the car, which must come within ``NEAR_M`` of the lanes for at least half of its poses.
-        where: what to call the file.
+        data: contents of the file.
+        ecef_from_world: ``T_world_base``; without it, or without the map's geodetic origin, the map is in world axes.
+        path: path of the car, of which at least half of the poses must be within ``NEAR_M`` of a lane.
+        where: name of the file in texts.
     """
     from scipy.spatial import cKDTree
 
@@ -55,10 +55,10 @@ def road_map_from(
 
 
 def lanes_from(data: bytes, where: str) -> list[Float64[np.ndarray, "k 3"]]:
-    """Centre lines of all driving lanes, in the map's coordinates, in the direction of their roads.
+    """Centre lines of all driving lanes, in map coordinates, in the direction of their roads.
 
     Raises:
-        ArchiveError: no OpenDRIVE, damaged, too long, or a geometry that is not known.
+        ArchiveError: not OpenDRIVE, damaged, too long, or with an unknown geometry.
     """
     root = opendrive_root(data, where)
     lines: list[np.ndarray] = []
@@ -75,14 +75,16 @@ def lanes_from(data: bytes, where: str) -> list[Float64[np.ndarray, "k 3"]]:
 
 
 def ecef_from_map(data: bytes, where: str) -> Float64[np.ndarray, "4 4"] | None:
-    """The map's place on the earth, from ``lat_0``, ``lon_0`` and ``alt_0`` of its geoReference; None without them."""
+    """The map's pose in ECEF, from ``lat_0``, ``lon_0`` and ``alt_0`` of its geoReference; None without them."""
     text = " ".join(each.text or "" for each in opendrive_root(data, where).iter("geoReference"))
+    # Also accepts the misspelling "+=alt_0".
     given = dict(re.findall(r"\+=?(lat_0|lon_0|alt_0)=([-+.\deE]+)", text.replace("+=alt", "+alt")))
     try:
         latitude, longitude = np.radians(float(given["lat_0"])), np.radians(float(given["lon_0"]))
         height = float(given.get("alt_0", 0.0))
     except (KeyError, ValueError):
         return None
+    # Geodetic to ECEF on the WGS84 ellipsoid; ``normal_m`` is the radius of curvature in the prime vertical.
     sin, cos = np.sin(latitude), np.cos(latitude)
     normal_m = _A_M / np.sqrt(1 - _E2 * sin**2)
     east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
@@ -108,6 +110,7 @@ def _lanes(road: ElementTree.Element) -> Iterator[np.ndarray]:
     offset = _profile(road.findall("lanes/laneOffset"), "s")(s)
     left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
     sections = road.findall("lanes/laneSection")
+    # A lane section ends where the next one starts.
     starts = [_value(section, "s") for section in sections] + [np.inf]
     for section, first, last in zip(sections, starts, starts[1:], strict=False):
         rows = np.flatnonzero((s >= first - 1e-6) & (s <= last + 1e-6))
@@ -115,6 +118,7 @@ def _lanes(road: ElementTree.Element) -> Iterator[np.ndarray]:
             continue
         for side, sign in (("left", 1.0), ("right", -1.0)):
             border = offset[rows]
+            # Lanes stack outwards from the centre in the order of their numbers, each by its width.
             for lane in sorted(section.findall(f"{side}/lane"), key=lambda lane: abs(_value(lane, "id"))):
                 width = _profile(lane.findall("width"), "sOffset")(s[rows] - first)
                 middle, border = border + sign * width / 2, border + sign * width
@@ -123,7 +127,7 @@ def _lanes(road: ElementTree.Element) -> Iterator[np.ndarray]:
 
 
 def _profile(pieces: list[ElementTree.Element], start: str) -> Profile:
-    """Cubic pieces along a road; zero where there are none."""
+    """A piecewise cubic a + b ds + c ds^2 + d ds^3 along a road; zero without pieces."""
     table = sorted([_value(piece, start), *(_value(piece, name) for name in "abcd")] for piece in pieces)
 
     def at(s: np.ndarray) -> np.ndarray:
@@ -162,6 +166,8 @@ def _shape(piece: ElementTree.Element, t: np.ndarray, length: float) -> tuple[np
         first = _value(kind, "curvature" if kind.tag == "arc" else "curvStart")
         last = first if kind.tag == "arc" else _value(kind, "curvEnd")
         fine = np.linspace(0, 1, 16 * (len(t) - 1) + 1) * length
+        # Curvature is linear in arc length (a clothoid), so the heading is quadratic; positions have no closed form and
+        # are integrated over 16 steps per sample.
         heading = first * fine + (last - first) * fine**2 / max(2 * length, 1e-12)
         step, middle = np.diff(fine), (heading[1:] + heading[:-1]) / 2
         u, v = (np.concatenate([[0.0], np.cumsum(step * f(middle))])[::16] for f in (np.cos, np.sin))
@@ -171,6 +177,7 @@ def _shape(piece: ElementTree.Element, t: np.ndarray, length: float) -> tuple[np
     if kind.tag == "poly3":
         v, dv = _cubic([_value(kind, name) for name in "abcd"], t)
         return t, v, np.arctan2(dv, np.ones_like(t))
+    # The parameter runs over the length or, by default, over 0..1.
     p = t if kind.get("pRange") == "arcLength" else t / max(length, 1e-12)
     u, du = _cubic([_value(kind, f"{name}U") for name in "abcd"], p)
     v, dv = _cubic([_value(kind, f"{name}V") for name in "abcd"], p)

@@ -1,8 +1,8 @@
 """An OpenDRIVE map (``map.xodr``) of a scene's drivable area and lanes, in ``<line>`` and ``<arc>`` only.
 
-``opendrive_layout`` says which roads there are; their widths are constant and heights are linear between knots. Map
+``opendrive.layout`` determines the roads; their widths are constant, their elevation is piecewise linear. Map
 coordinates equal world coordinates: the geo-reference names the same origin as ``T_world_base`` of
-``rig_trajectories.json``. Logs carry no geodetic position, so that origin is latitude 0, longitude 0.
+``rig_trajectories.json``. Logs have no geodetic position, so that origin is latitude 0, longitude 0.
 """
 
 from __future__ import annotations
@@ -23,29 +23,28 @@ from nurec_sim.types import RoadMap, Trajectory
 HEIGHT_KNOT_M = 5.0
 HEIGHT_NEIGHBOURS = 4
 JOINT_M = 1e-6
-"""Pieces end this much before the next one starts: rounding must not make borders go backwards at a joint."""
+"""Pieces end this much before the next one starts: rounding must not make borders run backwards at a joint."""
 GEO_REFERENCE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +alt_0=0 +no_defs"
 _WGS84_RADIUS_M = 6378137.0
 Heights = Callable[[Float64[np.ndarray, "n 2"]], Float64[np.ndarray, " n"]]
 
 
 def world_to_ecef() -> Float64[np.ndarray, "4 4"]:
-    """ECEF from the world, for a world whose x is east, y north, z up at latitude 0, longitude 0, height 0."""
+    """ECEF from the world: x east, y north, z up at latitude 0, longitude 0, height 0."""
     return np.array(
         [[0.0, 0.0, 1.0, _WGS84_RADIUS_M], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
     )
 
 
 def opendrive_map(name: str, road_map: RoadMap, ego: Trajectory) -> bytes | None:
-    """``map.xodr`` in UTF-8, None if the map has neither an area nor a lane to drive on.
+    """``map.xodr`` in UTF-8; None if no road can be derived from the map.
 
     Args:
-        name: of the scene.
-        road_map: without drivable areas every lane counts as ``LANE_WIDTH_M`` wide; without lanes the recorded path
-            is one.
-        ego: the recorded path, whose origin lies on the ground.
+        name: name of the scene.
+        road_map: without drivable areas, lanes are ``LANE_WIDTH_M`` wide; without lanes, the recorded path is one.
+        ego: the recorded path, with its origin on the ground.
     """
-    from nurec_sim.scene.opendrive.layout import laid_out  # shapely takes a while
+    from nurec_sim.scene.opendrive.layout import laid_out  # importing shapely is slow
 
     lanes = [lane for lane in road_map.lanes if len(lane) > 1 and np.ptp(lane[:, :2], axis=0).max() > 0]
     area = drivable_area(road_map) if road_map.drivable else _area_of_lanes(lanes)
@@ -65,12 +64,13 @@ def opendrive_map(name: str, road_map: RoadMap, ego: Trajectory) -> bytes | None
         _add_road(root, str(number), road, heights)
     ElementTree.indent(root)
     xml = ElementTree.tostring(root, encoding="unicode")
+    # ElementTree cannot write CDATA, which the standard uses for the projection string.
     xml = xml.replace(GEO_REFERENCE, f"<![CDATA[{GEO_REFERENCE}]]>")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{xml}\n'.encode()
 
 
 def _area_of_lanes(lanes: list[Float64[np.ndarray, "k 3"]]):
-    """The area of lanes of the usual width."""
+    """The union of lanes of the usual width."""
     import shapely
 
     bands = [shapely.LineString(lane[:, :2]).buffer(LANE_WIDTH_M / 2, cap_style="flat") for lane in lanes]
@@ -78,7 +78,7 @@ def _area_of_lanes(lanes: list[Float64[np.ndarray, "k 3"]]):
 
 
 def _heights(lines: list[Float64[np.ndarray, "k 3"]]) -> Heights:
-    """Ground heights: the mean of the nearest known ones, nearer ones counting more."""
+    """Ground height at any point: mean of the nearest known ones, weighted by inverse squared distance."""
     from scipy.spatial import cKDTree
 
     known = np.concatenate([resampled(line, 1.0) if len(line) > 1 else line for line in lines])
@@ -86,6 +86,7 @@ def _heights(lines: list[Float64[np.ndarray, "k 3"]]) -> Heights:
 
     def heights(xy: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, " n"]:
         distance, index = tree.query(xy, k=min(HEIGHT_NEIGHBOURS, len(known)))
+        # The offset (1 cm squared) keeps the weight finite on a known point.
         weight = 1 / (distance.reshape(len(xy), -1) ** 2 + 1e-4)
         return (known[index, 2].reshape(len(xy), -1) * weight).sum(axis=1) / weight.sum(axis=1)
 
@@ -120,10 +121,11 @@ def _add_road(root: Element, number: str, laid: LaidRoad, heights: Heights) -> N
 
 
 def _add_heights(profile: Element, laid: LaidRoad, heights: Heights) -> None:
-    """Of the middle of the lane, linear between knots."""
+    """Elevation along the middle of the lane, linear between knots."""
     xy, yaw = sampled(laid.reference)
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
     knots = np.linspace(0.0, laid.length_m, max(2, int(np.ceil(laid.length_m / HEIGHT_KNOT_M)) + 1))
+    # The reference line is the lane's left border; OpenDRIVE has one elevation across the road.
     right = laid.width_m / 2 * np.stack([np.sin(yaw), -np.cos(yaw)], axis=1)
     middle = np.stack([np.interp(knots, s, (xy + right)[:, axis]) for axis in range(2)], axis=1)
     z = heights(middle)
@@ -139,10 +141,10 @@ def _add_lane(side: Element, number: int, kind: str, width_m: float) -> None:
 
 
 def _text(value: float) -> str:
-    """A number with nanometre resolution; curvatures need it over long arcs too."""
+    """A number with 12 decimals; curvatures need them over long arcs."""
     return f"{float(value):.12f}"
 
 
 def _plain(name: str) -> str:
-    """A name free of characters that XML does not allow."""
+    """A name without characters that XML does not allow."""
     return re.sub(r"[^\w .@:+-]", "_", name)

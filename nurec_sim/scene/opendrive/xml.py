@@ -1,4 +1,4 @@
-"""The root of an OpenDRIVE file of any origin; entities, which could grow without bound, are never expanded."""
+"""Parses untrusted OpenDRIVE files; entities, which could expand without bound, are refused."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ def opendrive_root(data: bytes, where: str) -> ElementTree.Element:
     """The ``<OpenDRIVE>`` element of a file's bytes.
 
     Raises:
-        ArchiveError: no XML, damaged, too large, not UTF-8, with a document type, or no OpenDRIVE.
+        ArchiveError: not XML, damaged, too large, not UTF-8, with a document type, or not OpenDRIVE.
     """
-    if b"\0" in data:  # UTF-16, in which a document type would not be found below
+    if b"\0" in data:  # UTF-16 would hide a document type from the search below
         raise ArchiveError(f"{where}: it holds zero bytes, as UTF-16 does; XML must be UTF-8")
+    # Nested entities expand exponentially ("billion laughs"), external ones read other files.
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise ArchiveError(f"{where}: document types and entities are not read")
     try:

@@ -1,10 +1,10 @@
 """The moving part of an archive as USD: actors with their boxes, and windows of moving Gaussians.
 
-``/Actors/track_<id>`` holds the label, the size, a guide box that follows the recorded path, and one ParticleField per
+``/Actors/track_<id>`` has the label, the size, a guide box that follows the recorded path, and one ParticleField per
 window. A window is a set of Gaussians with the same three knot times: its positions have three time samples and it is
-visible from the first knot to the last. Positions are in the world, as recorded; Gaussians of no track live under
-``/Actors/untracked``. The fade of opacity within a window is not expressed in USD. Rigid parts of an actor are one
-window that moves with the box, in its frame.
+visible from the first knot to the last. Positions are in the world, as recorded; Gaussians without a track are under
+``/Actors/untracked``. The fade of opacity within a window is not represented in USD. Rigid parts of an actor form one
+window in the frame of the box, animated with it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def field_paths(layer) -> list[str]:
 
 
 def _prim_names(tracks: Sequence[Track]) -> list[str]:
-    """One prim name per track; ids that differ only in characters USD does not allow get their number appended."""
+    """One prim name per track; ids that differ only in characters invalid in USD get their index appended."""
     from pxr import Tf
 
     names: list[str] = []
@@ -80,7 +80,14 @@ def _author_track(stage, path: str, track: Track, start_us: int) -> None:
 
 
 def author_path(prim, t_us: Int64[np.ndarray, " t"], poses: np.ndarray, start_us: int) -> None:
-    """Time samples of a pose: translation (linear) and orientation (slerp), as in ``Trajectory.at``."""
+    """Adds time samples of a pose: translation (linear) and orientation (slerp), as in ``Trajectory.at``.
+
+    Args:
+        prim: the ``UsdGeom.Xformable`` to animate; both operations are appended to its transform.
+        t_us: [t] sample times, microseconds.
+        poses: [t,4,4] rigid transforms from the prim's frame to its parent's.
+        start_us: the scene's start, time code 0.
+    """
     from pxr import Gf, UsdGeom
 
     translate = prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
@@ -93,20 +100,21 @@ def author_path(prim, t_us: Int64[np.ndarray, " t"], poses: np.ndarray, start_us
 
 
 def _windows(dynamic: DynamicGaussians) -> list[tuple[int, Int64[np.ndarray, " k"]]]:
-    """(track, places of its Gaussians) for every window, in order of track and time.
+    """(track, indices of its Gaussians) for every window, in order of track and time.
 
-    Where almost every Gaussian has knot times of its own, times are put into coarse bins instead: a prim each would
-    be unusable. The exact knots are stored beside the layer in any case.
+    If almost every Gaussian has its own knot times, times are binned coarsely instead: one prim per Gaussian would be
+    unusable. The exact knots are stored beside the layer in any case.
     """
     if len(dynamic) == 0:
         return []
     in_box = np.zeros(len(dynamic), bool) if dynamic.in_box is None else dynamic.in_box
-    # The box's path moves rigid parts: one window is enough for them, whatever their knots.
+    # Rigid parts are animated by the box's path: one window is enough for them, whatever their knots.
     keys = np.column_stack([dynamic.track, in_box, np.where(in_box[:, None], 0, dynamic.knot_t_us)])
     unique, window = np.unique(keys, axis=0, return_inverse=True)
     if len(unique) > MAX_WINDOWS:
         keys[:, 2:] //= _COARSE_WINDOW_US
         unique, window = np.unique(keys, axis=0, return_inverse=True)
+    # Group indices by window with one sort instead of one search per window.
     order = np.argsort(window.reshape(-1), kind="stable")
     starts = np.searchsorted(window.reshape(-1)[order], np.arange(len(unique)))
     return [(int(key[0]), part) for key, part in zip(unique, np.split(order, starts[1:]), strict=True)]
@@ -117,6 +125,7 @@ def _author_window(stage, path: str, dynamic: DynamicGaussians, index: Int64[np.
 
     gaussians: Gaussians = dynamic.gaussians[index]
     knots_m = np.ascontiguousarray(np.moveaxis(dynamic.knot_m[index], 1, 0))
+    # Equal within a window, unless the times were binned.
     times_us = np.median(dynamic.knot_t_us[index], axis=0).astype(np.int64)
     field = author_field(stage, path, gaussians, index.astype(np.int32))
     positions = field.GetPositionsAttr()
@@ -136,10 +145,11 @@ def _author_rigid(
 
 
 def _author_life(field, first_us: int, last_us: int, start_us: int) -> None:
-    """Makes a field visible from one instant to another."""
+    """Makes a field visible from one instant to another, both included."""
     from pxr import UsdGeom
 
     visibility = field.CreateVisibilityAttr()
+    # Visibility is a token: samples are held until the next one, not interpolated.
     visibility.Set(UsdGeom.Tokens.invisible, time_code(first_us - 1, start_us))
     visibility.Set(UsdGeom.Tokens.inherited, time_code(first_us, start_us))
     visibility.Set(UsdGeom.Tokens.invisible, time_code(last_us + 1, start_us))

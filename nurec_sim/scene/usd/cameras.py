@@ -1,8 +1,8 @@
 """The rig and its cameras as USD: a moving Xform with one Camera per sensor.
 
 USD cameras look along -z with y up, ours along +z with y down: ``rig_from_usd = rig_from_camera @ diag(1, -1, -1)``.
-A plain USD camera knows no distortion; the lens travels as the f-theta attributes that Omniverse and 3DGRUT read,
-and exactly in ``nurec_sim/scene.json``.
+A plain USD camera has no distortion; the lens is written as the f-theta attributes that Omniverse and 3DGRUT read, and
+exactly in ``nurec_sim/scene.json``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from nurec_sim.scene.usd.actors import author_path
 from nurec_sim.scene.usd.layers import NAMESPACE, crate_bytes, new_stage
 from nurec_sim.types import CameraModel, FTheta, GaussianScene
 
-_APERTURE_MM = 20.955  # USD's own default width; only its ratio to the focal length has a meaning
+_APERTURE_MM = 20.955  # USD's default width; only its ratio to the focal length matters
 
 
 def cameras_layer(scene: GaussianScene, fits: Mapping[str, FTheta]) -> bytes:
@@ -41,6 +41,7 @@ def _author_camera(stage, path: str, camera: CameraModel, fit: FTheta) -> None:
     rig_from_usd = camera.rig_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
     prim.AddTransformOp().Set(Gf.Matrix4d(rig_from_usd.T.tolist()))  # USD multiplies row vectors
     fx, fy, cx, cy = _pinhole_view(camera, fit)
+    # USD has one focal length: the vertical aperture absorbs a ratio fx / fy other than 1.
     mm_per_px = _APERTURE_MM / camera.width_px
     prim.CreateHorizontalApertureAttr(_APERTURE_MM)
     prim.CreateVerticalApertureAttr(camera.height_px * mm_per_px * fx / fy)
@@ -67,5 +68,6 @@ def _pinhole_view(camera: CameraModel, fit: FTheta) -> tuple[float, float, float
     lens = camera.lens
     if lens.perspective:
         return lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px
+    # r(theta) = a1 theta + ... has the slope a1 on the axis, as has a pinhole with that focal length.
     focal_px = fit.angle_to_pixeldist[1]
     return focal_px, focal_px, fit.cx_px, fit.cy_px

@@ -1,9 +1,9 @@
-"""A look at the sizes that a binary USD layer claims, before OpenUSD believes them and allocates gigabytes.
+"""Validates the sizes declared in a binary USD layer, before OpenUSD trusts them and allocates gigabytes.
 
-A crate begins with ``PXR-USDC``, 8 bytes of version and the place of its table of contents: a count, then entries of a
-16-byte name, a start and a size. Sections begin with the count of what they hold. All numbers are 64-bit little-endian.
+A crate begins with ``PXR-USDC``, 8 bytes of version and the offset of its table of contents: a count, then entries of a
+16-byte name, a start and a size. Sections begin with their number of entries. All numbers are 64-bit little-endian.
 
-The arrays that its fields name are counted too (``scene.usd.crate_arrays``).
+Arrays referenced by its fields are counted too (``scene.usd.crate_arrays``).
 """
 
 from __future__ import annotations
@@ -16,23 +16,24 @@ from nurec_sim.scene.usd.crate_arrays import check_arrays, numbers
 
 MAGIC = b"PXR-USDC"
 _MAX_SECTIONS = 64
-_MAX_RATIO = 255  # of LZ4
-_INTEGERS_A_BYTE = 4  # the densest that integers are packed before LZ4
-_PACKED_SINCE = (0, 4, 0)  # earlier layers hold their names as plain text
+_MAX_RATIO = 255  # maximum compression ratio of LZ4
+_INTEGERS_A_BYTE = 4  # most integers per byte of the encoding before LZ4
+_PACKED_SINCE = (0, 4, 0)  # earlier versions store names uncompressed
 _COUNTED = (b"FIELDS", b"FIELDSETS", b"PATHS", b"SPECS")
 
 
 def check_crate(file: BinaryIO, where: str) -> None:
-    """Whether the sections of a layer lie in its file and can hold what they claim; text layers are not looked at.
+    """Checks that the sections of a layer lie in its file and can hold the declared entries; text layers are skipped.
 
     Raises:
-        ArchiveError: they do not; ``where`` begins the text.
+        ArchiveError: they do not; the text begins with ``where``.
     """
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
         return
     version = tuple(file.read(3))
+    # The bootstrap: magic (8 bytes), version (8), offset of the table of contents (8).
     (contents,) = numbers(file, 16, 1, where)
     (count,) = numbers(file, contents, 1, where)
     if count > _MAX_SECTIONS:
@@ -53,14 +54,16 @@ def check_crate(file: BinaryIO, where: str) -> None:
 
 
 def _check_section(file: BinaryIO, name: bytes, start: int, length: int, where: str, *, packs: bool) -> None:
-    """Whether a section can hold what its first numbers claim."""
+    """Checks that a section can hold the number of entries that it declares."""
     (count,) = numbers(file, start, 1, where)
     most = count
     if name in _COUNTED:
         most = length * _MAX_RATIO * _INTEGERS_A_BYTE
+    # Strings are 32-bit indices into the tokens.
     elif name == b"STRINGS":
         most = length // 4
     elif name == b"TOKENS" and length >= 24 and packs:
+        # Tokens are NUL-terminated names in one LZ4 block: each takes at least one byte unpacked.
         unpacked, packed = numbers(file, start + 8, 2, where)
         most = min(unpacked, (length + 8) * _MAX_RATIO)
         if packed > length or unpacked > (packed + 8) * _MAX_RATIO:

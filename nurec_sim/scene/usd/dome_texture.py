@@ -29,9 +29,10 @@ def latlong_directions(rows: int) -> Float64[np.ndarray, "rows columns 3"]:
 def sample_cubemap(
     sky: Float32[np.ndarray, "6 h h 3"], directions: Float64[np.ndarray, "*n 3"]
 ) -> Float64[np.ndarray, "*n 3"]:
-    """Colours of a cubemap in given directions, bilinear within each face."""
+    """Colours of a cubemap in given directions, bilinear within each face (clamped at face edges)."""
     size = sky.shape[1]
     face, s, t = cubemap_coordinates(directions)
+    # Texel centres are at half-integers.
     column, row = (np.clip(c * size - 0.5, 0, size - 1) for c in (s, t))
     left, top = column.astype(np.int64), row.astype(np.int64)
     right, bottom = np.minimum(left + 1, size - 1), np.minimum(top + 1, size - 1)
@@ -42,9 +43,11 @@ def sample_cubemap(
 
 
 def latlong_exr(sky: Float32[np.ndarray, "6 h h 3"]) -> bytes:
-    """A cubemap of display colours as a linear lat-long OpenEXR picture."""
+    """A cubemap of display colours as a linear lat-long OpenEXR image."""
     display = np.clip(sample_cubemap(sky, latlong_directions(min(2 * sky.shape[1], MAX_ROWS))), 0, None)
+    # Inverse of the sRGB transfer function (IEC 61966-2-1).
     linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+    # 65504 is the largest finite half float.
     return encode_exr(np.minimum(linear, 65504.0).astype(np.float16))
 
 
@@ -64,6 +67,7 @@ def encode_exr(image: np.ndarray) -> bytes:
     )
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)
     header = (
+        # Magic number and version 2 without flags: single-part scan lines.
         struct.pack("<II", 20000630, 2)
         + attribute("channels", "chlist", channels + b"\0")
         + attribute("compression", "compression", b"\0")
@@ -77,7 +81,9 @@ def encode_exr(image: np.ndarray) -> bytes:
     )
     row_bytes = width * 3 * 2
     first = len(header) + 8 * height
+    # The offset table: each line is its y, its size in bytes, and the pixels.
     offsets = first + np.arange(height, dtype="<u8") * (8 + row_bytes)
+    # Channels are stored in alphabetical order, one after the other within a scan line.
     rows = np.ascontiguousarray(image[:, :, ::-1].transpose(0, 2, 1), dtype="<f2")  # [h, BGR, w]
     lines = b"".join(struct.pack("<ii", y, row_bytes) + rows[y].tobytes() for y in range(height))
     return header + offsets.tobytes() + lines

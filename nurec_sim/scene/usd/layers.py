@@ -4,8 +4,8 @@ Conventions of OpenUSD: quaternion arrays are ``x, y, z, w`` in memory, spherica
 0.5 + C0 * DC + ...), particle-major with the constant term first. Time codes are milliseconds after
 ``absoluteTimeOffsetMicroSec``, which is the scene's start.
 
-What a ParticleField cannot hold travels in primvars of our namespace: the exact display colour (the DC coefficient
-rounds it), the normal, the semantic class, LiDAR intensity and ray drop, and ``index``, its place in the scene.
+Data that a ParticleField cannot represent are primvars of our namespace: the exact display colour (the DC coefficient
+rounds it), the normal, the semantic class, LiDAR intensity and ray drop, and ``index``, its index in the scene.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def Xform "World"
 
 
 def time_code(t_us: int, start_us: int) -> float:
-    """Milliseconds after the scene's start."""
+    """USD time code of an instant: milliseconds after the scene's start."""
     return (int(t_us) - start_us) / 1000
 
 
@@ -117,14 +117,14 @@ def crate_bytes(stage) -> bytes:
             text = "" if stage.GetRootLayer().Export(str(path)) else "no reason given"
         except Tf.ErrorException as error:
             text = str(error)
-        if text:  # OpenUSD tells what went wrong in the system's words only
+        if text:  # OpenUSD reports disk errors only by the system's message
             number = next((number for number in errno.errorcode if os.strerror(number) in text), errno.EIO)
             raise OSError(number, os.strerror(number))
         return path.read_bytes()
 
 
 def open_member(package: Path, name: str):
-    """A USD layer inside a package, without composing: nothing that it refers to is opened.
+    """Opens a USD layer inside a package without composition: referenced files are not opened.
 
     Raises:
         ArchiveError: OpenUSD cannot read it.
@@ -156,6 +156,7 @@ def extent_of(positions: Sequence[Float32[np.ndarray, "n 3"]], scale_m: Float32[
     """Bounds [2,3] of Gaussians at any of several sets of positions, three standard deviations wide."""
     if len(scale_m) == 0:
         return np.zeros((2, 3), np.float32)
+    # The largest axis bounds the ellipsoid whatever its rotation.
     margin = 3 * scale_m.max(axis=1, keepdims=True).astype(np.float64)
     low = np.min([(p - margin).min(axis=0) for p in positions], axis=0)
     high = np.max([(p + margin).max(axis=0) for p in positions], axis=0)
@@ -163,20 +164,30 @@ def extent_of(positions: Sequence[Float32[np.ndarray, "n 3"]], scale_m: Float32[
 
 
 def _to_float32(values: Float64[np.ndarray, "*n"]) -> Float32[np.ndarray, "*n"]:
-    """Nearest float32, the largest one instead of infinity."""
+    """Nearest float32, clamped to the largest finite one."""
     largest = np.finfo(np.float32).max
     return np.clip(values, -largest, largest).astype(np.float32)
 
 
 def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray, " n"]):
-    """Adds Gaussians as one ParticleField; ``index`` tells their places in the scene. Returns the schema object.
+    """Adds Gaussians as one ParticleField.
 
-    A field of none is there for our reader, but inactive: NVIDIA's asset requirement VG.035 refuses empty fields.
+    An empty field is written for our reader, but inactive: NVIDIA's asset requirement VG.035 refuses empty fields.
+
+    Args:
+        stage: the ``Usd.Stage`` to add to.
+        path: prim path of the field.
+        gaussians: n Gaussians, in the frame of the prim.
+        index: [n] their indices in the scene's layer, by which ``gather`` restores the order.
+
+    Returns:
+        The ``UsdVol.ParticleField3DGaussianSplat`` schema object.
     """
     from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
     rest = gaussians.sh_rest
+    # 3DGS convention: colour = 0.5 + SH_C0 * DC + the view-dependent terms.
     dc = _to_float32((gaussians.rgb.astype(np.float64) - 0.5) / SH_C0)[:, None]
     coefficients = dc if rest is None else np.concatenate([dc, rest], axis=1)
     terms = coefficients.shape[1]
@@ -185,12 +196,14 @@ def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray
     field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(np.ascontiguousarray(gaussians.quat_wxyz[:, [1, 2, 3, 0]])))
     field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(gaussians.scale_m)))
     field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(np.ascontiguousarray(gaussians.opacity)))
+    # Degree d has (d + 1)^2 terms.
     field.CreateRadianceSphericalHarmonicsDegreeAttr(int(np.sqrt(terms)) - 1)
     radiance = field.CreateRadianceSphericalHarmonicsCoefficientsAttr(
         Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(coefficients.reshape(-1, 3)))
     )
+    # ``elementSize`` values of the flat array belong to one particle.
     radiance.SetMetadata("elementSize", terms)
-    radiance.SetMetadata("interpolation", UsdGeom.Tokens.vertex)  # not stated it is "constant"; VG.035 asks for it
+    radiance.SetMetadata("interpolation", UsdGeom.Tokens.vertex)  # the default is "constant"; VG.035 requires "vertex"
     field.CreateSortingModeHintAttr("cameraDistance")
     field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent_of([gaussians.mean_m], gaussians.scale_m)))
     Usd.ColorSpaceAPI.Apply(field.GetPrim()).CreateColorSpaceNameAttr("srgb_rec709_display")
@@ -215,7 +228,7 @@ def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray
 
 
 def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Gaussians]:
-    """The Gaussians of one ParticleField and their places in the scene.
+    """Reads the Gaussians of one ParticleField and their indices in the scene.
 
     Raises:
         ArchiveError: an attribute is missing, of another type, or of another length than the positions.
@@ -262,10 +275,10 @@ def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Ga
 
 
 def gather(parts: Sequence[tuple[Int32[np.ndarray, " k"], Gaussians]], count: int, what: str) -> Gaussians:
-    """Puts Gaussians back in the order of the scene.
+    """Restores the scene's order of Gaussians from several fields.
 
     Raises:
-        ArchiveError: the places are not 0..count-1, each once, or the parts have different degrees.
+        ArchiveError: the indices are not a permutation of 0..count-1, or the parts have different degrees.
     """
     places = np.concatenate([index for index, _ in parts]) if parts else np.zeros(0, np.int32)
     if len(places) != count or not np.array_equal(np.sort(places), np.arange(count)):
@@ -274,6 +287,7 @@ def gather(parts: Sequence[tuple[Int32[np.ndarray, " k"], Gaussians]], count: in
         merged = Gaussians.concatenate([part for _, part in parts])
     except ValueError as error:
         raise ArchiveError(f"{what}: the fields differ in spherical-harmonics degree") from error
+    # ``places`` is a permutation; its inverse sorts the concatenated parts.
     order = np.empty(count, np.int64)
     order[places] = np.arange(count)
     return merged[order]

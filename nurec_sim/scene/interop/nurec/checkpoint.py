@@ -96,8 +96,10 @@ def _array(
         raise ArchiveError(f"{where}: {name} needs {values.count * dtype.itemsize:,} bytes, the file has {held}")
     stored = np.frombuffer(package.read(entry), dtype)
     if values.kind == _BRAIN_FLOATS:
+        # A bfloat16 is the upper half of a float32.
         stored = (stored.astype(np.uint32) << 16).view(np.float32)
     if 0 in tensor.shape:
         return np.zeros(tensor.shape, stored.dtype)
     strides = [step * stored.itemsize for step in tensor.stride]
+    # Offsets and strides were validated against the storage by ``torch_pickle``.
     return np.lib.stride_tricks.as_strided(stored[tensor.offset :], tensor.shape, strides).copy()

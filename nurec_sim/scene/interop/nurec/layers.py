@@ -84,6 +84,7 @@ def _add_tracks(found: Found, columns: Columns, ids: np.ndarray, names: Sequence
     nameless = (ids < 0) | (ids >= len(names))
     if nameless.any():
         found.unknown.append(f"layer {_short(layer)}: {int(nameless.sum()):,} Gaussians belong to no named track")
+    # Sorted by track, so that one split gives the rows of each.
     order = np.argsort(ids, kind="stable")
     order = order[~nameless[order]]
     for rows in np.split(order, np.flatnonzero(np.diff(ids[order])) + 1):

@@ -71,6 +71,7 @@ def _track(name: str, row: dict[str, Any]) -> tuple[Track, int]:
     sound = np.flatnonzero(np.isfinite(poses).all(axis=1) & (np.linalg.norm(poses[:, 3:], axis=1) > 1e-6))
     if len(sound) == 0:
         raise ValueError("it has no sample that can be used")
+    # Keep samples later than all before them, so that times increase strictly.
     latest = np.maximum.accumulate(times[sound])
     keep = sound[np.concatenate([[True], times[sound][1:] > latest[:-1]])]
     kept = poses[keep]

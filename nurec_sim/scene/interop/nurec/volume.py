@@ -61,6 +61,7 @@ def gunzipped(data: bytes, where: str) -> bytes:
         ArchiveError: not such a file, truncated, damaged, or unpacking to more than the limit.
     """
     limit = unpacked_limit(len(data))
+    # 15 bits of window, plus 16 for the gzip header.
     unpacker = zlib.decompressobj(wbits=31)
     try:
         content = unpacker.decompress(data, limit)

@@ -40,6 +40,7 @@ def main(path: Path, folder: Path) -> None:
     fields: list[dict[str, Any]] = []
     volumes: list[dict[str, Any]] = []
     others: Counter[str] = Counter()
+    # Instances share one prototype; each proxy has its own transform.
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
         kind = str(prim.GetTypeName())
         if files := _nurec_files(prim):
@@ -79,7 +80,7 @@ def _limit(size: int) -> None:
 
 
 def _hidden(prim) -> str | None:
-    """Reason why a field is invisible, or None."""
+    """Reason why a field is not rendered, or None."""
     from pxr import UsdGeom
 
     imageable = UsdGeom.Imageable(prim)
@@ -104,6 +105,7 @@ def _take(prim, number: int, folder: Path, notes: list[str]) -> dict[str, Any]:
     moving: list[str] = []
     for name, half in _COLUMNS.items():
         column = _values(prim, name, moving)
+        # The schema has a half-precision variant of every attribute, with the suffix "h".
         column = _values(prim, half, moving) if column is None else column
         if column is not None:
             (folder / f"{number}.{name.rsplit(':', 1)[-1]}.npy").write_bytes(npy_bytes(column))
@@ -152,6 +154,7 @@ def _world_from_prim(prim) -> tuple[list[list[float]], list[str]]:
                     only_samples.append(op.GetTimeSamples()[0])
         ancestor = ancestor.GetParent()
     time = Usd.TimeCode(min(only_samples)) if only_samples else Usd.TimeCode.Default()
+    # USD matrices multiply row vectors, hence the transpose.
     matrix = UsdGeom.XformCache(time).GetLocalToWorldTransform(prim)
     return np.array(matrix).T.tolist(), moving[:1]
 

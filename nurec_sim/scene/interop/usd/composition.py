@@ -49,6 +49,7 @@ class LayerSource:
             return name in self.members
         folder = self.path.resolve().parent
         file = (folder / name).resolve()
+        # Resolved paths: neither ".." nor symbolic links lead out of the folder.
         return file.is_file() and file.is_relative_to(folder)
 
     def open(self, name: str) -> Any:
@@ -99,6 +100,7 @@ def joined_layers(source: LayerSource) -> tuple[Any, list[str]]:
             if inside not in layers:
                 notes.append(f"{name} refers to {reference!r:.120}, which is not beside it or no USD layer; not read")
             layer.UpdateCompositionAssetDependency(reference, layers[inside].identifier if inside in layers else "")
+        # Verify that nothing else is left, whatever kinds of arcs OpenUSD knows.
         kept = {each.identifier for each in layers.values()}
         if left := [str(each) for each in layer.GetCompositionAssetDependencies() if str(each) not in kept]:
             raise ArchiveError(f"{source.path}: {name} refers to {left[0]!r:.120}, which cannot be taken out")
@@ -120,7 +122,7 @@ def _references(layer: Any, name: str) -> list[tuple[str, str]]:
 
 
 def _drop_clips(layer: Any, name: str, notes: list[str]) -> None:
-    """Removes value clips, whose files OpenUSD would open."""
+    """Removes value clips, whose files OpenUSD would open on its own."""
     from pxr import Sdf
 
     def drop(path: Any) -> None:

@@ -108,6 +108,7 @@ def _add_field(
 
 def _invertible(values: list[list[float]], where: str) -> np.ndarray:
     matrix = np.array(values, np.float64)
+    # The bound allows scaling by a millionth: 1e-6 cubed.
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-18:
         raise ArchiveError(f"{where}: its transform is not finite, or flattens it: {matrix.tolist()}")
     return matrix
@@ -134,4 +135,5 @@ def _colours(
     coefficients = coefficients.reshape(n, terms, 3)
     if degree > 3:
         found.unknown.append(f"{field['path']}: harmonics of degree {degree} are cut to degree 3")
+    # Degree 3 has 16 terms with the constant one.
     return coefficients[:, 0], coefficients[:, 1:16] if degree else None

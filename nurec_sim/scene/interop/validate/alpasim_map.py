@@ -145,6 +145,7 @@ class AlpasimMap:
             return True
         if len(near) < 2:
             return False
+        # Clipped first: the union of whole lanes would be slow.
         west, south, east, north = shapely.bounds(outline) + CLIP_M * np.array([-1, -1, 1, 1])
         around = shapely.clip_by_rect(self.polygons[near], west, south, east, north)
         return bool(shapely.contains(shapely.union_all(around), outline))

@@ -35,7 +35,15 @@ def check_roads(
     document: dict[str, Any],
     world_from_rig: Float64[np.ndarray, "t 4 4"],
 ) -> None:
-    """Adds findings on lanes and edges along the recorded path, as AlpaSim reads them."""
+    """Adds findings on lanes and edges along the recorded path, as AlpaSim reads them.
+
+    Args:
+        report: collects the findings.
+        contents: the archive.
+        root: root element of its ``map.xodr``.
+        document: contents of ``rig_trajectories.json``: ``T_world_base`` and the car's box.
+        world_from_rig: [t,4,4] recorded poses of the rig.
+    """
     import shapely
 
     with report.rule("xodr-lanes"):

@@ -203,6 +203,7 @@ def _check_polynomials(
     distance = np.linspace(0, reach_px, 200)
     with np.errstate(over="ignore", invalid="ignore"):
         angle = np.polynomial.polynomial.polyval(distance, to_angle)
+        # Only where the angle still increases: past a fold, the inverse belongs to another distance.
         seen = (angle <= max_angle) & (np.maximum.accumulate(angle) <= angle)
         off_px = np.abs(np.polynomial.polynomial.polyval(angle, to_px) - distance)[seen]
     worst = float(off_px.max()) if len(off_px) else np.inf

@@ -60,6 +60,7 @@ def placed(
     """Poses beside the path, evenly along it: up to 8 m lateral offset, rotated by up to 6 degrees."""
     draw = np.random.default_rng(seed)
     along = geometry.arc_length(world_from_rig[:, :2, 3])
+    # Uniform in distance, not in time: a waiting car would get most of the samples.
     at = np.interp(draw.uniform(0, along[-1], count), along, np.arange(len(along)))
     poses = world_from_rig[np.clip(np.rint(at).astype(int), 0, len(along) - 1)].copy()
     poses[:, :3, 3] += draw.uniform(-ASIDE_M, ASIDE_M, count)[:, None] * poses[:, :3, 1]
@@ -80,10 +81,21 @@ def agreement(
     count: int = PLACEMENTS,
     seed: int = 0,
 ) -> Agreement:
-    """Compares the verdicts; ``area`` is shapely geometry, the car's box is given in the rig frame."""
+    """Compares the off-road verdicts of map and area on random placements, and on the recorded poses.
+
+    Args:
+        roads: the map as AlpaSim reads it.
+        area: the drivable area, shapely geometry in the same coordinates.
+        world_from_rig: [n,4,4] recorded poses of the rig, in map coordinates.
+        centre_m: centre of the car's box in the rig frame.
+        size_m: length, width and height of the box.
+        count: number of placements beside the path.
+        seed: seed of the placements.
+    """
     import shapely
 
     middle, cars = outlines(placed(world_from_rig, count, seed), centre_m, size_m)
+    # Placements within BORDER_M of the border are ambiguous and not judged.
     inner, outer = shapely.buffer(area, -BORDER_M), shapely.buffer(area, BORDER_M)
     on, off = shapely.contains(inner, cars), ~shapely.contains(outer, cars)
     judged = on | off

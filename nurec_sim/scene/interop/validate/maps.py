@@ -26,7 +26,14 @@ MAX_TABLE_BYTES = 256 * 2**20
 def check_alpasim_map(
     report: Report, contents: Contents, rig: dict[str, Any] | None, world_from_rig: Float64[np.ndarray, "t 4 4"] | None
 ) -> None:
-    """Adds findings on the map used by AlpaSim: the first existing folder, else ``map.xodr``."""
+    """Adds findings on the map used by AlpaSim: the first existing folder, else ``map.xodr``.
+
+    Args:
+        report: collects the findings.
+        contents: the archive.
+        rig: contents of ``rig_trajectories.json``; None skips the checks that need it.
+        world_from_rig: [t,4,4] recorded poses of the rig; None skips the checks along the path.
+    """
     folder = next((name for name in MAP_FOLDERS if contents.folder(name)), None)
     if folder == "clipgt":
         with report.rule("clipgt"):

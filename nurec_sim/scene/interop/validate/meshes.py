@@ -43,6 +43,7 @@ def _has_ground(
         near = ((low <= place[:2] + 1e-6) & (high >= place[:2] - 1e-6)).all(axis=1)
         a, b, c = np.moveaxis(corners[near], 1, 0)
         ab, ac, ap = (b - a)[:, :2], (c - a)[:, :2], place[:2] - a[:, :2]
+        # Barycentric coordinates in the xy plane; vertical triangles have no area there.
         area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
         flat = np.abs(area) < 1e-12
         area = np.where(flat, 1.0, area)

@@ -1,7 +1,7 @@
-"""What USD tools need of an archive: the package, the stage, and the splats in it.
+"""Rules for USD tools: the package, the stage, and the splats in it.
 
-A damaged binary layer can make OpenUSD crash, or allocate and search for minutes. So layers of unknown origin are
-looked at in a process of their own, which may take so long and no longer.
+A damaged binary layer can make OpenUSD crash, or allocate and search for minutes. Layers of unknown origin are
+therefore read in a subprocess with a time limit.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ RULES = {
 
 
 def check(report: Report, contents: Contents, limit_s: float | None) -> None:
-    """Adds what USD tools will miss; with a limit in seconds, OpenUSD runs in a process of its own."""
+    """Adds the findings for USD tools; with a limit in seconds, OpenUSD runs in a subprocess."""
     _check_package(report, contents)
     if any(finding.severity == "error" for finding in report.findings):
         return
@@ -62,10 +62,10 @@ def check(report: Report, contents: Contents, limit_s: float | None) -> None:
 
 
 def _faults_apart(contents: Contents, limit_s: float) -> list[Fault]:
-    """``stage_faults`` in a process of its own.
+    """``stage_faults`` in a subprocess.
 
     Raises:
-        ArchiveError: OpenUSD crashed or did not come to an end.
+        ArchiveError: OpenUSD crashed or exceeded the limit.
     """
     command = [sys.executable, *_PROGRAM, str(contents.path)]
     try:

@@ -1,4 +1,4 @@
-"""What our own reader needs, and what a scene that it reads cannot do."""
+"""Rules for our own reader, and the limitations of a scene that it reads."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RULES = {
 
 
 def check(report: Report, path: Path) -> GaussianScene | None:
-    """Adds what our reader will miss; gives the scene if it can be read."""
+    """Adds the findings for our reader; returns the scene if it can be read."""
     scene = None
     with report.rule("reads"):
         scene = read_scene(path)

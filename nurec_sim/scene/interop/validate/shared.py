@@ -1,7 +1,7 @@
 """Rules that AlpaSim and CARLA share: both read ``rig_trajectories.json`` and ``sequence_tracks.json``.
 
-A consumer's report must know every rule that is named here. Functions give what they read, or None where it is unusable
-(and then the report says why).
+A consumer's report must have every rule named here. Functions return what they read, or None if it is unusable (the
+report then has the reason).
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def tracks(report: Report, contents: Contents, key: str | None) -> list[TrackRow
 
 
 def _rows(report: Report, columns: dict[str, list]) -> list[TrackRow]:
-    """Checks every track; the first fault of a rule is told, with the number of tracks that break it."""
+    """Checks every track; reports the first fault per rule, with the number of tracks that violate it."""
     faults: dict[str, list[str]] = {}
     good = []
     for index in range(len(columns["tracks_id"])):

@@ -1,7 +1,7 @@
-"""The layers and the stage of a package, looked at by OpenUSD; also a program, to be run in a process of its own.
+"""Validates the layers and the stage of a package with OpenUSD; also a program, to be run as a subprocess.
 
-Layers are looked at one by one first: a stage is only composed when all that it refers to are layers of the package,
-so that no other file is opened. ``UsdValidation`` is asked last, and what it finds is told as it says it.
+Layers are checked one by one first: the stage is composed only if all references are to layers of the package, so that
+no other file is opened. ``UsdValidation`` runs last; its messages are reported verbatim.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _ALREADY_TOLD = {
 }  # fmt: skip
 
 Fault = tuple[str, str]
-"""The name of a rule of ``openusd.RULES``, and what was found."""
+"""Name of a rule of ``openusd.RULES``, and the finding."""
 
 
 def stage_faults(path: Path) -> list[Fault]:
-    """What breaks the rules about layers, stage and splats."""
+    """Violations of the rules about layers, stage and splats."""
     from pxr import Tf
 
     faults: list[Fault] = []
@@ -95,7 +95,7 @@ def _composed_faults(path: Path) -> Iterator[Fault]:
 
 
 def _splat_faults(prim) -> Iterator[Fault]:
-    """(rule, what) of one prim; arrays with time samples are looked at where they start."""
+    """(rule, finding) of one prim; arrays with time samples are checked at their first one."""
     from pxr import Usd, UsdGeom
 
     path = prim.GetPath()
@@ -163,7 +163,7 @@ def _validator_faults(stage) -> Iterator[Fault]:
 
 
 def _limit_memory(path: Path) -> None:
-    """Lets this process end instead of the machine when a damaged layer promises huge arrays."""
+    """Limits the memory of this process, so that a damaged layer with huge arrays ends only it."""
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -172,7 +172,7 @@ def _limit_memory(path: Path) -> None:
 
 
 def main() -> None:
-    """Prints the faults of the archive that the first argument names, as JSON."""
+    """Prints the faults of the archive given as first argument, as JSON."""
     path = Path(sys.argv[1])
     _limit_memory(path)
     print(json.dumps(stage_faults(path)))
