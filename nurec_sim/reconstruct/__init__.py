@@ -107,7 +107,7 @@ def reconstruct(
 
 
 def _with_provenance(scene: GaussianScene, clip: Clip, method: str, cameras: list[str]) -> GaussianScene:
-    """The scene with what every provenance says, where the method left it out."""
+    """The scene with the entries that every provenance has, where the method left them out."""
     known: dict[str, Any] = {"method": method, "cameras": cameras}
     if clip.time_offset_us:
         known["time_offset_us"] = clip.time_offset_us

@@ -1,7 +1,7 @@
 """A partly seen sky cubemap made complete in every direction.
 
-What was seen is kept. Where nobody looked, the sky goes on as it does where it was seen: the colour of its own height
-above the horizon (the world's z is up), changed by what the nearest seen parts differ from that.
+What was seen is kept. Unseen parts are extrapolated: the mean colour at their height above
+the horizon (the world's z is up), plus the difference of the nearest seen parts from that mean.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ def _colour_by_height(
 ) -> Float32[np.ndarray, "6 s s 3"]:
     """Mean seen colour of each texel's height over the horizon, held above the highest and below the lowest seen."""
     height = geometry.cubemap_directions(sky.shape[1])[..., 2]
+    # Equal steps of sin(elevation) have equal solid angle (Archimedes), so bands hold equally many texels, about.
     place = (height + 1) / 2 * ELEVATION_STEPS - 0.5
     band = np.clip(np.round(place), 0, ELEVATION_STEPS - 1).astype(np.int64).ravel()
     mass = np.bincount(band, weight.ravel(), ELEVATION_STEPS)
@@ -67,6 +68,8 @@ def _spread(
     both = np.concatenate([value * weight, weight], axis=-1)
     coarse = np.stack([cv2.resize(face, (half, half), interpolation=cv2.INTER_AREA) for face in both])
     total, mass = coarse[..., :3], coarse[..., 3:]
+    # Pull-push (Gortler et al. 1996): averages fill holes from coarse to fine, and measured texels are kept at every
+    # level. A coarse texel with one known texel of four is taken as fully known, hence 4 * mass.
     smooth = _enlarged(_spread(total / np.maximum(mass, 1e-12), np.minimum(4 * mass, 1)), size)
     return smooth + weight * (value - smooth)
 

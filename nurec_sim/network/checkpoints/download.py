@@ -14,7 +14,7 @@ from nurec_sim.network.checkpoints.released import RELEASED, ReleasedFile
 from nurec_sim.network.profiles import PROFILES
 
 CHECKPOINT_VARIABLE = "INSTANT_NUREC_FULL_PT"
-"""Environment variable that names a weights file for whatever profile is asked for."""
+"""Environment variable that names a weights file, used for any requested profile."""
 
 _SHIPPED = Path(__file__).parents[1] / "weights"
 
@@ -76,7 +76,7 @@ def cached_file(released: ReleasedFile, revision: str | None = None) -> Path | N
 def fetch(released: ReleasedFile, revision: str | None = None, folder: Path | None = None) -> Path:
     """Download a released file, or find it in the cache, and check its size and digest.
 
-    The library shows progress, goes on with interrupted downloads and makes the file appear when it is complete.
+    The library shows progress, resumes interrupted downloads and makes the file appear when it is complete.
 
     Args:
         released: which file.

@@ -16,8 +16,8 @@ _BASE_SHA256 = "e01067dc1659613083d9145a9a2547ccdbe6ccbbf83c4fe7b3e8a4e2bdae78b5
 class ReleasedFile:
     """One published file on Hugging Face.
 
-    A file is known by its size and, where one is published, its digest. Commit ids of the repositories are not known to
-    us, so the revision is a branch: what it holds must have the size and digest that stand here, or it is refused.
+    A file is known by its size and, where one is published, its digest. Commit ids of the repositories are unknown,
+    so the revision is a branch: its content must have the size and digest given here, or it is refused.
 
     Attributes:
         name: the profile that it is for; ``da3-base`` for the file that training starts from.
@@ -27,8 +27,8 @@ class ReleasedFile:
         size_is_published: whether the size comes from the publisher; otherwise it is what ``torch.save`` makes of the
             known names and shapes in float32 under this file name, which gives the one published size to the byte.
         sha256: digest as hexadecimal text, None where none is published.
-        license: what its use falls under.
-        revision: branch, tag or commit to take it from unless another is asked for.
+        license: the licence that governs its use.
+        revision: branch, tag or commit to take it from unless another is requested.
     """
 
     name: str

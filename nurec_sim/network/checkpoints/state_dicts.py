@@ -135,7 +135,7 @@ def save_weights(module: nn.Module, path: Path, metadata: Mapping[str, str], *, 
     Args:
         module: the network.
         path: the file; it appears complete or not at all, and replaces one that is there.
-        metadata: facts about the weights, such as how they came about; ``read_metadata`` gives them back.
+        metadata: facts about the weights, such as how they came about; ``read_metadata`` returns them.
         half: round parameters to half precision; buffers are constants and stay exact.
 
     Raises:
@@ -155,7 +155,7 @@ def save_weights(module: nn.Module, path: Path, metadata: Mapping[str, str], *, 
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """What ``save_weights`` was told about the weights in a file; empty for files of others."""
+    """The facts that ``save_weights`` stored in a file; empty for other files."""
     with path.open("rb") as file:
         if file.read(9)[8:] != b"{":
             return {}

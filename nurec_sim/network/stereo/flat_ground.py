@@ -18,7 +18,7 @@ def rays_from_car(inputs: NetworkInputs) -> tuple[Float[Tensor, "b v h w 3"], Fl
     """Origins (metres) and directions of the pixels' rays in the frame of the rig when the first image was taken.
 
     Raises:
-        ValueError: the inputs do not say where the car is.
+        ValueError: the inputs lack ``rig_from_scene``.
     """
     if inputs.rig_from_scene is None:
         raise ValueError("this profile needs inputs with rig_from_scene, the scene frame as seen from the car")
@@ -36,7 +36,7 @@ def flat_ground(inputs: NetworkInputs) -> tuple[Float[Tensor, "b v h w"], Bool[T
     """z-depth of z = 0 in metres, and where rays meet it near enough; elsewhere it is ``FARTHEST_GROUND_M``.
 
     Raises:
-        ValueError: the inputs do not say where the car is.
+        ValueError: the inputs lack ``rig_from_scene``.
     """
     origin, direction = rays_from_car(inputs)
     down = -direction[..., 2]

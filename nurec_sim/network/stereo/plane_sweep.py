@@ -47,7 +47,7 @@ def plane_sweep(inputs: NetworkInputs) -> Float[Tensor, "b v h w 4"]:
     """The channels above, of every pixel.
 
     Raises:
-        ValueError: the inputs do not say where the car is.
+        ValueError: the inputs lack ``rig_from_scene``.
     """
     ground_m, there = flat_ground(inputs)
     with torch.autocast(inputs.rgb.device.type, enabled=False):

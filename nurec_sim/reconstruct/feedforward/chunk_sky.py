@@ -42,7 +42,7 @@ class ObservedSky:
         rgb: complete in every direction.
         shown: whether the texel was seen, 0..1.
         sure: what it counts among chunks that saw it, less towards the edge of what was seen: there, things show that
-            stand before the sky, and chunks differ a little in their colours.
+            lie in front of the sky, and chunks differ a little in their colours.
     """
 
     rgb: Float32[np.ndarray, "6 size size 3"]

@@ -41,7 +41,7 @@ class ChunkInputs:
     """A chunk ready for the network; ``images`` are camera-major, as is ``tensors`` (b = 1).
 
     ``span_us`` is what the chunk covers, ``world_from_scene`` the first image's camera at the end of its exposure,
-    ``ego`` True where the log's own mask says that a pixel shows the recording car.
+    ``ego`` True where the log's own mask marks a pixel of the recording car.
     """
 
     index: int

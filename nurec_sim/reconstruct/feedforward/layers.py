@@ -100,7 +100,7 @@ def _sky(
     """What lies behind everything, and how surely each texel was seen.
 
     Sky where images show sky; standing surfaces where they show those (``network.sky.background``); elsewhere the
-    learned sky, or what goes on from the sky that was seen.
+    learned sky, or the observed sky extrapolated.
     """
     context, size = outputs.context, settings.sky_px
     rays = chunk.tensors.rays.to(context.rgb.device)
@@ -196,7 +196,7 @@ def _split(
     points: _Points,
     motion_m: Float[Tensor, "1 n 2 3"] | None,
 ) -> tuple[Gaussians, DynamicGaussians]:
-    """Points of image ``number`` that stand, and those that move."""
+    """Static and moving points of image ``number``."""
     image, label = chunk.images[number], points.gaussians.label
     # With boxes even points that the network does not call movable may belong to one; road never does.
     rows = np.flatnonzero(label != Label.ROAD if actors else label == Label.MOVABLE)
@@ -228,7 +228,7 @@ def pixel_times_us(image: ContextImage, pixel: Int64[np.ndarray, " n"]) -> Int64
 def _displacement(
     chunk: ChunkInputs, motion_m: Float[Tensor, "1 n 2 3"] | None, rows: Int64[np.ndarray, " k"]
 ) -> Float64[np.ndarray, "k 2 3"]:
-    """What the motion head says of some Gaussians, in world axes; zeros without it."""
+    """Predictions of the motion head for some Gaussians, in world axes; zeros without it."""
     if motion_m is None:
         return np.zeros((len(rows), 2, 3))
     motion = _numpy(motion_m[0, torch.from_numpy(rows).to(motion_m.device)])

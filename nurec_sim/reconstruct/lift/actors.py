@@ -19,7 +19,7 @@ exp(-(1 / 1.2)**10) = 0.85."""
 
 
 def tracks_of(clip: Clip, actors: Sequence[Actor]) -> tuple[Track, ...]:
-    """The clip's tracks as the scene shows them: one that stands does so at one place, over the whole clip.
+    """The clip's tracks as the scene shows them: a static one stays at one place, over the whole clip.
 
     Logs label objects only while a sensor sees them; a parked car that the ego has passed is still there to be hit.
     """
@@ -43,6 +43,6 @@ def in_box(actor: Actor, gaussians_box: Gaussians) -> DynamicGaussians:
 
 
 def standing_knots_us(span_us: tuple[int, int]) -> Int64[np.ndarray, " 3"]:
-    """Knot times of Gaussians that stand over a whole span and should not fade within it."""
+    """Knot times of Gaussians that are static over a whole span and should not fade within it."""
     half, middle = int((span_us[1] - span_us[0]) / 2 * OUTSIDE) + 1, (span_us[0] + span_us[1]) // 2
     return np.array([middle - half, middle, middle + half])

@@ -28,7 +28,7 @@ class Ground:
 
     ``height_m`` is smooth and has no holes; ``known`` says where it was measured, ``near`` where it is measured or
     filled over a short distance, ``road`` where a car can drive to from the path without meeting a step, ``stride`` how
-    many cells one point of the sheet stands for.
+    many cells one point of the sheet represents.
     """
 
     corner_m: Float64[np.ndarray, " 2"]
@@ -153,7 +153,7 @@ def densify_path(world_from_rig: Float64[np.ndarray, "k 4 4"], step_m: float = 0
 
 
 def _low_heights(z: np.ndarray, flat: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean height of the lowest centimetres in each cell: less noisy than a quantile, blind to what stands there."""
+    """Mean height of the lowest centimetres in each cell: less noisy than a quantile, unaffected by objects on it."""
     height = np.zeros(rows * columns, np.float32)
     known = np.zeros(rows * columns, bool)
     if len(z):
@@ -210,7 +210,7 @@ def _steps(height: np.ndarray, cell_m: float, settings: GroundSettings) -> np.nd
 
 
 def _tall(points: np.ndarray, flat: np.ndarray, filled: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Cells in which something stands: two or more points between 0.2 and 1.5 m above the ground."""
+    """Cells with an upright object: two or more points between 0.2 and 1.5 m above the ground."""
     above = points[:, 2] - filled.reshape(-1)[flat]
     count = np.bincount(flat[(above > 0.2) & (above < 1.5)], minlength=rows * columns)
     return (count >= 2).reshape(rows, columns)

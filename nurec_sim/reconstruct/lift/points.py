@@ -21,7 +21,7 @@ FOOT_M = 0.3
 class Cloud:
     """Thinned points of one rigid body, in the world or in the box frame.
 
-    ``spacing_m`` is the edge of the voxel that each point stands for, ``eye_m`` the mean position of the sensor that
+    ``spacing_m`` is the edge of the voxel that each point represents, ``eye_m`` the mean position of the sensor that
     saw it, ``sweeps`` the number of sweeps that hit it; ``intensity`` is NaN where no sweep recorded one.
     """
 
@@ -54,7 +54,7 @@ CLOUD_FIELDS = ("xyz_m", "eye_m", "spacing_m", "intensity", "sweeps")
 
 @dataclass(frozen=True)
 class Actor:
-    """A labelled object, ``clip.tracks[index]``; one that stands has one pose, and is there over the whole clip."""
+    """A labelled object, ``clip.tracks[index]``; a static one has one pose, and exists over the whole clip."""
 
     index: int
     track: Track
@@ -69,7 +69,7 @@ class Actor:
 
 
 def actors_of(clip: Clip, settings: PointSettings) -> list[Actor]:
-    """The movable tracks of a clip, each known to stand or to move."""
+    """The movable tracks of a clip, each classified as static or moving."""
     actors = []
     for index, track in enumerate(clip.tracks):
         if track.label not in MOVABLE_LABELS:
@@ -77,7 +77,7 @@ def actors_of(clip: Clip, settings: PointSettings) -> list[Actor]:
         moved = np.linalg.norm(track.path.position_m - np.median(track.path.position_m, axis=0), axis=1).max()
         third = max(len(track.path.t_us) // 3, 1)
         shift = np.median(track.path.position_m[-third:], axis=0) - np.median(track.path.position_m[:third], axis=0)
-        # Labels of far objects jitter: without a net shift they stand even if single labels are farther off.
+        # Labels of far objects jitter: without a net shift they are static even if single labels are farther off.
         standing = bool(moved < settings.standing_m or (moved < 1.0 and np.linalg.norm(shift) < settings.standing_m))
         standing &= len(track.path.t_us) > 1
         path = track.path

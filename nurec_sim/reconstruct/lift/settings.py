@@ -15,7 +15,7 @@ class PointSettings:
     box_margin_m: float = 0.15
     """Boxes grow by this on every side before points are taken out of the static world."""
     standing_m: float = 0.3
-    """A track that moves less than this over its labelled life stands: it is kept over the whole clip."""
+    """A track that moves less than this over its labelled life is static: it is kept over the whole clip."""
     min_voxel_m: float = 0.06
     max_voxel_m: float = 0.48
     voxel_per_distance: float = 0.01

@@ -15,7 +15,7 @@ NEIGHBOURS = 20
 PLANE_RATIO = 0.15
 """First over second variance below which neighbours lie on a plane, and points are moved onto it."""
 LINE_RATIO = 0.02
-"""Second over first variance below which neighbours lie on one scan line and say nothing about the surface."""
+"""Second over first variance below which neighbours lie on one scan line and do not determine the surface."""
 DISC_SIGMA = 0.45
 """Standard deviation of a disc per metre of point spacing: discs on a square lattice then leave no visible gaps."""
 PIXEL_SIGMA = 0.6

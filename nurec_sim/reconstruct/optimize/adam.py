@@ -37,8 +37,8 @@ def adam_step(
         by_scale: [n,3] by standard deviations.
         by_opacity: [n] by opacity.
         by_rgb: [n,3] by colour.
-        scale: [n,3] standard deviations that were drawn.
-        opacity: [n] opacities that were drawn.
+        scale: [n,3] standard deviations as rendered.
+        opacity: [n] opacities as rendered.
         rates: [14] learning rates.
         largest_m: standard deviations end here.
     """

@@ -23,7 +23,7 @@ NOWHERE = -1
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Gaussians at an instant in the world: what a frame draws, and how it took them there (``adam_step``)."""
+    """Gaussians at an instant in the world: what a frame renders, and how they were moved there (``adam_step``)."""
 
     mean_m: Float32[np.ndarray, "n 3"]
     quat_wxyz: Float32[np.ndarray, "n 4"]
@@ -117,10 +117,10 @@ class Parameters:
         rates: Float64[np.ndarray, " 14"],
         largest_m: float,
     ) -> None:
-        """One step of Adam on the Gaussians ``rows`` that a frame has drawn.
+        """One step of Adam on the Gaussians ``rows`` that a frame has rendered.
 
         Args:
-            drawn: what it has drawn.
+            drawn: what it has rendered.
             rows: which of them it shows.
             gradients: by the arrays of ``drawn``, see ``Frame.draw_back``.
             rates: learning rate of each value.

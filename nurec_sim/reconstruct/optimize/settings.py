@@ -40,8 +40,8 @@ class OptimizeSettings:
     """All settings of ``refine``.
 
     Attributes:
-        seconds: wall time to spend, what comes before the first step left out; None: as ``steps`` says.
-        steps: images to fit, one a step; None: as ``seconds`` says. With both, what ends first ends it.
+        seconds: wall time to spend, counted from the first step; None: no limit but ``steps``.
+        steps: images to fit, one per step; None: no limit but ``seconds``. With both, the first to run out ends it.
         seed: of the order of images.
         final_rate: learning rates at the end of the budget, relative to those at its start.
         largest_m: no standard deviation may grow beyond this.

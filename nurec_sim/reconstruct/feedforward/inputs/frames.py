@@ -55,7 +55,7 @@ def choose_cameras(clip: Clip, profile: Profile, cameras: Sequence[str] | None =
 
     Args:
         clip: the driving log.
-        profile: says how many cameras there may be.
+        profile: determines how many cameras there may be.
         cameras: ids in the order wanted; None picks as many as the profile allows, by where they look and how wide,
             never by their names. Cameras that look the same way (a stereo pair, a tele beside a wide one) count as one.
 

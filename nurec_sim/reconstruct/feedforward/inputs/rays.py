@@ -13,7 +13,7 @@ from nurec_sim.types import CameraModel, Shutter
 SMALLEST_RAY_Z = 0.05
 """Pixels more than 87 degrees off the axis have no useful z-depth."""
 WIDEST_HALF_FIELD_RAD = np.radians(80.0)
-"""A pinhole stands for wider cameras badly, and for 90 degrees not at all."""
+"""A pinhole approximates wider cameras badly, and 90 degrees not at all."""
 
 
 def camera_rays(camera: CameraModel) -> tuple[Float64[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
@@ -69,7 +69,7 @@ def pinhole_field_rad(camera: CameraModel) -> tuple[float, float]:
     row, valid = sensors.unproject(camera, np.stack([u, np.full_like(u, camera.lens.cy_px)], axis=1))
     if not valid.any():
         raise ReconstructError(f"camera {camera.id!r}: its lens sees nothing along the row of its principal point")
-    # Where the lens does not reach the edge, its last ray stands for it.
+    # Where the lens does not reach the edge, its last ray is used instead.
     angle = np.arctan2(row[valid, 0], row[valid, 2])
     half = float(np.clip(min(-angle[0], angle[-1]), 0.01, WIDEST_HALF_FIELD_RAD))
     focal_px = width / 2 / np.tan(half)

@@ -15,11 +15,11 @@ from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ContextImage
 from nurec_sim.types import Clip, Track
 
 MAX_TIME_US = 150_000
-"""Sweeps farther in time from an image than this say nothing about it."""
+"""Sweeps farther in time from an image than this are not compared with it."""
 SWEEPS_PER_IMAGE = 2
 """Nearest sweeps of every LiDAR that are compared with an image."""
 STANDING_TIME_US, STANDING_SWEEPS = 1_000_000, 8
-"""The same for what stands: it is where it was, and more sweeps tell more of it."""
+"""The same for static surfaces: they stay in place, so more sweeps measure them."""
 MIN_RANGE_M = 1.0
 BODY_MARGIN_M = 0.3
 CONE_MARGIN_RAD = 0.1
@@ -137,7 +137,7 @@ def _visible(image: ContextImage, xyz: Float64[np.ndarray, "n 3"]) -> Seen:
     nearest = np.full((camera.height_px, camera.width_px), np.inf)
     np.minimum.at(nearest, (row, column), depth)
     # Sweeps are sparse and what hides a point may lie some pixels away. Below a point of the road is always nearer
-    # road, which hides nothing; so only what lies beside and above counts: things that stand up.
+    # road, which hides nothing; so only what lies beside and above counts: upright things.
     reach = max(1, round(camera.width_px / 100))
     nearest = cv2.erode(
         nearest, np.ones((reach + 1, 2 * reach + 1), np.uint8), anchor=(reach, reach), borderValue=np.inf

@@ -64,8 +64,8 @@ IDENTITY = ColourMap(np.eye(3), np.zeros(3), np.inf)
 def colour_map(rows: Rows, reference: Rows) -> ColourMap:
     """The map that takes a chunk's canonical colours to those of a reference chunk.
 
-    Least squares over the cameras that both have. Rows of a poor network can ask for absurd colours, or leave a channel
-    open; then the solution is drawn towards the identity, as little as makes it plausible: all singular values of its
+    Least squares over the cameras that both have. Rows of a poor network can imply absurd colours, or leave a channel
+    open; then the solution is pulled towards the identity, as little as makes it plausible: all singular values of its
     3 x 3 part within 1 / ``LARGEST_GAIN`` to ``LARGEST_GAIN``, no mirroring, offsets below 1. Where no weight does, or
     no camera is shared, colours stay as they are.
     """
@@ -103,11 +103,11 @@ def _plausible(y: Float64[np.ndarray, "3 4"]) -> bool:
 
 
 def aligned_chunks(chunks: Sequence[ChunkLayers]) -> tuple[list[ChunkLayers], list[ColourMap]]:
-    """Chunks whose static, dynamic and sky colours are all those of the first chunk, and how each was mapped.
+    """Chunks with the static, dynamic and sky colours of the first chunk, and how each was mapped.
 
-    Which chunk is the reference changes what is shown only where colours are cut to 0..1. It is the first, as in the
-    release, so that a scene does not change its colours when its log goes on. The rows of every chunk become those
-    that show its new colours as the old ones were shown.
+    The choice of the reference only matters where colours are clipped to 0..1. It is the first, as in the release, so
+    that a scene keeps its colours when its log is extended. The rows of every chunk are adjusted to show its new
+    colours as the old ones were shown.
     """
     maps = [dataclasses.replace(IDENTITY, ridge=0.0)] + [colour_map(c.isp, chunks[0].isp) for c in chunks[1:]]
     return [_mapped(chunk, colour) for chunk, colour in zip(chunks, maps, strict=True)], maps

@@ -40,7 +40,7 @@ class Sighting:
 
 
 def track_of(name: str, sightings: Sequence[Sighting], ego: Trajectory) -> Track:
-    """A track of constant size from the first to the last sighting; one pose if the thing stands.
+    """A track of constant size from the first to the last sighting; one pose if the thing is static.
 
     Args:
         name: id of the track.
@@ -102,7 +102,7 @@ def _steadied(
     times: Int64[np.ndarray, " t"],
     count: Int64[np.ndarray, " t"],
 ) -> Float64[np.ndarray, "t 3"]:
-    """Each value averaged with what the two before and the two after say of it, by their own rate of change.
+    """Each value averaged with the two before and the two after, extrapolated by their own rate of change.
 
     Values weigh as the points that they rest on, and less the more sightings lie between.
     """

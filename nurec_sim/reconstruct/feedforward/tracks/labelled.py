@@ -21,7 +21,7 @@ from nurec_sim.types import Clip, Trajectory
 PADDING_M = 0.5
 """Boxes grow by this on every side for movable points: 1 m on each whole dimension, as in the released model."""
 LONE_LABEL_US = 50_000
-"""An object that was labelled once is taken to stand there for this long before and after."""
+"""An object that was labelled once is assumed static for this long before and after."""
 
 Vectors = Float64[np.ndarray, "n 3"]
 Times = Int64[np.ndarray, " n"]
@@ -30,7 +30,7 @@ Times = Int64[np.ndarray, " n"]
 def scene_actors(clip: Clip) -> list[Actor]:
     """The movable tracks of a clip; ``Actor.index`` is the place in ``clip.tracks``.
 
-    One that stands (moves less than 0.3 m) has one pose and is there over the whole clip. The path of one that moves
+    A static one (moves less than 0.3 m) has one pose and exists over the whole clip. The path of one that moves
     is extended by one step at both ends, by the twist of the step beside it: labels come at 2 to 10 Hz, and the
     object does not vanish between the last one and the next frame.
     """
@@ -126,7 +126,7 @@ def knots_along(
         xyz_m: points in the world.
         t_us: when each was seen, the time of its middle knot.
         target_t_us: times of the outer knots; they are moved to the ends of the path where they lie beyond them.
-        span_us: the clip's. Points of an actor that stands live over all of it.
+        span_us: the clip's. Points of a static actor live over all of it.
 
     Returns:
         Times and positions of the knots.

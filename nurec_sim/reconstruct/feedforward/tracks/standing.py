@@ -1,4 +1,4 @@
-"""Which pixels of things that can move show one that stands: a parked car takes part in the consensus like a house."""
+"""Which movable pixels show a static object: a parked car takes part in the consensus like a house."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ def standing_pixels(
     semantic: Int64[np.ndarray, "v h w"],
     motion_m: Float[Tensor, "1 v h w 2 3"] | None,
 ) -> Bool[np.ndarray, "v h w"]:
-    """Movable pixels whose points, or else rays, meet the box of a track that stands, or no box and do not move.
+    """Movable pixels whose points, or else rays, meet the box of a static track, or no box and do not move.
 
-    What moves is shown by each image for a moment; what stands is there over the whole clip, so its points in all
-    images would lie in front of one another if the images did not agree on them. A log without boxes does not tell
-    what stands; there is none then.
+    A mover is shown by each image for a moment; a static object exists over the whole clip, so its points of all images
+    would lie in front of one another if the images did not agree on them. Without boxes in the log static objects are
+    unknown, and the result is empty.
 
     Args:
         clip: the driving log, with its tracks.
         chunk: the images.
         depth_m: depth along the optical axis.
         semantic: ``SemanticClass``.
-        motion_m: displacements to ``ContextImage.target_t_us``; without them only boxes tell what stands.
+        motion_m: displacements to ``ContextImage.target_t_us``; without them only boxes identify static objects.
     """
     actors, found = scene_actors(clip), np.zeros(semantic.shape, bool)
     if not actors:
