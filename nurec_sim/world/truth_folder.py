@@ -1,4 +1,4 @@
-"""Ground truth on disk, in a folder of its own: what no reader of the log may see. docs/world.md describes it.
+"""Ground truth on disk, in a separate folder that readers of the log never access; see docs/world.md.
 
 A folder appears complete or not at all.
 """
@@ -31,7 +31,7 @@ PLAN_FILE, RESPONSES_FILE = "plan.json", "responses.json"
 
 
 class TruthFolder:
-    """Collects truth beside ``path`` and moves it there when the ``with`` block ends well.
+    """Collects truth beside ``path`` and moves it there when the ``with`` block ends without an error.
 
     Raises:
         ClipError: ``path`` exists.
@@ -46,6 +46,7 @@ class TruthFolder:
     def __enter__(self) -> TruthFolder:
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
+            # On the same file system as the target, so that the final rename is atomic.
             self._work = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", dir=self.path.parent))
             self._folder = self._work / "truth"
             self._folder.mkdir()
@@ -62,14 +63,21 @@ class TruthFolder:
             shutil.rmtree(self._work, ignore_errors=True)
 
     def add_plan(self, plan: TownPlan, responses: Mapping[str, CameraResponse | LidarResponse]) -> None:
-        """The plan, and what each sensor does to light or echoes."""
+        """Adds the plan and the response of each sensor."""
         known = {name: dataclasses.asdict(response) for name, response in responses.items()}
         with writing(self.path):
             (self._folder / PLAN_FILE).write_text(plan.to_json(), encoding="utf-8")
             (self._folder / RESPONSES_FILE).write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
 
     def add_view(self, camera_id: str, index: int, view: TrueView, flow_m: Float32[np.ndarray, "h w 3"]) -> None:
-        """The truth of one image; ``flow_m`` is how far each pixel's point moves until the next one."""
+        """Adds the truth of one image.
+
+        Args:
+            camera_id: the camera; names the subfolder.
+            index: number of the image among those of its camera; names the file.
+            view: the image with its ground truth; its colours are not stored.
+            flow_m: motion (m) of each pixel's point until the next image, along the world's axes.
+        """
         file = self._folder / camera_id / f"{index:04d}.npz"
         with writing(self.path):
             file.parent.mkdir(exist_ok=True)
@@ -79,6 +87,7 @@ class TruthFolder:
                 depth_m=view.depth_m,
                 surface=view.surface,
                 instance=view.instance.astype(np.uint16),
+                # Half precision halves the files; unit normals and flow keep three digits.
                 normal=view.normal.astype(np.float16),
                 flow_m=flow_m.astype(np.float16),
             )

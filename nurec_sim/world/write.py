@@ -1,4 +1,4 @@
-"""Writing a drive through a town as a driving log: what its sensors saw, and nothing of the truth behind it."""
+"""Writes a drive through a town as a driving log: sensor data only, without the ground truth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from nurec_sim.world.truth_folder import TruthFolder
 from nurec_sim.world.xodr import opendrive_town
 
 Progress = Callable[[str, float], None]
-"""Called with (what was drawn, fraction done)."""
+"""Called with (sensor id, fraction done)."""
 Responses = Mapping[str, CameraResponse | LidarResponse]
 SPIN_US = 100_000
 READOUT_US = 20_000
@@ -48,33 +48,33 @@ def write_town_clip(
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Drive through a town and write the log, as a folder or a ``.zip``; log and truth appear complete or not at all.
+    """Drives through a town and writes the log, as a folder or a ``.zip``; log and truth appear complete or not at all.
 
     Every ``period_us`` the LiDAR turns once (0.1 s, from straight behind) and all cameras expose around the middle of
-    the turn, when the LiDAR looks straight ahead: at once with a global shutter, else from ``readout_us / 2`` before
+    the turn, when the LiDAR points straight ahead: at once with a global shutter, else from ``readout_us / 2`` before
     to as much after. Sweeps are motion-compensated to that middle. Poses, calibration, boxes and map are exact.
 
     Args:
         plan: the town and its traffic.
-        path: what to write.
+        path: folder or ``.zip`` file to write.
         rig: sensors; ``street_rig()`` by default.
         period_us: time from one set of frames to the next; at least one turn with a LiDAR.
         readout_us: how long rolling shutters take from their first to their last line, at most 0.1 s.
-        responses: what sensors do to light and echoes, by id (``random_responses``); ideal ones by default. They are
-            written to the truth, not to the log.
+        responses: imperfections of sensors, by id (``random_responses``); ideal sensors by default. They are written to
+            the truth, not to the log.
         jpeg_quality: 1..100; colours are stored at half resolution, as by real cameras.
         point_step_m: LiDAR coordinates are rounded to multiples of it (a centimetre halves the size of the file).
         backend: see ``TrueWorld``.
-        truth: a folder that does not exist yet, for everything that the log must not tell (docs/world.md).
-        command: the command line to remember in the log's meta data.
+        truth: a new folder for the ground truth, which the log must not contain (docs/world.md).
+        command: the command line to record in the log's metadata.
         progress: called after every camera or LiDAR frame.
-        overwrite: replace what is at ``path``.
+        overwrite: replace an existing log at ``path``.
 
     Returns:
         ``path``.
 
     Raises:
-        ClipError: the path or the truth folder exists, the plan has nobody who drives, or a time is out of range.
+        ClipError: the path or the truth folder exists, the plan has no ego, or a time is out of range.
     """
     path, rig = Path(path), street_rig() if rig is None else rig
     least_us = SPIN_US if rig.lidars else 2 * max(readout_us, 1)
@@ -108,7 +108,7 @@ def write_town_clip(
 
 
 def random_responses(rig: Rig, seed: int) -> dict[str, CameraResponse | LidarResponse]:
-    """Imperfect sensors: every camera with colours, vignette and noise of its own; LiDARs lose faint echoes."""
+    """Imperfect sensors: every camera has its own colours, vignette and noise; LiDARs lose faint echoes."""
     rng = np.random.default_rng([seed, 0x15B])
     cameras = {name: random_response(rng) for name in rig.cameras}
     return {**cameras, **{name: LidarResponse(1.0, 0.015) for name in rig.lidars}}
@@ -133,7 +133,7 @@ def _facts(plan: TownPlan, command: str, backend: str) -> dict[str, Any]:
 
 @dataclass
 class _Drive:
-    """The frames of a log, drawn one at a time."""
+    """The frames of a log, rendered one at a time."""
 
     world: TrueWorld
     rig: Rig
@@ -149,6 +149,7 @@ class _Drive:
 
     def frames(self) -> Iterator[logs.CameraEntry | logs.LidarEntry]:
         start_us, end_us = self.world.plan.span_us
+        # Only complete LiDAR turns within the span.
         turns = range(start_us, end_us - SPIN_US + 1, self.period_us)
         carried: list[LidarModel | CameraModel] = [*self.rig.lidars.values(), *self.rig.cameras.values()]
         total, done = len(turns) * len(carried), 0
@@ -169,6 +170,7 @@ class _Drive:
         poses = self.ego.at(np.array([start_us, end_us])) @ camera.rig_from_camera
         view = self.world.view(SensorRequest("", camera, start_us, end_us, poses))
         if self.truth is not None:
+            # Flow leads to the next frame of the same camera.
             now, then = self.world.boxes(middle_us), self.world.boxes(middle_us + self.period_us)
             pose = self.ego.at(middle_us) @ camera.rig_from_camera
             self.truth.add_view(camera.id, index, view, scene_flow(view, camera, pose, now, then))
@@ -178,15 +180,21 @@ class _Drive:
 def true_sweep(
     world: TrueWorld, ego: Trajectory, lidar: LidarModel, start_us: int, point_step_m: float | None = None
 ) -> Sweep:
-    """One turn of a LiDAR, compensated with the car's own motion to the middle of the turn.
+    """One turn of a LiDAR, motion-compensated to the middle of the turn.
 
-    Coordinates are rounded to multiples of ``point_step_m`` if given.
+    Args:
+        world: the simulated town.
+        ego: trajectory of the rig.
+        lidar: the sensor.
+        start_us: start of the turn, which takes 0.1 s.
+        point_step_m: coordinates are rounded to multiples of it; not rounded if None.
     """
     end_us, middle_us = start_us + SPIN_US, start_us + SPIN_US // 2
     pair = ego.at(np.array([start_us, end_us])) @ lidar.rig_from_lidar
     scan = world.scan(SensorRequest("", lidar, start_us, end_us, pair))
     xyz, intensity, beam = measured_points(lidar, scan)
     fraction = sensors.column_fraction(lidar)[beam % scan.range_m.shape[1]]
+    # Sensor pose at the firing time of every point; compensation moves the points into the frame of the middle pose.
     fired = geometry.interpolate_pose_pair(pair, fraction)
     middle = ego.at(middle_us) @ lidar.rig_from_lidar
     point_t_us: Int64[np.ndarray, " n"] = start_us + np.rint(fraction * SPIN_US).astype(np.int64)
@@ -197,5 +205,6 @@ def true_sweep(
 
 
 def _jpeg(rgb: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
+    # OpenCV expects BGR.
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
     return cv2.imencode(".jpg", np.ascontiguousarray(rgb[:, :, ::-1]), options)[1].tobytes()

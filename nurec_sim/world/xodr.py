@@ -1,4 +1,4 @@
-"""The town's roads as OpenDRIVE 1.6 (``map.xodr``), exactly: lines, arcs and spirals are those of the plan.
+"""The town's roads as OpenDRIVE 1.6 (``map.xodr``), exactly: with the lines, arcs and spirals of the plan.
 
 Map coordinates are the world's. Heights and cross slopes follow the terrain by cubic pieces of about ``PIECE_M``. Every
 junction path is a connecting road whose one lane lies in the middle of its reference line.
@@ -32,6 +32,7 @@ def opendrive_town(plan: TownPlan) -> bytes:
 class _Writer:
     def __init__(self, plan: TownPlan):
         self.plan, self.network = plan, TownNetwork(plan)
+        # OpenDRIVE ids are numbers as text; junction paths are roads too and are numbered after the real ones.
         self.road_number = {road.id: str(k) for k, road in enumerate(plan.roads)}
         self.junction_number = {junction.id: str(1000 + k) for k, junction in enumerate(plan.junctions)}
         paths = [path.id for junction in plan.junctions for path in junction.connections]
@@ -53,12 +54,14 @@ class _Writer:
             self._junction(root, junction)
         ElementTree.indent(root)
         xml = ElementTree.tostring(root, encoding="unicode")
+        # ElementTree cannot write CDATA, which the standard requires around the projection string.
         xml = xml.replace(GEO_REFERENCE, f"<![CDATA[{GEO_REFERENCE}]]>")
         return f'<?xml version="1.0" encoding="UTF-8"?>\n{xml}\n'.encode()
 
     # --------------------------------------------------------------------------------------------------------- roads
 
     def _road(self, root: Element, name: str, line: RoadLanes) -> None:
+        # Junction -1: a road outside of junctions.
         number = {"name": name, "length": _text(line.length_m), "id": self.road_number[name], "junction": "-1"}
         road = SubElement(root, "road", number)
         link = SubElement(road, "link")
@@ -74,6 +77,7 @@ class _Writer:
         centre = SubElement(SubElement(section, "center"), "lane", id="0", type="none", level="false")
         both = line.plan.lanes_forward and line.plan.lanes_backward
         colour = "yellow" if self.plan.style.yellow_lines else "white"
+        # The line between driving directions; on one-way roads the reference line is an edge.
         _mark(centre, _MARK_OF_LINE[line.plan.centre_line] if both else "solid", colour)
         self._side(SubElement(section, "right"), line, -1)
         crossings = [crossing for crossing in self.plan.crossings if crossing.road == name]
@@ -83,7 +87,7 @@ class _Writer:
                 _crosswalk(objects, f"{self.road_number[name]}{index:02d}", line, crossing)
 
     def _side(self, parent: Element, line: RoadLanes, side: int) -> None:
-        """Driving lanes, parking strip, kerb and sidewalk of a side, ordered from left to right as OpenDRIVE wants."""
+        """Driving lanes, parking strip, kerb and sidewalk of a side, from left to right as OpenDRIVE requires."""
         kerb, count = self.plan.kerb, line.count(side)
         narrow = line.plan.narrowing
         lane_width = (line.plan.lane_width_m, narrow.lane_width_m if narrow else None)
@@ -93,6 +97,7 @@ class _Writer:
         if strip or narrow_strip:
             kinds.append(("parking", strip, narrow_strip))
         kinds += [("curb", kerb.width_m, None), ("sidewalk", kerb.sidewalk_width_m, None)]
+        # Lanes count outwards from the reference line, and the file lists them by descending id.
         numbered = [(side * (k + 1), *kind) for k, kind in enumerate(kinds)]
         for number, kind, usual, narrowed in sorted(numbered, reverse=True):
             lane = SubElement(parent, "lane", id=str(number), type=kind, level="false")
@@ -102,6 +107,7 @@ class _Writer:
             edge = abs(number) == count and (strip or line.plan.edge_lines)
             _mark(lane, "broken" if inner else "solid" if edge else "none", "white")
             if kind in ("curb", "sidewalk"):
+                # Relative to the road surface, at both edges.
                 SubElement(lane, "height", sOffset="0", inner=_text(kerb.height_m), outer=_text(kerb.height_m))
 
     # ----------------------------------------------------------------------------------------------------- junctions
@@ -119,6 +125,7 @@ class _Writer:
         plan = self.network.roads[source].plan
         self._shape(road, line, plan.speed_limit_mps)
         lanes = SubElement(road, "lanes")
+        # Lanes lie beside the reference line; half a width of offset centres the only one on it.
         SubElement(lanes, "laneOffset", s="0", a=_text(plan.lane_width_m / 2), b="0", c="0", d="0")
         section = SubElement(lanes, "laneSection", s="0")
         _mark(SubElement(SubElement(section, "center"), "lane", id="0", type="none", level="false"), "none", "white")
@@ -172,6 +179,7 @@ def _ground_profile(line: RoadLine, terrain: Terrain) -> tuple[list[Cubic], list
     # Superelevation is positive where the right side is lower.
     tilt = np.arctan(gradient[:, 1] * np.cos(yaw) - gradient[:, 0] * np.sin(yaw))
     length, rise = np.diff(knots), np.diff(height)
+    # Cubic Hermite: meets heights and slopes of the terrain at both knots.
     c = (3 * rise / length - 2 * ahead[:-1] - ahead[1:]) / length
     d = (ahead[:-1] + ahead[1:] - 2 * rise / length) / length**2
     zero = np.zeros_like(c)
@@ -191,6 +199,7 @@ def _widths(line: RoadLanes, usual: float, narrowed: float | None) -> Iterator[C
     if narrow is None or narrowed is None or narrowed == usual:
         return
     change, taper = narrowed - usual, narrow.taper_m
+    # The smoothstep of RoadLanes as a polynomial in metres: w + 3 (dw / t^2) s^2 - 2 (dw / t^3) s^3.
     ease = (3 * change / taper**2, -2 * change / taper**3)
     yield (narrow.start_m - taper, usual, 0.0, *ease)
     yield (narrow.start_m, narrowed, 0.0, 0.0, 0.0)

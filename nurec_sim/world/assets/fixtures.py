@@ -53,6 +53,7 @@ def _sign(prop: Prop) -> Iterator[Part]:
     points = np.stack([np.full(len(flat), -0.05), -flat[:, 0] * size, flat[:, 1] * size + middle], axis=1)
     fan = [[0, i, i + 1] for i in range(1, len(flat) - 1)]
     face.add(points, fan, flat + 0.5)
+    # Reversed winding: the back is seen from behind.
     back.add(points + [0.012, 0, 0], [triangle[::-1] for triangle in fan], flat + 0.5)
     yield pole, _POLE, "metal"
     yield face, _SIGN, f"sign_{picture}"

@@ -58,11 +58,19 @@ class MeshBuilder:
         self._points = [points * scale + shift for points in self._points]
 
     def add(self, points: ArrayLike, faces: ArrayLike, uv: ArrayLike, normals: ArrayLike | None = None) -> None:
-        """Triangles ``faces [m,3]`` over ``points [n,3]`` with ``uv [n,2]``; ``normals [n,3]`` replace smooth ones."""
+        """Adds triangles.
+
+        Args:
+            points: [n,3] vertices.
+            faces: [m,3] indices of vertices, counter-clockwise seen from the front.
+            uv: [n,2] texture coordinates.
+            normals: [n,3] unit normals that replace smoothed ones, or None.
+        """
         vertices = np.asarray(points, np.float64)
         self._points.append(vertices)
         self._uv.append(np.asarray(uv, np.float64))
         self._faces.append(np.asarray(faces, np.int64) + self._count)
+        # NaN marks normals to be computed by `corners`.
         self._normals.append(np.full_like(vertices, np.nan) if normals is None else np.asarray(normals, np.float64))
         self._count += len(vertices)
 
@@ -85,7 +93,15 @@ class MeshBuilder:
         self._points = [move(points) for points in self._points]
 
     def quad(self, a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike, uv: ArrayLike = UNIT_SQUARE) -> None:
-        """One quad, counter-clockwise seen from its front."""
+        """One quad, counter-clockwise seen from its front.
+
+        Args:
+            a: first corner [3].
+            b: second corner.
+            c: third corner.
+            d: fourth corner.
+            uv: [4,2] texture coordinates; the whole texture by default.
+        """
         self.add(np.array([a, b, c, d], np.float64), [[0, 1, 2], [0, 2, 3]], uv)
 
     def grid(self, lattice: Float64[np.ndarray, "n m 3"], uv: Float64[np.ndarray, "n m 2"] | None = None) -> None:
@@ -125,10 +141,21 @@ class MeshBuilder:
         capped: bool = True,
         side_uv: float = 1.0,
     ) -> None:
-        """A cylinder or cone between two points; its side shows the first ``side_uv`` of the texture, its caps all."""
+        """A cylinder or cone between two points.
+
+        Args:
+            start: centre of the first end [3].
+            end: centre of the second end [3].
+            radius: at the start.
+            end_radius: at the end; as at the start if None.
+            sides: number of quads around.
+            capped: whether the ends are closed.
+            side_uv: the side shows this fraction of the texture from its corner on; caps show all of it.
+        """
         start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
         radii = (radius, radius if end_radius is None else end_radius)
         axis = (end - start) / np.linalg.norm(end - start)
+        # Any direction across the axis; the helper vector must not be parallel to it.
         side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
         side /= np.linalg.norm(side)
         angle = np.linspace(0, 2 * np.pi, sides + 1)
@@ -144,7 +171,16 @@ class MeshBuilder:
     def wall(
         self, outline: ArrayLike, low_m: float, high_m: float, u_per_m: float, v_low: float, v_high: float
     ) -> None:
-        """Vertical quads along a 2D polyline; their front is on its right (outside of a counter-clockwise ring)."""
+        """Vertical quads along a polyline; their front is on its right (outside of a counter-clockwise ring).
+
+        Args:
+            outline: [n,2] vertices of the line.
+            low_m: height of the lower edge.
+            high_m: height of the upper edge.
+            u_per_m: texture tiles per metre along the line.
+            v_low: texture coordinate of the lower edge.
+            v_high: texture coordinate of the upper edge.
+        """
         outline = np.asarray(outline, np.float64)
         u = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))]) * u_per_m
         for (a, b), (ua, ub) in zip(zip(outline[:-1], outline[1:], strict=True), zip(u[:-1], u[1:], strict=True),
@@ -160,6 +196,7 @@ class MeshBuilder:
         points, uv, faces = np.concatenate(self._points), np.concatenate(self._uv), np.concatenate(self._faces)
         normal = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
         area = np.linalg.norm(normal, axis=1)
+        # Degenerate triangles have no normal.
         faces, normal, area = faces[area > 1e-9], normal[area > 1e-9], area[area > 1e-9]
         place = points[faces].reshape(-1, 3)
         smooth = np.repeat(normal / area[:, None], 3, axis=0)
@@ -179,11 +216,14 @@ def _corner_angles(place: np.ndarray) -> np.ndarray:
 
 def _smoothed(place: np.ndarray, own: np.ndarray, weighted: np.ndarray, limit: float) -> np.ndarray:
     """Each corner's normal averaged over those at its position whose cosine to its own exceeds ``limit``."""
+    # Corners within 0.1 mm count as one vertex. The spatial hash of Teschner et al. (2003) makes one number of its grid
+    # cell, with products summed.
     grid = np.round(place * 1e4).astype(np.int64)
     key = grid @ np.array([73856093, 19349663, 83492791], np.int64)
     order = np.argsort(key, kind="stable")
     first = np.flatnonzero(np.concatenate([[True], np.diff(key[order]) != 0]))
     count = np.diff(np.concatenate([first, [len(order)]]))
+    # Every corner is compared with all corners of its vertex: a flat list of (corner, partner) pairs, sorted by corner.
     many = np.repeat(count, count)
     start = np.cumsum(many) - many  # of each corner's run of partners
     partner = np.arange(many.sum()) - np.repeat(start - np.repeat(first, count), many)
@@ -198,6 +238,7 @@ def _smoothed(place: np.ndarray, own: np.ndarray, weighted: np.ndarray, limit: f
 @functools.cache
 def icosphere(subdivisions: int) -> tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, "m 3"]]:
     """A unit sphere of near-equal triangles."""
+    # The golden ratio: vertices of an icosahedron.
     t = (1 + 5**0.5) / 2
     points = np.array([[-1, t, 0], [1, t, 0], [-1, -t, 0], [1, -t, 0], [0, -1, t], [0, 1, t],
                        [0, -1, -t], [0, 1, -t], [t, 0, -1], [t, 0, 1], [-t, 0, -1], [-t, 0, 1]])  # fmt: skip
@@ -206,6 +247,7 @@ def icosphere(subdivisions: int) -> tuple[Float64[np.ndarray, "n 3"], Int64[np.n
                       [2, 4, 11], [6, 2, 10], [8, 6, 7], [9, 8, 1]])  # fmt: skip
     points = points / np.linalg.norm(points[0])
     for _ in range(subdivisions):
+        # Every face becomes four; edges are shared, so each midpoint is created once and moved onto the sphere.
         edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
         unique, index = np.unique(edges, axis=0, return_inverse=True)
         middle = points[unique].mean(axis=1)

@@ -39,12 +39,14 @@ LIMBS = tuple(
 
 
 def walking_angles(phase_rad: float, stride: float) -> dict[str, float]:
-    """Joint angles (rad, positive swings backwards) of a walker; ``stride`` 0 stands, 1 walks briskly."""
+    """Joint angles (rad, positive swings backwards) of a walker; ``stride`` 0 is standing, 1 a brisk walk."""
     angles = {}
     for side, shift in (("left", 0.0), ("right", np.pi)):
         swing = np.sin(phase_rad + shift)
         angles[f"{side}_thigh"] = -0.50 * stride * swing - 0.03
+        # Knees only bend backwards, and most while the thigh swings forward through the middle.
         angles[f"{side}_shin"] = stride * (0.14 + 0.55 * max(0.0, np.cos(phase_rad + shift)) ** 1.5)
+        # Arms swing against the leg of their side.
         angles[f"{side}_arm"] = 0.42 * stride * swing + 0.02
         angles[f"{side}_forearm"] = -0.20 - 0.25 * stride
     return angles
@@ -62,7 +64,14 @@ def cycling_angles(phase_rad: float) -> dict[str, float]:
 
 
 def trunk(rng: np.random.Generator, *, helmet: bool = False, skirt: bool = False, lean_rad: float = 0.0) -> MeshBuilder:
-    """Torso, neck and head with hair, leaning forward about the hip; some carry a backpack."""
+    """Torso, neck and head, leaning forward about the hip; some people carry a backpack.
+
+    Args:
+        rng: random generator for build, hair and backpack.
+        helmet: a helmet instead of hair.
+        skirt: a skirt in the colour of the trousers.
+        lean_rad: forward lean about the y axis at hip height.
+    """
     mesh = MeshBuilder()
     rings = [(0.80, 0.095, 0.13), (0.90, 0.112, 0.162), (0.98, 0.112, 0.158), (1.10, 0.108, 0.150),
              (1.24, 0.118, 0.175), (1.36, 0.116, 0.190), (1.44, 0.098, 0.188), (1.49, 0.07, 0.11)]  # fmt: skip

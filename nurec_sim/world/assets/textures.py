@@ -15,11 +15,23 @@ Image = UInt8[np.ndarray, "h w 3"]
 def noise(
     rng: np.random.Generator, size: int, octaves: int = 5, cells: int = 4, persistence: float = 0.55
 ) -> np.ndarray:
-    """Tileable fractal value noise ``[size, size]`` in 0..1."""
+    """Tileable fractal value noise.
+
+    Args:
+        rng: random generator.
+        size: pixels of the square image.
+        octaves: number of layers, each with twice the frequency of the previous one.
+        cells: random values across the image in the coarsest layer.
+        persistence: amplitude of a layer relative to the previous one.
+
+    Returns:
+        ``[size, size]`` in 0..1.
+    """
     total, weight = np.zeros((size, size), np.float32), 0.0
     for octave in range(octaves):
         n = min(cells * 2**octave, size)
         between = _periodic_weights(size, n)
+        # Interpolation is separable: the same sparse weights on both axes.
         total += persistence**octave * (between @ (between @ rng.random((n, n), dtype=np.float32)).T)
         weight += persistence**octave
     return np.clip(total / weight, 0, 1)
@@ -31,6 +43,7 @@ def _periodic_weights(size: int, n: int) -> sparse.csr_array:
     place = (np.arange(size) + 0.5) * n / size - 0.5
     whole = np.floor(place).astype(int)
     t = (place - whole).astype(np.float32)
+    # Catmull-Rom weights of the four neighbours; indices modulo n make it periodic.
     cubic = [-0.5 * t + t**2 - 0.5 * t**3, 1 - 2.5 * t**2 + 1.5 * t**3, 0.5 * t + 2 * t**2 - 1.5 * t**3,
              -0.5 * t**2 + 0.5 * t**3]  # fmt: skip
     rows, columns = np.tile(np.arange(size), 4), np.concatenate([(whole + shift) % n for shift in (-1, 0, 1, 2)])
@@ -40,6 +53,7 @@ def _periodic_weights(size: int, n: int) -> sparse.csr_array:
 def grain(rng: np.random.Generator, size: int, sigma_px: float) -> np.ndarray:
     """Tileable blurred white noise ``[size, size]`` of unit variance."""
     margin = int(np.ceil(4 * sigma_px))
+    # Wrapping before the blur makes the result tileable.
     white = np.pad(rng.standard_normal((size, size), np.float32), margin, mode="wrap")
     blurred = cv2.GaussianBlur(white, (0, 0), sigma_px)[margin:-margin, margin:-margin]
     return blurred / float(blurred.std())

@@ -24,6 +24,12 @@ _NAMES = ("CAFE", "BAKERY", "BOOKS", "MARKET", "PIZZA", "BANK", "HOTEL", "FLOWER
 def facade(rng: np.random.Generator, family: str, lit: float, night: float) -> Image:
     """A facade of one family.
 
+    Args:
+        rng: random generator.
+        family: one of ``splits.FACADES``.
+        lit: fraction 0..1 of windows with light.
+        night: unlit parts are darkened by 1 + ``night``; 0 by day.
+
     Raises:
         ValueError: no such family.
     """
@@ -42,8 +48,10 @@ def _brick(rng: np.random.Generator, size: int) -> np.ndarray:
     rows, columns = 128, 44
     y, x = np.meshgrid(np.arange(size), np.arange(size), indexing="ij")
     row = y * rows // size
+    # Every other row is shifted by half a brick.
     shifted = (x + (row % 2) * size // columns // 2) % size
     tone = rng.normal(1.0, 0.13, (rows, columns)).astype(np.float32)[row, shifted * columns // size]
+    # The first pixel of every brick, across and down, is mortar.
     joint = (y * rows % size < rows) | (shifted * columns % size < columns)
     image = tone[..., None] * colour
     image[joint] = rng.uniform(140, 180)

@@ -36,6 +36,7 @@ def _bitumen(rng: np.random.Generator, size: int, level: float, cracks: int) -> 
     """Stones in bitumen: the larger ones show as light and dark specks."""
     grey = level * (1 + 0.20 * (noise(rng, size, 4, 5) - 0.5) + 0.22 * (noise(rng, size, 3, 48) - 0.5))
     grey += 0.11 * level * grain(rng, size, 0.7) + 0.05 * level * grain(rng, size, 1.6)
+    # Few bright and dark stones stick out of the bitumen.
     specks = rng.random((size, size), dtype=np.float32)
     grey[specks > 0.985] *= 1.35
     grey[specks < 0.012] *= 0.62
@@ -50,6 +51,7 @@ def _crack(rng: np.random.Generator, grey: Grey, shade: float) -> None:
     path = rng.random(2) * size + np.cumsum(size / 130 * np.stack([np.cos(steps), np.sin(steps)], axis=1), axis=0)
     for shift_x in (-size, 0, size):  # wraps around the tile
         for shift_y in (-size, 0, size):
+            # Fixed-point coordinates with 3 fractional bits, as the last argument tells OpenCV.
             moved = (path + [shift_x, shift_y]) * 8
             cv2.polylines(grey, [moved.astype(np.int32)], False, shade, 1 + int(rng.random() < 0.3), cv2.LINE_AA, 3)
 
@@ -86,6 +88,7 @@ def _cobbled(rng: np.random.Generator, size: int) -> Image:
     along = x * columns / size + 0.5 * (row % 2)
     stone = np.floor(along).astype(np.int32) % columns
     u, v = 2 * (along - np.floor(along)) - 1, 2 * np.mod(y * rows / size, 1) - 1
+    # Stones are rounded squares: a superellipse with a slightly domed top.
     round_off = np.clip(1.25 - np.maximum(np.abs(u) ** 4, np.abs(v) ** 4) - 0.25 * (u * u + v * v), 0, 1)
     tone = rng.normal(1.0, 0.13, (rows, columns)).astype(np.float32)[row, stone]
     grey = float(rng.uniform(98, 128)) * tone * (0.30 + 0.70 * round_off)

@@ -21,6 +21,7 @@ def band_uv(band: str, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Texture coordinates ``[..., 2]`` of fractions (u, v) of a band."""
     row = BANDS.index(band)
     margin = 0.1
+    # A margin keeps filtering from reading neighbouring bands.
     inside = margin + (1 - 2 * margin) * np.clip(v, 0, 1)
     return np.stack([u, 1 - (row + 1 - inside) / len(BANDS)], axis=-1)
 

@@ -51,6 +51,7 @@ def _leaves(rng: np.random.Generator, size: int, colour: np.ndarray, needles: bo
     axes = (7, 1) if needles else (5, 3)
     for (x, y), angle, tone, hue in zip(places, angles, tones, hues, strict=True):
         shade = (colour * np.clip(tone, 0.35, 1.7) * hue).tolist()
+        # Leaves over the left or right border are repeated on the other side, so that u tiles.
         for shift in ((0, 0), (size if x < 8 else -size, 0)) if x < 8 or x > size - 8 else ((0, 0),):
             cv2.ellipse(image, (int(x) + shift[0], int(y) + shift[1]), axes, float(angle), 0, 360, shade, -1)
     return image * (1 + 0.10 * grain(rng, size, 0.7) + 0.30 * (noise(rng, size, 3, 5) - 0.5))[..., None]

@@ -31,6 +31,7 @@ def sign(rng: np.random.Generator, picture: str, size: int = 128) -> Image:
 
     def board(inner: float, outer: tuple[int, int, int], colour: tuple[int, int, int]) -> None:
         image[:] = outer
+        # Image rows run downwards. OpenCV reads coordinates with 4 fractional bits, hence the factor 16.
         points = outline(SIGN_SHAPES[picture]) * inner * [1, -1] + 0.5
         cv2.fillPoly(image, [(points * size * 16).astype(np.int32)], colour, cv2.LINE_AA, 4)
 

@@ -66,6 +66,14 @@ def _nose(rng: np.random.Generator, front: np.ndarray, family: Family) -> None:
     rows, columns = front.shape
 
     def band(low: float, high: float, half: float, shade: float) -> None:
+        """A horizontal band across the middle of the nose.
+
+        Args:
+            low: lower edge, as a fraction of the vehicle's height.
+            high: upper edge.
+            half: width, as a fraction of the vehicle's.
+            shade: grey value 0..255.
+        """
         x0, x1 = int((0.5 - half / 2) * columns), int((0.5 + half / 2) * columns)
         cv2.rectangle(front, (x0, int((1 - high) * rows)), (x1, int((1 - low) * rows)), shade, -1)
 
@@ -163,11 +171,13 @@ def atlas_uv(
     along = corner[:, 0] / size_m[0] + 0.5
     across = corner[:, 1] / size_m[1] + 0.5
     high = corner[:, 2] / size_m[2] + 0.5
+    # Slanted flanks belong to the side, hence its larger weight.
     weight = np.abs(normal) * [1.0, 1.15, 1.0]
     facing = weight.argmax(axis=1)
     side = np.stack([along, 0.5 + 0.5 * high], axis=1)
     top = np.stack([along, 0.25 + 0.25 * across], axis=1)
     end = np.stack([0.5 * across + 0.5 * (normal[:, 0] < 0), 0.25 * high], axis=1)
+    # Keeps filtering from reading across the border of a region.
     margin = 0.004
     end = np.clip(end, [0.0, margin], [1.0, 0.25 - margin])
     side[:, 1] = np.clip(side[:, 1], 0.5 + margin, 1 - margin)

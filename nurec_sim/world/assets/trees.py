@@ -25,6 +25,7 @@ def tree(rng: np.random.Generator, family: str, scale: float) -> MeshBuilder:
     middle = np.array([0.0, 0.0, bottom + tall * 0.92])
     _trunk(mesh, rng, middle[2], (0.11 if slim else 0.17) * scale)
     lobes = 5 if slim else 6
+    # Lobes on an ellipsoid around the middle of the crown, evenly in angle.
     for i in range(lobes):
         angle, level = 2 * np.pi * (i + rng.random() * 0.5) / lobes, float(rng.uniform(-0.45, 0.45))
         reach = wide * (0.52 if slim else 0.56) * float(np.sqrt(1 - level**2))
@@ -75,6 +76,7 @@ def _conifer(rng: np.random.Generator, scale: float) -> MeshBuilder:
         radius = wide * (1 - share) ** 0.85 + 0.12
         drop = (high - low) / tiers * 1.5
         angle = np.linspace(0, 2 * np.pi, 2 * sides + 1) + float(rng.uniform(0, 1))
+        # Zigzag outline of branches.
         out = radius * np.where(np.arange(2 * sides + 1) % 2, 1.0, 0.62) * (1 + 0.12 * rng.normal(size=2 * sides + 1))
         out[-1] = out[0]
         ring = np.stack([out * np.cos(angle), out * np.sin(angle), z - 0.35 * drop * (out / radius)], axis=1)
@@ -112,8 +114,10 @@ def _lobe(mesh: MeshBuilder, rng: np.random.Generator, centre: np.ndarray, half:
     core = points * half * 0.90 * lumps[:, None] + centre
     uv = np.stack([np.arctan2(points[:, 1], points[:, 0]) * half[0], points[:, 2] * half[2]], axis=1) / LEAF_TILE_M
     mesh.add(core, faces, _in_leaves(uv + rng.random(2)), _soft(core, points, crown))
+    # Normalised Gaussian vectors are uniform on the sphere.
     out = rng.normal(size=(clusters, 3))
     out /= np.linalg.norm(out, axis=1, keepdims=True)
+    # Clusters lie roughly tangential to the crown, with random tilt.
     side = np.cross(out + 0.35 * rng.normal(size=out.shape), rng.normal(size=out.shape))
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     lift = np.cross(out, side)
@@ -135,6 +139,7 @@ def _soft(points: np.ndarray, outward: np.ndarray, crown: np.ndarray) -> np.ndar
     """Normals between those of a lobe and those of the whole crown."""
     away = points - crown
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
+    # Mostly the crown's own shape, brighter from above, as light scatters within it.
     normals = 0.55 * outward + 0.6 * away + [0, 0, 0.12]
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 

@@ -55,6 +55,7 @@ def _lower_body(paint: MeshBuilder, family: Family, half_l: float, half_w: float
     knots = np.array(family.top)
     tail, nose = knots[0, 0], knots[-1, 0]
     inner = np.linspace(tail + 0.10, nose - 0.10, 9)
+    # Dense near both ends, where the section is rounded.
     stations = np.concatenate([[tail, tail + 0.012, tail + 0.045], inner, [nose - 0.045, nose - 0.012, nose]])
     boxy = family.roof_width > 0.88
     rounding = 0.035 if boxy else 0.11
@@ -66,6 +67,7 @@ def _lower_body(paint: MeshBuilder, family: Family, half_l: float, half_w: float
         top = np.interp(x, knots[:, 0], knots[:, 1]) * high
         low = family.floor_m + (0.0 if boxy else 0.10 * np.clip(1 - from_end * 2.5, 0, 1))
         tall = top - low
+        # Right half of the section from the sill up to the middle of the hood; the left half mirrors it.
         right = [(-0.84 * width, low), (-0.955 * width, low + 0.05), (-0.992 * width, low + 0.30 * tall),
                  (-width, low + 0.58 * tall), (-0.985 * width, low + 0.80 * tall), (-0.95 * width, top - 0.035),
                  (-0.86 * width, top), (-0.5 * width, top + 0.018), (0.0, top + 0.028)]  # fmt: skip
@@ -99,6 +101,7 @@ def _cabin(paint: MeshBuilder, family: Family, half_l: float, half_w: float, hig
 
     def surface(side: int, s: float, t: float) -> np.ndarray:
         a, b = side, (side + 1) % 4
+        # Bilinear between bottom and roof edge, bulging outwards by a parabola along the side.
         point = (bottom[a] * (1 - s) + bottom[b] * s) * (1 - t) + (top[a] * (1 - s) + top[b] * s) * t
         return point + outward[side] * bulge[side] * 4 * s * (1 - s)
 
@@ -127,6 +130,7 @@ def _windows(glass: MeshBuilder, family: Family, surface: Surface) -> None:
         s, t = np.linspace(s0, s1, 6), np.linspace(t0, t1, 3)
         lattice = np.array([[surface(side, a, b) for b in t] for a in s])
         normal = np.cross(lattice[-1, 0] - lattice[0, 0], lattice[0, -1] - lattice[0, 0])
+        # 12 mm in front of the body, so that glass and paint do not intersect.
         glass.grid(lattice + normal / np.linalg.norm(normal) * 0.012)
 
 
@@ -198,6 +202,7 @@ def _trim(
 def _with_atlas(paint: MeshBuilder, size_m: tuple[float, float, float]) -> MeshBuilder:
     """The same surface mapped to the body atlas by face orientation."""
     place, smooth, _ = paint.corners(36.0)
+    # The atlas region follows the flat normal of a face, so that no triangle spans two regions.
     flat = np.cross(place[1::3] - place[::3], place[2::3] - place[::3])
     flat = np.repeat(flat / np.linalg.norm(flat, axis=1, keepdims=True), 3, axis=0)
     mesh = MeshBuilder()

@@ -37,6 +37,7 @@ class Gait:
 
     def angles(self, t_us: float) -> dict[str, float]:
         """Angle of every joint at a time."""
+        # The phase follows the distance walked, so that feet do not slide; the stride follows the speed over 0.2 s.
         here, before = np.interp([t_us, t_us - 200_000], self.t_us, self.distance_m)
         if self.kind == "cyclist":
             angles = people.cycling_angles(self.phase_rad + 2 * np.pi * here / PEDAL_TURN_M)
@@ -72,6 +73,7 @@ class ActorBuilder:
             self._vehicles[actor.kind] = actor.size_m, {name: mesh.corners(34.0) for name, mesh in parts.items()}
             self._paint(actor)
         made_for, shapes = self._vehicles[actor.kind]
+        # The mesh fills the box of the first vehicle of its kind; scaled copies fill their own.
         stretch = np.array(actor.size_m) / made_for
         looks = {"paint": f"paint_{actor.kind}", "wheel": f"wheel{rng.integers(3)}", "plate": f"plate{rng.integers(4)}",
                  "cargo": f"cargo{rng.integers(4)}"}  # fmt: skip
@@ -88,6 +90,7 @@ class ActorBuilder:
         if material not in self._shadows:
             self._shadows.add(material)
             self.builder.material(material, textures_ground.contact_shadow(length_m, width_m))
+        # In the box frame: 2 cm above the ground, half a metre beyond the body, as `contact_shadow` expects.
         half_l, half_w, ground = length_m / 2 + 0.5, width_m / 2 + 0.5, 0.02 - actor.size_m[2] / 2
         mesh = MeshBuilder()
         mesh.quad([-half_l, -half_w, ground], [half_l, -half_w, ground], [half_l, half_w, ground],
@@ -111,6 +114,14 @@ class ActorBuilder:
         foot, bare, lean = -actor.size_m[2] / 2, rng.random() < 0.3, LEAN_RAD if rides else 0.0
 
         def place(where: Any, corners: Corners, material: str, tint: tuple[float, ...] = (1.0, 1.0, 1.0)) -> None:
+            """Adds a part of the person, scaled to their height.
+
+            Args:
+                where: body that carries it.
+                corners: triangle corners in the frame of that body, for a person of ``people.HEIGHT_M``.
+                material: name of its material.
+                tint: colour factor 0..1.
+            """
             mesh = self.builder.shared_mesh(corners, [scale] * 3)
             self.builder.place(where, mesh, surface, material, instance=instance, tint=tint)
 
@@ -121,10 +132,12 @@ class ActorBuilder:
         for limb in people.LIMBS:
             x, y, z = limb.joint
             if rides and limb.name.endswith("_arm"):
+                # Shoulders move with the trunk, which leans forward about the hip.
                 up = z - people.HIP_M
                 x, z = up * np.sin(lean), people.HIP_M + up * np.cos(lean)
             part = _rigid(bodies[limb.parent], [x * scale, y * scale, z * scale])
             hinge = part.add_joint(name=f"{actor.id}_{limb.name}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
+            # All people share the meshes of limbs, with long or short clothes.
             if (limb.name, bare) not in self._limbs:
                 self._limbs[limb.name, bare] = people.limb(limb.name, bare=bare).corners(SMOOTH_DEG)
             place(part, self._limbs[limb.name, bare], cloth)

@@ -51,11 +51,19 @@ class Town:
         return places
 
     def pose(self, data: Any, t_us: float, places: ActorPlaces, instant: int = 0) -> None:
-        """Poses all actors and their limbs for an instant, and updates the kinematics."""
+        """Poses all actors and their limbs for an instant, and updates the kinematics.
+
+        Args:
+            data: MuJoCo state to update.
+            t_us: time of the instant, for the phase of limbs.
+            places: poses of all actors (``actor_places``).
+            instant: index of the instant in ``places``.
+        """
         data.mocap_pos[:], data.mocap_quat[:] = places[0][instant], places[1][instant]
         for gait, addresses in self.gaits:
             for joint, angle in gait.angles(t_us).items():
                 data.qpos[addresses[joint]] = angle
+        # Only body and light poses: no dynamics are simulated.
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_camlight(self.model, data)
 
@@ -73,6 +81,7 @@ def build_town(plan: TownPlan, network: TownNetwork | None = None) -> Town:
     spec = builder.spec
     spec.stat.extent, spec.stat.center = EXTENT_M, [0, 0, 0]
     visual = spec.visual
+    # MuJoCo measures these in units of the model's extent.
     visual.map.znear, visual.map.zfar, visual.map.shadowclip = NEAR_M / EXTENT_M, FAR_M / EXTENT_M, 0.5
     visual.quality.shadowsize, visual.quality.offsamples = 2048, 4
     sky = Sky(np.random.default_rng([plan.style.texture_seed, 30]), plan.weather)
@@ -83,6 +92,7 @@ def build_town(plan: TownPlan, network: TownNetwork | None = None) -> Town:
     actors = ActorBuilder(builder, plan)
     gaits = [actors.add(actor, index + 1) for index, actor in enumerate(plan.actors)]
     model = spec.compile()
+    # Filled in by SpecBuilder for every geom.
     user = model.geom_user
     return Town(
         plan=plan,

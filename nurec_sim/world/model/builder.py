@@ -46,7 +46,15 @@ class SpecBuilder:
         shine: float = 0.05,
         glow: float = 0.0,
     ) -> None:
-        """A material; with an ``image [h,w,3]`` its texture is tinted by ``colour``."""
+        """Adds a material.
+
+        Args:
+            name: of the material; its texture is called ``<name>_texture``.
+            image: texture, uint8 [h,w,3] or [h,w,4] with alpha, or None for a plain colour.
+            colour: red, green and blue 0..1; tints the texture.
+            shine: strength 0..1 of highlights.
+            glow: emission 0..1, independent of light.
+        """
         material = self.spec.add_material(name=name, rgba=[*colour, 1], specular=shine, shininess=0.1 + 0.7 * shine,
                                           reflectance=0.0, emission=glow)  # fmt: skip
         self._colour[name] = mean = np.asarray(colour, np.float64)
@@ -76,6 +84,7 @@ class SpecBuilder:
         mesh = self.spec.add_mesh(name=f"mesh{self._meshes}")
         mesh.uservert = (points * np.asarray(scale)).ravel().tolist()
         mesh.usernormal = normals.ravel().tolist()
+        # Texture rows run downwards in MuJoCo, v runs upwards here.
         mesh.usertexcoord = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1).ravel().tolist()
         mesh.userface = list(range(len(points)))
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # flat and open meshes have no volume
@@ -97,7 +106,22 @@ class SpecBuilder:
         crease_deg: float = 38.0,
         decal: bool = False,
     ) -> None:
-        """Adds a mesh to a body. A ``decal`` is alpha-blended and exists in colour images only."""
+        """Adds a mesh to a body.
+
+        Args:
+            body: of the spec, ``world`` for static geoms.
+            mesh: name of a registered mesh, or a builder to register.
+            surface: class in the ground truth.
+            material: name of its material.
+            instance: ``STATIC``, or i + 1 for actor i of the plan.
+            xyz: position in the body's frame (m).
+            yaw: rotation about z in the body's frame (rad).
+            tint: factor 0..1 on the material's colour.
+            reflectivity: for lasers, 0..1; by class if None.
+            shadow: whether it casts a shadow.
+            crease_deg: edges sharper than this stay sharp (only for a builder).
+            decal: alpha-blended, in colour images only, without a shadow.
+        """
         name = mesh if isinstance(mesh, str) else self.mesh(mesh, crease_deg)
         geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=xyz, quat=_yaw_quat(yaw))
         self._dress(geom, surface, material, instance, tint, reflectivity, shadow and not decal)
@@ -108,6 +132,7 @@ class SpecBuilder:
                reflectivity: float | None, shadow: bool) -> None:  # fmt: skip
         # A geom's colour replaces its material's, so the tint combines both.
         geom.material, geom.rgba, geom.castshadow = material, [*(self._colour[material] * np.asarray(tint)), 1], shadow
+        # No contacts and no mass: geoms are only seen.
         geom.contype = geom.conaffinity = 0
         geom.group, geom.mass = 1, 0
         colour = self._mean_colour[material] * np.asarray(tint)

@@ -31,7 +31,17 @@ class Chunks:
         decal: bool = False,
         crease_deg: float = 38.0,
     ) -> MeshBuilder:
-        """The mesh for this class and material at a location."""
+        """The mesh that collects this kind of surface at a location.
+
+        Args:
+            xy: location in the world (m).
+            surface: class in the ground truth.
+            material: name of the material.
+            tint: factor 0..1 on the material's colour.
+            shadow: whether it casts a shadow.
+            decal: whether it is a decal (``SpecBuilder.place``).
+            crease_deg: edges sharper than this stay sharp.
+        """
         column, row = (int(np.floor(v / self.size_m)) for v in xy[:2])
         key = (column, row, surface, material, tint, shadow, decal, crease_deg)
         return self._meshes.setdefault(key, MeshBuilder())
@@ -46,7 +56,16 @@ class Chunks:
         *,
         decal: bool = False,
     ) -> None:
-        """Adds triangles ``[n,3,3]`` without shadows, each to the square of its first corner."""
+        """Adds triangles without shadows, each to the square of its first corner.
+
+        Args:
+            corners: [n,3,3] positions in the world (m).
+            normals: [n,3,3] unit normals of the corners.
+            uv: [n,3,2] texture coordinates.
+            surface: class in the ground truth.
+            material: name of the material.
+            decal: whether they are a decal.
+        """
         squares = np.floor(corners[:, 0, :2] / self.size_m).astype(np.int64)
         unique, index = np.unique(squares, axis=0, return_inverse=True)
         for number, square in enumerate(unique):
@@ -59,6 +78,7 @@ class Chunks:
     def join(self, other: Chunks) -> None:
         """Adds the meshes of another collection, keeping its squares."""
         for key, mesh in other._meshes.items():
+            # A column far outside of any town, unique per mesh: squares of another size must not be merged with ours.
             self._meshes[(-(10**6) - len(self._meshes), *key[1:])] = mesh
 
     def place(self, builder: SpecBuilder) -> None:

@@ -25,13 +25,21 @@ FAR_REACH_M, HILLS_M, HILLS_END_M = 640.0, 540.0, 900.0
 
 
 def add_ground(chunks: Chunks, network: TownNetwork, rng: np.random.Generator, wetness: float) -> None:
-    """All ground of a town; materials are ``asphalt``, ``kerb``, ``paving``, ``grass``, ``white``, ``yellow``."""
+    """All ground of a town; materials are ``asphalt``, ``kerb``, ``paving``, ``grass``, ``white``, ``yellow``.
+
+    Args:
+        chunks: collects the meshes.
+        network: areas, lanes and terrain of the town.
+        rng: random generator for wear.
+        wetness: 0..1; puddles above 0.
+    """
     high = network.plan.kerb.height_m
     _lay(chunks, network, network.surface, 0.0, SurfaceClass.ROAD, "asphalt", ASPHALT_TILE_M)
     _lay(chunks, network, network.kerb, high, SurfaceClass.KERB, "kerb", 2.0)
     _walls(chunks, network, network.surface, 0.0, high, SurfaceClass.KERB, "kerb", inwards=True)
     # Grass is slightly lower than paving, so paving needs a side face towards it.
     _walls(chunks, network, network.paved, high - EDGE_M, high, SurfaceClass.SIDEWALK, "paving", inwards=False)
+    # Sidewalk within the outer outline of a surface lies on a traffic island.
     outside = shapely.union_all([shapely.Polygon(part.exterior) for part in network.surface.geoms])
     for area, surface in ((network.sidewalk.difference(outside), SurfaceClass.SIDEWALK),
                           (network.sidewalk.intersection(outside), SurfaceClass.ISLAND)):  # fmt: skip
@@ -68,6 +76,7 @@ def _walls(chunks: Chunks, network: TownNetwork, area: shapely.Geometry, low_m: 
         for ring in (oriented.exterior, *oriented.interiors):
             # The area is to the left of its rings; walls face to the right of their line.
             points = _split_at_lattice(np.asarray(ring.coords)[:: -1 if inwards else 1, :2])
+            # Texture coordinates along the wall: one tile per 2 m.
             along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]) * 0.5
             ground = network.height_m(points)
             a, b = slice(None, -1), slice(1, None)
@@ -90,6 +99,7 @@ def _split_at_lattice(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray,
     out = [points[:1]]
     for a, b in zip(points[:-1], points[1:], strict=True):
         cuts = []
+        # Crossings with the lattice lines x = k, y = k and the diagonals x - y = k of the cells.
         for start, end in ((a[0], b[0]), (a[1], b[1]), (a[0] - a[1], b[0] - b[1])):
             low, high = sorted((start, end))
             lines = np.arange(np.ceil(low / STEP_M), np.floor(high / STEP_M) + 1) * STEP_M
@@ -105,6 +115,7 @@ def _green(chunks: Chunks, network: TownNetwork) -> None:
     """Grass around the town, coarser far away, and wooded hills at the horizon."""
     high, bounds = network.plan.kerb.height_m, np.array(network.surface.bounds)
     low, top = bounds[:2] - NEAR_MARGIN_M, bounds[2:] + NEAR_MARGIN_M
+    # Larger squares for coarser triangles keep the number of geoms low.
     near, lawns = shapely.box(*low, *top), Chunks(2 * chunks.size_m)
     _lay(lawns, network, near.difference(shapely.buffer(network.paved, -0.2)), high - GRASS_BELOW_M,
          SurfaceClass.GRASS, "grass", GRASS_TILE_M, GRASS_STEP_M)  # fmt: skip
@@ -120,6 +131,7 @@ def _green(chunks: Chunks, network: TownNetwork) -> None:
 def _hills(chunks: Chunks, middle: np.ndarray, rng: np.random.Generator) -> None:
     angle = np.linspace(0, 2 * np.pi, 97)
     profile = noise(rng, 96, 4, 6)[0]
+    # Closed rings: the last column repeats the first.
     profile = np.concatenate([profile, profile[:1]])
     tops = np.concatenate([rng.normal(0, 1.2, 96), [0.0]])
     tops[-1] = tops[0]
@@ -146,6 +158,7 @@ def _wear(chunks: Chunks, network: TownNetwork, rng: np.random.Generator, wetnes
         side = np.gradient(line, axis=0)
         side = np.stack([-side[:, 1], side[:, 0]], axis=1) / np.linalg.norm(side, axis=1, keepdims=True)
         station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        # Five points across a lane let the decal follow the terrain.
         across = np.array([-0.5, -0.25, 0.0, 0.25, 0.5]) * min(lane.width_m, 3.4)
         xy = line[:, None] + across[:, None] * side[:, None]
         uv = np.stack(np.broadcast_arrays(np.linspace(0, 1, 5)[None], station[:, None] / 12.0), axis=-1)
@@ -155,6 +168,7 @@ def _wear(chunks: Chunks, network: TownNetwork, rng: np.random.Generator, wetnes
         kinds.append(("puddles", 5.5, 70.0 / wetness))
     for material, size, area_each in kinds:
         for polygon in network.surface.geoms:
+            # Rotated squares of this size stay on the road: their half diagonal is 0.71 of the side.
             inside = shapely.buffer(polygon, -0.75 * size)
             count = int(polygon.area / area_each)
             low, high = np.array(polygon.bounds).reshape(2, 2)
@@ -174,6 +188,7 @@ def add_light_pools(chunks: Chunks, network: TownNetwork) -> None:
     for prop in network.plan.props:
         if prop.kind != "lamp":
             continue
+        # A lamp's arm reaches along +y of its prop, over the road.
         towards = np.array([-np.sin(prop.yaw_rad), np.cos(prop.yaw_rad)])
         t = np.linspace(-6.5, 6.5, 8)
         lattice = np.array([prop.x_m, prop.y_m]) + 1.8 * towards + np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1)

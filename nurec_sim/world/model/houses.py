@@ -20,8 +20,17 @@ OVERHANG_M = 0.45
 
 
 def add_house(chunks: Chunks, house: Building, terrain: Terrain, kerb_m: float, rng: np.random.Generator) -> None:
-    """One building; materials ``facade_<family><variant>``, ``shop0..1``, ``roof0..1``, ``concrete``, ``metal``."""
+    """One building; materials ``facade_<family><variant>``, ``shop0..1``, ``roof0..1``, ``concrete``, ``metal``.
+
+    Args:
+        chunks: collects the meshes.
+        house: position, size and style.
+        terrain: the ground below it.
+        kerb_m: height of the ground behind kerbs above the terrain.
+        rng: random generator for details.
+    """
     corners = box_corners_xy(pose_from_xyyaw(house.x_m, house.y_m, house.yaw_rad), house.width_m, house.depth_m)
+    # The floor lies at the highest corner; the plinth reaches below the lowest.
     heights = terrain.height_m(corners)
     floor = float(heights.max()) + kerb_m
     low = float(heights.min()) - 0.6
@@ -72,7 +81,14 @@ class _House:
         self.trim.quad(*([*corner, 0.35] for corner in out[:4]))
 
     def walls(self, mesh: MeshBuilder, low: float, high: float, v_span: float) -> None:
-        """Walls with an integer number of bays and different texture offsets."""
+        """Walls on all four sides, with an integer number of bays and different texture offsets.
+
+        Args:
+            mesh: collects the walls.
+            low: lower edge above the floor (m).
+            high: upper edge (m).
+            v_span: height of the walls in texture tiles.
+        """
         for side in range(4):
             a, b = self.outline[side], self.outline[side + 1]
             bays = max(1, round(float(np.linalg.norm(b - a)) / BAY_M))
@@ -86,6 +102,7 @@ class _House:
         z, out = high - 0.25, float(rng.uniform(0.8, 1.3))
         a, b, c, d = [x, y, z], [-x, y, z], [-x, y + out, z - 0.45], [x, y + out, z - 0.45]
         self.dark.quad(a, b, c, d)
+        # Both sides, since quads have one visible side.
         self.dark.quad(d, c, b, a)
 
     def balconies(self, rng: np.random.Generator, first: int) -> None:
@@ -116,6 +133,7 @@ class _House:
         x, y = self.half
         rise = 0.36 * 2 * y * 0.8
         over_x, over_y = x + OVERHANG_M, y + OVERHANG_M
+        # The slope continues over the overhang, below the eaves.
         drop = rise * OVERHANG_M / y
         ridge, low = eaves + rise, eaves - drop
         uv = np.array([[0, 0], [2 * over_x, 0], [2 * over_x, 1.2 * over_y], [0, 1.2 * over_y]]) / 3.0
@@ -133,6 +151,7 @@ class _House:
             points = [[sign * x, -sign * y, eaves - 0.02], [sign * x, sign * y, eaves - 0.02],
                       [sign * x, 0, eaves + rise - 0.1]]  # fmt: skip
             v = self.house.floors / FLOORS
+            # A tiny part of the texture between two floors, so that gables are plain wall.
             self.facade.add(points, [[0, 1, 2]], [[0.02, v - 0.015], [0.02, v - 0.01], [0.025, v - 0.005]])
 
     def chimney(self, rng: np.random.Generator, eaves: float) -> None:

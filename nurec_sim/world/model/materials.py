@@ -47,6 +47,7 @@ def _ground(builder: SpecBuilder, plan: TownPlan, sky: Sky) -> None:
     if plan.weather.dusk > LAMPS_ON:
         builder.material("light_pool", textures_ground.light_pool(), glow=1.0)
     if wet > 0:
+        # Puddles show a mean sky colour, as the classic renderer has no reflections of the scene.
         mirrored = 0.5 * (sky.horizon + np.asarray(sky.colours.zenith))
         builder.material("puddles", textures_ground.puddles(rng, tuple(mirrored)), glow=0.35)
 
@@ -54,11 +55,14 @@ def _ground(builder: SpecBuilder, plan: TownPlan, sky: Sky) -> None:
 def _facades(builder: SpecBuilder, plan: TownPlan) -> None:
     dusk = plan.weather.dusk
     lit = 0.03 + 0.37 * dusk
+    # Emission adds `glow` to the light `level` on all of the facade; dividing unlit parts by 1 + glow / level brings
+    # them back to the light of the surroundings.
     level = sum(illumination(plan.weather).ambient) / 3 + 0.06
     glow = 0.72 if dusk > LAMPS_ON else 0.0
     night = glow / level
     wanted = sorted({(house.family, house.facade) for house in plan.buildings})
     for family, variant in wanted:
+        # A stream per facade, so that a facade does not depend on which others a town has.
         rng = np.random.default_rng([plan.style.texture_seed, 2, variant, *family.encode()])
         image = textures_facades.facade(rng, family, lit, night)
         builder.material(f"facade_{family}{variant}", image, shine=0.5 if family == "glass" else 0.04, glow=glow)

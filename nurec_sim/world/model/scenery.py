@@ -41,6 +41,7 @@ def add_scenery(builder: SpecBuilder, network: TownNetwork) -> None:
             mesh = trees.hedge(rng, prop.length_m, float(rng.uniform(*HEDGE_HEIGHT_M)))
             chunks.at(pose[:2, 3], SurfaceClass.VEGETATION, "hedge").extend(mesh, pose)
         else:
+            # Equal fixtures share one set of parts, merged into the chunk at each place.
             kind = prop.kind, prop.variant, prop.length_m
             if kind not in fixtures:
                 fixtures[kind] = tuple(fixture_parts(prop))
@@ -68,6 +69,7 @@ class _Plants:
         """One plant as its own geom with a shared mesh."""
         family = prop.variant % len(self.style.foliages)
         shape = (prop.variant // len(self.style.foliages)) % 2
+        # A few sizes are enough variety and share meshes.
         size = int(np.abs(np.array(TREE_SIZES) - prop.scale).argmin())
         key = (prop.kind, family, shape, size)
         if key not in self._shapes:

@@ -54,6 +54,7 @@ class Sky:
         self.sun = sun_direction(weather)
         self.sun_seen = self.colours.glow > 0.3
         clouds = noise(rng, 1024, 8, 4, 0.56)
+        # Normalised by its deviation, the noise exceeds a limit on about the same share of every sky.
         ranks = (clouds - clouds.mean()) / clouds.std()
         self._clouds = np.clip(0.5 + ranks / 4.4, 0, 1).astype(np.float32)
         self._tone = np.float32(rng.uniform(0.94, 1.04))
@@ -68,9 +69,11 @@ class Sky:
         direction = np.asarray(direction, np.float32)
         up = direction[..., 2:]
         flat = np.clip(up, 0, 1)
+        # Air is thickest at the horizon, so the gradient is steepest there.
         blend = 1 - np.exp(-3.2 * flat)
         colour = _single(self.colours.horizon) * (1 - blend) + _single(self.colours.zenith) * blend
         towards = direction @ _single(self.sun)
+        # A narrow and a wide halo around the sun, by the cosine to it.
         glow = np.exp((towards - 1) * 40)[..., None] * _single([70, 62, 46])
         glow = glow + np.exp((towards - 1) * 5)[..., None] * _single([34, 27, 14])
         colour = colour + self.colours.glow * glow
@@ -78,6 +81,7 @@ class Sky:
         lit = _single(self.colours.cloud_lit) + 0.35 * self.colours.glow * glow
         colour = colour + cover * (lit * light + _single(self.colours.cloud_dark) * (1 - light) - colour)
         if self.sun_seen:
+            # A disc of 0.75 degrees radius with a soft edge, dimmed by clouds.
             disc = np.clip((towards - np.cos(np.deg2rad(0.75))) / 4e-5, 0, 1)[..., None] * (1 - 0.85 * cover)
             colour = colour + disc * (_single(self.colours.sun) - colour)
         colour = np.where(up < 0, _single(self.colours.horizon) * (1 + 0.35 * np.clip(up, -0.6, 0)), colour)
@@ -86,6 +90,7 @@ class Sky:
     def _cloud(self, direction: np.ndarray) -> tuple[Float32[np.ndarray, "h w 1"], Float32[np.ndarray, "h w 1"]]:
         """Cloud opacity and brightness, 0..1."""
         up = np.maximum(direction[..., 2], 0.045)
+        # Clouds lie on a plane at unit height; the bound on `up` limits their stretch near the horizon.
         plane = direction[..., :2] / up[..., None]
         # Clouds are lit from the sun, so the second look-up is a step towards it.
         here = self._thickness(plane)
@@ -93,6 +98,7 @@ class Sky:
         limit = 0.5 + 0.75 * (0.5 - self.cover)
         cover = np.clip((here - limit) / 0.22, 0, 1) * np.clip((direction[..., 2] - 0.005) * 9, 0, 1)
         light = np.clip(0.72 + 2.6 * (here - nearer) - 0.75 * (here - limit), 0.0, 1.0)
+        # Smoothstep: soft edges of clouds.
         return (cover * cover * (3 - 2 * cover))[..., None], light[..., None]
 
     def _thickness(self, plane: np.ndarray) -> np.ndarray:
@@ -106,6 +112,7 @@ class Sky:
         u, v = np.meshgrid(t, t)
         one = np.ones_like(u)
         faces = ((one, -v, -u), (-one, -v, u), (u, one, v), (u, -one, -v), (u, -v, one), (-u, -v, -one))
+        # From OpenGL's axes (y up) to the world's (z up).
         return np.concatenate([self._face(np.stack([x, -z, y], axis=-1)) for x, y, z in faces])
 
     def _face(self, direction: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
@@ -113,6 +120,7 @@ class Sky:
         rows = int((direction[:, :, 2] > 0).any(axis=1).sum())
         width, image = direction.shape[1], np.empty(direction.shape, np.uint8)
         if rows < len(image):
+            # Ground hides nearly all of it, so a few columns are enough.
             step = direction[rows:, :: max(1, len(image) // 8)]
             below = self.colour(step / np.linalg.norm(step, axis=-1, keepdims=True))
             image[rows:] = cv2.resize(below, (width, len(below)), interpolation=cv2.INTER_LINEAR)

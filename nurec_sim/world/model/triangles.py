@@ -25,6 +25,7 @@ def ground_triangles(area: shapely.Geometry, step_m: float = STEP_M) -> Float64[
     """
     found = []
     for tile in _tiles(area, step_m * TILE_STEPS):
+        # Clipping to tiles first keeps the polygons of the lattice step small.
         inside = shapely.intersection(area, tile)
         for polygon in shapely.get_parts(inside):
             if polygon.geom_type == "Polygon" and polygon.area > _SMALLEST_M2:
@@ -54,10 +55,12 @@ def _cut(polygon: shapely.Polygon, step_m: float) -> Float64[np.ndarray, "n 3 2"
     low_x, low_y, high_x, high_y = np.asarray(polygon.bounds) / step_m
     x, y = np.meshgrid(np.arange(np.floor(low_x), np.ceil(high_x)), np.arange(np.floor(low_y), np.ceil(high_y)))
     corner = np.stack([x.ravel(), y.ravel()], axis=1)[:, None]
+    # Cells are divided along x - y = const, also on all other surfaces, so that edges coincide.
     halves = (np.array([[0, 0], [1, 0], [1, 1]]), np.array([[0, 0], [1, 1], [0, 1]]))
     cells = np.concatenate([corner + half for half in halves]) * step_m
     shapes = shapely.polygons(cells)
     shapely.prepare(polygon)
+    # Most half cells lie inside and are used as they are; only those on the border are intersected.
     whole = shapely.contains(polygon, shapes)
     cut = shapely.intersection(polygon, shapes[~whole & shapely.intersects(polygon, shapes)])
     parts = shapely.get_parts(cut)
@@ -65,5 +68,6 @@ def _cut(polygon: shapely.Polygon, step_m: float) -> Float64[np.ndarray, "n 3 2"
     parts = parts[(shapely.get_type_id(parts) == 3) & (shapely.area(parts) > _SMALLEST_M2)]
     pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(parts))
     pieces = pieces[shapely.area(pieces) > _SMALLEST_M2]
+    # Closed rings repeat their first corner.
     small = shapely.get_coordinates(shapely.orient_polygons(pieces)).reshape(-1, 4, 2)[:, :3]
     return np.concatenate([cells[whole], small])

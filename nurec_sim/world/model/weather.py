@@ -52,6 +52,7 @@ def add_lights(spec: Any, weather: Weather) -> None:
     """Sun, a weak fill light from the opposite side so that shaded walls keep contrast, and ambient light."""
     light, sun = illumination(weather), sun_direction(weather)
     directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    # From the opposite side, but always from above.
     fill = np.array([-sun[0], -sun[1], 0.8])
     spec.worldbody.add_light(name="sun", type=directional, pos=(sun * 120).tolist(), dir=(-sun).tolist(),
                              ambient=[0, 0, 0], diffuse=list(light.sun), specular=[light.highlight] * 3,
@@ -66,9 +67,15 @@ def add_lights(spec: Any, weather: Weather) -> None:
 def add_fog(
     rgb: UInt8[np.ndarray, "h w 3"], distance_m: Float32[np.ndarray, "h w"], sky: Sky, fog_per_m: float
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Applies fog of the horizon's colour; sky pixels (``distance_m`` 0) are unchanged.
+    """Applies fog of the horizon's colour; the sky is unchanged.
 
     Fog leaves ``exp(-fog_per_m * distance)`` of the light (Beer-Lambert).
+
+    Args:
+        rgb: image without fog.
+        distance_m: distance of each pixel's surface, 0 for the sky.
+        sky: for the colour of the horizon.
+        fog_per_m: extinction coefficient; 0 is clear air.
     """
     if fog_per_m <= 0:
         return rgb

@@ -70,10 +70,12 @@ def town_terrain(rng: np.random.Generator) -> Terrain:
     if rng.random() < 0.2:
         return Terrain()
     count = int(rng.integers(2, 5))
+    # A Dirichlet sample divides the total slope between the waves, so that it never exceeds STEEPEST.
     steep = rng.uniform(0.015, STEEPEST) * rng.dirichlet(np.full(count, 2.0))
     waves = []
     for slope in steep:
         length = float(rng.uniform(140.0, 380.0))
+        # The steepest slope of A sin(2 pi s / L) is 2 pi A / L.
         amplitude = float(slope) * length / (2 * np.pi)
         waves.append(Wave(round(amplitude, 4), round(length, 2), round(float(rng.uniform(-np.pi, np.pi)), 4),
                           round(float(rng.uniform(-np.pi, np.pi)), 4)))  # fmt: skip

@@ -49,19 +49,24 @@ def ego_driver(rng: np.random.Generator, rules: Rules, seconds: float) -> Driver
     best: tuple[float, Route, float] | None = None
     for _ in range(EGO_TRIES):
         first = firsts[int(rng.integers(len(firsts)))]
+        # Expected distance: the desired speed, less some for bends and waiting.
         distance = 0.85 * min(FASTEST_EGO_MPS, first.speed_limit_mps * eagerness) * seconds
         way = random_lanes(rng, rules.lanes, first.id, 2 * distance)
         route = lay_route(rules.lanes, way, speed_factor=min(eagerness, FASTEST_EGO_MPS / first.speed_limit_mps))
+        # Starting at a station of at most `free`, the ego does not reach the end of the town.
         free = route.length_m - END_M - distance
         inside = [leg for leg in route.legs if leg.in_junction]
+        # One point for a route that is long enough, one for a route through a junction.
         score = min(free, 10.0) / 10.0 + (1.0 if inside else 0.0)
         first_rank = min((rules.rank[leg.lane] for leg in inside[:1]), default=0)
+        # A drive that ends at a red light shows little; only some are kept.
         if first_rank < 0 and rng.random() < 0.8:
             score -= 1.5
         if first_rank >= FLOWING_RANK:
             score += float(rng.uniform(0.0, 1.0))
         start = float(rng.uniform(8.0, max(free, 10.0)))
         if inside:
+            # Reaches the junction after 10 to 60 % of the expected distance.
             start = max(min(free, inside[0].start_m - float(rng.uniform(0.1, 0.6)) * distance), 10.0)
         if best is None or score > best[0]:
             best = score, route, start
@@ -73,7 +78,15 @@ def ego_driver(rng: np.random.Generator, rules: Rules, seconds: float) -> Driver
 def other_vehicles(
     rng: np.random.Generator, rules: Rules, split: Split, ego: Driver, way: shapely.LineString
 ) -> list[Vehicle]:
-    """Usually a lead car, and vehicles on the lanes around ``way``, nearest first."""
+    """Usually a lead car, and vehicles on the lanes around ``way``, nearest first.
+
+    Args:
+        rng: random generator.
+        rules: lanes, right of way and stop positions of the town.
+        split: ``train`` or ``test``: selects the vehicle families.
+        ego: the ego at its start; nothing is placed on it.
+        way: the ego's route ahead (m); vehicles start within ``SEEN_M`` of it.
+    """
     places = _lead(rng, rules, ego) + _places(rng, rules, way)
     wanted = int(rng.integers(VEHICLES[0], VEHICLES[1] + 1))
     taken = [(ego.route.at(np.array(ego.station_m)), EGO_SIZE_M[0])]
@@ -81,15 +94,18 @@ def other_vehicles(
     for away, route, station in places:
         if len(found) == wanted:
             break
+        # Only the lead car has a negative order.
         leads = away < 0
         kind: ActorKind = "cyclist" if not leads and rng.random() < CYCLISTS else fleet.pick_kind(rng, split)
         if kind in fleet.LONG_KINDS and any(rules.lanes[leg.lane].turn not in ("", "straight") for leg in route.legs):
             kind = "van"  # long vehicles do not turn at junctions, since they would need both lanes
         size, lanes = fleet.pick_size(rng, kind), [leg.lane for leg in route.legs]
         if kind == "cyclist":
+            # Routes scale the lane's limit, so the pace of 3 to 6.5 m/s becomes a factor of it.
             pace = float(rng.uniform(3.0, 6.5)) / rules.lanes[lanes[0]].speed_limit_mps
             route = lay_route(rules.lanes, lanes, _cycling_m(rules, lanes), pace)
         place = route.at(np.array(station))
+        # Skips vehicles that stick out of the start of their route, or start too close to another one.
         if station < size[0] / 2 + 1.0 or any(
             np.linalg.norm(place - other) < (size[0] + length) / 2 + FREE_M for other, length in taken
         ):
@@ -107,6 +123,7 @@ Place = tuple[float, Route, float]
 
 def _lead(rng: np.random.Generator, rules: Rules, ego: Driver) -> list[Place]:
     """Start of a slower lead car ahead of the ego, most of the time."""
+    # The gap grows with speed by half a second of driving.
     station = ego.station_m + EGO_SIZE_M[0] + float(rng.uniform(7.0, 28.0)) + 0.5 * ego.speed_mps
     slower = float(rng.uniform(0.7, 1.1))
     if rng.random() > LEAD or station > ego.route.length_m - LEAVING_M:
@@ -123,10 +140,12 @@ def _places(rng: np.random.Generator, rules: Rules, way: shapely.LineString) -> 
         spacing = float(rng.uniform(12.0, 40.0))
         station = float(rng.uniform(4.0, spacing))
         while station < lane.length_m - 4.0:
+            # Vehicles stop at the end of their route, so it reaches 200 m beyond the start.
             lanes = random_lanes(rng, rules.lanes, lane.id, station + 200.0)
             route = lay_route(rules.lanes, lanes, speed_factor=float(rng.uniform(0.6, 1.05)))
             away = float(shapely.distance(way, shapely.Point(route.at(np.array(station)))))
             if away < SEEN_M and station < route.length_m - LEAVING_M:
+                # Jitter mixes near and far places, so that not only the nearest ones are taken.
                 places.append((away + float(rng.uniform(0, 25.0)), route, station))
             station += 8.0 + float(rng.exponential(spacing))
     return sorted(places, key=lambda place: place[0])

@@ -80,6 +80,7 @@ def simulate(
     count = len(drivers)
     half = np.array([[driver.size_m[0] / 2, driver.size_m[1] / 2] for driver in drivers])
     axle = np.array([driver.axle_m for driver in drivers])
+    # Stations are those of vehicle centres; vehicles start straight, with the rear axle on the route.
     road = _Roads([driver.route for driver in drivers])
     station = np.array([driver.station_m for driver in drivers])
     speed, accel = np.array([driver.speed_mps for driver in drivers]), np.zeros(count)
@@ -88,6 +89,7 @@ def simulate(
     rear = road.at(station - axle)
     for step in range(steps + 1):
         middle[step] = road.at(station)
+        # The tractrix: the rear axle is pulled towards the centre along the line between them.
         heading = middle[step] - rear
         heading /= np.linalg.norm(heading, axis=1, keepdims=True)
         rear = middle[step] - axle[:, None] * heading
@@ -96,10 +98,14 @@ def simulate(
         gap, lead_speed = _what_is_ahead(road, front, half, middle[step], yaw[step], speed, walkers, step)
         stop = np.minimum(yields.stops_m(front, speed, half[:, 0]), stops.stops_m(front, speed, step * STEP_S))
         wanted = follow(speed, road.allowed(station), gap, lead_speed)
+        # A stop line acts as a standing leader. The model halts STAND_GAP_M behind a leader; the offset moves that to
+        # STOP_SHORT_M before the line.
         wanted = np.minimum(wanted, follow(speed, road.allowed(station), stop - front + STAND_GAP_M - STOP_SHORT_M))
         accel = accel + np.clip(wanted - accel, -14.0 * STEP_S, 5.0 * STEP_S)  # jerk limit
         after = np.maximum(speed + accel * STEP_S, 0.0)
+        # A standing vehicle keeps no negative acceleration, or the jerk limit would delay its start.
         accel = np.where(after == 0.0, np.maximum(accel, 0.0), accel)
+        # Trapezoidal rule: exact for constant acceleration.
         station, speed = station + (speed + after) / 2 * STEP_S, after
     return Boxes(middle, np.unwrap(yaw, axis=0), half)
 
@@ -110,9 +116,18 @@ def follow(
     gap_m: Float64[np.ndarray, " n"],
     lead_speed: float | Float64[np.ndarray, " n"] = 0.0,
 ) -> Float64[np.ndarray, " n"]:
-    """Accelerations by the intelligent driver model; an infinite gap is a free road."""
+    """Accelerations (m/s^2) by the intelligent driver model, within -``HARD_BRAKE_MPS2`` .. ``ACCEL_MPS2``.
+
+    Args:
+        speed: current speeds (m/s) of n vehicles.
+        wanted: desired speeds (m/s).
+        gap_m: free distance ahead of the front bumper; infinite on a free road.
+        lead_speed: speed (m/s) of the obstacle at that distance, along the route.
+    """
+    # Free term 1 - (v / v0)^4. Above the desired speed its power would brake far too hard, so it is linear there.
     share = np.minimum(speed / np.maximum(wanted, 0.05), 1.0)
     free = np.where(speed < wanted, 1 - share**4, 1.5 * (wanted - speed))
+    # Desired gap s* = s0 + max(0, v T + v dv / (2 sqrt(a b))); the interaction term is (s* / s)^2.
     closing = speed * (speed - lead_speed) / (2 * np.sqrt(ACCEL_MPS2 * BRAKE_MPS2))
     desired = STAND_GAP_M + np.maximum(0.0, speed * HEADWAY_S + closing)
     wish = ACCEL_MPS2 * (free - (desired / np.maximum(gap_m, 0.1)) ** 2)
@@ -123,6 +138,7 @@ class _Roads:
     """All routes in one array, for vectorised look-up."""
 
     def __init__(self, routes: Sequence[Route]):
+        # Shorter routes repeat their last point; `last` is the last real segment, used beyond the end.
         longest = max(len(route.xy_m) for route in routes)
         self.last = np.array([len(route.xy_m) - 2 for route in routes])
         self.xy = np.stack([np.pad(r.xy_m, ((0, longest - len(r.xy_m)), (0, 0)), mode="edge") for r in routes])
@@ -149,6 +165,7 @@ def _what_is_ahead(
     """Free distance ahead of each front bumper, and the speed of the obstacle along the route."""
     count = len(front)
     way = road.at(front[:, None] + LOOK_AHEAD_M)
+    # Vehicles first, so that box i is vehicle i; people count as standing.
     boxes = np.concatenate([middle, walkers.middle_m[step]])
     box_yaw = np.concatenate([yaw, walkers.yaw_rad[step]])
     box_half = np.concatenate([half, walkers.half_m])
@@ -161,11 +178,13 @@ def _what_is_ahead(
     hit = (np.abs(along) < box_half[:, 0] + 0.3) & (np.abs(across) < box_half[:, 1] + aside)
     turned = np.abs(np.sin(yaw[:, None] - box_yaw))[:, None]
     hit |= (np.abs(along) < box_half[:, 0] + aside * turned) & (np.abs(across) < box_half[:, 1] + 0.3)
+    # No vehicle is its own obstacle.
     hit[np.arange(count), :, np.arange(count)] = False
     blocked = hit.any(axis=2)
     first = np.argmax(blocked, axis=1)
     other = np.argmax(hit[np.arange(count), first], axis=1)
     free = ~blocked.any(axis=1)
+    # The obstacle at the nearest blocked point counts, with its speed along this vehicle's heading.
     gap = np.where(free, np.inf, LOOK_AHEAD_M[first])
     return gap, np.where(free, 0.0, box_speed[other] * np.cos(box_yaw[other] - yaw))
 
@@ -174,6 +193,7 @@ class _Yields:
     """Right of way at junctions: one row per pair of drivers with conflicting lanes."""
 
     def __init__(self, drivers: Sequence[Driver], meetings: Mapping[tuple[str, str], Conflict]):
+        # Row: me, other, my stop, their stop, conflict zone on my route [2], on theirs [2], my rank, their rank.
         rows, reds = [], []
         entries = [
             [
@@ -213,19 +233,26 @@ class _Yields:
         """Stop position of each front bumper, infinite if none."""
         stops = np.full(self.count, np.inf)
         me, other = self.me, self.other
+        # Whoever is past the stop line does not stop any more.
         inside, they_inside = front[me] > self.stop + 0.5, front[other] > self.their_stop + 0.5
+        # Their rear bumper has left the conflict zone.
         passed = front[other] - 2 * half_length[other] > self.their_far
         # Stopped vehicles may start at any time, so both speeds are overestimated slightly.
         my_pace, their_pace = speed[me] + 1.5, speed[other] + 1.5
         they_come = np.maximum(self.their_near - front[other], 0.0) / their_pace
         they_leave = (self.their_far + 2 * half_length[other] - front[other]) / np.maximum(speed[other], 0.5)
         i_come = np.maximum(self.near - front[me], 0.0) / my_pace
+        # From a stop one accelerates through the zone, hence a mean speed between the present one and a usual one.
         i_leave = (self.far + 2 * half_length[me] - front[me]) / np.maximum(0.5 * speed[me] + 2.5, 3.0)
+        # Time intervals in the zone overlap, with a margin of a second after me and 0.8 s before.
         meet = ~passed & (they_come < i_leave + 1.0) & (they_leave > i_come - 0.8)
+        # Equal ranks: first come, first served; ties go to the lower index, so that never both wait.
         sooner = np.where(np.isclose(they_come, i_come), other < me, they_come < i_come)
         theirs = they_inside | (self.their_rank > self.my_rank) | ((self.their_rank == self.my_rank) & sooner)
         held = ~inside & meet & theirs & _concerns(self.stop - front[me], speed[me])
+        # A driver may yield to several others: the nearest stop counts, hence the unbuffered minimum.
         np.minimum.at(stops, me[held], self.stop[held])
+        # Red lights stay closed; a stop sign opens for a driver who has halted at it.
         for table, closed in ((self.red, np.ones(len(self.red), bool)), (self.halt, ~self._halts(front, speed))):
             who = table[:, 0].astype(int)
             held = closed & (front[who] < table[:, 1] + 0.5) & _concerns(table[:, 1] - front[who], speed[who])
@@ -259,4 +286,5 @@ class _Stops:
 
 def _concerns(distance_m: np.ndarray, speed: np.ndarray) -> Bool[np.ndarray, " r"]:
     """Whether a stop is near enough to brake for, and far enough to be reachable."""
+    # 10 m more than braking at 1.5 m/s^2 takes, and at most 1 m less than hard braking takes.
     return (distance_m < speed**2 / 3.0 + 10.0) & (distance_m > speed**2 / (2 * HARD_BRAKE_MPS2) - 1.0)

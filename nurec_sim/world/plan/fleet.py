@@ -47,6 +47,7 @@ def pick_kind(rng: np.random.Generator, split: Split, parked: bool = False) -> A
 
 def pick_size(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
     """A random size of that kind, rounded to millimetres."""
+    # 2.5 % of variation, at most 5 %; widths stay within the legal 2.55 m.
     length, width, height = np.array(SIZE_OF_KIND_M[kind]) * (1 + np.clip(rng.normal(0, 0.025, 3), -0.05, 0.05))
     return round(float(length), 3), round(float(min(width, 2.55)), 3), round(float(height), 3)
 
@@ -59,7 +60,15 @@ def pick_colour(rng: np.random.Generator) -> tuple[float, float, float]:
 def parked_cars(
     rng: np.random.Generator, network: TownNetwork, split: Split, span_us: tuple[int, int], way: shapely.LineString
 ) -> list[Actor]:
-    """Cars in the parking strips around the ego's route, nearest first, with small pose noise."""
+    """Cars in the parking strips around the ego's route, nearest first, with small pose noise.
+
+    Args:
+        rng: random generator.
+        network: roads with their parking strips.
+        split: ``train`` or ``test``: selects the vehicle families.
+        span_us: first and last time of their (constant) poses.
+        way: the ego's route ahead (m); cars are kept within ``PARKED_NEAR_M`` of it.
+    """
     found: list[tuple[float, Actor]] = []
     for name, road in network.roads.items():
         kept_free = _kept_free(network, name)
@@ -78,6 +87,7 @@ def parked_cars(
                 if not taken or narrow or any(ends[0] < high and low < ends[1] for low, high in kept_free):
                     continue
                 middle = (ends[0] + ends[1]) / 2
+                # The narrowest point along the car counts, in road coordinates signed by side.
                 edge = side * float((side * road.edge_m(side, np.array([*ends, middle]))).min())
                 # Wheels are about 10 cm from the kerb.
                 xy, yaw = road.at(middle, edge - side * (size[1] / 2 + 0.1 + out))

@@ -20,7 +20,14 @@ ROOM_M = {"tree": 1.0, "bus_stop": 2.2, "billboard": 3.0, "hedge": 0.5, "fence":
 def town_props(
     rng: np.random.Generator, network: TownNetwork, houses: tuple[Building, ...], style: Style
 ) -> tuple[Prop, ...]:
-    """All props; only cones are on the road, and none intersects a house."""
+    """All props; only cones are on the road, and none intersects a house.
+
+    Args:
+        rng: random generator.
+        network: roads, areas and the plan with crossings and stop lines.
+        houses: of the town, which props keep clear of.
+        style: district (urban or suburban density).
+    """
     return _Furniture(rng, network, houses, style).build()
 
 
@@ -39,6 +46,7 @@ class _Furniture:
         crossings = []
         for crossing in network.plan.crossings:
             line, end = network.roads[crossing.road], crossing.station_m + crossing.depth_m
+            # Kept free up to 3 m behind both kerbs, so that people can reach the crossing.
             edges = [float(line.edge_m(side, end)) + side * 3.0 for side in (-1, 1)]
             crossings.append(line.band(crossing.station_m - 0.3, end + 0.3, *edges))
         self.crossings = shapely.union_all(crossings)
@@ -65,6 +73,7 @@ class _Furniture:
         """Adds a prop if there is space; returns whether it was added."""
         point = shapely.Point(xy)
         room = ROOM_M.get(kind, 0.35)
+        # Trees stand in narrow strips: their trunk must clear the road, their crown only the houses.
         reach = point.buffer(0.25 if kind == "tree" else min(room, 0.35), quad_segs=2)
         if self.road.intersects(reach) or self.houses.intersects(point.buffer(room, quad_segs=2)):
             return False
@@ -95,6 +104,7 @@ class _Furniture:
         stops = [s.station_m for s in self.network.plan.stop_lines if s.road == mouth.arm.road
                  and s.forward != mouth.outward]  # fmt: skip
         station = stops[0] if stops else mouth.station_m
+        # Signs are needed: if something is in the way, they move away from the kerb.
         for beyond in (0.45, 0.8, 1.2):
             xy, heading = self._beside(mouth.line, station, side, beyond)
             if rule in ("red", "green"):
@@ -136,9 +146,11 @@ class _Furniture:
             for start in (narrow.start_m - narrow.taper_m, narrow.end_m):
                 for station in np.linspace(start, start + narrow.taper_m, 5):
                     offset = float(line.edge_m(side, station)) - side * 0.3
+                    # Cones stand on parking strips only, never in a lane.
                     if abs(offset) < abs(float(line.lane_edge_m(side, station))) + 0.1:
                         continue  # no strip beside the lane here
                     xy, yaw = line.at(station, offset)
+                    # Directly, without the test for free ground, since cones are on the road.
                     self.props.append(Prop("cone", round(float(xy[0]), 3), round(float(xy[1]), 3),
                                            round(float(yaw), 4), on_road=True))  # fmt: skip
 

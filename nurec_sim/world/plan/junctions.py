@@ -65,9 +65,12 @@ def reaches(arms: Sequence[tuple[float, float, float]], corner_radius_m: float) 
     for a in range(len(arms)):
         b = (a + 1) % len(arms)
         angle = (arms[b][0] - arms[a][0]) % (2 * np.pi)
+        # Nearly straight neighbours have no corner to round.
         if len(arms) < 2 or angle > np.radians(160.0):
             continue
         left_of_a, right_of_b, tangent = arms[a][1], arms[b][2], corner_radius_m / np.tan(angle / 2)
+        # Where the left edge of a meets the right edge of b, measured along each arm; the arc of the kerb begins r /
+        # tan(angle / 2) further out.
         corner_a = (right_of_b + left_of_a * np.cos(angle)) / np.sin(angle)
         corner_b = (left_of_a + right_of_b * np.cos(angle)) / np.sin(angle)
         needed[a] = max(needed[a], float(corner_a + tangent) + MOUTH_MARGIN_M)
@@ -80,13 +83,16 @@ def join(start: Pose2, end: Pose2) -> tuple[RoadPiece, ...]:
     (p, from_yaw), (q, to_yaw) = start, end
     u, v = (np.array([np.cos(yaw), np.sin(yaw)]) for yaw in (from_yaw, to_yaw))
     turn, chord = _wrapped(to_yaw - from_yaw), q - p
+    # The sine of the turn: zero for parallel poses, which make a straight line if they also lie on one.
     cross = float(u[0] * v[1] - u[1] * v[0])
     if abs(cross) < 1e-9 and abs(float(u[0] * chord[1] - u[1] * chord[0])) < 1e-6 and float(u @ v) > 0:
         return (RoadPiece(float(np.hypot(*chord))),)
     if abs(cross) > 1e-3:
+        # Cramer's rule: distances from the start, and back from the end, to the point where the tangents meet.
         before = float(chord[0] * v[1] - chord[1] * v[0]) / cross
         after = float(u[0] * chord[1] - u[1] * chord[0]) / cross
         if before > 0.5 and after > 0.5:
+            # An arc of curvature k that turns by an angle has tangents of length tan(turn / 2) / k.
             tangent = min(before, after)
             curvature = np.tan(turn / 2) / tangent
             pieces = [RoadPiece(turn / curvature, float(curvature), float(curvature))]
@@ -95,6 +101,8 @@ def join(start: Pose2, end: Pose2) -> tuple[RoadPiece, ...]:
             if after - tangent > 1e-6:
                 pieces.append(RoadPiece(after - tangent))
             return tuple(pieces)
+    # Two arcs with equal tangents d (a biarc): |chord - d (u + v)| = 2 d, a quadratic equation in d. The arcs meet in
+    # the middle of the inner control points.
     both, bend = float(chord @ (u + v)), 2 * (1 - float(u @ v))
     handle = (np.sqrt(both**2 + bend * float(chord @ chord)) - both) / bend if bend > 1e-9 else float(
         chord @ chord) / (2 * both)  # fmt: skip
@@ -105,6 +113,7 @@ def join(start: Pose2, end: Pose2) -> tuple[RoadPiece, ...]:
 
 def _arc(chord: np.ndarray, tangent: np.ndarray, at_end: bool = False) -> RoadPiece:
     """The arc over a chord with the given tangent at its start (or its end)."""
+    # Between tangent and chord lies half the turn: chord = 2 R sin(angle), length = 2 R angle.
     angle = float(np.arctan2(tangent[0] * chord[1] - tangent[1] * chord[0], tangent @ chord)) * (-1 if at_end else 1)
     curvature = 2 * np.sin(angle) / float(np.hypot(*chord))
     return RoadPiece(float(np.hypot(*chord) / np.sinc(angle / np.pi)), float(curvature), float(curvature))
@@ -113,8 +122,14 @@ def _arc(chord: np.ndarray, tangent: np.ndarray, at_end: bool = False) -> RoadPi
 def ring_path(start: Pose2, end: Pose2, centre: np.ndarray, ring_m: float, flare_m: float) -> tuple[RoadPiece, ...]:
     """Into a roundabout from a lane, counter-clockwise along its ring, and out into another lane.
 
-    ``flare_m`` is the radius of the arcs that lead in and out. Both lanes run parallel to the line from the centre
-    through the middle of their road.
+    Both lanes run parallel to the line from the centre through the middle of their road.
+
+    Args:
+        start: position (m) and heading (rad) at which the path enters.
+        end: position and heading at which it leaves.
+        centre: of the ring [2] (m).
+        ring_m: radius of the middle of the ring's lane.
+        flare_m: radius of the arcs that lead in and out.
 
     Raises:
         ValueError: the flares do not fit between the lane and the ring.
@@ -126,6 +141,8 @@ def ring_path(start: Pose2, end: Pose2, centre: np.ndarray, ring_m: float, flare
         from_centre = xy - centre
         along = -float(inward @ from_centre)
         aside = abs(float(inward[0] * from_centre[1] - inward[1] * from_centre[0]))
+        # The flare touches the lane and, from outside, the ring: its centre is aside + flare from the axis and ring +
+        # flare from the centre of the roundabout.
         depth = np.sqrt((ring_m + flare_m) ** 2 - (aside + flare_m) ** 2)
         turn = float(np.arcsin((aside + flare_m) / (ring_m + flare_m)))
         if along < depth:
@@ -153,6 +170,7 @@ def connections(junction: str, mouths: Sequence[Mouth], ring: tuple[np.ndarray, 
             outbound = target.lanes(inbound=False)
             if a == b or not inbound or not outbound:
                 continue
+            # Both mouths head outwards, so going straight on is a difference of pi.
             change = _wrapped(target.pose()[1] - source.pose()[1] - np.pi)
             if ring is None and abs(change) > SHARPEST_TURN_RAD:
                 continue
@@ -160,6 +178,7 @@ def connections(junction: str, mouths: Sequence[Mouth], ring: tuple[np.ndarray, 
             turn = "straight" if abs(change) < STRAIGHT_RAD else "left" if change > 0 else "right"
             if turn == "left":
                 pairs = [(inbound[0], outbound[0])]
+            # Ramps leave and join the outermost lane.
             elif turn == "right" or _has_ramp(source, target):
                 pairs = [(inbound[-1], outbound[-1])]
             else:
@@ -185,7 +204,16 @@ def _has_ramp(*mouths: Mouth) -> bool:
 
 def crossing(junction: str, kind: Literal["crossing", "fork"], centre: np.ndarray, arms: Sequence[Arm],
              roads: dict[str, Road], corner_radius_m: float) -> Junction:  # fmt: skip
-    """A junction of roads that already end at its mouths."""
+    """A junction of roads that already end at its mouths.
+
+    Args:
+        junction: id of the junction.
+        kind: ``crossing``, or ``fork`` for a ramp.
+        centre: of the junction [2] (m).
+        arms: ends of roads that meet, with their traffic control.
+        roads: at least the roads of the arms, by id.
+        corner_radius_m: radius of the kerbs between neighbouring arms.
+    """
     mouths = [Mouth(arm, RoadLanes(roads[arm.road])) for arm in arms]
     return Junction(junction, kind, float(centre[0]), float(centre[1]), corner_radius_m, tuple(arms),
                     connections(junction, mouths))  # fmt: skip
@@ -193,7 +221,18 @@ def crossing(junction: str, kind: Literal["crossing", "fork"], centre: np.ndarra
 
 def roundabout(junction: str, centre: np.ndarray, arms: Sequence[Arm], roads: dict[str, Road], corner_radius_m: float,
                ring_radius_m: float, ring_width_m: float, flare_m: float) -> Junction:  # fmt: skip
-    """A roundabout, entered to the right and driven counter-clockwise."""
+    """A roundabout, entered to the right and driven counter-clockwise.
+
+    Args:
+        junction: id of the junction.
+        centre: of the ring [2] (m).
+        arms: ends of roads that meet, with their traffic control.
+        roads: at least the roads of the arms, by id.
+        corner_radius_m: radius of the kerbs between arms and ring.
+        ring_radius_m: radius of the middle of the ring's lane.
+        ring_width_m: width of the ring.
+        flare_m: radius of the arcs from lanes into the ring and out of it.
+    """
     mouths = [Mouth(arm, RoadLanes(roads[arm.road])) for arm in arms]
     paths = connections(junction, mouths, (centre, ring_radius_m, flare_m))
     return Junction(junction, "roundabout", float(centre[0]), float(centre[1]), corner_radius_m, tuple(arms), paths,

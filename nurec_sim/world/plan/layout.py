@@ -43,7 +43,14 @@ def town_plan(seed: int, split: Split = "train", template: str | None = None, se
 
 
 def still_town(seed: int, split: Split = "train", template: str | None = None, seconds: float = 12.0) -> TownPlan:
-    """The same town without traffic; arguments and errors as in ``town_plan``."""
+    """The same town without traffic; raises as ``town_plan`` does.
+
+    Args:
+        seed: seed of the town, at least 0.
+        split: ``train`` or ``test``.
+        template: one of ``splits.TEMPLATES``; by seed if not given.
+        seconds: length of the drive, 1..30.
+    """
     if seed < 0 or not 1.0 <= seconds <= MOST_SECONDS:
         raise ValueError(
             f"a town needs a seed >= 0 and 1..{MOST_SECONDS:g} seconds, got seed {seed}, {seconds} seconds"
@@ -54,6 +61,7 @@ def still_town(seed: int, split: Split = "train", template: str | None = None, s
     if template is not None and template not in allowed:
         raise ValueError(f"no template {template!r} in split {split!r}; have {', '.join(allowed)}")
 
+    # One independent stream per group of properties: more samples in one group leave all others unchanged.
     def stream(number: int) -> np.random.Generator:
         return np.random.default_rng([STREAM_OF_SPLIT[split], seed, number])
 
@@ -81,6 +89,7 @@ def still_town(seed: int, split: Split = "train", template: str | None = None, s
         buildings=(),
         props=(),
     )
+    # Each stage needs the areas of the previous one: paint needs roads, houses need paved areas, props need houses.
     crossings, stop_lines = _crossings(stream(5), TownNetwork(plan))
     plan = replace(plan, crossings=crossings, stop_lines=stop_lines)
     network = TownNetwork(plan)
@@ -95,6 +104,7 @@ def _crossings(rng: np.random.Generator, network: TownNetwork) -> tuple[tuple[Cr
     stops: list[StopLine] = []
     for junction in network.plan.junctions:
         for mouth in network.junction_mouths[junction.id]:
+            # Stop lines lie behind a crossing if there is one.
             from_mouth = 0.4
             if junction.kind != "fork" and mouth.line.length_m > 30.0 and rng.random() < 0.7:
                 depth = round(float(rng.uniform(2.6, 3.6)), 2)

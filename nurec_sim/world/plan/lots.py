@@ -19,7 +19,10 @@ NEAR_HOUSE_M = 1.0
 
 @dataclass(frozen=True)
 class _Manner:
-    """Building parameters of a district: ranges in metres."""
+    """Building parameters of a district: ranges in metres, ``floors`` as [low, high).
+
+    ``gable`` and ``shop`` are probabilities of a gable roof and a ground-floor shop, ``built`` that a lot is built on.
+    """
 
     width: tuple[float, float]
     depth: tuple[float, float]
@@ -43,6 +46,7 @@ def town_houses(rng: np.random.Generator, network: TownNetwork, style: Style) ->
 class _Lots:
     def __init__(self, rng: np.random.Generator, network: TownNetwork, style: Style):
         self.rng, self.network, self.style = rng, network, style
+        # A small margin keeps walls and roof edges off the sidewalk; prepared geometry speeds up the many tests.
         self.streets = network.paved.buffer(0.3, quad_segs=2)
         shapely.prepare(self.streets)
         self.houses: list[Building] = []
@@ -65,8 +69,10 @@ class _Lots:
 
     def _row(self, road: str, side: int) -> None:
         rng, line, kerb = self.rng, self.network.roads[road], self.network.plan.kerb
+        # Rows start before the road does and end behind it, so that corners do not look open.
         station = float(rng.uniform(-8, 4))
         while station < line.length_m + 4:
+            # The district is looked up at a typical half width, since the width depends on the district.
             middle = min(max(station + 7.0, 0.0), line.length_m)
             manner = self._manner(line.at(middle)[0])
             width, depth = float(rng.uniform(*manner.width)), float(rng.uniform(*manner.depth))
@@ -74,10 +80,13 @@ class _Lots:
             edge = abs(float(line.edge_m(side, middle))) + kerb.width_m + kerb.sidewalk_width_m
             away = edge + float(rng.uniform(*manner.setback)) + depth / 2
             xy, yaw = line.at(middle, side * away)
+            # A house faces +y of its own frame: on the right of a road that is towards the road, on the left away from
+            # it.
             facing = float(yaw) + (np.pi if side > 0 else 0.0)
             built = rng.random() < manner.built and self._place(
                 xy, facing, width, depth, int(rng.integers(*manner.floors)), manner
             )
+            # Where nothing fits, try again a little further along the road.
             station += width + float(rng.uniform(*manner.gap)) if built else 3.0
 
     def _ends(self) -> None:
@@ -88,6 +97,7 @@ class _Lots:
                 if (name, end) in with_mouth:
                     continue
                 xy, yaw = line.at(station)
+                # Far enough beyond the end for the sidewalk, near enough to close the view along the road.
                 away = xy + sign * 16.0 * np.array([np.cos(yaw), np.sin(yaw)])
                 self._place(away, float(yaw + np.pi / 2), 28.0, 12.0, int(self.rng.integers(3, 6)), _URBAN)
 
@@ -104,9 +114,11 @@ class _Lots:
         footprint = shapely.Polygon(box_corners_xy(pose_from_xyyaw(xy[0], xy[1], yaw), width, depth))
         if self.streets.intersects(footprint):
             return False
+        # dwithin on all footprints at once is faster than buffering each candidate.
         if self.footprints and shapely.dwithin(np.array(self.footprints), footprint, clear).any():
             return False
         self.footprints.append(footprint)
+        # Numbers are rounded because a plan is stored as text.
         red, green, blue = (round(float(v), 3) for v in rng.uniform(0.82, 1.0, 3))
         self.houses.append(Building(
             round(float(xy[0]), 3), round(float(xy[1]), 3), round(float(yaw), 5), round(width, 3), round(depth, 3),

@@ -28,7 +28,14 @@ class Marking:
 def town_markings(
     plan: TownPlan, roads: Mapping[str, RoadLanes], junctions: Mapping[str, list[Mouth]], surface: shapely.Geometry
 ) -> tuple[Marking, ...]:
-    """All paint of a town, within ``surface``."""
+    """All paint of a town, within ``surface``.
+
+    Args:
+        plan: the town; its style decides the colour of centre lines.
+        roads: by id, centre line and cross-section of every road.
+        junctions: by id, the arms of every junction.
+        surface: area between the kerbs (m); paint is clipped to it.
+    """
     painted: list[Marking] = []
     centre_colour: Literal["white", "yellow"] = "yellow" if plan.style.yellow_lines else "white"
     for line in roads.values():
@@ -39,12 +46,14 @@ def town_markings(
     white: list[shapely.Polygon] = []
     for junction in plan.junctions:
         if junction.kind == "fork":
+            # A fork has no kerbs between main road and ramp: its lines run on, with short wide dashes along the exit.
             through = _through(junctions[junction.id])
             painted += [Marking(centre_colour, area) for area in _centre_line(through, 0.0, through.length_m)]
             white += _lane_lines(through, 0.0, through.length_m)
             white += _dashes(through, 0.0, through.length_m, -through.plan.lanes_forward, 1.0, 1.5, 0.2)
     for crossing in plan.crossings:
         white += _crossing(roads[crossing.road], crossing)
+    # Keyed as stop lines are: a road that ends at the junction (not outward) is left driving forward.
     rules = {(mouth.arm.road, not mouth.outward): mouth.arm.rule for group in junctions.values() for mouth in group}
     for stop in plan.stop_lines:
         white += _stop_line(roads[stop.road], stop, broken=rules.get((stop.road, stop.forward)) == "yield")
@@ -52,12 +61,14 @@ def town_markings(
         for mouth in group:
             white += _arrows(mouth, plan)
     painted += [Marking("white", area) for area in white]
+    # Paint keeps 2 cm off the kerb. Most of it lies inside, where no intersection is needed.
     inside = shapely.buffer(surface, -0.02)
     shapely.prepare(inside)
     clipped: list[Marking] = []
     for marking in painted:
         area = marking.area if inside.contains(marking.area) else marking.area.intersection(inside)
         parts = shapely.get_parts(area)
+        # Slivers and stray lines of an intersection are no paint.
         clipped += [Marking(marking.colour, part) for part in parts
                     if isinstance(part, shapely.Polygon) and part.area > 0.005]  # fmt: skip
     return tuple(clipped)
@@ -92,8 +103,10 @@ def _dashes(line: RoadLanes, start: float, end: float, offset_of: float, on: flo
             ) -> list[shapely.Polygon]:  # fmt: skip
     """Dashes aligned with the road's stations, ``offset_of`` lane widths from the centre line."""
     found = []
+    # Multiples of the period from station 0, so that dashes continue from one part of a line to the next.
     for dash in np.arange(np.floor(start / (on + off)) * (on + off), end, on + off):
         low, high = max(dash, start), min(dash + on, end)
+        # Shorter stubs at crossings would look like errors.
         if high - low > 0.3:
             offset = offset_of * line.lane_width_m(line.stations(low, high))
             found.append(_stripe(line, low, high, offset, width))
@@ -138,6 +151,7 @@ def _crossing(line: RoadLanes, crossing: Crossing) -> list[shapely.Polygon]:
     right, left = (float(line.edge_m(side, (start + end) / 2)) for side in (-1, 1))
     if not crossing.zebra:
         return [line.band(s - 0.07, s + 0.07, right + 0.1, left - 0.1) for s in (start, end)]
+    # Stripes of 0.5 m at a pitch of 1 m, centred between the kerbs.
     count = int((left - right - 0.4) // 1.0)
     first = (left + right) / 2 - count / 2 + 0.25
     return [line.band(start, end, first + k, first + k + 0.5) for k in range(count)]
@@ -146,10 +160,12 @@ def _crossing(line: RoadLanes, crossing: Crossing) -> list[shapely.Polygon]:
 def _stop_line(line: RoadLanes, stop: StopLine, broken: bool) -> list[shapely.Polygon]:
     side = -1 if stop.forward else 1
     edge = float(line.lane_edge_m(side, stop.station_m)) - side * 0.25
+    # From beside the centre line to a little before the edge of the lanes.
     low, high = sorted((0.12 * side, edge))
     behind = (stop.station_m - 0.4, stop.station_m) if stop.forward else (stop.station_m, stop.station_m + 0.4)
     if not broken:
         return [line.band(*behind, low, high)]
+    # A yield line is a row of blocks.
     return [line.band(*behind, a, a + 0.5) for a in np.arange(low + 0.1, high - 0.45, 0.8)]
 
 
@@ -162,6 +178,7 @@ def _arrows(mouth: Mouth, plan: TownPlan) -> list[shapely.Polygon]:
     found = []
     for number in lanes:
         turns = {c.turn for c in junction.connections if c.from_lane == f"{mouth.arm.road}:{number}"}
+        # Arrows lie 17 m before the junction and point towards it.
         station = 17.0 if mouth.outward else mouth.line.length_m - 17.0
         xy, yaw = mouth.line.at(station, mouth.line.lane_offset_m(number, station))
         heading = float(yaw) + (np.pi if mouth.outward else 0.0)

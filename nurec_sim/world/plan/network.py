@@ -97,6 +97,7 @@ class TownNetwork:
         return town_markings(self.plan, self.roads, self.junction_mouths, self.surface)
 
     def _grown(self, by_m: float) -> shapely.Geometry:
+        # The same rounding and grid as the surface, so that neighbouring areas share vertices.
         grown = shapely.buffer(self.surface, by_m, quad_segs=QUARTER_SEGMENTS)
         return shapely.set_precision(grown.simplify(SMOOTH_M), GRID_M)
 
@@ -107,6 +108,7 @@ class TownNetwork:
         after: dict[str, list[str]] = {}
         for _, path in paths:
             after.setdefault(path.from_lane, []).append(path.id)
+        # Lanes into a junction, by their id.
         ends_at = {
             f"{mouth.arm.road}:{number}": junction
             for junction, arms in self.junction_mouths.items()
@@ -121,6 +123,7 @@ class TownNetwork:
                 yield Lane(
                     id=key,
                     road=name,
+                    # Positive lanes drive against the stations.
                     polyline=self._on_ground(xy if number < 0 else xy[::-1]),
                     width_m=float(line.lane_width_m(stations).min()),
                     speed_limit_mps=line.plan.speed_limit_mps,

@@ -41,6 +41,7 @@ def junction_area(junction: Junction, roads: Mapping[str, RoadLanes]) -> shapely
     for path in junction.connections:
         half = roads[path.from_lane.rpartition(":")[0]].plan.lane_width_m / 2
         line = RoadLine(path)
+        # buffer(0) repairs bands that overlap themselves in tight turns.
         parts.append(line.band(0.0, line.length_m, -half, half).buffer(0))
     if junction.kind == "roundabout":
         point, half = shapely.Point(centre), junction.ring_width_m / 2
@@ -52,6 +53,7 @@ def junction_area(junction: Junction, roads: Mapping[str, RoadLanes]) -> shapely
 
 def _rounded(area: shapely.Geometry, radius_m: float) -> shapely.Geometry:
     """An area with its inner corners filled to arcs."""
+    # A morphological closing: outer corners return to their place, inner ones keep the radius.
     return area.buffer(radius_m, quad_segs=QUARTER_SEGMENTS).buffer(-radius_m, quad_segs=QUARTER_SEGMENTS)
 
 
@@ -66,5 +68,6 @@ def _stub(mouth: Mouth, centre: np.ndarray) -> shapely.Polygon:
     right, yaw = mouth.line.at(station, mouth.line.edge_m(-1, station))
     left, _ = mouth.line.at(station, mouth.line.edge_m(1, station))
     outward = np.array([np.cos(yaw), np.sin(yaw)]) * (1 if mouth.outward else -1)
+    # As far as the centre, plus 5 cm of overlap so that opposite arms leave no gap.
     inwards = -outward * (float(outward @ (right - centre)) + 0.05)
     return shapely.Polygon([right, left, left + inwards, right + inwards])

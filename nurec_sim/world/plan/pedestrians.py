@@ -84,10 +84,12 @@ def _on_sidewalks(
 ) -> list[Walker]:
     kerb = network.plan.kerb
     near, far = _walking_m(kerb)
+    # Walking directions keep different distances from the kerb, so that people do not meet head-on.
     rings = {direction: _rings(network.surface.buffer(kerb.width_m + m)) for direction, m in ((1, near), (-1, far))}
     walkable = network.sidewalk.buffer(0.05)
     shapely.prepare(walkable)
     found: list[Walker] = []
+    # Some places are unsuitable; a few tries each are enough.
     for _ in range(4 * count):
         if len(found) == count:
             break
@@ -103,8 +105,10 @@ def _on_sidewalks(
             continue
         if not shapely.contains_xy(walkable, *xy[:: max(1, len(xy) // 12)].T).all():
             continue
+        # Headings from a secant of 1.2 m turn smoothly at the corners of the ring.
         step = at((station + 0.6) % length[-1]) - at((station - 0.6) % length[-1])
         yaw = np.unwrap(np.arctan2(step[:, 1], step[:, 0])) + (np.pi if direction < 0 else 0.0)
+        # Standing people face in any direction.
         if pace == 0.0:
             yaw = yaw + float(rng.uniform(-np.pi, np.pi))
         found.append(Walker(xy, yaw, np.full(len(t_s), kerb.height_m), _size(rng), pick_colour(rng)))
@@ -142,6 +146,7 @@ def _on_crossings(
         middle, _ = road.at(crossing.station_m + crossing.depth_m / 2)
         if shapely.distance(way, shapely.Point(middle)) > NEAR_M:
             continue
+        # Two people cross side by side, not through each other.
         for share in (0.3, 0.7)[: int(rng.choice(3, p=CROSSERS))]:
             station = crossing.station_m + share * crossing.depth_m
             walker = _crosser(rng, network, crossing, station, t_s)
@@ -160,6 +165,7 @@ def _crosser(
     near, far = (float(road.edge_m(s, station_m)) + s * beyond for s in (side, -side))
     inward = 1.0 if station_m < road.length_m / 2 else -1.0  # away from the junction that the crossing belongs to
     before, after = (station_m + inward * float(rng.uniform(2.0, 12.0)) for _ in range(2))
+    # In road coordinates (station, offset), so that the path follows bends.
     corners = np.array([(before, near), (station_m, near), (station_m, far), (after, far)])
     places = _rounded(corners)
     xy = road.at(places[:, 0], places[:, 1])[0]
@@ -172,12 +178,14 @@ def _crosser(
     edges = sorted(float(road.edge_m(s, station_m)) for s in (-1, 1))
     outside = np.maximum(offset - edges[1], edges[0] - offset)
     both_ways = road.count(-1) > 0 and road.count(1) > 0
+    # On a one-way road its traffic waits for the whole width.
     sides = ((edges[0], 0.0), (0.0, edges[1])) if both_ways else ((edges[0], edges[1]),) * 2
     busy = []
     for low, high in sides:  # a side is occupied from one step before entering until one step after leaving
         inside = length[(places[:, 1] > low - 0.7) & (places[:, 1] < high + 0.7)]
         busy.append((start_s + float(inside[0]) / pace, start_s + float(inside[-1]) / pace))
     yaw = np.unwrap(np.arctan2(*(ahead - behind).T[::-1]))
+    # Feet step up the kerb over 25 cm.
     foot = kerb.height_m * np.clip(outside / 0.25 + 0.5, 0.0, 1.0)
     return Walker(at(walked), yaw, foot, _size(rng), pick_colour(rng), crossing, tuple(busy))
 

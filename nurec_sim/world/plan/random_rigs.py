@@ -59,7 +59,7 @@ def random_rig(
         lidar: ``64x900``, a key of ``sensors.LIDAR_TABLES``, or None for a rig without a LiDAR.
 
     Raises:
-        ValueError: a value that is not listed here; the text says which and what is allowed.
+        ValueError: a value outside the options above; the message names it and the allowed ones.
     """
     if seed < 0:
         raise ValueError(f"a rig needs a seed >= 0, got {seed}")
@@ -69,8 +69,10 @@ def random_rig(
         raise ValueError(f"no kind of lens {lens!r}; have {list(LENS_KINDS)}")
     if pixels < 64 * PATCH_PX**2:
         raise ValueError(f"an image needs at least {64 * PATCH_PX**2} pixels, got {pixels}")
+    # The second key separates this stream from those of other generators with the same seed.
     rng = np.random.default_rng([seed, 0x416])
     count = int(rng.choice(CAMERA_COUNTS)) if cameras is None else cameras
+    # Sampled even if ``lens`` overrides it, so that all later samples stay the same.
     kind = str(rng.choice(list(LENS_KINDS), p=list(LENS_KINDS.values())))
     shutter = list(SHUTTERS)[int(rng.choice(len(SHUTTERS), p=list(SHUTTERS.values())))]
     size = _size_px(rng, pixels)
@@ -90,11 +92,14 @@ def random_readout_us(seed: int) -> int:
 
 def _size_px(rng: np.random.Generator, pixels: int) -> tuple[int, int]:
     """Sides in whole patches: of all that meet the wanted number of pixels, those nearest to a random aspect ratio."""
+    # Sides of whole patches keep images usable by networks that work on patches of 14 pixels.
     patches = pixels / PATCH_PX**2
+    # Log-uniform: ratios have no preferred direction.
     wanted = np.exp(rng.uniform(*np.log(ASPECT)))
     rows = np.arange(4, int(np.sqrt(patches)) + 2)
     columns = np.maximum(np.rint(patches / rows), 4).astype(int)
     fits = np.abs(rows * columns / patches - 1) < 0.1
+    # Distance in log ratio; sizes that miss the pixel count are out.
     off = np.where(fits, np.abs(np.log(columns / rows / wanted)), np.inf)
     best = int(np.argmin(off))
     return int(columns[best]) * PATCH_PX, int(rows[best]) * PATCH_PX
@@ -124,6 +129,7 @@ def _camera(
 ) -> CameraModel:
     yaw, place = mount
     tilt, roll = np.deg2rad(rng.normal(1.0, 2.0)), np.deg2rad(rng.normal(0.0, 0.7))
+    # Yaw, then pitch, then roll, each with a small mounting error.
     turn = geometry.rotation_from_yaw(yaw + np.deg2rad(rng.normal(0, 1.2))) @ _pitch(tilt) @ _roll(roll)
     pose = geometry.pose(turn @ CAMERA_FROM_RIG_AXES, place)
     return CameraModel(name, *size_px, _lens(rng, kind, size_px, field_rad), pose, shutter)
@@ -144,6 +150,7 @@ def _lens(rng: np.random.Generator, kind: str, size_px: tuple[int, int], field_r
     width, height = size_px
     centre = float(width * rng.uniform(0.48, 0.52)), float(height * rng.uniform(0.4, 0.54))
     shape = rng.uniform(-1.0, 1.0, 6)
+    # Strong distortion folds the image, so that rim pixels have no ray; easing towards an ideal lens removes the fold.
     for ease in 0.9 ** np.arange(20):
         lens = _MAKERS[kind](width, centre, ease * field_rad / 2, ease * shape)
         if sensors.pixel_rays(CameraModel("", width, height, lens, np.eye(4)))[1].all():
@@ -163,9 +170,11 @@ def _pinhole(width: int, centre: Centre, half_rad: float, shape: Shape) -> Lens:
 
 def _distorted(width: int, centre: Centre, half_rad: float, shape: Shape) -> Lens:
     """Barrel or slight pincushion distortion."""
+    # Distortion of the Brown-Conrady model: r (1 + k1 r^2 + k2 r^4 + k3 r^6).
     radial = (-0.12 + 0.18 * shape[0], 0.04 + 0.04 * shape[1], 0.01 * shape[2])
     edge = np.tan(half_rad)
     spread = edge * (1 + np.polynomial.polynomial.polyval(edge**2, (0.0, *radial)))
+    # The ray at half the field lies on the image border; the bound keeps folded lenses finite.
     focal = float(width / 2 / max(spread, 0.3 * edge))
     k1, k2, k3 = (float(value) for value in radial)
     tangential = (float(6e-4 * shape[3]), float(6e-4 * shape[4]))
@@ -190,6 +199,7 @@ def _ftheta(width: int, centre: Centre, half_rad: float, shape: Shape) -> Lens:
     lens = FTheta(*centre, FThetaReference.ANGLE_TO_PIXELDIST, angle_to_pixeldist=distances)
     if shape[3] > 0:
         return lens
+    # The inverse polynomial is fitted out to twice the image width, then becomes the reference.
     filled = sensors.fill_ftheta(lens, 2.0 * width)
     return replace(filled, reference=FThetaReference.PIXELDIST_TO_ANGLE)
 

@@ -13,11 +13,18 @@ CAMERAS = {  # yaw (deg), horizontal field of view (deg), position in the rig (m
     "camera_front_right": (-58.0, 74.0, (1.55, -0.5, 1.45)),
 }
 LIDAR_ID = "lidar_top"
+# Columns: the camera's right, down and forward axes in a rig frame of x forward, y left, z up.
 CAMERA_FROM_RIG_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def street_rig(width_px: int = 448, height_px: int = 256, lidar_rows: int = 48, lidar_columns: int = 600) -> Rig:
     """The rig of the demo clip, in any resolution.
+
+    Args:
+        width_px: image width of every camera, at least 16.
+        height_px: image height, at least 16.
+        lidar_rows: laser rows, at least 2.
+        lidar_columns: firings per turn, at least 8.
 
     Raises:
         ValueError: images smaller than 16 pixels, or a LiDAR with fewer than 2 rows or 8 columns.
@@ -40,6 +47,8 @@ def street_rig(width_px: int = 448, height_px: int = 256, lidar_rows: int = 48, 
 
 def dense_near_horizon(rows: int, columns: int, rig_from_lidar: Matrix4) -> LidarModel:
     """A clockwise LiDAR with the densest rows around the horizon, reaching up to roofs."""
+    # A third of the rows looks down at the road, a fifth up, and the rest lies within 9 degrees below and 6 above the
+    # horizon.
     steep, high = rows // 3, rows // 5
     bands = ((-26.0, -9.0, steep), (-9.0, 6.0, rows - steep - high), (6.0, 21.0, high))
     elevation_deg = np.concatenate([np.linspace(low, top, count, endpoint=False) for low, top, count in bands])

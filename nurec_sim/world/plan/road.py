@@ -14,6 +14,7 @@ from jaxtyping import Float64
 from nurec_sim.world.plan.town import Road, RoadPiece
 
 STEP_M = 1.0
+# Eight nodes integrate polynomials up to degree 15 exactly, far beyond what the gentle clothoids of a road need.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
@@ -56,6 +57,7 @@ class RoadLine:
     ) -> tuple[Float64[np.ndarray, "*n 2"], Float64[np.ndarray, "*n"]]:
         """Position and heading on the curve; stations are clamped to its range."""
         station = np.clip(np.asarray(station_m, np.float64), 0.0, self.length_m)
+        # A station on a boundary belongs to the next piece; the end of the road belongs to the last one.
         piece_of = np.clip(
             np.searchsorted(self.piece_station_m, station, side="right") - 1, 0, len(self.curve.pieces) - 1
         )
@@ -64,6 +66,7 @@ class RoadLine:
             here = piece_of == index
             if here.any():
                 xy[here], yaw[here] = _along(piece, *self._starts[index], station[here] - self.piece_station_m[index])
+        # The left normal of a heading (cos, sin) is (-sin, cos).
         offset = np.asarray(offset_m, np.float64)[..., None]
         return xy + offset * np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1), yaw
 
@@ -75,7 +78,14 @@ class RoadLine:
     def band(
         self, start_m: float, end_m: float, right_m: float | np.ndarray, left_m: float | np.ndarray
     ) -> shapely.Polygon:
-        """The area between two offsets (one number, or one per ``stations(start_m, end_m)``)."""
+        """The area between two lateral offsets, as a polygon with a vertex on each side at every station.
+
+        Args:
+            start_m: first station, in metres along the centre line.
+            end_m: last station.
+            right_m: offset of the right edge (m, left positive): one number, or one per ``stations(start_m, end_m)``.
+            left_m: offset of the left edge, likewise.
+        """
         stations = self.stations(start_m, end_m)
         right, _ = self.at(stations, right_m)
         left, _ = self.at(stations, left_m)
@@ -134,8 +144,10 @@ class RoadLanes(RoadLine):
         narrow = self.plan.narrowing
         if narrow is None or narrow_value is None:
             return np.full(station.shape, usual)
+        # 1 at both ends of the narrow part and beyond 1 within it; falls to 0 over the length of a taper outside.
         inside = np.minimum(station - narrow.start_m, narrow.end_m - station) / narrow.taper_m + 1
         share = np.clip(inside, 0.0, 1.0)
+        # The smoothstep 3 s^2 - 2 s^3 has zero slope at both ends, and OpenDRIVE can express it exactly.
         return usual + (narrow_value - usual) * share**2 * (3 - 2 * share)
 
 
@@ -145,12 +157,16 @@ def _along(
     """Position and heading along a piece: closed form for arcs, Gauss-Legendre for clothoids."""
     first = piece.start_curvature_per_m
     change = (piece.end_curvature_per_m - first) / piece.length_m
+    # Curvature k0 + k' s integrates to the heading yaw0 + k0 s + k' s^2 / 2.
     yaw = yaw_rad + (first + change * distance_m / 2) * distance_m
     if change == 0.0:  # the chord of an arc
+        # A chord is s sin(a) / a long for half the turned angle a, and points along the mean heading. np.sinc(x) is
+        # sin(pi x) / (pi x), so that straight lines need no special case.
         half = (yaw - yaw_rad) / 2
         chord = distance_m * np.sinc(half / np.pi)
         middle = yaw_rad + half
         return start + np.stack([chord * np.cos(middle), chord * np.sin(middle)], axis=-1), yaw
+    # Fresnel integrals: position is the integral of (cos, sin) of the heading, per distance from the start.
     inner = distance_m[:, None] * (_NODES + 1) / 2
     heading = yaw_rad + (first + change * inner / 2) * inner
     scale = distance_m / 2

@@ -58,7 +58,14 @@ def _on_grid(points: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def random_lanes(rng: np.random.Generator, lanes: Mapping[str, Lane], first: str, length_m: float) -> tuple[str, ...]:
-    """A random lane sequence from the start of ``first``, until ``length_m`` or the end of the town."""
+    """A random lane sequence.
+
+    Args:
+        rng: random generator.
+        lanes: of the town, by id.
+        first: id of the lane to start on.
+        length_m: the sequence ends when its lanes are this long together, or at the end of the town.
+    """
     way, length = [first], lanes[first].length_m
     while length < length_m and lanes[way[-1]].successors:
         options = lanes[way[-1]].successors
@@ -68,19 +75,28 @@ def random_lanes(rng: np.random.Generator, lanes: Mapping[str, Lane], first: str
 
 
 def lay_route(lanes: Mapping[str, Lane], way: Sequence[str], right_m: float = 0.0, speed_factor: float = 1.0) -> Route:
-    """The route along lanes, ``right_m`` to the right of their centre, with limits scaled by a factor."""
+    """The route along a sequence of lanes.
+
+    Args:
+        lanes: of the town, by id.
+        way: ids of successive lanes.
+        right_m: lateral offset to the right of the lane centres.
+        speed_factor: scales the speed limits; below 1 also the speed in bends.
+    """
     pieces: list[np.ndarray] = []
     limits, legs, start = [], [], 0.0
     for name in way:
         lane = lanes[name]
         xy = lane.polyline[:, :2]
         length = lane.length_m
+        # A lane starts where its predecessor ends; the shared point is kept once.
         pieces.append(xy if not pieces else xy[1:])
         limits.append(lane.speed_limit_mps)
         legs.append(Leg(name, start, start + length, lane.in_junction))
         start += length
     points = np.concatenate(pieces)
     station = geometry.arc_length(points)
+    # Interpolation needs strictly growing stations.
     keep = np.concatenate([[True], np.diff(station) > 1e-6])
     points, station = points[keep], station[keep]
     grid = np.arange(int(start / SPACING_M) + 1) * SPACING_M
@@ -100,6 +116,7 @@ def _allowed(xy: np.ndarray, limit_mps: np.ndarray, speed_factor: float) -> Floa
     padded = np.pad(yaw, reach, mode="edge")
     bend = np.abs(padded[2 * reach :] - padded[: -2 * reach]) / (2 * reach * SPACING_M)
     bend = np.append(bend, bend[-1])
+    # Lateral acceleration v^2 k stays below SIDEWAYS_MPS2.
     speed = np.minimum(limit_mps, np.sqrt(SIDEWAYS_MPS2 / np.maximum(bend, 1e-6)) * min(speed_factor, 1.0))
     speed[-int(END_M / SPACING_M) :] = 0.0
     # v^2 falls by 2 a per metre before a slow place: the lower envelope of lines of that slope, from the end on.
@@ -128,6 +145,7 @@ def conflicts(lanes: Mapping[str, Lane]) -> dict[tuple[str, str], Conflict]:
     found = {}
     for a, first in inside.items():
         for b, second in inside.items():
+            # Paths from the same lane diverge: their vehicles already follow each other.
             if a == b or before[a] & before[b]:
                 continue
             near = cdist(first.polyline[:, :2], second.polyline[:, :2]) < CONFLICT_M

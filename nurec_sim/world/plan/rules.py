@@ -40,6 +40,7 @@ class Rules:
             rule_of = {(arm.road, arm.end): arm.rule for arm in junction.arms}
             for path in junction.connections:
                 road, _, number = path.from_lane.rpartition(":")
+                # Negative lanes run with the stations of their road and reach the junction at its end.
                 forward = int(number) < 0
                 rule = rule_of[road, "end" if forward else "start"]
                 self.rank[path.id] = RANK_OF_RULE[rule] + (LEFT_TURN_RANK if path.turn == "left" else 0)
@@ -58,7 +59,15 @@ class Rules:
         size_m: tuple[float, float, float],
         axle_m: float | None = None,
     ) -> Driver:
-        """A driver with these rules; the rear axle position follows from the length if ``axle_m`` is None."""
+        """A driver who follows these rules.
+
+        Args:
+            route: lanes to drive.
+            station_m: initial station of the vehicle's centre on the route.
+            speed_mps: initial speed.
+            size_m: length, width and height.
+            axle_m: distance from the rear axle to the centre; if None, a usual fraction of the length.
+        """
         axle = drivers.AXLE_BEHIND_MIDDLE * size_m[0] if axle_m is None else axle_m
         return Driver(route, station_m, speed_mps, size_m, self.rank, self.stop_short_m, self.must_halt, axle)
 
@@ -74,6 +83,8 @@ class Rules:
                         continue
                     forward = int(number) < 0
                     end = crossing.station_m + crossing.depth_m
+                    # Distance from the start of the lane, in its own driving direction, to the near edge of the
+                    # crossing.
                     before = crossing.station_m if forward else self.network.roads[road].length_m - end
                     since, until = walker.on_road_s[0 if forward else 1]
                     stop = leg.start_m + before - BEFORE_CROSSING_M

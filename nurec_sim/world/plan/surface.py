@@ -30,6 +30,7 @@ class SurfaceClass(enum.IntEnum):
     ISLAND = 15
 
 
+# Fraction of a laser's light that is reflected: retroreflecting signs and paint are bright, asphalt is dark.
 REFLECTIVITY = {
     SurfaceClass.SKY: 0.0,
     SurfaceClass.ROAD: 0.12,

@@ -47,6 +47,7 @@ def touching(boxes: Boxes, margin_m: float = 0.0) -> list[tuple[int, int]]:
     rows, columns = np.triu_indices(len(radius), 1)
     some = moves[rows] | moves[columns]
     rows, columns = rows[some], columns[some]
+    # Circumscribed circles first: few pairs and times are left for the exact test.
     away = np.linalg.norm(boxes.middle_m[:, rows] - boxes.middle_m[:, columns], axis=2)
     at, pair = np.nonzero(away < radius[rows] + radius[columns])
     first, second = rows[pair], columns[pair]
@@ -54,6 +55,7 @@ def touching(boxes: Boxes, margin_m: float = 0.0) -> list[tuple[int, int]]:
     half_a, half_b = boxes.half_m[first] + margin_m / 2, boxes.half_m[second] + margin_m / 2
     yaw_a, yaw_b = boxes.yaw_rad[at, first], boxes.yaw_rad[at, second]
     c, s = np.abs(np.cos(yaw_b - yaw_a)), np.abs(np.sin(yaw_b - yaw_a))
+    # Separating axes of two rectangles: they are apart if their projections are, on any of the four side directions.
     apart = np.zeros(len(at), bool)
     for yaw, mine, other in ((yaw_a, half_a, half_b), (yaw_b, half_b, half_a)):
         along = np.abs(between[:, 0] * np.cos(yaw) + between[:, 1] * np.sin(yaw))

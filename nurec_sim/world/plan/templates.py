@@ -41,6 +41,7 @@ def bend(turn_rad: float, radius_m: float) -> Pieces:
     """A curve (left positive) of clothoid, arc and clothoid."""
     ease = min(EASE_M, 0.4 * abs(turn_rad) * radius_m)
     curvature = float(np.sign(turn_rad) / radius_m)
+    # Each clothoid turns half as much as an arc of its length, so both together replace one length of arc.
     arc = abs(turn_rad) * radius_m - ease
     return (
         RoadPiece(ease, 0.0, curvature),
@@ -72,6 +73,7 @@ def _usual(rng: np.random.Generator, lanes: Sequence[int] = (1, 1, 1, 2)) -> dic
 def _single(rng: np.random.Generator, pieces: Pieces, **changes: Any) -> RoadGraph:
     """One road whose middle lies near the origin, in any direction."""
     road = Road("main", 0.0, 0.0, 0.0, pieces, **{**_usual(rng), **changes})
+    # Laid out from the origin first; then turned, and moved so that its middle lies at the origin.
     middle, _ = RoadLine(road).at(road.length_m / 2)
     yaw = float(rng.uniform(-np.pi, np.pi))
     turned = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ -middle
@@ -83,6 +85,7 @@ def _straight(rng: np.random.Generator) -> RoadGraph:
 
 
 def _curve(rng: np.random.Generator) -> RoadGraph:
+    # Log-uniform: tight bends are as likely as wide ones. The bound on the turn limits the length of the arc.
     radius = float(np.exp(rng.uniform(np.log(25.0), np.log(200.0))))
     turn = float(rng.choice([-1, 1]) * min(rng.uniform(0.7, 1.6), 150.0 / radius))
     entry = float(rng.uniform(85.0, 105.0))
@@ -175,6 +178,7 @@ def _turned(section: dict[str, Any]) -> dict[str, Any]:
 
 
 def _reaches(spokes: Sequence[_Spoke], corner_m: float, at_least: Sequence[float] | None = None) -> list[float]:
+    # `reaches` expects counter-clockwise order.
     order = np.argsort([spoke.angle_rad % (2 * np.pi) for spoke in spokes])
     sorted_reaches = reaches([(spokes[i].angle_rad, *spokes[i].widths_m) for i in order], corner_m)
     found = [0.0] * len(spokes)
@@ -233,6 +237,7 @@ def _double_junction(rng: np.random.Generator) -> RoadGraph:
         spokes_at.append([replace(s, tail=(RoadPiece(100.0),)) if k > 1 else s for k, s in enumerate(spokes)])
     junctions = []
     reach = [_reaches(spokes, corner) for spokes in spokes_at]
+    # The road between the two junctions, from mouth to mouth.
     link_m = apart - reach[0][1] - reach[1][1]
     start = centres[0] + ahead * reach[0][1]
     roads.append(Road("link", float(start[0]), float(start[1]), turn, (RoadPiece(link_m),), **spokes_at[0][1].section))
@@ -281,6 +286,7 @@ def _roundabout(rng: np.random.Generator) -> RoadGraph:
         for name, angle in zip(("east", "north", "west", "south"), spread, strict=False)
     ]
     corner = float(rng.uniform(7.0, 10.0))
+    # Room for the flares between mouth and ring.
     reach = ring + flare + 2.0
     centre = np.zeros(2)
     roads = tuple(spoke.road(centre, reach) for spoke in spokes)

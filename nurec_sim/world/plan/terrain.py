@@ -41,6 +41,7 @@ class Terrain:
         xy = np.asarray(xy, np.float64)
         gradient = np.zeros_like(xy)
         for wave in self.waves:
+            # The derivative of A sin(2 pi s / L) along the wave's direction.
             steep = wave.amplitude_m * 2 * np.pi / wave.length_m * np.cos(self._phase(wave, xy))
             gradient += steep[..., None] * np.array([np.cos(wave.direction_rad), np.sin(wave.direction_rad)])
         return gradient
@@ -69,6 +70,7 @@ class Terrain:
         xy, yaw_rad = np.asarray(xy, np.float64), np.asarray(yaw_rad, np.float64)
         slope = np.zeros_like(xy) if upright else self.gradient(xy)
         heading = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=1)
+        # forward rises with the slope along the heading, up = (-slope, 1) is square to the ground and thus to forward.
         forward = np.concatenate([heading, (slope * heading).sum(axis=1, keepdims=True)], axis=1)
         up = np.concatenate([-slope, np.ones((len(xy), 1))], axis=1)
         forward /= np.linalg.norm(forward, axis=1, keepdims=True)

@@ -294,6 +294,7 @@ class TownPlan:
         """The recorded drive: rear axle on the ground, tilted by the slope under the centre of the car."""
         times = np.array([point[0] for point in self.ego], np.int64)
         x, y, yaw = np.array([point[1:] for point in self.ego], np.float64).T
+        # The body is placed by the slope under its centre, then moved back along its own axis to the rear axle.
         ahead = EGO_MIDDLE_M * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
         poses = self.terrain.poses(np.stack([x, y], axis=1) + ahead, yaw, np.zeros(len(yaw)))
         poses[:, :3, 3] -= poses[:, :3, 0] * EGO_MIDDLE_M
@@ -317,6 +318,7 @@ class TownPlan:
         try:
             plan = TypeAdapter(TownPlan).validate_json(text)
         except ValidationError as error:
+            # One error is enough to act on; all of them would fill pages.
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"]) or "the text itself"
             known = ", ".join(field.name for field in fields(TownPlan))

@@ -40,6 +40,14 @@ EgoPath = tuple[tuple[int, float, float, float], ...]
 def drive(network: TownNetwork, seed: int, split: Split, span_us: tuple[int, int]) -> tuple[EgoPath, tuple[Actor, ...]]:
     """All trajectories in a town, deterministic for seed and split.
 
+    Of up to ``ATTEMPTS`` random scenes the first lively one is taken, else the liveliest.
+
+    Args:
+        network: the town's lanes and areas.
+        seed: seed of the town.
+        split: ``train`` or ``test``: selects vehicle families and the random stream.
+        span_us: first and last time of the trajectories.
+
     Returns:
         The ego as (t_us, x, y, yaw) every 50 ms over the whole span, and all other actors; no two boxes ever touch.
     """
@@ -91,6 +99,7 @@ class _Scene:
                 found.append(self._moving(index, vehicle.name, vehicle.kind, size, vehicle.colour, above))
         for index, walker in enumerate(self.walkers, start=1 + len(self.vehicles)):
             if self.stays[index]:
+                # Feet were sampled from the warm-up on; the scene starts after it.
                 above = walker.foot_m[-len(self.t_us) :] + walker.size_m[2] / 2
                 name = f"pedestrian_{index - 1 - len(self.vehicles)}"
                 found.append(self._moving(index, name, "pedestrian", walker.size_m, walker.colour, above))
@@ -108,6 +117,7 @@ class _Scene:
     ) -> Actor:
         rows = np.column_stack([self.boxes.middle_m[:, index], above_m, self.boxes.yaw_rad[:, index]]).round(4)
         last = len(rows) - 1
+        # Vehicles that wait for the whole drive count as static and repeat one pose.
         moves = bool(np.ptp(rows[:, :2], axis=0).max() > 0.02)
         steps = sorted({*range(0, last, KEPT_EVERY), last}) if moves else [0, last]
         path = tuple((int(self.t_us[i]), *rows[i if moves else 0].tolist()) for i in steps)
@@ -118,6 +128,7 @@ def _scene(rng: np.random.Generator, rules: Rules, split: Split, span_us: tuple[
     """One attempt: simulates and removes colliding actors until none is left."""
     seconds = (span_us[1] - span_us[0]) * 1e-6
     steps, warm = round(seconds / STEP_S), round(WARM_UP_S / STEP_S)
+    # Time 0 is the start of the log; the warm-up is negative.
     t_s = (np.arange(warm + steps + 1) - warm) * STEP_S
     ego = departures.ego_driver(rng, rules, seconds + WARM_UP_S)
     ahead = ego.route.at(np.linspace(ego.station_m, min(ego.station_m + AHEAD_M, ego.route.length_m), 27))
@@ -125,7 +136,10 @@ def _scene(rng: np.random.Generator, rules: Rules, split: Split, span_us: tuple[
     parked = fleet.parked_cars(rng, rules.network, split, span_us, way)
     walkers = pedestrians.people(rng, rules.network, ahead, t_s)
     vehicles = departures.other_vehicles(rng, rules, split, ego, way)
+    # Without the removed actors the others drive differently, so the simulation starts again. After the last round, the
+    # remaining colliding actors are only left out.
     for again in range(AGAIN):
+        # Vehicles react to each other and to people on crossings; people and parked cars react to nobody.
         everyone = [ego, *(vehicle.driver for vehicle in vehicles)]
         crossers = [walker for walker in walkers if walker.crossing is not None]
         passes = rules.passes(everyone, crossers, WARM_UP_S)
@@ -154,6 +168,7 @@ def _superfluous(everything: Boxes, driving: int, walking: int) -> Bool[np.ndarr
         walking: see ``everything``.
     """
     order = np.arange(len(everything.half_m))
+    # A higher order is removed first.
     order[driving:walking] += len(order)
     out = np.zeros(len(order), bool)
     for i, j in boxes.touching(everything, APART_M):
@@ -164,11 +179,13 @@ def _superfluous(everything: Boxes, driving: int, walking: int) -> Bool[np.ndarr
 
 def liveliness(everything: Boxes, who: Bool[np.ndarray, " n"]) -> float:
     """Fraction of time in which ``LIVELY_COUNT`` of ``who`` move close ahead of box 0, the ego."""
+    # Every half second is enough, and a displacement of 15 cm over it is a moving actor.
     each = round(0.5 / STEP_S)
     middle, yaw = everything.middle_m[::each], everything.yaw_rad[::each, :1]
     away = middle[:-1, who] - middle[:-1, :1]
     c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
     ahead, aside = away[..., 0] * c + away[..., 1] * s, np.abs(away[..., 1] * c - away[..., 0] * s)
     moves = np.linalg.norm(np.diff(middle[:, who], axis=0), axis=2) > 0.15
+    # A sector of about 50 degrees to either side of straight ahead.
     seen = (ahead > 0) & (ahead < LIVELY_M) & (aside < 1.2 * ahead) & moves
     return float((seen.sum(axis=1) >= LIVELY_COUNT).mean())

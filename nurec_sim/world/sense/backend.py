@@ -1,6 +1,6 @@
-"""Which way images are drawn: OpenGL through EGL, OpenGL through OSMesa, or ray casting without any OpenGL.
+"""Rendering back ends: OpenGL through EGL, OpenGL through OSMesa, or ray casting without OpenGL.
 
-A GL library that does not work may end the process, so it is tried in a process of its own, once.
+A broken GL library may crash the process, so each back end is probed once, in a subprocess.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ context.free()
 
 @functools.cache
 def why_not(name: str) -> str:
-    """Why a back end does not work on this machine; empty where it does."""
+    """Why a back end does not work here; empty if it does."""
     if name == "rays":
         return ""
+    # MuJoCo and PyOpenGL choose their library by these variables; the probe must test the named one.
     environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
     try:
         done = subprocess.run(
@@ -50,11 +51,11 @@ def why_not(name: str) -> str:
 
 
 def pick_backend(wanted: str | None = None) -> str:
-    """The back end to use: ``wanted``, else what NUREC_SIM_GL says, else the first of egl, osmesa, rays that works.
+    """The back end to use: ``wanted``, else that of NUREC_SIM_GL, else the first of egl, osmesa, rays that works.
 
     Raises:
         ValueError: no back end has that name.
-        RuntimeError: the one asked for does not work here.
+        RuntimeError: the requested one does not work here.
     """
     wanted = wanted or os.environ.get(ENVIRONMENT) or None
     if wanted is None:
@@ -67,14 +68,15 @@ def pick_backend(wanted: str | None = None) -> str:
 
 
 def gl_context(name: str) -> Any:
-    """An OpenGL context of back end ``egl`` or ``osmesa``; current in no thread yet. The caller frees it.
+    """An OpenGL context of back end ``egl`` or ``osmesa``, not yet current in any thread. The caller frees it.
 
     Raises:
-        RuntimeError: this process already uses the other one, and PyOpenGL binds to one only.
+        RuntimeError: this process already uses the other one; PyOpenGL binds to a single library.
     """
     other = {"egl": "osmesa", "osmesa": "egl"}[name]
     if f"mujoco.{other}" in sys.modules:
         raise RuntimeError(f"this process already draws with {other!r} and cannot use {name!r} as well")
+    # PyOpenGL reads this on its first import, so the import below must come after it.
     os.environ["PYOPENGL_PLATFORM"] = name
     if name == "egl":
         from mujoco.egl import GLContext

@@ -1,8 +1,8 @@
-"""Any sensor from flat images: which pinhole images to draw for a grid of rays, and how to read them along the rays.
+"""Any sensor from pinhole images: which images to render for a grid of rays, and how to resample them along the rays.
 
-Ids and surfaces are read from the nearest pixel, but depth is where the ray meets the plane that this pixel sees, so
-that a surface at a grazing angle is not half a pixel off. Colours are interpolated, from finer sampling where the
-sensor is coarser than the image. Axes of a face are those of a camera: x right, y down, z forward.
+Ids and surfaces come from the nearest pixel, but depth is the intersection of the ray with the plane seen by that
+pixel: otherwise a surface at a grazing angle would be off by half a pixel. Colours are interpolated, and supersampled
+where the sensor is coarser than the image. The axes of a face are those of a camera: x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from nurec_sim.types import Pinhole
 from nurec_sim.world.sense.truth import plane_normals, slopes
 
 WIDEST_TANGENT = 1.3
-"""One image sees up to this tangent (105 degrees across); wider fields take several."""
+"""Largest tangent of one image (105 degrees across); wider fields of view need several."""
 SECTOR_RAD = np.deg2rad(80.0)
 COARSE_STEP = 1.3
-"""Colours are sampled twice as densely where neighbouring rays lie this many pixels of the face apart."""
+"""Colours are sampled twice as densely where neighbouring rays are this many pixels of the face apart."""
 RIM_PX = 2
 MAX_SIDE_PX = 4096
 
@@ -30,7 +30,7 @@ Mask = Bool[np.ndarray, "h w"]
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A pinhole image: colours (None where not asked for), geom ids (-1 sky) and 1 / z (0 sky)."""
+    """A pinhole image: colours (None if not requested), geom ids (-1 sky) and 1 / z (0 sky)."""
 
     rgb: UInt8[np.ndarray, "h w 3"] | None
     geom: Int32[np.ndarray, "h w"]
@@ -39,9 +39,9 @@ class Drawn:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a grid of rays meets: colours, geom ids (-1 nothing), distance along the ray (0) and normals (0).
+    """Ray hits of a grid: colours, geom ids (-1 no hit), distance along the ray (0 no hit) and normals (0 unknown).
 
-    Normals are of unit length, in the sensor's frame and towards it.
+    Normals are unit vectors in the sensor's frame, pointing towards it.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]
@@ -51,23 +51,23 @@ class Seen:
 
     @staticmethod
     def nothing(height: int, width: int) -> Seen:
-        """Black emptiness, to be filled."""
+        """Black and without hits, to be filled."""
         return Seen(np.zeros((height, width, 3), np.uint8), np.full((height, width), -1, np.int32),
                     np.zeros((height, width), np.float32), np.zeros((height, width, 3), np.float32))  # fmt: skip
 
     def part(self, rows: slice, columns: slice) -> Seen:
-        """A window into it; what is filled in there is filled in here."""
+        """A view of a window, sharing memory."""
         return Seen(*(image[rows, columns] for image in (self.rgb, self.geom, self.range_m, self.normal)))
 
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """One pinhole image and the rays that are read from it.
+    """One pinhole image and the rays that are resampled from it.
 
-    ``rows`` and ``columns`` bound the part of the grid that has such rays, ``owned`` marks them in it. ``nearest`` is
-    the flat index of each ray's pixel, ``offset_px`` how far right of and below its centre the ray passes, ``cosine``
-    the z of the ray in the face. ``colour_maps`` are places to read colours at, to be averaged. A face whose pixels are
-    the grid itself has no ``nearest`` and what follows it.
+    ``rows`` and ``columns`` bound the window of the grid with such rays, and ``owned`` marks them in it. ``nearest`` is
+    the flat index of each ray's pixel, ``offset_px`` the ray's offset from the pixel centre to the right and down,
+    ``cosine`` the z of the unit ray in the face. ``colour_maps`` are sampling positions whose colours are averaged. If
+    the pixels of the face are the grid itself, ``nearest``, ``offset_px`` and ``colour_maps`` are unset.
     """
 
     lens: Pinhole
@@ -90,13 +90,15 @@ class Face:
         if self.nearest is not None:
             assert self.offset_px is not None
             geom, nearness = geom.ravel()[self.nearest], nearness.ravel()[self.nearest]
+            # 1 / z is linear in pixel coordinates on a plane, so extrapolation by the slopes is exact.
             on_plane = nearness + self.offset_px[0] * right.ravel()[self.nearest]
             on_plane += self.offset_px[1] * down.ravel()[self.nearest]
-            # Where a surface bends away within half a pixel, its plane says nothing.
+            # Where the surface curves within half a pixel, the plane is no valid extrapolation.
             nearness = np.where(np.abs(on_plane - nearness) < 0.5 * nearness, on_plane, nearness)
             normal = normal.reshape(-1, 3)[self.nearest] @ self.sensor_from_face.T.astype(np.float32)
             rgb = None if rgb is None else self._colours(rgb)
         range_m = np.zeros_like(nearness)
+        # z = range * cosine.
         np.divide(1, nearness * self.cosine, out=range_m, where=geom >= 0)
         owned = np.ones((1, 1), bool) if self.owned is None else self.owned
         part = seen.part(self.rows, self.columns)
@@ -107,7 +109,7 @@ class Face:
             np.copyto(part.rgb, rgb, where=owned[..., None])
 
     def _colours(self, rgb: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """Colours along the rays, between pixel centres bilinear."""
+        """Colours along the rays, bilinear between pixel centres, averaged over all maps."""
         images = [
             np.asarray(cv2.remap(rgb, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
             for at in self.colour_maps
@@ -127,22 +129,26 @@ def pinhole_face(lens: Pinhole, rays: Rays) -> Face:
 
 
 def plan_faces(rays: Rays, valid: Mask, down: Float64[np.ndarray, " 3"], fineness: float) -> tuple[Face, ...]:
-    """Faces that together show all valid rays of a grid.
+    """Faces that together cover all valid rays of a grid.
 
     Args:
         rays: unit rays in the sensor's frame.
-        valid: which of them exist.
-        down: a direction of the sensor's frame that shall point down in the faces.
-        fineness: pixels of a face for the closest two neighbouring rays of it.
+        valid: which rays exist.
+        down: a direction in the sensor's frame that points down in the faces.
+        fineness: pixels of a face between the closest neighbouring rays.
     """
     if not valid.any():
         return ()
     frame = _frame(rays[valid].mean(axis=0), down)
     local = rays @ frame
+    # Missing rays become the optical axis, which fits into any face.
     x, y, z = np.moveaxis(np.where(valid[..., None], local, (0.0, 0.0, 1.0)), -1, 0)
+    # A normal field of view fits into a single image.
     if (z > 0.1).all() and max(np.abs(x / z).max(), np.abs(y / z).max()) <= WIDEST_TANGENT:
         return (_face(rays, valid, frame, fineness),)
     azimuth = np.arctan2(x, z)
+    # A panorama that is wide but not high, as of a LiDAR, is divided into sectors of azimuth. At the edge of a sector z
+    # is smaller by the cosine of half its width, hence the bound on the elevation.
     steep = np.abs(y) / np.maximum(np.hypot(x, z), 1e-9)
     first, last = azimuth[valid].min(), azimuth[valid].max()
     sectors = max(int(np.ceil((last - first) / SECTOR_RAD)), 1)
@@ -164,6 +170,7 @@ def plan_faces(rays: Rays, valid: Mask, down: Float64[np.ndarray, " 3"], finenes
 def _frame(forward: Float64[np.ndarray, " 3"], down: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
     """Rotation sensor_from_face that looks ``forward`` with ``down`` pointing as much down as this allows."""
     length = np.linalg.norm(forward)
+    # Rays in all directions have no mean direction; any one perpendicular to `down` serves.
     z = forward / length if length > 1e-6 else np.roll(down, 1)
     x = np.cross(down, z)
     if np.linalg.norm(x) < 1e-3:
@@ -183,15 +190,17 @@ def _face(rays: Rays, owned: Mask, sensor_from_face: Float64[np.ndarray, "3 3"],
     owned = np.ascontiguousarray(owned[rows, columns])
     local = rays[rows, columns] @ sensor_from_face
     forward = np.where(owned, local[..., 2], 1.0)
+    # Rays of other faces are NaN, which the nan-functions below ignore.
     tangent = np.where(owned[..., None], local[..., :2] / forward[..., None], np.nan)
     steps = [_step(tangent, axis) for axis in (0, 1)]
     closest = np.nanpercentile(np.fmin(*steps), 20) if owned.sum() > 1 else 1e-3
     low, high = np.nanmin(tangent, axis=(0, 1)), np.nanmax(tangent, axis=(0, 1))
-    # The closest fifth of the rays may share pixels: some lenses crowd their rim without end.
+    # The closest fifth of the rays may share pixels: at the rim of some lenses their distance tends to zero.
     focal = min(fineness / max(closest, 1e-6), (MAX_SIDE_PX - 2 * RIM_PX - 2) / max((high - low).max(), 1e-9))
     centre = RIM_PX - low * focal
     width, height = (int(n) for n in np.ceil((high - low) * focal) + 2 * RIM_PX)
     lens = Pinhole(focal, focal, float(centre[0]), float(centre[1]))
+    # Pixel centres lie at half-integer image coordinates, hence at integer places.
     places = tangent * focal + centre - 0.5
     place = np.where(owned[..., None], places, 0.0)
     index = np.rint(place).astype(np.int64)
@@ -211,7 +220,7 @@ def _step(tangent: Float64[np.ndarray, "h w 2"], axis: int) -> Float64[np.ndarra
 
 
 def _colour_maps(places: Float32[np.ndarray, "h w 2"], coarse: bool) -> tuple[Float32[np.ndarray, "h w 2"], ...]:
-    """Where to read colours: at the rays, or at four places within each ray's share of the image."""
+    """Sampling positions of colours: the rays, or four positions within each ray's footprint in the image."""
     place = np.nan_to_num(places)
     if not coarse or min(place.shape[:2]) < 2:
         return (place,)

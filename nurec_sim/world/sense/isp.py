@@ -1,4 +1,4 @@
-"""What a camera makes of light: white balance, exposure, vignette, gamma and noise."""
+"""Camera response: white balance, exposure, vignette, gamma and noise."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from jaxtyping import Float32, UInt8
 
 @dataclass(frozen=True)
 class CameraResponse:
-    """How a camera differs from an ideal one; the default values are that one.
+    """Deviations of a camera from an ideal one; the defaults are ideal.
 
     Args:
         white_balance: gain of red, green and blue.
-        exposure: gain of all of them.
-        vignette: share of the light that is missing in the corners, 0..1; grows with the square of the distance from
-            the middle of the image.
-        gamma: exponent of the values 0..1 after the gains; below 1 brightens.
-        noise: standard deviation, in values 0..1, of the noise of white; black has 30 % of it.
+        exposure: gain of all channels.
+        vignette: fraction of the light lost in the corners, 0..1; the loss grows with the square of the distance from
+            the image centre.
+        gamma: exponent applied to the values 0..1 after the gains; below 1 brightens.
+        noise: standard deviation of the noise at white, in values 0..1; black has 30 % of it.
 
     Raises:
         ValueError: a value is out of range.
@@ -44,7 +44,7 @@ class CameraResponse:
 
 
 def random_response(rng: np.random.Generator) -> CameraResponse:
-    """One as cameras of one car differ from each other: some percent in colour, brightness, corners and contrast."""
+    """A random response with the spread between cameras of one car, in colour, brightness, vignette and contrast."""
     red, green, blue = rng.normal(1.0, 0.03, 3)
     return CameraResponse(
         (float(np.clip(red, 0.9, 1.1)), float(np.clip(green, 0.9, 1.1)), float(np.clip(blue, 0.9, 1.1))),
@@ -58,8 +58,9 @@ def random_response(rng: np.random.Generator) -> CameraResponse:
 def apply_response(
     rgb: UInt8[np.ndarray, "h w 3"], response: CameraResponse, seed: int | Sequence[int]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """An ideal image as the camera takes it; the same seed gives the same noise."""
+    """An ideal image as this camera records it; the same seed gives the same noise."""
     value = rgb.astype(np.float32)
+    # Light first (gains, vignette), then saturation, the tone curve, and noise last.
     value *= np.asarray(response.white_balance, np.float32) * np.float32(response.exposure / 255)
     if response.vignette > 0:
         value *= _vignette(rgb.shape[0], rgb.shape[1], response.vignette)[..., None]
@@ -68,6 +69,7 @@ def apply_response(
         value = np.asarray(cv2.pow(value, response.gamma), np.float32)
     if response.noise > 0:
         noise = np.random.default_rng(seed).standard_normal(value.shape, np.float32)
+        # A constant part as of read-out, and a part that grows with the square root of the signal, as shot noise does.
         noise *= np.float32(0.3 * response.noise) + np.float32(0.7 * response.noise) * np.sqrt(value)
         value += noise
     value *= 255
@@ -75,7 +77,7 @@ def apply_response(
 
 
 def _vignette(height: int, width: int, corner: float) -> Float32[np.ndarray, "h w"]:
-    """Share of the light that reaches each pixel."""
+    """Fraction of the light that reaches each pixel."""
     v, u = (np.arange(n, dtype=np.float32) * 2 + (1 - n) for n in (height, width))
     radius2 = (v * v)[:, None] + u * u
     return 1 - np.float32(corner) * radius2 / np.float32(max((height - 1) ** 2 + (width - 1) ** 2, 1))

@@ -1,6 +1,6 @@
-"""Images by OpenGL: colours with shadows in one pass, and which geom at which depth in a second one.
+"""OpenGL rendering: colours with shadows in one pass, geom ids and depth in a second one.
 
-All calls must come from one thread, the one that made the painter: a GL context belongs to its thread.
+All calls must come from the thread that created the painter, since a GL context belongs to its thread.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ HIDDEN_GROUP = 5
 TEXTURE_LOD_BIAS = -0.7
 HORIZON = -0.03
 FAINT_SUN = 0.3
-"""A sun weaker than this throws no shadows worth drawing, which saves a third of the time."""
+"""A weaker sun casts no visible shadows; skipping them saves a third of the time."""
 
 
 class GlPainter:
-    """Draws a town with MuJoCo's classic renderer. Call ``close`` in the same thread when done.
+    """Renders a town with MuJoCo's classic renderer. Call ``close`` in the same thread when done.
 
     Args:
-        town: what to draw.
+        town: what to render.
         backend: ``egl`` or ``osmesa``.
-        samples: colour samples per pixel, 0, 2 or 4: smooth edges against time.
+        samples: colour samples per pixel, 0, 2 or 4: more samples give smoother edges and take longer.
         shadow_px: side of the shadow map, 0 for no shadows.
     """
 
@@ -47,6 +47,7 @@ class GlPainter:
         self._options.geomgroup[:] = [1, 1, 1, 0, 0, 0]
         self._gl = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gl)
+        # Reversed depth (far is 0) keeps its precision at long range.
         self._gl.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         _sharpen_textures()
         self._groups = self.model.geom_group.copy()
@@ -56,26 +57,34 @@ class GlPainter:
         self._shadows = shadow_px > 0 and suns.max(initial=0.0) > FAINT_SUN
 
     def close(self) -> None:
-        """Frees the context; nothing can be drawn afterwards."""
+        """Frees the context; nothing can be rendered afterwards."""
         self._context.make_current()
         self._gl.free()
         self._context.free()
 
     def draw(self, data: Any, face: Face, world_from_sensor: Float64[np.ndarray, "4 4"], colours: bool = True) -> Drawn:
-        """One face of a sensor; without ``colours`` only what is where, at a fraction of the cost."""
+        """Renders one face of a sensor.
+
+        Args:
+            data: MuJoCo state with the poses of the instant.
+            face: the pinhole image to render.
+            world_from_sensor: pose of the sensor that the face belongs to.
+            colours: if False only ids and depth are rendered, at a fraction of the cost.
+        """
         width, height = face.width_px, face.height_px
         if self._gl.offWidth < width or self._gl.offHeight < height:
-            # Drawing past the buffer's edge leaves garbage without any error.
+            # Rendering beyond the buffer leaves garbage without any error.
             size = max(width, self._gl.offWidth), max(height, self._gl.offHeight)
             mujoco.mjr_resizeOffscreen(*size, self._gl)
         eye, axes = world_from_sensor[:3, 3], world_from_sensor[:3, :3] @ face.sensor_from_face
         viewport, flags = mujoco.MjrRect(0, 0, width, height), self._scene.flags
-        # Leaves and other open surfaces are seen from both sides, as rays meet them.
+        # Leaves and other open surfaces are visible from both sides, as they are for rays.
         flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = False
         offset = data.geom_xpos - eye
         seen = self._in_view(offset @ axes, face)
         rgb = None
         if colours:
+            # Decals are blended into colours but have neither id nor depth.
             self._options.geomgroup[DECAL_GROUP] = 1
             self._gather(data, seen | self._throws_shadows(offset, axes) if self._shadows else seen)
             self._options.geomgroup[DECAL_GROUP] = 0
@@ -86,6 +95,7 @@ class GlPainter:
             rgb = np.empty((height, width, 3), np.uint8)
             mujoco.mjr_render(viewport, self._scene, self._gl)
             mujoco.mjr_readPixels(rgb, None, viewport, self._gl)
+            # OpenGL images start at the lower left.
             rgb = np.ascontiguousarray(rgb[::-1])
         self._gather(data, seen)
         self._aim(face, eye, axes)
@@ -94,22 +104,23 @@ class GlPainter:
         mujoco.mjr_render(viewport, self._scene, self._gl)
         mujoco.mjr_readPixels(ids, depth, viewport, self._gl)
         geom = np.ascontiguousarray(self._geom_ids(ids)[::-1])
-        # Depth is stored reversed, as a linear function of 1 / z, so that it is exact where it matters.
+        # Depth is stored reversed, as a linear function of 1 / z: 1 at the near plane, 0 at the far plane.
         nearness = depth[::-1] * np.float32(1 / self._near_m - 1 / self._far_m) + np.float32(1 / self._far_m)
         drawn = Drawn(rgb, geom, np.where(geom < 0, np.float32(0), nearness))
         _close_cracks(drawn, face.lens, axes[2])
         return drawn
 
     def _gather(self, data: Any, shown: Bool[np.ndarray, " g"]) -> None:
-        """Puts some of the geoms into the scene: the renderer itself culls nothing."""
+        """Adds the chosen geoms to the scene, since the renderer itself does not cull."""
         self.model.geom_group[:] = np.where(shown, self._groups, HIDDEN_GROUP)
         mujoco.mjv_updateScene(self.model, data, self._options, None, mujoco.MjvCamera(),
                                mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)  # fmt: skip
         self.model.geom_group[:] = self._groups
 
     def _aim(self, face: Face, eye: Float64[np.ndarray, " 3"], axes: Float64[np.ndarray, "3 3"]) -> None:
-        """Sets both GL cameras to the exact frustum, and the shadow map to what lies before them."""
+        """Sets both GL cameras to the exact frustum, and centres the shadow map on the area in front of them."""
         left, right, top, bottom = _tangents(face.lens, face.width_px, face.height_px)
+        # Mono rendering uses the mean of both stereo cameras, so both get the same frustum, given at the near plane.
         for camera in self._scene.camera:
             camera.pos, camera.forward, camera.up = eye, axes[:, 2], -axes[:, 1]
             camera.frustum_near, camera.frustum_far = self._near_m, self._far_m
@@ -122,11 +133,12 @@ class GlPainter:
                 light.pos = middle + 120.0 * self.town.sun
 
     def _in_view(self, local: Float64[np.ndarray, "g 3"], face: Face) -> Bool[np.ndarray, " g"]:
-        """Geoms whose bounding sphere meets the frustum; those without a size, as planes, always."""
+        """Geoms whose bounding sphere intersects the frustum; geoms without a size, such as planes, always."""
         x, y, z = local.T
         radius = self.model.geom_rbound
         left, right, top, bottom = _tangents(face.lens, face.width_px, face.height_px)
         seen = z > -radius
+        # Signed distance of the sphere's centre from each side plane x = z tan, whose normal has length hypot(1, tan).
         for place, tangent, side in ((x, left, -1), (x, right, 1), (y, top, -1), (y, bottom, 1)):
             seen &= side * (place - z * tangent) < radius * np.hypot(1, tangent)
         return seen | (radius <= 0)
@@ -134,31 +146,33 @@ class GlPainter:
     def _throws_shadows(
         self, offset: Float64[np.ndarray, "g 3"], axes: Float64[np.ndarray, "3 3"]
     ) -> Bool[np.ndarray, " g"]:
-        """Geoms that may stand between the sun and what is shown near by."""
+        """Geoms that may cast shadows on the visible ground near by."""
         apart = offset - _shadow_middle(np.zeros(3), axes)
+        # Distance from the line towards the sun through the middle of the shadowed area, plus the bounding sphere.
         across = apart - np.outer(apart @ self.town.sun, self.town.sun)
         return np.linalg.norm(across, axis=1) < SHADOW_RADIUS_M * np.sqrt(2) + self.model.geom_rbound
 
     def _geom_ids(self, colours: UInt8[np.ndarray, "h w 3"]) -> Int32[np.ndarray, "h w"]:
-        """Geom ids from the colours of the segmentation pass, which count the geoms of this scene, not the model's."""
+        """Geom ids from the colours of the segmentation pass, which index the geoms of this scene, not of the model."""
         table = np.full(self._scene.ngeom + 2, -1, np.int32)
         for i in range(self._scene.ngeom):
             geom = self._scene.geoms[i]
             if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
                 table[geom.segid + 1] = geom.objid
+        # A colour is the index plus one in 24 bits, red lowest; 0 is the background.
         index = colours.astype(np.int32) @ np.array([1, 256, 65536], np.int32)
         return table[np.minimum(index, len(table) - 1)]
 
 
 def _sharpen_textures() -> None:
-    """Takes finer levels of textures in the current context: without it roads are a blur from ten metres on."""
-    from OpenGL import GL  # only now, because PyOpenGL binds to the back end that the environment names
+    """Biases mipmaps of the current context to finer levels; otherwise roads are blurred from ten metres on."""
+    from OpenGL import GL  # imported late: PyOpenGL binds to the back end named in the environment
 
     GL.glTexEnvf(GL.GL_TEXTURE_FILTER_CONTROL, GL.GL_TEXTURE_LOD_BIAS, TEXTURE_LOD_BIAS)
 
 
 def _tangents(lens: Pinhole, width: int, height: int) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom edge of an image in the plane z = 1."""
+    """Left, right, top and bottom edge of an image on the plane z = 1."""
     return -lens.cx_px / lens.fx_px, (width - lens.cx_px) / lens.fx_px, \
            -lens.cy_px / lens.fy_px, (height - lens.cy_px) / lens.fy_px  # fmt: skip
 
@@ -169,7 +183,7 @@ def _shadow_middle(eye: Float64[np.ndarray, " 3"], axes: Float64[np.ndarray, "3 
 
 
 def _close_cracks(drawn: Drawn, lens: Pinhole, up: Float64[np.ndarray, " 3"]) -> None:
-    """Fills lone pixels of sky below the horizon from their left neighbours.
+    """Fills isolated sky pixels below the horizon from their left neighbours.
 
     Where the edge of one mesh lies along an edge of another, rounding leaves about two in a million pixels open.
     ``up`` is the world's z in the face.

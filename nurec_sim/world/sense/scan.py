@@ -1,4 +1,4 @@
-"""What a turning LiDAR measures: exactly, a ray per beam, or read from OpenGL images; echoes and lost beams."""
+"""LiDAR measurements: exact, with one ray per beam, or resampled from OpenGL images; echoes and dropped beams."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from nurec_sim.world.sense.shutter import lidar_patches
 from nurec_sim.world.sense.stage import Stage, named
 
 UNKNOWN_COSINE = 0.7
-"""Incidence where a drawn surface is too thin to tell its normal."""
+"""Cosine of incidence where a rendered surface is too thin for a normal."""
 FAINTEST_ECHO = 0.008
 ECHO_AT_M = 50.0
 CLEAR = 0.06
-"""Surfaces that reflect less than this let most of the light through or mirror it away: glass, wet paint, water."""
+"""Surfaces of lower reflectivity transmit most of the light or mirror it away: glass, wet paint, water."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class TrueScan:
 
 @dataclass(frozen=True)
 class LidarResponse:
-    """How a real LiDAR differs from an ideal one.
+    """Deviations of a real LiDAR from an ideal one.
 
     Args:
-        drop: scales the probability that a faint echo, or one of glass, is lost; 0 keeps all, 1 is usual.
+        drop: factor on the probability that a faint echo, or one from glass, is lost; 0 keeps all, 1 is usual.
         range_noise_m: standard deviation of the measured range.
 
     Raises:
@@ -59,7 +59,7 @@ class LidarResponse:
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """What all beams of a turn meet: geom ids (-1 nothing), distance and cosine of the incidence."""
+    """First hits of all beams of a turn: geom ids (-1 no hit), distance (m) and cosine of incidence."""
 
     geom: Int32[np.ndarray, "r c"]
     range_m: Float64[np.ndarray, "r c"]
@@ -67,7 +67,7 @@ class Turn:
 
 
 def cast_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
-    """A turn by one ray per beam, each column from where the sensor and the actors are when it fires."""
+    """A turn with one ray per beam, each column from the poses of sensor and actors at its firing time."""
     beams, fractions = sensors.beam_directions(lidar), sensors.column_fraction(lidar)
     moments, shape = stage.moments(request, fractions), beams.shape[:2]
     turn = Turn(np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
@@ -81,11 +81,11 @@ def cast_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
 
 
 def drawn_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
-    """A turn from OpenGL images: a sector at a time, seen from the sector's middle instant.
+    """A turn from OpenGL images: one sector at a time, rendered at the sector's middle instant.
 
-    Every beam then meets the plane that was seen in its direction from where the sensor really is when it fires, so
-    that surfaces are exact although the sensor moves; edges may be off by as much as it moves within half a sector,
-    actors by as much as they do.
+    Every beam is then intersected, from the sensor's true position at firing, with the plane seen in its direction, so
+    that surfaces are exact although the sensor moves. Edges may be off by the sensor's motion within half a sector,
+    actors by their own.
     """
     columns = sensors.column_fraction(lidar)
     moments = stage.moments(request, columns)
@@ -98,16 +98,21 @@ def drawn_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
         pose = middles.enter(index)
         part = seen.part(patch.rows, patch.columns)
         stage.look(patch, pose, part, colours=False)
+        # Beams in the frame of the rendered image: origin o and direction d per column.
         middle_from_fired = geometry.inverse(pose) @ moments.world_from_sensor[patch.columns]
         direction = np.einsum("cij,rcj->rci", middle_from_fired[:, :3, :3], patch.rays)
         origin = middle_from_fired[:, :3, 3]
         normal, distance = part.normal.astype(np.float64), part.range_m.astype(np.float64)
         known = normal.any(axis=-1)
+        # Plane through p = distance * ray with normal n: the beam o + t d meets it at t = n (p - o) / (n d), where
+        # height is -n (p - o) and met is -n d.
         met = np.where(known, -np.einsum("rci,rci->rc", normal, direction), 1.0)
         height = -np.einsum("rci,rci->rc", normal, distance[..., None] * patch.rays - origin)
+        # Without a plane only the motion along the beam is compensated.
         straight = distance - np.einsum("ci,rci->rc", origin, direction)
-        # A beam along the surface meets its plane anywhere.
+        # A beam almost parallel to the surface intersects its plane at an arbitrary distance.
         on_plane = np.where(met > 1e-3, height / np.maximum(met, 1e-3), straight)
+        # Large corrections are no longer on the visible part of the plane.
         near = known & (np.abs(on_plane - straight) < 0.2 * distance)
         range_m[:, patch.columns] = np.where(near, on_plane, straight)
         cosine[:, patch.columns] = np.where(known, met, UNKNOWN_COSINE)
@@ -117,14 +122,23 @@ def drawn_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
 def measure(
     town: Town, lidar: LidarModel, turn: Turn, response: LidarResponse | None = None, seed: Sequence[int] = ()
 ) -> TrueScan:
-    """What the sensor reports of a turn; without a response all surfaces within its range return."""
+    """The measurement that the sensor reports for a turn.
+
+    Args:
+        town: the compiled town, for class, instance and reflectivity of geoms.
+        lidar: the sensor, for its range.
+        turn: first hits of all beams.
+        response: drop-outs and noise; if None every surface within range returns, without noise.
+        seed: of the random drop-outs and noise.
+    """
     near, far = lidar.range_m
-    # mj_multiRay leaves out whole geoms by their distance, so a large one still answers beyond the reach.
+    # mj_multiRay culls whole geoms by distance, so a large one may still be hit beyond the reach.
     returned = (turn.geom >= 0) & (turn.range_m >= near) & (turn.range_m <= far)
     reflectivity = town.geom_reflectivity[turn.geom]
     range_m = turn.range_m
     if response is not None:
         rng = np.random.default_rng(list(seed))
+        # Misses have distance 0; the lower bound keeps it out of the division.
         lost = drop_probability(reflectivity, turn.cosine, np.maximum(range_m, near)) * response.drop
         returned &= rng.random(lost.shape) >= lost
         range_m = np.maximum(range_m + response.range_noise_m * rng.standard_normal(lost.shape), near)
@@ -136,19 +150,21 @@ def measure(
 def drop_probability(
     reflectivity: Float64[np.ndarray, "*n"], cosine: Float64[np.ndarray, "*n"], range_m: Float64[np.ndarray, "*n"]
 ) -> Float64[np.ndarray, "*n"]:
-    """How likely a beam is lost: its echo fades with distance and grazing incidence, and glass gives hardly any.
+    """Probability that a beam is lost: echoes fade with distance and grazing incidence, and glass hardly returns any.
 
-    A model of ours in the shape of measured ones: asphalt is lost half of the time at 50 m for a sensor at 1.9 m.
+    Our own model, with the shape of measured drop-out: asphalt is lost half of the time at 50 m for a sensor at 1.9 m.
     """
+    # Received power of a Lambertian surface that fills the beam falls with the square of the distance.
     echo = reflectivity * np.clip(cosine, 0, 1) * (ECHO_AT_M / range_m) ** 2
     through = np.exp(-((reflectivity / CLEAR) ** 2))
+    # A beam returns if its echo is detected and the surface does not transmit it.
     return 1 - (1 - np.exp(-echo / FAINTEST_ECHO)) * (1 - through)
 
 
 def measured_points(
     lidar: LidarModel, scan: TrueScan
 ) -> tuple[Float64[np.ndarray, "n 3"], Float32[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
-    """Returns of a turn: points in the frame of the LiDAR at their own instant, intensity, beam (row-major)."""
+    """Returns of a turn: points in the LiDAR frame at their own firing time, intensity, and beam index (row-major)."""
     beam = np.flatnonzero(scan.range_m.ravel() > 0).astype(np.int32)
     directions = sensors.beam_directions(lidar).reshape(-1, 3)[beam]
     return directions * scan.range_m.ravel()[beam, None], scan.intensity.ravel()[beam], beam

@@ -1,7 +1,7 @@
-"""When which part of a sensor looks: patches of rays that share one instant.
+"""Rolling shutters and spinning LiDARs as patches of rays that share one instant.
 
-A rolling shutter becomes bands of lines, a turning LiDAR sectors of columns; each is taken from the poses of its own
-middle instant.
+A rolling shutter is divided into bands of lines, a LiDAR turn into sectors of columns; each is rendered with the poses
+of its own middle instant.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from nurec_sim.types import CameraModel, Lens, LidarModel, Pinhole, Shutter, Win
 from nurec_sim.world.sense.faces import Face, pinhole_face, plan_faces
 
 MOTION_PX = 0.5
-"""Bands are made so narrow that things move less than this within one, if ``MOST_BANDS`` are enough for it."""
+"""Bands are narrow enough for less image motion than this within one, if ``MOST_BANDS`` suffice."""
 MOST_BANDS = 16
 FEWEST_LINES = 4
 FINENESS = 1.5
-"""Pixels of a drawn face per pixel of the camera or beam; finer ones cost time and sharpen edges."""
+"""Pixels of a rendered face per camera pixel or beam; more give sharper edges and take longer."""
 SECTORS = 12
 SECTOR_PIXEL_RAD = np.deg2rad(0.1)
-"""Pixels of a LiDAR's faces are no wider than this, however far apart its beams are."""
+"""Maximum pixel size of a LiDAR's faces, however sparse its beams."""
 KEPT_PIXELS = 1 << 21
-"""Patches of images up to this size are kept for the next frame; about 50 bytes a pixel."""
+"""Patches of images up to this size are cached for the next frame; about 50 bytes per pixel."""
 IMAGE_DOWN, LIDAR_DOWN = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class RayPatch:
-    """Rays of a sensor that look at one instant: the ``fraction`` of the exposure or turn, 0 at its start.
+    """Rays of a sensor at one instant: ``fraction`` of the exposure or turn, 0 at its start.
 
-    ``rays`` are those of the sensor's pixels or beams in ``rows`` and ``columns``; ``flat`` is the lens whose pixels
-    they are, if it is a pinhole without distortion. ``down`` and ``fineness`` as in ``faces.plan_faces``.
+    ``rays`` belong to the sensor's pixels or beams in ``rows`` and ``columns``; ``flat`` is the lens of these pixels
+    if it is a pinhole without distortion. ``down`` and ``fineness`` as in ``faces.plan_faces``.
     """
 
     rows: slice
@@ -49,7 +49,7 @@ class RayPatch:
 
     @functools.cached_property
     def faces(self) -> tuple[Face, ...]:
-        """Pinhole images that together show all rays."""
+        """Pinhole images that together cover all rays."""
         if self.flat is not None:
             return (pinhole_face(self.flat, self.rays),)
         return plan_faces(self.rays, self.valid, self.down, self.fineness)
@@ -74,9 +74,11 @@ def _camera_patches(
     for low, high in zip(edges[:-1], edges[1:], strict=True):
         band, whole = slice(int(low), int(high)), slice(0, height if by_column else width)
         rows, columns = (whole, band) if by_column else (band, whole)
+        # The mean time of the first and the last line of the band.
         lines = np.array([low, high - 1]) + 0.5
         fraction = float(sensors.shutter_fraction(camera, np.stack([lines, lines], axis=1)).mean())
         part, seen = rays[rows, columns], valid[rows, columns]
+        # A band of an undistorted pinhole is itself a pinhole, with a shifted principal point: no resampling.
         flat = None if camera.ideal_pinhole is None else camera.ideal_pinhole.cropped(columns.start, rows.start)
         patches.append(RayPatch(rows, columns, fraction, part, seen, IMAGE_DOWN, FINENESS, flat))
     return tuple(patches)
@@ -91,6 +93,7 @@ def lidar_patches(lidar: LidarModel) -> tuple[RayPatch, ...]:
     beams, fraction = sensors.beam_directions(lidar), sensors.column_fraction(lidar)
     rows, columns = beams.shape[:2]
     angles = (lidar.elevation_rad, lidar.azimuth_rad)
+    # Sparse beams get more face pixels each, so that edges are located to the same angle.
     closest = min((float(np.quantile(np.abs(np.diff(k)), 0.2)) for k in angles if len(k) > 1), default=0.0)
     fineness = max(FINENESS, closest / SECTOR_PIXEL_RAD)
     edges = np.unique(np.rint(np.linspace(0, columns, SECTORS + 1)).astype(int)).tolist()
@@ -103,17 +106,18 @@ def lidar_patches(lidar: LidarModel) -> tuple[RayPatch, ...]:
 
 
 def bands_for(camera: CameraModel, motion_px: float) -> int:
-    """How many bands a rolling shutter needs where things move ``motion_px`` in its whole time: 1, 2, 4, 8 or 16."""
+    """Number of bands for an image motion of ``motion_px`` during the whole readout: 1, 2, 4, 8 or 16."""
     lines = camera.width_px if camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT) else camera.height_px
     most = max(min(MOST_BANDS, lines // FEWEST_LINES), 1)
     bands = 1
+    # Powers of two: a slowly changing speed keeps hitting the same cached patches.
     while bands * 2 <= most and motion_px / bands > MOTION_PX:
         bands *= 2
     return bands
 
 
 def turned_patch(patch: RayPatch, turns: Float64[np.ndarray, "*lines 3 3"]) -> RayPatch:
-    """The patch with the rays of every line turned (``turns`` broadcasts over its rays): a camera that turns fast."""
+    """The patch with the rays of every line rotated (``turns`` broadcasts over its rays), for fast rotating cameras."""
     rays = (turns @ np.where(patch.valid[..., None], patch.rays, 0.0)[..., None])[..., 0]
     return RayPatch(patch.rows, patch.columns, patch.fraction, rays, patch.valid, patch.down, patch.fineness)
 
@@ -127,6 +131,7 @@ def line_turns(
     lines = np.arange(band.start, band.stop) + 0.5
     fractions = sensors.shutter_fraction(camera, np.stack([lines, lines], axis=1))
     poses = geometry.interpolate_pose_pair(world_from_camera, np.append(fractions, patch.fraction))[:, :3, :3]
+    # band_from_line = (world_from_band)^T world_from_line; the last pose is the band's.
     turns = poses[-1].T @ poses[:-1]
     return turns[None] if by_column else turns[:, None]
 
@@ -137,7 +142,14 @@ def motion_px(
     start_m: Float64[np.ndarray, "n 3"],
     end_m: Float64[np.ndarray, "n 3"],
 ) -> float:
-    """How far nearly all (95 %) of some world points, which move from start to end, move in the image meanwhile."""
+    """Image motion (95th percentile, in pixels) of world points during an exposure.
+
+    Args:
+        camera: the camera.
+        world_from_camera: its poses at the start and at the end.
+        start_m: points in the world at the start.
+        end_m: the same points at the end.
+    """
     (first, seen), (last, still_seen) = (
         sensors.project(camera, geometry.transform_points(geometry.inverse(pose), points))
         for pose, points in zip(world_from_camera, (start_m, end_m), strict=True)

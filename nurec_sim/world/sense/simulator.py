@@ -1,4 +1,4 @@
-"""The town itself as a sensor simulator: what a renderer of its reconstruction should have shown."""
+"""The town itself as a sensor simulator: the reference for any renderer of its reconstruction."""
 
 from __future__ import annotations
 
@@ -29,18 +29,17 @@ T = TypeVar("T")
 
 
 class TrueWorld:
-    """A town that answers sensor requests for any pose and any place of its actors.
+    """A town that serves sensor requests for any sensor pose and any actor poses.
 
-    Cameras may have any lens, windshield and shutter. All of MuJoCo and OpenGL runs in one thread of its own, because
-    a GL context belongs to its thread; ``sense`` may be called from any thread. Use it as a context manager or call
-    ``close``.
+    Cameras may have any lens, windshield and shutter. MuJoCo and OpenGL run in a dedicated thread, since a GL context
+    belongs to its thread; ``sense`` may be called from any thread. Use it as a context manager or call ``close``.
 
     Args:
         plan: the town.
         backend: ``egl``, ``osmesa`` or ``rays``; None picks the first that works (``backend.pick_backend``).
-        responses: how cameras turn light into pixels and which echoes LiDARs lose, by sensor id; others are ideal.
-            Noise depends on the plan's seed, the sensor's id and the time only.
-        quality: how images are drawn.
+        responses: imperfections of cameras and LiDARs, by sensor id; other sensors are ideal. Noise depends only on the
+            plan's seed, the sensor's id and the time.
+        quality: of rendering.
     """
 
     def __init__(
@@ -64,7 +63,7 @@ class TrueWorld:
 
     @property
     def town(self) -> Town:
-        """The compiled model; only to look things up in it."""
+        """The compiled model; read-only."""
         return self._stage.town
 
     def __enter__(self) -> TrueWorld:
@@ -84,7 +83,7 @@ class TrueWorld:
         """One frame per request, in order (``types.Sense``).
 
         Raises:
-            RequestError: a lens or shutter that the town cannot draw, an unknown actor, or a pose that is none.
+            RequestError: an unsupported lens or shutter, an unknown actor, or an invalid pose.
             TooLargeError: an image wider or higher than 4096 pixels.
         """
         for request in requests:
@@ -97,7 +96,7 @@ class TrueWorld:
         return self._run(functools.partial(self._view, request))
 
     def scan(self, request: SensorRequest) -> TrueScan:
-        """A LiDAR turn as measured, each column from where the sensor and the actors were when it fired."""
+        """A LiDAR turn as measured, each column from the poses of sensor and actors at its firing time."""
         self._check(request)
         return self._run(functools.partial(self._scan, request))
 
@@ -120,8 +119,10 @@ class TrueWorld:
         if not isinstance(camera, CameraModel):
             raise RequestError(f"a view needs a camera, and {camera.id!r} is none")
         seen = self._stage.see(request, camera)
+        # Depth along the optical axis; rays of more than 90 degrees off the axis have none.
         forward = sensors.pixel_rays(camera)[0][..., 2]
         depth = np.where(seen.range_m > 0, np.maximum(seen.range_m * forward, 0), 0).astype(np.float32)
+        # Fog lies between surface and camera, so it comes before the camera response.
         rgb, response = self.town.through_air(seen.rgb, seen.range_m), self._responses.get(camera.id)
         if isinstance(response, CameraResponse):
             rgb = apply_response(rgb, response, self._seed(request))
@@ -139,6 +140,7 @@ class TrueWorld:
         return scan.measure(self.town, lidar, turn)
 
     def _seed(self, request: SensorRequest) -> tuple[int, ...]:
+        # crc32 is the same in every process, unlike hash().
         return self.plan.seed, crc32(request.sensor.id.encode()), request.start_us
 
     def _frame(self, request: SensorRequest) -> SensorFrame:
@@ -183,12 +185,13 @@ class TrueWorld:
 def _in_world(
     normal: Float32[np.ndarray, "h w 3"], request: SensorRequest, camera: CameraModel
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Normals of a camera that turns during its exposure, line by line in the world's axes."""
+    """Normals in the world's axes; a camera that rotates during its exposure has one rotation per line."""
     height, width = normal.shape[:2]
     by_column = camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
     lines = np.arange(width if by_column else height) + 0.5
     fractions = sensors.shutter_fraction(camera, np.stack([lines, lines], axis=1))
     poses = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), fractions)
+    # Row vectors: n R^T is R n.
     turns = np.ascontiguousarray(poses[:, :3, :3].transpose(0, 2, 1), np.float32)
     if by_column:
         return np.ascontiguousarray((normal.transpose(1, 0, 2) @ turns).transpose(1, 0, 2))
@@ -196,7 +199,7 @@ def _in_world(
 
 
 def _lidar_frame(request: SensorRequest, lidar: LidarModel, turn: TrueScan) -> LidarFrame:
-    """A turn as a frame: points in the sensor frame at the end of the spin."""
+    """A turn as a frame, with points motion-compensated to the sensor frame at the end of the spin."""
     xyz, intensity, beam = measured_points(lidar, turn)
     pair = np.asarray(request.world_from_sensor, np.float64)
     fired = geometry.interpolate_pose_pair(pair, sensors.column_fraction(lidar))[beam % turn.range_m.shape[1]]

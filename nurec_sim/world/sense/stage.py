@@ -1,4 +1,4 @@
-"""The town at an instant, and the eye that looks at it; all of it belongs to one thread, as OpenGL does."""
+"""The town posed at an instant, viewed by a sensor; everything here belongs to one thread, as OpenGL contexts do."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from nurec_sim.world.sense.shutter import (
 )
 
 PROBES = (24, 16)
-"""Rays, across and down, that find out how fast things move in the image of a rolling shutter."""
+"""Probe rays, across and down, that measure the image motion during a rolling shutter."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """What pictures may cost.
+    """Rendering quality against time.
 
     Args:
-        samples: colour samples per pixel, 0, 2 or 4; edges are smooth with more.
+        samples: colour samples per pixel, 0, 2 or 4; more give smoother edges.
         shadow_px: side of the shadow map, 0 for no shadows.
-        lidar: ``rays`` casts one exact ray per beam from its own instant; ``drawn`` reads twelve sectors from OpenGL
-            images, several times faster, exact on surfaces and less so at their edges and on what moves.
+        lidar: ``rays`` casts one exact ray per beam at its own firing time; ``drawn`` resamples twelve sectors of
+            OpenGL images: several times faster, exact on static surfaces, approximate at edges and on moving actors.
     """
 
     samples: int = 4
@@ -55,7 +55,7 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Instants of one request: times, where all actors are, and where the sensor is."""
+    """Instants of one request: times, poses of all actors, and poses of the sensor."""
 
     town: Town
     data: Any
@@ -64,7 +64,7 @@ class Moments:
     world_from_sensor: Float64[np.ndarray, "n 4 4"]
 
     def enter(self, index: int) -> Float64[np.ndarray, "4 4"]:
-        """Puts the town into an instant and gives the sensor's pose."""
+        """Poses the town at an instant and returns the sensor's pose."""
         self.town.pose(self.data, float(self.t_us[index]), self.places, index)
         return self.world_from_sensor[index]
 
@@ -81,9 +81,9 @@ class Stage:
 
     Args:
         town: the town.
-        recorded: where its actors are when a request does not say.
+        recorded: trajectories of its actors, for those that a request does not place.
         backend: ``egl``, ``osmesa`` or ``rays``.
-        quality: of drawn images.
+        quality: of rendered images.
     """
 
     def __init__(self, town: Town, recorded: Mapping[str, Trajectory], backend: str, quality: Quality):
@@ -107,7 +107,7 @@ class Stage:
     def actor_boxes(
         self, request: SensorRequest, fractions: Float64[np.ndarray, " n"]
     ) -> dict[str, Float64[np.ndarray, "n 4 4"]]:
-        """``world_from_box`` of all actors at fractions of the request's time: as asked for, else as recorded."""
+        """``world_from_box`` of all actors at fractions of the request's time: as requested, else as recorded."""
         times = request.start_us + np.rint(fractions * (request.end_us - request.start_us)).astype(np.int64)
         boxes = {name: path.at(times) for name, path in self._recorded.items() if name not in request.actors}
         for name, pair in request.actors.items():
@@ -124,7 +124,14 @@ class Stage:
     def look(
         self, patch: RayPatch, world_from_sensor: Float64[np.ndarray, "4 4"], seen: Seen, colours: bool = True
     ) -> None:
-        """Fills ``seen``, as large as the patch, with what its rays meet at the instant that was entered."""
+        """Fills in what the rays of a patch hit at the current instant.
+
+        Args:
+            patch: rays of the sensor.
+            world_from_sensor: pose of the sensor.
+            seen: result, of the same size as the patch.
+            colours: if False only geometry is needed, and OpenGL back ends skip the colour pass.
+        """
         if self.painter is None:
             rays.look(self.town, self.data, patch.rays, patch.valid, world_from_sensor, seen)
         else:
@@ -132,10 +139,10 @@ class Stage:
                 face.read(self.painter.draw(self.data, face, world_from_sensor, colours), seen)
 
     def see(self, request: SensorRequest, camera: CameraModel) -> Seen:
-        """A camera image, every band of a rolling shutter at its own time.
+        """A camera image, with every band of a rolling shutter at its own time.
 
-        What moves is off by half of its motion within a band at most. If bands are not narrow enough for a camera
-        that turns fast, every line gets its own direction, and only the motion of its place is left to the bands.
+        Moving points are off by at most half of their motion within a band. If the bands are too wide for a camera that
+        rotates fast, every line gets its own rotation, and the bands only approximate the translation.
         """
         bands, turning = self._bands(request, camera)
         patches = camera_patches(camera, bands)
@@ -146,15 +153,16 @@ class Stage:
             if turning:
                 turns = line_turns(camera, patch, np.asarray(request.world_from_sensor, np.float64))
                 self.look(turned_patch(patch, turns), pose, part)
+                # Normals are returned in the frame of their own line, not of the band.
                 part.normal[:] = (part.normal[..., None, :] @ turns.astype(np.float32))[..., 0, :]
             else:
                 self.look(patch, pose, part)
         return seen
 
     def _bands(self, request: SensorRequest, camera: CameraModel) -> tuple[int, bool]:
-        """Bands of a rolling shutter, and whether its lines need directions of their own.
+        """Number of bands of a rolling shutter, and whether every line needs its own rotation.
 
-        As many as the motion in the image asks for; every line with exact rays.
+        The number depends on the image motion; ray casting uses one band per line.
         """
         if camera.shutter is Shutter.GLOBAL:
             return 1, False
@@ -170,8 +178,10 @@ class Stage:
         pose = moments.enter(0)
         directions = directions[valid] @ pose[:3, :3].T
         geom, distance, _ = rays.cast(self.town, self.data, pose[:3, 3], directions)
+        # The sky is placed so far away that only rotation moves it.
         start = pose[:3, 3] + np.where(geom < 0, 1e4, distance)[:, None] * directions
         end, instance = start.copy(), np.where(geom < 0, 0, self.town.geom_instance[geom])
+        # Probed points on actors move rigidly with their boxes.
         for index, actor in enumerate(self.town.plan.actors):
             on_it = instance == index + 1
             if on_it.any():
@@ -182,6 +192,7 @@ class Stage:
         bands = bands_for(camera, motion)
         if motion <= bands * MOTION_PX:
             return bands, False
+        # Lines with their own rotation leave only the translation to the bands.
         straight = pair.copy()
         straight[1, :3, :3] = pair[0, :3, :3]
         return bands_for(camera, motion_px(camera, straight, start, end)), True

@@ -1,6 +1,6 @@
-"""What exact depth and exact boxes tell: slopes within a pixel, normals, and how every point moves.
+"""Geometry from exact depth and exact boxes: slopes within a pixel, normals, and scene flow.
 
-``nearness`` is 1 / z along the optical axis, 0 for the sky: seen by a pinhole, a plane's nearness is linear in the
+``nearness`` is 1 / z along the optical axis, 0 for the sky. In a pinhole image the nearness of a plane is linear in the
 pixel coordinates, so that differences of neighbours are exact on planes, at any distance and angle.
 """
 
@@ -21,15 +21,15 @@ Plane = Float32[np.ndarray, "h w"]
 
 @dataclass(frozen=True)
 class TrueView:
-    """An image with its ground truth. Pixels outside of the lens are black sky, and everything else is zero there.
+    """An image with its ground truth. Pixels outside the lens are black sky, with all other values zero.
 
     Args:
-        rgb: colours, as the camera's ``CameraResponse`` makes them.
-        depth_m: distance of the surface along the optical axis, 0 for the sky and for what lies behind the camera
+        rgb: colours, after the camera's ``CameraResponse``.
+        depth_m: distance of the surface along the optical axis, 0 for the sky and for points behind the camera
             (lenses of more than 180 degrees).
         surface: ``SurfaceClass``.
         instance: 0 for static surfaces, i + 1 for actor i of the plan.
-        normal: unit normal of the surface in the camera frame, towards the camera; zero where none is known.
+        normal: unit normal of the surface in the camera frame, towards the camera; zero where unknown.
         range_m: distance of the surface from the camera, 0 for the sky.
     """
 
@@ -42,10 +42,11 @@ class TrueView:
 
 
 def slopes(nearness: Plane, geom: Int32[np.ndarray, "h w"]) -> tuple[Plane, Plane, Bool[np.ndarray, "h w"]]:
-    """How much nearness grows per pixel, rightwards and downwards, and where both are known (elsewhere they may be 0).
+    """Gradient of nearness per pixel, rightwards and downwards, and where both are known (elsewhere they may be 0).
 
-    Differences never cross from one geom to another; of the two neighbours on a line, the one is taken behind which
-    the surface goes on most evenly, so that folds and edges inside a geom are not smeared either.
+    Differences never cross from one geom to another. Of the two one-sided differences along a line, the one beyond
+    which the surface continues most evenly is used, so that folds and edges inside a geom are not smeared (the idea of
+    ENO schemes).
     """
     right, right_known = _slope(nearness, geom)
     down, down_known = _slope(nearness.T, geom.T)
@@ -62,7 +63,9 @@ def _slope(nearness: Plane, geom: Int32[np.ndarray, "h w"]) -> tuple[Plane, Bool
     np.abs(np.diff(step, axis=1), out=bend[:, 1:-1])
     size = np.abs(step)
     unknown = size >= _NO_NEIGHBOUR / 2
+    # How much the slope changes one step further out; if that step leaves the geom, the size of the step itself.
     after, before = np.minimum(bend[:, 2:], size[:, 1:]), np.minimum(bend[:, :-2], size[:, :-1])
+    # A step into another geom is never chosen over a known one.
     after[unknown[:, 1:]] = before[unknown[:, :-1]] = 2 * _NO_NEIGHBOUR
     slope = np.where(after < before, step[:, 1:], step[:, :-1])
     known = slope < _NO_NEIGHBOUR / 2
@@ -73,7 +76,15 @@ def _slope(nearness: Plane, geom: Int32[np.ndarray, "h w"]) -> tuple[Plane, Bool
 def plane_normals(
     lens: Pinhole, nearness: Plane, right: Plane, down: Plane, known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Unit normals in the camera frame, towards the camera, of the planes with these slopes; zero where not known."""
+    """Unit normals of the planes with these slopes, in the camera frame and towards the camera.
+
+    Args:
+        lens: pinhole without distortion that took the image.
+        nearness: 1 / z of every pixel (1/m).
+        right: slope of nearness per pixel to the right.
+        down: slope of nearness per pixel downwards.
+        known: where the slopes are valid; normals are zero elsewhere.
+    """
     height, width = nearness.shape
     u = np.arange(width, dtype=np.float32) + np.float32(0.5 - lens.cx_px)
     v = np.arange(height, dtype=np.float32)[:, None] + np.float32(0.5 - lens.cy_px)
@@ -93,12 +104,12 @@ def scene_flow(
     boxes_now: Float64[np.ndarray, "actors 4 4"],
     boxes_then: Float64[np.ndarray, "actors 4 4"],
 ) -> Float32[np.ndarray, "h w 3"]:
-    """How far every pixel's point moves from now to then, in metres along the world's axes; zero where it stands.
+    """Motion of every pixel's point from now to then, in metres along the world's axes; zero on static surfaces.
 
-    Points of an actor move with its box: limbs that swing and wheels that turn are not followed.
+    Points of an actor move rigidly with its box: swinging limbs and turning wheels are not followed.
 
     Args:
-        view: what the camera sees now.
+        view: image with ground truth, taken now.
         camera: the camera.
         world_from_camera: its pose now.
         boxes_now: ``world_from_box`` of all actors of the plan in its order (``TrueWorld.boxes``).
@@ -121,10 +132,17 @@ def follow(
     flow_m: Float32[np.ndarray, "h w 3"],
     world_from_camera_then: Float64[np.ndarray, "4 4"],
 ) -> tuple[Float64[np.ndarray, "h w 2"], Float64[np.ndarray, "h w"]]:
-    """Where a camera sees each pixel's point at another time, if nothing hides it.
+    """Projection of each pixel's point at another time, ignoring occlusion.
+
+    Args:
+        view: image with ground truth, taken now.
+        camera: the camera.
+        world_from_camera: its pose now.
+        flow_m: motion of every pixel's point until then (``scene_flow``).
+        world_from_camera_then: pose of the camera at the other time.
 
     Returns:
-        Pixel coordinates then, NaN for the sky and for what the lens does not see; and the distance then.
+        Pixel coordinates then, NaN for the sky and for points outside the lens; and the distance (m) then.
     """
     rays, _ = sensors.pixel_rays(camera)
     met = view.range_m > 0
