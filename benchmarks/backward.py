@@ -107,7 +107,7 @@ def _step(
 
 
 def _frame(asked: SensorRequest, values: np.ndarray, second: np.ndarray, alpha: np.ndarray) -> SensorFrame:
-    """What was drawn, as the renderer would return it: colour, depth and alpha, or range, intensity and alpha."""
+    """The images as a frame of the renderer: colour, depth and alpha, or range, intensity and alpha."""
     if isinstance(asked.sensor, CameraModel):
         return CameraFrame(asked.sensor, asked.start_us, asked.end_us, to_uint8(values), second, alpha)
     nearest, farthest = asked.sensor.range_m

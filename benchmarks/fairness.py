@@ -86,7 +86,7 @@ def channel(address: str) -> grpc.Channel:
 
 
 def flood(name: str, address: str) -> None:
-    """Keeps so many calls in flight until the input ends; prints how they ended."""
+    """Keeps a number of calls in flight until the input ends; prints their outcomes."""
     procedure, make, in_flight, _ = FLOODS[name]
     data, ended, stop = make().SerializeToString(), Counter[str](), threading.Event()
     with channel(address) as own:
@@ -194,7 +194,7 @@ def measure_flood(name: str, address: str, pid: int, rounds: int, scale: float) 
 
 
 def report(rows: list[dict]) -> None:
-    """The table, and whether it is what it must be."""
+    """The table, and whether it meets the limits."""
     print(
         f"{'flood':14s} {'alone p50':>9s} {'p99':>7s} {'flooded p50':>11s} {'p99':>7s} {'health p99':>10s} {'peak':>8s}"
     )

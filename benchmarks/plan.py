@@ -98,7 +98,7 @@ def quick(options: Options) -> Options:
 
 
 def build(name: str, options: Options, progress: Callable[[str, float], None]) -> BenchScene:
-    """A scene by name, of another number of Gaussians if that is asked for and the scene is a seeded one."""
+    """A scene by name; seeded scenes with another number of Gaussians if requested."""
     if name == "real":
         return SCENES[name](progress)
     return SCENES[name]() if options.gaussians is None else SCENES[name](options.gaussians)
@@ -110,7 +110,7 @@ def count(scene: GaussianScene) -> int:
 
 
 def entries(name: str, built: BenchScene, renderer: CpuRenderer, options: Options) -> tuple[list[Entry], list[str]]:
-    """Everything to be timed on a scene, and remarks on what cannot be."""
+    """All entries to time on a scene, and remarks on those that cannot be timed."""
     chosen = options.sensors or SCENE_SENSORS.get(name, OTHER_SCENES)
     frames = max(2, round(options.repeats * FEWER_FRAMES.get(name, 1.0)))
     paths = [path for path in built.paths if path in options.paths] or list(built.paths)
@@ -161,7 +161,7 @@ def row_name(scene: str, sensor: str, path: str, backend: str) -> str:
 
 
 def each(renderer: CpuRenderer, outputs: tuple[str, ...]) -> Draw:
-    """Draws requests one after the other, cameras with the given outputs."""
+    """Renders requests one after the other, cameras with the given outputs."""
 
     def draw(requests: Sequence[SensorRequest]) -> list[SensorFrame]:
         return [
@@ -180,5 +180,5 @@ def own_account(renderer: CpuRenderer, outputs: tuple[str, ...]) -> Callable[[Se
 
 
 def one_by_one(renderer: CpuRenderer) -> Draw:
-    """Draws requests as ``sense`` calls of one request."""
+    """Renders requests as ``sense`` calls of one request."""
     return lambda requests: [frame for asked in requests for frame in renderer.sense([asked])]

@@ -119,7 +119,7 @@ class Client:
 def load(
     address: str, pid: int, clients: int, seconds: float, asks: Sequence[Ask], expected: Sequence[bytes]
 ) -> dict[str, float | dict]:
-    """What so many clients get in so many seconds, and how long health takes meanwhile."""
+    """Throughput of a number of clients over some seconds, and the latency of health calls under this load."""
     crowd, waits = [Client(address) for _ in range(clients)], list[float]()
     begin, used_s, own_s = time.monotonic(), cpu_s(pid), time.process_time()
     until = begin + seconds

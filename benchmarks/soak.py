@@ -109,7 +109,7 @@ def sensor_mix(width: int, height: int) -> list[CameraModel | LidarModel]:
 
 
 def drive(scene: GaussianScene, mix: list[CameraModel | LidarModel]) -> Iterator[SensorRequest]:
-    """Requests without end: the sensors in turn, the ego on its path, and every other time an actor off its own."""
+    """Endless requests: the sensors in turn, the ego on its path, and every other time an edited actor."""
     for k in itertools.count():
         sensor = mix[k % len(mix)]
         mount = sensor.rig_from_camera if isinstance(sensor, CameraModel) else sensor.rig_from_lidar
@@ -135,7 +135,7 @@ def sensing(scene: GaussianScene, direct: bool, threads: int) -> Iterator[Sense]
 
 
 def resident_mb() -> float:
-    """Resident memory of this process, without what the C library has been given back and keeps for later."""
+    """Resident memory of this process, without freed memory that the C library retains."""
     gc.collect()
     if hasattr(ctypes.CDLL(None), "malloc_trim"):
         ctypes.CDLL(None).malloc_trim(0)

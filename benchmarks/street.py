@@ -91,7 +91,7 @@ def first_hits(origin, direction, low, high):
 
 
 def surfels(boxes: Boxes, count: int, rng: np.random.Generator) -> Gaussians:
-    """``count`` Gaussians on what 36 views along the street see, a random part of what their pixels hit."""
+    """``count`` Gaussians on the surfaces visible in 36 views along the street, a random subset of their pixels."""
     views = [(np.array([x, LANE_Y_M, EYE_HEIGHT_M]), np.radians(yaw)) for x in VIEW_X_M for yaw in VIEW_YAW_DEG]
     probe = np.random.default_rng(0)
     width = 24
@@ -103,7 +103,7 @@ def surfels(boxes: Boxes, count: int, rng: np.random.Generator) -> Gaussians:
 
 
 def _view(boxes: Boxes, eye: np.ndarray, yaw_rad: float, width: int, rng: np.random.Generator) -> Gaussians:
-    """What the rays of one view meet: 80 degrees wide, one jittered ray per pixel."""
+    """Ray hits of one view: 80 degrees wide, one jittered ray per pixel."""
     height, tangent = max(width * 9 // 16, 1), np.tan(np.radians(40.0))
     column, row = np.meshgrid(np.arange(width), np.arange(height))
     u = ((column + rng.random(column.shape)) / width * 2 - 1).ravel() * tangent
@@ -163,7 +163,7 @@ def lying_on(axis: np.ndarray, facing: np.ndarray, rng: np.random.Generator) -> 
 
 
 def gaussians_of(point, scale, quat, *, opacity, rgb, label=Label.OTHER, normal=0.0, intensity=np.nan) -> Gaussians:
-    """Gaussians from float64 values; what is not an array holds for all of them."""
+    """Gaussians from float64 values; scalars apply to all of them."""
     n = len(point)
     return dataclasses.replace(
         Gaussians.empty(n),

@@ -164,7 +164,7 @@ def flow_consistency(
 
 
 def agreement(name: str, drawn: TrueWorld, cast: TrueWorld, camera: CameraModel, duration_us: int = 0) -> Row:
-    """A drawn image against one ray per pixel, each from its own line's instant."""
+    """A rasterised image against one ray per pixel, each at the exposure time of its line."""
     request = request_at(drawn.plan, camera, 3.0, duration_us)
     drawn.view(request)
     view, seconds = timed(lambda: drawn.view(request))

@@ -40,9 +40,9 @@ def score_window(
 
     Args:
         contender: the method.
-        window: what it sees, and the truth.
-        progress: called with what is done and the fraction of it that is.
-        device: that renders; see ``render.choose_device``.
+        window: inputs and ground truth.
+        progress: called with the stage and the fraction done.
+        device: rendering device; see ``render.choose_device``.
 
     Returns:
         The record: ``gaussians``, ``seconds`` (``reconstruct``; ``render`` per view), ``unknown``, and per target
@@ -78,6 +78,7 @@ def score_view(view: ScoredView, target: Target) -> dict[str, Figures | None]:
     """
     true, mask = target.true, target.movable
     full: Figures = {"psnr_db": _capped(psnr(view.rgb, true.rgb)), "ssim": ssim(view.rgb, true.rgb)}
+    # One scale per frame, from all its pixels: a scale per region would hide errors between the regions.
     scale = 1.0
     if view.depth_m is not None and true.depth_m is not None:
         scale = least_squares_scale(view.depth_m, true.depth_m)

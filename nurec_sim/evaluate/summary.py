@@ -100,6 +100,7 @@ def doubling_offset(abs_rel: Mapping[float, float | None]) -> float | None:
     known = [value for value in values if value is not None]
     if not offsets or offsets[0] != 0 or len(known) < len(values):
         return None
+    # The first crossing of twice the value on the path, linear between the sampled offsets.
     limit = 2 * known[0]
     for index in range(1, len(known)):
         before, after = known[index - 1], known[index]
@@ -139,6 +140,8 @@ def interval(values: Sequence[float]) -> list[float] | None:
     """Deterministic 95 % bootstrap interval of the mean; None with fewer than three values."""
     if len(values) < 3:
         return None
+    # Seeded by the sample size: the same values always have the same interval. Below three values a percentile
+    # bootstrap has almost no distinct resamples.
     draws = np.random.default_rng([len(values), 0xB007]).integers(0, len(values), (DRAWS, len(values)))
     low, high = np.quantile(np.asarray(values)[draws].mean(axis=1), (0.025, 0.975))
     return [float(low), float(high)]

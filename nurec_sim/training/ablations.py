@@ -1,4 +1,4 @@
-"""The ablations of the paper's Table 2 as changes of a recipe: each takes one thing away from the full training."""
+"""The ablations of the paper's Table 2 as changes of a recipe; each removes one component of the full training."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from nurec_sim.errors import TrainingError
 from nurec_sim.training.config import LossWeights, Part, Stage, TrainingConfig
 
 SKY_MLP_PROFILES = {"tiny": "tiny-sky-mlp"}
-"""Profiles with an MLP in place of the sky decoder, and nothing else changed."""
+"""Profiles that differ only in a sky MLP in place of the sky decoder."""
 DEPTH_LOSSES = ("depth", "edges", "rendered_depth")
-"""All losses that know the true depth."""
+"""All losses that use the true depth."""
 
 
 @dataclass(frozen=True)
 class TableRow:
-    """Columns of the paper's Table 2; depth figures are taken after scaling, smaller ``abs_rel`` is better."""
+    """Columns of the paper's Table 2; depth figures are after scaling, smaller ``abs_rel`` is better."""
 
     psnr_db: float
     ssim: float
@@ -30,10 +30,10 @@ class Ablation:
     """One row of the table.
 
     Attributes:
-        text: what is different, for tables.
+        text: the difference, for tables.
         paper: the paper's figures, on its own data.
-        change: the full recipe, without what is ablated.
-        merge: how chunks become one scene when the network is used; ``FeedForwardSettings.merge``.
+        change: makes the ablated recipe from the full one.
+        merge: how chunks are merged into one scene at inference; ``FeedForwardSettings.merge``.
     """
 
     text: str
@@ -50,7 +50,7 @@ def ablated(config: TrainingConfig, name: str) -> TrainingConfig:
         name: one of ``ABLATIONS``.
 
     Raises:
-        TrainingError: there is no such ablation, or the recipe has nothing to take away.
+        TrainingError: there is no such ablation, or the recipe lacks the ablated component already.
     """
     if name not in ABLATIONS:
         raise TrainingError(f"no ablation {name!r}; have {list(ABLATIONS)}")
@@ -62,7 +62,7 @@ def ablated(config: TrainingConfig, name: str) -> TrainingConfig:
 
 
 def scaled(config: TrainingConfig, steps: int, pixels: int) -> TrainingConfig:
-    """A recipe cut down to so many steps in all, with images of at most so many pixels; stages keep their shares.
+    """A recipe reduced to ``steps`` total steps and at most ``pixels`` pixels per image; stages keep their shares.
 
     Raises:
         TrainingError: there are fewer steps than stages.
@@ -85,10 +85,10 @@ def scaled(config: TrainingConfig, steps: int, pixels: int) -> TrainingConfig:
 
 
 def _in_one_stage(config: TrainingConfig) -> TrainingConfig:
-    """All parts and all losses at once, for as many steps; rate and warm-up are those of the first stage.
+    """All parts and losses at once, for the same number of steps, with learning rate and warm-up of the first stage.
 
-    A loss keeps the weight that it has in the first stage to which it applies. Views are rendered in every step, so the
-    same steps take longer; the paper says so too.
+    A loss has its weight from the first stage to which it applies. Views are rendered in every step, so training takes
+    longer, as in the paper.
     """
     if len(config.stages) == 1:
         return config
@@ -112,7 +112,7 @@ def _first_weight(name: str, stages: tuple[Stage, ...]) -> float:
 
 
 def _applies(name: str, stage: Stage) -> bool:
-    """Whether a stage computes a loss at all, its weight aside (``objective.Objective``)."""
+    """Whether a stage computes a loss at all, regardless of its weight (``objective.Objective``)."""
     if name in ("depth", "edges", "normal", "semantic", "rgb"):
         return bool({"encoder", "context"} & set(stage.trains))
     if name in ("sky", "motion"):
@@ -127,7 +127,7 @@ def _with_sky_mlp(config: TrainingConfig) -> TrainingConfig:
 
 
 def _without(*losses: str) -> Callable[[TrainingConfig], TrainingConfig]:
-    """Stages that do not compute a loss are left as they are: variants then share them."""
+    """Disables losses; stages that do not compute them are unchanged, so that variants can share them."""
 
     def without(stage: Stage) -> Stage:
         none = {name: 0.0 for name in losses if _applies(name, stage)}
@@ -150,4 +150,4 @@ ABLATIONS: Mapping[str, Ablation] = {
         "without frustum-ownership merging", TableRow(26.10, 0.648, 0.098, 0.891), _unchanged, "concatenate"
     ),
 }
-"""By name, in the order of the paper's table. ``concatenation`` trains nothing of its own."""
+"""By name, in the order of the paper's table. ``concatenation`` needs no training of its own."""

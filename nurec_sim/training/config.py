@@ -1,4 +1,4 @@
-"""The file that a training run is: YAML, checked key by key."""
+"""Training recipes in YAML, strictly validated."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Part = Literal["encoder", "context", "motion", "sky", "gaussians", "isp"]
 
 
 class LossWeights(Strict):
-    """Weights of the loss terms; 0 leaves a term out.
+    """Weights of the loss terms; 0 disables a term.
 
     The paper's context losses are ``depth``, ``normal`` and ``semantic``, its motion loss is ``motion``, its render
-    losses are ``colour``, ``perceptual`` and ``opacity`` (section 4.1). Ours beside them: ``edges`` (slopes of the
-    depth), ``rgb`` (the colour head against the image), ``sky`` (the sky decoder against pixels that show sky) and
+    losses are ``colour``, ``perceptual`` and ``opacity`` (section 4.1). Additional ones of ours: ``edges`` (slopes of
+    the depth), ``rgb`` (the colour head against the image), ``sky`` (the sky decoder against sky pixels) and
     ``rendered_depth``.
     """
 
@@ -39,10 +39,10 @@ class LossWeights(Strict):
 
 
 class Stage(Strict):
-    """One stage of the curriculum: which parts of the network learn, for how long, from what.
+    """One stage of the curriculum: trained parts of the network, duration and losses.
 
-    The learning rate rises over ``warm_up`` steps and falls by a cosine to ``final_rate`` of its peak. ``targets``
-    views are rendered per step, none if 0. ``pixels`` is about how many an input image has.
+    The learning rate rises linearly over ``warm_up`` steps and decays by a cosine to ``final_rate`` of its peak.
+    ``targets`` views are rendered per step. ``pixels`` is the approximate number of pixels of an input image.
     """
 
     name: str = Field(min_length=1, pattern=r"^[a-z0-9_]+$")
@@ -57,9 +57,9 @@ class Stage(Strict):
 
 
 class TrainingConfig(Strict):
-    """A recipe. ``start`` names weights to begin with; parts that they lack begin at random.
+    """A recipe. ``start`` is a file of initial weights; parameters missing in it are initialised randomly.
 
-    ``lpips`` names a file with the weights of LPIPS to use in place of our own perceptual term.
+    ``lpips`` is a file with LPIPS weights, which replaces the built-in perceptual term.
     """
 
     profile: str = "tiny"

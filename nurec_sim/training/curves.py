@@ -1,4 +1,4 @@
-"""The curves of a training run: from ``curves.csv`` to a page that anyone can open, and to a picture."""
+"""The curves of a training run: ``curves.csv`` plotted as a self-contained HTML page and as a picture."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from nurec_sim.report.template import STYLE
 
 FIXED = ("step", "stage", "seconds")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-"""Of the stages, in turn; told apart by all eyes (Okabe and Ito)."""
+"""Colours of the stages, in turn; safe for colour blindness (Okabe and Ito)."""
 RATIO = 20.0
 """Positive curves that span more than this factor get a logarithmic scale."""
 SMOOTHING = 0.6
-"""How much each next neighbour counts in the bold line; the thin one is what was measured."""
+"""Decay per neighbour of the weights in the bold, smoothed line; the thin line is the raw data."""
 COLUMNS = 4
 PANEL_PX = (340, 210)
 LEGEND_PX = 26
@@ -37,7 +37,7 @@ MARGIN = (52, 10, 24, 26)
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """What a run recorded, n rows in the order of the steps; NaN where a row has no such value."""
+    """Recorded curves of a run, n rows in the order of the steps; NaN for missing values."""
 
     step: Float64[np.ndarray, " n"]
     stage: tuple[str, ...]
@@ -46,7 +46,7 @@ class Curves:
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """Names of the stages in the order in which they came."""
+        """Names of the stages in order of appearance."""
         return tuple(dict.fromkeys(self.stage))
 
     def of_stage(self, name: str, stage: str) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
@@ -57,13 +57,13 @@ class Curves:
 
 
 def read_curves(path: Path) -> Curves:
-    """Read ``curves.csv`` while it is being written or afterwards.
+    """Reads ``curves.csv`` while it is being written or afterwards.
 
-    A last line that is not finished is left out, and so are rows that do not go on from the row before, but for the
-    newest: a run that went on from a checkpoint repeats steps.
+    An incomplete last line is ignored. Where steps repeat, because a run was resumed from a checkpoint, the newest rows
+    are kept.
 
     Raises:
-        TrainingError: there is no such file, or it has other columns or other text where numbers belong.
+        TrainingError: there is no such file, columns are missing, or a value is not a number.
     """
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
@@ -93,10 +93,10 @@ def read_curves(path: Path) -> Curves:
 
 
 def write_curves(folder: Path) -> tuple[Path, Path]:
-    """Draw a run folder's ``curves.csv`` as ``curves.html`` and ``curves.png`` beside it; their paths.
+    """Plots a run folder's ``curves.csv`` as ``curves.html`` and ``curves.png``; returns their paths.
 
     Raises:
-        TrainingError: the curves cannot be read, or hold nothing yet.
+        TrainingError: the curves cannot be read, or are empty.
     """
     curves = read_curves(folder / "curves.csv")
     if not curves.values:
@@ -108,7 +108,7 @@ def write_curves(folder: Path) -> tuple[Path, Path]:
 
 
 def smoothed(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Means of each value and its neighbours, which count less the farther they are."""
+    """Two-sided exponential moving average, normalised at both ends."""
     forth, back = _fading_sums(values), _fading_sums(values[::-1])[::-1]
     count = _fading_sums(np.ones(len(values)))
     return (forth + back - values) / (count + count[::-1] - 1)
@@ -148,7 +148,7 @@ def curves_page(curves: Curves, title: str) -> str:
 
 
 def curves_image(curves: Curves) -> UInt8[np.ndarray, "h w 3"]:
-    """A panel for every curve, stages in their colours."""
+    """One panel per curve, stages in their colours."""
     names = list(curves.values)
     columns = min(COLUMNS, len(names))
     rows = -(-len(names) // columns)
@@ -242,7 +242,7 @@ def _shown(values: Float64[np.ndarray, " n"]) -> str:
 
 
 def _number(text: str) -> float:
-    """A number, NaN for an empty cell; infinities count as not known."""
+    """A number, NaN for an empty cell; infinities count as unknown."""
     if not text.strip():
         return math.nan
     value = float(text)

@@ -25,10 +25,10 @@ class Processes:
 
     @classmethod
     def from_torchrun(cls) -> Processes:
-        """As torchrun's environment says; one process where there is none. Joins the process group.
+        """Reads torchrun's environment and joins the process group; a single process without torchrun.
 
         Raises:
-            TrainingError: the environment contradicts itself.
+            TrainingError: the environment is inconsistent.
         """
         if "WORLD_SIZE" not in os.environ:
             return cls.alone()
@@ -52,6 +52,6 @@ class Processes:
         return nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
 
     def leave(self) -> None:
-        """Leave the process group, if there is one."""
+        """Leaves the process group, if any."""
         if self.count > 1:
             torch.distributed.destroy_process_group()

@@ -1,4 +1,4 @@
-"""The data part of a recipe: how many clips are drawn, what they are like, and how samples are taken from them."""
+"""The data part of a recipe: number and settings of the generated clips, and sampling from them."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ class Strict(BaseModel):
 
 
 class DataSettings(Strict):
-    """Training data, drawn while training goes on.
+    """Training data, generated on the fly.
 
     Attributes:
-        clips: kept at a time.
+        clips: number of clips in the cache.
         clips_per_town: drives through each town.
-        clip_frames: of every camera of a clip.
-        clip_period_us: from one frame to the next.
-        clip_pixels: of every image that is drawn, about.
+        clip_frames: frames of every camera of a clip.
+        clip_period_us: frame interval.
+        clip_pixels: approximate number of pixels of rendered images.
         first_town: number of the first town; the following ones come next.
-        refresh: whether new clips replace the oldest ones when all are there; runs are then not repeatable.
-        cameras: weight of each number of cameras in a sample.
-        frames: weight of each number of context frames per camera.
-        most_images: of a sample.
-        zoom: most that images are magnified by cutting away their border.
-        mirror: how often left and right change places.
-        colours: whether colours are changed, by a response of each camera, blur, noise and JPEG.
+        refresh: whether new clips replace the oldest ones once the cache is full; runs are then not reproducible.
+        cameras: sampling weight of each number of cameras in a sample.
+        frames: sampling weight of each number of context frames per camera.
+        most_images: maximum number of images of a sample.
+        zoom: maximum magnification by random crops.
+        mirror: probability of mirroring left and right.
+        colours: whether colours are augmented (camera response, blur, noise, JPEG).
     """
 
     clips: int = Field(240, ge=1)
@@ -52,7 +52,7 @@ class DataSettings(Strict):
     colours: bool = True
 
     def clip_settings(self) -> ClipSettings:
-        """Of the clips that are drawn."""
+        """Settings of the generated clips."""
         return ClipSettings(
             frames=self.clip_frames,
             period_us=self.clip_period_us,
@@ -61,7 +61,7 @@ class DataSettings(Strict):
         )
 
     def window_settings(self, profile: Profile, pixels: int, targets: int) -> WindowSettings:
-        """Of samples with images of about so many pixels, and so many views to be rendered."""
+        """Settings of samples with about ``pixels`` pixels per image and ``targets`` views to render."""
         share = (pixels / (profile.width_px * profile.height_px)) ** 0.5
         sized = dataclasses.replace(
             profile, width_px=round(profile.width_px * share), height_px=round(profile.height_px * share)

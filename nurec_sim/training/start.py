@@ -1,6 +1,6 @@
-"""How training begins: colours as in the image, depth as matches and ground say, Gaussians as footprints of pixels.
+"""Initialisation for training: image colours, depth from matching and flat ground, Gaussians of pixel size.
 
-A network that starts so has only to learn how the world differs from that before its renderings look right.
+Starting from this baseline, a network only has to learn the deviations from it before renderings look right.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from nurec_sim.network.pixel_detail import PixelDetail
 FIRST_RAW_OPACITY = 5.0
 """An opacity of 0.95."""
 LINEAR_PART = 3.0
-"""GELU is nearly the identity from here on; what passes is shifted by it on its way."""
+"""GELU is nearly the identity from here on; passed values are shifted by it."""
 GROUND_CHANNEL = 3 + GROUND_DEPTH
-"""Of what the depth head's detail sees: the colours come first."""
+"""Channel of the ground depth in the input of the depth head's detail branch; the colours come first."""
 FIRST_TRUST = 2.0
-"""A logit: nine tenths of the first depth are those of matching, the rest that of flat ground."""
+"""A logit (0.88): initial share of the depth from matching; the rest is that of flat ground."""
 
 
 def prepare(model: InstantNuRec) -> None:
-    """Change a randomly initialised network as above."""
+    """Applies this initialisation to a randomly initialised network."""
     decoder = model.decoder
     with torch.no_grad():
         # Raw colours r are shown as sigmoid(2 r).
@@ -43,7 +43,7 @@ def prepare(model: InstantNuRec) -> None:
         assert isinstance(colours, nn.Sequential)
         _pass_through(colours, decoder.context_head, (0, 1, 2), grey, torch.logit(grey) / 2)
         if decoder.depth_fusion is not None:
-            # The depth head puts out the logarithm, which is what the car's view holds.
+            # The depth head predicts the logarithm of the depth, as the car-view channel contains it.
             log_depth = torch.linspace(-1.2, 2.9, 10)
             _pass_through(decoder.depth_fusion.pixels, decoder.depth_head, (GROUND_CHANNEL,), log_depth, log_depth)
             decoder.depth_fusion.hourglass.last.weight[0] = 0
@@ -58,17 +58,20 @@ def _pass_through(
     seen: Float[Tensor, " n"],
     wanted: Float[Tensor, " n"],
 ) -> None:
-    """The head's first outputs become these channels of what its fusion sees, by the line that takes seen to wanted."""
+    """Makes the head's first outputs copies of these input channels of its fusion, mapped from ``seen`` to ``wanted``.
+
+    The map is the least-squares line.
+    """
     kept = range(len(channels))
     into, last = _convolutions(head.fusion_head.after_conv)
     layers = _convolutions(fusion)
-    # The first channels of every layer hand on these inputs, and nothing else.
+    # The first channels of every layer pass on these inputs only: an identity kernel at the centre.
     for layer, sources in zip((*layers, into), (channels, kept, kept, kept), strict=True):
         layer.weight[: len(channels)] = 0
         layer.weight[list(kept), list(sources), 1, 1] = 1
     _biases(layers[0])[: len(channels)] = LINEAR_PART
     head.fusion_head.before_conv.weight[: len(channels)] = 0
-    # The last layer undoes what the others did on the way: the line with the least squared error.
+    # The last layer inverts the distortion by the others, by linear regression over probe images of constant value.
     images = torch.zeros(len(seen), layers[0].in_channels, 5, 5)
     images[:, list(channels)] = seen[:, None, None, None]
     passed = torch.relu(fusion(images)[:, 0, 2, 2])
@@ -89,7 +92,7 @@ def _biases(layer: nn.Conv2d | nn.Linear) -> Tensor:
 
 
 def _first_gaussians(decoder: DenseDecoder | SelectiveDecoder) -> None:
-    """Biases of the last layer: scale 3, quaternion 4, opacity 1, for each Gaussian of a cluster."""
+    """Biases of the last layer for each Gaussian of a cluster: 3 for scale, 4 for the quaternion, 1 for opacity."""
     first = torch.tensor([0.0] * 3 + [1.0, 0, 0, 0] + [FIRST_RAW_OPACITY])
     last: nn.Module
     if isinstance(decoder, DenseDecoder):
@@ -102,7 +105,9 @@ def _first_gaussians(decoder: DenseDecoder | SelectiveDecoder) -> None:
 
 
 def load_shared(model: InstantNuRec, path: Path) -> list[str]:
-    """Weights of a file for all parts that fit, such as those that dense and selective share; names of the rest.
+    """Loads all weights of a file that fit by name and shape; returns the names of the others.
+
+    Dense and selective networks, for example, share most of their parts.
 
     Raises:
         WeightsError: the file cannot be read.

@@ -1,8 +1,8 @@
-"""The training loop: stages one after the other, curves, checkpoints and sample renders in a run folder.
+"""The training loop: consecutive stages, with curves, checkpoints and sample renderings in a run folder.
 
-A run folder holds ``recipe.json``, ``curves.csv`` (and as pictures), ``checkpoint.safetensors`` (to go on),
-``weights.safetensors`` (the moving average in half precision, to use) and ``samples/``. Under torchrun every process
-takes its own samples, and gradients are averaged by DDP; only the first process writes.
+A run folder holds ``recipe.json``, ``curves.csv`` (also plotted), ``checkpoint.safetensors`` (to resume),
+``weights.safetensors`` (the moving average in half precision, for inference) and ``samples/``. Under torchrun every
+process takes its own samples, and DDP averages the gradients; only the first process writes files.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class Trainer:
 
     Args:
         config: the recipe.
-        folder: the run folder; an unfinished run of the same recipe there goes on.
-        samples: where samples come from.
+        folder: the run folder; an unfinished run of the same recipe is resumed.
+        samples: source of the samples.
         perceptual: the perceptual term.
         processes: this process among those of the run.
-        threads: of torch and of the renderer; torch's own number if None.
+        threads: threads of the renderer; its default if None.
 
     Raises:
         TrainingError: the folder holds a run of another recipe, or a damaged one.
@@ -86,7 +86,7 @@ class Trainer:
         self._since = time.perf_counter()
 
     def run(self, progress: Progress | None = None, until: int | None = None) -> None:
-        """Train to the end of the recipe, or for tests up to a step."""
+        """Trains to the end of the recipe, or (for tests) up to a step."""
         report = progress or (lambda stage, fraction: None)
         if self.processes.first:
             write_file(self.folder / RECIPE, self.config.model_dump_json(indent=1) + "\n")
@@ -125,6 +125,7 @@ class Trainer:
                         curve.write(done, self.position.seconds)
                     if done % self.config.sample_every == 0 or done == last:
                         self._write_sample(done, sample, outputs)
+                    # At the end of a stage the moments are dropped: the next stage trains other parameters.
                     if done % self.config.checkpoint_every == 0 or done == last:
                         self._save(None if done == first + stage.steps else optimiser)
                 shown = f"PSNR {said['psnr']:.1f} dB" if "psnr" in said else f"AbsRel {said['abs_rel']:.3f}"
@@ -138,13 +139,14 @@ class Trainer:
     def _update(
         self, optimiser: torch.optim.AdamW, trained: Mapping[str, nn.Parameter], loss: Tensor, step: int
     ) -> dict[str, float]:
-        """One optimiser step and the moving average; a step whose gradient is not finite is left out, and counted."""
+        """One optimiser step and the moving average; a step with a non-finite gradient is skipped and counted."""
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         norm = float(nn.utils.clip_grad_norm_(list(trained.values()), self.config.clip_norm))
         if not math.isfinite(norm):
             return {"skipped": 1.0}
         optimiser.step()
+        # A short average at first, otherwise it would keep the random initialisation for 1 / (1 - decay) steps.
         decay = min(self.config.average, (1 + step) / (10 + step))
         with torch.no_grad():
             for mean, (name, now) in zip(self.average.parameters(), self.model.named_parameters(), strict=True):
@@ -158,7 +160,7 @@ class Trainer:
         return self.position.seconds + spent
 
     def _write_weights(self) -> None:
-        # Of files only their names: weights travel, folders don't.
+        # File names without folders: the weights are published, local paths are not.
         named = {key: Path(path.name) for key in ("start", "lpips") if (path := getattr(self.config, key))}
         facts = {
             "recipe": self.config.model_copy(update=named).model_dump_json(),
@@ -195,7 +197,7 @@ def _stages_with_starts(config: TrainingConfig) -> Iterator[tuple[Stage, int]]:
 
 
 def _groups(trained: Mapping[str, nn.Parameter], decay: float) -> list[dict[str, object]]:
-    """Matrices and kernels decay; biases, norms, scales, tokens and positions don't."""
+    """Weight decay for matrices and kernels only, not for biases, norms, scales, tokens and position embeddings."""
     decays = [each for name, each in trained.items() if each.ndim >= 2 and not name.endswith(("embed", "tokens"))]
     known = {id(each) for each in decays}
     others = [each for each in trained.values() if id(each) not in known]
@@ -203,7 +205,7 @@ def _groups(trained: Mapping[str, nn.Parameter], decay: float) -> list[dict[str,
 
 
 class _Curve:
-    """Rows of means since the last row; rows after the step that a run goes on from are dropped."""
+    """Rows of means since the previous row; rows after the step at which a run resumes are dropped."""
 
     def __init__(self, path: Path, step: int) -> None:
         self.path, self.stage = path, ""

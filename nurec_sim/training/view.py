@@ -1,4 +1,4 @@
-"""A step of training as one picture: what the network says of the input images beside the truth, and its renderings."""
+"""A training step as one picture: predictions for the input images next to the ground truth, and renderings."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from nurec_sim.training.data.sample import TrainingSample
 TILE_WIDTH_PX = 208
 MARGIN_PX, CAPTION_PX = 4, 16
 MOST_ROWS = 4
-"""So many input images are shown, evenly taken, and as many views."""
+"""Maximum number of input images (evenly sampled) and of rendered views."""
 NEAREST_M, FARTHEST_M = 2.0, 120.0
-"""Ends of the colour scale of depth, which is even in its logarithm: near is red, far is blue, not known is black."""
+"""Range of the logarithmic colour scale of depth: near is red, far is blue, unknown is black."""
 DIFFERENCE_GAIN = 3.0
 CLASS_COLOURS = {
     SemanticClass.OTHERS: (110, 110, 110),
@@ -34,12 +34,12 @@ Image = UInt8[np.ndarray, "h w 3"]
 def sample_sheet(
     sample: TrainingSample, context: ContextMaps, renders: Sequence[Float[np.ndarray, "h w 3"]] = ()
 ) -> Image:
-    """One row per input image: image, depth, classes and normals, each beside its truth; then the rendered views.
+    """One row per input image: image, depth, classes and normals, each next to its ground truth; then rendered views.
 
     Args:
-        sample: what the network saw, and the truth; b = 1.
-        context: what it said.
-        renders: renderings of the sample's first targets, 0..1; may be none.
+        sample: inputs and ground truth; b = 1.
+        context: predictions of the network.
+        renders: renderings of the sample's first targets, 0..1; may be empty.
     """
     truth = sample.truth
     rows = []
@@ -101,7 +101,7 @@ def _depth(depth_m: Float[np.ndarray, "h w"]) -> Image:
 
 
 def _classes(semantic: Int64[np.ndarray, "h w"]) -> Image:
-    """Class colours, black where the class is not known."""
+    """Class colours, black where the class is unknown."""
     table = np.zeros((len(SemanticClass) + 1, 3), np.uint8)
     for each, colour in CLASS_COLOURS.items():
         table[each] = colour
@@ -109,13 +109,13 @@ def _classes(semantic: Int64[np.ndarray, "h w"]) -> Image:
 
 
 def _normals(normal: Float[np.ndarray, "h w 3"]) -> Image:
-    """Right is red, up green and towards the camera blue, black where not known."""
+    """Right is red, up green and towards the camera blue; black where unknown."""
     known = (normal != 0).any(-1, keepdims=True)
     return np.where(known, _colours(normal * np.array([0.5, -0.5, -0.5]) + 0.5), 0).astype(np.uint8)
 
 
 def _pasted(rows: Sequence[Sequence[tuple[str, Image]]]) -> Image:
-    """Captioned tiles of one width on white paper; rows are as high as their highest tile."""
+    """Captioned tiles of equal width on white; rows are as high as their highest tile."""
     scaled = [[(name, _scaled(image)) for name, image in row] for row in rows]
     width = MARGIN_PX + max(len(row) for row in scaled) * (TILE_WIDTH_PX + MARGIN_PX)
     heights = [max(image.shape[0] for _, image in row) + CAPTION_PX + MARGIN_PX for row in scaled]

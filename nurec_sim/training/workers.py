@@ -1,4 +1,4 @@
-"""How processes that work in the background of a training behave: out of its way, and gone when it is gone."""
+"""Setup of background worker processes of a training run: low priority, and ended with their parent."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ import signal
 import threading
 
 PARENT_GONE = 3
-"""Exit status of a worker whose parent ended without ending it first."""
+"""Exit status of a worker whose parent ended first."""
 
 
 def work_in_background(niceness: int) -> None:
-    """To be called first in a worker process.
+    """Must be called first in a worker process.
 
-    It takes only the time that others leave, lets its parent alone answer Ctrl-C, and ends with it, even where the
-    parent was killed.
+    Lowers its priority, leaves Ctrl-C to the parent, and ends the process with its parent, even if that was killed.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(niceness)

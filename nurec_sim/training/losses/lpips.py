@@ -1,8 +1,8 @@
-"""LPIPS (Zhang et al. 2018), where the user has its weights: distances of the features of AlexNet or VGG16.
+"""LPIPS (Zhang et al. 2018) with weights provided by the user: distances between features of AlexNet or VGG16.
 
-Weights are those that others publish, in files of ``torch.save`` or safetensors: the image network under torchvision's
-names (``features.0.weight``, ...), and one positive factor per channel under those of the LPIPS authors
-(``lin0.model.1.weight``, ...). None come with this package.
+Published weights are read from ``torch.save`` or safetensors files: the image network under torchvision's names
+(``features.0.weight``, ...), and one positive factor per channel under the LPIPS authors' names
+(``lin0.model.1.weight``, ...). This package contains no weights.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from nurec_sim.network.checkpoints.state_dicts import load_state_dict, non_finit
 
 SUFFIXES = (".pth", ".pt", ".safetensors")
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""What the authors take from colours in -1..1, and divide by."""
+"""The authors' normalisation of colours in -1..1: subtracted, then divided by (ImageNet's mean and deviation)."""
 
 
 @dataclass(frozen=True)
 class _Conv:
-    """A convolution followed by a ReLU: its number in torchvision's list, and whether its outcome is compared."""
+    """A convolution followed by a ReLU: its number in torchvision's list, and whether its output is compared."""
 
     number: int
     channels: tuple[int, int]
@@ -80,14 +80,14 @@ def _factor(level: int) -> str:
 
 
 class Lpips:
-    """The distance; call it with two images [h, w, 3] in 0..1. Gradients go to the first one only.
+    """The distance between two images [h, w, 3] in 0..1; only the first one receives gradients.
 
     Args:
-        state: weights of both networks; others in it are ignored.
-        name: where they come from, for errors.
+        state: weights of the image network and the channel factors; others are ignored.
+        name: origin of the weights, for error texts.
 
     Raises:
-        WeightsError: they are of neither network, some are missing or of other shapes, or not finite.
+        WeightsError: weights of neither network, missing, of wrong shape, or not finite.
     """
 
     def __init__(self, state: Mapping[str, Tensor], name: str = "LPIPS weights") -> None:
@@ -110,10 +110,10 @@ class Lpips:
             raise WeightsError(f"{name} holds values that are not finite: {', '.join(bad)}")
 
     def __call__(self, image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-        """How different they look, 0 if equal.
+        """Perceived difference, 0 if equal.
 
         Raises:
-            ValueError: the images differ in shape, are no [h, w, 3], or are too small for the network.
+            ValueError: the images differ in shape, are not [h, w, 3], or are too small for the network.
         """
         least = self.network.smallest_px
         if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < least:
@@ -125,13 +125,14 @@ class Lpips:
         seen = self._features(image)
         with torch.no_grad():
             true = self._features(reference)
+        # Paper, eq. 1: squared differences of unit-length features, weighted per channel, averaged over the image.
         total = image.new_zeros(())
         for level, (a, b) in enumerate(zip(seen, true, strict=True)):
             total = total + functional.conv2d((_unit(a) - _unit(b)).square(), self.state[_factor(level)]).mean()
         return total
 
     def _features(self, image: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "1 c y x"]]:
-        """What is compared, level by level."""
+        """Compared features of each level."""
         shift, scale = (torch.tensor(each, device=image.device) for each in (SHIFT, SCALE))
         x = ((2 * image.float() - 1 - shift) / scale).permute(2, 0, 1)[None]
         levels = []
@@ -165,7 +166,7 @@ def load_lpips(path: Path) -> Lpips:
 
 
 def _recognised(state: Mapping[str, Tensor], name: str) -> _Network:
-    """Which network it is, by the size of the first kernel."""
+    """Identifies the network by the shape of the first kernel."""
     first = state.get("features.0.weight")
     for network in (_ALEX, _VGG):
         if first is not None and list(first.shape) == network.needed()["features.0.weight"]:
@@ -178,7 +179,7 @@ def _recognised(state: Mapping[str, Tensor], name: str) -> _Network:
 
 
 def _unit(x: Float[Tensor, "1 c y x"]) -> Float[Tensor, "1 c y x"]:
-    """Features of length 1 at every place, 0 where there are none."""
-    # The root's gradient at 0 is infinite; the authors add as little to the root itself.
+    """Features scaled to unit length at every pixel; zero vectors stay zero."""
+    # The square root has an infinite gradient at 0, hence the clamp; 1e-10 is the authors' epsilon.
     length = x.square().sum(dim=1, keepdim=True).clamp(min=1e-20).sqrt()
     return x / (length + 1e-10)
