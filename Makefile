@@ -15,7 +15,7 @@ $(VENV)/.installed: pyproject.toml setup.py constraints.txt
 demo: $(VENV)/.installed ## log -> Gaussian scene -> gRPC server -> closed loop -> report
 	$(BIN)/nurec-sim demo --out $(OUT)
 
-test: $(VENV)/.installed ## every rule once, at most five minutes on two cores
+test: $(VENV)/.installed ## every rule once, some seven minutes on two cores
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.installed ## tests that take many seconds, and repetitions of quick ones

@@ -64,8 +64,10 @@ def compare(
     write_file(out_path, render_comparison(found))
     if json_path is not None:
         write_file(json_path, json.dumps(found.figures, indent=1, sort_keys=True) + "\n")
-    rows = [(name, *(row.text if row else "none" for row in each)) for _, name, each in side_by_side(found.figures)]
-    print_table(f"scenes of {log.id}", rows, ("figure", *names))
+    table = side_by_side(found.figures)
+    for group in dict.fromkeys(group for group, _, _ in table):
+        rows = [(name, *(row.text if row else "none" for row in each)) for at, name, each in table if at == group]
+        print_table(group, rows, ("figure", *names))
     out.print(f"wrote {out_path}", soft_wrap=True)
 
 

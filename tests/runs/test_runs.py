@@ -395,9 +395,9 @@ def test_bad_orders_are_refused(tmp_path):
         drive([], ["log_replay"])
     with pytest.raises(ScenarioError, match="policy names must be unique; repeated: .'crash'"):
         drive([scene], [Crash(), Crash()])
-    with pytest.raises(ScenarioError, match="scenes need different ids, but .'street'"):
+    with pytest.raises(ScenarioError, match="scene ids must be unique; repeated: .'street'"):
         drive([scene, scene], ["log_replay"])
-    with pytest.raises(RunError, match="does not exist; give a folder that"):
+    with pytest.raises(RunError, match="does not exist; give a folder written by"):
         drive([scene], ["log_replay"], resume=tmp_path / "no")
 
 
