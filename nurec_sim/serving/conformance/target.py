@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import Any
 
 import grpc
 import numpy as np
@@ -86,7 +87,15 @@ class Target:
 
     # ----------------------------------------------------------------------------------------------------------- calls
 
-    def call(self, name: str, request=None, *, path: str = wire.SERVICE, metadata=(), timeout_s: float | None = None):
+    def call(
+        self,
+        name: str,
+        request: Any = None,
+        *,
+        path: str = wire.SERVICE,
+        metadata: Sequence[tuple[str, str]] = (),
+        timeout_s: float | None = None,
+    ) -> Any:
         """The reply of a procedure.
 
         Args:
@@ -101,7 +110,15 @@ class Target:
         """
         return self.begin(name, request, path=path, metadata=metadata, timeout_s=timeout_s).result()
 
-    def begin(self, name: str, request=None, *, path: str = wire.SERVICE, metadata=(), timeout_s: float | None = None):
+    def begin(
+        self,
+        name: str,
+        request: Any = None,
+        *,
+        path: str = wire.SERVICE,
+        metadata: Sequence[tuple[str, str]] = (),
+        timeout_s: float | None = None,
+    ) -> Any:
         """Starts a call.
 
         Args:

@@ -117,7 +117,7 @@ _LENS_WRITERS: dict[str, Callable[[Any, Any], None]] = {
 }
 
 
-def read_camera(message, width_px: int, height_px: int, known: Mapping[str, CameraModel]) -> CameraModel:
+def read_camera(message: Any, width_px: int, height_px: int, known: Mapping[str, CameraModel]) -> CameraModel:
     """The camera that a ``CameraSpec`` message describes, scaled to the requested size with its field of view kept.
 
     A message without lens parameters names one of the scene's ``known`` cameras by ``logical_id``. A requested width of
