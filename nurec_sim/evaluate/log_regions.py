@@ -6,7 +6,6 @@ time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -41,25 +40,24 @@ class SeenPoints:
     bin: Int64[np.ndarray, " n"]
 
 
-def actor_mask(clip: Clip, request: SensorRequest) -> Bool[np.ndarray, "h w"]:
-    """Pixels inside the outlines of labelled boxes of movable objects."""
-    camera = _camera(request)
-    mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
-    for outline in box_outlines(clip, request):
-        cv2.fillConvexPoly(mask, outline.astype(np.int32), 1)
-    return mask.astype(bool)
+def actor_mask(clip: Clip, request: SensorRequest, size_px: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
+    """Pixels inside the outlines of labelled boxes of movable objects.
 
-
-def box_outlines(clip: Clip, request: SensorRequest) -> Iterator[Float64[np.ndarray, "k 2"]]:
-    """Convex outlines, in pixels, of the boxes that are entirely in front of the camera."""
+    ``size_px`` is the width and height of the mask; the camera's own if None.
+    """
     camera = _camera(request)
+    width, height = size_px or (camera.width_px, camera.height_px)
+    mask = np.zeros((height, width), np.uint8)
     for track in clip.tracks:
         if track.label not in MOVABLE_LABELS or not track.path.covers(request.start_us):
             continue
         corners = geometry.transform_points(track.path.at(request.start_us), _CORNERS * np.asarray(track.size_m))
         uv, valid, _ = sensors.project_rolling(camera, request.world_from_sensor, corners)
+        # A box with a corner behind the camera or outside the lens's valid field has no convex image outline.
         if valid.all():
-            yield cv2.convexHull(uv.astype(np.float32))[:, 0]
+            outline = cv2.convexHull((uv * (width / camera.width_px, height / camera.height_px)).astype(np.int32))
+            cv2.fillConvexPoly(mask, outline, 1)
+    return mask.astype(bool)
 
 
 def seen_points(clip: Clip, request: SensorRequest) -> SeenPoints:

@@ -8,22 +8,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import ReconstructError
+from nurec_sim.evaluate.log_regions import actor_mask
 from nurec_sim.evaluate.views import ScoredView, reduced, scored_size
 from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, Target, Window
 from nurec_sim.reconstruct.feedforward.inputs.frames import choose_cameras
-from nurec_sim.types import MOVABLE_LABELS, CameraModel, Clip, Rig, SensorRequest
+from nurec_sim.types import CameraModel, Clip, Rig, SensorRequest
 
 STEP_TOLERANCE = 0.25
 """Tolerance of the frame interval."""
 NEAREST_SWEEP_US = 60_000
 """Maximum time between a frame and the sweep for its depth."""
-CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
 def front_cameras(clip: Clip, most: int) -> tuple[str, ...]:
@@ -175,7 +174,7 @@ def _target(clip: Clip, camera_id: str, index: int, sweep: tuple[str, int] | Non
     depth_m = np.zeros(true.rgb.shape[:2], np.float32)
     if sweep is not None:
         depth_m = projected_depth(request, camera, clip.sweep(*sweep).xyz_world_m)
-    movable = movable_pixels(clip, request, camera) if clip.tracks else None
+    movable = actor_mask(clip, request, scored_size(camera.width_px, camera.height_px)) if clip.tracks else None
     name = f"{camera_id}-{index:04d}"
     return Target(name, request, ScoredView(true.rgb, depth_m), movable, beyond=beyond)
 
@@ -196,19 +195,3 @@ def projected_depth(
     depth_m = np.full((height, width), np.inf, np.float32)
     np.minimum.at(depth_m, (row, column), z.astype(np.float32))
     return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
-
-
-def movable_pixels(clip: Clip, request: SensorRequest, camera: CameraModel) -> Bool[np.ndarray, "h w"]:
-    """Mask of the projected boxes of movable objects, at the scored size."""
-    width, height = scored_size(camera.width_px, camera.height_px)
-    mask = np.zeros((height, width), np.uint8)
-    for track in clip.tracks:
-        if track.label not in MOVABLE_LABELS or not track.path.covers(request.start_us):
-            continue
-        corners = geometry.transform_points(track.path.at(request.start_us), CORNERS * np.asarray(track.size_m))
-        uv, valid, _ = sensors.project_rolling(camera, request.world_from_sensor, corners)
-        # A box with a corner behind the camera or outside the lens's valid field has no convex image outline.
-        if valid.all():
-            outline = cv2.convexHull((uv * (width / camera.width_px, height / camera.height_px)).astype(np.int32))
-            cv2.fillConvexPoly(mask, outline, 1)
-    return mask.astype(bool)
