@@ -76,6 +76,9 @@ def test_free_space_is_where_three_beams_passed_away_from_surfaces():
     points = np.array([[10.0, 0, 0], [19.7, 0, 0], [21.5, 0, 0], [10.0, 9.0, 0], [45.0, 0, 0]])
     assert beams_of(3).free(points).tolist() == [True, False, False, False, False]
     assert not beams_of(2).free(points).any()
+    fired = [wall_sweep(y_m=0.1 * k)[0] for k in range(3)]
+    beside = RecordedBeams(fired, np.array([[10.3, 0, 0]]))  # all beams pass, but something was met 0.3 m away
+    assert beside.free(np.array([[10.0, 0, 0], [9.8, 0, 0]])).tolist() == [False, True]
 
 
 def test_returns_inside_boxes_of_movers_do_not_count():
@@ -105,6 +108,7 @@ def test_ranges_are_scored_apart_and_clouds_by_their_distances():
     xyz = np.array([[5.0, 0, 0], [0, 15.0, 0], [0, 0, 30.0]])
     score = LidarScore(xyz, np.array([5.5, np.nan, 33.0]))
     assert score.within(0, 10).median_abs_error_m == pytest.approx(0.5)
+    assert score.within(0, 10).beams == 1
     assert score.within(10, 20).recall == 0
     # Simulated (5.5, 0, 0) and (0, 0, 33): 0.5 and 3 m off; recorded (0, 15, 0) is nearest to (5.5, 0, 0).
     precision, coverage = score.chamfer()
