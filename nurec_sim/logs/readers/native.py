@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,65 +12,53 @@ from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.logs import calibration, fields, tables
 from nurec_sim.logs.clip import Clip, ImageRecord
-from nurec_sim.logs.storage import META_FILE, Storage, checked_name, schema_of
+from nurec_sim.logs.readers._schema import SchemaReader
+from nurec_sim.logs.storage import Storage, checked_name
 from nurec_sim.logs.stored import StoredFiles
 from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.logs.write import SCHEMA
 from nurec_sim.types import CameraModel, LidarModel, Matrix4, Trajectory
 
 
-class NativeReader:
+class NativeReader(SchemaReader):
     """Reads clip folders (``types.LogReader``)."""
 
     name = "nurec-sim-clip"
-    description = f"a folder, or a .zip of one, whose {META_FILE} has the schema {SCHEMA!r}"
+    schema = SCHEMA
 
-    def can_open(self, path: Path) -> bool:
-        """Whether it is a clip folder of ours."""
-        return schema_of(path) == SCHEMA
-
-    def open(self, path: Path) -> Clip:
-        """The clip.
-
-        Raises:
-            ClipError: a file or a field is missing or wrong.
-        """
-        storage = Storage(path)
-        return _read(storage, storage.read_json(META_FILE))
-
-
-def _read(storage: Storage, meta: dict[str, Any]) -> Clip:
-    calib = storage.read_json(calibration.CALIBRATION_FILE)
-    rig, scales = calibration.rig_from_json(calib)
-    ego_from_rig = geometry.inverse(calibration.ground_shift(calib))
-    frames = storage.read_json("frames.json")
-    recorded = tables.trajectory_from_json(
-        "frames.json: ego", fields.required("frames.json", frames, "ego"), "T_world_ego"
-    )
-    ego = Trajectory(recorded.t_us, recorded.world_from_body @ ego_from_rig)
-    image_rows = _grouped(frames, "cameras", list(rig.cameras))
-    images = {name: list(_images(rows, rig.cameras[name], ego)) for name, rows in image_rows.items()}
-    sweep_rows = _grouped(frames, "lidars", list(rig.lidars))
-    sweeps = {name: list(_sweeps(rows, rig.lidars[name], ego)) for name, rows in sweep_rows.items()}
-    tracks: list[Any] = []
-    if storage.exists("tracks.json"):
-        tracks = fields.of_kind("tracks.json", storage.read_json("tracks.json"), "tracks", list)
-    parsed = [tables.track_from_json(index, row) for index, row in enumerate(tracks)]
-    names = [track.id for track in parsed]
-    if doubles := sorted({name for name in names if names.count(name) > 1}):
-        raise ClipError(f"tracks.json: track id {doubles[0]!r} appears twice")
-    return Clip(
-        id=fields.of_kind("meta.json", meta, "name", str),
-        rig=rig,
-        ego=ego,
-        images=images,
-        sweeps=sweeps,
-        source=StoredFiles(storage, images, sweeps, scales),
-        tracks=parsed,
-        road_map=tables.map_from_json(storage.read_json("map.json")) if storage.exists("map.json") else None,
-        facts={key: value for key, value in meta.items() if key != "schema"},
-        rig_from_log=geometry.inverse(ego_from_rig),
-    )
+    def read(self, storage: Storage, meta: dict[str, Any]) -> Clip:
+        """The clip."""
+        calib = storage.read_json(calibration.CALIBRATION_FILE)
+        rig, scales = calibration.rig_from_json(calib)
+        ego_from_rig = geometry.inverse(calibration.ground_shift(calib))
+        frames = storage.read_json("frames.json")
+        recorded = tables.trajectory_from_json(
+            "frames.json: ego", fields.required("frames.json", frames, "ego"), "T_world_ego"
+        )
+        ego = Trajectory(recorded.t_us, recorded.world_from_body @ ego_from_rig)
+        image_rows = _grouped(frames, "cameras", list(rig.cameras))
+        images = {name: list(_images(rows, rig.cameras[name], ego)) for name, rows in image_rows.items()}
+        sweep_rows = _grouped(frames, "lidars", list(rig.lidars))
+        sweeps = {name: list(_sweeps(rows, rig.lidars[name], ego)) for name, rows in sweep_rows.items()}
+        tracks: list[Any] = []
+        if storage.exists("tracks.json"):
+            tracks = fields.of_kind("tracks.json", storage.read_json("tracks.json"), "tracks", list)
+        parsed = [tables.track_from_json(index, row) for index, row in enumerate(tracks)]
+        names = [track.id for track in parsed]
+        if doubles := sorted({name for name in names if names.count(name) > 1}):
+            raise ClipError(f"tracks.json: track id {doubles[0]!r} appears twice")
+        return Clip(
+            id=fields.of_kind("meta.json", meta, "name", str),
+            rig=rig,
+            ego=ego,
+            images=images,
+            sweeps=sweeps,
+            source=StoredFiles(storage, images, sweeps, scales),
+            tracks=parsed,
+            road_map=tables.map_from_json(storage.read_json("map.json")) if storage.exists("map.json") else None,
+            facts={key: value for key, value in meta.items() if key != "schema"},
+            rig_from_log=geometry.inverse(ego_from_rig),
+        )
 
 
 def _grouped(frames: dict[str, Any], group: str, known: list[str]) -> dict[str, list[Any]]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,8 @@ from nurec_sim.errors import ClipError
 from nurec_sim.logs import calibration, fields
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.labels import IGNORED, is_movable, our_label
-from nurec_sim.logs.storage import META_FILE, Storage, checked_name, schema_of
+from nurec_sim.logs.readers._schema import SchemaReader
+from nurec_sim.logs.storage import Storage, checked_name
 from nurec_sim.logs.stored import StoredFiles
 from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.types import CameraModel, LidarModel, Matrix4, Pinhole, Rig, Track, Trajectory
@@ -37,72 +37,59 @@ _TABLE_OF_WORDS = {
 }
 
 
-class RealdataPackReader:
+class RealdataPackReader(SchemaReader):
     """Reads packs as clips, their rig frame moved to the ground (``types.LogReader``)."""
 
     name = "realdata-pack"
-    description = f"a folder, or a .zip of one, whose {META_FILE} has the schema {SCHEMA!r}"
+    schema = SCHEMA
 
-    def can_open(self, path: Path) -> bool:
-        """Whether it is a pack."""
-        return schema_of(path) == SCHEMA
-
-    def open(self, path: Path) -> Clip:
-        """The pack as a clip.
-
-        Raises:
-            ClipError: a file or a field is missing or wrong.
-        """
-        storage = Storage(path)
-        return _read(storage, storage.read_json(META_FILE))
-
-
-def _read(storage: Storage, meta: dict[str, Any]) -> Clip:
-    calib = storage.read_json(calibration.CALIBRATION_FILE)
-    rig_from_ego = calibration.ground_shift(calib)
-    ego_from_rig = geometry.inverse(rig_from_ego)
-    frames = fields.of_kind("frames.json", storage.read_json("frames.json"), "frames", list)
-    if not frames:
-        raise ClipError("frames.json: there are no frames")
-    cameras = {
-        name: _camera(name, row, rig_from_ego)
-        for name, row in fields.of_kind(calibration.CALIBRATION_FILE, calib, "cameras", dict).items()
-    }
-    facts = {key: value for key, value in meta.items() if key != "schema"}
-    lidars: dict[str, LidarModel] = {}
-    sweeps: dict[str, list[SweepRecord]] = {}
-    scale, lidar_from_file = FULL_BYTE, np.eye(4)
-    if calib.get("lidar") is not None:
-        rate = fields.number("meta.json", meta, "rate_hz", default=10.0)
-        lidar, lidar_from_file, note = _lidar(calib["lidar"], rig_from_ego, rate)
-        lidars[LIDAR_ID] = lidar
-        facts["lidar_note"] = note
-        scale = calibration.positive_scale(f"{calibration.CALIBRATION_FILE}: lidar", calib["lidar"])
-        if scale == 1:
-            scale = FULL_BYTE  # "as in the source": bytes over their full range
-        sweeps[LIDAR_ID] = list(_sweeps(frames, lidar_from_file))
-    times = [_microseconds(f"frames.json: frame {i}", frame, "timestamp_s") for i, frame in enumerate(frames)]
-    for index in range(1, len(times)):
-        if times[index] <= times[index - 1]:
-            raise ClipError(
-                f"frames.json: frame {index}: time goes back or stands still, "
-                f"{times[index]} us after {times[index - 1]} us"
-            )
-    world_from_ego = [
-        fields.transform(f"frames.json: frame {i}", frame, "T_world_ego") for i, frame in enumerate(frames)
-    ]
-    images = {name: list(_images(frames, name)) for name in cameras}
-    return Clip(
-        id=fields.of_kind("meta.json", meta, "name", str),
-        rig=Rig(cameras, lidars),
-        ego=Trajectory(np.array(times, np.int64), np.array(world_from_ego) @ ego_from_rig),
-        images=images,
-        sweeps=sweeps,
-        source=StoredFiles(storage, images, sweeps, {LIDAR_ID: scale}, lidar_from_file),
-        tracks=_tracks(frames, times, world_from_ego),
-        facts=facts,
-        rig_from_log=rig_from_ego,
-    )
+    def read(self, storage: Storage, meta: dict[str, Any]) -> Clip:
+        """The pack as a clip."""
+        calib = storage.read_json(calibration.CALIBRATION_FILE)
+        rig_from_ego = calibration.ground_shift(calib)
+        ego_from_rig = geometry.inverse(rig_from_ego)
+        frames = fields.of_kind("frames.json", storage.read_json("frames.json"), "frames", list)
+        if not frames:
+            raise ClipError("frames.json: there are no frames")
+        cameras = {
+            name: _camera(name, row, rig_from_ego)
+            for name, row in fields.of_kind(calibration.CALIBRATION_FILE, calib, "cameras", dict).items()
+        }
+        facts = {key: value for key, value in meta.items() if key != "schema"}
+        lidars: dict[str, LidarModel] = {}
+        sweeps: dict[str, list[SweepRecord]] = {}
+        scale, lidar_from_file = FULL_BYTE, np.eye(4)
+        if calib.get("lidar") is not None:
+            rate = fields.number("meta.json", meta, "rate_hz", default=10.0)
+            lidar, lidar_from_file, note = _lidar(calib["lidar"], rig_from_ego, rate)
+            lidars[LIDAR_ID] = lidar
+            facts["lidar_note"] = note
+            scale = calibration.positive_scale(f"{calibration.CALIBRATION_FILE}: lidar", calib["lidar"])
+            if scale == 1:
+                scale = FULL_BYTE  # "as in the source": bytes over their full range
+            sweeps[LIDAR_ID] = list(_sweeps(frames, lidar_from_file))
+        times = [_microseconds(f"frames.json: frame {i}", frame, "timestamp_s") for i, frame in enumerate(frames)]
+        for index in range(1, len(times)):
+            if times[index] <= times[index - 1]:
+                raise ClipError(
+                    f"frames.json: frame {index}: time goes back or stands still, "
+                    f"{times[index]} us after {times[index - 1]} us"
+                )
+        world_from_ego = [
+            fields.transform(f"frames.json: frame {i}", frame, "T_world_ego") for i, frame in enumerate(frames)
+        ]
+        images = {name: list(_images(frames, name)) for name in cameras}
+        return Clip(
+            id=fields.of_kind("meta.json", meta, "name", str),
+            rig=Rig(cameras, lidars),
+            ego=Trajectory(np.array(times, np.int64), np.array(world_from_ego) @ ego_from_rig),
+            images=images,
+            sweeps=sweeps,
+            source=StoredFiles(storage, images, sweeps, {LIDAR_ID: scale}, lidar_from_file),
+            tracks=_tracks(frames, times, world_from_ego),
+            facts=facts,
+            rig_from_log=rig_from_ego,
+        )
 
 
 def _microseconds(where: str, row: Any, key: str) -> int:
