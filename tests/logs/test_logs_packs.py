@@ -143,7 +143,12 @@ def test_exposures_of_zero_length_and_no_faults(pack):
 @pytest.mark.parametrize(
     "name, old, new, text",
     [
-        ("frames", '"track_id": null', '"track_id": 5', "frame 0: box 1: track_id 5 appears twice in the frame"),
+        (
+            "frames",
+            '"track_id": null',
+            '"track_id": 5',
+            "frame 0: box 1: track '5' appears twice at 1600000000000000 us",
+        ),
         ("frames", '"timestamp_s": 1600000000.1,', '"timestamp_s": 1600000000.0,', "frame 1: time goes back or stands"),
         ("frames", '"yaw_ego": 0.3', '"yaw_ego": "east"', "frame 0: box 0: 'yaw_ego' must be a finite number"),
         ("frames", '"motion_compensated"', '"compensated"', "frame 0: lidar: 'motion_compensated' is missing"),

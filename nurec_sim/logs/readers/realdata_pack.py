@@ -15,8 +15,9 @@ import numpy as np
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import ClipError
 from nurec_sim.logs import calibration, fields
+from nurec_sim.logs.boxes import BoxTracks
 from nurec_sim.logs.clip import Clip, ImageRecord
-from nurec_sim.logs.labels import IGNORED, is_movable, our_label
+from nurec_sim.logs.labels import our_label
 from nurec_sim.logs.readers._schema import SchemaReader
 from nurec_sim.logs.storage import Storage, checked_name
 from nurec_sim.logs.stored import StoredFiles
@@ -172,40 +173,17 @@ def _images(frames: list[Any], camera_id: str) -> Iterator[ImageRecord]:
 
 def _tracks(frames: list[Any], times: list[int], world_from_ego: list[Matrix4]) -> list[Track]:
     """Tracks from boxes with the same ``track_id``; a box without one becomes a track of a single pose."""
-    seen: dict[str, dict[str, Any]] = {}
+    boxes = BoxTracks()
     for index, frame in enumerate(frames):
         for number, box in enumerate(fields.of_kind(f"frames.json: frame {index}", frame, "boxes", list, default=[])):
             where = f"frames.json: frame {index}: box {number}"
-            given = fields.of_kind(where, box, "type", str)
-            if given.lower() in IGNORED:
-                continue
-            label = our_label(given)
+            label = fields.of_kind(where, box, "type", str)
             known = box.get("track_id")
-            name = f"{label}-{index}-{number}" if known is None else str(known)
-            track = seen.setdefault(name, {"label": label, "times": [], "poses": [], "sizes": []})
-            if track["times"] and track["times"][-1] == times[index]:
-                raise ClipError(f"{where}: track_id {known} appears twice in the frame")
-            size = fields.array(where, box, "size_lwh", (3,))
-            if (size <= 0).any():
-                raise ClipError(f"{where}: size_lwh must be positive, got {size.tolist()}")
-            track["times"].append(times[index])
-            track["poses"].append(world_from_ego[index] @ _ego_from_box(where, box))
-            track["sizes"].append(size)
-    return [
-        Track(
-            id=name,
-            label=track["label"],
-            size_m=_median_size(track["sizes"]),
-            path=Trajectory(np.array(track["times"], np.int64), np.array(track["poses"])),
-            controllable=is_movable(track["label"]),
-        )
-        for name, track in seen.items()
-    ]
-
-
-def _median_size(sizes: list[np.ndarray]) -> tuple[float, float, float]:
-    length, width, height = np.median(sizes, axis=0)
-    return float(length), float(width), float(height)
+            name = f"{our_label(label)}-{index}-{number}" if known is None else str(known)
+            length, width, height = fields.array(where, box, "size_lwh", (3,)).tolist()
+            pose = world_from_ego[index] @ _ego_from_box(where, box)
+            boxes.add(where, name, label, times[index], pose, (length, width, height))
+    return boxes.tracks()
 
 
 def _ego_from_box(where: str, box: Any) -> Matrix4:
