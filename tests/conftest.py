@@ -26,6 +26,15 @@ def realdata() -> Path:
 
 
 @pytest.fixture(scope="session")
+def rawlogs() -> Path:
+    """Folder of real logs in their publishers' layouts, which are not part of the repository."""
+    folder = Path(os.environ.get("NUREC_SIM_RAWLOGS", Path(__file__).parents[2] / "shared" / "rawlogs"))
+    if not folder.is_dir():
+        pytest.skip(f"no published logs at {folder}; set NUREC_SIM_RAWLOGS to their folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def alpasim_messages() -> Path:
     """Folder of all recorded AlpaSim messages; those of the demo log alone are part of the repository."""
     shared = Path(__file__).parents[2] / "shared" / "alpasim_messages"

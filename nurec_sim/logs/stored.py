@@ -18,26 +18,39 @@ from nurec_sim.types import Matrix4, SweepPoints
 
 
 @dataclass(frozen=True)
-class StoredFiles:
-    """The files of a clip folder as a ``types.LogSource``.
+class ImageFiles:
+    """Images of a folder or zip file, one file each: what sources (``types.LogSource``) of such logs have in common.
 
     Attributes:
         storage: the folder or zip file.
         images: records of each camera's frames.
         sweeps: records of each LiDAR's sweeps.
-        intensity_scale: per LiDAR, the divisor that maps stored intensities to 0..1.
-        lidar_from_file: rotation from the axes of sweep files to ours (x forward).
     """
 
     storage: Storage
     images: Mapping[str, Sequence[ImageRecord]]
     sweeps: Mapping[str, Sequence[SweepRecord]]
-    intensity_scale: Mapping[str, float]
-    lidar_from_file: Matrix4 = field(default_factory=lambda: np.eye(4))
 
     def image(self, camera_id: str, index: int) -> UInt8[np.ndarray, "h w 3"]:
         """One RGB frame."""
         return self.storage.read_image(self.images[camera_id][index].file)
+
+    def ego_mask(self, camera_id: str) -> None:
+        """None: unknown."""
+        return None
+
+
+@dataclass(frozen=True)
+class StoredFiles(ImageFiles):
+    """The files of a clip folder as a ``types.LogSource``.
+
+    Attributes:
+        intensity_scale: per LiDAR, the divisor that maps stored intensities to 0..1.
+        lidar_from_file: rotation from the axes of sweep files to ours (x forward).
+    """
+
+    intensity_scale: Mapping[str, float]
+    lidar_from_file: Matrix4 = field(default_factory=lambda: np.eye(4))
 
     def sweep(self, lidar_id: str, index: int) -> SweepPoints:
         """The points of one sweep."""
@@ -48,10 +61,6 @@ class StoredFiles:
         if intensity is not None:
             intensity = np.clip(intensity / self.intensity_scale[lidar_id], 0.0, 1.0).astype(np.float32)
         return SweepPoints(geometry.transform_points(self.lidar_from_file, xyz_m), intensity, arrays.get("dt_us"))
-
-    def ego_mask(self, camera_id: str) -> None:
-        """Clip folders have none."""
-        return None
 
 
 def encode_points(xyz_m: Float64[np.ndarray, "n 3"]) -> np.ndarray:
