@@ -78,9 +78,7 @@ def test_a_reader_can_be_given_by_hand(example, folder):
     ):
         logs.open_clip(folder)
     assert logs.open_clip(folder, example["CsvReader"]()).id == "drive"
-    with pytest.raises(
-        ClipError, match="unknown log reader 'kitty'; have .*'kitti_raw', .*'native', 'realdata_pack'.*my_reader.py"
-    ):
+    with pytest.raises(ClipError, match="unknown log reader 'kitty'; have .*'native', .*'realdata_pack'.*my_reader.py"):
         logs.open_clip(folder, "kitty")
 
 
@@ -89,7 +87,6 @@ def test_unknown_formats_name_those_that_are_known(example, install, tmp_path):
     with pytest.raises(ClipError) as caught:
         logs.open_clip(tmp_path)
     for text in ("an empty folder", "nurec-sim-clip: a folder, or a .zip", "csv-and-png: a folder with poses.csv",
-                 "kitti-raw: ", "kitti-odometry: ",
                  "docs/write_a_log_reader.md"):  # fmt: skip
         assert text in str(caught.value)
 
