@@ -62,7 +62,7 @@ def world(
         cameras: random rig with this many cameras: front, + front left and right, + rear left and right.
         lens: random rig with this lens type.
         pixels: random rig with about this many pixels per image (width times height).
-        lidar: random rig with this LiDAR: 64x900, PANDAR128, AT128, HDL-64, HDL-32, VLP-16, or none.
+        lidar: random rig with this LiDAR: 64x900, PANDAR128, AT128, HDL-64, HDL-32, VLP-32C, VLP-16, or none.
         rig_seed: seed of the random rig; default: the town's seed.
         imperfect: add per-camera colour response, vignette and noise, and drop weak LiDAR returns.
         overwrite: replace an existing clip.

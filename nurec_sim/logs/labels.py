@@ -5,15 +5,25 @@ from __future__ import annotations
 from nurec_sim.types import MOVABLE_LABELS
 
 _SAME = {
-    "automobile": ("car", "van", "suv", "vehicle", "pickup"),
-    "heavy_truck": ("truck", "lorry", "semi_truck"),
-    "bus": ("bus/rv/caravan", "bendy_bus", "rigid_bus"),
-    "train": ("tram", "train_or_tram_car"),
+    "automobile": ("car", "van", "suv", "vehicle", "pickup", "regular_vehicle"),
+    "heavy_truck": ("truck", "lorry", "semi_truck", "large_vehicle", "box_truck", "truck_cab"),
+    "bus": ("bus/rv/caravan", "bendy_bus", "rigid_bus", "articulated_bus", "school_bus"),
+    "train": ("tram", "train_or_tram_car", "railed_vehicle"),
+    "trailer": ("vehicular_trailer",),
     "other_vehicle": ("misc", "other", "construction_vehicle", "emergency_vehicle", "towed_object", "wheeled_slow"),
-    "person": ("pedestrian", "person_sitting", "stroller", "wheelchair"),
+    "person": ("pedestrian", "person_sitting", "stroller", "wheelchair", "official_signaler"),
     # A parked bicycle may start to move as well.
-    "rider": ("cyclist", "motorcyclist", "bicycle", "bicyclist", "motorcycle", "motorized_slow"),
-    "animal": (),
+    "rider": (
+        "cyclist",
+        "motorcyclist",
+        "bicycle",
+        "bicyclist",
+        "motorcycle",
+        "motorized_slow",
+        "wheeled_rider",
+        "wheeled_device",
+    ),
+    "animal": ("dog",),
 }
 _OURS = {other: label for label, others in _SAME.items() for other in others}
 IGNORED = frozenset({"dontcare"})

@@ -45,6 +45,47 @@ LIDAR_TABLES: dict[str, LidarTable] = {
     ),
     # Velodyne HDL-32E: +10.67 to -30.67 degrees.
     "HDL-32": LidarTable(10.67 - 4.0 / 3.0 * np.arange(32), columns=2170, range_m=(0.9, 100.0)),
+    # Velodyne VLP-32C: dense about the horizon, +15 to -25 degrees.
+    "VLP-32C": LidarTable(
+        np.array(
+            [
+                15,
+                10.333,
+                7,
+                4.667,
+                3.333,
+                2.333,
+                1.667,
+                1.333,
+                1,
+                0.667,
+                0.333,
+                0,
+                -0.333,
+                -0.667,
+                -1,
+                -1.333,
+                -1.667,
+                -2,
+                -2.333,
+                -2.667,
+                -3,
+                -3.333,
+                -3.667,
+                -4,
+                -4.667,
+                -5.333,
+                -6.148,
+                -7.254,
+                -8.843,
+                -11.31,
+                -15.639,
+                -25,
+            ]
+        ),  # fmt: skip
+        columns=1808,
+        range_m=(0.5, 200.0),
+    ),
     # Velodyne VLP-16: +15 to -15 degrees.
     "VLP-16": LidarTable(15.0 - 2.0 * np.arange(16), columns=1808, range_m=(0.5, 100.0)),
 }

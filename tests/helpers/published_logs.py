@@ -1,5 +1,6 @@
 """The demo log in the layouts of public data sets, as their publishers write them."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ INDICES = (4, 5, 6, 12, 18)
 """Frames of the demo log that are written."""
 EPOCH_US = 1_317_042_164_000_000
 """2011-09-26 13:02:44, added to the times of the demo log."""
-LIDAR = "lidar_top"
+LIDAR, CAMERAS = "lidar_top", ("camera_front", "camera_front_left")
 
 
 def demo() -> logs.Clip:
@@ -163,3 +164,134 @@ def kitti_odometry(root: Path, clip: logs.Clip) -> Path:
     put(folder / "times.txt", "\n".join(times) + "\n")
     put(root / "poses" / "07.txt", "\n".join(poses) + "\n")
     return folder
+
+
+# -------------------------------------------------------------------------------------------------------- Argoverse 2
+
+LOG = "7fab2350-7eaf-3b7e-a39d-6937a4c1beef"
+RIG_FROM_EGO = geometry.pose(np.eye(3), np.array([0, 0, 0.33]))
+CITY_M = np.array([5172.0, 2419.0, 66.0])
+EPOCH_NS = 315_966_253_000_000_000
+DOWN = geometry.pose(
+    cv2.Rodrigues(np.array([np.pi, 0, 0]))[0] @ geometry.rotation_from_yaw(0.4), np.array([1.1, 0, 1.7])
+)
+"""Pose in the rig of the lower LiDAR, which hangs upside down."""
+
+
+def pose_columns(poses: np.ndarray) -> dict[str, np.ndarray]:
+    quaternions = geometry.quat_from_matrix(poses[:, :3, :3])
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    return dict(zip(names, np.concatenate([quaternions, poses[:, :3, 3]], axis=1).T, strict=True))
+
+
+def feather(path: Path, columns: dict, **types) -> None:
+    import polars
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table = polars.DataFrame({name: polars.Series(name, list(values)) for name, values in columns.items()})
+    table.cast(types).write_ipc(path, compression="zstd")
+
+
+def argoverse2(root: Path, clip: logs.Clip, invert: bool = False) -> Path:
+    """A log of Argoverse 2 with two cameras of the demo; every second point is one of the lower LiDAR.
+
+    ``invert``: the poses of the cameras are the inverse of what they should be.
+    """
+    import polars
+
+    folder, city = root / "val" / LOG, geometry.pose(np.eye(3), CITY_M)
+    sensors = {
+        **{name: clip.rig.cameras[name].rig_from_camera for name in CAMERAS},
+        "up_lidar": clip.rig.lidars[LIDAR].rig_from_lidar, "down_lidar": DOWN,
+    }  # fmt: skip
+    ego_from_sensor = geometry.inverse(RIG_FROM_EGO) @ np.array(list(sensors.values()))
+    if invert:
+        ego_from_sensor[: len(CAMERAS)] = geometry.inverse(ego_from_sensor[: len(CAMERAS)])
+    feather(
+        folder / "calibration/egovehicle_SE3_sensor.feather",
+        {"sensor_name": list(sensors), **pose_columns(ego_from_sensor)},
+    )
+    cameras = [clip.rig.cameras[name] for name in CAMERAS]
+    lenses = [camera.lens for camera in cameras]
+    feather(
+        folder / "calibration/intrinsics.feather",
+        {
+            "sensor_name": [*(camera.id for camera in cameras), "ring_rear_left"],
+            **{name: [*(getattr(lens, name) for lens in lenses), 1684.0] for name in ("fx_px", "fy_px")},
+            **{name: [*(getattr(lens, name) - 0.5 for lens in lenses), 800.0] for name in ("cx_px", "cy_px")},
+            **{name: [-0.28, 0.1, 0.1] for name in ("k1", "k2", "k3")},
+            "height_px": [*(camera.height_px for camera in cameras), 1550],
+            "width_px": [*(camera.width_px for camera in cameras), 2048],
+        },
+        height_px=polars.UInt16,
+        width_px=polars.UInt16,
+    )
+    ego = city @ clip.ego.world_from_body @ RIG_FROM_EGO
+    feather(
+        folder / "city_SE3_egovehicle.feather",
+        {"timestamp_ns": EPOCH_NS + clip.ego.t_us * 1000, **pose_columns(ego)},
+    )
+    boxes = []
+    for index in INDICES:
+        for camera in CAMERAS:
+            t_us = clip.image_records(camera)[index].start_us
+            put(folder / f"sensors/cameras/{camera}/{EPOCH_NS + t_us * 1000}.jpg", jpeg(clip.image(camera, index)))
+        sweep = clip.sweep(LIDAR, index)
+        ego_from_world = geometry.inverse(clip.ego.at(sweep.t_us) @ RIG_FROM_EGO)
+        points = geometry.transform_points(ego_from_world, sweep.xyz_world_m)
+        rows = np.arange(len(points))
+        feather(
+            folder / f"sensors/lidar/{EPOCH_NS + sweep.t_us * 1000}.feather",
+            {
+                **dict(zip("xyz", points.T, strict=True)),
+                "intensity": np.rint(sweep.intensity * 255).astype(int),
+                "laser_number": rows % 2 * 32 + rows % 31,
+                "offset_ns": (sweep.point_t_us - sweep.start_us) * 1000,
+            },
+            **dict.fromkeys("xyz", polars.Float16), intensity=polars.UInt8, laser_number=polars.UInt8,
+            offset_ns=polars.Int32,
+        )  # fmt: skip
+        for track in clip.tracks:
+            boxes.append((index, track, ego_from_world @ track.path.at(sweep.t_us)))
+    feather(
+        folder / "annotations.feather",
+        {
+            "timestamp_ns": [EPOCH_NS + clip.sweep_records(LIDAR)[index].t_us * 1000 for index, _, _ in boxes],
+            "track_uuid": [track.id for _, track, _ in boxes],
+            "category": [{"automobile": "REGULAR_VEHICLE", "person": "PEDESTRIAN"}[t.label] for _, t, _ in boxes],
+            **{
+                name: [track.size_m[axis] for _, track, _ in boxes]
+                for axis, name in enumerate(("length_m", "width_m", "height_m"))
+            },
+            **pose_columns(np.array([pose for _, _, pose in boxes])),
+            "num_interior_pts": [1] * len(boxes),
+        },
+    )
+    put(folder / f"map/log_map_archive_{LOG}____PIT_city_1.json", argoverse_map())
+    return folder
+
+
+def argoverse_map() -> str:
+    """A square, and a bus lane and a bicycle lane along x in it."""
+
+    def line(*points) -> list[dict]:
+        return [dict(zip("xyz", (CITY_M + point).tolist(), strict=True)) for point in points]
+
+    lane = {
+        "is_intersection": False, "left_lane_mark_type": "NONE", "right_lane_mark_type": "NONE", "successors": [],
+        "predecessors": [], "right_neighbor_id": None, "left_neighbor_id": None,
+        "left_lane_boundary": line([0, 4, 0], [8, 4, 0]),
+        "right_lane_boundary": line([0, 0, 0], [4, 0, 0], [8, 0, 2]),
+    }  # fmt: skip
+    return json.dumps(
+        {
+            "pedestrian_crossings": {},
+            "lane_segments": {
+                "1": {**lane, "id": 1, "lane_type": "BUS"},
+                "2": {**lane, "id": 2, "lane_type": "BIKE"},
+            },
+            "drivable_areas": {
+                "3": {"area_boundary": line([0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]), "id": 3},
+            },
+        }
+    )

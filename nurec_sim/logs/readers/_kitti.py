@@ -55,25 +55,6 @@ def calibration_file(storage: Storage, name: str) -> dict[str, Float64[np.ndarra
     return found
 
 
-def numbered_files(storage: Storage, folder: str, suffix: str, count: int | None = None) -> dict[int, str]:
-    """Files of a folder by the number in their name, which is the line of their time; numbers may be missing.
-
-    Args:
-        storage: where the folder is.
-        folder: its name.
-        suffix: end of the names of its files.
-        count: how many times there are, None if that is checked later.
-
-    Raises:
-        ClipError: a number is not below ``count``.
-    """
-    files = sorted((storage.path / folder).glob(f"*{suffix}"))
-    found = {int(each.stem): f"{folder}/{each.name}" for each in files if each.stem.isascii() and each.stem.isdigit()}
-    if count is not None and found and max(found) >= count:
-        raise ClipError(f"{found[max(found)]}: has no time: there are {count}")
-    return found
-
-
 def text_lines(storage: Storage, name: str) -> list[str]:
     """The lines of a text file, without empty ones at its end.
 

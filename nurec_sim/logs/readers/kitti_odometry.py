@@ -16,6 +16,7 @@ from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import image_size
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.readers import _kitti as kitti
+from nurec_sim.logs.readers._folders import numbered_files, only_one
 from nurec_sim.logs.storage import Storage
 from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.types import Rig, Trajectory
@@ -44,11 +45,7 @@ class KittiOdometryReader:
         Raises:
             ClipError: a file or a value is missing or wrong, or there are several sequences.
         """
-        found = _sequences(path)
-        if len(found) != 1:
-            names = [str(each.relative_to(path)) for each in found]
-            raise ClipError(f"holds {len(found)} sequences of KITTI odometry; give the folder of one: {names}")
-        folder = found[0].resolve()
+        folder = only_one(path, _sequences(path), "sequences of KITTI odometry")
         return _read(Storage(folder.parents[1]), folder.name)
 
 
@@ -82,7 +79,7 @@ def _read(storage: Storage, sequence: str) -> Clip:
     # The world is the rig frame at the first pose, so that z points up.
     world_from_rig = rig_from_rectified @ poses @ geometry.inverse(rig_from_rectified)
     ego = Trajectory(np.array(times, np.int64), world_from_rig)
-    files = {name: kitti.numbered_files(storage, f"{folder}/{name}", ".png", len(times)) for name in (*COLOUR, *GREY)}
+    files = {name: _files(storage, f"{folder}/{name}", ".png", len(times)) for name in (*COLOUR, *GREY)}
     names = [name for name in COLOUR if files[name]] or [name for name in GREY if files[name]]
     cameras, images = {}, {}
     for name in names:
@@ -98,7 +95,7 @@ def _read(storage: Storage, sequence: str) -> Clip:
             for i, file in files[name].items()
         ]
     lidars, sweeps = {}, {}
-    if sweep_files := kitti.numbered_files(storage, f"{folder}/velodyne", ".bin", len(times)):
+    if sweep_files := _files(storage, f"{folder}/velodyne", ".bin", len(times)):
         lidars = {kitti.LIDAR_ID: kitti.velodyne(RIG_FROM_VELO)}
         sweeps = {
             kitti.LIDAR_ID: [
@@ -117,6 +114,14 @@ def _read(storage: Storage, sequence: str) -> Clip:
         source=kitti.KittiFiles(storage, images, sweeps),
         facts={"dataset": f"KITTI odometry {sequence}", "licence": kitti.LICENCE, "poses": "of the benchmark"},
     )
+
+
+def _files(storage: Storage, folder: str, suffix: str, count: int) -> dict[int, str]:
+    """Files of a sensor by the line of their time."""
+    found = numbered_files(storage.path, folder, suffix)
+    if found and max(found) >= count:
+        raise ClipError(f"{found[max(found)]}: has no time: there are {count}")
+    return found
 
 
 def _numbers(storage: Storage, name: str, count: int) -> list[list[float]]:

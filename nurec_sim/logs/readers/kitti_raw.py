@@ -17,6 +17,7 @@ from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.readers import _kitti as kitti
+from nurec_sim.logs.readers._folders import numbered_files, only_one
 from nurec_sim.logs.readers._kitti_tracklets import read_tracklets
 from nurec_sim.logs.storage import Storage
 from nurec_sim.logs.sweeps import SweepRecord, prolonged
@@ -51,11 +52,7 @@ class KittiRawReader:
         Raises:
             ClipError: a file or a value is missing or wrong, or there are several drives.
         """
-        drives = _drives(path)
-        if len(drives) != 1:
-            names = [str(each.relative_to(path)) for each in drives]
-            raise ClipError(f"holds {len(drives)} drives of KITTI raw; give the folder of one: {names}")
-        drive = drives[0].resolve()
+        drive = only_one(path, _drives(path), "drives of KITTI raw")
         return _read(Storage(drive.parent), drive.name)
 
 
@@ -72,14 +69,14 @@ def _drives(path: Path) -> list[Path]:
 def _read(storage: Storage, drive: str) -> Clip:
     velo_from_imu = kitti.rotation_and_shift(storage, IMU_TO_VELO)
     rig_from_velo = RIG_FROM_IMU @ geometry.inverse(velo_from_imu)
-    sweep_files = kitti.numbered_files(storage, f"{drive}/velodyne_points/data", ".bin")
+    sweep_files = numbered_files(storage.path, f"{drive}/velodyne_points/data", ".bin")
     sweep_times = {
         name: _times(storage, f"{drive}/velodyne_points/timestamps{name}.txt") if sweep_files else []
         for name in ("_start", "", "_end")
     }
-    image_files = {name: kitti.numbered_files(storage, f"{drive}/{name}/data", ".png") for name in kitti.COLOUR}
+    image_files = {name: numbered_files(storage.path, f"{drive}/{name}/data", ".png") for name in kitti.COLOUR}
     if not any(image_files.values()):
-        image_files = {name: kitti.numbered_files(storage, f"{drive}/{name}/data", ".png") for name in kitti.GREY}
+        image_files = {name: numbered_files(storage.path, f"{drive}/{name}/data", ".png") for name in kitti.GREY}
     image_files = {name: files for name, files in image_files.items() if files}
     image_times = {name: _times(storage, f"{drive}/{name}/timestamps.txt") for name in image_files}
     if not sweep_files and not image_files:
@@ -145,7 +142,7 @@ def _at(times: Sequence[int | None], index: int, file: str) -> int:
 
 def _poses(storage: Storage, drive: str) -> Trajectory:
     """Poses of the rig by GPS/IMU; the first is at the origin and looks along x, roll and pitch as recorded."""
-    files = kitti.numbered_files(storage, f"{drive}/oxts/data", ".txt")
+    files = numbered_files(storage.path, f"{drive}/oxts/data", ".txt")
     if not files:
         raise ClipError(f"{drive}/oxts/data: there are no poses; files like 0000000000.txt are read")
     all_times = _times(storage, f"{drive}/oxts/timestamps.txt")
