@@ -6,6 +6,7 @@ A Gaussian's moments rest while it is out of view; its bias correction counts th
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float32
 
 from nurec_sim.compute.kernels import kernel
 
@@ -14,15 +15,13 @@ MEAN, QUAT, SCALE, OPACITY, RGB = 0, 3, 7, 10, 11
 """First columns of a Gaussian's values: mean, quaternion, log scales, logit of opacity, colour."""
 BETA1, BETA2 = 0.9, 0.99
 EPSILON = 1e-15
+KEEP1, KEEP2, TINY = np.float32(1 - BETA1), np.float32(1 - BETA2), np.float32(EPSILON)
 SMALLEST_M = 1e-3
 
 
 @kernel
-def adam_step(
-    rows, values, first, second, visits, turns, row_turn, by_mean, by_quat, by_scale, by_opacity, by_rgb, scale,
-    opacity, rates, largest_m,
-):  # fmt: skip
-    """One step on some Gaussians.
+def adam_step(rows, values, first, second, visits, corrections, turns, row_turn, by, scale, opacity, rates, largest_m):
+    """One step on some Gaussians; those without any gradient, which others hide, are left as they are.
 
     Args:
         rows: [k] which ones.
@@ -30,30 +29,36 @@ def adam_step(
         first: [n,14] first moments; changed.
         second: [n,14] second moments; changed.
         visits: [n] steps so far; changed.
+        corrections: [v,2] what bias corrections multiply both moments by after so many steps, see ``bias_corrections``.
         turns: [t,4] rotations world_from_frame as quaternions, what ``row_turn`` numbers.
         row_turn: [n] which of ``turns`` took a Gaussian to the world; -1 none.
-        by_mean: [n,3] gradient by the mean in the world, like the following ones.
-        by_quat: [n,4] by the quaternion in the world.
-        by_scale: [n,3] by standard deviations.
-        by_opacity: [n] by opacity.
-        by_rgb: [n,3] by colour.
+        by: gradients in the world by mean, quaternion, standard deviations, opacity and colour, see
+            ``backward.repack.RawGaussians``; those of ``rows`` are set to 0 again.
         scale: [n,3] standard deviations as rendered.
         opacity: [n] opacities as rendered.
-        rates: [14] learning rates.
+        rates: [14] float32 learning rates.
         largest_m: standard deviations end here.
     """
-    gradient = np.zeros(VALUES)
-    low, high = np.log(SMALLEST_M), np.log(largest_m)
+    gradient = np.zeros(VALUES, np.float32)
+    low, high = np.float32(np.log(SMALLEST_M)), np.float32(np.log(largest_m))
     for row in range(rows.shape[0]):
         i = rows[row]
+        size = np.float32(0)
         for k in range(3):
-            gradient[MEAN + k] = by_mean[i, k]
+            gradient[MEAN + k] = by.mean[i, k]
             # Chain rule of the activations: d exp(x) / dx = exp(x), d sigmoid(x) / dx = s (1 - s).
-            gradient[SCALE + k] = by_scale[i, k] * scale[i, k]
-            gradient[RGB + k] = by_rgb[i, k]
+            gradient[SCALE + k] = by.scale[i, k] * scale[i, k]
+            gradient[RGB + k] = by.features[i, k]
+            by.mean[i, k] = by.scale[i, k] = by.features[i, k] = np.float32(0)
         for k in range(4):
-            gradient[QUAT + k] = by_quat[i, k]
-        gradient[OPACITY] = by_opacity[i] * opacity[i] * (1 - opacity[i])
+            gradient[QUAT + k] = by.quat[i, k]
+            by.quat[i, k] = np.float32(0)
+        gradient[OPACITY] = by.opacity[i] * opacity[i] * (np.float32(1) - opacity[i])
+        by.opacity[i] = np.float32(0)
+        for k in range(VALUES):
+            size += abs(gradient[k])
+        if not (size > 0 and size < np.inf):
+            continue
         turn = row_turn[i]
         if turn >= 0:
             # mean_world = R mean + t and quat_world = r quat, so gradients go back by R^T and by conj(r).
@@ -68,47 +73,32 @@ def adam_step(
             gradient[QUAT + 2] = w * r + x * s - y * p - z * q
             gradient[QUAT + 3] = w * s - x * r + y * q - z * p
         visits[i] += 1
-        correction1, correction2 = 1 - BETA1 ** visits[i], 1 - BETA2 ** visits[i]
+        correction = corrections[min(visits[i], corrections.shape[0] - 1)]
+        c1, c2 = correction[0], correction[1]
+        # Float32 throughout, so that the fourteen values are a vector.
         for k in range(VALUES):
             g = gradient[k]
-            first[i, k] = BETA1 * first[i, k] + (1 - BETA1) * g
-            second[i, k] = BETA2 * second[i, k] + (1 - BETA2) * g * g
-            step = first[i, k] / correction1 / (np.sqrt(second[i, k] / correction2) + EPSILON)
-            values[i, k] -= rates[k] * step
+            m = first[i, k] + KEEP1 * (g - first[i, k])
+            v = second[i, k] + KEEP2 * (g * g - second[i, k])
+            first[i, k], second[i, k] = m, v
+            values[i, k] -= rates[k] * (m * c1) / (np.sqrt(v * c2) + TINY)
         # Bounds: a scale near 0 makes the covariance singular, a huge one covers the view from inside.
         for k in range(SCALE, SCALE + 3):
             values[i, k] = min(max(values[i, k], low), high)
         # The renderer takes unit quaternions, and a step leaves the unit sphere.
-        norm = 0.0
+        norm = np.float32(0)
         for k in range(QUAT, QUAT + 4):
             norm += values[i, k] * values[i, k]
-        norm = np.sqrt(max(norm, 1e-24))
+        shrink = np.float32(1) / np.sqrt(max(norm, TINY))
         for k in range(QUAT, QUAT + 4):
-            values[i, k] /= norm
+            values[i, k] *= shrink
 
 
-@kernel
-def activate(rows, values, mean, quat, scale, opacity, rgb):
-    """Write what is rendered of some Gaussians, in their own frames: activations of the optimised values.
-
-    Args:
-        rows: [k] which ones.
-        values: [n,14] what is optimised, see ``MEAN`` and the others.
-        mean: [n,3] output, metres.
-        quat: [n,4] output, (w, x, y, z), unit.
-        scale: [n,3] output, standard deviations in metres: exp of the log scales.
-        opacity: [n] output: sigmoid of the logits.
-        rgb: [n,3] output.
-    """
-    for row in range(rows.shape[0]):
-        i = rows[row]
-        for k in range(3):
-            mean[i, k] = values[i, MEAN + k]
-            scale[i, k] = np.exp(values[i, SCALE + k])
-            rgb[i, k] = values[i, RGB + k]
-        for k in range(4):
-            quat[i, k] = values[i, QUAT + k]
-        opacity[i] = 1 / (1 + np.exp(-values[i, OPACITY]))
+def bias_corrections() -> Float32[np.ndarray, "v 2"]:
+    """1 / (1 - beta^v) of both moments; the last row holds for all further steps."""
+    steps = np.arange(2000)
+    steps[0] = 1  # never read
+    return np.stack([1 / (1 - BETA1**steps), 1 / (1 - BETA2**steps)], axis=1).astype(np.float32)
 
 
 @kernel

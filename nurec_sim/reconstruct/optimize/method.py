@@ -15,6 +15,7 @@ import numpy as np
 
 from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.optimize.adam import SkyAdam
+from nurec_sim.reconstruct.optimize.compositing import Composite
 from nurec_sim.reconstruct.optimize.depth_loss import depth_loss
 from nurec_sim.reconstruct.optimize.image_loss import colour_loss
 from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
@@ -75,7 +76,7 @@ class Optimization:
         for view in views:
             frames[view.camera.id] += 1
         self.responses = FrameResponses(scene.isp, frames)
-        self._clear: dict[int, np.ndarray] = {}
+        self._clear: dict[int, tuple[np.ndarray, ...]] = {}
         self.steps = 0
 
     def run(self, progress: Progress) -> None:
@@ -95,42 +96,35 @@ class Optimization:
         height, width = view.image.shape[:2]
         frame = Frame(SENSORS.tables(view.camera), view.world_from_camera, False)
         drawn = self.parameters.at(view.t_us)
-        planes = frame.draw(*drawn.arrays)[:, :height, :width]
-        alpha, behind = planes[0], frame.draw_sky(self.sky)
-        clear = (1 - alpha) * (frame.sensor.grid.valid > 0)
-        colour, recorded = planes[1:4] + clear * behind, view.colours
+        alpha, distance = frame.draw_packed(drawn.packed)[[0, 4], :height, :width]
+        composite, recorded = Composite(frame, self.sky), view.colours
         if self.responses.is_new(view.camera.id, view.frame):
-            self.responses.start(view.camera.id, view.frame, self._shown(view, frame, colour), recorded)
-        response = self.responses.of(view.camera.id, view.frame).astype(np.float32)
-        shown = self._shown(view, frame, colour)
+            before = composite.shown(self.responses.of(view.camera.id, view.frame))
+            self.responses.start(view.camera.id, view.frame, before, recorded)
+        response = self.responses.of(view.camera.id, view.frame)
+        shown = composite.shown(response)
         loss, by_shown = colour_loss(shown, recorded, weights.dssim)
 
-        # Back through shown = R (c + (1 - alpha) sky) + b: to the composited colour, from there to alpha and the sky.
-        by_colour = np.einsum("ij,hwi->jhw", response[:, :3], by_shown)
-        by_alpha = -(by_colour * behind).sum(axis=0)
-        by_distance = np.zeros_like(alpha)
-        loss += depth_loss(view.returns, alpha, planes[4], frame.ray_z, weights.depth, weights.solid, by_alpha,
+        by_planes, by_sky, by_response = composite.back(response, shown, by_shown)
+        by_alpha, by_distance = by_planes[0, :height, :width], by_planes[4, :height, :width]
+        loss += depth_loss(view.returns, alpha, distance, frame.ray_z, weights.depth, weights.solid, by_alpha,
                            by_distance)  # fmt: skip
         # The sky mask is fixed at a view's first step: taken anew, it would follow what it is meant to hold.
-        sky = self._clear.setdefault(number, np.flatnonzero(alpha < SEEN_SKY))
-        if len(sky):
-            by_alpha.reshape(-1)[sky] += weights.sky / len(sky)
-            loss += weights.sky * float(alpha.reshape(-1)[sky].mean())
+        if number not in self._clear:
+            self._clear[number] = np.nonzero(alpha < SEEN_SKY)
+        sky = self._clear[number]
+        if len(sky[0]):
+            by_alpha[sky] += weights.sky / len(sky[0])
+            loss += weights.sky * float(alpha[sky].mean())
 
-        gradients = frame.draw_back(*drawn.arrays[:4], {0: by_alpha, 1: by_colour, 4: by_distance})[:5]
+        world = drawn.world
+        frame.draw_back(world.mean, world.quat, world.scale, world.opacity, by_planes, self.parameters.gradients)
         columns = rate * rate_columns(rates.mean_m, rates.quat, rates.log_scale, rates.logit_opacity, rates.rgb)
-        self.parameters.step(drawn, frame.drawn_rows, gradients, columns, self.settings.largest_m)
-        by_sky, _ = frame.draw_sky_back(self.sky, np.ascontiguousarray(by_colour * clear))
+        self.parameters.step(drawn, frame.drawn_rows, columns, self.settings.largest_m)
         self._sky_adam.step(self.sky, by_sky, rate * rates.sky)
-        self.responses.step(view.camera.id, view.frame, shown, by_shown, rate * rates.response, weights.response)
+        self.responses.step(view.camera.id, view.frame, by_response, rate * rates.response, weights.response)
         self.steps += 1
         return loss
-
-    def _shown(self, view: TrainingView, frame: Frame, colour: np.ndarray) -> np.ndarray:
-        """Colours [3,h,w] as the view's camera shows them, [h,w,3]; pixels without a ray are black."""
-        response = self.responses.of(view.camera.id, view.frame).astype(np.float32)
-        shown = np.einsum("ij,jhw->hwi", response[:, :3], colour) + response[:, 3]
-        return np.ascontiguousarray(shown * (frame.sensor.grid.valid > 0)[..., None])
 
     def scene(self, clip: Clip) -> GaussianScene:
         """The scene as it is now."""

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
-from nurec_sim.reconstruct.optimize.adam import MEAN, OPACITY, QUAT, RGB, SCALE, VALUES, activate, adam_step
-from nurec_sim.render.cpu.backward.frame import shared_workers
-from nurec_sim.render.cpu.pack import morton_order
+from nurec_sim.reconstruct.optimize.adam import MEAN, OPACITY, QUAT, RGB, SCALE, VALUES, adam_step, bias_corrections
+from nurec_sim.reconstruct.optimize.placing import place_moving, place_static
+from nurec_sim.render.cpu.backward.frame import shared_workers, zeros_by_gaussian
+from nurec_sim.render.cpu.backward.repack import RawGaussians
+from nurec_sim.render.cpu.pack import BLOCK, FIELDS, LOG_OPACITY, morton_order, to_blocks
 from nurec_sim.types import Gaussians, GaussianScene
 
 OPACITIES = (0.005, 0.985)
@@ -25,18 +27,9 @@ NOWHERE = -1
 class Drawn:
     """Gaussians at an instant in the world: what a frame renders, and how they were moved there (``adam_step``)."""
 
-    mean_m: Float32[np.ndarray, "n 3"]
-    quat_wxyz: Float32[np.ndarray, "n 4"]
-    scale_m: Float32[np.ndarray, "n 3"]
-    opacity: Float32[np.ndarray, " n"]
-    rgb: Float32[np.ndarray, "n 3"]
+    world: RawGaussians
+    packed: Float32[np.ndarray, "blocks 21 256"]
     turns: Float64[np.ndarray, "t 4"]
-    row_turn: Int32[np.ndarray, " n"]
-
-    @property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """What ``Frame.draw`` takes, colours last."""
-        return self.mean_m, self.quat_wxyz, self.scale_m, self.opacity, self.rgb
 
 
 class Parameters:
@@ -63,77 +56,74 @@ class Parameters:
         count = len(everything)
         self.first, self.second = np.zeros((count, VALUES), np.float32), np.zeros((count, VALUES), np.float32)
         self.visits = np.zeros(count, np.int32)
-        self._active = tuple(np.zeros((count, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (3,)))
-        activate(np.arange(count, dtype=np.int32), self.values, *self._active)
-        self._start_m = scene.dynamic.gaussians.mean_m.copy()
+        self._corrections = bias_corrections()
+        self._world, self.gradients = zeros_by_gaussian(count), zeros_by_gaussian(count)
+        self._packed = to_blocks(np.zeros((0, FIELDS), np.float32), -(-count // BLOCK), fill=LOG_OPACITY)
+        self._place(np.arange(self.static_count, dtype=np.int32))
+        dynamic = scene.dynamic
+        self._start_m = dynamic.gaussians.mean_m.copy()
+        self._rigid = np.zeros(len(dynamic), bool) if dynamic.in_box is None else dynamic.in_box
+        self._row_turn = np.full(count, NOWHERE, np.int32)
+        self._row_turn[self.static_count :][self._rigid] = dynamic.track[self._rigid]
 
     def __len__(self) -> int:
         """Number of Gaussians."""
         return len(self.values)
-
-    @cached_property
-    def _rigid(self) -> np.ndarray:
-        dynamic = self._scene.dynamic
-        return np.zeros(len(dynamic), bool) if dynamic.in_box is None else dynamic.in_box
 
     def at(self, t_us: int) -> Drawn:
         """All Gaussians at an instant; the opacity of those that are not there is 0.
 
         The arrays are valid until the next call of ``at`` or ``step``.
         """
-        mean, quat, scale, opacity, rgb = self._active
         dynamic, tracks, static = self._scene.dynamic, self._scene.tracks, self.static_count
-        row_turn = np.full(len(self), NOWHERE, np.int32)
-        turns = np.zeros((len(tracks), 4))
+        turns, poses, covered = np.zeros((len(tracks), 4)), np.zeros((len(tracks), 4, 4)), np.zeros(len(tracks), bool)
         if len(dynamic):
-            values = self.values[static:].astype(np.float64)
-            alive, knot_m, fade = dynamic.at(t_us)
-            shown = np.zeros(len(dynamic))
-            shown[alive] = fade
-            place = values[:, MEAN : MEAN + 3].copy()
-            free = ~self._rigid[alive]
-            # The trajectory keeps its shape: the optimised middle knot shifts all knots alike.
-            place[alive[free]] += knot_m[free] - self._start_m[alive[free]]
-            turned = values[:, QUAT : QUAT + 4].copy()
             for index in np.unique(dynamic.track[self._rigid]):
-                mine = np.flatnonzero(self._rigid & (dynamic.track == index))
-                if not tracks[index].path.covers(t_us):
-                    shown[mine] = 0
-                    continue
-                world_from_box = tracks[index].path.at(t_us)
-                turns[index] = geometry.quat_from_matrix(world_from_box[:3, :3])
-                place[mine] = geometry.transform_points(world_from_box, place[mine])
-                turned[mine] = geometry.quat_multiply(np.broadcast_to(turns[index], (len(mine), 4)), turned[mine])
-                row_turn[static + mine] = index
-            mean[static:], quat[static:] = place, turned
-            opacity[static:] = shown / (1 + np.exp(-values[:, OPACITY]))
-        return Drawn(mean, quat, scale, opacity, rgb, turns, row_turn)
+                covered[index] = tracks[index].path.covers(t_us)
+                if covered[index]:
+                    poses[index] = tracks[index].path.at(t_us)
+                    turns[index] = geometry.quat_from_matrix(poses[index, :3, :3])
+            fade, shift = np.zeros(len(dynamic), np.float32), np.zeros((len(dynamic), 3))
+            fade[self._rigid] = covered[dynamic.track[self._rigid]]
+            if not self._rigid.all():
+                alive, knot_m, faded = dynamic.at(t_us)
+                free = ~self._rigid[alive]
+                # The trajectory keeps its shape: the optimised middle knot shifts all knots alike.
+                shift[alive[free]] = knot_m[free] - self._start_m[alive[free]]
+                fade[alive[free]] = faded[free]
+            moving = np.arange(static, len(self), dtype=np.int32)
+            self._parts(
+                place_moving, moving,
+                (static, self.values, poses, turns, self._row_turn, shift, fade, self._world, self._packed),
+            )  # fmt: skip
+        return Drawn(self._world, self._packed, turns)
 
     def step(
-        self,
-        drawn: Drawn,
-        rows: Int32[np.ndarray, " k"],
-        gradients: tuple[np.ndarray, ...],
-        rates: Float64[np.ndarray, " 14"],
-        largest_m: float,
+        self, drawn: Drawn, rows: Int32[np.ndarray, " k"], rates: Float64[np.ndarray, " 14"], largest_m: float
     ) -> None:
-        """One step of Adam on the Gaussians ``rows`` that a frame has rendered.
+        """One step of Adam on the Gaussians ``rows`` that a frame has rendered, by ``gradients``, which end as 0.
 
         Args:
             drawn: what it has rendered.
             rows: which of them it shows.
-            gradients: by the arrays of ``drawn``, see ``Frame.draw_back``.
             rates: learning rate of each value.
             largest_m: standard deviations end here.
         """
-        workers = shared_workers(None)
-        parts = [rows[low:high] for low, high in workers.ranges(len(rows), 4096)]
-        workers.run(
-            adam_step,
-            [(part, self.values, self.first, self.second, self.visits, drawn.turns, drawn.row_turn, *gradients,
-              drawn.scale_m, drawn.opacity, rates, largest_m) for part in parts],
+        self._parts(
+            adam_step, rows,
+            (self.values, self.first, self.second, self.visits, self._corrections, drawn.turns, self._row_turn,
+             self.gradients, drawn.world.scale, drawn.world.opacity, rates.astype(np.float32), largest_m),
         )  # fmt: skip
-        workers.run(activate, [(part, self.values, *self._active) for part in parts])
+        self._place(rows[rows < self.static_count])
+
+    def _place(self, rows: Int32[np.ndarray, " k"]) -> None:
+        self._parts(place_static, rows, (self.values, self._world, self._packed))
+
+    @staticmethod
+    def _parts(kernel: Callable, rows: Int32[np.ndarray, " k"], arguments: tuple) -> None:
+        """Run a kernel on some rows, in parts."""
+        workers = shared_workers(None)
+        workers.run(kernel, [(rows[low:high], *arguments) for low, high in workers.ranges(len(rows), 4096)])
 
     def scene(self) -> GaussianScene:
         """The scene with the present values."""

@@ -55,8 +55,7 @@ class FrameResponses:
         self,
         camera: str,
         frame: int,
-        shown: Float32[np.ndarray, "h w 3"],
-        by_shown: Float32[np.ndarray, "h w 3"],
+        sums: Float64[np.ndarray, "2 3"],
         rate: float,
         weight: float,
     ) -> None:
@@ -65,15 +64,15 @@ class FrameResponses:
         Args:
             camera: id of the camera.
             frame: index among its images.
-            shown: the rendered image after this response.
-            by_shown: gradient of the loss by ``shown``.
+            sums: per channel over all pixels, of the loss's gradient by the shown image times that image, and of the
+                gradient alone.
             rate: learning rate.
             weight: of the squares of log gains and offsets in the loss.
         """
         values = self._values[camera][frame]
         # shown = exp(gain) x + offset, so d shown / d gain = shown - offset, and d shown / d offset = 1.
-        by_offset = by_shown.sum(axis=(0, 1), dtype=np.float64)
-        by_gain = np.einsum("hwc,hwc->c", by_shown, shown, dtype=np.float64) - by_offset * values[1]
+        by_offset = sums[1]
+        by_gain = sums[0] - by_offset * values[1]
         self._adam[camera, frame].step(values, np.stack([by_gain, by_offset]) + 2 * weight * values, rate)
 
     def all(self) -> dict[str, Float64[np.ndarray, "frames 3 4"]]:

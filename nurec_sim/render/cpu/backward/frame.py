@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import weakref
-from collections.abc import Mapping
 from contextlib import ExitStack
 from functools import cached_property
 
@@ -73,9 +72,11 @@ class Frame:
         """Depth per distance along each ray; None where distances are depths already."""
         return None if self.view.projection_mode == AFFINE else self.sensor.grid.direction[..., 2]
 
-    def draw_sky(self, sky: Float32[np.ndarray, "6 s s 3"]) -> Float32[np.ndarray, "3 h w"]:
-        """Colours of a cubemap behind every ray."""
-        return draw_sky(self._directions, self.view.world_from_reference[:3, :3], sky, self._workers)
+    def draw_sky(
+        self, sky: Float32[np.ndarray, "6 s s 3"], clear: Float32[np.ndarray, "h w"] | None = None
+    ) -> Float32[np.ndarray, "3 h w"]:
+        """Colours of a cubemap behind every ray, or only behind those that let something through (``clear``)."""
+        return draw_sky(self._directions, self.view.world_from_reference[:3, :3], sky, self._workers, clear)
 
     def draw_sky_back(
         self, sky: Float32[np.ndarray, "6 s s 3"], by_behind: Float32[np.ndarray, "3 h w"]
@@ -120,6 +121,11 @@ class Frame:
             repack,
             [(first, last, gaussians, self.lidar, packed) for first, last in self._workers.ranges(blocks, 8)],
         )
+        return self.draw_packed(packed)
+
+    def draw_packed(self, packed: Float32[np.ndarray, "blocks 21 256"]) -> Float32[np.ndarray, "6 h w"]:
+        """Render Gaussians that are packed already (``pack``), like ``draw``; row i of them is packed row i."""
+        blocks = len(packed)
         nothing = np.zeros((0, 0, 0), np.float32)
         layer = PackedGaussians(packed, nothing, np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros(0))
         rays = NO_TABLE if self.view.projection_mode == AFFINE else self.sensor.rays
@@ -135,13 +141,21 @@ class Frame:
         picture = self._picture
         return np.concatenate([picture.projected.sources[first : first + many] for _, first, many in picture.runs])
 
+    def empty_planes(self) -> Float32[np.ndarray, "6 h w"]:
+        """Zeros, in memory that the frame owns, to be filled with gradients by the planes of ``draw``."""
+        gradients = self._scratch("gradients", self.planes.shape, np.float32)
+        assert len(gradients) == IMAGE_PLANES
+        gradients[:] = 0
+        return gradients
+
     def draw_back(
         self,
         mean: Float32[np.ndarray, "n 3"],
         quat: Float32[np.ndarray, "n 4"],
         scale: Float32[np.ndarray, "n 3"],
         opacity: Float32[np.ndarray, " n"],
-        by_planes: Mapping[int, Float32[np.ndarray, "... h w"]],
+        by_planes: Float32[np.ndarray, "6 h w"],
+        into: RawGaussians | None = None,
     ) -> tuple[Float32[np.ndarray, "n c"], ...]:
         """Gradients by mean, quaternion, scale, opacity, features and ``world_from_sensor`` [4,4] at the reference.
 
@@ -150,16 +164,10 @@ class Frame:
             quat: see mean.
             scale: see mean.
             opacity: see mean.
-            by_planes: gradients of the loss by the planes of ``draw``, by the number of the first plane.
+            by_planes: gradients of the loss by the planes of ``draw``, 0 where there is no ray; see ``empty_planes``.
+            into: arrays to which the gradients by the Gaussians are added; None: new ones.
         """
-        picture, grid = self._picture, self.sensor.grid
-        height, width = grid.valid.shape
-        gradients = self._scratch("gradients", self.planes.shape, np.float32)
-        # Scratch holds another frame's values; cells without a valid ray need zeros.
-        gradients[:] = 0
-        for plane, values in by_planes.items():
-            gradients[plane : plane + (len(values) if values.ndim == 3 else 1), :height, :width] = values
-        assert len(gradients) == IMAGE_PLANES
+        picture = self._picture
         # A slot per record and tile: each is written by one tile only, whatever the number of threads.
         starts = np.array([first for _, first, _ in picture.runs], np.int64)
         counts = np.array([count for _, _, count in picture.runs], np.int64)
@@ -169,11 +177,11 @@ class Frame:
         rays = sensor_rays(picture)
         self._workers.run(
             draw_tiles_back,
-            [(rays, picture.projected, picture.binned, picture.output_kind, tiles, self.planes, gradients, slots)
+            [(rays, picture.projected, picture.binned, picture.output_kind, tiles, self.planes, by_planes, slots)
              for tiles in tile_ranges(picture, self._workers.threads)],
         )  # fmt: skip
         pose, count = self.view.world_from_reference, len(mean)
-        shares = RawGaussians(*(np.zeros((count, *width), np.float32) for width in ((3,), (4,), (3,), (), (3,))))
+        shares = zeros_by_gaussian(count) if into is None else into
         # The features are not needed: the image is linear in them.
         gaussians = RawGaussians(mean, quat, scale, opacity, shares.features)
         forces = np.zeros((-(-count // BLOCK), 6))
@@ -183,6 +191,11 @@ class Frame:
              for _, first, many in picture.runs],
         )  # fmt: skip
         return *shares, pose_gradient(forces[:, :3].sum(axis=0), forces[:, 3:].sum(axis=0), pose)
+
+
+def zeros_by_gaussian(count: int) -> RawGaussians:
+    """Gradients of 0 for some Gaussians."""
+    return RawGaussians(*(np.zeros((count, *width), np.float32) for width in ((3,), (4,), (3,), (), (3,))))
 
 
 def pose_gradient(

@@ -232,7 +232,11 @@ class _Draw(torch.autograd.Function):
             by_half: [h,w].
         """
         parts = {1: by_features, 0: by_alpha, 4: by_distance, 5: by_half}
-        by_planes = {plane: part.numpy() for plane, part in parts.items() if part is not None}
+        by_planes = ctx.frame.empty_planes()
+        height, width = ctx.frame.sensor.grid.valid.shape
+        for plane, part in parts.items():
+            if part is not None:
+                by_planes[plane : plane + (len(part) if part.ndim == 3 else 1), :height, :width] = part.numpy()
         results = ctx.frame.draw_back(*(_array(tensor) for tensor in ctx.saved_tensors), by_planes)
         return *(torch.from_numpy(g).to(dtype) for g, dtype in zip(results, ctx.dtypes, strict=True)), None
 

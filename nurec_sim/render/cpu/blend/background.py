@@ -50,7 +50,7 @@ def _turned(direction, row, column, turn, d):
 
 
 @kernel
-def look_up(first, last, direction, turn, sky, behind):
+def look_up(first, last, direction, turn, sky, clear, behind):
     """Colours of the sky behind the rays of some rows.
 
     Args:
@@ -59,11 +59,16 @@ def look_up(first, last, direction, turn, sky, behind):
         direction: [h,w,3] rays in the reference frame.
         turn: [3,3] float64, world_from_reference.
         sky: [6,s,s,3] cubemap.
-        behind: [3,h,w] output.
+        clear: [h,w] what the rays let through; empty: look behind all of them.
+        behind: [3,h,w] output; 0 behind rays that let nothing through.
     """
     d, size = np.empty(3), sky.shape[1]
     for row in range(first, last):
         for column in range(direction.shape[1]):
+            if clear.size and clear[row, column] <= 0:
+                for c in range(3):
+                    behind[c, row, column] = np.float32(0)
+                continue
             _turned(direction, row, column, turn, d)
             face = _face(d)
             x, y, _, _ = _place(d, size, face)
@@ -77,7 +82,7 @@ def look_up(first, last, direction, turn, sky, behind):
 
 
 @kernel
-def look_back(first, last, direction, turn, sky, by_behind, by_sky, torque):
+def look_back(first, last, direction, turn, sky, by_behind, by_sky, touched, torque):
     """Gradients of ``look_up``.
 
     Args:
@@ -88,18 +93,22 @@ def look_back(first, last, direction, turn, sky, by_behind, by_sky, torque):
         sky: see first.
         by_behind: [3,h,w] gradients of ``behind``.
         by_sky: [6,s,s,3] float64 gradients of the sky, added to.
+        touched: [6,s] rows of texels that have a gradient, set to 1.
         torque: [h,3] output, per row, about the world's axes.
     """
     d, by_d, size = np.empty(3), np.empty(3), sky.shape[1]
     for row in range(first, last):
         torque[row] = 0.0
         for column in range(direction.shape[1]):
+            if by_behind[0, row, column] == 0 and by_behind[1, row, column] == 0 and by_behind[2, row, column] == 0:
+                continue
             _turned(direction, row, column, turn, d)
             face = _face(d)
             x, y, inside_x, inside_y = _place(d, size, face)
             i, j = np.uint64(x), np.uint64(y)
             i1, j1 = min(i + np.uint64(1), np.uint64(size - 1)), min(j + np.uint64(1), np.uint64(size - 1))
             fx, fy = x - i, y - j
+            touched[face, j] = touched[face, j1] = 1
             by_x = by_y = 0.0
             for c in range(3):
                 g = by_behind[c, row, column]
@@ -127,6 +136,7 @@ def draw_sky(
     turn: Float64[np.ndarray, "3 3"],
     sky: Float32[np.ndarray, "6 s s 3"],
     workers: Workers,
+    clear: Float32[np.ndarray, "h w"] | None = None,
 ) -> Float32[np.ndarray, "3 h w"]:
     """Colours of the sky behind every ray.
 
@@ -135,10 +145,12 @@ def draw_sky(
         turn: world_from_reference rotation.
         sky: cubemap, faces as in ``geometry.cubemap_coordinates``.
         workers: threads to run on.
+        clear: what the rays let through; the sky behind those that let nothing through is black. None: all of it.
     """
     height, width = direction.shape[:2]
     behind = np.empty((3, height, width), np.float32)
-    workers.run(look_up, [(*rows, direction, turn, sky, behind) for rows in workers.ranges(height, 16)])
+    clear = np.empty((0, 0), np.float32) if clear is None else clear
+    workers.run(look_up, [(*rows, direction, turn, sky, clear, behind) for rows in workers.ranges(height, 16)])
     return behind
 
 
@@ -163,10 +175,15 @@ def draw_sky_back(
     """
     height = len(direction)
     by_sky, torque = np.zeros((PARTS, *sky.shape)), np.empty((height, 3))
+    touched = np.zeros((PARTS, *sky.shape[:2]), np.uint8)
     # Each part has a gradient of its own: texels are shared by rays of all rows.
     edges = np.linspace(0, height, PARTS + 1).astype(np.int64)
     workers.run(
         look_back,
-        [(edges[k], edges[k + 1], direction, turn, sky, by_behind, by_sky[k], torque) for k in range(PARTS)],
-    )
-    return by_sky.sum(axis=0), torque.sum(axis=0)
+        [(edges[k], edges[k + 1], direction, turn, sky, by_behind, by_sky[k], touched[k], torque)
+         for k in range(PARTS)],
+    )  # fmt: skip
+    # Most of the sky is out of view; what no part has touched need not be read.
+    total, rows = np.zeros(sky.shape), np.nonzero(touched.any(axis=0))
+    total[rows] = by_sky[:, rows[0], rows[1]].sum(axis=0)
+    return total, torque.sum(axis=0)
