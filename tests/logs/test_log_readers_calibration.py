@@ -3,6 +3,7 @@
 import pytest
 from ncore_files import write_ncore
 from part_of_log import DEMO, first_frames
+from ros_files import write_bag
 
 from nurec_sim import geometry, logs
 
@@ -12,7 +13,11 @@ def town():
     return first_frames(logs.open_clip(DEMO), frames=3, cameras=2)
 
 
-@pytest.mark.parametrize("write, needs", [(write_ncore, "ncore")])
+def write_ros(folder, clip):
+    return write_bag(folder / "town.mcap", clip)
+
+
+@pytest.mark.parametrize("write, needs", [(write_ncore, "ncore"), (write_ros, "mcap_ros2")])
 def test_lidar_projects_into_every_camera(town, write, needs, tmp_path):
     pytest.importorskip(needs)
     clip = logs.open_clip(write(tmp_path, town))
