@@ -22,7 +22,8 @@ def open_clip(path: str | Path, reader: LogReader | str | None = None) -> Clip:
     starts within the second from there; ``Clip.time_offset_us`` is the shift.
 
     Args:
-        path: a file or folder of any supported format.
+        path: a file or folder of any supported format; for formats that keep several logs in a folder, the folder
+            followed by the name of one, as in ``nuscenes/scene-0061``.
         reader: a reader, or a reference to one for ``plugins.load``; None selects the first that recognises the log.
 
     Raises:
@@ -42,12 +43,12 @@ def read_tables(path: str | Path, reader: LogReader | str | None = None) -> Clip
         ClipError: nothing there, an unknown format, or a corrupt file.
     """
     path = Path(path)
-    if not path.exists():
-        raise ClipError(f"no clip at {str(path)!r}: give a log, such as a clip folder or a .zip of one")
     if reader is None:
         reader = find_reader(path)
     elif isinstance(reader, str):
         reader = plugins.load(plugins.LOG_READERS, reader)
+    if not path.exists() and not reader.can_open(path):
+        raise _nothing_at(path)
     try:
         clip = reader.open(path)
     except ClipError as error:
@@ -99,11 +100,17 @@ def find_reader(path: Path) -> LogReader:
             broken.append(f"log reader '{name}' cannot look at {path.name}: {type(error).__name__}: {error}")
     if damaged is not None:
         raise damaged
+    if not path.exists():
+        raise _nothing_at(path)
     raise ClipError(
         f"{path.name}: no log reader knows this format; it is {_looks(path)}. Known are "
         + "; ".join([*known, *broken])
         + ". docs/write_a_log_reader.md says how to read others"
     )
+
+
+def _nothing_at(path: Path) -> ClipError:
+    return ClipError(f"no clip at {str(path)!r}: give a log, such as a clip folder or a .zip of one")
 
 
 def _looks(path: Path) -> str:

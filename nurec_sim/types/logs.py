@@ -166,7 +166,10 @@ class LogReader(Protocol):
     """One line that describes a log of this format: "a folder with ...". Shown if no reader recognises a log."""
 
     def can_open(self, path: Path) -> bool:
-        """Whether an existing file or folder has this format, from names and headers only.
+        """Whether a file or folder has this format, from names and headers only.
+
+        A format that keeps several logs in one folder may accept the folder followed by the name of a log, a path that
+        does not exist.
 
         Raises:
             ClipError: it is of this format, but damaged.

@@ -1,5 +1,6 @@
 """The demo log in the layouts of public data sets, as their publishers write them."""
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -295,3 +296,116 @@ def argoverse_map() -> str:
             },
         }
     )
+
+
+# ----------------------------------------------------------------------------------------------------------- nuScenes
+
+MAP_M = np.array([411.0, 1180.0, 0.0])
+EPOCH_NUSCENES_US = 1_532_402_927_000_000
+FILE_FROM_LIDAR = geometry.pose(geometry.rotation_from_yaw(np.pi / 2), np.zeros(3))
+KEYFRAMES = INDICES[::2]
+"""Frames with boxes; the others are sweeps between them."""
+
+
+def token(*parts) -> str:
+    return hashlib.md5(repr(parts).encode()).hexdigest()
+
+
+def as_table(pose: np.ndarray) -> dict[str, list[float]]:
+    return {"translation": pose[:3, 3].tolist(), "rotation": geometry.quat_from_matrix(pose[:3, :3]).tolist()}
+
+
+def nuscenes(root: Path, clip: logs.Clip, invert: bool = False) -> Path:
+    """A folder of nuScenes with the scene ``scene-0007`` from the demo, and ``scene-0008`` without sensors.
+
+    ``invert``: the poses of the cameras are the inverse of what they should be.
+    """
+    moved = geometry.pose(np.eye(3), MAP_M)
+    names = {"CAM_FRONT": "camera_front", "CAM_FRONT_LEFT": "camera_front_left", "LIDAR_TOP": LIDAR}
+    tables: dict[str, list[dict]] = {name: [] for name in (
+        "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample",
+        "sample_annotation", "sample_data", "scene", "sensor", "visibility",
+    )}  # fmt: skip
+    for name in ("vehicle.car", "human.pedestrian.adult"):
+        tables["category"].append({"token": token(name), "name": name, "description": "", "index": 1})
+    tables["log"] = [
+        {"token": token("log"), "logfile": "n015", "vehicle": "n015", "date_captured": "2018", "location": "x"}
+    ]
+    tables["map"] = [{"token": token("map"), "log_tokens": [token("log")], "category": "x", "filename": "maps/x.png"}]
+    put(root / "maps" / "x.png", png(np.full((8, 8, 3), 255, np.uint8)))
+    for number, scene in ((7, "scene-0007"), (8, "scene-0008")):
+        count = len(KEYFRAMES) if number == 7 else 1
+        ends = (token("sample", number, 0), token("sample", number, count - 1))
+        tables["scene"].append(
+            {"token": token(scene), "log_token": token("log"), "nbr_samples": count, "name": scene,
+             "first_sample_token": ends[0], "last_sample_token": ends[1], "description": "a {street}"}
+        )  # fmt: skip
+        for k in range(count):
+            near = [token("sample", number, j) if 0 <= j < count else "" for j in (k - 1, k + 1)]
+            t_us = EPOCH_NUSCENES_US + clip.sweep_records(LIDAR)[KEYFRAMES[k]].t_us
+            tables["sample"].append(
+                {"token": token("sample", number, k), "timestamp": t_us, "prev": near[0], "next": near[1],
+                 "scene_token": token(scene)}
+            )  # fmt: skip
+    for channel, name in names.items():
+        is_lidar = name == LIDAR
+        rig_from_sensor = clip.rig.lidars[name].rig_from_lidar if is_lidar else clip.rig.cameras[name].rig_from_camera
+        pose = rig_from_sensor @ geometry.inverse(FILE_FROM_LIDAR) if is_lidar else rig_from_sensor
+        if invert and not is_lidar:
+            pose = geometry.inverse(pose)
+        lens = None if is_lidar else clip.rig.cameras[name].lens
+        k = [] if lens is None else [[lens.fx_px, 0, lens.cx_px - 0.5], [0, lens.fy_px, lens.cy_px - 0.5], [0, 0, 1]]
+        modality = "lidar" if is_lidar else "camera"
+        tables["sensor"].append({"token": token(channel), "channel": channel, "modality": modality})
+        tables["calibrated_sensor"].append(
+            {
+                "token": token("mounted", channel),
+                "sensor_token": token(channel),
+                **as_table(pose),
+                "camera_intrinsic": k,
+            }
+        )
+        for number, index in enumerate(INDICES):
+            t_us = clip.sweep_records(LIDAR)[index].t_us if is_lidar else clip.image_records(name)[index].start_us
+            key = index in KEYFRAMES
+            file = f"{'samples' if key else 'sweeps'}/{channel}/n015__{channel}__{EPOCH_NUSCENES_US + t_us}"
+            file += ".pcd.bin" if is_lidar else ".jpg"
+            near = [token(channel, n) if 0 <= n < len(INDICES) else "" for n in (number - 1, number + 1)]
+            size = (0, 0) if is_lidar else (clip.rig.cameras[name].width_px, clip.rig.cameras[name].height_px)
+            sample = min(range(len(KEYFRAMES)), key=lambda j: (KEYFRAMES[j] < index, abs(KEYFRAMES[j] - index)))
+            tables["sample_data"].append(
+                {"token": token(channel, number), "sample_token": token("sample", 7, sample), "is_key_frame": key,
+                 "ego_pose_token": token(channel, number), "calibrated_sensor_token": token("mounted", channel),
+                 "timestamp": EPOCH_NUSCENES_US + t_us, "fileformat": "pcd" if is_lidar else "jpg",
+                 "height": size[1], "width": size[0], "filename": file, "prev": near[0], "next": near[1]}
+            )  # fmt: skip
+            tables["ego_pose"].append(
+                {"token": token(channel, number), "timestamp": EPOCH_NUSCENES_US + t_us,
+                 **as_table(moved @ clip.ego.at(t_us))}
+            )  # fmt: skip
+            if is_lidar:
+                sweep = clip.sweep(LIDAR, index)
+                points = geometry.transform_points(FILE_FROM_LIDAR, sweep.xyz_m)
+                data = np.column_stack([points, sweep.intensity * 255, np.zeros(len(points))])
+                put(root / file, data.astype("<f4").tobytes())
+            else:
+                put(root / file, jpeg(clip.image(name, index)))
+    for track in clip.tracks:
+        kind = {"automobile": "vehicle.car", "person": "human.pedestrian.adult"}[track.label]
+        boxes = [token("box", track.id, k) for k in range(len(KEYFRAMES))]
+        tables["instance"].append(
+            {"token": token(track.id), "category_token": token(kind), "nbr_annotations": len(boxes),
+             "first_annotation_token": boxes[0], "last_annotation_token": boxes[-1]}
+        )  # fmt: skip
+        length, width, height = track.size_m
+        for k, index in enumerate(KEYFRAMES):
+            pose = moved @ track.path.at(clip.sweep_records(LIDAR)[index].t_us)
+            near = [boxes[j] if 0 <= j < len(boxes) else "" for j in (k - 1, k + 1)]
+            tables["sample_annotation"].append(
+                {"token": boxes[k], "sample_token": token("sample", 7, k), "instance_token": token(track.id),
+                 "visibility_token": "4", "attribute_tokens": [], **as_table(pose), "size": [width, length, height],
+                 "prev": near[0], "next": near[1], "num_lidar_pts": 1, "num_radar_pts": 0}
+            )  # fmt: skip
+    for name, rows in tables.items():
+        put(root / "v1.0-mini" / f"{name}.json", json.dumps(rows, indent=0))
+    return root

@@ -83,7 +83,12 @@ def content_key(clip_path: Path, recipe: Recipe | str) -> str:
 
 
 def files_hash(path: Path, pattern: str = "*") -> str:
-    """SHA-256 of the names and contents of a folder's files, or of one file's content; hexadecimal."""
+    """SHA-256 of the names and contents of a folder's files, or of one file's content; hexadecimal.
+
+    A log that is named inside of a data set is no file: its path stands for it, as published data do not change.
+    """
+    if not path.exists():
+        return hashlib.sha256(str(path.resolve()).encode()).hexdigest()
     digest = hashlib.sha256()
     files: Iterable[Path] = sorted(p for p in path.rglob(pattern) if p.is_file()) if path.is_dir() else [path]
     for each in files:

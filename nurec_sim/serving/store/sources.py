@@ -85,15 +85,15 @@ def identify(source: GaussianScene | str | Path, name: str = "", recipe: Recipe 
 
     if isinstance(source, GaussianScene):
         return Source(alpasim_id(source.id), source, (source.id,))
+    from nurec_sim.logs import is_log, open_clip
+
     path = Path(source)
-    if not path.exists():
+    if not path.exists() and not is_log(path):
         raise ArchiveError(f"{path} does not exist")
     others: tuple[str, ...] = ()
     if is_archive(path):
         own_id, others = _archive_id(path), _metadata_id(path)
     else:
-        from nurec_sim.logs import open_clip
-
         own_id = open_clip(path).id
     if name:
         return Source(alpasim_id(name), path, (name,), recipe)
