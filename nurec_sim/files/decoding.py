@@ -211,6 +211,28 @@ def check_image(data: bytes, most_pixels: int | None = None) -> tuple[int, int]:
     return width, height
 
 
+def image_pixels(data: bytes, flags: int) -> np.ndarray:
+    """The pixels of a JPEG or PNG file, channels as OpenCV gives them.
+
+    Args:
+        data: the file.
+        flags: of ``cv2.imdecode``.
+
+    Raises:
+        ValueError: it is truncated, not an image, or has too many pixels.
+    """
+    import cv2
+
+    check_image(data)  # decoders silently fill the missing part of a truncated file with grey
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise ValueError("cannot be decoded")
+    return pixels
+
+
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:

@@ -85,6 +85,21 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
         sync_folder(path.parent)
 
 
+def swap(ready: Path, path: Path, aside: Path) -> None:
+    """Renames ``ready`` to ``path``; what was there moves to ``aside``, which must be free, and back on failure.
+
+    All three lie on one file system, where renaming is atomic; a folder with files in it cannot be replaced at once.
+    """
+    if path.exists():
+        os.rename(path, aside)
+    try:
+        os.rename(ready, path)
+    except OSError:
+        if aside.exists():
+            os.rename(aside, path)
+        raise
+
+
 def write_file(path: Path, content: bytes | str) -> None:
     """Writes a file atomically; text as UTF-8.
 

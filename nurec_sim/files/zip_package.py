@@ -16,9 +16,9 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from types import TracebackType
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.files.closing import Closing
 from nurec_sim.files.decoding import TooMuchError, check_directory
 from nurec_sim.files.new_files import new_file
 
@@ -79,7 +79,7 @@ def name_fault(name: str) -> str | None:
     return None
 
 
-class Package:
+class Package(Closing):
     """An open package; members are views of the memory-mapped file, nothing is extracted or decompressed.
 
     Raises:
@@ -199,12 +199,6 @@ class Package:
     def close(self) -> None:
         """Unmaps the file."""
         self._bytes.close()
-
-    def __enter__(self) -> Package:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
-        self.close()
 
 
 class _Member(io.RawIOBase):

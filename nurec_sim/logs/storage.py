@@ -21,8 +21,8 @@ from nurec_sim.files.decoding import (
     LIMITS,
     TooMuchError,
     check_directory,
-    check_image,
     check_member,
+    image_pixels,
     json_value,
     npz_arrays,
 )
@@ -66,14 +66,7 @@ def decode_image(data: bytes) -> UInt8[np.ndarray, "h w 3"]:
     """
     import cv2
 
-    check_image(data)  # decoders silently fill the missing part of a truncated file with grey
-    try:
-        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:
-        bgr = None
-    if bgr is None:
-        raise ValueError("cannot be decoded")
-    return np.ascontiguousarray(bgr[:, :, ::-1])
+    return np.ascontiguousarray(image_pixels(data, cv2.IMREAD_COLOR)[:, :, ::-1])
 
 
 class Storage:

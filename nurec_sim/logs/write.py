@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import os
 import re
 import shutil
 import tempfile
@@ -20,7 +19,7 @@ from jaxtyping import Float64, UInt8
 
 from nurec_sim import sensors
 from nurec_sim.errors import ClipError
-from nurec_sim.files.new_files import writing
+from nurec_sim.files.new_files import swap, writing
 from nurec_sim.logs import calibration, tables
 from nurec_sim.logs.consistency import EARLIEST_US
 from nurec_sim.logs.storage import META_FILE
@@ -145,10 +144,7 @@ def _check_rig(rig: Rig) -> None:
     if shared := set(rig.cameras) & set(rig.lidars):
         raise ClipError(f"a camera and a LiDAR share the id {sorted(shared)[0]!r}")
     try:
-        for camera in rig.cameras.values():
-            sensors.check_camera(camera)
-        for lidar in rig.lidars.values():
-            sensors.check_lidar(lidar)
+        sensors.check_rig(rig)
     except ValueError as error:
         raise ClipError(str(error)) from error
 
@@ -255,15 +251,7 @@ def _move_into_place(folder: Path, path: Path, work: Path) -> None:
     if path.suffix == ".zip":
         ready = work / "clip.zip"
         _zip_folder(folder, ready)
-    replaced = work / "replaced"
-    if path.exists():
-        os.replace(path, replaced)
-    try:
-        os.replace(ready, path)
-    except OSError:
-        if replaced.exists():
-            os.replace(replaced, path)
-        raise
+    swap(ready, path, work / "replaced")
 
 
 def _zip_folder(folder: Path, target: Path) -> None:

@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from nurec_sim.errors import RunError, WriteError
-from nurec_sim.files.new_files import writing
+from nurec_sim.files.new_files import swap, writing
 
 ROLLOUT, SCENARIO, VERSIONS, VIDEO, ERROR = "rollout.npz", "scenario.yaml", "versions.json", "front.mp4", "error.txt"
 VIDEO_ERROR = "video_error.txt"
@@ -158,15 +158,8 @@ def written_at_once(target: Path) -> Iterator[Path]:
         part.mkdir()
         try:
             yield part
-            if target.exists():
-                shutil.rmtree(old, ignore_errors=True)
-                os.rename(target, old)
-            try:
-                os.rename(part, target)
-            except OSError:
-                if old.exists():
-                    os.rename(old, target)
-                raise
+            shutil.rmtree(old, ignore_errors=True)
+            swap(part, target, old)
         except WriteError as error:  # report the final name instead of the hidden one
             raise WriteError(error.errno, error.strerror, error.filename.replace(str(part), str(target))) from error
         finally:

@@ -72,10 +72,7 @@ def _check_rig(rig: Rig) -> None:
         if own_id != key:
             raise ArchiveError(f"the rig lists the sensor {own_id!r} as {key!r}; both must be the same")
     try:
-        for camera in rig.cameras.values():
-            sensors.check_camera(camera)
-        for lidar in rig.lidars.values():
-            sensors.check_lidar(lidar)
+        sensors.check_rig(rig)
     except ValueError as error:
         raise ArchiveError(str(error)) from error
 

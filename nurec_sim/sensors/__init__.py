@@ -16,6 +16,7 @@ from nurec_sim.sensors.lidar import (
     beam_coordinates,
     beam_directions,
     check_lidar,
+    check_rig,
     column_fraction,
     compensate_sweep,
 )
@@ -28,6 +29,7 @@ __all__ = [
     "beam_directions",
     "check_camera",
     "check_lidar",
+    "check_rig",
     "column_fraction",
     "compensate_sweep",
     "fill_ftheta",

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from nurec_sim import geometry
-from nurec_sim.sensors.camera import check_pose
-from nurec_sim.types import LidarModel, Matrix4, Spin
+from nurec_sim.sensors.camera import check_camera, check_pose
+from nurec_sim.types import LidarModel, Matrix4, Rig, Spin
 
 Values = Float64[np.ndarray, " n"]
 
@@ -79,6 +79,18 @@ def compensate_sweep(
     """
     world = np.einsum("nij,nj->ni", world_from_lidar_fired[:, :3, :3], xyz_lidar) + world_from_lidar_fired[:, :3, 3]
     return geometry.transform_points(geometry.inverse(world_from_lidar), world)
+
+
+def check_rig(rig: Rig) -> None:
+    """Check that all sensors of a rig can be used.
+
+    Raises:
+        ValueError: see ``check_camera`` and ``check_lidar``.
+    """
+    for camera in rig.cameras.values():
+        check_camera(camera)
+    for lidar in rig.lidars.values():
+        check_lidar(lidar)
 
 
 def check_lidar(lidar: LidarModel) -> None:

@@ -7,12 +7,13 @@ import functools
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self, TypedDict
+from typing import Any, TypedDict
 
 import grpc
 from google.protobuf import message_factory
 
 from nurec_sim.errors import RequestError, ServerError
+from nurec_sim.files.closing import Closing
 from nurec_sim.serving import channels, wire
 
 _RETRY = {
@@ -40,7 +41,7 @@ class ConnectionOptions(TypedDict, total=False):
     client_key: Path | None
 
 
-class Connection:
+class Connection(Closing):
     """One service of a server; what its clients share.
 
     The first call waits ``connect_timeout_s`` for a server that is starting. Later ones are repeated for some 3 s when
@@ -86,12 +87,6 @@ class Connection:
     def close(self) -> None:
         """Ends the connection."""
         self._channel.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _options(self, timeout_s: float | None) -> Mapping[str, Any]:
         """Keywords of every call, once the server has been reached; None for no time limit.

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from nurec_sim.errors import WeightsError
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
+from nurec_sim.reconstruct.methods._method import ShippedMethod
 from nurec_sim.types import Clip, GaussianScene, Progress
 
 
-class NetworkMethod:
+class NetworkMethod(ShippedMethod):
     """The Instant NuRec network, with the decoder that the method is named after."""
 
-    name: str
     settings = FeedForwardSettings
 
     def files(self, settings: FeedForwardSettings) -> tuple[Path, ...]:
@@ -28,24 +28,15 @@ class NetworkMethod:
         except WeightsError:  # says more when the clip is reconstructed
             return ()
 
-    def reconstruct(
+    def run(
         self,
         clip: Clip,
-        settings: FeedForwardSettings,
-        *,
         cameras: Sequence[str] | None,
-        hold_out_sweeps: Collection[int],
+        held: set[int],
         progress: Progress,
+        settings: FeedForwardSettings,
     ) -> GaussianScene:
-        """The scene of a log (``types.Method``).
-
-        Args:
-            clip: the driving log.
-            settings: of this method.
-            cameras: ids of the cameras to use; None: as many as the profile takes.
-            hold_out_sweeps: LiDAR sweeps that must not be read, by index.
-            progress: called with the stage's name and the fraction of all work done.
-        """
+        """The scene of a log, by default from as many cameras as the profile takes."""
         from nurec_sim.reconstruct.feedforward.method import feedforward
 
-        return feedforward(clip, self.name, cameras, set(hold_out_sweeps), progress, settings)
+        return feedforward(clip, self.name, cameras, held, progress, settings)

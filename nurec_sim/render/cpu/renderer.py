@@ -24,13 +24,8 @@ from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.cpu.workers import Buffers, Scratch, Workers
 from nurec_sim.render.lod import Detail, check_detail
 from nurec_sim.render.rays import actors_at, reference_pose
-from nurec_sim.render.requests import (
-    SENSED_OUTPUTS,
-    check_camera_call,
-    check_lidar_call,
-    check_outputs,
-    check_request,
-)
+from nurec_sim.render.requests import SENSED_OUTPUTS, check_outputs, check_request
+from nurec_sim.render.single import SingleFrames
 from nurec_sim.types import CameraFrame, CameraModel, GaussianScene, LidarFilter, LidarFrame, SensorFrame, SensorRequest
 
 IDENTITY_ISP = np.eye(3, 4, dtype=np.float32)
@@ -49,7 +44,7 @@ class _Begun:
     picture: Picture
 
 
-class CpuRenderer:
+class CpuRenderer(SingleFrames):
     """A scene prepared for rendering. Immutable but for caches; all methods can be called from many threads.
 
     Args:
@@ -90,27 +85,10 @@ class CpuRenderer:
         check_outputs(outputs)
         return self.measure(requests, outputs)[0]
 
-    def render_camera(self, request: SensorRequest, outputs: Sequence[str] = SENSED_OUTPUTS) -> CameraFrame:
-        """A camera frame with ``rgb`` and those of depth, alpha, label and normal that ``outputs`` names.
-
-        Raises:
-            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or an unknown output.
-        """
-        check_camera_call(request, outputs)
-        frame = self.measure([request], outputs)[0][0]
-        assert isinstance(frame, CameraFrame)
-        return frame
-
-    def render_lidar(self, request: SensorRequest, filter: LidarFilter | None = None) -> LidarFrame:
-        """A sweep: the beams that return by ``filter`` (``LidarFilter()`` if None); see ``spec.sweep_frame``.
-
-        Raises:
-            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
-        """
-        check_lidar_call(request)
-        frame = self.measure([request], filter=filter)[0][0]
-        assert isinstance(frame, LidarFrame)
-        return frame
+    def _frames(
+        self, requests: Sequence[SensorRequest], outputs: Sequence[str], filter: LidarFilter
+    ) -> list[SensorFrame]:
+        return self.measure(requests, outputs, filter)[0]
 
     def measure(
         self,

@@ -21,12 +21,11 @@ from nurec_sim.render.lod import Detail, check_detail
 from nurec_sim.render.requests import (
     CAMERA_OUTPUTS,
     SENSED_OUTPUTS,
-    check_camera_call,
-    check_lidar_call,
     check_outputs,
     check_requests,
     ray_count,
 )
+from nurec_sim.render.single import SingleFrames
 from nurec_sim.types import (
     CameraFrame,
     CameraModel,
@@ -78,7 +77,7 @@ class Images:
     returns: torch.Tensor | None = None
 
 
-class GpuRenderer:
+class GpuRenderer(SingleFrames):
     """A scene prepared for rendering on a GPU, a ``render.Renderer``.
 
     Immutable but for caches; all methods can be called from many threads. Work is queued on torch's current stream.
@@ -137,28 +136,6 @@ class GpuRenderer:
                 frames += self._frames(group, outputs, LidarFilter())
                 group = []
         return frames
-
-    def render_camera(self, request: SensorRequest, outputs: Sequence[str] = SENSED_OUTPUTS) -> CameraFrame:
-        """A camera frame with ``rgb`` and those of the other outputs that ``outputs`` names.
-
-        Raises:
-            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or an unknown output.
-        """
-        check_camera_call(request, outputs)
-        frame = self._frames([request], outputs, LidarFilter())[0]
-        assert isinstance(frame, CameraFrame)
-        return frame
-
-    def render_lidar(self, request: SensorRequest, filter: LidarFilter | None = None) -> LidarFrame:
-        """A sweep: the beams that return by ``filter`` (``LidarFilter()`` if None); see ``spec.sweep_frame``.
-
-        Raises:
-            RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``.
-        """
-        check_lidar_call(request)
-        frame = self._frames([request], (), filter or LidarFilter())[0]
-        assert isinstance(frame, LidarFrame)
-        return frame
 
     def draw(self, requests: Sequence[SensorRequest], filter: LidarFilter | None = None) -> Images:
         """The frames of ``sense`` with all outputs, left on the device; at least one request.

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from nurec_sim.errors import ServerError
+from nurec_sim.files.closing import Closing
 from nurec_sim.files.decoding import TooMuchError, check_image
 from nurec_sim.serving import wire
 from nurec_sim.serving.wire import ImageFormat, sensorsim
@@ -36,7 +37,7 @@ def expect(condition: object, text: str) -> None:
         raise Failed(text)
 
 
-class Target:
+class Target(Closing):
     """One scene of a server.
 
     Use it as a context manager, or call ``close``.
@@ -79,36 +80,15 @@ class Target:
         """Ends the connection."""
         self.channel.close()
 
-    def __enter__(self) -> Target:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     # ----------------------------------------------------------------------------------------------------------- calls
 
-    def call(
-        self,
-        name: str,
-        request: Any = None,
-        *,
-        path: str = wire.SERVICE,
-        metadata: Sequence[tuple[str, str]] = (),
-        timeout_s: float | None = None,
-    ) -> Any:
-        """The reply of a procedure.
-
-        Args:
-            name: the procedure.
-            request: a message, its bytes, or None for an empty message.
-            path: the service name in the URL of the call.
-            metadata: (key, value) pairs that are sent with it.
-            timeout_s: time limit; the target's own if None.
+    def call(self, name: str, request: Any = None, **options: Any) -> Any:
+        """The reply of a procedure; arguments as for ``begin``.
 
         Raises:
             grpc.RpcError: the server refuses it.
         """
-        return self.begin(name, request, path=path, metadata=metadata, timeout_s=timeout_s).result()
+        return self.begin(name, request, **options).result()
 
     def begin(
         self,

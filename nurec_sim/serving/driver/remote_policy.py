@@ -16,6 +16,7 @@ from urllib.parse import parse_qsl, urlsplit
 import grpc
 
 from nurec_sim.errors import PlanError, RequestError, ScenarioError, ServerError
+from nurec_sim.files.closing import Closing
 from nurec_sim.render.images.encode import encode_image
 from nurec_sim.serving.connection import channel_options
 from nurec_sim.serving.wire import common, driving, driving_paths, driving_states, egodriver
@@ -36,7 +37,7 @@ _RETRY = {
 _HANG_UP_S = 2.0
 
 
-class RemotePolicy:
+class RemotePolicy(Closing):
     """A driver at ``host:port`` as a policy.
 
     Drivers of this package report their needs; for others name the cameras. A driver that cannot be
@@ -121,12 +122,6 @@ class RemotePolicy:
     def close(self) -> None:
         """Ends open sessions and the connection."""
         self._hang_up()
-
-    def __enter__(self) -> RemotePolicy:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # ---------------------------------------------------------------------------------------------------------- policy
 

@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 
 from nurec_sim.compute.turns import aside, rest
 from nurec_sim.errors import RequestError
-from nurec_sim.files.decoding import check_image
+from nurec_sim.files.decoding import image_pixels
 from nurec_sim.render.cpu.workers import Workers
 from nurec_sim.serving import wire
 from nurec_sim.serving.sensor_service.render_queue import LARGE_RAYS
@@ -68,12 +68,9 @@ def _scaled_mask(path: Path, width_px: int, height_px: int) -> tuple[np.ndarray,
     import cv2
 
     try:
-        check_image(data := path.read_bytes())
-        bgra = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, ValueError, cv2.error):
-        bgra = None
-    if bgra is None:
-        raise RequestError(f"the ego mask {path.parent.name}/{path.name} is not a readable PNG")
+        bgra = image_pixels(path.read_bytes(), cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError) as error:
+        raise RequestError(f"the ego mask {path.parent.name}/{path.name} is not a readable PNG") from error
     scale = 65535 if bgra.dtype == np.uint16 else 255
     bgra = np.atleast_3d(bgra.astype(np.float32) * (255 / scale))
     rgb = np.repeat(bgra[..., :1], 3, axis=2) if bgra.shape[2] < 3 else bgra[..., 2::-1]

@@ -19,6 +19,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from nurec_sim.errors import ClipError, WriteError
+from nurec_sim.files.closing import Closing
 from nurec_sim.files.new_files import writing
 from nurec_sim.training.data.clips import UNFINISHED_PREFIX, CachedClip, ready_clips
 from nurec_sim.training.data.generate import ClipSettings, clip_ids, generate_town, town_of
@@ -36,7 +37,7 @@ TRIALS = 3
 POLL_S = 0.5
 
 
-class ClipCache:
+class ClipCache(Closing):
     """The clips of one folder and one settings hash, filled by worker processes after ``start``.
 
     A later run reuses existing clips. Unreadable clips are deleted when the cache is opened. Towns are generated as a
@@ -71,12 +72,6 @@ class ClipCache:
             self.clips.mkdir(parents=True, exist_ok=True)
         self._drop_unfinished()
         self._drop_damaged()
-
-    def __enter__(self) -> ClipCache:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def clip_ids(self) -> list[str]:
         """Complete clips, sorted."""

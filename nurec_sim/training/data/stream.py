@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from nurec_sim.errors import ClipError
+from nurec_sim.files.closing import Closing
 from nurec_sim.training.data.clips import CachedClip, ready_clips
 from nurec_sim.training.data.sample import TrainingSample
 from nurec_sim.training.data.windows import WindowSettings, sample_window
@@ -61,7 +62,7 @@ def draw_sample(folder: Path, settings: WindowSettings, seed: int, index: int) -
     raise problem or ClipError(f"no training clips in {folder}")
 
 
-class SampleStream:
+class SampleStream(Closing):
     """Endless samples of steps ``start``, ``start + 1``, ... of one rank; a context manager, or call ``close``.
 
     Args:
@@ -123,12 +124,6 @@ class SampleStream:
             self._ahead.append(coming)
             self._next += self._stride
         return self._ahead.popleft().result()
-
-    def __enter__(self) -> SampleStream:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Ends the workers and discards prefetched samples."""

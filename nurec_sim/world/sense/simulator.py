@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError, TooLargeError
+from nurec_sim.files.closing import Closing
 from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, LidarModel, SensorFrame, SensorRequest, Shutter
 from nurec_sim.world.model.assemble import Town, build_town
 from nurec_sim.world.plan.surface import LABEL_OF_CLASS
@@ -28,7 +29,7 @@ MAX_SIDE_PX = 4096
 T = TypeVar("T")
 
 
-class TrueWorld:
+class TrueWorld(Closing):
     """A town that serves sensor requests for any sensor pose and any actor poses.
 
     Cameras may have any lens, windshield and shutter. MuJoCo and OpenGL run in a dedicated thread, since a GL context
@@ -65,12 +66,6 @@ class TrueWorld:
     def town(self) -> Town:
         """The compiled model; read-only."""
         return self._stage.town
-
-    def __enter__(self) -> TrueWorld:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Frees the GL context and the thread; may be called again."""

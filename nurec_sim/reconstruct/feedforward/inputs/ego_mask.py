@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from nurec_sim.errors import ReconstructError
-from nurec_sim.files.decoding import check_image
+from nurec_sim.files.decoding import image_pixels
 from nurec_sim.reconstruct.feedforward.inputs.crop import Crop
 from nurec_sim.types import Clip
 
@@ -47,13 +47,9 @@ def _masks_in(folder: Path, clip: Clip, cameras: Iterable[str]) -> dict[str, Boo
 
 def _read(path: Path) -> Bool[np.ndarray, "h w"]:
     try:
-        check_image(data := path.read_bytes())
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, ValueError, cv2.error):
-        pixels = None
-    if pixels is None:
-        raise ReconstructError(f"the ego mask {path} is not a readable PNG")
-    channels = np.atleast_3d(pixels)
+        channels = np.atleast_3d(image_pixels(path.read_bytes(), cv2.IMREAD_UNCHANGED))
+    except (OSError, ValueError) as error:
+        raise ReconstructError(f"the ego mask {path} is not a readable PNG") from error
     return (channels[..., 3] if channels.shape[2] == 4 else channels.max(axis=2)) > 0
 
 

@@ -11,7 +11,7 @@ from nurec_sim.errors import ArchiveError
 from nurec_sim.files.decoding import TooMuchError, check_directory
 from nurec_sim.files.torch_pickle import StoredTensor, read_tensor_pickle
 from nurec_sim.files.torch_zip import TorchZipError, is_little_endian, root_of, stored_entries
-from nurec_sim.scene.interop.nurec.state import NurecState, is_read, plain_name, track_ids_of
+from nurec_sim.scene.interop.nurec.state import NurecState, read_entries
 
 _BRAIN_FLOATS = "torch.BFloat16Storage"
 _TYPES = {
@@ -59,21 +59,13 @@ def _state(
     if not isinstance(state, dict):
         raise ArchiveError(f"{where}: no NuRec checkpoint: 'state_dict' is missing")
     arrays: dict[str, np.ndarray] = {}
-    others, track_ids = [], {}
-    for key, value in state.items():
-        if not isinstance(key, str):
-            continue
-        name = plain_name(key)
-        if name == "_extra_state":
-            track_ids = track_ids_of(value)
-        elif not is_read(name):
-            others.append(name)
-        elif isinstance(value, StoredTensor):
-            arrays[name] = _array(package, entries, root, name, value, where)
-            if sum(array.nbytes for array in arrays.values()) > 2 * size:  # brain floats take twice their room
-                raise ArchiveError(f"{where}: its tensors show the same values again and again")
-        else:
+    found, others, track_ids = read_entries(state.items())
+    for name, (_, value) in found.items():
+        if not isinstance(value, StoredTensor):
             raise ArchiveError(f"{where}: {name} must be a tensor")
+        arrays[name] = _array(package, entries, root, name, value, where)
+        if sum(array.nbytes for array in arrays.values()) > 2 * size:  # bfloat16 values take twice their size
+            raise ArchiveError(f"{where}: its tensors show the same values again and again")
     version = contents.get("pytorch-lightning_version") if isinstance(contents, dict) else None
     return NurecState(arrays, track_ids, {}, others, f"Lightning {version}" if isinstance(version, str) else "")
 

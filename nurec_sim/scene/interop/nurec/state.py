@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,7 +23,7 @@ class NurecState:
     """Arrays of a reconstruction by name, the names spelt alike for both files (``plain_name``).
 
     Attributes:
-        arrays: those that ``is_read`` names, as stored.
+        arrays: those that ``read_entries`` finds, as stored.
         track_ids: ``obj_track_ids``: for each layer the tracks that ``gaussian_cuboid_ids`` counts.
         config: settings of the layers and of the background, empty where the file has none.
         others: names of the arrays and values that are not read.
@@ -42,12 +42,32 @@ def plain_name(name: str) -> str:
     return name.removeprefix("model.").removeprefix(".")
 
 
-def is_read(name: str) -> bool:
-    """Whether an array of that plain name is required."""
-    return _READ.fullmatch(name) is not None
+def read_entries(
+    entries: Iterable[tuple[Any, Any]],
+) -> tuple[dict[str, tuple[str, Any]], list[str], dict[str, tuple[str, ...]]]:
+    """Sorts the entries of a state.
+
+    Returns:
+        The key and the value of each array to read by plain name, the plain names of those that are not read, and the
+        tracks by layer (``NurecState.track_ids``).
+    """
+    found: dict[str, tuple[str, Any]] = {}
+    others: list[str] = []
+    track_ids: dict[str, tuple[str, ...]] = {}
+    for key, value in entries:
+        if not isinstance(key, str):
+            continue
+        name = plain_name(key)
+        if name == "_extra_state":
+            track_ids = _track_ids(value)
+        elif _READ.fullmatch(name):
+            found[name] = key, value
+        else:
+            others.append(name)
+    return found, others, track_ids
 
 
-def track_ids_of(extra_state: object) -> dict[str, tuple[str, ...]]:
+def _track_ids(extra_state: object) -> dict[str, tuple[str, ...]]:
     """``obj_track_ids`` of the extra state by layer; layers whose ids are no list of texts are left out."""
     ids = extra_state.get("obj_track_ids") if isinstance(extra_state, Mapping) else None
     if not isinstance(ids, Mapping):

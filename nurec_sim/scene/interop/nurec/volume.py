@@ -15,7 +15,7 @@ import numpy as np
 
 from nurec_sim.errors import ArchiveError
 from nurec_sim.files.decoding import TooMuchError, msgpack_value, unpacked_limit
-from nurec_sim.scene.interop.nurec.state import NurecState, is_read, plain_name, track_ids_of
+from nurec_sim.scene.interop.nurec.state import NurecState, read_entries
 
 _INTEGERS = ("gaussian_cuboid_ids", "n_active_features")
 _MAX_DIMENSIONS = 8
@@ -32,17 +32,9 @@ def read_volume(data: bytes, where: str) -> NurecState:
     if not isinstance(nre, dict) or not isinstance(nre.get("state_dict"), dict):
         raise ArchiveError(f"{where}: no NuRec volume: 'nre_data' with a 'state_dict' is missing")
     state = nre["state_dict"]
-    arrays, others, track_ids = {}, [], {}
-    for key, value in state.items():
-        if not isinstance(key, str) or (key.endswith(".shape") and key.removesuffix(".shape") in state):
-            continue
-        name = plain_name(key)
-        if name == "_extra_state":
-            track_ids = track_ids_of(value)
-        elif not is_read(name):
-            others.append(name)
-        else:
-            arrays[name] = _array(name, value, state.get(f"{key}.shape"), where)
+    shapes = {f"{key}.shape" for key in state}
+    found, others, track_ids = read_entries((key, value) for key, value in state.items() if key not in shapes)
+    arrays = {name: _array(name, value, state.get(f"{key}.shape"), where) for name, (key, value) in found.items()}
     config = nre.get("config")
     version = nre.get("version")
     return NurecState(

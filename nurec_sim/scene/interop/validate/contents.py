@@ -10,12 +10,12 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.files.closing import Closing
 from nurec_sim.files.decoding import LIMITS, TooMuchError, check_directory, json_value, unpacked_limit
 from nurec_sim.files.zip_package import MAX_MEMBERS
 
@@ -32,7 +32,7 @@ def shown(value: Any) -> str:
     return _short.repr(value)
 
 
-class Contents:
+class Contents(Closing):
     """An open ZIP; members are read completely, up to a limit.
 
     Raises:
@@ -131,12 +131,6 @@ class Contents:
     def close(self) -> None:
         """Closes the file."""
         self._zip.close()
-
-    def __enter__(self) -> Contents:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
-        self.close()
 
 
 def entry_of(value: Any, key: str, where: str) -> Any:
