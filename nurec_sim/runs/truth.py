@@ -41,8 +41,10 @@ def true_world(
     """
     try:
         plan = TownPlan.from_json(Path(plan_file).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, ClipError) as error:
-        raise RunError(f"{plan_file} is not a town plan: {error}") from None
+    except ClipError as error:
+        raise RunError(f"{plan_file}: {error}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise RunError(f"{plan_file}: the town plan cannot be read: {error}") from None
     _check_same_town(plan, scene)
     with TrueWorld(plan, backend) as world:
         provenance = {**scene.provenance, "method": TRUTH}

@@ -77,8 +77,8 @@ def test_a_plan_of_another_town_is_refused(plan, log, tmp_path):
 
     broken = tmp_path / "plan.json"
     broken.write_text("{}")
-    refused("plan.json is not a town plan: not a town plan", broken)
-    refused("is not a town plan: .*No such file", tmp_path / "nowhere.json")
+    refused("plan.json: not a town plan: seed: Field required", broken)
+    refused("nowhere.json: the town plan cannot be read: .*No such file", tmp_path / "nowhere.json")
     refused("the plan has no actor 'ghost'", tracks=(dataclasses.replace(plan.tracks()[0], id="ghost"),))
     beside = scene.ego.world_from_body + np.pad([[0.0, 0.0, 0.0, 0.3]], ((1, 2), (0, 0)))
     refused(r"its ego is up to 0.30 m beside the plan's", ego=Trajectory(scene.ego.t_us, beside))

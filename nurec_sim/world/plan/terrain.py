@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 from jaxtyping import Float64
-from pydantic import ConfigDict
+
+from nurec_sim.world.plan.parts import plan_part
 
 
-@dataclass(frozen=True)
+@plan_part
 class Wave:
     """One sine: its height, its length, the direction in which it runs, and its phase at the origin."""
 
@@ -18,15 +16,13 @@ class Wave:
     length_m: float
     direction_rad: float
     phase_rad: float
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-@dataclass(frozen=True)
+@plan_part
 class Terrain:
     """Height over the plane z = 0 as a sum of waves; without waves the ground is flat."""
 
     waves: tuple[Wave, ...] = ()
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     def height_m(self, xy: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n"]:
         """Height of the ground (the road surface; sidewalks and grass lie a kerb higher)."""

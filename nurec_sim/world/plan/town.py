@@ -7,18 +7,18 @@ from the centre line to the right, driving with growing stations; 1, 2 to the le
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Annotated, ClassVar, Literal, get_args
+from dataclasses import fields
+from typing import Annotated, Literal, get_args
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from nurec_sim.errors import ClipError
 from nurec_sim.types import Track, Trajectory
+from nurec_sim.world.plan.parts import plan_part
 from nurec_sim.world.plan.splits import Split
 from nurec_sim.world.plan.terrain import FLAT, Terrain
 
-_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 Positive = Annotated[float, Field(gt=0)]
 EGO_MIDDLE_M = 1.4
 """Distance from the ego's rear axle to the centre of its wheelbase, where the slope is evaluated."""
@@ -37,17 +37,16 @@ ActorKind = Literal[
 LABEL_OF_KIND = {"pedestrian": "person", "cyclist": "rider", "truck": "heavy_truck", "bus": "bus"}
 
 
-@dataclass(frozen=True)
+@plan_part
 class RoadPiece:
     """A stretch of centre line whose curvature (left positive) changes linearly: line, arc or clothoid."""
 
     length_m: Positive
     start_curvature_per_m: float = 0.0
     end_curvature_per_m: float = 0.0
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class Narrowing:
     """Other widths between two stations; they ease in over ``taper_m`` before and out over ``taper_m`` after."""
 
@@ -57,10 +56,9 @@ class Narrowing:
     lane_width_m: float
     left_strip_m: float
     right_strip_m: float
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class Road:
     """Lanes and parking strips along a centre line, up to the mouths of the junctions at its ends.
 
@@ -81,7 +79,6 @@ class Road:
     centre_line: Literal["none", "dashed", "solid", "double"] = "dashed"
     edge_lines: bool = True
     narrowing: Narrowing | None = None
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
     @property
     def length_m(self) -> float:
@@ -89,17 +86,16 @@ class Road:
         return float(sum(piece.length_m for piece in self.pieces))
 
 
-@dataclass(frozen=True)
+@plan_part
 class Arm:
     """A road's end in a junction, with its traffic control (lights are constant during a clip)."""
 
     road: str
     end: Literal["start", "end"]
     rule: Rule = "priority"
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class Connection:
     """A path through a junction from one lane to another; lanes are ``<road id>:<lane number>``."""
 
@@ -111,10 +107,9 @@ class Connection:
     y_m: float
     yaw_rad: float
     pieces: Annotated[tuple[RoadPiece, ...], Field(min_length=1)]
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class Junction:
     """A junction, drivable between the mouths of its arms; its corners are rounded by ``corner_radius_m``.
 
@@ -130,10 +125,9 @@ class Junction:
     connections: tuple[Connection, ...]
     ring_radius_m: float = 0.0
     ring_width_m: float = 0.0
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class Crossing:
     """A pedestrian crossing: ``depth_m`` long from ``station_m`` on, with or without zebra stripes."""
 
@@ -141,20 +135,18 @@ class Crossing:
     station_m: float
     depth_m: float
     zebra: bool
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class StopLine:
     """A line across the lanes of one driving direction; drivers stop with their front bumper at ``station_m``."""
 
     road: str
     station_m: float
     forward: bool
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class Building:
     """A house; ``width_m`` runs along its street side, and ``yaw_rad`` is the heading of that side.
 
@@ -173,10 +165,9 @@ class Building:
     gable: bool
     tint: tuple[float, float, float]
     family: str = "plaster"
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class Prop:
     """Street furniture or a plant on the ground, ``on_road`` or a kerb higher; it faces ``yaw_rad``.
 
@@ -192,10 +183,9 @@ class Prop:
     scale: float = 1.0
     length_m: float = 0.0
     on_road: bool = False
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class Actor:
     """A vehicle, a cyclist or a pedestrian.
 
@@ -209,7 +199,6 @@ class Actor:
     colour: tuple[float, float, float]
     moves: bool
     path: Annotated[tuple[tuple[int, float, float, float, float], ...], Field(min_length=1)]
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
     @property
     def label(self) -> str:
@@ -224,17 +213,16 @@ class Actor:
         return Track(self.id, self.label, self.size_m, Trajectory(times, poses), controllable=self.moves)
 
 
-@dataclass(frozen=True)
+@plan_part
 class Kerb:
     """The edge of every road, and the sidewalk behind it."""
 
     width_m: float = 0.16
     height_m: float = 0.13
     sidewalk_width_m: float = 2.6
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class Style:
     """Asset names from ``splits`` and the texture seed."""
 
@@ -245,10 +233,9 @@ class Style:
     foliages: tuple[str, ...]
     yellow_lines: bool
     texture_seed: int
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class Weather:
     """Light and air. ``preset`` is one of ``splits.SKIES``; ``cloud_cover``, ``wetness`` and ``dusk`` are 0..1.
 
@@ -262,10 +249,9 @@ class Weather:
     fog_per_m: float
     wetness: float
     dusk: float
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
 
-@dataclass(frozen=True)
+@plan_part
 class TownPlan:
     """A town with its traffic in ``span_us`` [start, end). ``ego`` holds (t_us, x, y, yaw) of the rig.
 
@@ -288,7 +274,6 @@ class TownPlan:
     props: tuple[Prop, ...]
     actors: tuple[Actor, ...] = ()
     ego: tuple[tuple[int, float, float, float], ...] = ()
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
 
     def ego_trajectory(self) -> Trajectory:
         """The recorded drive: rear axle on the ground, tilted by the slope under the centre of the car."""
