@@ -55,9 +55,9 @@ class Options:
         pixels: of an input image, at most in training and always in evaluation.
         start: weights that every variant begins with.
         seed: of the training.
-        training_clips: drawn before training, equal for all; the recipe's number if not given.
-        clips: folder for them, OUT/clips if not given; nobody else should draw into it meanwhile.
-        drawers: processes that draw them; with 0 they must be there already.
+        training_clips: generated before training, equal for all; the recipe's number if not given.
+        clips: folder for them, OUT/clips if not given; no other process may write to it during the run.
+        generators: processes that generate them; with 0 all of them must exist.
         worlds: held-out worlds to evaluate in; three or more give intervals.
         seconds: of each.
         cameras: of each, 1 or 3.
@@ -75,7 +75,7 @@ class Options:
     seed: int = 0
     training_clips: int | None = None
     clips: Path | None = None
-    drawers: int = 1
+    generators: int = 1
     worlds: int = 4
     seconds: float = 8.0
     cameras: int = 1
@@ -100,7 +100,10 @@ def main() -> None:
     began = time.perf_counter()
     config = budget(options)
     clips = options.clips or options.out / "clips"
-    with TownSamples(config, clips, options.drawers, 0, report=err.print) as samples, progress("ablations") as advance:
+    with (
+        TownSamples(config, clips, options.generators, 0, report=err.print) as samples,
+        progress("ablations") as advance,
+    ):
         weights = {name: train(ablated(config, name), options, samples, advance) for name in options.names}
     with progress("evaluation") as advance:
         results = evaluate(weights, options, advance)
@@ -152,17 +155,17 @@ def train(config: TrainingConfig, options: Options, samples: TownSamples | Sampl
 
 
 def wait_for_clips(samples: TownSamples, count: int, advance: Progress) -> None:
-    """All variants must see the same clips, so that training begins when all are drawn.
+    """All variants must see the same clips, so that training begins when all of them exist.
 
     Raises:
-        TrainingError: some are missing and nobody draws them.
+        TrainingError: some are missing, and no process generates them.
     """
     while (ready := len(ready_clips(samples.cache.clips))) < count:
-        if not samples.drawers:
+        if not samples.generators:
             raise TrainingError(
-                f"{samples.cache.clips} holds {ready} clips, and {count} are needed; drawers must draw them"
+                f"{samples.cache.clips} holds {ready} clips, and {count} are needed; give --generators 1 or more"
             )
-        advance(f"drawing clips, {ready} of {count}", 0.0)
+        advance(f"generating clips, {ready} of {count}", 0.0)
         time.sleep(1.0)
 
 

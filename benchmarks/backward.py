@@ -96,14 +96,14 @@ def _step(
     else:
         images = gradients.render_lidar(tensors, asked.sensor, pose, threads)
         outputs = (images.range, images.intensity, images.alpha)
-    drawn = time.perf_counter()
+    rendered = time.perf_counter()
     seeded = torch.Generator().manual_seed(5)
     loss = sum((output * torch.rand(output.shape, generator=seeded)).sum() for output in outputs)
     ready, cpu = time.perf_counter(), time.process_time()
     loss.backward()
     done = time.perf_counter()
     frame = _frame(asked, *(image.detach().numpy() for image in outputs))
-    return (drawn - began) * 1e3, (done - ready) * 1e3, (time.process_time() - cpu) * 1e3, frame
+    return (rendered - began) * 1e3, (done - ready) * 1e3, (time.process_time() - cpu) * 1e3, frame
 
 
 def _frame(asked: SensorRequest, values: np.ndarray, second: np.ndarray, alpha: np.ndarray) -> SensorFrame:

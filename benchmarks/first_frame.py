@@ -29,7 +29,7 @@ def measure(scene: GaussianScene, request: SensorRequest, threads: int, folder: 
         folder: where the archive is kept.
 
     Returns:
-        ``first_frame_s`` for importing the renderer, packing the scene and drawing; ``first_frame_process_s`` for the
+        ``first_frame_s`` for importing the renderer, packing the scene and rendering; ``first_frame_process_s`` for the
         whole process, with the interpreter's start and the archive read; and those of ``measure_served``.
     """
     from nurec_sim.scene import write_scene
@@ -92,7 +92,7 @@ def _cpu_seconds(process_id: int) -> float:
 
 
 def main(archive: str, asked: str) -> None:
-    """Draw one frame and print how long it took, apart from reading the archive."""
+    """Render one frame and print how long it took, apart from reading the archive."""
     import numpy as np
 
     from nurec_sim.render import CpuRenderer

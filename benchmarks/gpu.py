@@ -56,7 +56,7 @@ class Options:
         sensors: sensors to render.
         detail_px: level of detail of further rows, for the sensors of DETAILED; 0 leaves them out.
         frames: frames per row, each from another pose of the path.
-        parity_rays: pixels or beams per row that the reference draws; 0 leaves it out.
+        parity_rays: pixels or beams per row that the reference renders; 0 leaves it out.
         device: a CUDA device.
         output: the results, as JSON.
     """
@@ -102,7 +102,7 @@ def scene_rows(
         ticks = cases.tick_requests(bench, CASES[sensor], path, options.frames)
         for tick in ticks[:10]:
             renderer.sense(tick)
-        ms = [timed(lambda tick=tick, renderer=renderer: renderer.draw(tick))[1] for tick in ticks]
+        ms = [timed(lambda tick=tick, renderer=renderer: renderer.render(tick))[1] for tick in ticks]
         wall = []
         for tick in ticks[: max(1, options.frames // 4)]:
             began = time.perf_counter()
@@ -125,9 +125,9 @@ def backward_row(
     forward, backward = [], []
     for (asked,) in cases.tick_requests(bench, CASES[sensor], path, max(2, options.frames // 4)):
         poses = [torch.from_numpy(np.asarray(asked.world_from_sensor, np.float64))]
-        (seen,), drawn_ms = timed(lambda poses=poses: renderer.render(GaussianTensors(**leaves), poses))
+        (seen,), render_ms = timed(lambda poses=poses: renderer.render(GaussianTensors(**leaves), poses))
         loss = sum((value * torch.rand_like(value)).sum() for value in vars(seen).values())
-        forward.append(drawn_ms)
+        forward.append(render_ms)
         backward.append(timed(loss.backward)[1])
         for leaf in leaves.values():
             leaf.grad = None

@@ -100,12 +100,12 @@ def measured(sensor_count: int, actor_count: int, batches: int) -> dict[str, flo
     ticks = [tick(scene, (*cameras, lidar("VLP-16", 90)), t_us)
              for t_us in np.linspace(START_US, END_US - 200_000, batches + 10).astype(int).tolist()]  # fmt: skip
     for requests in ticks[:10]:
-        renderer.draw(requests)
+        renderer.render(requests)
     launcher.launches = launcher.synchronisations = 0
     spent = []
     for requests in ticks[10:]:
         began = time.process_time()
-        renderer.draw(requests)
+        renderer.render(requests)
         spent.append((time.process_time() - began) * 1e3)
     return {
         "sensors": sensor_count,

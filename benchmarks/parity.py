@@ -1,6 +1,6 @@
 """How far frames are from ``render.spec``, at rays spread over the frame: the whole scene at the full resolution.
 
-The float64 reference takes some milliseconds per ray, so it draws a stratified, seeded sample of the pixels or beams.
+The float64 reference takes some milliseconds per ray, so it renders a stratified, seeded sample of the pixels or beams.
 It is given only those Gaussians that a sampled ray passes within their reach; all others weigh nothing on these rays.
 PSNR is over 8-bit colours (peak 255), alpha (peak 1), depth where both see a surface (peak 100 m), and LiDAR ranges of
 beams that both return (peak: the sensor's own maximum); identical samples count as 100 dB.

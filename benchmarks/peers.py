@@ -1,7 +1,7 @@
 """What the renderer is compared with: a plain torch renderer of the same response, gsplat, and our own lesser kernels.
 
 ``torch_frame`` is written as one would without kernels: exact ellipsoid bounds, 16 x 16 tiles, and per tile a batch of
-Gaussians by all of the tile's rays in ordinary tensor operations, with early stop. It draws the same image as the
+Gaussians by all of the tile's rays in ordinary tensor operations, with early stop. It renders the same image as the
 renderer (its PSNR against the reference is in its row). Peers that cannot run here are named with what they said.
 """
 
@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
-from timing import Draw
+from timing import Render
 
 from nurec_sim import geometry
 from nurec_sim.render import spec
@@ -38,7 +38,7 @@ def torch_frame(scene: GaussianScene, request: SensorRequest, threads: int = 2) 
     """
     camera = request.sensor
     if camera.ideal_pinhole is None or camera.shutter is not Shutter.GLOBAL:
-        raise ValueError("torch_frame draws ideal pinhole cameras with a global shutter")
+        raise ValueError("torch_frame renders ideal pinhole cameras with a global shutter")
     lens, width, height = camera.ideal_pinhole, camera.width_px, camera.height_px
     pose = np.asarray(request.world_from_sensor[0])
     grid = ray_grid(camera)
@@ -183,7 +183,7 @@ def gsplat_frame(scene: GaussianScene, request: SensorRequest) -> CameraFrame:
 
 
 def why_gsplat_cannot_run(scene: GaussianScene, request: SensorRequest) -> str | None:
-    """Draw a few Gaussians with gsplat; what it says if that fails."""
+    """Render a few Gaussians with gsplat; what it says if that fails."""
     few = GaussianScene(**{**vars(scene), "static": scene.static[:GSPLAT_PROBE]})
     try:
         gsplat_frame(few, request)
@@ -193,10 +193,10 @@ def why_gsplat_cannot_run(scene: GaussianScene, request: SensorRequest) -> str |
     return None
 
 
-def drawing(frame_of: Callable[..., CameraFrame], scene: GaussianScene, **settings: int) -> Draw:
+def rendering(frame_of: Callable[..., CameraFrame], scene: GaussianScene, **settings: int) -> Render:
     """One of the functions above as a back end."""
 
-    def draw(requests: Sequence[SensorRequest]) -> list[SensorFrame]:
+    def render(requests: Sequence[SensorRequest]) -> list[SensorFrame]:
         return [frame_of(scene, request, **settings) for request in requests]
 
-    return draw
+    return render

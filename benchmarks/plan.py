@@ -13,7 +13,7 @@ import cases
 import peers
 from cases import SENSORS
 from scenes import PATHS, ROOT, SCENES, BenchScene
-from timing import Draw, Entry
+from timing import Entry, Render
 
 from nurec_sim.render import CpuRenderer
 from nurec_sim.types import CameraModel, GaussianScene, SensorFrame, SensorRequest
@@ -60,7 +60,7 @@ class Options:
         repeats: frames per row; scenes of millions of Gaussians take fewer.
         threads: render threads; all that the process may use if not given.
         gaussians: make the seeded scenes of this many Gaussians instead of their own number.
-        parity_rays: pixels or beams per row that the reference draws; 0 leaves it out.
+        parity_rays: pixels or beams per row that the reference renders; 0 leaves it out.
         detail_px: what the rows with level of detail ask for; 0 leaves them out.
         extras: with the driving scene also run the plain torch renderer, gsplat where it runs, gradients, the first
             frame of a new process, and our kernels for lesser machines.
@@ -117,7 +117,9 @@ def entries(name: str, built: BenchScene, renderer: CpuRenderer, options: Option
     first = paths[0]
     result: list[Entry] = []
 
-    def add(sensor: str, path: str, backend: str, draw: Draw, measured: CpuRenderer | None = None, **more: Any) -> None:
+    def add(
+        sensor: str, path: str, backend: str, render: Render, measured: CpuRenderer | None = None, **more: Any
+    ) -> None:
         case, outputs = SENSORS[sensor], SENSORS[sensor].outputs
         ticks = cases.tick_requests(built, case, path, more.pop("frames", frames))
         width, height = case.size
@@ -127,7 +129,7 @@ def entries(name: str, built: BenchScene, renderer: CpuRenderer, options: Option
             "path": path, "backend": backend, "pixels": sum(w * h for w, h in map(cases.sensor_size, case.sensors)),
             **more,
         }  # fmt: skip
-        result.append(Entry(facts, ticks, draw, None if measured is None else own_account(measured, outputs)))
+        result.append(Entry(facts, ticks, render, None if measured is None else own_account(measured, outputs)))
 
     for sensor in chosen:
         if len(SENSORS[sensor].sensors) > 1:
@@ -144,11 +146,11 @@ def entries(name: str, built: BenchScene, renderer: CpuRenderer, options: Option
             add(sensor, first, "ours lod", each(coarse, SENSORS[sensor].outputs), coarse, full=full)
     notes = []
     if options.extras and name == "driving" and PEER_SENSOR in chosen:
-        torch = peers.drawing(peers.torch_frame, built.scene, threads=options.thread_count)
+        torch = peers.rendering(peers.torch_frame, built.scene, threads=options.thread_count)
         add(PEER_SENSOR, first, "torch", torch, frames=PEER_FRAMES)
         reason = peers.why_gsplat_cannot_run(built.scene, result[-1].ticks[0][0])
         if reason is None:
-            add(PEER_SENSOR, first, "gsplat", peers.drawing(peers.gsplat_frame, built.scene), frames=PEER_FRAMES)
+            add(PEER_SENSOR, first, "gsplat", peers.rendering(peers.gsplat_frame, built.scene), frames=PEER_FRAMES)
         else:
             notes.append(f"gsplat does not run here: {reason}")
         notes += [f"{peer} is not run: {text}" for peer, text in peers.NOT_RUN.items()]
@@ -160,10 +162,10 @@ def row_name(scene: str, sensor: str, path: str, backend: str) -> str:
     return f"{scene} {sensor} {path}" + ("" if backend == "ours" else f" {backend.removeprefix('ours ')}")
 
 
-def each(renderer: CpuRenderer, outputs: tuple[str, ...]) -> Draw:
+def each(renderer: CpuRenderer, outputs: tuple[str, ...]) -> Render:
     """Renders requests one after the other, cameras with the given outputs."""
 
-    def draw(requests: Sequence[SensorRequest]) -> list[SensorFrame]:
+    def render(requests: Sequence[SensorRequest]) -> list[SensorFrame]:
         return [
             renderer.render_camera(asked, outputs)
             if isinstance(asked.sensor, CameraModel)
@@ -171,7 +173,7 @@ def each(renderer: CpuRenderer, outputs: tuple[str, ...]) -> Draw:
             for asked in requests
         ]
 
-    return draw
+    return render
 
 
 def own_account(renderer: CpuRenderer, outputs: tuple[str, ...]) -> Callable[[Sequence[SensorRequest]], list[Any]]:
@@ -179,6 +181,6 @@ def own_account(renderer: CpuRenderer, outputs: tuple[str, ...]) -> Callable[[Se
     return lambda requests: renderer.measure(requests, outputs)[1]
 
 
-def one_by_one(renderer: CpuRenderer) -> Draw:
+def one_by_one(renderer: CpuRenderer) -> Render:
     """Renders requests as ``sense`` calls of one request."""
     return lambda requests: [frame for asked in requests for frame in renderer.sense([asked])]

@@ -119,7 +119,7 @@ def compared(
 ) -> dict[str, Any]:
     """Distances of a row's middle frame from the reference, and of simplified scenes from the full one."""
     asked = entry.ticks[len(entry.ticks) // 2]
-    frames = entry.draw(asked)
+    frames = entry.render(asked)
     figures: dict[str, Any] = {}
     if parity_rays:
         figures.update(parity.against_spec(built.scene, asked, frames, parity_rays))
@@ -127,7 +127,7 @@ def compared(
     full = entry.facts.get("full")
     for other in entries:
         if full is not None and other.facts["name"] == full:
-            figures["psnr_vs_full_db"] = parity.image_psnr_db(frames, other.draw(asked))
+            figures["psnr_vs_full_db"] = parity.image_psnr_db(frames, other.render(asked))
     return figures
 
 

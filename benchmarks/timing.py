@@ -12,12 +12,12 @@ import numpy as np
 
 from nurec_sim.types import SensorFrame, SensorRequest
 
-Draw = Callable[[Sequence[SensorRequest]], list[SensorFrame]]
+Render = Callable[[Sequence[SensorRequest]], list[SensorFrame]]
 
 
 @dataclass
 class Entry:
-    """One row in the making: what identifies it, how to draw a tick, and the times so far.
+    """One row in the making: what identifies it, how to render a tick, and the times so far.
 
     ``reports`` gives the renderer's own account of a tick (evaluations, seconds per stage) where it has one; it is
     called apart from the timed frames.
@@ -25,7 +25,7 @@ class Entry:
 
     facts: dict[str, Any]
     ticks: list[list[SensorRequest]]
-    draw: Draw
+    render: Render
     reports: Callable[[Sequence[SensorRequest]], list[Any]] | None = None
     first_ms: float | None = None
     wall_ms: list[float] = field(default_factory=list)
@@ -49,9 +49,9 @@ class Entry:
 
 
 def warm_up(entries: Sequence[Entry], tick: Callable[[Entry], None]) -> None:
-    """Draw and time the first frame of every entry; ``tick`` is called after every frame."""
+    """Render and time the first frame of every entry; ``tick`` is called after every frame."""
     for entry in entries:
-        entry.first_ms = _timed(entry.draw, entry.ticks[0])[0]
+        entry.first_ms = _timed(entry.render, entry.ticks[0])[0]
         tick(entry)
 
 
@@ -60,25 +60,25 @@ def take_turns(entries: Sequence[Entry], tick: Callable[[Entry], None]) -> None:
     for number in range(max((len(entry.ticks) for entry in entries), default=0)):
         for entry in entries:
             if number < len(entry.ticks):
-                wall, cpu = _timed(entry.draw, entry.ticks[number])
+                wall, cpu = _timed(entry.render, entry.ticks[number])
                 entry.wall_ms.append(wall)
                 entry.cpu_ms.append(cpu)
                 entry.load = os.getloadavg()[0]
                 tick(entry)
 
 
-def _timed(draw: Draw, requests: Sequence[SensorRequest]) -> tuple[float, float]:
+def _timed(render: Render, requests: Sequence[SensorRequest]) -> tuple[float, float]:
     """Wall and process CPU time in milliseconds."""
     wall, cpu = time.perf_counter(), time.process_time()
-    draw(requests)
+    render(requests)
     return (time.perf_counter() - wall) * 1e3, (time.process_time() - cpu) * 1e3
 
 
 def account(entry: Entry, ticks: int = 3) -> dict[str, Any]:
     """Means over some ticks of what the renderer counts itself; nothing if it does not count.
 
-    ``evaluations_per_pixel`` are responses of a Gaussian computed for a ray over rays drawn, ``in_view`` the Gaussians
-    that reach some ray, ``stages`` the milliseconds per stage as seen by the calling thread.
+    ``evaluations_per_pixel`` are responses of a Gaussian computed for a ray over rays rendered, ``in_view`` the
+    Gaussians that reach some ray, ``stages`` the milliseconds per stage as seen by the calling thread.
     """
     if entry.reports is None:
         return {}

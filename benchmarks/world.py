@@ -40,7 +40,7 @@ Row = tuple[str, float, str]
 
 @dataclass(frozen=True)
 class Options:
-    """Draw a town with all its ground truth, compare OpenGL with ray casting, and print one table.
+    """Render a town with all its ground truth, compare OpenGL with ray casting, and print one table.
 
     Args:
         seed: of the town.
@@ -74,19 +74,19 @@ def rows(plan: TownPlan, rig: Rig, options: Options) -> Iterator[Row]:
     front = rig.cameras["camera_front"]
     _, seconds = timed(lambda: town_plan(options.seed))
     yield "plan a town and 12 s of its traffic", seconds, f"{len(plan.actors)} actors"
-    drawn, seconds = timed(lambda: TrueWorld(plan))
-    yield f"build a town ({drawn.backend})", seconds, f"{drawn.town.model.ngeom} geoms"
+    rendered, seconds = timed(lambda: TrueWorld(plan))
+    yield f"build a town ({rendered.backend})", seconds, f"{rendered.town.model.ngeom} geoms"
     cast = TrueWorld(plan, "rays")
-    with drawn, cast:
-        yield from clip_rows(drawn, rig, options.frames)
-        yield agreement("pinhole", drawn, cast, front)
+    with rendered, cast:
+        yield from clip_rows(rendered, rig, options.frames)
+        yield agreement("pinhole", rendered, cast, front)
         for shutter, milliseconds in ((Shutter.TOP_TO_BOTTOM, 15), (Shutter.LEFT_TO_RIGHT, 30)):
             rolling = dataclasses.replace(front, shutter=shutter)
             name = f"{shutter.value} {milliseconds} ms"
-            yield agreement(name, drawn, cast, rolling, milliseconds * 1000)
+            yield agreement(name, rendered, cast, rolling, milliseconds * 1000)
         if not options.quick:
             for name, camera in lenses(front).items():
-                yield agreement(name, drawn, cast, camera)
+                yield agreement(name, rendered, cast, camera)
             for name in LIDARS:
                 yield from lidar_rows(plan, cast, sensors.lidar_model(name, rig.lidars["lidar_top"].rig_from_lidar))
     for quality in (Quality(), Quality(samples=0), Quality(shadow_px=0), Quality(samples=0, shadow_px=0)):
@@ -119,7 +119,7 @@ def clip_rows(world: TrueWorld, rig: Rig, frames: int) -> Iterator[Row]:
     views: dict[tuple[str, int], tuple[SensorRequest, TrueView]] = {}
     flows: dict[tuple[str, int], np.ndarray] = {}
 
-    def draw() -> None:
+    def render() -> None:
         with TrueWorld(world.plan, responses=responses) as noisy:
             for index, seconds in enumerate(times):
                 for name, camera in rig.cameras.items():
@@ -130,7 +130,7 @@ def clip_rows(world: TrueWorld, rig: Rig, frames: int) -> Iterator[Row]:
                                                     noisy.boxes(request.start_us), noisy.boxes(then))  # fmt: skip
                     views[name, index] = request, view
 
-    seconds = timed(draw)[1]
+    seconds = timed(render)[1]
     verdict = "" if frames != 18 else f" (at most {CLIP_LIMIT_S:g}: {'kept' if seconds <= CLIP_LIMIT_S else 'MISSED'})"
     yield f"{frames} frames x {len(rig.cameras)} cameras, all truths", seconds, f"with town and context{verdict}"
     explained = [
@@ -163,11 +163,11 @@ def flow_consistency(
     return float(np.mean(nearest < expected + slack)), float(same[moving].mean()) if moving.any() else np.nan
 
 
-def agreement(name: str, drawn: TrueWorld, cast: TrueWorld, camera: CameraModel, duration_us: int = 0) -> Row:
+def agreement(name: str, rendered: TrueWorld, cast: TrueWorld, camera: CameraModel, duration_us: int = 0) -> Row:
     """A rasterised image against one ray per pixel, each at the exposure time of its line."""
-    request = request_at(drawn.plan, camera, 3.0, duration_us)
-    drawn.view(request)
-    view, seconds = timed(lambda: drawn.view(request))
+    request = request_at(rendered.plan, camera, 3.0, duration_us)
+    rendered.view(request)
+    view, seconds = timed(lambda: rendered.view(request))
     exact = cast.view(request)
     labels = float(np.mean(LABEL_OF_CLASS[view.surface] == LABEL_OF_CLASS[exact.surface]))
     same = (view.surface == exact.surface) & (view.instance == exact.instance) & (view.range_m > 0)
@@ -208,13 +208,13 @@ def lidar_rows(plan: TownPlan, cast: TrueWorld, lidar: LidarModel) -> Iterator[R
     exact, seconds = timed(lambda: cast.scan(request))
     size = f"{exact.range_m.shape[0]} x {exact.range_m.shape[1]}"
     yield f"{lidar.id} {size}, rays", seconds, f"{exact.range_m.size / seconds / 1e6:.2f} M rays per CPU-second"
-    with TrueWorld(plan, quality=Quality(lidar="drawn")) as world:
+    with TrueWorld(plan, quality=Quality(lidar="rasterised")) as world:
         world.scan(request)
         fast, seconds = timed(lambda: world.scan(request))
     same = (fast.surface == exact.surface) & (fast.instance == exact.instance)
     error = np.abs(fast.range_m - exact.range_m)[same & (exact.range_m > 0) & (fast.range_m > 0)]
     returns = np.mean((fast.range_m > 0) == (exact.range_m > 0))
-    yield f"{lidar.id} {size}, drawn", seconds, (
+    yield f"{lidar.id} {size}, rendered", seconds, (
         f"range error {np.median(error):.1e} m median, {np.quantile(error, 0.95):.1e} m p95;"
         f" class {same.mean():.4f}, returns {returns:.4f}"
     )  # fmt: skip

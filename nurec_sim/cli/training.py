@@ -20,7 +20,7 @@ def train(
     *,
     out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     clips: Path = Path("runs/clips"),
-    drawers: int = 1,
+    generators: int = 1,
     loaders: int = 1,
     threads: int | None = None,
     until: int | None = None,
@@ -35,7 +35,7 @@ def train(
         recipe: a YAML file such as nurec_sim/training/recipes/tiny.yaml.
         out_path: the run folder; default: runs/train/RECIPE-NAME.
         clips: cache folder for generated clips, which may be shared between runs.
-        drawers: processes that generate clips; 0 uses existing clips only.
+        generators: processes that generate clips; 0 uses existing clips only.
         loaders: processes that prepare samples; 0 is a thread of the training process.
         threads: of torch and of the renderer; default: all cores.
         until: stop after this step, counted from the start of the recipe.
@@ -51,9 +51,9 @@ def train(
     from nurec_sim.training.processes import Processes
     from nurec_sim.training.trainer import WEIGHTS, Trainer
 
-    if min(drawers, loaders) < 0 or (threads is not None and threads < 1):
+    if min(generators, loaders) < 0 or (threads is not None and threads < 1):
         raise TrainingError(
-            f"drawers and loaders must be 0 or more and threads 1 or more, got {drawers}, {loaders}, {threads}"
+            f"generators and loaders must be 0 or more and threads 1 or more, got {generators}, {loaders}, {threads}"
         )
     config = ablated(read_config(recipe), ablation)
     folder = out_path or Path("runs/train") / (recipe.stem if ablation == "full" else f"{recipe.stem}-{ablation}")
@@ -64,7 +64,10 @@ def train(
     perceptual = perceptual_distance if config.lpips is None else load_lpips(config.lpips)
     processes = Processes.from_torchrun()
     try:
-        with TownSamples(config, clips, drawers, loaders, processes, _tell) as samples, progress("training") as advance:
+        with (
+            TownSamples(config, clips, generators, loaders, processes, _tell) as samples,
+            progress("training") as advance,
+        ):
             Trainer(config, folder, samples, perceptual, processes, threads).run(advance, until)
     finally:
         processes.leave()

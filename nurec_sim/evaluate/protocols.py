@@ -34,7 +34,7 @@ SHIFT_FRAMES = (3, 8, 13)
 """Target frames for lateral offsets: each about halfway between two input frames."""
 NEAR_M, NEAR_SHARE = 1.0, 0.2
 """A camera with more than this fraction of pixels nearer than this is inside an object."""
-QUALITY = Quality(lidar="drawn")
+QUALITY = Quality(lidar="rasterised")
 
 Progress = Callable[[str, float], None]
 Made = tuple[ContextClip, list[Target]]

@@ -25,7 +25,7 @@ PAIRS = (
     ("optimized", "dense"),
 )
 """Pairs of methods whose difference is reported."""
-DRAWS = 2000
+RESAMPLES = 2000
 CURVE = ("psnr_db", "ssim", "abs_rel", "abs_rel_metric", "depth_coverage")
 
 
@@ -142,6 +142,6 @@ def interval(values: Sequence[float]) -> list[float] | None:
         return None
     # Seeded by the sample size: the same values always have the same interval. Below three values a percentile
     # bootstrap has almost no distinct resamples.
-    draws = np.random.default_rng([len(values), 0xB007]).integers(0, len(values), (DRAWS, len(values)))
-    low, high = np.quantile(np.asarray(values)[draws].mean(axis=1), (0.025, 0.975))
+    chosen = np.random.default_rng([len(values), 0xB007]).integers(0, len(values), (RESAMPLES, len(values)))
+    low, high = np.quantile(np.asarray(values)[chosen].mean(axis=1), (0.025, 0.975))
     return [float(low), float(high)]

@@ -108,7 +108,7 @@ def plan_view(entry: ReportRollout, view: PlanAxes, image_key: str | None, road_
             _outlines("ego at the first event", [_outline(view, ego, moment)], ALARM, fill="rgba(220,38,38,0.25)")
         )
     data += marks
-    drawn = [trace for trace in data if trace["x"]]
+    traces = [trace for trace in data if trace["x"]]
     reach = np.vstack([view.points(rollout.world_from_rig[:, :2, 3]), line])
     low, high = reach.min(axis=0) - 10, reach.max(axis=0) + 10
     layout = base_layout(460)
@@ -117,7 +117,7 @@ def plan_view(entry: ReportRollout, view: PlanAxes, image_key: str | None, road_
     layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
     if image_key is not None:
         layout["images"] = [{"image_key": image_key}]
-    return {"data": drawn, "layout": layout}
+    return {"data": traces, "layout": layout}
 
 
 def _outlines(

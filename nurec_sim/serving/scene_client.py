@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Unpack
+from typing import NamedTuple, Unpack
 
 import numpy as np
 from jaxtyping import Float32
@@ -19,6 +20,39 @@ from nurec_sim.types import CameraFrame, LidarFrame, LidarModel, SensorRequest
 CHUNK_BYTES = 1 << 20
 
 Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class ListedScene:
+    """One scene of a server.
+
+    Attributes:
+        scene_id: its id.
+        kind: ``memory`` (an object that the server was started with), ``archive``, ``clip`` (reconstructed when it is
+            first used) or ``unknown``.
+        file_bytes: size of its file; 0 for folders and objects in memory.
+        loaded: whether it is in memory.
+        loading: whether it is being loaded or reconstructed.
+        loaded_bytes: memory that it takes; 0 if it is not loaded.
+        users: calls that use it now.
+        uploaded: whether it was uploaded, and can be deleted.
+    """
+
+    scene_id: str
+    kind: str
+    file_bytes: int
+    loaded: bool
+    loading: bool
+    loaded_bytes: int
+    users: int
+    uploaded: bool
+
+
+class SceneListing(NamedTuple):
+    """The scenes of a server, and why its other sources cannot be opened, by file name without the ending."""
+
+    scenes: tuple[ListedScene, ...]
+    faults: Mapping[str, str]
 
 
 class SceneClient(Connection):
@@ -38,9 +72,24 @@ class SceneClient(Connection):
 
     # --------------------------------------------------------------------------------------------------------- scenes
 
-    def scenes(self) -> Any:
-        """The ``ListScenesReply``: available scenes, and sources that cannot be opened."""
-        return self._call("ListScenes", v1.ListScenesRequest())
+    def scenes(self) -> SceneListing:
+        """Available scenes, and sources that cannot be opened."""
+        reply = self._call("ListScenes", v1.ListScenesRequest())
+        known = {kind.value: kind.name.lower() for kind in wire.SceneKind}
+        scenes = [
+            ListedScene(
+                scene_id=info.scene_id,
+                kind=known.get(info.kind, "unknown"),
+                file_bytes=info.file_bytes,
+                loaded=info.loaded,
+                loading=info.loading,
+                loaded_bytes=info.loaded_bytes,
+                users=info.users,
+                uploaded=info.uploaded,
+            )
+            for info in reply.scenes
+        ]
+        return SceneListing(tuple(scenes), {fault.name: fault.text for fault in reply.faults})
 
     def stats(self) -> Mapping[str, float]:
         """Counters of the server by name, as in ``StatsReply``."""

@@ -95,13 +95,13 @@ def _in_one_stage(config: TrainingConfig) -> TrainingConfig:
     first = config.stages[0]
     parts: tuple[Part, ...] = tuple(dict.fromkeys(part for stage in config.stages for part in stage.trains))
     weights = {name: _first_weight(name, config.stages) for name in LossWeights.model_fields}
-    drawn = max(config.stages, key=lambda stage: stage.targets)
+    last = max(config.stages, key=lambda stage: stage.targets)
     changes = {
         "name": "joint",
         "steps": config.steps,
         "trains": parts,
-        "pixels": drawn.pixels,
-        "targets": drawn.targets,
+        "pixels": last.pixels,
+        "targets": last.targets,
         "losses": LossWeights(**weights),
     }
     return config.model_copy(update={"stages": (first.model_copy(update=changes),)})

@@ -53,15 +53,15 @@ def render_view(
         threads: threads of the renderer.
     """
     gaussians = gaussians_at(query, inputs, view.time)
-    drawn = render_camera(gaussians, view.camera, torch.from_numpy(view.scene_from_camera), None, threads)
+    rendered = render_camera(gaussians, view.camera, torch.from_numpy(view.scene_from_camera), None, threads)
     rays, _ = camera_rays(view.camera)
     direction = scene_rays(view.camera, rays, view.scene_from_camera)[..., 3:].astype(np.float32)
     behind = cubemap.sample(sky, torch.from_numpy(direction))
     # Premultiplied colours: the sky shows through the remaining transmittance. The response comes last, as in a camera,
     # so that Gaussians and sky share one canonical colour space.
-    canonical = drawn.rgb + (1 - drawn.alpha)[..., None] * behind
+    canonical = rendered.rgb + (1 - rendered.alpha)[..., None] * behind
     shown = canonical @ isp[:, :3].T + isp[:, 3]
-    return Rendering(shown.clamp(0, 1), drawn.depth, drawn.alpha)
+    return Rendering(shown.clamp(0, 1), rendered.depth, rendered.alpha)
 
 
 def render_losses(

@@ -168,7 +168,7 @@ class Trainer:
             "steps": str(self.position.step),
             "seconds": f"{self.position.seconds:.0f}",
             "data": self.position.data_hash,
-            "trained_on": "worlds drawn by nurec_sim.world",
+            "trained_on": "procedural worlds of nurec_sim.world",
         }
         save_weights(self.average, self.folder / WEIGHTS, facts, half=True)
 

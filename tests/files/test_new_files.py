@@ -282,7 +282,7 @@ def test_towns_that_cannot_be_kept_end_the_wait_for_them(tmp_path: Path, monkeyp
     with ClipCache(tmp_path, ClipSettings(), 1, report=said.append) as cache:
         with room_for(1000), pytest.raises(WriteError, match="train-000000-0: No space left on device"):
             cache.fill()
-        assert len(said) == 1 and said[0].startswith("no more towns are drawn: cannot write ")
+        assert len(said) == 1 and said[0].startswith("no more towns are generated: cannot write ")
         assert not files(tmp_path)
         stream = SampleStream(cache.clips, WindowSettings(PROFILES["tiny"]), 0, check=cache.check)
         with stream, pytest.raises(WriteError):

@@ -1,4 +1,4 @@
-"""Protocols on the street of planes and boxes: windows in milliseconds, without a drawing back end."""
+"""Protocols on the street of planes and boxes: windows in milliseconds, without a rendering back end."""
 
 import contextlib
 from dataclasses import dataclass

@@ -58,11 +58,10 @@ def test_scenes_are_listed_with_their_state_and_faults(client, archive):
     reply = client.scenes()
     street, stored = reply.scenes
     assert (street.scene_id, stored.scene_id) == ("clipgt-street", "clipgt-stored")
-    assert (street.kind, stored.kind) == (wire.SceneKind.MEMORY, wire.SceneKind.ARCHIVE)
+    assert (street.kind, stored.kind) == ("memory", "archive")
     assert street.loaded and street.loaded_bytes > 50_000 and not street.users and not street.uploaded
     assert stored.file_bytes == archive.stat().st_size
-    (fault,) = reply.faults
-    assert fault.name == "broken" and "broken.usdz" in fault.text
+    assert list(reply.faults) == ["broken"] and "broken.usdz" in reply.faults["broken"]
 
 
 @pytest.mark.parametrize("camera", ["front", "wide", "fish"])

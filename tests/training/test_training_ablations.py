@@ -153,8 +153,8 @@ def test_finished_runs_are_not_trained_again(script, tmp_path):
 def test_clips_that_nobody_draws_are_not_waited_for(script, tmp_path):
     options = script.Options(out=tmp_path, training_clips=2)
     with (
-        TownSamples(script.budget(options), tmp_path / "clips", drawers=0) as samples,
-        pytest.raises(TrainingError, match="holds 0 clips, and 2 are needed; drawers must draw them"),
+        TownSamples(script.budget(options), tmp_path / "clips", generators=0) as samples,
+        pytest.raises(TrainingError, match="holds 0 clips, and 2 are needed; give --generators 1 or more"),
     ):
         script.train(CONFIG.model_copy(update={"data": script.budget(options).data}), options, samples, lambda *a: None)
     assert not (tmp_path / "runs").exists()

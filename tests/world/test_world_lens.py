@@ -9,7 +9,7 @@ from sensor_worlds import painted_world, request_at, small_plan, true_world
 from nurec_sim import geometry, sensors
 from nurec_sim.types import Fisheye, FTheta, FThetaReference, Pinhole, Shutter, Windshield, WindshieldReference
 from nurec_sim.world import LABEL_OF_CLASS, SurfaceClass, street_rig
-from nurec_sim.world.sense.faces import Drawn, Seen, plan_faces
+from nurec_sim.world.sense.faces import FaceImage, Seen, plan_faces
 from nurec_sim.world.sense.shutter import bands_for, camera_patches, lidar_patches
 
 FRONT = street_rig(112, 64).cameras["camera_front"]
@@ -41,7 +41,7 @@ def drawn_ground(face, world_from_sensor):
     down = -(direction @ (world_from_sensor[:3, :3] @ face.sensor_from_face).T)[..., 2]
     nearness = np.where(down > 1e-4, down / world_from_sensor[2, 3], 0).astype(np.float32)
     rgb = np.stack([u, v, 0 * u], axis=-1).astype(np.uint8)
-    return Drawn(rgb, np.where(nearness > 0, 0, -1).astype(np.int32), nearness)
+    return FaceImage(rgb, np.where(nearness > 0, 0, -1).astype(np.int32), nearness)
 
 
 @pytest.mark.parametrize("name", CAMERAS)
@@ -86,7 +86,7 @@ def test_lone_holes_in_the_ground_are_closed_and_those_in_leaves_are_not():
     for row, column in ((1, 4), (6, 3), (6, 6), (6, 7)):  # above the horizon; alone below it; two side by side
         geom[row, column], nearness[row, column] = -1, 0
     rgb = np.where(geom[..., None] < 0, 255, 90).astype(np.uint8) * np.ones((1, 1, 3), np.uint8)
-    drawn = Drawn(rgb, geom, nearness)
+    drawn = FaceImage(rgb, geom, nearness)
     _close_cracks(drawn, Pinhole(9.0, 9.0, 4.5, 4.5), np.array([0.0, -1.0, 0.0]))
     assert np.argwhere(geom < 0).tolist() == [[1, 4], [6, 6], [6, 7]]
     assert nearness[6, 3] == np.float32(0.1) and rgb[6, 3].tolist() == [90, 90, 90]

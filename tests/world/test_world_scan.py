@@ -35,11 +35,11 @@ def rays(plan):
 
 @pytest.mark.needs_gl
 @pytest.mark.parametrize("name", LIDARS)
-def test_drawn_turns_agree_with_rays(plan, rays, name):
+def test_rasterised_turns_agree_with_rays(plan, rays, name):
     request = request_at(plan, LIDARS[name], 5.0, 100_000)
     assert np.linalg.norm(np.diff(request.world_from_sensor[:, :3, 3], axis=0)) > 0.2
     cast = rays.scan(request)
-    with painted_world(plan, quality=Quality(lidar="drawn")) as world:
+    with painted_world(plan, quality=Quality(lidar="rasterised")) as world:
         drawn = world.scan(request)
     assert np.mean((drawn.range_m > 0) == (cast.range_m > 0)) > 0.99
     same = (drawn.surface == cast.surface) & (drawn.instance == cast.instance)
@@ -51,7 +51,7 @@ def test_drawn_turns_agree_with_rays(plan, rays, name):
 
 
 def test_rays_backends_never_draw(plan):
-    with true_world(plan, "rays", quality=Quality(lidar="drawn")) as world:
+    with true_world(plan, "rays", quality=Quality(lidar="rasterised")) as world:
         assert (world.scan(request_at(plan, LIDARS["AT128"], 1.0)).range_m > 0).any()
 
 
@@ -109,5 +109,5 @@ def test_measured_points_are_beams_times_ranges(plan, rays):
 def test_impossible_lidars_are_refused(wrong):
     with pytest.raises(ValueError, match="drop and range_noise_m must be finite and not negative"):
         LidarResponse(**wrong)
-    with pytest.raises(ValueError, match="lidar 'rays' or 'drawn'; got 3, 2048, 'rays'"):
+    with pytest.raises(ValueError, match="lidar 'rays' or 'rasterised'; got 3, 2048, 'rays'"):
         Quality(samples=3)

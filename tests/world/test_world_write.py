@@ -216,7 +216,7 @@ def test_too_small_rigs_are_refused():
         street_rig(8)
 
 
-# ------------------------------------------------------------------------------------------------- drawing back ends
+# ------------------------------------------------------------------------------------------------- rendering back ends
 
 
 def fake(monkeypatch, broken):
@@ -239,7 +239,7 @@ def test_environment_and_argument_choose_the_back_end(monkeypatch):
     with pytest.raises(RuntimeError, match="'egl' does not work here: it is missing; 'rays' always does"):
         backend.pick_backend()
     monkeypatch.setenv(backend.ENVIRONMENT, "vulkan")
-    with pytest.raises(ValueError, match="no drawing back end 'vulkan'; have egl, osmesa, rays .NUREC_SIM_GL sets it"):
+    with pytest.raises(ValueError, match="no rendering back end 'vulkan'; have egl, osmesa, rays .NUREC_SIM_GL sets"):
         backend.pick_backend()
 
 

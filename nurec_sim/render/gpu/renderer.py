@@ -137,15 +137,15 @@ class GpuRenderer(SingleFrames):
                 group = []
         return frames
 
-    def draw(self, requests: Sequence[SensorRequest], filter: LidarFilter | None = None) -> Images:
+    def render(self, requests: Sequence[SensorRequest], filter: LidarFilter | None = None) -> Images:
         """The frames of ``sense`` with all outputs, left on the device; at least one request.
 
         Raises:
             RequestError, OutOfRangeError, TooLargeError: see ``requests.check_request``; or the GPU's memory is full.
         """
-        return self._drawn(requests, CAMERA_OUTPUTS, filter or LidarFilter(), on_host=False)[0]
+        return self._rendered(requests, CAMERA_OUTPUTS, filter or LidarFilter(), on_host=False)[0]
 
-    def _drawn(
+    def _rendered(
         self, requests: Sequence[SensorRequest], outputs: Sequence[str], filter: LidarFilter, on_host: bool
     ) -> tuple[Images, dict[str, np.ndarray]]:
         """The images on the device and, with ``on_host``, on the host; waits for the device once."""
@@ -208,7 +208,7 @@ class GpuRenderer(SingleFrames):
     ) -> list[SensorFrame]:
         if not requests:
             return []
-        images, host = self._drawn(requests, outputs, filter, on_host=True)
+        images, host = self._rendered(requests, outputs, filter, on_host=True)
         frames: list[SensorFrame] = []
         for k, request in enumerate(requests):
             part = slice(images.first_ray[k], images.first_ray[k + 1])

@@ -177,9 +177,9 @@ class ClipCache(Closing):
                 if self._stop.is_set() or status == 0:
                     break
                 if self._fault is not None:
-                    self._report(f"no more towns are drawn: {self._fault}")
+                    self._report(f"no more towns are generated: {self._fault}")
                     return
-                self._report(f"drawing the towns {list(batch)} ended with status {status}, trial {trial} of {TRIALS}")
+                self._report(f"generating towns {list(batch)} ended with status {status}, trial {trial} of {TRIALS}")
 
     def _run(self, batch: tuple[int, ...], backend: str, niceness: int, refresh: bool) -> int | None:
         """Runs a process that generates a few towns; returns its exit status."""

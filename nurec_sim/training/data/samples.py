@@ -31,7 +31,7 @@ class TownSamples:
     Args:
         config: the recipe.
         folder: folder of clips, shared by runs with the same data settings.
-        drawers: processes that generate clips, started by the first process of a run only.
+        generators: processes that generate clips, started by the first process of a run only.
         loaders: processes that prepare samples; 0 uses a thread.
         processes: this process among those of the run.
         report: called with messages about background errors.
@@ -41,20 +41,20 @@ class TownSamples:
         self,
         config: TrainingConfig,
         folder: Path,
-        drawers: int = 1,
+        generators: int = 1,
         loaders: int = 0,
         processes: Processes | None = None,
         report: Callable[[str], None] | None = None,
     ) -> None:
-        self.config, self.drawers, self.loaders = config, drawers, loaders
+        self.config, self.generators, self.loaders = config, generators, loaders
         self.first = processes is None or processes.first
         data = config.data
         self.cache = ClipCache(folder, data.clip_settings(), data.clips, data.first_town, report)
         self._open = ExitStack()
 
     def __enter__(self) -> TownSamples:
-        if self.first and self.drawers:
-            self.cache.start(self.drawers, refresh=self.config.data.refresh)
+        if self.first and self.generators:
+            self.cache.start(self.generators, refresh=self.config.data.refresh)
         self._open.callback(self.cache.close)
         return self
 

@@ -61,9 +61,9 @@ def pick_backend(wanted: str | None = None) -> str:
     if wanted is None:
         return next(name for name in BACKENDS if not why_not(name))
     if wanted not in BACKENDS:
-        raise ValueError(f"no drawing back end {wanted!r}; have {', '.join(BACKENDS)} ({ENVIRONMENT} sets it)")
+        raise ValueError(f"no rendering back end {wanted!r}; have {', '.join(BACKENDS)} ({ENVIRONMENT} sets it)")
     if reason := why_not(wanted):
-        raise RuntimeError(f"the drawing back end {wanted!r} does not work here: {reason}; 'rays' always does")
+        raise RuntimeError(f"the rendering back end {wanted!r} does not work here: {reason}; 'rays' always does")
     return wanted
 
 
@@ -75,7 +75,7 @@ def gl_context(name: str) -> Any:
     """
     other = {"egl": "osmesa", "osmesa": "egl"}[name]
     if f"mujoco.{other}" in sys.modules:
-        raise RuntimeError(f"this process already draws with {other!r} and cannot use {name!r} as well")
+        raise RuntimeError(f"this process already renders with {other!r} and cannot use {name!r} as well")
     # PyOpenGL reads this on its first import, so the import below must come after it.
     os.environ["PYOPENGL_PLATFORM"] = name
     if name == "egl":

@@ -29,7 +29,7 @@ Mask = Bool[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class FaceImage:
     """A pinhole image: colours (None if not requested), geom ids (-1 sky) and 1 / z (0 sky)."""
 
     rgb: UInt8[np.ndarray, "h w 3"] | None
@@ -82,11 +82,11 @@ class Face:
     offset_px: Float32[np.ndarray, "2 h w"] | None = None
     colour_maps: tuple[Float32[np.ndarray, "h w 2"], ...] = ()
 
-    def read(self, drawn: Drawn, seen: Seen) -> None:
+    def read(self, image: FaceImage, seen: Seen) -> None:
         """Fills this face's part of what the sensor sees."""
-        right, down, known = slopes(drawn.nearness, drawn.geom)
-        normal = plane_normals(self.lens, drawn.nearness, right, down, known)
-        geom, nearness, rgb = drawn.geom, drawn.nearness, drawn.rgb
+        right, down, known = slopes(image.nearness, image.geom)
+        normal = plane_normals(self.lens, image.nearness, right, down, known)
+        geom, nearness, rgb = image.geom, image.nearness, image.rgb
         if self.nearest is not None:
             assert self.offset_px is not None
             geom, nearness = geom.ravel()[self.nearest], nearness.ravel()[self.nearest]

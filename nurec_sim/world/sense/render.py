@@ -15,7 +15,7 @@ from nurec_sim.types import Pinhole
 from nurec_sim.world.model.assemble import Town
 from nurec_sim.world.model.builder import DECAL_GROUP
 from nurec_sim.world.sense.backend import gl_context
-from nurec_sim.world.sense.faces import Drawn, Face
+from nurec_sim.world.sense.faces import Face, FaceImage
 
 SHADOW_RADIUS_M = 28.0
 SHADOW_AHEAD_M = 22.0
@@ -26,7 +26,7 @@ FAINT_SUN = 0.3
 """A weaker sun casts no visible shadows; skipping them saves a third of the time."""
 
 
-class GlPainter:
+class GlRenderer:
     """Renders a town with MuJoCo's classic renderer. Call ``close`` in the same thread when done.
 
     Args:
@@ -62,7 +62,9 @@ class GlPainter:
         self._gl.free()
         self._context.free()
 
-    def draw(self, data: Any, face: Face, world_from_sensor: Float64[np.ndarray, "4 4"], colours: bool = True) -> Drawn:
+    def render(
+        self, data: Any, face: Face, world_from_sensor: Float64[np.ndarray, "4 4"], colours: bool = True
+    ) -> FaceImage:
         """Renders one face of a sensor.
 
         Args:
@@ -106,9 +108,9 @@ class GlPainter:
         geom = np.ascontiguousarray(self._geom_ids(ids)[::-1])
         # Depth is stored reversed, as a linear function of 1 / z: 1 at the near plane, 0 at the far plane.
         nearness = depth[::-1] * np.float32(1 / self._near_m - 1 / self._far_m) + np.float32(1 / self._far_m)
-        drawn = Drawn(rgb, geom, np.where(geom < 0, np.float32(0), nearness))
-        _close_cracks(drawn, face.lens, axes[2])
-        return drawn
+        image = FaceImage(rgb, geom, np.where(geom < 0, np.float32(0), nearness))
+        _close_cracks(image, face.lens, axes[2])
+        return image
 
     def _gather(self, data: Any, shown: Bool[np.ndarray, " g"]) -> None:
         """Adds the chosen geoms to the scene, since the renderer itself does not cull."""
@@ -182,13 +184,13 @@ def _shadow_middle(eye: Float64[np.ndarray, " 3"], axes: Float64[np.ndarray, "3 
     return eye + SHADOW_AHEAD_M * forward / (np.linalg.norm(forward) + 1e-9)
 
 
-def _close_cracks(drawn: Drawn, lens: Pinhole, up: Float64[np.ndarray, " 3"]) -> None:
+def _close_cracks(image: FaceImage, lens: Pinhole, up: Float64[np.ndarray, " 3"]) -> None:
     """Fills isolated sky pixels below the horizon from their left neighbours.
 
     Where the edge of one mesh lies along an edge of another, rounding leaves about two in a million pixels open.
     ``up`` is the world's z in the face.
     """
-    empty = drawn.geom < 0
+    empty = image.geom < 0
     height, width = empty.shape
     x = (np.arange(1, width - 1) + 0.5 - lens.cx_px) / lens.fx_px
     y = (np.arange(1, height - 1) + 0.5 - lens.cy_px) / lens.fy_px
@@ -197,6 +199,6 @@ def _close_cracks(drawn: Drawn, lens: Pinhole, up: Float64[np.ndarray, " 3"]) ->
     rows, columns = np.nonzero(lone)
     below = up[0] * x[columns] + up[1] * y[rows] + up[2] < HORIZON
     rows, columns = rows[below] + 1, columns[below] + 1
-    for image in (drawn.rgb, drawn.geom, drawn.nearness):
-        if image is not None:
-            image[rows, columns] = image[rows, columns - 1]
+    for plane in (image.rgb, image.geom, image.nearness):
+        if plane is not None:
+            plane[rows, columns] = plane[rows, columns - 1]

@@ -80,7 +80,7 @@ def cast_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
     return turn
 
 
-def drawn_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
+def rasterised_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
     """A turn from OpenGL images: one sector at a time, rendered at the sector's middle instant.
 
     Every beam is then intersected, from the sensor's true position at firing, with the plane seen in its direction, so

@@ -127,8 +127,8 @@ class TrueWorld(Closing):
         lidar = request.sensor
         if not isinstance(lidar, LidarModel):
             raise RequestError(f"a scan needs a LiDAR, and {lidar.id!r} is none")
-        drawn = self._quality.lidar == "drawn" and self.backend != "rays"
-        turn = (scan.drawn_turn if drawn else scan.cast_turn)(self._stage, request, lidar)
+        rasterised = self._quality.lidar == "rasterised" and self.backend != "rays"
+        turn = (scan.rasterised_turn if rasterised else scan.cast_turn)(self._stage, request, lidar)
         response = self._responses.get(lidar.id)
         if isinstance(response, LidarResponse):
             return scan.measure(self.town, lidar, turn, response, self._seed(request))
@@ -157,7 +157,7 @@ class TrueWorld(Closing):
         if not np.isfinite(pair).all() or request.end_us < request.start_us:
             raise RequestError(f"sensor {sensor.id!r}: poses must be finite and end_us not before start_us")
         if request.hidden:
-            raise RequestError(f"this town draws all of its actors; hidden must be empty, got {sorted(request.hidden)}")
+            raise RequestError(f"this town renders all actors; hidden must be empty, got {sorted(request.hidden)}")
         for name, actor in request.actors.items():
             if name not in self._recorded:
                 raise RequestError(f"no actor {name!r} in this town; have {sorted(self._recorded)}")

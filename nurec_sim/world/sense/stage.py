@@ -37,7 +37,7 @@ class Quality:
     Args:
         samples: colour samples per pixel, 0, 2 or 4; more give smoother edges.
         shadow_px: side of the shadow map, 0 for no shadows.
-        lidar: ``rays`` casts one exact ray per beam at its own firing time; ``drawn`` resamples twelve sectors of
+        lidar: ``rays`` casts one exact ray per beam at its own firing time; ``rasterised`` resamples twelve sectors of
             OpenGL images: several times faster, exact on static surfaces, approximate at edges and on moving actors.
     """
 
@@ -46,9 +46,9 @@ class Quality:
     lidar: str = "rays"
 
     def __post_init__(self) -> None:
-        if self.samples not in (0, 2, 4) or not 0 <= self.shadow_px <= 8192 or self.lidar not in ("rays", "drawn"):
+        if self.samples not in (0, 2, 4) or not 0 <= self.shadow_px <= 8192 or self.lidar not in ("rays", "rasterised"):
             raise ValueError(
-                "samples must be 0, 2 or 4, shadow_px 0..8192, lidar 'rays' or 'drawn'; "
+                "samples must be 0, 2 or 4, shadow_px 0..8192, lidar 'rays' or 'rasterised'; "
                 f"got {self.samples}, {self.shadow_px}, {self.lidar!r}"
             )
 
@@ -92,17 +92,17 @@ class Stage:
         start_us = town.plan.span_us[0]
         actors = {name: path.at(start_us)[None] for name, path in recorded.items()}
         town.pose(self.data, start_us, town.actor_places(actors, 1))
-        self.painter: Any = None
+        self.gl: Any = None
         if backend != "rays":
-            from nurec_sim.world.sense.render import GlPainter
+            from nurec_sim.world.sense.render import GlRenderer
 
-            self.painter = GlPainter(town, backend, quality.samples, quality.shadow_px)
+            self.gl = GlRenderer(town, backend, quality.samples, quality.shadow_px)
 
     def close(self) -> None:
         """Frees the painter."""
-        if self.painter is not None:
-            self.painter.close()
-            self.painter = None
+        if self.gl is not None:
+            self.gl.close()
+            self.gl = None
 
     def actor_boxes(
         self, request: SensorRequest, fractions: Float64[np.ndarray, " n"]
@@ -132,11 +132,11 @@ class Stage:
             seen: result, of the same size as the patch.
             colours: if False only geometry is needed, and OpenGL back ends skip the colour pass.
         """
-        if self.painter is None:
+        if self.gl is None:
             rays.look(self.town, self.data, patch.rays, patch.valid, world_from_sensor, seen)
         else:
             for face in patch.faces:
-                face.read(self.painter.draw(self.data, face, world_from_sensor, colours), seen)
+                face.read(self.gl.render(self.data, face, world_from_sensor, colours), seen)
 
     def see(self, request: SensorRequest, camera: CameraModel) -> Seen:
         """A camera image, with every band of a rolling shutter at its own time.
@@ -166,7 +166,7 @@ class Stage:
         """
         if camera.shutter is Shutter.GLOBAL:
             return 1, False
-        if self.painter is None:
+        if self.gl is None:
             by_column = camera.shutter in (Shutter.LEFT_TO_RIGHT, Shutter.RIGHT_TO_LEFT)
             return (camera.width_px if by_column else camera.height_px), False
         ends = np.array([0.0, 1.0])
