@@ -6,6 +6,7 @@ import time
 
 import grpc
 import numpy as np
+from raw_calls import RawCalls
 
 from nurec_sim import geometry
 from nurec_sim.render.images.encode import encode_image
@@ -58,22 +59,11 @@ def answering(plan_of, needs=None):
     return Odd
 
 
-class Stub:
+class Stub(RawCalls):
     """Raw procedures of a driver."""
 
     def __init__(self, address):
-        self.channel = grpc.insecure_channel(address)
-        for name, method in driving.DRIVER_METHODS.items():
-            procedure = self.channel.unary_unary(
-                f"/{driving.DRIVER_SERVICE}/{name}", method.request.SerializeToString, method.reply.FromString
-            )
-            setattr(self, name, procedure)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.channel.close()
+        super().__init__(grpc.insecure_channel(address), driving.DRIVER_SERVICE, driving.DRIVER_METHODS)
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ import cv2
 import grpc
 import numpy as np
 import pytest
+from raw_calls import RawCalls
 from serving_world import camera_request, lidar_request, scene
 
 from nurec_sim.compute.turns import rest
@@ -20,23 +21,12 @@ from nurec_sim.serving.wire import ImageFormat, sensorsim
 from nurec_sim.serving.wire.requests import write_poses
 
 
-class Stub:
+class Stub(RawCalls):
     """Raw procedures of a server, under any spelling of the service."""
 
     def __init__(self, address: str, path: str = wire.SERVICE) -> None:
         options = [("grpc.max_receive_message_length", 64 << 20)]
-        self.channel = grpc.insecure_channel(address, options=options)
-        for name, method in wire.METHODS.items():
-            procedure = self.channel.unary_unary(
-                f"/{path}/{name}", method.request.SerializeToString, method.reply.FromString
-            )
-            setattr(self, name, procedure)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.channel.close()
+        super().__init__(grpc.insecure_channel(address, options=options), path, wire.METHODS)
 
 
 @contextlib.contextmanager

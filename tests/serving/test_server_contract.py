@@ -30,12 +30,6 @@ from nurec_sim.types import Trajectory
 
 
 @pytest.fixture(scope="module")
-def stub():
-    with street_stub() as stub:
-        yield stub
-
-
-@pytest.fixture(scope="module")
 def rgb():
     return street_renderer().render_camera(camera_request()).rgb
 

@@ -8,7 +8,7 @@ from generated_code import generate_like_alpasim
 from grpc import StatusCode as Code
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
-from serving_calls import Stub, camera_message, decode, pixels, refusal, street_renderer, street_server, street_stub
+from serving_calls import Stub, camera_message, decode, pixels, refusal, street_server, street_stub
 from serving_world import camera_request, rig, scene
 
 from nurec_sim.serving import wire
@@ -25,11 +25,6 @@ def address():
 def stub(address):
     with Stub(address) as stub:
         yield stub
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return street_renderer()
 
 
 def test_scenes_are_listed_and_answer_to_their_aliases(stub):

@@ -20,7 +20,6 @@ from serving_calls import (
     lidar_message,
     pixels,
     refusal,
-    street_renderer,
     street_server,
     street_stub,
     wait_until,
@@ -33,17 +32,6 @@ from nurec_sim.serving.sensor_service import ServiceOptions
 from nurec_sim.serving.server import SensorServer
 from nurec_sim.serving.store import SceneStore
 from nurec_sim.serving.wire import common, sensorsim
-
-
-@pytest.fixture(scope="module")
-def stub():
-    with street_stub() as stub:
-        yield stub
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return street_renderer()
 
 
 def test_a_batch_answers_every_item_and_says_what_is_wrong_with_one(stub, renderer):

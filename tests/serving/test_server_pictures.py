@@ -12,7 +12,6 @@ from serving_calls import (
     place,
     red_count,
     refusal,
-    street_renderer,
     street_stub,
 )
 from serving_world import LAST_US, START_US, camera_request, lidar_request, scene
@@ -21,17 +20,6 @@ from nurec_sim import geometry
 from nurec_sim.render import CpuRenderer
 from nurec_sim.serving.wire import ImageFormat
 from nurec_sim.serving.wire.requests import write_poses
-
-
-@pytest.fixture(scope="module")
-def stub():
-    with street_stub() as stub:
-        yield stub
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return street_renderer()
 
 
 def test_the_scene_is_worth_looking_at(renderer):

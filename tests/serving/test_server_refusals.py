@@ -14,7 +14,6 @@ from serving_calls import (
     pixels,
     place,
     refusal,
-    street_renderer,
     street_stub,
     with_change,
 )
@@ -32,11 +31,6 @@ def stub(tmp_path_factory):
     broken.write_bytes(b"no archive at all, just bytes")
     with street_stub(broken) as stub:
         yield stub
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return street_renderer()
 
 
 def hundred_megapixels(message):

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from sensor_worlds import painted_world, request_at, small_plan, true_world
+from sensor_worlds import request_at
 
 from nurec_sim import geometry, sensors
 from nurec_sim.types import Fisheye, FTheta, FThetaReference, Pinhole, Shutter, Windshield, WindshieldReference
@@ -120,23 +120,6 @@ def test_bands_are_as_many_as_the_motion_needs():
 
 
 # ------------------------------------------------------------------------------------------------------ in the town
-
-
-@pytest.fixture(scope="module")
-def plan():
-    return small_plan()
-
-
-@pytest.fixture(scope="module")
-def rays(plan):
-    with true_world(plan, "rays") as world:
-        yield world
-
-
-@pytest.fixture(scope="module")
-def painted(plan):
-    with painted_world(plan) as world:
-        yield world
 
 
 def assert_agree(drawn, cast, labels=0.98):

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from sensor_worlds import painted_world, request_at, small_plan, true_world
+from sensor_worlds import painted_world, request_at, true_world
 
 from nurec_sim import geometry, sensors
 from nurec_sim.types import Spin
@@ -20,17 +20,6 @@ LIDARS = {
 LIDARS["counterclockwise"] = dataclasses.replace(
     LIDARS["HDL-32"], spin=Spin.COUNTERCLOCKWISE, azimuth_rad=LIDARS["HDL-32"].azimuth_rad[::-1].copy()
 )
-
-
-@pytest.fixture(scope="module")
-def plan():
-    return small_plan()
-
-
-@pytest.fixture(scope="module")
-def rays(plan):
-    with true_world(plan, "rays") as world:
-        yield world
 
 
 @pytest.mark.needs_gl

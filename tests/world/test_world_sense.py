@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import shapely
-from sensor_worlds import painted_world, request_at, small_plan, true_world
+from sensor_worlds import request_at, small_plan, true_world
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError, TooLargeError
@@ -19,23 +19,6 @@ RIG = street_rig(112, 64, lidar_rows=16, lidar_columns=90)
 FRONT, LIDAR = RIG.cameras["camera_front"], RIG.lidars[LIDAR_ID]
 HORIZON = -0.05
 """Towns are hilly: only rays steeper than this must meet the ground."""
-
-
-@pytest.fixture(scope="module")
-def plan():
-    return small_plan()
-
-
-@pytest.fixture(scope="module")
-def rays(plan):
-    with true_world(plan, "rays") as world:
-        yield world
-
-
-@pytest.fixture(scope="module")
-def painted(plan):
-    with painted_world(plan) as world:
-        yield world
 
 
 def test_two_worlds_of_one_plan_give_the_same_bytes(plan, rays):

@@ -50,6 +50,7 @@ class SkyQueries(nn.Module):
     """Shared by both sky decoders: the directions of the cubemap, and image tokens with their rays."""
 
     query_rays: Tensor
+    kv_projector: KeyValueProjector
 
     def __init__(self, profile: Profile, size: SkySize, stored: bool) -> None:
         super().__init__()
@@ -66,17 +67,24 @@ class SkyQueries(nn.Module):
         """Compute the directions again, where the module was built without values."""
         self.query_rays.copy_(cubemap.directions(self.size.cubemap_px, self.query_rays.device))
 
-    def seen(
+    def forward(
         self,
         patches: Float[Tensor, "b v y x c"],
         rgb: Float[Tensor, "b v h w 3"],
         directions: Float[Tensor, "b v h w 3"],
-    ) -> Float[Tensor, "b tokens c"]:
-        """Tokens of all patches of a clip: encoder features, colours and ray directions, added up."""
+    ) -> Float[Tensor, "b 6 s s 3"]:
+        """The sky in the frame of the directions, 0..1."""
+        # A token per patch of the clip: encoder features, colours and ray directions, added up.
         tokens = self.feature_transform(patches).flatten(0, 1)
         tokens = tokens + self.patch_embed_img(normalized(rgb.flatten(0, 1)))
         tokens = tokens + self.patch_embed_ray(directions.flatten(0, 1))
-        return tokens.reshape(len(rgb), -1, self.size.width)
+        return self.decode(*self.kv_projector(tokens.reshape(len(rgb), -1, self.size.width)))
+
+    def decode(
+        self, k: Float[Tensor, "b heads m d"], values: Float[Tensor, "b heads m d"]
+    ) -> Float[Tensor, "b 6 s s 3"]:
+        """The sky from keys and values of the clip's patches."""
+        raise NotImplementedError
 
 
 class SkyDecoder(SkyQueries):
@@ -88,15 +96,11 @@ class SkyDecoder(SkyQueries):
         self.kv_projector = KeyValueProjector(size.width, size.heads, normed=True)
         self.upsample = SkyUpsampling(size, profile.head)
 
-    def forward(
-        self,
-        patches: Float[Tensor, "b v y x c"],
-        rgb: Float[Tensor, "b v h w 3"],
-        directions: Float[Tensor, "b v h w 3"],
+    def decode(
+        self, k: Float[Tensor, "b heads m d"], values: Float[Tensor, "b heads m d"]
     ) -> Float[Tensor, "b 6 s s 3"]:
-        """The sky in the frame of the directions, 0..1."""
-        b = len(rgb)
-        k, values = self.kv_projector(self.seen(patches, rgb, directions))
+        """The sky from keys and values of the clip's patches."""
+        b = len(k)
         # Texels and image patches share one ray embedding, so a texel finds the patches that look in its direction.
         query = self.patch_embed_ray(self.query_rays) + self.token
         x = query.reshape(1, -1, self.size.width).expand(b, -1, -1)

@@ -34,15 +34,11 @@ class SkyMlp(SkyQueries):
         self.hidden = nn.ModuleList(nn.Linear(size.width, size.width) for _ in range(HIDDEN_LAYERS - 1))
         self.colour = nn.Linear(size.width, 3)
 
-    def forward(
-        self,
-        patches: Float[Tensor, "b v y x c"],
-        rgb: Float[Tensor, "b v h w 3"],
-        directions: Float[Tensor, "b v h w 3"],
+    def decode(
+        self, k: Float[Tensor, "b heads m d"], values: Float[Tensor, "b heads m d"]
     ) -> Float[Tensor, "b 6 s s 3"]:
-        """The sky in the frame of the directions, 0..1."""
-        k, values = self.kv_projector(self.seen(patches, rgb, directions))
-        token = self.token + self.pooling(self.token.expand(len(rgb), 1, -1), k, values)
+        """The sky from keys and values of the clip's patches."""
+        token = self.token + self.pooling(self.token.expand(len(k), 1, -1), k, values)
         x = self.from_direction(_sinusoids(self.query_rays)) + self.from_token(token)[:, :, None, None]
         for layer in self.hidden:
             x = layer(functional.gelu(x))
