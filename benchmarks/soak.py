@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from nurec_sim import geometry, sensors
+from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Pinhole
 from nurec_sim.render import CpuRenderer
 from nurec_sim.serving.client import RemoteSensors
 from nurec_sim.serving.server import SensorServer
@@ -28,13 +29,9 @@ from nurec_sim.serving.store import SceneStore
 from nurec_sim.types import (
     CameraModel,
     DynamicGaussians,
-    Fisheye,
-    FTheta,
-    FThetaReference,
     Gaussians,
     GaussianScene,
     LidarModel,
-    Pinhole,
     Rig,
     Sense,
     SensorRequest,

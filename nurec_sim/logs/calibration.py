@@ -16,15 +16,7 @@ from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import LIMITS
 from nurec_sim.lenses import decode_parameters, encode_parameters, lens_class
 from nurec_sim.logs import fields
-from nurec_sim.types import (
-    Box,
-    CameraModel,
-    LidarModel,
-    Rig,
-    Shutter,
-    Spin,
-    Windshield,
-)
+from nurec_sim.types import Box, CameraModel, LidarModel, Rig, Shutter, Spin, Windshield
 
 CALIBRATION_FILE = "calib.json"
 MAX_COLUMNS = 1 << 14

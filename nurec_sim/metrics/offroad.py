@@ -25,7 +25,7 @@ SAMPLE_STEP_M = 0.1
 MAX_OUTSIDE_FRAC = 0.25
 
 
-class Verdict(enum.IntEnum):
+class RoadState(enum.IntEnum):
     """Result for one footprint."""
 
     ON = 0
@@ -34,7 +34,7 @@ class Verdict(enum.IntEnum):
 
 
 @dataclass(frozen=True)
-class Footprints:
+class FootprintStates:
     """Results for n footprints: verdict, largest excursion beyond possible road, fraction of area beyond it."""
 
     verdict: UInt8[np.ndarray, " n"]
@@ -47,7 +47,7 @@ def judge_footprints(
     world_from_rig: Float64[np.ndarray, "n 4 4"],
     body: Box,
     tolerance_m: float = TOLERANCE_M,
-) -> Footprints:
+) -> FootprintStates:
     """Classifies the body's footprint, sampled every 0.1 m, at n rig poses.
 
     Args:
@@ -71,18 +71,18 @@ def judge_footprints(
     # undecidable.
     off = (possible > tolerance_m).any(axis=1)
     unsure = (known > tolerance_m).any(axis=1) | ((~inside).mean(axis=1) > MAX_OUTSIDE_FRAC)
-    verdict = np.where(off, Verdict.OFF, np.where(unsure, Verdict.UNKNOWN, Verdict.ON)).astype(np.uint8)
-    return Footprints(verdict, possible.max(axis=1), (possible > 0).mean(axis=1))
+    verdict = np.where(off, RoadState.OFF, np.where(unsure, RoadState.UNKNOWN, RoadState.ON)).astype(np.uint8)
+    return FootprintStates(verdict, possible.max(axis=1), (possible > 0).mean(axis=1))
 
 
 def debounced(verdict: UInt8[np.ndarray, " t"]) -> tuple[Float64[np.ndarray, " t"], Bool[np.ndarray, " t"]]:
     """Off-road values and validity: 1 from the second consecutive ``OFF``; invalid where undecidable."""
     verdict = np.asarray(verdict)
-    before = np.concatenate([[Verdict.ON], verdict[:-1]])
-    off = verdict == Verdict.OFF
+    before = np.concatenate([[RoadState.ON], verdict[:-1]])
+    off = verdict == RoadState.OFF
     # An OFF after an UNKNOWN may be the first or the second in a row, so it is undecidable too.
-    values = (off & (before == Verdict.OFF)).astype(np.float64)
-    valid = (verdict != Verdict.UNKNOWN) & ~(off & (before == Verdict.UNKNOWN))
+    values = (off & (before == RoadState.OFF)).astype(np.float64)
+    valid = (verdict != RoadState.UNKNOWN) & ~(off & (before == RoadState.UNKNOWN))
     return values, valid
 
 
@@ -98,12 +98,12 @@ def offroad_series(rollout: Rollout, grid: OffroadGrid | None) -> list[Series]:
         return [unknown_series(name, t_us) for name in names]
     found = judge_footprints(grid, rollout.world_from_rig, rollout.rig.body)
     first = _first_relevant(rollout)
-    if found.verdict[first] != Verdict.ON:
+    if found.verdict[first] != RoadState.ON:
         recorded = rollout.recorded.at(np.array([t_us[first]]))
-        if judge_footprints(grid, recorded, rollout.rig.body).verdict[0] != Verdict.ON:
+        if judge_footprints(grid, recorded, rollout.rig.body).verdict[0] != RoadState.ON:
             return [unknown_series(name, t_us) for name in names]
     values, valid = debounced(found.verdict)
-    known = found.verdict != Verdict.UNKNOWN
+    known = found.verdict != RoadState.UNKNOWN
     return [
         make_series("offroad", t_us, values, valid),
         make_series("offroad_max_excursion_m", t_us, found.excursion_m, known),
@@ -124,7 +124,7 @@ def true_offroad_series(rollout: Rollout, road_map: RoadMap | None) -> Series:
         recorded = rollout.recorded.at(np.array([t_us[first]]))
         if corners_outside_m(area, recorded, rollout.rig.body)[0] > TOLERANCE_M:
             return unknown_series("offroad_true", t_us)
-    values, valid = debounced(np.where(outside, Verdict.OFF, Verdict.ON))
+    values, valid = debounced(np.where(outside, RoadState.OFF, RoadState.ON))
     return make_series("offroad_true", t_us, values, valid)
 
 
@@ -192,7 +192,7 @@ def offroad_agreement(
     poses[:, :3, 3] += offset[:, None] * poses[:, :3, 1]
     verdict = judge_footprints(grid, poses, body).verdict
     beyond = corners_outside_m(drivable_area(road_map), poses, body)
-    truth, known, said = beyond > TOLERANCE_M, verdict != Verdict.UNKNOWN, verdict == Verdict.OFF
+    truth, known, said = beyond > TOLERANCE_M, verdict != RoadState.UNKNOWN, verdict == RoadState.OFF
     wrong = known & (said != truth)
     margin = float(np.quantile(np.abs(beyond[wrong] - TOLERANCE_M), 0.95)) if wrong.any() else float("nan")
     count = int(known.sum())

@@ -11,7 +11,7 @@ from jaxtyping import Float64, UInt8
 
 from nurec_sim.errors import RequestError
 from nurec_sim.metrics.collision import find_contacts
-from nurec_sim.metrics.offroad import Verdict, judge_footprints
+from nurec_sim.metrics.offroad import RoadState, judge_footprints
 from nurec_sim.metrics.offroad_grid import OffroadGrid
 from nurec_sim.sensors import scaled_camera
 from nurec_sim.types import CameraFrame, CameraModel, Rollout, Sense, SensorRequest
@@ -103,8 +103,8 @@ def _captions(rollout: Rollout, grid: OffroadGrid | None) -> list[tuple[str, str
     if grid is not None:
         verdicts = judge_footprints(grid, rollout.world_from_rig, rollout.rig.body).verdict
         for state, verdict in enumerate(verdicts):
-            if verdict != Verdict.ON and t_us[state] >= rollout.first_closed_loop_us:
-                alarms[state].append("OFF ROAD" if verdict == Verdict.OFF else "road unknown")
+            if verdict != RoadState.ON and t_us[state] >= rollout.first_closed_loop_us:
+                alarms[state].append("OFF ROAD" if verdict == RoadState.OFF else "road unknown")
     plain = [
         f"{rollout.policy}  {(t - t_us[0]) / 1e6:4.1f} s  {state.speed_mps:4.1f} m/s"
         + ("" if t >= rollout.first_closed_loop_us else "  (log)")

@@ -7,15 +7,12 @@ import dataclasses
 import numpy as np
 
 from nurec_sim import geometry, sensors
+from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Pinhole
 from nurec_sim.types import (
     CameraModel,
     DynamicGaussians,
-    Fisheye,
-    FTheta,
-    FThetaReference,
     Gaussians,
     GaussianScene,
-    Pinhole,
     Rig,
     SensorRequest,
     Shutter,

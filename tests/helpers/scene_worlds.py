@@ -4,18 +4,15 @@ import numpy as np
 import shapely
 
 from nurec_sim import geometry
+from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Pinhole
 from nurec_sim.sensors import lidar_model
 from nurec_sim.types import (
     Box,
     CameraModel,
     DynamicGaussians,
-    Fisheye,
-    FTheta,
-    FThetaReference,
     Gaussians,
     GaussianScene,
     Label,
-    Pinhole,
     Rig,
     RoadMap,
     Shutter,

@@ -5,17 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from nurec_sim import geometry
+from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Pinhole
 from nurec_sim.types import (
     CameraModel,
     DynamicGaussians,
-    Fisheye,
-    FTheta,
-    FThetaReference,
     Gaussians,
     GaussianScene,
     Label,
     LidarModel,
-    Pinhole,
     Rig,
     SensorRequest,
     Shutter,

@@ -23,7 +23,7 @@ from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
 from nurec_sim.metrics import build_offroad_grid, judge_footprints, offroad_agreement, score_rollout
 from nurec_sim.metrics.ground import fit_ground
-from nurec_sim.metrics.offroad import Verdict, corners_outside_m, debounced
+from nurec_sim.metrics.offroad import RoadState, corners_outside_m, debounced
 from nurec_sim.metrics.offroad_grid import Cell, OffroadGrid, driven_path
 from nurec_sim.scene.opendrive.road_area import drivable_area
 from nurec_sim.types import Label, RoadMap
@@ -91,7 +91,7 @@ def test_car_on_the_kerb_is_off_and_in_the_lane_it_is_not(grid):
 
 def test_a_bridge_above_does_not_make_the_verge_road(grid):
     under_the_deck = geometry.pose_from_xyyaw(60.0, 12.0, 0.0)
-    assert judge_footprints(grid, under_the_deck[None], BODY).verdict[0] != Verdict.ON
+    assert judge_footprints(grid, under_the_deck[None], BODY).verdict[0] != RoadState.ON
 
 
 def test_unseen_ground_is_unknown_never_off_and_never_on(grid):
@@ -105,7 +105,7 @@ def test_unseen_ground_is_unknown_never_off_and_never_on(grid):
     assert not found["offroad"].valid[lost].any()
     assert found["offroad"].value() == 0, "what is known says nothing of what is not"
     far = geometry.pose_from_xyyaw(60.0, 500.0, 0.0)
-    assert judge_footprints(grid, far[None], BODY).verdict[0] == Verdict.UNKNOWN
+    assert judge_footprints(grid, far[None], BODY).verdict[0] == RoadState.UNKNOWN
 
 
 def test_without_a_grid_offroad_is_invalid_not_zero():
@@ -131,7 +131,7 @@ def test_true_offroad_is_the_polygons(grid):
 
 
 def test_offroad_needs_two_states_in_a_row():
-    on, off, unknown = Verdict.ON, Verdict.OFF, Verdict.UNKNOWN
+    on, off, unknown = RoadState.ON, RoadState.OFF, RoadState.UNKNOWN
     values, valid = debounced(np.array([off, on, off, off, unknown, off, off]))
     assert values.tolist() == [0, 0, 0, 1, 0, 0, 1]
     assert valid.tolist() == [True, True, True, True, False, False, True]
@@ -202,4 +202,4 @@ def test_a_body_is_off_road_from_30_cm_beyond_the_border(beyond_m, off):
     rows, columns = np.indices((400, 800))  # cells of 0.1 m from (-20, -20)
     state = np.where(-20 + (rows + 0.5) * 0.1 < 3.0, Cell.ROAD, Cell.NONROAD)
     grid = OffroadGrid.from_state((-20.0, -20.0), 0.1, state, 0.1, 0.0)
-    assert (judge_footprints(grid, poses, BODY).verdict == (Verdict.OFF if off else Verdict.ON)).all()
+    assert (judge_footprints(grid, poses, BODY).verdict == (RoadState.OFF if off else RoadState.ON)).all()

@@ -26,7 +26,7 @@ SHARE_BELOW = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class GroundPlane:
     """A plane in the rig frame: z = height_m + slope . (x, y)."""
 
     height_m: float
@@ -42,7 +42,7 @@ class Ground:
         return points[:, 2] - self.height_m - points[:, :2] @ self.slope
 
 
-def find_ground(points: Points, body: Box) -> Ground | None:
+def find_ground(points: Points, body: Box) -> GroundPlane | None:
     """The ground plane around the car, or None if no plane is dominant.
 
     Points are thinned to one per cell, so that planes are weighted by area rather than by point density. The plane with
@@ -79,7 +79,7 @@ def find_ground(points: Points, body: Box) -> Ground | None:
     floor = cells[on[:, best]]
     equations = np.column_stack([np.ones(len(floor)), floor[:, :2]])
     height, *slope = np.linalg.lstsq(equations, floor[:, 2], rcond=None)[0]
-    return Ground(float(height), np.array(slope))
+    return GroundPlane(float(height), np.array(slope))
 
 
 def check_ground(clip: Clip, sweeps: Sequence[SampledSweep]) -> list[Measure]:
@@ -96,16 +96,16 @@ def check_ground(clip: Clip, sweeps: Sequence[SampledSweep]) -> list[Measure]:
     return rows
 
 
-def usual_ground(planes: Sequence[Ground | None]) -> Ground | None:
+def usual_ground(planes: Sequence[GroundPlane | None]) -> GroundPlane | None:
     """Component-wise median of the planes that were found; None if none was."""
     found = [plane for plane in planes if plane is not None]
     if not found:
         return None
     height = float(np.median([plane.height_m for plane in found]))
-    return Ground(height, np.median([plane.slope for plane in found], axis=0))
+    return GroundPlane(height, np.median([plane.slope for plane in found], axis=0))
 
 
-def _faults(name: str, ground: Ground) -> list[str]:
+def _faults(name: str, ground: GroundPlane) -> list[str]:
     faults = []
     if abs(ground.height_m) > ALLOWED_HEIGHT_M:
         faults.append(

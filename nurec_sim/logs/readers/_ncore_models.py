@@ -13,21 +13,9 @@ import numpy as np
 
 from nurec_sim import sensors
 from nurec_sim.errors import ClipError
+from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Lens, Pinhole
 from nurec_sim.logs import calibration
-from nurec_sim.types import (
-    CameraModel,
-    Fisheye,
-    FTheta,
-    FThetaReference,
-    Lens,
-    LidarModel,
-    Matrix4,
-    Pinhole,
-    Shutter,
-    Spin,
-    Windshield,
-    WindshieldReference,
-)
+from nurec_sim.types import CameraModel, LidarModel, Matrix4, Shutter, Spin, Windshield, WindshieldReference
 
 STAND_IN_TABLE = "PANDAR128"
 _SHUTTERS = {

@@ -16,7 +16,7 @@ from nurec_sim.serving.wire.discovery import (
     write_available_camera,
     write_available_lidar,
 )
-from nurec_sim.serving.wire.messages import Method, pool
+from nurec_sim.serving.wire.messages import Procedure, pool
 from nurec_sim.serving.wire.replies import read_lidar_frame, write_lidar_frame
 from nurec_sim.serving.wire.requests import MAX_TIME_US, read_poses, write_poses
 from nurec_sim.types import (
@@ -32,7 +32,7 @@ from nurec_sim.types import (
 
 DRIVER_SERVICE = "egodriver.EgodriverService"
 DRIVER_METHODS = {
-    method.name: Method(
+    method.name: Procedure(
         message_factory.GetMessageClass(method.input_type), message_factory.GetMessageClass(method.output_type)
     )
     for method in pool.FindServiceByName(DRIVER_SERVICE).methods

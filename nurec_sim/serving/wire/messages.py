@@ -25,7 +25,7 @@ MAX_MESSAGE_BYTES = 64 << 20
 """Default limit of a request or reply; AlpaSim's clients accept no more."""
 
 
-class Method(NamedTuple):
+class Procedure(NamedTuple):
     """Request and reply class of one remote procedure."""
 
     request: Any
@@ -81,7 +81,7 @@ SceneKind = _enum("nurec_sim.v1.SceneInfo.Kind")
 CustomSpin = _enum(f"{SENSORSIM}.CustomLidarModel.Spin")
 
 METHODS = {
-    method.name: Method(_class(method.input_type), _class(method.output_type))
+    method.name: Procedure(_class(method.input_type), _class(method.output_type))
     for method in pool.FindServiceByName(SERVICE).methods
 }
 """Every procedure of the sensor service by name."""

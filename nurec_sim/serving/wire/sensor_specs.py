@@ -16,7 +16,16 @@ import numpy as np
 
 from nurec_sim.errors import RequestError
 from nurec_sim.files.decoding import json_value
-from nurec_sim.lenses import decode_parameters, encode_parameters, lens_class
+from nurec_sim.lenses import (
+    Fisheye,
+    FTheta,
+    FThetaReference,
+    Lens,
+    Pinhole,
+    decode_parameters,
+    encode_parameters,
+    lens_class,
+)
 from nurec_sim.sensors import check_camera, check_lidar, fit_ftheta, lidar_model, scaled_camera
 from nurec_sim.serving.wire.messages import (
     CustomSpin,
@@ -25,19 +34,7 @@ from nurec_sim.serving.wire.messages import (
     ShutterType,
     WindshieldPolynomial,
 )
-from nurec_sim.types import (
-    CameraModel,
-    Fisheye,
-    FTheta,
-    FThetaReference,
-    Lens,
-    LidarModel,
-    Pinhole,
-    Shutter,
-    Spin,
-    Windshield,
-    WindshieldReference,
-)  # fmt: skip
+from nurec_sim.types import CameraModel, LidarModel, Shutter, Spin, Windshield, WindshieldReference
 
 MAX_COEFFICIENTS = 64
 """Of one polynomial; cameras in use have 6, windshields up to 21, and the time to solve one grows with its cube."""

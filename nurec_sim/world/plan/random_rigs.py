@@ -11,18 +11,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from nurec_sim import geometry, sensors
-from nurec_sim.types import (
-    CameraModel,
-    Fisheye,
-    FTheta,
-    FThetaReference,
-    Lens,
-    LidarModel,
-    Matrix4,
-    Pinhole,
-    Rig,
-    Shutter,
-)
+from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Lens, Pinhole
+from nurec_sim.types import CameraModel, LidarModel, Matrix4, Rig, Shutter
 from nurec_sim.world.plan.rig import CAMERA_FROM_RIG_AXES, LIDAR_ID, dense_near_horizon
 
 CAMERA_COUNTS = (1, 3, 5)

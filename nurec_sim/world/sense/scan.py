@@ -58,7 +58,7 @@ class LidarResponse:
 
 
 @dataclass(frozen=True, eq=False)
-class Turn:
+class BeamHits:
     """First hits of all beams of a turn: geom ids (-1 no hit), distance (m) and cosine of incidence."""
 
     geom: Int32[np.ndarray, "r c"]
@@ -66,11 +66,11 @@ class Turn:
     cosine: Float64[np.ndarray, "r c"]
 
 
-def cast_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
+def cast_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> BeamHits:
     """A turn with one ray per beam, each column from the poses of sensor and actors at its firing time."""
     beams, fractions = sensors.beam_directions(lidar), sensors.column_fraction(lidar)
     moments, shape = stage.moments(request, fractions), beams.shape[:2]
-    turn = Turn(np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
+    turn = BeamHits(np.empty(shape, np.int32), np.empty(shape), np.empty(shape))
     for column in range(shape[1]):
         pose = moments.enter(column)
         direction = beams[:, column] @ pose[:3, :3].T
@@ -80,7 +80,7 @@ def cast_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
     return turn
 
 
-def rasterised_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> Turn:
+def rasterised_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> BeamHits:
     """A turn from OpenGL images: one sector at a time, rendered at the sector's middle instant.
 
     Every beam is then intersected, from the sensor's true position at firing, with the plane seen in its direction, so
@@ -116,11 +116,11 @@ def rasterised_turn(stage: Stage, request: SensorRequest, lidar: LidarModel) -> 
         near = known & (np.abs(on_plane - straight) < 0.2 * distance)
         range_m[:, patch.columns] = np.where(near, on_plane, straight)
         cosine[:, patch.columns] = np.where(known, met, UNKNOWN_COSINE)
-    return Turn(seen.geom, range_m, cosine)
+    return BeamHits(seen.geom, range_m, cosine)
 
 
 def measure(
-    town: Town, lidar: LidarModel, turn: Turn, response: LidarResponse | None = None, seed: Sequence[int] = ()
+    town: Town, lidar: LidarModel, turn: BeamHits, response: LidarResponse | None = None, seed: Sequence[int] = ()
 ) -> TrueScan:
     """The measurement that the sensor reports for a turn.
 

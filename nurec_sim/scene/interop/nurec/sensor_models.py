@@ -12,20 +12,10 @@ from typing import Any
 import numpy as np
 
 from nurec_sim import sensors
+from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Lens, Pinhole
 from nurec_sim.scene import codec
 from nurec_sim.scene.sidecars import SHUTTER_NAMES
-from nurec_sim.types import (
-    CameraModel,
-    Fisheye,
-    FTheta,
-    FThetaReference,
-    Lens,
-    LidarModel,
-    Pinhole,
-    Spin,
-    Windshield,
-    WindshieldReference,
-)
+from nurec_sim.types import CameraModel, LidarModel, Spin, Windshield, WindshieldReference
 
 _SHUTTERS = {name: shutter for shutter, name in SHUTTER_NAMES.items()}
 _MATRIX = codec.array(np.float64, 4, 4)

@@ -15,7 +15,7 @@ from nurec_sim.scene import codec
 from nurec_sim.scene.interop.validate.alpasim_map import AlpasimMap
 from nurec_sim.scene.interop.validate.contents import Contents, entry_of, numbers_of
 from nurec_sim.scene.interop.validate.finding import Report
-from nurec_sim.scene.interop.validate.map_agreement import LEAST_SHARE, Agreement, agreement, outlines
+from nurec_sim.scene.interop.validate.map_agreement import LEAST_SHARE, MapAgreement, agreement, outlines
 from nurec_sim.scene.interop.validate.shared import RIG
 from nurec_sim.scene.opendrive.reader import ecef_from_map
 from nurec_sim.scene.opendrive.road_area import drivable_area
@@ -78,7 +78,7 @@ def _check_verdicts(
         report.add("offroad-on-path", f"{XODR}: {alarms} of {len(poses)} recorded poses are off the road by its lanes")
 
 
-def _told(found: Agreement) -> str:
+def _told(found: MapAgreement) -> str:
     return (
         f"on {found.share:.1%} of {found.judged} placements beside the path the verdict is that of the drivable area "
         f"({found.false_alarms} false alarms, {found.misses} misses)"

@@ -19,7 +19,7 @@ LEAST_SHARE = 0.98
 
 
 @dataclass(frozen=True)
-class Agreement:
+class MapAgreement:
     """Agreement of map and area.
 
     ``judged`` of ``placements`` have no corner within ``BORDER_M`` of reaching over the border. ``false_alarms`` are
@@ -80,7 +80,7 @@ def agreement(
     size_m: Float64[np.ndarray, " 3"],
     count: int = PLACEMENTS,
     seed: int = 0,
-) -> Agreement:
+) -> MapAgreement:
     """Compares the off-road verdicts of map and area on random placements, and on the recorded poses.
 
     Args:
@@ -105,7 +105,7 @@ def agreement(
     path_middle, path_cars = outlines(world_from_rig, centre_m, size_m)
     at_home = shapely.contains(area, path_cars)
     alarms = roads.offroad(path_middle[at_home], path_cars[at_home])
-    return Agreement(
+    return MapAgreement(
         count,
         int(judged.sum()),
         int((on & said).sum()),
