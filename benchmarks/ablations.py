@@ -91,7 +91,7 @@ class Options:
 
 
 def main() -> None:
-    """Run what the command line asks for."""
+    """Run the benchmark."""
     import torch
 
     options = tyro.cli(Options)

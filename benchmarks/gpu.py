@@ -71,7 +71,7 @@ class Options:
 
 
 def main() -> int:
-    """Run what the command line asks for; 1 where there is no GPU."""
+    """Run the benchmark; 1 where there is no GPU."""
     options = tyro.cli(Options)
     try:
         launcher = CudaLauncher(options.device)

@@ -81,7 +81,7 @@ class StubLauncher:
 
 
 def main() -> None:
-    """Run what the command line asks for."""
+    """Run the benchmark."""
     options = tyro.cli(Options)
     rows = [measured(options.sensors, actors, options.batches) for actors in (0, options.actors)]
     options.output.parent.mkdir(parents=True, exist_ok=True)

@@ -68,7 +68,7 @@ class Options:
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the benchmark."""
     options = tyro.cli(Options)
     if options.only is not None:
         print(json.dumps(measured(*options.only, options)))

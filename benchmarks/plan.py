@@ -50,7 +50,7 @@ class Options:
     errors. Ctrl-C keeps the rows that have been measured. docs/benchmarks.md explains every column.
 
     Examples: "python benchmarks/render.py --quick" takes a minute; "python benchmarks/render.py --scenes driving 2m
-    --sensors pinhole-960 lidar-128 --repeats 100" looks closely at four rows.
+    --sensors pinhole-960 lidar-128 --repeats 100" measures four rows closely.
 
     Args:
         scenes: scenes to render.
@@ -61,7 +61,7 @@ class Options:
         threads: render threads; all that the process may use if not given.
         gaussians: make the seeded scenes of this many Gaussians instead of their own number.
         parity_rays: pixels or beams per row that the reference renders; 0 leaves it out.
-        detail_px: what the rows with level of detail ask for; 0 leaves them out.
+        detail_px: of the rows with level of detail; 0 leaves them out.
         extras: with the driving scene also run the plain torch renderer, gsplat where it runs, gradients, the first
             frame of a new process, and our kernels for lesser machines.
         output: the results, as JSON.
@@ -86,7 +86,7 @@ class Options:
 
 
 def quick(options: Options) -> Options:
-    """The options that ``--quick`` stands for."""
+    """The options of ``--quick``."""
     return dataclasses.replace(
         options,
         scenes=("driving",),

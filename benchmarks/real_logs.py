@@ -68,7 +68,7 @@ class Options:
 
 
 def window_of(path: Path) -> tuple[str, Window]:
-    """What of a log is asked for, in words and as a window."""
+    """The chosen part of a log, in words and as a window."""
     log = logs.open_clip(path)
     names = list(log.rig.cameras)
     count = min(len(log.camera_times_us(name)) for name in names)
@@ -126,7 +126,7 @@ def cells(values: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def main() -> None:
-    """Run what the command line asks for."""
+    """Run the benchmark."""
     options = tyro.cli(Options)
     plain = FeedForwardSettings(
         profile=options.profile, checkpoint=options.checkpoint, random_weights=options.random_weights

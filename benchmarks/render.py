@@ -37,7 +37,7 @@ HEADING = (
 
 
 def main() -> None:
-    """Run what the command line asks for."""
+    """Run the benchmark."""
     options = tyro.cli(Options)
     if options.quick:
         options = plan.quick(options)

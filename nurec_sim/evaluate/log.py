@@ -51,7 +51,7 @@ def evaluate(
         method: reconstruction method.
         input_cameras: input cameras of the reconstruction; default: all, or as many as the method supports.
         target_cameras: cameras to score at all their frames; default: the input cameras.
-        hold_out_every: hold out images N-1, 2N-1, ... of the input cameras, and the sweeps taken meanwhile; 0: none.
+        hold_out_every: hold out images N-1, 2N-1, ... of the input cameras, and sweeps taken with them; 0: none.
         hold_out_sweeps_every: hold out sweeps K, 2K, ...; 0: none.
         hold_out_sweeps: further sweeps to hold out, by index.
         via_grpc: render through a sensor server in this process over gRPC, or directly.

@@ -52,9 +52,9 @@ def true_world(
 
 
 def _check_same_town(plan: TownPlan, scene: GaussianScene) -> None:
-    strangers = sorted({track.id for track in scene.tracks if track.actor} - {actor.id for actor in plan.actors})
-    if strangers:
-        raise RunError(f"scene {scene.id!r} is not from this town: the plan has no actor {strangers[0]!r}")
+    unknown = sorted({track.id for track in scene.tracks if track.actor} - {actor.id for actor in plan.actors})
+    if unknown:
+        raise RunError(f"scene {scene.id!r} is not from this town: the plan has no actor {unknown[0]!r}")
     driven = plan.ego_trajectory()
     times = scene.ego.t_us
     if not (driven.covers(int(times[0])) and driven.covers(int(times[-1]))):

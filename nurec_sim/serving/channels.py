@@ -25,7 +25,7 @@ def open_channel(
 
     Args:
         address: ``host:port``.
-        root_ca: PEM file of the certificates that vouch for the server's; plain text if None.
+        root_ca: PEM file of the root certificates that verify the server's; plain text if None.
         client_cert: PEM file of the certificate to show, for mutual TLS.
         client_key: PEM file of its private key.
         options: of gRPC, in place of the default.

@@ -28,8 +28,8 @@ _RETRY = {
 class ConnectionOptions(TypedDict, total=False):
     """Keywords of ``Connection``; all may be left out.
 
-    ``timeout_s`` (300): for one call. ``connect_timeout_s`` (10): for the first contact. ``token``: what the server
-    wants to be shown. ``root_ca``: PEM file of the certificates that vouch for the server's; plain text without.
+    ``timeout_s`` (300): for one call. ``connect_timeout_s`` (10): for the first contact. ``token``: the bearer token
+    of the server. ``root_ca``: PEM file of the root certificates that verify the server's; plain text without.
     ``client_cert`` and ``client_key``: PEM files of the certificate to show, for mutual TLS, and of its private key.
     """
 
@@ -55,8 +55,8 @@ class Connection(Closing):
         service: full name in ``protos/``.
         timeout_s: for one call.
         connect_timeout_s: for the first contact; at most ``timeout_s``.
-        token: what the server wants to be shown; None if it wants nothing.
-        root_ca: PEM file of the certificates that vouch for the server's; plain text if None.
+        token: the bearer token of the server; None if it needs none.
+        root_ca: PEM file of the root certificates that verify the server's; plain text if None.
         client_cert: PEM file of the certificate to show, for mutual TLS.
         client_key: PEM file of its private key.
 
@@ -162,7 +162,7 @@ def channel_options(service_config: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 @contextlib.contextmanager
 def our_errors(address: str) -> Iterator[None]:
-    """Statuses of gRPC become the errors of ours that the server raised; ``ServerError`` where they stand for none."""
+    """Statuses of gRPC become the errors of ours that the server raised; ``ServerError`` where none corresponds."""
     try:
         yield
     except grpc.RpcError as error:

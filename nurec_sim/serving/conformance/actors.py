@@ -72,7 +72,7 @@ def underground(target: Target) -> str:
 
 @check("actors-where-listed")
 def where_listed(target: Target) -> str:
-    """An actor that is listed where it was recorded looks as recorded, and moves when it is listed elsewhere."""
+    """An actor that is listed where it was recorded appears as recorded, and moves when it is listed elsewhere."""
     sighting = _sight(target)
     there = _with(target, sighting, sighting.pose)
     aside = sighting.pose.copy()

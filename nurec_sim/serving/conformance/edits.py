@@ -34,8 +34,8 @@ def external_listed(target: Target) -> str:
     """get_external_asset_objects names tracks of the scene only."""
     request = sensorsim.ExternalAssetObjectsRequest(scene_id=target.scene_id)
     ids = set(target.call("get_external_asset_objects", request).track_ids)
-    strangers = ids - {track.id for track in target.tracks}
-    expect(not strangers, f"{sorted(strangers)} are no tracks of the scene")
+    unknown = ids - {track.id for track in target.tracks}
+    expect(not unknown, f"{sorted(unknown)} are no tracks of the scene")
     return f"{len(ids)} tracks"
 
 
@@ -45,7 +45,7 @@ def insert_and_restore(target: Target) -> str:
     if not target.allow_changes:
         raise Skipped("it would change the scene for all clients; allow it with --changes")
     if not target.tracks:
-        raise Skipped("the scene has no track whose looks could be used")
+        raise Skipped("the scene has no track whose appearance could be used")
     plain = target.call("render_rgb", target.request()).image_bytes
     restore = sensorsim.RestoreModelParametersRequest(scene_id=target.scene_id)
     try:
@@ -57,9 +57,9 @@ def insert_and_restore(target: Target) -> str:
     finally:
         target.call("restore_model_parameters", restore)
     ids = [track.id for track in target.call("get_dynamic_objects", listed).dynamic_objects]
-    expect(_NEW not in ids, f"the scene was restored, but {_NEW!r} is still there")
-    expect(target.call("render_rgb", target.request()).image_bytes == plain, "the restored scene looks different")
-    return "the picture changed and came back" if grown != plain else "listed and gone again; not in the picture"
+    expect(_NEW not in ids, f"the scene was restored, but {_NEW!r} is still listed")
+    expect(target.call("render_rgb", target.request()).image_bytes == plain, "the restored scene renders differently")
+    return "the picture changed and was restored" if grown != plain else "listed and removed again; not in the picture"
 
 
 def _insert(target: Target) -> None:
@@ -85,4 +85,4 @@ def _insert(target: Target) -> None:
         if reply.success:
             return
         faults.append(f"{track.id!r}: {reply.message}")
-    expect(False, f"no track's looks could be inserted: {'; '.join(faults)}")
+    expect(False, f"no copy of a track could be inserted: {'; '.join(faults)}")

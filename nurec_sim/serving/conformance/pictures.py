@@ -14,7 +14,7 @@ Code = grpc.StatusCode
 
 @check("png")
 def png(target: Target) -> str:
-    """A PNG comes in the size that is asked for and shows something."""
+    """A PNG comes in the requested size and shows something."""
     data = target.call("render_rgb", target.request()).image_bytes
     expect(data.startswith(b"\x89PNG"), f"it begins with {data[:8]!r}")
     image = decode(data)
@@ -26,7 +26,7 @@ def png(target: Target) -> str:
 
 @check("jpeg")
 def jpeg(target: Target) -> str:
-    """A JPEG of quality 95 looks like the PNG."""
+    """A JPEG of quality 95 is close to the PNG."""
     request = target.request(image_format=ImageFormat.JPEG)
     data = target.call("render_rgb", request).image_bytes
     expect(data.startswith(b"\xff\xd8"), f"it begins with {data[:8]!r}")
@@ -76,7 +76,7 @@ def _optional_format(target: Target, image_format: int, read) -> str:
 
 @check("jpeg2000")
 def jpeg2000(target: Target) -> str:
-    """JPEG2000, if offered, looks like the PNG."""
+    """JPEG2000, if offered, is close to the PNG."""
     return _optional_format(target, ImageFormat.JPEG2000, decode)
 
 

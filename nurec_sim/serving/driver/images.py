@@ -1,6 +1,6 @@
 """Camera images for policies: checked before they are decoded, rectified to ideal pinholes.
 
-Policies only ever meet ideal pinhole images of the width that they ask for (``sim.policy_sensors``). In our own loop
+Policies only ever meet ideal pinhole images of the width that they need (``sim.policy_sensors``). In our own loop
 such an image is rendered; a client of the egodriver interface sends what its camera sees, fisheye and all.
 """
 
@@ -61,7 +61,7 @@ def see_image(image: EncodedImage, camera: CameraModel, width_px: int) -> Camera
     Args:
         image: what the client sent.
         camera: its camera as the client described it, at any resolution.
-        width_px: the width that the policy asks for; an image that is marked ``as_is`` keeps its own.
+        width_px: the width that the policy needs; an image that is marked ``as_is`` keeps its own.
 
     Raises:
         RequestError: the image is damaged, or marked ``as_is`` and not that of an ideal pinhole, or the camera is one

@@ -95,7 +95,7 @@ class ImageReplies:
         self._encoders = Workers(threads)
 
     def of(self, frames: Sequence[Any], options: Sequence[wire.ImageOptions]) -> list[Any]:
-        """An ``RGBRenderReturn``, or an error, for each frame: its colours in the format asked for."""
+        """An ``RGBRenderReturn``, or an error, for each frame: its colours in the requested format."""
         calls = [(self._reply, *pair) for pair in zip(frames, options, strict=True)]
         if all(frame.rgb.size <= 3 * LARGE_RAYS for frame in frames):
             return self._encoders.run_calls(calls)

@@ -30,7 +30,7 @@ class LoadedScene:
 
     @cached_property
     def times_us(self) -> tuple[int, int]:
-        """First and last time that a frame may be asked for.
+        """First and last time for which a frame may be requested.
 
         Clients take their times from the recorded path, which may reach a little farther than the sensors' data.
         """

@@ -79,7 +79,7 @@ def read_camera_frame(message, request: SensorRequest, field: str = "image_bytes
     ``field`` is what errors call the picture.
 
     Raises:
-        RequestError: the reply has another size than asked for.
+        RequestError: the reply has another size than requested.
     """
     camera = sensor_of(request, CameraModel)
     shape = (3, camera.height_px, camera.width_px)
@@ -203,7 +203,7 @@ def read_range_map(
     """Range in metres and intensity of every beam of a ``RangeMap``, 0 where none came back.
 
     Raises:
-        RequestError: the map does not have the beams that were asked for.
+        RequestError: the map does not have the requested beams.
     """
     shape = (message.rows, message.columns)
     asked = (len(request.sensor.elevation_rad), len(request.sensor.azimuth_rad))  # type: ignore[union-attr]
