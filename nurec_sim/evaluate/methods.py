@@ -139,10 +139,10 @@ def describe(contender: Contender) -> dict[str, Any]:
     Raises:
         WeightsError: the network's weights are missing.
     """
-    said: dict[str, Any] = {"method": contender.method}
+    described: dict[str, Any] = {"method": contender.method}
     settings = contender.settings
     if settings is None:
-        return said
+        return described
     values = dataclasses.asdict(settings)
     if isinstance(settings, FeedForwardSettings):
         from nurec_sim.network.checkpoints.download import find_weights, sha256
@@ -153,7 +153,7 @@ def describe(contender: Contender) -> dict[str, Any]:
         values["checkpoint"] = None
         if settings.random_weights is None:
             values["checkpoint"] = sha256(find_weights(profile, settings.checkpoint))
-    return said | {"settings": values}
+    return described | {"settings": values}
 
 
 def build(contender: Contender, window: Window, device: str = "auto") -> Built:

@@ -80,9 +80,9 @@ def _table(table: Table) -> str:
 
 def _methods(methods: Mapping[str, Any]) -> str:
     items = []
-    for name, said in methods.items():
-        weights = (said.get("settings") or {}).get("checkpoint")
-        seed = (said.get("settings") or {}).get("random_weights")
+    for name, described in methods.items():
+        weights = (described.get("settings") or {}).get("checkpoint")
+        seed = (described.get("settings") or {}).get("random_weights")
         text = f"{CHOICES.get(name, '')}"
         text += f"; weights {weights[:12]}" if weights else ""
         text += f"; random weights of seed {seed}: its results are meaningless" if seed is not None else ""

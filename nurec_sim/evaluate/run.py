@@ -74,13 +74,13 @@ def run_protocol(
 
 def settings_of(protocol: Protocol, methods: Sequence[Contender]) -> dict[str, Any]:
     """All settings that affect the results, as round-tripped JSON."""
-    said = {
+    described = {
         "version": nurec_sim.__version__,
         "protocol": dataclasses.asdict(protocol),
         "methods": {method.name: describe(method) for method in methods},
         "ids": list(protocol.ids),
     }
-    return json.loads(json.dumps(said, default=str))
+    return json.loads(json.dumps(described, default=str))
 
 
 def _window(

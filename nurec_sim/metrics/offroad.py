@@ -192,13 +192,13 @@ def offroad_agreement(
     poses[:, :3, 3] += offset[:, None] * poses[:, :3, 1]
     verdict = judge_footprints(grid, poses, body).verdict
     beyond = corners_outside_m(drivable_area(road_map), poses, body)
-    truth, known, said = beyond > TOLERANCE_M, verdict != RoadState.UNKNOWN, verdict == RoadState.OFF
-    wrong = known & (said != truth)
+    truth, known, predicted = beyond > TOLERANCE_M, verdict != RoadState.UNKNOWN, verdict == RoadState.OFF
+    wrong = known & (predicted != truth)
     margin = float(np.quantile(np.abs(beyond[wrong] - TOLERANCE_M), 0.95)) if wrong.any() else float("nan")
     count = int(known.sum())
     return Agreement(
         placements, count, 1 - float(wrong.sum()) / count if count else float("nan"), 1 - count / placements,
-        int((wrong & said).sum()), int((wrong & truth).sum()), margin,
+        int((wrong & predicted).sum()), int((wrong & truth).sum()), margin,
     )  # fmt: skip
 
 

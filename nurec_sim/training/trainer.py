@@ -115,12 +115,12 @@ class Trainer:
                 rate = learning_rate(stage, step - first)
                 for group in optimiser.param_groups:
                     group["lr"] = rate
-                loss, said, outputs = wrapped(sample)
-                said |= self._update(optimiser, trained, loss, step) | {"rate": rate, "loss": float(loss.detach())}
+                loss, figures, outputs = wrapped(sample)
+                figures |= self._update(optimiser, trained, loss, step) | {"rate": rate, "loss": float(loss.detach())}
                 done = step + 1
                 self.position = dataclasses.replace(self.position, step=done, seconds=self._seconds())
                 if curve is not None:
-                    curve.add(stage.name, said)
+                    curve.add(stage.name, figures)
                     if done % self.config.log_every == 0 or done == last:
                         curve.write(done, self.position.seconds)
                     if done % self.config.sample_every == 0 or done == last:
@@ -128,7 +128,7 @@ class Trainer:
                     # At the end of a stage the moments are dropped: the next stage trains other parameters.
                     if done % self.config.checkpoint_every == 0 or done == last:
                         self._save(None if done == first + stage.steps else optimiser)
-                shown = f"PSNR {said['psnr']:.1f} dB" if "psnr" in said else f"AbsRel {said['abs_rel']:.3f}"
+                shown = f"PSNR {figures['psnr']:.1f} dB" if "psnr" in figures else f"AbsRel {figures['abs_rel']:.3f}"
                 report(f"{stage.name} {done - first}/{stage.steps}, {shown}", done / self.config.steps)
 
     def _save(self, optimiser: torch.optim.AdamW | None) -> None:

@@ -224,7 +224,7 @@ def test_observed_sky_is_the_same_at_any_thread_count():
         many = observed_world_sky(context, rays, pose, 64)
     finally:
         torch.set_num_threads(threads)
-    assert all(np.array_equal(getattr(alone, name), getattr(many, name)) for name in ("rgb", "shown", "sure"))
+    assert all(np.array_equal(getattr(alone, name), getattr(many, name)) for name in ("rgb", "shown", "weight"))
 
 
 def test_what_stands_before_the_sky_leaves_no_outline_in_it():
@@ -237,13 +237,13 @@ def test_what_stands_before_the_sky_leaves_no_outline_in_it():
     rgb[0, 0, :31, [39, 70]] = 0.3
     edged = observed_world_sky(dataclasses.replace(context, rgb=rgb, logits=logits), rays, pose, 96)
     clean = observed_world_sky(context, rays, pose, 96)
-    assert np.abs(edged.rgb - clean.rgb)[clean.sure > 0.5].max() < 0.02
+    assert np.abs(edged.rgb - clean.rgb)[clean.weight > 0.5].max() < 0.02
 
 
 def test_skies_of_chunks_meet_softly():
     pose = camera_in_world()
     context, rays = camera_maps(pose)
     observed = observed_world_sky(context, rays, pose, 96)
-    assert (observed.sure <= observed.shown + 1e-6).all() and observed.sure.max() > 0.95
-    along = observed.sure[observed.shown > 0.999]
+    assert (observed.weight <= observed.shown + 1e-6).all() and observed.weight.max() > 0.95
+    along = observed.weight[observed.shown > 0.999]
     assert along.min() < 0.1 and ((along > 0.2) & (along < 0.8)).mean() > 0.1

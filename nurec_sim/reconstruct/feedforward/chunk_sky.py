@@ -25,13 +25,13 @@ CUBE_FROM_WORLD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]
 """Axes in which ``GaussianScene``'s sky (world z up) is a cubemap as in ``network.sky.cubemap``, whose y is down."""
 
 FEATHER_PX = 2.0
-"""How softly what was seen ends, in texels."""
+"""Standard deviation of the blur at the border of the observed part, in texels."""
 EDGE_PX = 3
-"""So near to something else, in pixels of an image, sky may show a little of it."""
+"""Sky pixels this near to something else, in image pixels, may be mixed with it."""
 SEAM_PX = 6.0
-"""How softly the skies of chunks meet, in texels."""
-LEAST_SURE = 0.05
-"""What sky counts at its edge, where chunks meet."""
+"""Standard deviation of the blur between the skies of chunks, in texels."""
+BORDER_WEIGHT = 0.05
+"""Weight of a chunk's sky at the border of its observed part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +40,14 @@ class ObservedSky:
 
     Attributes:
         rgb: complete in every direction.
-        shown: whether the texel was seen, 0..1.
-        sure: what it counts among chunks that saw it, less towards the edge of what was seen: there, things show that
-            lie in front of the sky, and chunks differ a little in their colours.
+        shown: whether the texel was observed, 0..1.
+        weight: in the mean of all chunks; it falls towards the border of the observed part, where things in front of
+            the sky mix in and the colours of chunks differ a little.
     """
 
     rgb: Float32[np.ndarray, "6 size size 3"]
     shown: Float32[np.ndarray, "6 size size"]
-    sure: Float32[np.ndarray, "6 size size"]
+    weight: Float32[np.ndarray, "6 size size"]
 
 
 def observed_world_sky(
@@ -79,11 +79,11 @@ def observed_world_sky(
     )
     rgb = np.where((clear_hits > 0)[..., None], clear, edge)
     seen = (clear_hits + edge_hits > 0).astype(np.float32)
-    # Images may be coarser than the cubemap and leave texels between their pixels: half of them is as good as all.
-    surely = np.minimum(2 * _blurred((clear_hits > 0).astype(np.float32), FEATHER_PX), 1)
+    # Images may be coarser than the cubemap and leave texels between their pixels: half of them count as all.
+    clearly = np.minimum(2 * _blurred((clear_hits > 0).astype(np.float32), FEATHER_PX), 1)
     # The square lets the weight vanish smoothly with zero slope; 2 * blurred - 1 falls to 0 at the border itself.
-    sure = surely**2 * np.clip(2 * _blurred(surely, SEAM_PX) - 1, LEAST_SURE, 1)
-    return ObservedSky(fill_unseen(rgb, seen), np.minimum(2 * _blurred(seen, FEATHER_PX), 1), sure)
+    weight = clearly**2 * np.clip(2 * _blurred(clearly, SEAM_PX) - 1, BORDER_WEIGHT, 1)
+    return ObservedSky(fill_unseen(rgb, seen), np.minimum(2 * _blurred(seen, FEATHER_PX), 1), weight)
 
 
 def _blurred(faces: Float32[np.ndarray, "6 s s"], sigma_px: float) -> Float32[np.ndarray, "6 s s"]:
@@ -138,7 +138,7 @@ def world_sky(
 
     Args:
         sky: colours, faces as in ``network.sky.cubemap``.
-        seen: how surely each texel was seen, 0..1.
+        seen: how clearly each texel was seen, 0..1.
         world_from_scene: pose of the scene frame; only its rotation is used, as the sky is infinitely far.
         size: edge of the result's faces, texels.
 

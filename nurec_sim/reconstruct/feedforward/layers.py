@@ -113,7 +113,7 @@ def _sky(
     # Layered from the weakest evidence to the strongest: extrapolated or learned sky, surfaces, observed sky.
     sky = sky + covered[..., None] * (surfaces - sky)
     covered = np.maximum(covered, observed.shown)
-    return sky + observed.shown[..., None] * (observed.rgb - sky), np.maximum(observed.sure, COVERED_WEIGHT * covered)
+    return sky + observed.shown[..., None] * (observed.rgb - sky), np.maximum(observed.weight, COVERED_WEIGHT * covered)
 
 
 # ------------------------------------------------------------------------------------------------- scene to world

@@ -142,14 +142,14 @@ def _model(settings: FeedForwardSettings, device: torch.device) -> tuple[Instant
         # The precisions that the release runs these decoders in.
         precision = "float16" if network.PROFILES[name].decoder == "dense" else "bfloat16"
     model = network.build(name, seed=settings.random_weights, precision=precision)
-    said: dict[str, Any] = {"precision": precision, "device": device.type}
+    facts: dict[str, Any] = {"precision": precision, "device": device.type}
     if settings.random_weights is not None:
-        said["random_seed"] = settings.random_weights
+        facts["random_seed"] = settings.random_weights
     else:
         path = find_weights(name, settings.checkpoint)
         load_weights(model, path, name)
-        said["file"] = path.name
-    return model.to(device), said
+        facts["file"] = path.name
+    return model.to(device), facts
 
 
 def _chunk(

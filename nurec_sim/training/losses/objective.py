@@ -73,14 +73,14 @@ class Objective(nn.Module):
         losses = self._losses(sample, outputs)
         weights = self.stage.losses
         total = torch.stack([getattr(weights, name) * value for name, value in losses.items()]).sum()
-        said = {name: float(value.detach()) for name, value in losses.items()}
+        figures = {name: float(value.detach()) for name, value in losses.items()}
         if outputs.renderings:
             pairs = zip(outputs.renderings, sample.targets, strict=False)
-            said["psnr"] = sum(psnr_db(each.rgb, view.rgb) for each, view in pairs) / len(outputs.renderings)
+            figures["psnr"] = sum(psnr_db(each.rgb, view.rgb) for each, view in pairs) / len(outputs.renderings)
         known = sample.truth.depth_m > 0
         true = sample.truth.depth_m[known]
-        said["abs_rel"] = float(((outputs.context.depth_m.detach()[known] - true).abs() / true).mean())
-        return total, said, outputs
+        figures["abs_rel"] = float(((outputs.context.depth_m.detach()[known] - true).abs() / true).mean())
+        return total, figures, outputs
 
     def run(self, sample: TrainingSample) -> StepOutputs:
         """The forward pass of the stage, with its renderings."""

@@ -109,8 +109,8 @@ def _steadied(
     number = np.arange(len(times))
     weight = np.maximum(1 - np.abs(number[:, None] - number) / 3, 0) * count
     passed_s = (times[:, None] - times) / 1e6
-    said = value + (rate[:, None] + rate) / 2 * passed_s[..., None]
-    return np.einsum("ij,ijk->ik", weight / weight.sum(axis=1, keepdims=True), said)
+    predicted = value + (rate[:, None] + rate) / 2 * passed_s[..., None]
+    return np.einsum("ij,ijk->ik", weight / weight.sum(axis=1, keepdims=True), predicted)
 
 
 def _headings(velocity: Float64[np.ndarray, "t 3"], speed: Float64[np.ndarray, " t"]) -> Float64[np.ndarray, " t"]:

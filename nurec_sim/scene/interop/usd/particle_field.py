@@ -71,8 +71,8 @@ def _run(path: Path, folder: Path) -> None:
     except subprocess.TimeoutExpired:
         raise ArchiveError(f"{path}: OpenUSD did not read it within {MAX_SECONDS} s") from None
     if done.returncode:
-        said = done.stderr.decode("utf-8", "replace").strip().splitlines()
-        last = said[-1][:300] if said else "nothing said"
+        lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        last = lines[-1][:300] if lines else "no error text"
         if done.returncode == 3:
             raise ArchiveError(last)
         raise ArchiveError(f"{path}: OpenUSD cannot read it (process ended with {done.returncode}: {last})")

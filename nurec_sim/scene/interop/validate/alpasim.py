@@ -33,7 +33,7 @@ RULES = {
         "mapping logger, numbers time_range.start and .end",
         "the scene cannot be listed",
     ),
-    "time-range": Rule("warning", "time_range in microseconds, on the clock of the rig", "times are told wrongly"),
+    "time-range": Rule("warning", "time_range in microseconds, on the clock of the rig", "times are misinterpreted"),
     "rig-file": Rule("error", f"{RIG} with a list rig_trajectories", "the scene cannot be opened"),
     "one-trajectory": Rule("error", "exactly one rig trajectory", "the scene cannot be opened"),
     "sequence-id": Rule("error", "the text rig_trajectories[0].sequence_id", "the scene cannot be opened"),
@@ -191,8 +191,8 @@ def _check_metadata(report: Report, contents: Contents, path_us: Int64[np.ndarra
         start, end = (_number(entry_of(span, key, f"{name}: time_range"), f"{name}: time_range.{key}")
                       for key in ("start", "end"))  # fmt: skip
         if path_us is not None and not (start < end and start <= path_us[-1] and end >= path_us[0]):
-            told = f"{name}: time_range is {start:.0f} to {end:.0f}, the rig's path {path_us[0]} to {path_us[-1]}"
-            report.add("time-range", told)
+            message = f"{name}: time_range is {start:.0f} to {end:.0f}, the rig's path {path_us[0]} to {path_us[-1]}"
+            report.add("time-range", message)
 
 
 def _number(value: Any, where: str) -> float:
@@ -251,12 +251,12 @@ def _check_frames_inside(
         )
         return
     if frames[0, 1] < first_us + SHUTTER_ROOM_US:
-        told = f"{where}: the first frame ends {(frames[0, 1] - first_us) / 1000:.2f} ms after the first pose"
-        report.add("shutter-room", told)
+        message = f"{where}: the first frame ends {(frames[0, 1] - first_us) / 1000:.2f} ms after the first pose"
+        report.add("shutter-room", message)
     outside = (frames[:, 0] < first_us) | (frames[:, 1] > last_us)
     if outside.any():
-        told = f"{where}: {int(outside.sum())} of {len(frames)} frames are outside of {first_us} to {last_us} us"
-        report.add("frames-inside", told)
+        message = f"{where}: {int(outside.sum())} of {len(frames)} frames are outside of {first_us} to {last_us} us"
+        report.add("frames-inside", message)
 
 
 def _check_box(report: Report, trajectory: dict[str, Any]) -> None:
@@ -290,5 +290,5 @@ def _check_tracks(report: Report, contents: Contents) -> None:
         if "CONTROLLABLE" not in row.flags and np.linalg.norm(np.ptp(row.poses[:, :3], axis=0)) > MOVED_M
     ]
     if moving:
-        told = f"{TRACKS}: {len(moving)} tracks move but are not CONTROLLABLE: {shown(moving)}"
-        report.add("static-moves", told)
+        message = f"{TRACKS}: {len(moving)} tracks move but are not CONTROLLABLE: {shown(moving)}"
+        report.add("static-moves", message)

@@ -73,12 +73,12 @@ def _check_verdicts(
         found = agreement(roads, area, poses, centre_m, size_m, PLACEMENTS)
         alarms = found.alarms_on_path
         if found.judged and found.share < LEAST_SHARE:
-            report.add("offroad-agrees", f"{XODR}: {_told(found)}")
+            report.add("offroad-agrees", f"{XODR}: {_described(found)}")
     if alarms:
         report.add("offroad-on-path", f"{XODR}: {alarms} of {len(poses)} recorded poses are off the road by its lanes")
 
 
-def _told(found: MapAgreement) -> str:
+def _described(found: MapAgreement) -> str:
     return (
         f"on {found.share:.1%} of {found.judged} placements beside the path the verdict is that of the drivable area "
         f"({found.false_alarms} false alarms, {found.misses} misses)"

@@ -117,8 +117,8 @@ def _check_data_info(report: Report, contents: Contents, path_us: np.ndarray | N
         span = entry_of(info, "pose-range", DATA_INFO)
         start_us, end_us = _interval(span, ("start-timestamp_us", "end-timestamp_us"), f"{DATA_INFO}: pose-range")
         if path_us is not None and not path_us[0] <= start_us <= end_us <= path_us[-1]:
-            told = f"{DATA_INFO}: pose-range is {start_us} to {end_us}, the rig's path {path_us[0]} to {path_us[-1]}"
-            report.add("pose-range", told)
+            message = f"{DATA_INFO}: pose-range is {start_us} to {end_us}, the rig's path {path_us[0]} to {path_us[-1]}"
+            report.add("pose-range", message)
     with report.rule("interval"):
         key = "sequence_timestamp_interval_us"
         _interval(entry_of(info, key, DATA_INFO), ("start", "stop"), f"{DATA_INFO}: {key}")
@@ -143,8 +143,8 @@ def _check_scene_name(report: Report, contents: Contents, sequence_id: str) -> N
         return  # AlpaSim's rules tell
     scene_id = metadata.get("scene_id") if isinstance(metadata, dict) else None
     if isinstance(scene_id, str) and sequence_id not in scene_id:
-        told = f"{DATA_INFO}: sequence_id {shown(sequence_id)} is no part of the scene_id {shown(scene_id)}"
-        report.add("scene-name", told)
+        message = f"{DATA_INFO}: sequence_id {shown(sequence_id)} is no part of the scene_id {shown(scene_id)}"
+        report.add("scene-name", message)
 
 
 def _check_camera(report: Report, camera: dict[str, Any], where: str) -> None:

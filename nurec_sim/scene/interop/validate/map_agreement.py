@@ -99,16 +99,16 @@ def agreement(
     inner, outer = shapely.buffer(area, -BORDER_M), shapely.buffer(area, BORDER_M)
     on, off = shapely.contains(inner, cars), ~shapely.contains(outer, cars)
     judged = on | off
-    said: Bool[np.ndarray, " n"] = np.zeros(count, bool)
-    said[judged] = roads.offroad(middle[judged], cars[judged])
-    missed = judged & off & ~said
+    predicted: Bool[np.ndarray, " n"] = np.zeros(count, bool)
+    predicted[judged] = roads.offroad(middle[judged], cars[judged])
+    missed = judged & off & ~predicted
     path_middle, path_cars = outlines(world_from_rig, centre_m, size_m)
     at_home = shapely.contains(area, path_cars)
     alarms = roads.offroad(path_middle[at_home], path_cars[at_home])
     return MapAgreement(
         count,
         int(judged.sum()),
-        int((on & said).sum()),
+        int((on & predicted).sum()),
         int(missed.sum()),
         int(shapely.intersects(area, cars[missed]).sum()),
         int(alarms.sum()),

@@ -23,11 +23,11 @@ def check_ground(report: Report, contents: Contents, world_from_rig: Float64[np.
             places = world_from_rig[np.unique(np.linspace(0, len(world_from_rig) - 1, PROBES).astype(int)), :3, 3]
             found = _has_ground(vertices, triangles, places)
             if not found.all():
-                told = (
+                message = (
                     f"mesh_ground.ply: no ground within {GROUND_WITHIN_M:g} m of the rig at {int((~found).sum())} of "
                 )
                 first = ", ".join(f"{value:.1f}" for value in places[np.argmin(found)])
-                report.add("mesh-under-path", f"{told}{len(found)} places of the path, the first at {first}")
+                report.add("mesh-under-path", f"{message}{len(found)} places of the path, the first at {first}")
     with report.rule("mesh"):
         read_triangles(contents.read("mesh.ply"), "mesh.ply")
 

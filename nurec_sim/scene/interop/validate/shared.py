@@ -88,8 +88,8 @@ def check_rigid(poses: Float64[np.ndarray, "n 4 4"], where: str) -> None:
     last_row = np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1)
     sound = (skew <= 1e-3) & (np.linalg.det(rotation) > 0) & (last_row <= 1e-6)  # NaN, where huge numbers overflow
     if not sound.all():
-        told = "is no rotation and translation (with a last row 0 0 0 1)"
-        raise ArchiveError(f"{where} {told}" if len(poses) == 1 else f"{where}[{int(np.argmin(sound))}] {told}")
+        message = "is no rotation and translation (with a last row 0 0 0 1)"
+        raise ArchiveError(f"{where} {message}" if len(poses) == 1 else f"{where}[{int(np.argmin(sound))}] {message}")
 
 
 def tracks(report: Report, contents: Contents, key: str | None) -> list[TrackRow]:
@@ -119,8 +119,8 @@ def tracks(report: Report, contents: Contents, key: str | None) -> list[TrackRow
         return []
     lengths = {name: len(column) for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        report.add("tracks-lengths", f"{TRACKS}: lists of different lengths: {told}")
+        message = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        report.add("tracks-lengths", f"{TRACKS}: lists of different lengths: {message}")
         return []
     return _rows(report, columns)
 

@@ -115,8 +115,8 @@ def _splat_faults(prim) -> Iterator[Fault]:
     terms = (int(degree if degree is not None else 3) + 1) ** 2
     coefficients = values("radiance:sphericalHarmonicsCoefficients")
     if set(lengths.values()) != {count} or len(coefficients) != count * terms:
-        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        yield "splat-arrays", f"{path} has {told}, {len(coefficients)} coefficients of degree {degree}"
+        message = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        yield "splat-arrays", f"{path} has {message}, {len(coefficients)} coefficients of degree {degree}"
         return
     if count == 0:
         yield "vg-035", f"{path} has no Gaussians; leave the prim out or make it inactive"
