@@ -196,12 +196,7 @@ def _device(flags: OperationFlags) -> str:
 
 
 def _run(
-    store: SceneStore,
-    host: str,
-    port: int,
-    options: ServiceOptions,
-    listening: ServerOptions,
-    flags: OperationFlags,
+    store: SceneStore, host: str, port: int, options: ServiceOptions, listening: ServerOptions, flags: OperationFlags
 ) -> None:
     from nurec_sim.serving.scene_service import SceneOptions
     from nurec_sim.serving.server import SensorServer, run_until_signal

@@ -57,10 +57,7 @@ def list_weights() -> None:
 
 @weights.command
 def fetch(
-    profile: Annotated[Fetchable, tyro.conf.Positional],
-    *,
-    revision: str | None = None,
-    to: Path | None = None,
+    profile: Annotated[Fetchable, tyro.conf.Positional], *, revision: str | None = None, to: Path | None = None
 ) -> None:
     """Download released weights from Hugging Face and check their size and digest.
 

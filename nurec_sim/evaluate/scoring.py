@@ -31,10 +31,7 @@ class Scored:
 
 
 def score_window(
-    contender: Contender,
-    window: Window,
-    progress: Callable[[str, float], None] | None = None,
-    device: str = "auto",
+    contender: Contender, window: Window, progress: Callable[[str, float], None] | None = None, device: str = "auto"
 ) -> Scored:
     """Runs a method on a window and scores its target views.
 

@@ -12,7 +12,7 @@ from nurec_sim import geometry, sensors
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.checks.sampling import pose_at
 from nurec_sim.logs.clip import Clip
-from nurec_sim.types import CameraModel, Sweep, Track
+from nurec_sim.types import CameraModel, Matrix4, Sweep, Track
 
 TILE_PX = 960
 COLUMNS = 3
@@ -122,11 +122,7 @@ def depth_rgb(depth_m: Float64[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
 
 
 def _draw_box(
-    image: Image,
-    camera: CameraModel,
-    poses: Float64[np.ndarray, "2 4 4"],
-    track: Track,
-    world_from_box: Float64[np.ndarray, "4 4"],
+    image: Image, camera: CameraModel, poses: Float64[np.ndarray, "2 4 4"], track: Track, world_from_box: Matrix4
 ) -> None:
     """Draws twelve edges and a cross on the front face, in short segments: lenses bend straight lines."""
     import cv2

@@ -117,7 +117,7 @@ def prolonged(ego: Trajectory, margin_us: int) -> Trajectory | None:
     if len(ego.t_us) < 2:
         return None
 
-    def carried(near: int, far: int) -> Float64[np.ndarray, "4 4"]:
+    def carried(near: int, far: int) -> Matrix4:
         # The motion from `far` to `near`, scaled to the margin and applied once more at `near`.
         step = geometry.inverse(ego.world_from_body[far]) @ ego.world_from_body[near]
         share = margin_us / abs(int(ego.t_us[near] - ego.t_us[far]))

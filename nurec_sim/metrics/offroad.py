@@ -43,10 +43,7 @@ class FootprintStates:
 
 
 def judge_footprints(
-    grid: OffroadGrid,
-    world_from_rig: Float64[np.ndarray, "n 4 4"],
-    body: Box,
-    tolerance_m: float = TOLERANCE_M,
+    grid: OffroadGrid, world_from_rig: Float64[np.ndarray, "n 4 4"], body: Box, tolerance_m: float = TOLERANCE_M
 ) -> FootprintStates:
     """Classifies the body's footprint, sampled every 0.1 m, at n rig poses.
 

@@ -70,10 +70,7 @@ class MotionTransformer(nn.Module):
         self.blocks = nn.ModuleList([ModulatedBlock(width, heads)])
 
     def forward(
-        self,
-        patches: Float[Tensor, "n y x c"],
-        extra: Float[Tensor, "n e c"],
-        condition: Float[Tensor, "n c"],
+        self, patches: Float[Tensor, "n y x c"], extra: Float[Tensor, "n e c"], condition: Float[Tensor, "n c"]
     ) -> Float[Tensor, "n y x d"]:
         """The patches' states, then the same normed, side by side."""
         n, rows, columns, width = patches.shape

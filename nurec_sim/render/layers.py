@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 from nurec_sim import geometry
 from nurec_sim.render.rays import RayGrid, actors_at, reference_pose
 from nurec_sim.scene.harmonics import sh_basis
-from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, SensorRequest, Track
+from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Matrix4, SensorRequest, Track
 
 MIN_ALPHA = 1 / 255
 """Gaussians that are less opaque are not rendered."""
@@ -61,7 +61,7 @@ def moving_gaussians(
     dynamic: DynamicGaussians,
     tracks: Sequence[Track],
     t_us: int,
-    actors: Mapping[str, Float64[np.ndarray, "4 4"]],
+    actors: Mapping[str, Matrix4],
     eye_m: Float64[np.ndarray, " 3"],
     hidden: Set[str] = frozenset(),
 ) -> Gaussians:

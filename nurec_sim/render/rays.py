@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from nurec_sim import geometry, sensors
-from nurec_sim.types import CameraModel, LidarModel, SensorRequest, Shutter
+from nurec_sim.types import CameraModel, LidarModel, Matrix4, SensorRequest, Shutter
 
 NEAR_M = 0.2
 """Gaussians whose centre lies closer than this, and closer hits, are not rendered (LiDARs: their own minimal range)."""
@@ -65,13 +65,13 @@ def reference_fraction(fraction: Float64[np.ndarray, "*n"]) -> float:
     return first if (fraction == first).all() else 0.5
 
 
-def reference_pose(request: SensorRequest, reference: float) -> tuple[Float64[np.ndarray, "4 4"], int]:
+def reference_pose(request: SensorRequest, reference: float) -> tuple[Matrix4, int]:
     """``world_from_sensor`` and time in microseconds at the fraction ``reference`` of the exposure."""
     pose = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), np.array(reference))
     return pose, request.start_us + int(round(reference * (request.end_us - request.start_us)))
 
 
-def actors_at(request: SensorRequest, reference: float, known: Container[str]) -> dict[str, Float64[np.ndarray, "4 4"]]:
+def actors_at(request: SensorRequest, reference: float, known: Container[str]) -> dict[str, Matrix4]:
     """``world_from_box`` of the request's actors that are known and not hidden, at a fraction of the exposure."""
     names = [name for name in request.actors if name in known and name not in request.hidden]
     pairs = np.array([request.actors[name] for name in names], np.float64)

@@ -73,10 +73,7 @@ class RaySums:
 
 
 def render_camera(
-    scene: GaussianScene,
-    request: SensorRequest,
-    apply_isp: bool = True,
-    pixels: Int64[np.ndarray, " k"] | None = None,
+    scene: GaussianScene, request: SensorRequest, apply_isp: bool = True, pixels: Int64[np.ndarray, " k"] | None = None
 ) -> CameraFrame:
     """A camera frame; see the module for what it contains.
 

@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int64
 from nurec_sim import geometry
 from nurec_sim.errors import ScenarioError
 from nurec_sim.sim.scenario import ActorEdit
-from nurec_sim.types import ActorState, Track
+from nurec_sim.types import ActorState, Matrix4, Track
 
 HIDDEN_BELOW_M = 100.0
 """Hidden actors are placed this far below the ground, as in AlpaSim's clients."""
@@ -59,7 +59,7 @@ class Actors:
             result[track_id] = pair
         return result
 
-    def seen_from(self, t_us: int, world_from_rig: Float64[np.ndarray, "4 4"]) -> tuple[ActorState, ...]:
+    def seen_from(self, t_us: int, world_from_rig: Matrix4) -> tuple[ActorState, ...]:
         """Current ground-truth actors in the rig frame; velocities are over ground, in rig axes."""
         rig_from_world = geometry.inverse(world_from_rig)
         result = []

@@ -22,6 +22,7 @@ from nurec_sim.types import (
     CameraModel,
     LidarFrame,
     LidarModel,
+    Matrix4,
     Needs,
     Pinhole,
     Rig,
@@ -35,7 +36,7 @@ from nurec_sim.types import (
 
 MAX_VIRTUAL_FOV_RAD = math.radians(100.0)
 FRONT_TOLERANCE_RAD = math.radians(10.0)
-PoseAt = Callable[[int], Float64[np.ndarray, "4 4"]]
+PoseAt = Callable[[int], Matrix4]
 Exposures = Int64[np.ndarray, "frames 2"]
 
 

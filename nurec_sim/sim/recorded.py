@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from nurec_sim import geometry
-from nurec_sim.types import Trajectory
+from nurec_sim.types import Matrix4, Trajectory
 
 VERTEX_SPACING_M = 0.1
 ROUTE_SPACING_M, ROUTE_POINTS = 4.0, 20
@@ -62,7 +62,7 @@ class RecordedDrive:
         """Recorded arc length at ``t_us``."""
         return float(np.interp(t_us - self.t_us[0], self.t_us - self.t_us[0], self.station_m))
 
-    def on_ground(self, x_m: float, y_m: float, yaw_rad: float, station_m: float) -> Float64[np.ndarray, "4 4"]:
+    def on_ground(self, x_m: float, y_m: float, yaw_rad: float, station_m: float) -> Matrix4:
         """A rig pose at a planar pose: height, pitch and roll of the recorded car at ``station_m``, rotated to ``yaw``.
 
         Cameras thus keep their height above a sloping road. Across the path the ground is assumed level: a car 3 m

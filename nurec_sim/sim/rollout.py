@@ -17,7 +17,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
 
 from nurec_sim import geometry
 from nurec_sim.errors import PlanError, PolicyError, ScenarioError
@@ -28,7 +27,7 @@ from nurec_sim.sim.policy_sensors import SceneFacts, SensorSuite
 from nurec_sim.sim.recorded import RecordedDrive
 from nurec_sim.sim.scenario import STATE_S, Perturbation, Scenario
 from nurec_sim.sim.vehicle import TICK_US, Limits, VehicleState
-from nurec_sim.types import EgoState, Event, Observation, Plan, Policy, Rollout, Sense, SensorFrame
+from nurec_sim.types import EgoState, Event, Matrix4, Observation, Plan, Policy, Rollout, Sense, SensorFrame
 
 STATE_US = int(round(STATE_S * 1e6))
 HISTORY_STATES = 21
@@ -312,7 +311,7 @@ class _Drive:
         rate = car.yaw_rate_radps(self.limits)
         return EgoState(t_us, pose, car.speed_mps, car.accel_mps2, rate, car.steering_rad)
 
-    def pose_at(self, t_us: int) -> Float64[np.ndarray, "4 4"]:
+    def pose_at(self, t_us: int) -> Matrix4:
         """Rig pose at a past time: from the ticks of the closed loop, before that from the log."""
         if t_us == self.states[-1].t_us:
             return self.states[-1].world_from_rig

@@ -35,11 +35,7 @@ class Position:
 
 
 def save_checkpoint(
-    folder: Path,
-    model: nn.Module,
-    average: nn.Module,
-    optimiser: torch.optim.AdamW | None,
-    position: Position,
+    folder: Path, model: nn.Module, average: nn.Module, optimiser: torch.optim.AdamW | None, position: Position
 ) -> Path:
     """Writes the state of a run.
 

@@ -25,7 +25,7 @@ class SampledSweep:
 
     lidar_id: str
     sweep: Sweep
-    world_from_rig: Float64[np.ndarray, "4 4"]
+    world_from_rig: Matrix4
     rig_m: Points
 
 

@@ -173,11 +173,7 @@ class _Thing:
         return best @ car_axes if least < standing - BETTER else car_axes.new_zeros(3)
 
     def _cost(
-        self,
-        tried: Float[Tensor, "d 2"],
-        frames: list[_Frame],
-        car_axes: Float[Tensor, "2 3"],
-        every: int = 1,
+        self, tried: Float[Tensor, "d 2"], frames: list[_Frame], car_axes: Float[Tensor, "2 3"], every: int = 1
     ) -> Float[Tensor, " d"]:
         """How badly each shift (along and across, metres) fits, about 0..1, comparing one point in ``every``."""
         points, own = self.points[::every], self.look[:, None, None, ::every]

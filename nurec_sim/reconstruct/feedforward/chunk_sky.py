@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 from torch.nn import functional
 
@@ -20,6 +20,7 @@ from nurec_sim.network.sky.background import background, is_static
 from nurec_sim.network.sky.observed import texture
 from nurec_sim.network.tensors import ContextMaps, SemanticClass
 from nurec_sim.reconstruct.sky_fill import fill_unseen
+from nurec_sim.types import Matrix4
 
 CUBE_FROM_WORLD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 """Axes in which ``GaussianScene``'s sky (world z up) is a cubemap as in ``network.sky.cubemap``, whose y is down."""
@@ -53,7 +54,7 @@ class ObservedSky:
 def observed_world_sky(
     context: ContextMaps,
     rays: Float[Tensor, "1 v h w 6"],
-    world_from_scene: Float64[np.ndarray, "4 4"],
+    world_from_scene: Matrix4,
     size: int,
     ego: Bool[np.ndarray, "v h w"] | None = None,
 ) -> ObservedSky:
@@ -93,7 +94,7 @@ def _blurred(faces: Float32[np.ndarray, "6 s s"], sigma_px: float) -> Float32[np
 def world_background(
     context: ContextMaps,
     rays: Float[Tensor, "1 v h w 6"],
-    world_from_scene: Float64[np.ndarray, "4 4"],
+    world_from_scene: Matrix4,
     size: int,
     ego: Bool[np.ndarray, "v h w"] | None = None,
 ) -> tuple[Float32[np.ndarray, "6 size size 3"], Float32[np.ndarray, "6 size size"]]:
@@ -116,7 +117,7 @@ def _pixels(
     chosen: Bool[Tensor, "v h w"],
     context: ContextMaps,
     rays: Float[Tensor, "1 v h w 6"],
-    world_from_scene: Float64[np.ndarray, "4 4"],
+    world_from_scene: Matrix4,
     ego: Bool[np.ndarray, "v h w"] | None,
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Colours of pixels and where they look, in the axes of the world's cubemap; none on the car."""
@@ -129,10 +130,7 @@ def _pixels(
 
 
 def world_sky(
-    sky: Float32[np.ndarray, "6 s s 3"],
-    seen: Float32[np.ndarray, "6 s s"],
-    world_from_scene: Float64[np.ndarray, "4 4"],
-    size: int,
+    sky: Float32[np.ndarray, "6 s s 3"], seen: Float32[np.ndarray, "6 s s"], world_from_scene: Matrix4, size: int
 ) -> tuple[Float32[np.ndarray, "6 size size 3"], Float32[np.ndarray, "6 size size"]]:
     """A cubemap of the network (scene frame) resampled as one of ``GaussianScene`` (world axes).
 

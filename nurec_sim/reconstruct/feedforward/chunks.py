@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from nurec_sim import sensors
 from nurec_sim.network.tensors import NetworkInputs
-from nurec_sim.types import CameraModel, DynamicGaussians, Gaussians
+from nurec_sim.types import CameraModel, DynamicGaussians, Gaussians, Matrix4
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ChunkInputs:
     index: int
     span_us: tuple[int, int]
     images: tuple[ContextImage, ...]
-    world_from_scene: Float64[np.ndarray, "4 4"]
+    world_from_scene: Matrix4
     tensors: NetworkInputs
     ego: Bool[np.ndarray, "v h w"]
 

@@ -36,7 +36,7 @@ from nurec_sim.render.cpu.project.colours import harmonics_1, harmonics_2, harmo
 from nurec_sim.render.cpu.records import EYE_HIGH, EYE_LOW, FEATURES, LOG_255, SCRATCH, VIEW
 from nurec_sim.render.cpu.simd import LANES
 from nurec_sim.render.layers import LARGEST, drawable
-from nurec_sim.types import DynamicGaussians, Track
+from nurec_sim.types import DynamicGaussians, Matrix4, Track
 
 if TYPE_CHECKING:
     from nurec_sim.render.cpu.workers import Workers
@@ -162,7 +162,7 @@ class PackedMoving:
     def at(
         self,
         t_us: int,
-        actors: Mapping[str, Float64[np.ndarray, "4 4"]],
+        actors: Mapping[str, Matrix4],
         hidden: Set[str],
         eye_m: Float64[np.ndarray, " 3"],
         workers: Workers,
@@ -197,7 +197,7 @@ class PackedMoving:
         return PackedGaussians(fields, np.zeros((0, 0, 0), np.float32), index, placed.centre_m, placed.radius_m)
 
     def _motions(
-        self, t_us: int, actors: Mapping[str, Float64[np.ndarray, "4 4"]], eye_m: Float64[np.ndarray, " 3"]
+        self, t_us: int, actors: Mapping[str, Matrix4], eye_m: Float64[np.ndarray, " 3"]
     ) -> tuple[Float64[np.ndarray, "owners 20"], Int64[np.ndarray, " some_owners"]]:
         """Motions by ``track``, the last, for Gaussians of no track, being none; and which are not there at all."""
         count = len(self.span_us)

@@ -19,12 +19,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int16, Int32
+from jaxtyping import Float32, Int16, Int32
 from llvmlite import ir
 
 from nurec_sim.render.cpu.kernel import inner
 from nurec_sim.render.cpu.pack import BLOCK, COLOUR, DROP, INTENSITY, KNOWN, LABEL, LOG_OPACITY, MEAN, QUAT, SCALE
 from nurec_sim.render.cpu.simd import I32, LANES, Lanes, Vector, declare, spread, vector_kernel
+from nurec_sim.types import Matrix4
 
 # Columns of a record.
 XROW, YROW, WROW, FLAT, FADE, LIM, TAG, FEATURE = 0, 3, 6, 9, 10, 11, 12, 13
@@ -64,7 +65,7 @@ class Projected(NamedTuple):
 
 
 def view_parameters(
-    world_from_reference: Float64[np.ndarray, "4 4"],
+    world_from_reference: Matrix4,
     near_m: float,
     by_range: bool,
     travel_m: float,

@@ -27,7 +27,7 @@ from nurec_sim.reconstruct.feedforward.inputs.rays import camera_rays, scene_ray
 from nurec_sim.reconstruct.feedforward.inputs.window import span_fractions
 from nurec_sim.training.data.clips import FrameTruth, TrueClip
 from nurec_sim.training.data.sample import TargetView, TrueMaps
-from nurec_sim.types import CameraModel, Label, Shutter
+from nurec_sim.types import CameraModel, Label, Matrix4, Shutter
 
 SEMANTIC_OF_LABEL = np.full(len(Label), SemanticClass.OTHERS, np.int64)
 SEMANTIC_OF_LABEL[Label.ROAD] = SemanticClass.ROAD
@@ -126,7 +126,7 @@ def _motion(
     image: ContextImage,
     instance: Int64[np.ndarray, "h w"],
     scene_points: Float64[np.ndarray, "h w 3"],
-    world_from_scene: Float64[np.ndarray, "4 4"],
+    world_from_scene: Matrix4,
 ) -> tuple[Float32[np.ndarray, "h w 2 3"], Bool[np.ndarray, "h w"]]:
     """Displacement of every pixel's point with the rigid motion of its box, and where the box's path is known."""
     motion, known = np.zeros((*instance.shape, 2, 3)), np.ones(instance.shape, bool)

@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy.typing import ArrayLike
 
+from nurec_sim.types import Matrix4
+
 Corners = tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"]]
 """Positions, unit normals and texture coordinates of triangle corners, three per triangle."""
 UNIT_SQUARE = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
@@ -74,7 +76,7 @@ class MeshBuilder:
         self._normals.append(np.full_like(vertices, np.nan) if normals is None else np.asarray(normals, np.float64))
         self._count += len(vertices)
 
-    def extend(self, other: MeshBuilder, pose: Float64[np.ndarray, "4 4"] | None = None) -> None:
+    def extend(self, other: MeshBuilder, pose: Matrix4 | None = None) -> None:
         """Everything of another mesh, moved by a rigid ``pose``."""
         turn, shift = (np.eye(3), np.zeros(3)) if pose is None else (pose[:3, :3], pose[:3, 3])
         for points, faces, uv, normals in zip(other._points, other._faces, other._uv, other._normals, strict=True):

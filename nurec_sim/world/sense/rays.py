@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
+from nurec_sim.types import Matrix4
 from nurec_sim.world.model.assemble import Town
 from nurec_sim.world.sense.faces import Seen
 
@@ -58,7 +59,7 @@ def look(
     data: Any,
     rays: Float64[np.ndarray, "h w 3"],
     valid: Bool[np.ndarray, "h w"],
-    world_from_sensor: Float64[np.ndarray, "4 4"],
+    world_from_sensor: Matrix4,
     seen: Seen,
 ) -> None:
     """Fills in the view of a grid of rays: plain material colours, shaded by the sun, before the rendered sky.

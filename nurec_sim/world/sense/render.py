@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, UInt8
 
-from nurec_sim.types import Pinhole
+from nurec_sim.types import Matrix4, Pinhole
 from nurec_sim.world.model.assemble import Town
 from nurec_sim.world.model.builder import DECAL_GROUP
 from nurec_sim.world.sense.backend import gl_context
@@ -62,9 +62,7 @@ class GlRenderer:
         self._gl.free()
         self._context.free()
 
-    def render(
-        self, data: Any, face: Face, world_from_sensor: Float64[np.ndarray, "4 4"], colours: bool = True
-    ) -> FaceImage:
+    def render(self, data: Any, face: Face, world_from_sensor: Matrix4, colours: bool = True) -> FaceImage:
         """Renders one face of a sensor.
 
         Args:

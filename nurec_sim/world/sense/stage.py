@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int32, UInt8
 
 from nurec_sim import geometry, sensors
-from nurec_sim.types import CameraModel, SensorRequest, Shutter, Trajectory
+from nurec_sim.types import CameraModel, Matrix4, SensorRequest, Shutter, Trajectory
 from nurec_sim.world.model.assemble import ActorPlaces, Town
 from nurec_sim.world.plan.surface import SurfaceClass
 from nurec_sim.world.sense import rays
@@ -63,7 +63,7 @@ class Moments:
     places: ActorPlaces
     world_from_sensor: Float64[np.ndarray, "n 4 4"]
 
-    def enter(self, index: int) -> Float64[np.ndarray, "4 4"]:
+    def enter(self, index: int) -> Matrix4:
         """Poses the town at an instant and returns the sensor's pose."""
         self.town.pose(self.data, float(self.t_us[index]), self.places, index)
         return self.world_from_sensor[index]
@@ -121,9 +121,7 @@ class Stage:
         poses = geometry.interpolate_pose_pair(np.asarray(request.world_from_sensor, np.float64), fractions)
         return Moments(self.town, self.data, times, places, poses)
 
-    def look(
-        self, patch: RayPatch, world_from_sensor: Float64[np.ndarray, "4 4"], seen: Seen, colours: bool = True
-    ) -> None:
+    def look(self, patch: RayPatch, world_from_sensor: Matrix4, seen: Seen, colours: bool = True) -> None:
         """Fills in what the rays of a patch hit at the current instant.
 
         Args:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
 from nurec_sim import geometry, sensors
-from nurec_sim.types import CameraModel, Pinhole
+from nurec_sim.types import CameraModel, Matrix4, Pinhole
 
 _NO_NEIGHBOUR = np.float32(1e9)
 
@@ -100,7 +100,7 @@ def plane_normals(
 def scene_flow(
     view: TrueView,
     camera: CameraModel,
-    world_from_camera: Float64[np.ndarray, "4 4"],
+    world_from_camera: Matrix4,
     boxes_now: Float64[np.ndarray, "actors 4 4"],
     boxes_then: Float64[np.ndarray, "actors 4 4"],
 ) -> Float32[np.ndarray, "h w 3"]:
@@ -128,9 +128,9 @@ def scene_flow(
 def follow(
     view: TrueView,
     camera: CameraModel,
-    world_from_camera: Float64[np.ndarray, "4 4"],
+    world_from_camera: Matrix4,
     flow_m: Float32[np.ndarray, "h w 3"],
-    world_from_camera_then: Float64[np.ndarray, "4 4"],
+    world_from_camera_then: Matrix4,
 ) -> tuple[Float64[np.ndarray, "h w 2"], Float64[np.ndarray, "h w"]]:
     """Projection of each pixel's point at another time, ignoring occlusion.
 

@@ -30,7 +30,7 @@ from nurec_sim.reconstruct.feedforward.inputs.ego_mask import ego_masks
 from nurec_sim.reconstruct.feedforward.inputs.frames import ChunkWindow
 from nurec_sim.reconstruct.feedforward.inputs.rays import camera_rays, pinhole_field_rad, scene_rays
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
-from nurec_sim.types import CameraModel, Clip
+from nurec_sim.types import CameraModel, Clip, Matrix4
 
 LONE_FRAME_GAP_US = 500_000
 """How far the motion decoder looks from the only frame of a camera."""
@@ -141,7 +141,7 @@ def span_fractions(times: Int64[np.ndarray, "*n"], window: ChunkWindow) -> Float
     return (times - window.span_us[0]) / max(length, 1)
 
 
-def _rescaled(scene_from_camera: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+def _rescaled(scene_from_camera: Matrix4) -> Matrix4:
     """A pose in the network's unit of length."""
     pose = scene_from_camera.copy()
     pose[:3, 3] *= SCENE_RESCALE

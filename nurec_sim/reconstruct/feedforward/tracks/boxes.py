@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from nurec_sim import geometry
-from nurec_sim.types import Track, Trajectory
+from nurec_sim.types import Matrix4, Track, Trajectory
 
 STANDING_MPS = 0.5
 """Slower things are static; their heading is the longer side of what was seen."""
@@ -87,7 +87,7 @@ def lengthened(path: Trajectory, life_us: tuple[int, int]) -> Trajectory:
     return Trajectory(np.concatenate([[first], times, [last]])[keep], all_poses[keep])
 
 
-def _beyond(path: Trajectory, end: int, neighbour: int, t_us: int) -> Float64[np.ndarray, "4 4"]:
+def _beyond(path: Trajectory, end: int, neighbour: int, t_us: int) -> Matrix4:
     """The pose at an end of a path moved on as it moves between there and the pose beside it."""
     pose = path.world_from_body[end].copy()
     if len(path.t_us) > 1:
