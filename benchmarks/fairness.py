@@ -59,7 +59,7 @@ def together(count: int, size: tuple[int, int]):
 
 
 def crowded(count: int):
-    """A small image with so many actors, whom the scene does not know."""
+    """A small image with this many actors that the scene does not know."""
     message = image(SMALL)
     for k in range(count):
         pair = message.dynamic_objects.add(track_id=f"actor-{k}").pose_pair

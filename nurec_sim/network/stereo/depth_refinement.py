@@ -17,7 +17,7 @@ from nurec_sim.network.tensors import NetworkInputs
 LARGEST, STEPS = 0.24, 7
 """How far the logarithm of a depth may change, and how many depths are tried."""
 NEIGHBOURS, MOST_NEIGHBOURS = (-1, 1, -2, 2, -3, 3), 3
-"""Frames of the same camera to compare with, by their places in the order of time; so many of those that there are."""
+"""Frames of the same camera to compare with, by their offsets in time order, and the maximum number of them."""
 WINDOW_PX = 9
 OUTSIDE = 0.3
 """Cost of a depth whose point the other image does not show."""

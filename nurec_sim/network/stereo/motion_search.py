@@ -24,7 +24,7 @@ STEP_PX, MOST_STEPS = 2.5, 40
 STEP_ALONG_M, STEP_ALONG_SHARE = 0.6, 1 / 15
 """Steps along the car's axis: least, and as a share of the distance."""
 ROUNDS, FINER = 3, 2.5
-"""After the first search come so many around the best, each with steps so many times smaller."""
+"""Number of searches around the best after the first one, and the factor by which each reduces the step."""
 CONTRAST, COLOUR = 2.0, 0.1
 """Differences of normalized brightness, and of colours, from which on nothing gets worse."""
 OUTSIDE = 0.5

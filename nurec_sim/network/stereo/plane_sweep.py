@@ -25,7 +25,7 @@ than others it fits by the pixel alone; and how well another image agrees."""
 NEAREST_M, FARTHEST_M, DEPTHS = 2.0, 120.0, 48
 """Depths are tried in equal steps of their logarithm, each 9 % farther than the last."""
 USUAL_M, UNUSUAL = 40.0, 0.003
-"""Where nothing else is known, depths of this logarithm are preferred, by this much times the squared difference."""
+"""Prior: depth in metres, and weight of the squared difference of the logarithms."""
 NEIGHBOURS = (-1, 1, -2)
 """Frames of the same camera to compare with, by their places in the order of time."""
 WINDOW_PX = 5

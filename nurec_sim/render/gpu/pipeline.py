@@ -32,7 +32,7 @@ FEATURES, DISTANCE, ALPHA, HALF = 0, 3, 4, 5
 SUMS, GRADIENTS = 16, 14
 WARPS = 8
 MOST_NARROW = 0xFFFF
-"""Up to so many tiles, pairs are sorted by 16 bits."""
+"""Maximum number of tiles for which pairs are sorted by 16 bits."""
 MOST_KINDS = 64
 FIRST_RECORDS, PAIRS_PER_RECORD = 1 << 18, 4
 """Room for records at first, at most, and for how many pairs per record."""

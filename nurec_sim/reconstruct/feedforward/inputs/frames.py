@@ -25,7 +25,7 @@ FIELD_WEIGHT = 0.1
 PAIR_AZIMUTHS_DEG = (60.0, 130.0)
 """Where the front and the rear side cameras of a surround rig look, left positive."""
 AHEAD_DEG, BEHIND_DEG = 20.0, 165.0
-"""A side camera looks at least so far to the side, and not straight back."""
+"""Range of the yaw of a side camera, to either side."""
 PAIR_ASYMMETRY_DEG = 45.0
 
 SLOWEST_STEP_US = 500_000
@@ -35,7 +35,7 @@ FASTEST_STEP_US = 250_000
 RELEASE_STEP_US = 750_000
 RELEASE_MARGIN_US = 100_000
 STAGGER_US = 200_000
-"""Cameras whose only frames end so far apart still count as recording at the same time."""
+"""Maximum time between the only frames of cameras that count as recording at the same time."""
 
 
 @dataclass(frozen=True)

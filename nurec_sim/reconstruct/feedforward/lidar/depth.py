@@ -35,7 +35,7 @@ MIN_AFFINE_POINTS = 200
 MIN_AFFINE_SPREAD = 1.5
 """A slope needs points over a range of depths: their 90th percentile over their 10th."""
 MAX_BEND = 3.0
-"""A slope may change the factor over the measured range at most so much."""
+"""Largest ratio by which a slope may change the factor over the measured range."""
 EDGE_RATIO = 1.25
 """Where the four pixels around a point differ by more than this, the point may belong to either side of an edge."""
 ABSOLUTE_STEPS, TUKEY_STEPS = 20, 10

@@ -25,7 +25,7 @@ BODY_MARGIN_M = 0.3
 CONE_MARGIN_RAD = 0.1
 BOX_MARGIN_M = 0.1
 HIDDEN_RATIO = 1.1
-"""A point is hidden if one so much nearer shows beside or above it."""
+"""A point is occluded if one nearer by this factor lies beside or above it in the image."""
 
 Values = Float64[np.ndarray, " n"]
 Points = tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, " n"]]

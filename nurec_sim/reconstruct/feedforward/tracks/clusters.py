@@ -41,7 +41,7 @@ ALIKE_MPS = 1.0
 MOMENT_US = 100_000
 """The velocity of a path is taken over this long before and after."""
 MOST_MISSED = 2
-"""A chain resumes after at most so many instants at which the thing was hidden..."""
+"""Maximum number of instants for which an object may be hidden within a chain..."""
 BRIDGE_M = 2.0
 """...if it is then this close to where it was heading, as alike in velocity as ``METRES_PER_MPS`` counts."""
 LARGEST_M = 20.0
