@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -76,20 +77,12 @@ class SceneClient(Connection):
         """Available scenes, and sources that cannot be opened."""
         reply = self._call("ListScenes", v1.ListScenesRequest())
         known = {kind.value: kind.name.lower() for kind in wire.SceneKind}
-        scenes = [
-            ListedScene(
-                scene_id=info.scene_id,
-                kind=known.get(info.kind, "unknown"),
-                file_bytes=info.file_bytes,
-                loaded=info.loaded,
-                loading=info.loading,
-                loaded_bytes=info.loaded_bytes,
-                users=info.users,
-                uploaded=info.uploaded,
-            )
-            for info in reply.scenes
-        ]
-        return SceneListing(tuple(scenes), {fault.name: fault.text for fault in reply.faults})
+        names = [field.name for field in dataclasses.fields(ListedScene)]  # those of the message
+        scenes = [{name: getattr(info, name) for name in names} for info in reply.scenes]
+        return SceneListing(
+            tuple(ListedScene(**{**scene, "kind": known.get(scene["kind"], "unknown")}) for scene in scenes),
+            {fault.name: fault.text for fault in reply.faults},
+        )
 
     def stats(self) -> Mapping[str, float]:
         """Counters of the server by name, as in ``StatsReply``."""
