@@ -4,6 +4,7 @@ import pytest
 from ncore_files import write_ncore
 from part_of_log import DEMO, first_frames
 from ros_files import write_bag
+from waymo_files import write_waymo
 
 from nurec_sim import geometry, logs
 
@@ -17,7 +18,7 @@ def write_ros(folder, clip):
     return write_bag(folder / "town.mcap", clip)
 
 
-@pytest.mark.parametrize("write, needs", [(write_ncore, "ncore"), (write_ros, "mcap_ros2")])
+@pytest.mark.parametrize("write, needs", [(write_ncore, "ncore"), (write_ros, "mcap_ros2"), (write_waymo, "polars")])
 def test_lidar_projects_into_every_camera(town, write, needs, tmp_path):
     pytest.importorskip(needs)
     clip = logs.open_clip(write(tmp_path, town))
