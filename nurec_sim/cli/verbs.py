@@ -11,6 +11,7 @@ import sys
 from nurec_sim.cli import (  # noqa: F401  (each registers its commands)
     comparison,
     conformance,
+    converting,
     drive,
     driving,
     evaluation,

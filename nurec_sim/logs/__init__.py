@@ -4,6 +4,7 @@ from nurec_sim.logs.check import check_clip
 from nurec_sim.logs.checks import Measure, measure_clip
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.conformance import check_reader
+from nurec_sim.logs.convert import convert_clip
 from nurec_sim.logs.describe import SENSOR_COLUMNS, ClipSummary, describe_clip
 from nurec_sim.logs.overlay import draw_overlay
 from nurec_sim.logs.reader import is_log, open_clip
@@ -22,6 +23,7 @@ __all__ = [
     "SweepRecord",
     "check_clip",
     "check_reader",
+    "convert_clip",
     "decode_image",
     "describe_clip",
     "draw_overlay",

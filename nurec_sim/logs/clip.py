@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
@@ -41,6 +41,15 @@ class ImageRecord:
     start_us: int
     end_us: int
     world_from_camera: Float64[np.ndarray, "2 4 4"]
+
+
+@runtime_checkable
+class EncodedImages(Protocol):
+    """A source (``types.LogSource``) whose images are JPEG or PNG files."""
+
+    def encoded_image(self, camera_id: str, index: int) -> bytes:
+        """The file of one frame."""
+        ...
 
 
 class _Recent:
@@ -211,6 +220,18 @@ class Clip:
         """
         record = self._record("camera", camera_id, self.image_records(camera_id), index)
         return self._recent_images.get((camera_id, index), lambda: self._read_image(camera_id, index, record))
+
+    def encoded_image(self, camera_id: str, index: int) -> bytes | UInt8[np.ndarray, "h w 3"]:
+        """The JPEG or PNG file of a frame as it is, if the log has one, otherwise its pixels; both are checked.
+
+        Raises:
+            ClipError: see ``image``.
+        """
+        pixels = self.image(camera_id, index)
+        if not isinstance(self.source, EncodedImages):
+            return pixels
+        with self._reading(f"image {self.image_records(camera_id)[index].file}"):
+            return self.source.encoded_image(camera_id, index)
 
     def sweep(self, lidar_id: str, index: int) -> Sweep:
         """One motion-compensated sweep; its arrays are read-only.

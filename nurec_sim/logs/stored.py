@@ -35,6 +35,10 @@ class ImageFiles:
         """One RGB frame."""
         return self.storage.read_image(self.images[camera_id][index].file)
 
+    def encoded_image(self, camera_id: str, index: int) -> bytes:
+        """The JPEG or PNG file of one frame."""
+        return self.storage.read(self.images[camera_id][index].file)
+
     def ego_mask(self, camera_id: str) -> None:
         """None: unknown."""
         return None
