@@ -11,7 +11,7 @@ import zipfile
 import zlib
 from pathlib import Path, PurePosixPath
 from tokenize import TokenError
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
@@ -26,6 +26,8 @@ from nurec_sim.files.decoding import (
     json_value,
     npz_arrays,
 )
+
+T = TypeVar("T")
 
 META_FILE = "meta.json"
 # Exceptions of the zip and numpy readers on corrupt data.
@@ -56,6 +58,33 @@ def schema_of(path: Path) -> str | None:
     storage = Storage(path)
     schema = storage.read_json(META_FILE).get("schema") if storage.exists(META_FILE) else None
     return schema if isinstance(schema, str) else None
+
+
+def parsed_json(data: bytes, where: str, kind: type[T], noun: str) -> T:
+    """The value of a JSON file.
+
+    Args:
+        data: the file.
+        where: its name, for messages.
+        kind: what the value must be.
+        noun: the same in words.
+
+    Raises:
+        ClipError: it is not JSON, holds NaN or infinity, or is of another kind.
+    """
+
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is not a number that JSON knows")
+
+    try:
+        value = json_value(data, parse_constant=refuse)
+    except TooMuchError as error:
+        raise ClipError(f"{where} {error}") from None
+    except (ValueError, RecursionError) as error:
+        raise ClipError(f"{where} is not valid JSON: {error}") from error
+    if not isinstance(value, kind):
+        raise ClipError(f"{where} must hold {noun}, got {type(value).__name__}")
+    return value
 
 
 def decode_image(data: bytes) -> UInt8[np.ndarray, "h w 3"]:
@@ -142,19 +171,7 @@ class Storage:
         Raises:
             ClipError: it is missing, not JSON, holds NaN or infinity, or is not an object.
         """
-
-        def refuse(constant: str) -> None:
-            raise ValueError(f"{constant} is not a number that JSON knows")
-
-        try:
-            value = json_value(self.read(name), parse_constant=refuse)
-        except TooMuchError as error:
-            raise ClipError(f"{self.path.name}: {name} {error}") from None
-        except (ValueError, RecursionError) as error:
-            raise ClipError(f"{self.path.name}: {name} is not valid JSON: {error}") from error
-        if not isinstance(value, dict):
-            raise ClipError(f"{self.path.name}: {name} must hold a JSON object, got {type(value).__name__}")
-        return value
+        return parsed_json(self.read(name), f"{self.path.name}: {name}", dict, "a JSON object")
 
     def read_image(self, name: str) -> UInt8[np.ndarray, "h w 3"]:
         """A JPEG or PNG file as RGB.

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.errors import ClipError
@@ -38,6 +38,18 @@ class ImageFiles:
     def encoded_image(self, camera_id: str, index: int) -> bytes:
         """The JPEG or PNG file of one frame."""
         return self.storage.read(self.images[camera_id][index].file)
+
+    def float_rows(self, lidar_id: str, index: int, columns: int) -> Float32[np.ndarray, "n columns"]:
+        """A sweep file of little-endian float32 records.
+
+        Raises:
+            ClipError: it is missing, or does not hold whole records.
+        """
+        file = self.sweeps[lidar_id][index].file
+        data = self.storage.read(file)
+        if len(data) % (4 * columns):
+            raise ClipError(f"{file} must hold {4 * columns} bytes for each point, got {len(data)} bytes")
+        return np.frombuffer(data, "<f4").reshape(-1, columns)
 
     def ego_mask(self, camera_id: str) -> None:
         """None: unknown."""

@@ -1,26 +1,53 @@
-"""Folders of logs: the one that was meant, and the files of a sensor in it."""
+"""Formats whose logs are folders: the base of their readers, and the files of a sensor."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import abc
 from pathlib import Path
 
 from nurec_sim.errors import ClipError
+from nurec_sim.logs.clip import Clip
 
 NAMES_SHOWN = 12
 
 
-def only_one(path: Path, found: Sequence[Path], noun: str) -> Path:
-    """The only folder of a kind at or below a path.
+class FolderReader(abc.ABC):
+    """Reads the folder of a log, or one above that holds a single log (``types.LogReader``).
 
-    Raises:
-        ClipError: there is none, or there are several; the text names them.
+    Attributes:
+        name: of the format.
+        description: for messages.
+        noun: several logs of the format, for messages.
     """
-    if len(found) != 1:
-        names = [str(each.relative_to(path)) for each in found[:NAMES_SHOWN]]
-        more = f" and {len(found) - NAMES_SHOWN} more" if len(found) > NAMES_SHOWN else ""
-        raise ClipError(f"holds {len(found)} {noun}; give the folder of one: {names}{more}")
-    return found[0].resolve()
+
+    name: str
+    description: str
+    noun: str
+
+    def can_open(self, path: Path) -> bool:
+        """Whether it is a log, or a folder with logs."""
+        return bool(self.logs(path))
+
+    def open(self, path: Path) -> Clip:
+        """The log as a clip.
+
+        Raises:
+            ClipError: a file or a value is missing or wrong, or there are several logs.
+        """
+        found = self.logs(path)
+        if len(found) != 1:
+            names = [str(each.relative_to(path)) for each in found[:NAMES_SHOWN]]
+            more = f" and {len(found) - NAMES_SHOWN} more" if len(found) > NAMES_SHOWN else ""
+            raise ClipError(f"holds {len(found)} {self.noun}; give the folder of one: {names}{more}")
+        return self.read(found[0].resolve())
+
+    @abc.abstractmethod
+    def logs(self, path: Path) -> list[Path]:
+        """Folders of logs: the path itself, or those below it, sorted."""
+
+    @abc.abstractmethod
+    def read(self, folder: Path) -> Clip:
+        """The clip in the folder of a log; errors as for ``open``."""
 
 
 def numbered_files(root: Path, folder: str, suffix: str) -> dict[int, str]:

@@ -20,7 +20,6 @@ COLOUR, GREY = ("image_02", "image_03"), ("image_00", "image_01")
 LICENCE = "CC BY-NC-SA 3.0 (KITTI; non-commercial, attribution, share-alike)"
 # Volkswagen Passat B6: 4.77 m long, 1.82 m wide, 1.1 m of it behind the rear axle.
 BODY = Box((1.285, 0.0, 0.75), (4.77, 1.82, 1.5))
-POINT_BYTES = 16
 
 
 @dataclass(frozen=True)
@@ -29,11 +28,7 @@ class KittiFiles(ImageFiles):
 
     def sweep(self, lidar_id: str, index: int) -> SweepPoints:
         """The points of one sweep."""
-        file = self.sweeps[lidar_id][index].file
-        data = self.storage.read(file)
-        if len(data) % POINT_BYTES:
-            raise ClipError(f"{file} must hold {POINT_BYTES} bytes for each point, got {len(data)} bytes")
-        points = np.frombuffer(data, "<f4").reshape(-1, 4)
+        points = self.float_rows(lidar_id, index, 4)
         return SweepPoints(points[:, :3].astype(np.float64), np.clip(points[:, 3], 0.0, 1.0))
 
 

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from nurec_sim.errors import ClipError
-from nurec_sim.files.decoding import LIMITS, TooMuchError, json_value
+from nurec_sim.files.decoding import LIMITS
 from nurec_sim.logs import fields
+from nurec_sim.logs.storage import parsed_json
 
 Row = dict[str, Any]
 LONGEST_RECORD = 1 << 16
@@ -30,14 +31,7 @@ def small_table(folder: Path, name: str) -> dict[str, Row]:
     path = _existing(folder, name)
     if path.stat().st_size > LIMITS.json_bytes:
         raise ClipError(f"{path.name} has {path.stat().st_size:,} bytes; at most {LIMITS.json_bytes:,} are read")
-    try:
-        rows = json_value(path.read_bytes())
-    except TooMuchError as error:
-        raise ClipError(f"{path.name} {error}") from None
-    except (ValueError, RecursionError) as error:
-        raise ClipError(f"{path.name} is not valid JSON: {error}") from None
-    if not isinstance(rows, list):
-        raise ClipError(f"{path.name} must hold a list of records, got {type(rows).__name__}")
+    rows: list[Row] = parsed_json(path.read_bytes(), path.name, list, "a list of records")
     return {fields.of_kind(f"{path.name}: record {n}", row, "token", str): row for n, row in enumerate(rows)}
 
 

@@ -1,8 +1,10 @@
-"""Imports packages that only some readers need, when they open a log."""
+"""Packages that only some readers need: imported when they open a log; their errors become ours."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+from collections.abc import Iterator
 from types import ModuleType
 
 from nurec_sim.errors import ClipError
@@ -23,3 +25,15 @@ def package(name: str, extra: str, format: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError as error:
         raise ClipError(f"{format} needs the extra {extra!r}: pip install 'nurec-sim[{extra}]' ({error})") from None
+
+
+@contextlib.contextmanager
+def clip_errors(what: str, advice: str = "") -> Iterator[None]:
+    """Turns whatever a package raises into a ``ClipError`` that begins with ``what`` and ends with ``advice``."""
+    try:
+        yield
+    except ClipError:
+        raise
+    except Exception as error:
+        text = str(error) or "a check of the package failed"
+        raise ClipError(f"{what}: {type(error).__name__}: {text}{advice}") from error

@@ -8,6 +8,7 @@ import threading
 import weakref
 from collections import Counter
 from collections.abc import Collection, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +17,7 @@ import yaml
 from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import LIMITS
 from nurec_sim.logs.readers import _ros_messages as messages
-from nurec_sim.logs.readers._packages import package
+from nurec_sim.logs.readers._packages import clip_errors, package
 
 METADATA = "metadata.yaml"
 _INFORMATION = b"rosbag2_bagfile_information"
@@ -101,16 +102,9 @@ def _open(file: Path) -> Storage:
         return McapFile(file) if file.suffix == ".mcap" else SqliteFile(file)
 
 
-@contextlib.contextmanager
-def _damage(file: Path) -> Iterator[None]:
-    """Turns what libraries raise for damaged files into a ``ClipError``."""
-    try:
-        yield
-    except ClipError:
-        raise
-    except Exception as error:
-        advice = "; the command 'mcap recover' mends recordings that were cut off" if file.suffix == ".mcap" else ""
-        raise ClipError(f"{file.name} is damaged: {type(error).__name__}: {error}{advice}") from error
+def _damage(file: Path) -> AbstractContextManager[None]:
+    advice = "; the command 'mcap recover' mends recordings that were cut off" if file.suffix == ".mcap" else ""
+    return clip_errors(f"{file.name} is damaged", advice)
 
 
 class McapFile:

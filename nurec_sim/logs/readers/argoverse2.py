@@ -23,7 +23,7 @@ from nurec_sim.logs import calibration
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.labels import is_movable, our_label
 from nurec_sim.logs.readers._argoverse2_map import read_map
-from nurec_sim.logs.readers._folders import numbered_files, only_one
+from nurec_sim.logs.readers._folders import FolderReader, numbered_files
 from nurec_sim.logs.storage import Storage
 from nurec_sim.logs.stored import ImageFiles
 from nurec_sim.logs.sweeps import SweepRecord
@@ -45,32 +45,24 @@ _TEXTS = ("sensor_name", "track_uuid", "category")
 RIG_FROM_EGO = geometry.pose(np.eye(3), np.array([0.0, 0.0, 0.33]))
 
 
-class Argoverse2Reader:
+class Argoverse2Reader(FolderReader):
     """Reads logs of the Argoverse 2 sensor data set as clips (``types.LogReader``)."""
 
     name = "argoverse2"
     description = f"the folder of an Argoverse 2 sensor log, with {POSES} and calibration/, or one above with one log"
+    noun = "logs of Argoverse 2"
 
-    def can_open(self, path: Path) -> bool:
-        """Whether it is a log, or a folder with logs."""
-        return bool(_logs(path))
+    def logs(self, path: Path) -> list[Path]:
+        """Folders of logs: the path itself, or those one or two levels below it."""
+        places = ("", "*/", "*/*/") if path.is_dir() else ()
+        for place in places:
+            if found := sorted(each.parent for each in path.glob(f"{place}{POSES}")):
+                return [each for each in found if (each / SENSORS).is_file()]
+        return []
 
-    def open(self, path: Path) -> Clip:
-        """The log as a clip.
-
-        Raises:
-            ClipError: a file, a column or a value is missing or wrong, or there are several logs.
-        """
-        return _read(Storage(only_one(path, _logs(path), "logs of Argoverse 2")))
-
-
-def _logs(path: Path) -> list[Path]:
-    """Folders of logs: the path itself, or those one or two levels below it."""
-    places = ("", "*/", "*/*/") if path.is_dir() else ()
-    for place in places:
-        if found := sorted(each.parent for each in path.glob(f"{place}{POSES}")):
-            return [each for each in found if (each / SENSORS).is_file()]
-    return []
+    def read(self, folder: Path) -> Clip:
+        """The log as a clip."""
+        return _read(Storage(folder))
 
 
 def _read(storage: Storage) -> Clip:

@@ -16,7 +16,7 @@ from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import image_size
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.readers import _kitti as kitti
-from nurec_sim.logs.readers._folders import numbered_files, only_one
+from nurec_sim.logs.readers._folders import FolderReader, numbered_files
 from nurec_sim.logs.storage import Storage
 from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.types import Rig, Trajectory
@@ -26,38 +26,31 @@ COLOUR, GREY = ("image_2", "image_3"), ("image_0", "image_1")
 # 1.73 m high; it is taken to be level.
 RIG_FROM_VELO = geometry.pose(np.eye(3), np.array([0.76, 0.0, 1.73]))
 SEQUENCE = re.compile(r"\d\d")
+FILES = ("calib.txt", "times.txt")
 LATEST_S = 1e9
 
 
-class KittiOdometryReader:
+class KittiOdometryReader(FolderReader):
     """Reads sequences of the KITTI odometry benchmark as clips (``types.LogReader``)."""
 
     name = "kitti-odometry"
     description = "a folder sequences/NN of the KITTI odometry benchmark with calib.txt and times.txt, and poses/NN.txt"
+    noun = "sequences of KITTI odometry"
 
-    def can_open(self, path: Path) -> bool:
-        """Whether it is a sequence, or a folder with sequences."""
-        return bool(_sequences(path))
+    def logs(self, path: Path) -> list[Path]:
+        """Folders of sequences: the path itself, or those in ``sequences`` below it."""
+        if not path.is_dir():
+            return []
+        found = [path] if SEQUENCE.fullmatch(path.resolve().name) else [*path.glob("*"), *path.glob("sequences/*")]
+        return sorted(
+            each
+            for each in found
+            if SEQUENCE.fullmatch(each.resolve().name) and all((each / name).is_file() for name in FILES)
+        )
 
-    def open(self, path: Path) -> Clip:
-        """The sequence as a clip.
-
-        Raises:
-            ClipError: a file or a value is missing or wrong, or there are several sequences.
-        """
-        folder = only_one(path, _sequences(path), "sequences of KITTI odometry")
+    def read(self, folder: Path) -> Clip:
+        """The sequence as a clip."""
         return _read(Storage(folder.parents[1]), folder.name)
-
-
-def _sequences(path: Path) -> list[Path]:
-    """Folders of sequences: the path itself, or those in ``sequences`` below it."""
-    if not path.is_dir():
-        return []
-    found = [path] if SEQUENCE.fullmatch(path.resolve().name) else [*path.glob("*"), *path.glob("sequences/*")]
-    return sorted(
-        each for each in found
-        if SEQUENCE.fullmatch(each.resolve().name) and (each / "calib.txt").is_file() and (each / "times.txt").is_file()
-    )  # fmt: skip
 
 
 def _read(storage: Storage, sequence: str) -> Clip:

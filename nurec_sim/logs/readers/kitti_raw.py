@@ -17,7 +17,7 @@ from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.readers import _kitti as kitti
-from nurec_sim.logs.readers._folders import numbered_files, only_one
+from nurec_sim.logs.readers._folders import FolderReader, numbered_files
 from nurec_sim.logs.readers._kitti_tracklets import read_tracklets
 from nurec_sim.logs.storage import Storage
 from nurec_sim.logs.sweeps import SweepRecord, prolonged
@@ -33,7 +33,7 @@ POSE_VALUES = 6
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?")
 
 
-class KittiRawReader:
+class KittiRawReader(FolderReader):
     """Reads drives of KITTI raw as clips (``types.LogReader``)."""
 
     name = "kitti-raw"
@@ -41,29 +41,20 @@ class KittiRawReader:
         "the folder of a KITTI raw drive, such as 2011_09_26_drive_0002_sync, in the folder of its day with "
         f"{CAM_TO_CAM}, or a folder above with one drive"
     )
+    noun = "drives of KITTI raw"
 
-    def can_open(self, path: Path) -> bool:
-        """Whether it is a drive, or a folder with drives."""
-        return bool(_drives(path))
+    def logs(self, path: Path) -> list[Path]:
+        """Folders of drives: the path itself, or those one or two levels below it."""
+        if not path.is_dir():
+            return []
+        if DRIVE.fullmatch(path.resolve().name):
+            return [path]
+        found = sorted([*path.glob("*_drive_*_sync"), *path.glob("*/*_drive_*_sync")])
+        return [each for each in found if DRIVE.fullmatch(each.name) and each.is_dir()]
 
-    def open(self, path: Path) -> Clip:
-        """The drive as a clip.
-
-        Raises:
-            ClipError: a file or a value is missing or wrong, or there are several drives.
-        """
-        drive = only_one(path, _drives(path), "drives of KITTI raw")
-        return _read(Storage(drive.parent), drive.name)
-
-
-def _drives(path: Path) -> list[Path]:
-    """Folders of drives: the path itself, or those one or two levels below it."""
-    if not path.is_dir():
-        return []
-    if DRIVE.fullmatch(path.resolve().name):
-        return [path]
-    found = sorted([*path.glob("*_drive_*_sync"), *path.glob("*/*_drive_*_sync")])
-    return [each for each in found if DRIVE.fullmatch(each.name) and each.is_dir()]
+    def read(self, folder: Path) -> Clip:
+        """The drive as a clip."""
+        return _read(Storage(folder.parent), folder.name)
 
 
 def _read(storage: Storage, drive: str) -> Clip:

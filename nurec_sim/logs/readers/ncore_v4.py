@@ -6,9 +6,9 @@ of LiDARs are as measured, in the frame of their own instant; angles of cuboids 
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from nurec_sim.files.decoding import LIMITS
 from nurec_sim.logs.boxes import BoxTracks
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.readers import _ncore_models as models
-from nurec_sim.logs.readers._packages import package
+from nurec_sim.logs.readers._packages import clip_errors, package
 from nurec_sim.logs.storage import decode_image
 from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.types import LidarModel, Rig, SweepPoints, Track, Trajectory
@@ -105,16 +105,8 @@ def _refuse_pickles() -> None:
     registry.register_codec(NoPickles)
 
 
-@contextlib.contextmanager
-def _reading(what: str) -> Iterator[None]:
-    """Turns what the package raises, assertions among them, into a ``ClipError``."""
-    try:
-        yield
-    except ClipError:
-        raise
-    except Exception as error:
-        text = str(error) or "a check of the package failed"
-        raise ClipError(f"{FORMAT}: {what} cannot be read: {type(error).__name__}: {text}") from error
+def _reading(what: str) -> AbstractContextManager[None]:
+    return clip_errors(f"{FORMAT}: {what} cannot be read")
 
 
 def _group(reader: Any, component: Any, what: str) -> str | None:

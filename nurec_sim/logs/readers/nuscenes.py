@@ -26,7 +26,6 @@ from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.types import Box, CameraModel, LidarModel, Matrix4, Pinhole, Rig, SweepPoints, Track, Trajectory
 
 TURN_US = 50_000
-POINT_BYTES = 20
 NAMES_SHOWN = 12
 # The LiDAR of the files looks along y; ours along x.
 FILE_FROM_LIDAR = geometry.pose(geometry.rotation_from_yaw(np.pi / 2), np.zeros(3)).round()
@@ -86,11 +85,7 @@ class _Files(ImageFiles):
 
     def sweep(self, lidar_id: str, index: int) -> SweepPoints:
         """The points of one sweep."""
-        file = self.sweeps[lidar_id][index].file
-        data = self.storage.read(file)
-        if len(data) % POINT_BYTES:
-            raise ClipError(f"{file} must hold {POINT_BYTES} bytes for each point, got {len(data)} bytes")
-        points = np.frombuffer(data, "<f4").reshape(-1, 5)
+        points = self.float_rows(lidar_id, index, 5)
         xyz = geometry.transform_points(geometry.inverse(FILE_FROM_LIDAR), points[:, :3].astype(np.float64))
         return SweepPoints(xyz, np.clip(points[:, 3] / 255, 0.0, 1.0).astype(np.float32))
 
