@@ -109,9 +109,9 @@ def add_lidar_part(
 
     Args:
         v: vectors.
-        part: number of the part, 0 to ``PARTS`` - 1; the first part replaces what the boxes held.
-        chosen: mask of the boxes to change.
-        local: address of the group seen from the part's middle line.
+        part: as for ``add_lens_part``, like the next two.
+        chosen: see part.
+        local: see part.
         params: address of the chart's parameters.
         rows: address of the chart's rows by sine of elevation.
         motion: address of ``motion.motion_parameters``.
