@@ -103,7 +103,7 @@ class Profile:
         motion: size of the motion decoder.
         sky: size of the learned sky; None uses the sky seen in the images.
         observed_sky_px: edge of the cubemap of the observed sky.
-        log_geometry: whether matching refines the depth and finds the motion of movable things, and Gaussians start as
+        log_geometry: whether matching refines the depth and finds the motion of movable objects, and Gaussians start as
             the footprints of their pixels; the released network has learned all that.
         image_colours: whether canonical colours are those of the images (``network.image_colours``) or decoded ones.
         isp_heads: attention heads of the decoder of camera responses.

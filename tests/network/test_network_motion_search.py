@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nurec_sim import network
-from nurec_sim.network.stereo.motion_search import LEAST_PIXELS, searched_motion, things
+from nurec_sim.network.stereo.motion_search import LEAST_PIXELS, objects_of, searched_motion
 from nurec_sim.network.tensors import NetworkInputs
 from nurec_sim.reconstruct.feedforward.inputs.rays import camera_rays, pinhole_field_rad
 from nurec_sim.types import CameraModel, Fisheye, Pinhole
@@ -108,7 +108,7 @@ def test_things_end_at_edges_of_the_depth_and_small_ones_are_left_out():
     depth[5:15, 15:25] = 20.0  # another thing behind the first
     movable[1:3, 30:33] = True
     assert 2 * 3 < LEAST_PIXELS
-    numbers = things(depth, movable)
+    numbers = objects_of(depth, movable)
     assert set(np.unique(numbers)) == {0, 1, 2}
     assert len(np.unique(numbers[5:15, 5:15])) == 1 and len(np.unique(numbers[5:15, 17:25])) == 1
     assert numbers[8, 8] != numbers[8, 20] and (numbers[5:15, 5:25] > 0).all() and (numbers[:4] == 0).all()

@@ -1,7 +1,7 @@
 """The background seen through gaps between Gaussians: in every direction the surfaces that the images show there.
 
 Nobody sees the sky behind a house, and in a gap between its Gaussians a bright sky would flash. So the background
-cubemap holds sky only where an image shows sky, or where none looks. Movable things leave no trace there.
+cubemap holds sky only where an image shows sky, or where none looks. Movable objects leave no trace there.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Motion by matching: displacement of each movable thing, from finding it again in its camera's neighbouring frames.
+"""Motion by matching: displacement of each movable object, found again in the neighbouring frames of its camera.
 
-Nothing is learned. Things are connected pieces of the pixels classified as movable; each moves over the ground as a
+Nothing is learned. Objects are connected regions of the pixels classified as movable; each moves over the ground as a
 whole and at a constant velocity from the previous frame to the next. What is not found again keeps its decoded motion.
 """
 
@@ -18,25 +18,25 @@ from nurec_sim.network.stereo.matching import ImageView, neighbours, sampled, sm
 from nurec_sim.network.tensors import NetworkInputs
 
 FARTHEST_M = (12.0, 6.0)
-"""How far things may move from one frame to the next, along the car's axis and across it."""
+"""How far objects may move from one frame to the next, along the car's axis and across it."""
 STEP_PX, MOST_STEPS = 2.5, 40
-"""Steps across are so wide in the smaller image; their number each way is bounded."""
+"""Width of a step across in the smaller image; the number of steps to either side is bounded."""
 STEP_ALONG_M, STEP_ALONG_SHARE = 0.6, 1 / 15
 """Steps along the car's axis: least, and as a share of the distance."""
 ROUNDS, FINER = 3, 2.5
 """Number of searches around the best after the first one, and the factor by which each reduces the step."""
 CONTRAST, COLOUR = 2.0, 0.1
-"""Differences of normalized brightness, and of colours, from which on nothing gets worse."""
+"""Differences of normalized brightness, and of colours, at which the cost saturates."""
 OUTSIDE = 0.5
 """Cost of points that the other image does not show."""
 FAR_PENALTY, BETTER = 0.05, 0.06
-"""Cost of the largest possible motion; and how much better than standing still a motion must fit."""
+"""Cost of the largest possible motion; and how much better than no motion a motion must fit."""
 EDGE = 0.15
-"""Things end where the logarithm of the depth jumps by more."""
-LEAST_PIXELS, MOST_THINGS = 32, 8
-"""Of a thing; and in an image, the largest ones."""
+"""Objects end where the logarithm of the depth jumps by more."""
+LEAST_PIXELS, MOST_OBJECTS = 32, 8
+"""Pixels of an object, and objects in an image, the largest ones."""
 SAMPLES, FIRST_SAMPLES = 128, 40
-"""Points that are compared of each thing, about, and in the first search."""
+"""Number of compared points of an object, about, and in the first search."""
 
 
 @torch.no_grad()
@@ -46,12 +46,12 @@ def searched_motion(
     movable: Bool[Tensor, "b v h w"],
     motion_m: Float[Tensor, "b v h w 2 3"],
 ) -> Float[Tensor, "b v h w 2 3"]:
-    """``motion_m`` with that of movable things replaced wherever matching found it.
+    """``motion_m`` with that of movable objects replaced wherever matching found it.
 
     Args:
         inputs: the images and their rays; ``rig_from_scene`` must be given.
         depth_m: z-depth, metres.
-        movable: pixels of things that can move.
+        movable: pixels of objects that can move.
         motion_m: displacements to the times before and after, metres, scene frame.
 
     Raises:
@@ -91,15 +91,15 @@ def _search_clip(
         # Both neighbours test one velocity: shifts are per shortest gap and scale with each frame's own.
         unit = min(abs(span) for span in spans)
         frames = [_Frame(images.views[n], appearance[n], span / unit) for n, span in zip(others, spans, strict=True)]
-        thing_of = torch.from_numpy(things(depth_m[k], movable[k])).to(depth_m.device)
-        for number in range(1, int(thing_of.max()) + 1):
-            mine = thing_of == number
-            thing = _Thing(points[k][mine], _appearance_at(appearance[k], mine))
-            shift = thing.search(frames, car_axes, images.size[1])
+        object_of = torch.from_numpy(objects_of(depth_m[k], movable[k])).to(depth_m.device)
+        for number in range(1, int(object_of.max()) + 1):
+            mine = object_of == number
+            moved = _Object(points[k][mine], _appearance_at(appearance[k], mine))
+            shift = moved.search(frames, car_axes, images.size[1])
             motion_m[k][mine] = (gaps[k, :, None] / unit * shift)[None].to(motion_m.dtype)
 
 
-def things(depth_m: Float[Tensor, "h w"], movable: Bool[Tensor, "h w"]) -> Int32[np.ndarray, "h w"]:
+def objects_of(depth_m: Float[Tensor, "h w"], movable: Bool[Tensor, "h w"]) -> Int32[np.ndarray, "h w"]:
     """Numbers of the largest connected pieces of what is movable, from 1; 0 elsewhere. Pieces end at edges of depth."""
     log_depth, mask = depth_m.clamp(min=1e-3).log().cpu().numpy(), movable.cpu().numpy()
     jump = np.zeros(mask.shape, bool)
@@ -108,7 +108,7 @@ def things(depth_m: Float[Tensor, "h w"], movable: Bool[Tensor, "h w"]) -> Int32
     jump[1:] |= np.abs(np.diff(log_depth, axis=0)) > EDGE
     count, pieces, stats, _ = cv2.connectedComponentsWithStats((mask & ~jump).astype(np.uint8), connectivity=4)
     areas = stats[1:, cv2.CC_STAT_AREA]
-    largest = np.argsort(-areas, kind="stable")[:MOST_THINGS]
+    largest = np.argsort(-areas, kind="stable")[:MOST_OBJECTS]
     renumbered = np.zeros(count, np.int32)
     for number, piece in enumerate(largest[areas[largest] >= LEAST_PIXELS]):
         renumbered[piece + 1] = number + 1
@@ -128,15 +128,15 @@ def _appearance_at(look: Float[Tensor, "4 h w"], mine: Bool[Tensor, "h w"]) -> F
 
 
 class _Frame(NamedTuple):
-    """A frame to look into: projection, appearance features, and how long after the thing's own (least gap = 1)."""
+    """A neighbouring frame: projection, appearance features, and time after the frame of the object (least gap = 1)."""
 
     view: ImageView
     look: Float[Tensor, "4 h w"]
     span: float
 
 
-class _Thing:
-    """Some points of one thing and their appearance features."""
+class _Object:
+    """Some points of one object and their appearance features."""
 
     def __init__(self, points: Float[Tensor, "n 3"], look: Float[Tensor, "4 n"]) -> None:
         step = max(1, len(points) // SAMPLES)

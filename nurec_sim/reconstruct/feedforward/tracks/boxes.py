@@ -1,6 +1,6 @@
-"""From the points of a moving thing over time to a track: its box, its label and the path of its centre.
+"""From the points of a moving object over time to a track: its box, its label and the path of its centre.
 
-A thing is seen from one side. Its box has the largest extent that was seen, or the least size of its kind, and lies
+An object is seen from one side. Its box has the largest extent that was seen, or the least size of its kind, and lies
 behind the surface that faces the recording car.
 """
 
@@ -16,23 +16,23 @@ from nurec_sim import geometry
 from nurec_sim.types import Matrix4, Track, Trajectory
 
 STANDING_MPS = 0.5
-"""Slower things are static; their heading is the longer side of what was seen."""
+"""Slower objects are static; their heading is the longer side of what was seen."""
 EXTENT = (0.05, 0.95)
-"""Quantiles of the points that count as the ends of a thing."""
+"""Quantiles of the points that count as the ends of an object."""
 BEST_VIEW = 0.8
-"""Quantile, over the instants, of what was seen of a thing's length, width or height that counts as its own."""
+"""Quantile, over the instants, of what was seen of an object's length, width or height that counts as its own."""
 LEAST_M: Mapping[str, tuple[float, float, float]] = {
     "person": (0.5, 0.5, 1.5),
     "rider": (1.6, 0.6, 1.5),
     "automobile": (4.2, 1.7, 1.4),
     "heavy_truck": (6.0, 2.2, 2.6),
 }
-"""Length, width and height that things of a label have at least."""
+"""Length, width and height that objects of a label have at least."""
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """Where the points of a thing are at one instant, and how they move."""
+    """Where the points of an object are at one instant, and how they move."""
 
     t_us: int
     position_m: Float64[np.ndarray, "n 3"]
@@ -40,7 +40,7 @@ class Sighting:
 
 
 def track_of(name: str, sightings: Sequence[Sighting], ego: Trajectory) -> Track:
-    """A track of constant size from the first to the last sighting; one pose if the thing is static.
+    """A track of constant size from the first to the last sighting; one pose if the object is static.
 
     Args:
         name: id of the track.
@@ -114,7 +114,7 @@ def _steadied(
 
 
 def _headings(velocity: Float64[np.ndarray, "t 3"], speed: Float64[np.ndarray, " t"]) -> Float64[np.ndarray, " t"]:
-    """Direction of motion; where a thing stops for a while that of the instant nearest in time at which it moves."""
+    """Direction of motion; where an object stops for a while that of the instant nearest in time at which it moves."""
     moving = np.flatnonzero(speed >= STANDING_MPS)
     nearest = moving[np.argmin(np.abs(np.arange(len(speed))[:, None] - moving), axis=1)]
     return np.arctan2(velocity[nearest, 1], velocity[nearest, 0])
@@ -128,7 +128,7 @@ def _long_side(xy: Float64[np.ndarray, "n 2"]) -> float:
 
 
 def _label(extent: Float64[np.ndarray, " 3"], speed_mps: float) -> str:
-    """What a thing of this size and speed most likely is (one of ``MOVABLE_LABELS``)."""
+    """What an object of this size and speed most likely is (one of ``MOVABLE_LABELS``)."""
     length, width, height = extent
     if max(length, width) < 1.3 and height < 2.3:
         return "person" if speed_mps < 3.5 else "rider"

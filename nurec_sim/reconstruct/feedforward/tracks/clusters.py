@@ -2,7 +2,7 @@
 
 Frames of different cameras and chunks are exposed at different times. So every Gaussian is placed, by its own motion,
 at the two instants of a common clock that lie around its middle knot. At each instant Gaussians close to each other and
-alike in velocity are one *blob*; a blob and one of the next instant are the same thing if each shares more Gaussians
+alike in velocity are one *blob*; a blob and one of the next instant are the same object if each shares more Gaussians
 with the other than with any other blob. Such chains of blobs, which may miss an instant or two, become tracks
 (``boxes``), the largest first, and each takes along what moves with it inside its box.
 """
@@ -37,7 +37,7 @@ MIN_GAUSSIANS = 20
 MIN_INSTANTS = 2
 """What was seen around one instant only is no track."""
 ALIKE_MPS = 1.0
-"""A Gaussian in a thing's box belongs to it if its velocity differs by less than this."""
+"""A Gaussian in an object's box belongs to it if its velocity differs by less than this."""
 MOMENT_US = 100_000
 """The velocity of a path is taken over this long before and after."""
 MOST_MISSED = 2
@@ -69,11 +69,11 @@ class _Placed:
 def group_into_tracks(
     dynamic: DynamicGaussians, ego: Trajectory, first_index: int = 0, taken: Collection[str] = ()
 ) -> tuple[tuple[Track, ...], Int32[np.ndarray, " n"]]:
-    """Tracks of the moving things among the Gaussians that have none, over a whole clip.
+    """Tracks of the moving objects among the Gaussians that have none, over a whole clip.
 
     Args:
         dynamic: the merged dynamic layer; those with ``track == -1`` are grouped.
-        ego: the recording car, from which every thing was seen from one side only.
+        ego: the recording car, from which every object was seen from one side only.
         first_index: index that the first new track will have among the scene's.
         taken: ids that new tracks must not get.
 
@@ -121,7 +121,7 @@ def _living(track: Track, times: Int64[np.ndarray, "n 3"]) -> Track:
 def _goes_along(
     track: Track, xyz_m: Float64[np.ndarray, "n 3"], t_us: Int64[np.ndarray, " n"], velocity: Float64[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
-    """Which points lie in a track's padded box and move with it: sides of a thing too sparse to be linked to it."""
+    """Which points lie in a track's padded box and move with it: sides of an object too sparse to be linked to it."""
     inside = owners_of_points([Actor(0, track, False, track.path)], xyz_m, t_us, np.ones(len(xyz_m), bool)) == 0
     rows = np.flatnonzero(inside)
     before = np.maximum(t_us[rows] - MOMENT_US, track.path.start_us)
@@ -219,7 +219,7 @@ def _components(pairs: Int64[np.ndarray, "k 2"], nodes: int) -> tuple[int, Int32
 def _chains(blobs: _Blobs, step_us: int) -> Int64[np.ndarray, " blobs"]:
     """The chain of each blob: it and a blob of the next instant are linked if each shares most with the other."""
     number = len(blobs.instant)
-    # A Gaussian lies in a blob of each of its two instants: it votes for them being one thing.
+    # A Gaussian lies in a blob of each of its two instants: it votes for them being one object.
     both = blobs.of_gaussian[:, (blobs.of_gaussian >= 0).all(axis=0)]
     pair, shared = np.unique(both[0] * number + both[1], return_counts=True)
     earlier, later = np.divmod(pair, number)
@@ -233,7 +233,7 @@ def _chains(blobs: _Blobs, step_us: int) -> Int64[np.ndarray, " blobs"]:
 def _bridges(
     blobs: _Blobs, links: Int64[np.ndarray, "k 2"], missed: int, step_us: int
 ) -> Int64[np.ndarray, "bridges 2"]:
-    """Links over instants at which a thing was hidden: from ends of chains to beginnings where they were heading."""
+    """Links over instants at which an object was hidden: from ends of chains to beginnings where they were heading."""
     everything = np.arange(len(blobs.instant))
     ends, beginnings = np.setdiff1d(everything, links[:, 0]), np.setdiff1d(everything, links[:, 1])
     # Constant velocity over the hidden instants; velocities are stored times METRES_PER_MPS.
