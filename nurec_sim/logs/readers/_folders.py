@@ -1,4 +1,4 @@
-"""Formats whose logs are folders: the base of their readers, and the files of a sensor."""
+"""Formats whose logs are folders of files: the base of their readers, and the files of a sensor."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ class FolderReader(abc.ABC):
             ClipError: a file or a value is missing or wrong, or there are several logs.
         """
         found = self.logs(path)
-        if len(found) != 1:
+        if not found:
+            raise ClipError(f"holds no {self.noun}; give {self.description}")
+        if len(found) > 1:
             names = [str(each.relative_to(path)) for each in found[:NAMES_SHOWN]]
             more = f" and {len(found) - NAMES_SHOWN} more" if len(found) > NAMES_SHOWN else ""
             raise ClipError(f"holds {len(found)} {self.noun}; give the folder of one: {names}{more}")
@@ -43,11 +45,11 @@ class FolderReader(abc.ABC):
 
     @abc.abstractmethod
     def logs(self, path: Path) -> list[Path]:
-        """Folders of logs: the path itself, or those below it, sorted."""
+        """Folders (or main files) of logs: the path itself, or those below it, sorted."""
 
     @abc.abstractmethod
-    def read(self, folder: Path) -> Clip:
-        """The clip in the folder of a log; errors as for ``open``."""
+    def read(self, log: Path) -> Clip:
+        """The clip in one of ``logs``; errors as for ``open``."""
 
 
 def numbered_files(root: Path, folder: str, suffix: str) -> dict[int, str]:

@@ -60,9 +60,9 @@ class Argoverse2Reader(FolderReader):
                 return [each for each in found if (each / SENSORS).is_file()]
         return []
 
-    def read(self, folder: Path) -> Clip:
+    def read(self, log: Path) -> Clip:
         """The log as a clip."""
-        return _read(Storage(folder))
+        return _read(Storage(log))
 
 
 def _read(storage: Storage) -> Clip:

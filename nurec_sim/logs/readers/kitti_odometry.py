@@ -48,9 +48,9 @@ class KittiOdometryReader(FolderReader):
             if SEQUENCE.fullmatch(each.resolve().name) and all((each / name).is_file() for name in FILES)
         )
 
-    def read(self, folder: Path) -> Clip:
+    def read(self, log: Path) -> Clip:
         """The sequence as a clip."""
-        return _read(Storage(folder.parents[1]), folder.name)
+        return _read(Storage(log.parents[1]), log.name)
 
 
 def _read(storage: Storage, sequence: str) -> Clip:

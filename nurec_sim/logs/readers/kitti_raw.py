@@ -52,9 +52,9 @@ class KittiRawReader(FolderReader):
         found = sorted([*path.glob("*_drive_*_sync"), *path.glob("*/*_drive_*_sync")])
         return [each for each in found if DRIVE.fullmatch(each.name) and each.is_dir()]
 
-    def read(self, folder: Path) -> Clip:
+    def read(self, log: Path) -> Clip:
         """The drive as a clip."""
-        return _read(Storage(folder.parent), folder.name)
+        return _read(Storage(log.parent), log.name)
 
 
 def _read(storage: Storage, drive: str) -> Clip:

@@ -20,7 +20,7 @@ from nurec_sim.logs import calibration
 from nurec_sim.logs.boxes import BoxTracks
 from nurec_sim.logs.clip import Clip, ImageRecord
 from nurec_sim.logs.readers import _waymo_lidar as ranges
-from nurec_sim.logs.readers._folders import only_one
+from nurec_sim.logs.readers._folders import FolderReader
 from nurec_sim.logs.readers._waymo_tables import CAMERA, LASER, OBJECT, ROW, TIME, Tables, floats, transforms
 from nurec_sim.logs.storage import decode_image
 from nurec_sim.logs.sweeps import SweepRecord
@@ -45,7 +45,7 @@ _EXPOSURE = tuple(
 )
 
 
-class WaymoReader:
+class WaymoReader(FolderReader):
     """Reads segments of Waymo's Perception data set v2 as clips (``types.LogReader``)."""
 
     name = "waymo-v2"
@@ -53,33 +53,18 @@ class WaymoReader:
         f"a folder of Waymo Perception v2 with {POSE}/SEGMENT.parquet and its other components beside it, "
         "or one such file if there are several segments"
     )
+    noun = "segments of Waymo Perception v2"
 
-    def can_open(self, path: Path) -> bool:
-        """Whether it is a folder with components, or a file of one, by names."""
-        return bool(_segments(path))
+    def logs(self, path: Path) -> list[Path]:
+        """The files of the vehicle's poses, one for each segment; of any component's file, that beside it."""
+        if path.is_file() and path.suffix == ".parquet":
+            beside = path.resolve().parent.parent / POSE / path.name
+            return [beside] if beside.is_file() else []
+        return sorted((path / POSE).glob("*.parquet")) if path.is_dir() else []
 
-    def open(self, path: Path) -> Clip:
-        """The segment as a clip.
-
-        Raises:
-            ClipError: a file or a column is missing or wrong, or there are several segments.
-        """
-        if path.is_file():
-            found = _segments(path)
-            if not found:
-                raise ClipError(f"is no segment of Waymo Perception v2; give {self.description}")
-            file = found[0].resolve()
-        else:
-            file = only_one(path, _segments(path), "segments of Waymo Perception v2")
-        return _read(Tables(file.parent.parent, file.stem))
-
-
-def _segments(path: Path) -> list[Path]:
-    """The files of the vehicle's poses at a path, one for each segment; of any component's file, that beside it."""
-    if path.is_file() and path.suffix == ".parquet":
-        beside = path.resolve().parent.parent / POSE / path.name
-        return [beside] if beside.is_file() else []
-    return sorted((path / POSE).glob("*.parquet")) if path.is_dir() else []
+    def read(self, log: Path) -> Clip:
+        """The segment as a clip."""
+        return _read(Tables(log.parent.parent, log.stem))
 
 
 @dataclass(frozen=True)
