@@ -32,6 +32,7 @@ def reconstruct(
     cameras: tuple[str, ...] = (),
     map_from_gaussians: bool = False,
     refine: float | None = None,
+    resume: bool = False,
     overwrite: bool = False,
     changes: Annotated[
         tuple[str, ...], tyro.conf.arg(name="set", metavar="NAME=VALUE"), tyro.conf.UseAppendAction
@@ -44,7 +45,7 @@ def reconstruct(
     one Gaussian per pixel or clusters around selected points; the second group of options applies to them. `nurec-sim
     weights list` shows profiles and local weights. `optimized` optimises the result of `lift` on the log for five
     minutes, or for --refine seconds; --refine does so after any other method. Ctrl-C during optimisation keeps its
-    result so far.
+    best result so far; the same command with --resume goes on from there, also after a kill.
 
     Args:
         clip: a driving log, such as a clip folder or a .zip of one.
@@ -55,6 +56,7 @@ def reconstruct(
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
         refine: time budget in seconds for optimising the scene on the log's images and sweeps.
+        resume: go on with an optimisation that was interrupted, from its state in OUT.refine.npz.
         overwrite: replace an existing archive.
         network: network settings.
     """
@@ -64,8 +66,9 @@ def reconstruct(
     settings = method_settings(method, network, changes)
     log = logs.open_clip(clip)
     target = out_path or Path(f"{log.id}.usdz")
-    if target.exists() and not overwrite:
+    if target.exists() and not overwrite and not resume:
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
+    settings, fit = _with_checkpoint(method, settings, refinement(refine), target, resume)
     check_writable(target)
     with progress("reconstructing") as advance:
         world_scene = run_method(
@@ -74,7 +77,7 @@ def reconstruct(
             cameras=cameras or None,
             progress=advance,
             settings=settings,
-            refine=refinement(refine),
+            refine=fit,
         )
     derived = None
     if map_from_gaussians and world_scene.road_map is None:
@@ -185,6 +188,22 @@ def refinement(seconds: float | None) -> OptimizeSettings | None:
         return OptimizeSettings(seconds=seconds)
     except ValueError as error:
         raise NurecSimError(f"--refine: {error}") from None
+
+
+def _with_checkpoint(
+    method: str, settings: Any, fit: OptimizeSettings | None, target: Path, resume: bool
+) -> tuple[Any, OptimizeSettings | None]:
+    """Settings of the method and of the optimisation, which keeps its state beside the archive."""
+    from nurec_sim.reconstruct import load_method
+
+    kept: dict[str, Any] = {"checkpoint": target.with_name(f"{target.name}.refine.npz"), "resume": resume}
+    if fit is not None:
+        return settings, dataclasses.replace(fit, **kept)
+    if load_method(method).settings is OptimizeSettings:
+        return dataclasses.replace(settings or OptimizeSettings(), **kept), None
+    if resume:
+        raise NurecSimError(f"--resume goes on with an optimisation; give --refine, or --method optimized ({method!r})")
+    return settings, None
 
 
 def loaded(source: Path, device: str) -> LoadedScene:

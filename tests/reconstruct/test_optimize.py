@@ -1,6 +1,7 @@
 """Per-scene optimisation: its losses against skimage and finite differences, and what it makes of a street."""
 
 import dataclasses
+import signal
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from nurec_sim.reconstruct.optimize.depth_loss import depth_loss
 from nurec_sim.reconstruct.optimize.image_loss import colour_loss
 from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
 from nurec_sim.reconstruct.optimize.responses import borrowed_responses
+from nurec_sim.reconstruct.optimize.settings import LearningRates, PosePriors
 from nurec_sim.reconstruct.optimize.views import Returns, returns_in, training_views
 from nurec_sim.render import CpuRenderer
 from nurec_sim.render.cpu.backward.frame import SENSORS, Frame, zeros_by_gaussian
@@ -93,6 +95,77 @@ def test_an_interruption_keeps_what_has_been_reached(street, lifted):
     scene = method.refine(lifted, street, ["front"], set(), interrupt, OptimizeSettings(seconds=None, steps=1000))
     assert scene.provenance["refined"]["steps"] == 5
     assert mean_psnr(scene, street, "front") > mean_psnr(lifted, street, "front")
+
+
+def test_an_optimisation_resumes_exactly(street, lifted, tmp_path, monkeypatch):
+    """Ctrl-C within the fourth step of eight: that step ends, and the rest gives the bytes of an uncut run."""
+    whole = OptimizeSettings(seconds=None, steps=8, check_every=2)
+    uncut = method.refine(lifted, street, ["front"], set(), lambda *_: None, whole)
+    assert uncut.provenance["refined"]["held_out_psnr_db"] > 0
+    kept = dataclasses.replace(whole, checkpoint=tmp_path / "state.npz")
+    step = method.Optimization.step
+
+    def interrupted(self, number, rate):
+        if self.steps == 3:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, number, rate)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # background processes ignore it
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(method.Optimization, "step", interrupted)
+            method.refine(lifted, street, ["front"], set(), lambda *_: None, kept)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    counts = []
+    resume = dataclasses.replace(kept, resume=True)
+    with pytest.raises(ReconstructError, match="belongs to another optimisation"):
+        method.refine(lifted, street, ["front"], {0}, lambda *_: None, resume)
+    again = method.refine(lifted, street, ["front"], set(), lambda stage, _: counts.append(stage), resume)
+    assert [text.split(",")[1] for text in counts if text.startswith("fitting")] == [
+        f" {k} images" for k in range(5, 9)
+    ]
+    assert scene_hash(again) == scene_hash(uncut)
+    assert not kept.checkpoint.exists(), "the budget is spent"
+    with pytest.raises(ReconstructError, match="nothing to resume"):
+        method.refine(lifted, street, ["front"], set(), lambda *_: None, resume)
+    kept.checkpoint.write_bytes(b"PK")
+    with pytest.raises(ReconstructError, match="is not the state of an optimisation"):
+        method.refine(lifted, street, ["front"], set(), lambda *_: None, resume)
+
+
+def test_the_best_state_by_held_out_images_is_kept(street, lifted, monkeypatch):
+    """Learning rates far too large after the first check: what was best by then is the result."""
+    settings = OptimizeSettings(seconds=None, steps=20, check_every=2, final_rate=1.0)
+    step = method.Optimization.step
+    monkeypatch.setattr(
+        method.Optimization, "step", lambda run, number, rate: step(run, number, 100.0 if run.steps > 9 else rate)
+    )
+    scene = method.refine(lifted, street, ["front"], set(), lambda *_: None, settings)
+    assert 2 <= scene.provenance["refined"]["steps"] <= 10
+    run = method.Optimization(scene, training_views(street, scene, ["front"], set()), settings)
+    assert run.checked == [1, 3]
+    assert np.mean([psnr(image_of(scene, street, "front", k), street.image("front", k)) for k in run.checked]) == (
+        pytest.approx(scene.provenance["refined"]["held_out_psnr_db"], abs=0.1)
+    )
+
+
+def test_a_wrong_pose_is_corrected(street, lifted):
+    views = training_views(street, lifted, ["front"], set())
+    wrong = views[2].world_from_camera.copy()
+    wrong[:, :3, 3] += (0.0, 0.04, 0.0)
+    views[2] = dataclasses.replace(views[2], world_from_camera=wrong)
+    settings = OptimizeSettings(
+        seconds=None, steps=60, final_rate=0.3, rates=LearningRates(0, 0, 0, 0, 0, 0), correct_poses=True,
+        poses=PosePriors(shift_m=0.05),
+    )  # fmt: skip
+    run = method.Optimization(lifted, views, settings)
+    run.run(lambda *_: None)
+    assert run.poses.of(2)[4] == pytest.approx(-0.04, abs=0.015)
+    assert max(np.abs(run.poses.of(k)[4]) for k in (0, 1, 3)) < 0.02
+    told = run.scene(street).provenance["refined"]["poses"]["front"]
+    assert told["largest_shift_m"] > 0.02 and abs(told["time_offset_ms"]) < 2
 
 
 def test_the_method_is_lift_and_a_fit_and_needs_images(street):
@@ -287,7 +360,7 @@ def test_gradients_of_the_shown_image_are_those_of_differences():
         np.moveaxis(planes[1:4, :24, :40], 0, -1) + through * np.moveaxis(frame.draw_sky(sky), 0, -1)
     ) @ response[:, :3].T + response[:, 3]
     assert np.allclose(shown, expected, atol=1e-5)
-    by_planes, by_sky, sums = composite.back(response, shown, weight)
+    by_planes, by_sky, _, sums = composite.back(response, shown, weight)
     by_planes = by_planes.copy()
     assert sums == pytest.approx(np.stack([(weight * shown).sum(axis=(0, 1)), weight.sum(axis=(0, 1))]), rel=1e-4)
 

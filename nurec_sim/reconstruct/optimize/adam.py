@@ -141,16 +141,16 @@ class SkyAdam:
         adam_cells(sky.reshape(self._shape), self.first, self.second, self.visits, gradient.reshape(self._shape), rate)
 
 
-class DenseAdam:
-    """Adam on a whole small array, with the same constants."""
+class RowAdam:
+    """Adam on the rows of a small array, with the same constants; rows rest until they are stepped."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self.first, self.second, self.steps = np.zeros(shape), np.zeros(shape), 0
+        self.first, self.second, self.visits = np.zeros(shape), np.zeros(shape), np.zeros(shape[0], np.int64)
 
-    def step(self, values: np.ndarray, gradient: np.ndarray, rate: float) -> None:
-        """Change ``values`` in place."""
-        self.steps += 1
-        self.first += (1 - BETA1) * (gradient - self.first)
-        self.second += (1 - BETA2) * (gradient * gradient - self.second)
-        corrected = np.sqrt(self.second / (1 - BETA2**self.steps)) + EPSILON
-        values -= (rate * self.first / (1 - BETA1**self.steps) / corrected).astype(values.dtype)
+    def step(self, row: int, values: np.ndarray, gradient: np.ndarray, rate: float) -> None:
+        """Change ``values[row]`` in place."""
+        self.visits[row] += 1
+        first, second, visits = self.first[row], self.second[row], self.visits[row]
+        first += (1 - BETA1) * (gradient - first)
+        second += (1 - BETA2) * (gradient * gradient - second)
+        values[row] -= rate * first / (1 - BETA1**visits) / (np.sqrt(second / (1 - BETA2**visits)) + EPSILON)

@@ -45,8 +45,14 @@ class Composite:
         response: Float64[np.ndarray, "3 4"],
         shown: Float32[np.ndarray, "h w 3"],
         by_shown: Float32[np.ndarray, "h w 3"],
-    ) -> tuple[Float32[np.ndarray, "6 h w"], Float64[np.ndarray, "6 s s 3"], Float64[np.ndarray, "2 3"]]:
-        """Gradients by the frame's planes and by the sky, and the sums of ``by_shown * shown`` and of ``by_shown``."""
+    ) -> tuple[
+        Float32[np.ndarray, "6 h w"], Float64[np.ndarray, "6 s s 3"], Float64[np.ndarray, "4 4"],
+        Float64[np.ndarray, "2 3"],
+    ]:  # fmt: skip
+        """Gradients by the frame's planes, and by the sky and the pose it is seen from; sums for the response.
+
+        The sums over all pixels, by channel, are those of ``by_shown * shown`` and of ``by_shown``.
+        """
         by_planes, by_behind = self._frame.empty_planes(), np.empty((3, *self._valid.shape), np.float32)
         sums = np.zeros((PARTS, 2, 3))
         values = (
@@ -60,8 +66,7 @@ class Composite:
             by_behind,
         )
         shared_workers(None).run(_take_back, [(*rows, *values, sums[k]) for k, rows in enumerate(self._bands)])
-        by_sky, _ = self._frame.draw_sky_back(self._sky, by_behind)
-        return by_planes, by_sky, sums.sum(axis=0)
+        return by_planes, *self._frame.draw_sky_back(self._sky, by_behind), sums.sum(axis=0)
 
 
 @kernel

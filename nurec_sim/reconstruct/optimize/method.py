@@ -7,27 +7,38 @@ response. Only Gaussians in view take part.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
+import itertools
+import signal
+import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import FrameType
 
 import numpy as np
 
 from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.optimize.adam import SkyAdam
+from nurec_sim.reconstruct.optimize.checkpoint import read_checkpoint, write_checkpoint
 from nurec_sim.reconstruct.optimize.compositing import Composite
 from nurec_sim.reconstruct.optimize.depth_loss import depth_loss
 from nurec_sim.reconstruct.optimize.image_loss import colour_loss
 from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
+from nurec_sim.reconstruct.optimize.poses import PoseCorrections
 from nurec_sim.reconstruct.optimize.responses import FrameResponses, borrowed_responses
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 from nurec_sim.reconstruct.optimize.views import TrainingView, training_views
 from nurec_sim.render.cpu.backward.frame import SENSORS, Frame
+from nurec_sim.scene import scene_hash
 from nurec_sim.types import Clip, GaussianScene
 
 Progress = Callable[[str, float], None]
 SEEN_SKY = 0.05
 """Pixels with less alpha than this at the start show the sky."""
+CHECK_SHARE = 0.05
+"""The images held out are looked at once in this share of the budget."""
 
 
 def refine(
@@ -40,7 +51,7 @@ def refine(
 ) -> GaussianScene:
     """Fit a scene to the images of some cameras and to the sweeps of its clip.
 
-    An interruption (KeyboardInterrupt) ends it early; what has been reached by then is the result.
+    Ctrl-C ends it early, after the present step; the best state by then is the result.
 
     Args:
         scene: what any method made of the clip.
@@ -60,41 +71,151 @@ def refine(
     if not views:
         raise ReconstructError(f"clip {clip.id!r}: an optimisation needs images; cameras {list(cameras)} have none")
     run = Optimization(scene, views, settings)
+    if settings.checkpoint is not None:
+        run.key = _key(scene, cameras, hold_out, settings)
+        if settings.resume:
+            run.restore(read_checkpoint(settings.checkpoint, run.key))
     run.run(progress)
     return run.scene(clip)
+
+
+def _key(scene: GaussianScene, cameras: Sequence[str], hold_out: set[int], settings: OptimizeSettings) -> str:
+    """What a checkpoint must have in common with the optimisation that resumes it: all but the budget."""
+    same = dataclasses.replace(settings, seconds=None, steps=1, checkpoint=None, checkpoint_s=0.0, resume=False)
+    text = f"{scene_hash(scene)} {list(cameras)} {sorted(hold_out)} {same}"
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@contextlib.contextmanager
+def _whole_steps() -> Iterator[list[int]]:
+    """Ctrl-C fills the list, so that a step is not torn apart; the second one raises KeyboardInterrupt."""
+    interrupted: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if interrupted:
+            raise KeyboardInterrupt
+        interrupted.append(number)
+
+    usual = signal.getsignal(signal.SIGINT)
+    # Handlers belong to the main thread; a caller that handles or ignores Ctrl-C itself is left alone.
+    if threading.current_thread() is not threading.main_thread() or usual is not signal.default_int_handler:
+        yield interrupted
+        return
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, usual)
 
 
 class Optimization:
     """What changes while a scene is fitted."""
 
     def __init__(self, scene: GaussianScene, views: Sequence[TrainingView], settings: OptimizeSettings) -> None:
-        self.settings, self.views = settings, views
+        self.settings, self.views, self.key = settings, views, ""
         self.parameters = Parameters(scene)
         self.sky = scene.sky.astype(np.float32).copy()
         self._sky_adam = SkyAdam(self.sky)
         frames = {view.camera.id: 0 for view in views}
         for view in views:
             frames[view.camera.id] += 1
+        self.poses = PoseCorrections(views, settings.poses)
         self.responses = FrameResponses(scene.isp, frames)
-        self._clear: dict[int, tuple[np.ndarray, ...]] = {}
-        self.steps = 0
+        every = settings.check_every
+        self.checked = [
+            number for number, view in enumerate(views)
+            if every and frames[view.camera.id] >= 2 * every and view.frame % every == every // 2
+        ]  # fmt: skip
+        self._clear: dict[int, np.ndarray] = {}
+        self.steps, self._seconds_before = 0, 0.0
+        self.best: dict[str, np.ndarray] = {}
+        self.best_psnr_db, self.best_steps = -np.inf, 0
 
     def run(self, progress: Progress) -> None:
-        """Spend the budget."""
+        """Spend the budget; end with the best state."""
         started, smooth, order = time.perf_counter(), float("nan"), self._order()
-        try:
-            while (spent := self._spent(time.perf_counter() - started)) < 1:
+        saved, checked, file = started, self._spent(self._seconds_before), self.settings.checkpoint
+        with _whole_steps() as interrupted, contextlib.suppress(KeyboardInterrupt):
+            while (spent := self._spent(seconds := self._seconds_before + time.perf_counter() - started)) < 1:
+                if spent >= checked + CHECK_SHARE:
+                    checked = spent
+                    self._check()
+                if file is not None and (interrupted or time.perf_counter() - saved > self.settings.checkpoint_s):
+                    write_checkpoint(file, self.key, self.state(seconds))
+                    saved = time.perf_counter()
+                if interrupted:
+                    break
                 loss = self.step(next(order), self.settings.final_rate**spent)
                 smooth = loss if smooth != smooth else 0.95 * smooth + 0.05 * loss
-                progress(f"fitting, {self.steps} images, loss {smooth:.4f}", spent)
-        except KeyboardInterrupt:
-            pass  # the caller gets what has been reached
+                progress(f"fitting, {self._text(smooth)}", spent)
+        if file is not None and not interrupted:
+            file.unlink(missing_ok=True)
+        self._check()
+        self._restore(self.best)
+
+    def _text(self, loss: float) -> str:
+        known = f", best {self.best_psnr_db:.2f} dB" if self.best else ""
+        return f"{self.steps} images, loss {loss:.4f}{known}, {len(self.parameters) / 1e6:.2f} M Gaussians"
+
+    def _check(self) -> None:
+        """Keep the state if it shows the images that are held out better than all before."""
+        if not self.checked:
+            return
+        psnr_db = float(np.mean([self.psnr_db(number) for number in self.checked]))
+        if psnr_db > self.best_psnr_db:
+            self.best_psnr_db, self.best_steps = psnr_db, self.steps
+            self.best = {name: array.copy() for name, array in self._result().items()}
+
+    def psnr_db(self, number: int) -> float:
+        """How well an image is shown."""
+        view = self.views[number]
+        frame = Frame(SENSORS.tables(view.camera), self.poses.pair(number), False)
+        frame.draw_packed(self.parameters.at(view.t_us).packed)
+        shown = Composite(frame, self.sky).shown(self.responses.of(view.camera.id, view.frame))
+        error = np.square(np.clip(shown, 0, 1) - view.colours).mean(dtype=np.float64)
+        return -10 * float(np.log10(max(error, 1e-12)))
+
+    def _result(self) -> dict[str, np.ndarray]:
+        """The arrays that make the scene, as they are kept."""
+        found = {"values": self.parameters.values, "sky": self.sky, "poses": self.poses.values,
+                 "offsets": self.poses.offsets}  # fmt: skip
+        return found | {f"response {name}": values for name, values in self.responses.values.items()}
+
+    def _moments(self) -> dict[str, np.ndarray]:
+        """The arrays of all Adams, as they are kept."""
+        adams = {"gaussians": self.parameters, "sky": self._sky_adam, "poses": self.poses.adam,
+                 "offsets": self.poses.offset_adam}  # fmt: skip
+        adams |= {f"response {name}": adam for name, adam in self.responses.adam.items()}
+        return {f"{part} of {name}": getattr(adam, part) for name, adam in adams.items()
+                for part in ("first", "second", "visits")}  # fmt: skip
+
+    def state(self, seconds: float) -> dict[str, np.ndarray]:
+        """Everything that a later run needs to go on exactly; ``seconds`` have been spent."""
+        numbers = np.array([self.steps, seconds, self.best_steps, self.best_psnr_db])
+        best = {f"best {name}": array for name, array in self.best.items()}
+        clear = {f"clear {number}": rows for number, rows in self._clear.items()}
+        return self._result() | self._moments() | best | clear | {"numbers": numbers}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on from a state."""
+        steps, self._seconds_before, best_steps, self.best_psnr_db = state["numbers"].tolist()
+        self.steps, self.best_steps = int(steps), int(best_steps)
+        self.best = {name.removeprefix("best "): a for name, a in state.items() if name.startswith("best ")}
+        self._clear = {int(name.split()[1]): a for name, a in state.items() if name.startswith("clear ")}
+        self._restore({name: state[name] for name in self._result() | self._moments()})
+
+    def _restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        for name, array in (self._result() | self._moments()).items():
+            if name in arrays:
+                array[...] = arrays[name]
+        if "values" in arrays:
+            self.parameters.values_changed()
 
     def step(self, number: int, rate: float) -> float:
         """Fit one view, with learning rates ``rate`` times those at the start; the loss before the step."""
         view, weights, rates = self.views[number], self.settings.weights, self.settings.rates
         height, width = view.image.shape[:2]
-        frame = Frame(SENSORS.tables(view.camera), view.world_from_camera, False)
+        frame = Frame(SENSORS.tables(view.camera), self.poses.pair(number), False)
         drawn = self.parameters.at(view.t_us)
         alpha, distance = frame.draw_packed(drawn.packed)[[0, 4], :height, :width]
         composite, recorded = Composite(frame, self.sky), view.colours
@@ -105,20 +226,24 @@ class Optimization:
         shown = composite.shown(response)
         loss, by_shown = colour_loss(shown, recorded, weights.dssim)
 
-        by_planes, by_sky, by_response = composite.back(response, shown, by_shown)
+        by_planes, by_sky, by_pose, by_response = composite.back(response, shown, by_shown)
         by_alpha, by_distance = by_planes[0, :height, :width], by_planes[4, :height, :width]
         loss += depth_loss(view.returns, alpha, distance, frame.ray_z, weights.depth, weights.solid, by_alpha,
                            by_distance)  # fmt: skip
         # The sky mask is fixed at a view's first step: taken anew, it would follow what it is meant to hold.
         if number not in self._clear:
-            self._clear[number] = np.nonzero(alpha < SEEN_SKY)
-        sky = self._clear[number]
+            self._clear[number] = np.argwhere(alpha < SEEN_SKY).astype(np.int16)
+        sky = tuple(self._clear[number].T)
         if len(sky[0]):
             by_alpha[sky] += weights.sky / len(sky[0])
             loss += weights.sky * float(alpha[sky].mean())
 
         world = drawn.world
-        frame.draw_back(world.mean, world.quat, world.scale, world.opacity, by_planes, self.parameters.gradients)
+        *_, by_pose_too = frame.draw_back(
+            world.mean, world.quat, world.scale, world.opacity, by_planes, self.parameters.gradients
+        )
+        if self.settings.correct_poses:
+            self.poses.step(number, frame.view.world_from_reference, by_pose + by_pose_too, rate)
         columns = rate * rate_columns(rates.mean_m, rates.quat, rates.log_scale, rates.logit_opacity, rates.rgb)
         self.parameters.step(drawn, frame.drawn_rows, columns, self.settings.largest_m)
         self._sky_adam.step(self.sky, by_sky, rate * rates.sky)
@@ -134,9 +259,15 @@ class Optimization:
         others = [name for name in clip.rig.cameras if name not in exposures]
         exposures |= borrowed_responses(exposures, times, clip.rig, others)
         done = {
-            "settings": dataclasses.asdict(self.settings),
+            "settings": {
+                name: value
+                for name, value in dataclasses.asdict(self.settings).items()
+                if name not in ("checkpoint", "checkpoint_s", "resume")
+            },
             "cameras": sorted({view.camera.id for view in self.views}),
-            "steps": self.steps,
+            "steps": self.best_steps if self.best else self.steps,
+            **({"held_out_psnr_db": round(self.best_psnr_db, 3)} if self.best else {}),
+            **({"poses": self.poses.report()} if self.settings.correct_poses else {}),
             "borrowed_responses": [name for name in others if name in exposures],
         }
         return dataclasses.replace(
@@ -151,7 +282,8 @@ class Optimization:
 
     def _order(self) -> Iterator[int]:
         """Numbers of views: every one once, in random order, again and again."""
+        fitted = np.setdiff1d(np.arange(len(self.views)), self.checked)
         random = np.random.default_rng(self.settings.seed)
-        while True:
-            # Without replacement: every view counts once per round.
-            yield from random.permutation(len(self.views)).tolist()
+        # Without replacement: every view counts once per round. What was fitted before is passed over.
+        rounds = (number for _ in itertools.count() for number in random.permutation(fitted).tolist())
+        return itertools.islice(rounds, self.steps, None)

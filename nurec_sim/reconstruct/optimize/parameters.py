@@ -59,7 +59,7 @@ class Parameters:
         self._corrections = bias_corrections()
         self._world, self.gradients = zeros_by_gaussian(count), zeros_by_gaussian(count)
         self._packed = to_blocks(np.zeros((0, FIELDS), np.float32), -(-count // BLOCK), fill=LOG_OPACITY)
-        self._place(np.arange(self.static_count, dtype=np.int32))
+        self.values_changed()
         dynamic = scene.dynamic
         self._start_m = dynamic.gaussians.mean_m.copy()
         self._rigid = np.zeros(len(dynamic), bool) if dynamic.in_box is None else dynamic.in_box
@@ -115,6 +115,10 @@ class Parameters:
              self.gradients, drawn.world.scale, drawn.world.opacity, rates.astype(np.float32), largest_m),
         )  # fmt: skip
         self._place(rows[rows < self.static_count])
+
+    def values_changed(self) -> None:
+        """To be called after ``values`` were written from outside."""
+        self._place(np.arange(self.static_count, dtype=np.int32))
 
     def _place(self, rows: Int32[np.ndarray, " k"]) -> None:
         self._parts(place_static, rows, (self.values, self._world, self._packed))

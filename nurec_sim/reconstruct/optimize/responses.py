@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from nurec_sim.reconstruct.optimize.adam import DenseAdam
+from nurec_sim.reconstruct.optimize.adam import RowAdam
 from nurec_sim.types import Rig
 
 GAINS = (0.5, 2.0)
@@ -23,12 +23,18 @@ class FrameResponses:
 
     def __init__(self, isp: Mapping[str, np.ndarray], frames: Mapping[str, int]) -> None:
         self._isp = {name: np.asarray(isp.get(name, np.eye(3, 4)), np.float64) for name in frames}
-        self._values = {name: np.zeros((count, 2, 3)) for name, count in frames.items()}
-        self._adam = {(name, k): DenseAdam((2, 3)) for name, count in frames.items() for k in range(count)}
+        self.values = {name: np.zeros((count, 2, 3)) for name, count in frames.items()}
+        self.adam = {name: RowAdam(values.shape) for name, values in self.values.items()}
 
     def of(self, camera: str, frame: int) -> Float64[np.ndarray, "3 4"]:
-        """Shown colour = ``[:, :3] @ colour + [:, 3]``."""
-        gain, offset = self._values[camera][frame]
+        """Shown colour = ``[:, :3] @ colour + [:, 3]``; between the frames beside it if a frame was not fitted."""
+        values, fitted = self.values[camera], np.flatnonzero(self.adam[camera].visits)
+        gain, offset = values[frame]
+        if self.is_new(camera, frame) and len(fitted):
+            after = min(int(np.searchsorted(fitted, frame)), len(fitted) - 1)
+            before = fitted[max(after - 1, 0)] if fitted[after] > frame else fitted[after]
+            share = np.clip((frame - before) / max(fitted[after] - before, 1), 0, 1)
+            gain, offset = values[before] * (1 - share) + values[fitted[after]] * share
         shown = np.exp(gain)[:, None] * self._isp[camera]
         shown[:, 3] += offset
         return shown
@@ -45,11 +51,11 @@ class FrameResponses:
             recorded: the image of the log.
         """
         ratio = recorded.mean(axis=(0, 1), dtype=np.float64) / np.maximum(shown.mean(axis=(0, 1)), 1e-3)
-        self._values[camera][frame, 0] = np.log(np.clip(ratio, *GAINS))
+        self.values[camera][frame, 0] = np.log(np.clip(ratio, *GAINS))
 
     def is_new(self, camera: str, frame: int) -> bool:
         """Whether a frame has not been fitted yet."""
-        return self._adam[camera, frame].steps == 0
+        return bool(self.adam[camera].visits[frame] == 0)
 
     def step(
         self,
@@ -69,15 +75,16 @@ class FrameResponses:
             rate: learning rate.
             weight: of the squares of log gains and offsets in the loss.
         """
-        values = self._values[camera][frame]
+        values = self.values[camera][frame]
         # shown = exp(gain) x + offset, so d shown / d gain = shown - offset, and d shown / d offset = 1.
         by_offset = sums[1]
         by_gain = sums[0] - by_offset * values[1]
-        self._adam[camera, frame].step(values, np.stack([by_gain, by_offset]) + 2 * weight * values, rate)
+        gradient = np.stack([by_gain, by_offset]) + 2 * weight * values
+        self.adam[camera].step(frame, self.values[camera], gradient, rate)
 
     def all(self) -> dict[str, Float64[np.ndarray, "frames 3 4"]]:
         """Responses of all frames by camera."""
-        return {name: np.array([self.of(name, k) for k in range(len(v))]) for name, v in self._values.items()}
+        return {name: np.array([self.of(name, k) for k in range(len(v))]) for name, v in self.values.items()}
 
 
 def borrowed_responses(

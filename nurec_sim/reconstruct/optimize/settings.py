@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,17 @@ class LossWeights:
 
 
 @dataclass(frozen=True)
+class PosePriors:
+    """Standard deviations of the errors that poses of images may have, and the weight of their squares in the loss."""
+
+    turn_deg: float = 0.1
+    shift_m: float = 0.02
+    time_s: float = 0.002
+    """Of a camera's clock."""
+    weight: float = 1e-4
+
+
+@dataclass(frozen=True)
 class OptimizeSettings:
     """All settings of ``refine``.
 
@@ -47,6 +59,13 @@ class OptimizeSettings:
         largest_m: no standard deviation may grow beyond this.
         rates: learning rates.
         weights: of the loss.
+        check_every: hold out every so many images of a camera to choose the best state by, where it has twice as many
+            or more; 0: none, the last state counts.
+        checkpoint: file for the state, written every ``checkpoint_s`` seconds and removed at the end; None: none.
+        checkpoint_s: see checkpoint.
+        resume: go on from the state in ``checkpoint``; budgets count from the very start.
+        correct_poses: whether to correct the poses of images and the clocks of cameras.
+        poses: how much.
     """
 
     seconds: float | None = 300.0
@@ -56,6 +75,12 @@ class OptimizeSettings:
     largest_m: float = 1.5
     rates: LearningRates = field(default_factory=LearningRates)
     weights: LossWeights = field(default_factory=LossWeights)
+    check_every: int = 16
+    checkpoint: Path | None = None
+    checkpoint_s: float = 60.0
+    resume: bool = False
+    correct_poses: bool = False
+    poses: PosePriors = field(default_factory=PosePriors)
 
     def __post_init__(self) -> None:
         """Checks the budget.
@@ -69,3 +94,7 @@ class OptimizeSettings:
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"{name} must be positive and finite, got {value}")
+        if self.check_every < 0 or self.check_every == 1:
+            raise ValueError(f"check_every must be 0 (none) or at least 2, got {self.check_every}")
+        if self.resume and self.checkpoint is None:
+            raise ValueError("resume needs a checkpoint")
