@@ -55,7 +55,7 @@ def reconstruct(
     settings: Any = None,
     refine: OptimizeSettings | None = None,
 ) -> GaussianScene:
-    """Build a Gaussian scene from a clip.
+    """Build a Gaussian scene from a clip, at the precision of archives: reading it from one gives the same values.
 
     Args:
         clip: the driving log.
@@ -91,6 +91,8 @@ def reconstruct(
     if wrong:
         raise ReconstructError(f"clip {clip.id!r} has no sweeps {wrong} to hold out; have 0..{most - 1}")
 
+    from nurec_sim.scene.precision import archived
+
     held = {int(index) for index in hold_out_sweeps}
     report = progress or (lambda stage, fraction: None)
     share = 1.0 if refine is None else START_SHARE
@@ -99,11 +101,13 @@ def reconstruct(
     )
     scene = _with_provenance(scene, clip, made.name, chosen)
     if refine is None:
-        return scene
+        return archived(scene)
     from nurec_sim.reconstruct.optimize.method import refine as fit_to_log
 
     used = list(scene.provenance["cameras"])
-    return fit_to_log(scene, clip, used, held, lambda stage, done: report(stage, share + (1 - share) * done), refine)
+    return archived(
+        fit_to_log(scene, clip, used, held, lambda stage, done: report(stage, share + (1 - share) * done), refine)
+    )
 
 
 def _with_provenance(scene: GaussianScene, clip: Clip, method: str, cameras: list[str]) -> GaussianScene:

@@ -1,8 +1,8 @@
-"""The scene archive: a ``.usdz`` that stores a GaussianScene losslessly and opens in USD tools and AlpaSim.
+"""The scene archive: a ``.usdz`` that stores a GaussianScene and opens in USD tools and AlpaSim.
 
 Layout, see ``docs/scene_format.md``: USD layers are authoritative for geometry and appearance; ``nurec_sim/`` has data
 that USD cannot represent exactly; JSON, YAML, PLY and XODR files at the root are for other simulators. Nothing is
-pickled. The same scene gives the same bytes.
+pickled. The same scene gives the same bytes. Numbers are kept at the precision of ``scene.precision``.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from nurec_sim.errors import ArchiveError
 from nurec_sim.files.decoding import LIMITS
 from nurec_sim.files.npy import array_from_npy, npy_bytes
 from nurec_sim.files.zip_package import Package, write_package
-from nurec_sim.scene import codec
+from nurec_sim.scene import codec, knots
 from nurec_sim.scene.checks import check_scene
 from nurec_sim.scene.describe import scene_hash
 from nurec_sim.scene.facts import facts_from_json, scene_facts
+from nurec_sim.scene.precision import archived, half
 from nurec_sim.scene.sidecars import ftheta_fits, sidecars
 from nurec_sim.scene.usd.actors import actors_layer, field_paths
 from nurec_sim.scene.usd.cameras import cameras_layer
@@ -39,16 +40,15 @@ from nurec_sim.scene.usd.layers import (
 )
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, RoadMap
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""Version 1 had float32 everywhere, and the knots of all moving Gaussians; it is still read."""
 MANIFEST = "nurec_sim/manifest.json"
 FACTS, ISP, SKY = "nurec_sim/scene.json", "nurec_sim/isp.json", "nurec_sim/sky_cubemap.npy"
 EXPOSURES = "nurec_sim/exposures.json"
-KNOT_TIMES, KNOTS, OWNERS, IN_BOX = (
-    f"nurec_sim/dynamic_{name}.npy" for name in ("knot_t_us", "knot_m", "track", "in_box")
-)
-TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY, KNOT_TIMES, KNOTS, OWNERS)
-"""Members required by ``read_archive``, besides optional ``IN_BOX`` and ``EXPOSURES``; others are for other
-programs."""
+IN_BOX = "nurec_sim/dynamic_in_box.npy"
+TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY)
+"""Members required by ``read_archive`` besides those of ``scene.knots`` and the optional ``IN_BOX`` and ``EXPOSURES``;
+others are for other programs."""
 
 
 def write_scene(
@@ -57,7 +57,7 @@ def write_scene(
     """Writes a scene archive atomically.
 
     Args:
-        scene: the scene; validated first.
+        scene: the scene; validated first. The archive keeps ``scene.precision.archived(scene)``.
         path: ends in ``.usdz``; missing folders are created.
         overwrite: whether an existing file may be replaced.
         derived_map: a map for other simulators (``map.xodr``) that is not part of the scene, for a scene without a map.
@@ -74,6 +74,7 @@ def write_scene(
     if path.exists() and not overwrite:
         raise ArchiveError(f"{path} exists; pass overwrite=True to replace it")
     check_scene(scene)
+    scene = archived(scene)
     digest = scene_hash(scene)
     fits = ftheta_fits(scene)
     members = {
@@ -85,10 +86,8 @@ def write_scene(
         **sidecars(scene, digest, fits, derived_map),
         FACTS: codec.dump(scene_facts(scene), FACTS),
         ISP: codec.dump(scene.isp, ISP, indent=2),
-        SKY: npy_bytes(scene.sky),
-        KNOT_TIMES: npy_bytes(scene.dynamic.knot_t_us),
-        KNOTS: npy_bytes(scene.dynamic.knot_m),
-        OWNERS: npy_bytes(scene.dynamic.track),
+        SKY: npy_bytes(half(scene.sky)),
+        **{name: npy_bytes(array) for name, array in knots.knot_arrays(scene.dynamic).items()},
     }
     if scene.exposures:
         members[EXPOSURES] = codec.dump(scene.exposures, EXPOSURES)
@@ -100,7 +99,7 @@ def write_scene(
 
 
 def read_archive(path: Path | str) -> GaussianScene:
-    """Reads a scene archive written by ``write_scene`` losslessly.
+    """Reads a scene archive written by ``write_scene``, of this version of the format or an earlier one.
 
     Nothing is extracted, unpickled or executed, and no file outside the archive is opened.
 
@@ -110,7 +109,8 @@ def read_archive(path: Path | str) -> GaussianScene:
     path = Path(path)
     with Package(path) as package:
         manifest = _read_manifest(package)
-        _check_hashes(package, manifest, TRUTH)
+        knot_members = tuple(knots.KINDS) if manifest["version"] > 1 else knots.OF_VERSION_1
+        _check_hashes(package, manifest, TRUTH + knot_members)
         counts = manifest["counts"]
         facts_json = codec.load(package.read(FACTS, LIMITS.json_bytes), f"{path}: {FACTS}")
         facts = facts_from_json(facts_json, f"{path}: {FACTS}")
@@ -125,15 +125,15 @@ def read_archive(path: Path | str) -> GaussianScene:
         in_box = None
         if counts.get("dynamic_in_box"):
             _check_hashes(package, manifest, (IN_BOX,))
-            in_box = array_from_npy(package.read(IN_BOX), f"{path}: {IN_BOX}", kinds="b")
-        knot_t_us, knot_m, owners = (_array(package, name) for name in (KNOT_TIMES, KNOTS, OWNERS))
-        dynamic = DynamicGaussians(moving, knot_t_us, knot_m, owners, in_box)
+            in_box = _array(package, IN_BOX, "b")
+        arrays = {name: _array(package, name, knots.KINDS[name]) for name in knot_members}
+        dynamic = DynamicGaussians(moving, *knots.knots_of(arrays, moving.mean_m, str(path)), in_box)
         isp_json = codec.load(package.read(ISP, LIMITS.json_bytes), f"{path}: {ISP}")
         isp = codec.from_json(codec.mapping(codec.array(np.float64, 3, 4)), isp_json, f"{path}: {ISP}")
         scene = GaussianScene(
             static=static,
             dynamic=dynamic,
-            sky=_array(package, SKY),
+            sky=_array(package, SKY, "f").astype(np.float32),
             isp=isp,
             exposures=_exposures(package, manifest),
             **facts,
@@ -197,9 +197,9 @@ def _read_manifest(package: Package) -> dict[str, Any]:
     manifest = codec.load(package.read(MANIFEST, LIMITS.json_bytes), where)
     if not isinstance(manifest, dict) or manifest.get("format") != "nurec_sim scene archive":
         raise ArchiveError(f"{where}: not the manifest of a nurec_sim scene archive")
-    if manifest.get("version") != FORMAT_VERSION:
+    if manifest.get("version") not in range(1, FORMAT_VERSION + 1):
         raise ArchiveError(
-            f"{where}: format version {manifest.get('version')!r}; this nurec_sim reads version {FORMAT_VERSION}"
+            f"{where}: format version {manifest.get('version')!r}; this nurec_sim reads versions 1 to {FORMAT_VERSION}"
         )
     for key, decoder in (("counts", codec.mapping(codec.integer)), ("sha256", codec.mapping(codec.text))):
         codec.from_json(decoder, manifest.get(key), f"{where}: {key}")
@@ -243,5 +243,5 @@ def _exposures(package: Package, manifest: dict[str, Any]) -> dict[str, np.ndarr
     return codec.from_json(codec.mapping(codec.array(np.float64, -1, 3, 4)), raw, where)
 
 
-def _array(package: Package, name: str) -> np.ndarray:
-    return array_from_npy(package.read(name), f"{package.path}: {name}")
+def _array(package: Package, name: str, kinds: str) -> np.ndarray:
+    return array_from_npy(package.read(name), f"{package.path}: {name}", kinds)

@@ -5,6 +5,7 @@ import shapely
 
 from nurec_sim import geometry
 from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Pinhole
+from nurec_sim.scene.precision import archived
 from nurec_sim.sensors import lidar_model
 from nurec_sim.types import (
     Box,
@@ -105,7 +106,7 @@ def join(parts: list[DynamicGaussians]) -> DynamicGaussians:
 
 
 def full_scene(sh_terms: int = 8) -> GaussianScene:
-    """A scene with one of everything an archive can hold."""
+    """A scene with one of everything an archive can hold, at the precision of archives."""
     rng = np.random.default_rng(1)
     still = Trajectory(np.array([START_US]), geometry.pose_from_xyyaw(20, -4, 0.3, 0.7)[None])
     tracks = [
@@ -116,7 +117,7 @@ def full_scene(sh_terms: int = 8) -> GaussianScene:
     street = np.array(shapely.LineString(lane[::8, :2]).buffer(4.0, cap_style="square").exterior.coords)[:-1]
     hole = np.array([[18.0, 1.5], [19.0, 2.0], [19.0, 3.0]])
     lidars = {name: lidar_model(name, FRONT.copy(), id=name, columns=90) for name in ("VLP-16", "PANDAR128")}
-    return GaussianScene(
+    scene = GaussianScene(
         id="clip-é \"7\"",
         static=gaussians(400, 3, sh_terms),
         dynamic=join([moving_car(0, 40, 4, sh_terms), moving_car(1, 6, 5, sh_terms), moving_car(-1, 7, 6, sh_terms)]),
@@ -131,6 +132,7 @@ def full_scene(sh_terms: int = 8) -> GaussianScene:
                          "roof": START_US + np.array([[60_005, 60_005]])},
         provenance={"method": "lift", "settings": {"voxel_m": 0.1, "names": ["a", None, True, 3]}},
     )  # fmt: skip
+    return archived(scene)
 
 
 def empty_scene() -> GaussianScene:
@@ -153,4 +155,6 @@ def hilly_road(seed: int = 0) -> GaussianScene:
     road.mean_m[:10, 2] += 40
     road.label[:] = Label.ROAD
     base = empty_scene()
-    return GaussianScene("hilly", road, base.dynamic, base.sky, {}, base.rig, path, [], None, (START_US, END_US))
+    return archived(
+        GaussianScene("hilly", road, base.dynamic, base.sky, {}, base.rig, path, [], None, (START_US, END_US))
+    )

@@ -15,7 +15,7 @@ from scene_worlds import empty_scene, full_scene
 
 from nurec_sim.errors import ArchiveError
 from nurec_sim.files.zip_package import Package, write_package
-from nurec_sim.scene import archive, archive_faults, read_scene, scene_hash, write_scene
+from nurec_sim.scene import archive, archive_faults, knots, read_scene, scene_hash, write_scene
 from nurec_sim.scene.usd.layers import static_layer
 
 
@@ -184,7 +184,7 @@ def test_array_with_a_pickle(good, monkeypatch):
     monkeypatch.chdir(good.parent)
     buffer = io.BytesIO()
     np.save(buffer, np.array([Trap()], dtype=object), allow_pickle=True)
-    refused(forge(good, **{archive.SKY: buffer.getvalue()}), "must hold plain numbers in C order, got object")
+    refused(forge(good, **{archive.SKY: buffer.getvalue()}), "must hold plain values in C order, got object")
     assert not os.path.exists("unpickled")
 
 
@@ -197,19 +197,25 @@ def test_array_that_promises_too_much(good):
 
 def test_array_of_another_shape(good):
     data = archive.npy_bytes(np.zeros((7, 3), np.int64))
-    refused(forge(good, **{archive.KNOT_TIMES: data}), r"knot_t_us must be int64 \(53, 3\), got int64 \(7, 3\)")
+    refused(forge(good, **{knots.KNOTS: data}), "must hold plain values in C order, got int64")
+    data = archive.npy_bytes(np.zeros((2, 3), np.float32))
+    refused(forge(good, **{knots.KNOTS: data}), "dynamic_knot_m.npy must have the knots of those of 53 Gaussians")
+    data = archive.npy_bytes(np.full(53, 99, np.int16))
+    refused(
+        forge(good, **{knots.WINDOW: data}), "dynamic_window.npy must name one of 2 triples of times for each of 53"
+    )
 
 
 def test_array_of_another_type(good):
-    data = archive.npy_bytes(np.zeros((6, 8, 8, 3), np.float64))
-    refused(forge(good, **{archive.SKY: data}), "sky must be float32")
+    data = archive.npy_bytes(np.zeros((6, 8, 8, 3), np.int32))
+    refused(forge(good, **{archive.SKY: data}), "must hold plain values in C order, got int32")
 
 
 def test_text_instead_of_an_array(good):
-    refused(forge(good, **{archive.OWNERS: b"hello"}), "is no array file")
+    refused(forge(good, **{knots.OWNERS: b"hello"}), "is no array file")
 
 
-@pytest.mark.parametrize("name", archive.TRUTH)
+@pytest.mark.parametrize("name", [*archive.TRUTH, *knots.KINDS])
 def test_missing_member(good, name):
     refused(forge(good, **{name: None}), "does not list")
     members = members_of(good)
@@ -218,7 +224,7 @@ def test_missing_member(good, name):
     refused(good, f"{name} is missing; have")
 
 
-@pytest.mark.parametrize("name", archive.TRUTH)
+@pytest.mark.parametrize("name", [*archive.TRUTH, *knots.KINDS])
 def test_changed_member(good, name):
     members = members_of(good)
     members[name] = members[name][:-1] + bytes([members[name][-1] ^ 1])
@@ -234,11 +240,11 @@ def test_changed_sidecar_is_reported_but_does_not_stop_reading(good):
     ]
 
 
-@pytest.mark.parametrize("version", [2, 0, "1", None])
+@pytest.mark.parametrize("version", [3, 0, "1", None])
 def test_other_version(good, version):
     manifest = json.loads(members_of(good)[archive.MANIFEST]) | {"version": version}
     path = forge(good, **{archive.MANIFEST: json.dumps(manifest).encode()})
-    refused(path, f"format version {version!r}; this nurec_sim reads version 1")
+    refused(path, f"format version {version!r}; this nurec_sim reads versions 1 to 2")
 
 
 @pytest.mark.parametrize("text", [b"[]", b"{}", b"{", b"\xff", b"[" * 100_000, b'{"format": NaN}', b'{"a":1,"a":2}'])

@@ -19,7 +19,7 @@ from serving_world import camera_request, scene
 
 from nurec_sim.errors import ArchiveError, NurecSimError, RequestError, ServerError, TooLargeError, UnknownSceneError
 from nurec_sim.render import CpuRenderer
-from nurec_sim.scene import write_scene
+from nurec_sim.scene import read_scene, write_scene
 from nurec_sim.serving import wire
 from nurec_sim.serving.client import RemoteSensors
 from nurec_sim.serving.connection import open_channel, our_errors
@@ -66,7 +66,7 @@ def names_in(folder):
 
 def test_an_uploaded_scene_is_rendered_bit_for_bit_and_outlives_the_server(archive, folder):
     said, request = [], camera_request(scene_id="sent")
-    expected = CpuRenderer(scene("sent", seed=4), threads=1).render_camera(request).rgb
+    expected = CpuRenderer(read_scene(archive), threads=1).render_camera(request).rgb
     with server_of(folder, scene()) as address, SceneClient(address, timeout_s=30) as client:
         assert client.upload(archive, lambda *step: said.append(step)) == "clipgt-sent"
         assert said[0] == ("hashing", 0.0) and said[-1] == ("sending", 1.0)

@@ -4,8 +4,9 @@ Conventions of OpenUSD: quaternion arrays are ``x, y, z, w`` in memory, spherica
 0.5 + C0 * DC + ...), particle-major with the constant term first. Time codes are milliseconds after
 ``absoluteTimeOffsetMicroSec``, which is the scene's start.
 
-Data that a ParticleField cannot represent are primvars of our namespace: the exact display colour (the DC coefficient
-rounds it), the normal, the semantic class, LiDAR intensity and ray drop, and ``index``, its index in the scene.
+Positions are float32, everything else half floats (``scene.precision``). Data that a ParticleField cannot represent are
+primvars of our namespace: the normal, the semantic class, LiDAR intensity and ray drop, and ``index``, its index in the
+scene. Archives of version 1 are float32 throughout, with the exact display colour as primvar ``rgb``.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from jaxtyping import Float32, Float64, Int32
 from nurec_sim.errors import ArchiveError
 from nurec_sim.files.new_files import temporary_folder
 from nurec_sim.files.zip_package import Package
-from nurec_sim.scene.harmonics import SH_C0
+from nurec_sim.scene.precision import colours, constant_terms, half
 from nurec_sim.scene.usd.crate_check import check_crate
 from nurec_sim.types import Gaussians, GaussianScene, Label
 
@@ -187,19 +188,18 @@ def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray
 
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
     rest = gaussians.sh_rest
-    # 3DGS convention: colour = 0.5 + SH_C0 * DC + the view-dependent terms.
-    dc = _to_float32((gaussians.rgb.astype(np.float64) - 0.5) / SH_C0)[:, None]
-    coefficients = dc if rest is None else np.concatenate([dc, rest], axis=1)
+    dc = constant_terms(gaussians.rgb)[:, None]
+    coefficients = dc if rest is None else np.concatenate([dc, half(rest)], axis=1)
     terms = coefficients.shape[1]
 
     field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(gaussians.mean_m)))
-    field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(np.ascontiguousarray(gaussians.quat_wxyz[:, [1, 2, 3, 0]])))
-    field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(gaussians.scale_m)))
-    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(np.ascontiguousarray(gaussians.opacity)))
+    field.CreateOrientationshAttr(Vt.QuathArray.FromNumpy(half(gaussians.quat_wxyz[:, [1, 2, 3, 0]])))
+    field.CreateScaleshAttr(Vt.Vec3hArray.FromNumpy(half(gaussians.scale_m)))
+    field.CreateOpacitieshAttr(Vt.HalfArray.FromNumpy(half(gaussians.opacity)))
     # Degree d has (d + 1)^2 terms.
     field.CreateRadianceSphericalHarmonicsDegreeAttr(int(np.sqrt(terms)) - 1)
-    radiance = field.CreateRadianceSphericalHarmonicsCoefficientsAttr(
-        Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(coefficients.reshape(-1, 3)))
+    radiance = field.CreateRadianceSphericalHarmonicsCoefficientshAttr(
+        Vt.Vec3hArray.FromNumpy(np.ascontiguousarray(coefficients.reshape(-1, 3)))
     )
     # ``elementSize`` values of the flat array belong to one particle.
     radiance.SetMetadata("elementSize", terms)
@@ -212,14 +212,12 @@ def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray
     primvars = UsdGeom.PrimvarsAPI(field)
     columns = [
         ("index", types.IntArray, Vt.IntArray.FromNumpy(np.ascontiguousarray(index))),
-        ("rgb", types.Color3fArray, Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(gaussians.rgb))),
-        ("normal", types.Normal3fArray, Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(gaussians.normal))),
+        ("normal", types.Normal3hArray, Vt.Vec3hArray.FromNumpy(half(gaussians.normal))),
         ("semanticClass", types.UCharArray, Vt.UCharArray.FromNumpy(np.ascontiguousarray(gaussians.label))),
-        ("intensity", types.FloatArray, Vt.FloatArray.FromNumpy(np.ascontiguousarray(gaussians.intensity))),
+        ("intensity", types.HalfArray, Vt.HalfArray.FromNumpy(half(gaussians.intensity))),
     ]
     if gaussians.ray_drop is not None:
-        drop = Vt.FloatArray.FromNumpy(np.ascontiguousarray(gaussians.ray_drop))
-        columns.append(("rayDrop", types.FloatArray, drop))
+        columns.append(("rayDrop", types.HalfArray, Vt.HalfArray.FromNumpy(half(gaussians.ray_drop))))
     for name, kind, array in columns:
         primvars.CreatePrimvar(f"{NAMESPACE}:{name}", kind, UsdGeom.Tokens.vertex).Set(array)
     if not len(gaussians):
@@ -235,12 +233,15 @@ def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Ga
     """
 
     def values(name: str, dtype: type, *shape: int) -> np.ndarray:
-        spec = layer.GetAttributeAtPath(f"{path}.{name}")
-        given = None if spec is None or spec.default is None else np.array(spec.default)
-        if given is None or given.dtype != dtype or given.shape[1:] != shape:
+        """The values of an attribute; floats may be halves, which the schema names ``<name>h``."""
+        specs = (layer.GetAttributeAtPath(f"{path}.{each}") for each in (name, f"{name}h"))
+        spec = next((spec for spec in specs if spec is not None and spec.default is not None), None)
+        given = None if spec is None else np.array(spec.default)
+        allowed = (np.float32, np.float16) if dtype is np.float32 else (dtype,)
+        if given is None or given.dtype not in allowed or given.shape[1:] != shape:
             found = "nothing" if given is None else f"{given.dtype} {given.shape}"
             raise ArchiveError(f"{what} {path}.{name} must be {np.dtype(dtype).name} [n, {shape}], got {found}")
-        return given
+        return given.astype(dtype, copy=False)
 
     positions = values("positions", np.float32, 3)
     n = len(positions)
@@ -254,22 +255,24 @@ def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Ga
         "orientations": values("orientations", np.float32, 4),
         "scales": values("scales", np.float32, 3),
         "opacities": values("opacities", np.float32),
-        "rgb": values(f"{prefix}rgb", np.float32, 3),
         "normal": values(f"{prefix}normal", np.float32, 3),
         "label": values(f"{prefix}semanticClass", np.uint8),
         "intensity": values(f"{prefix}intensity", np.float32),
         "index": values(f"{prefix}index", np.int32),
     }
-    if layer.GetAttributeAtPath(f"{path}.{prefix}rayDrop") is not None:
-        columns["ray_drop"] = values(f"{prefix}rayDrop", np.float32)
+    for name, attribute, *shape in (("rgb", "rgb", 3), ("ray_drop", "rayDrop")):
+        if layer.GetAttributeAtPath(f"{path}.{prefix}{attribute}") is not None:
+            columns[name] = values(f"{prefix}{attribute}", np.float32, *shape)
     lengths = {name: len(column) for name, column in columns.items()} | {"coefficients": len(coefficients) / terms}
     wrong = {name: length for name, length in lengths.items() if length != n}
     if wrong:
         raise ArchiveError(f"{what} {path}: {n} positions, but other counts in {wrong}")
-    rest = np.ascontiguousarray(coefficients.reshape(n, terms, 3)[:, 1:]) if terms > 1 else None
+    coefficients = coefficients.reshape(n, terms, 3)
+    rest = np.ascontiguousarray(coefficients[:, 1:]) if terms > 1 else None
+    rgb = columns.get("rgb", colours(coefficients[:, 0]))
     quat_wxyz = np.ascontiguousarray(columns["orientations"][:, [3, 0, 1, 2]])
     return columns["index"], Gaussians(
-        positions, quat_wxyz, columns["scales"], columns["opacities"], columns["rgb"], columns["normal"],
+        positions, quat_wxyz, columns["scales"], columns["opacities"], rgb, columns["normal"],
         columns["label"], columns["intensity"], rest, columns.get("ray_drop"),
     )  # fmt: skip
 
