@@ -114,14 +114,12 @@ def is_rotation(rotation: Float64[np.ndarray, "3 3"], tolerance: float = 1e-3) -
 
 def are_rotations(rotations: Float64[np.ndarray, "n 3 3"], tolerance: float = 1e-3) -> Bool[np.ndarray, " n"]:
     """``is_rotation`` of many matrices."""
-    m = np.asarray(rotations, np.float64)
-    # First the magnitude, so that nothing below overflows.
-    sound = np.asarray(
-        (np.abs(m) < 2).all(axis=(1, 2))
-    )  # false for NaN; entries of a rotation are at most 1, and larger ones may overflow
-    m = np.where(sound[:, None, None], m, 0.0)
-    # Elementwise over all matrices: numpy's matmul and det on many small matrices take ten times as long.
-    a, b, c = rows = np.ascontiguousarray(m.transpose(1, 2, 0))
+    # Elementwise over all matrices, each entry one array: numpy's matmul, det and reductions of many small matrices
+    # take ten times as long.
+    m = np.array(np.asarray(rotations, np.float64).transpose(1, 2, 0), order="C")
+    # First the magnitude, so that nothing below overflows; false for NaN. Entries of a rotation are at most 1.
+    sound = np.asarray((np.abs(m) < 2).all(axis=(0, 1)))
+    a, b, c = rows = np.where(sound, m, 0.0)
     # Rows must be orthonormal: m m^T = identity, of which the lower triangle is enough.
     for i in range(3):
         for j in range(i + 1):

@@ -195,7 +195,7 @@ def test_the_host_waits_once_per_batch(sensors):
     counts.launches, counts.uploads, counts.reads = [], 0, 0
     renderer.sense(asked)
     assert (counts.reads, counts.uploads) == (1, 1)
-    assert len(counts.launches) == len(set(counts.launches)) == 13  # whatever the number of sensors and actors
+    assert len(counts.launches) == len(set(counts.launches)) == 14  # whatever the number of sensors and actors
 
 
 def test_a_batch_that_needs_more_room_is_drawn_again(launcher, monkeypatch):

@@ -56,7 +56,7 @@ class ExposureView:
             turn = reference[:3, :3].T
             # Motion of the whole exposure in the reference frame: constant speed and turn rate between the two poses.
             motion[:3] = turn @ (pair[1, :3, 3] - pair[0, :3, 3])
-            motion[3:6] = _rotation_vector(turn @ (pair[1, :3, :3] @ pair[0, :3, :3].T) @ turn.T)
+            motion[3:6] = rotation_vector(turn @ (pair[1, :3, :3] @ pair[0, :3, :3].T) @ turn.T)
             motion[6:] = places[0], places[1] - places[0]
         # From the reference, the sensor gets at most this fraction of its motion away.
         far = float(np.abs(places).max())
@@ -118,7 +118,7 @@ class ExposureView:
                                grid.intrinsics.tolist(), (width, height))  # fmt: skip
 
 
-def _rotation_vector(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 3"]:
+def rotation_vector(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 3"]:
     """Axis times angle of a rotation by less than half a turn."""
     w, *xyz = geometry.quat_from_matrix(rotation)
     sine = np.linalg.norm(xyz)

@@ -21,11 +21,13 @@ from nurec_sim.render import torch_maths
 from nurec_sim.render.cpu.backward.gradients import CameraImages, GaussianTensors, LidarImages
 from nurec_sim.render.cpu.grid import make_grid
 from nurec_sim.render.cpu.pack import BLOCK, MAX_OPACITY, MIN_SCALE_M
+from nurec_sim.render.cpu.view import rotation_vector
+from nurec_sim.render.gpu.batch import Batch, make_batch
 from nurec_sim.render.gpu.launcher import CudaLauncher, Launcher
 from nurec_sim.render.gpu.pipeline import ALPHA, DISTANCE, HALF, Blocks, Drawn, Room, Rooms, draw, draw_backward
 from nurec_sim.render.gpu.sky_lookup import sky_colour
 from nurec_sim.render.gpu.tensors import blocks_of
-from nurec_sim.render.gpu.views import Batch, GridTensors, make_batch, rotation_vector, view_rows
+from nurec_sim.render.gpu.views import GridTensors, view_rows
 from nurec_sim.render.spec import MIN_ALPHA, SURFACE_ALPHA
 from nurec_sim.types import CameraModel, LidarModel
 
@@ -76,9 +78,10 @@ class DifferentiableRenderer:
             *(_poses(poses, grid.grid.reference) for poses, grid in zip(world_from_sensor, self._grids, strict=True)),
             strict=True,
         )
-        rows = view_rows(self._grids, np.array(pairs))
+        rows = view_rows(self._grids)
         rows["sky"], rows["sky_size"] = self._no_sky.data_ptr(), 1
-        batch = make_batch(self._grids, rows, self._launcher.upload(rows.view(np.uint8)), self._no_sky)
+        views, poses = (self._launcher.upload(array) for array in (rows.view(np.uint8), np.array(pairs)))
+        batch = make_batch(self._launcher, self._grids, rows, views, poses, self._no_sky)
         planes = _Blend.apply(
             self._launcher, batch, self._rooms, gaussians.mean_m, gaussians.quat_wxyz, gaussians.scale_m,
             gaussians.opacity, self._features(gaussians, references[0]), *references,

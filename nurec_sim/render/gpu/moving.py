@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Int32
 
 from nurec_sim.render.cpu.pack import BLOCK, FIELDS, LOG_OPACITY, MAX_OPACITY, gaussian_columns, to_blocks
+from nurec_sim.render.gpu.batch import Batch
 from nurec_sim.render.gpu.launcher import THREADS, Launcher
 from nurec_sim.render.gpu.pipeline import Blocks
-from nurec_sim.render.gpu.views import Batch
 from nurec_sim.render.layers import drawable
 from nurec_sim.types import DynamicGaussians, SensorRequest, Track
 
@@ -93,12 +93,18 @@ class MovingLayer:
             Numbers of pairs, counted over the actors of all requests in their order; NOT_ASKED, or HIDDEN.
         """
         table = np.full((len(requests), len(self.number_of)), NOT_ASKED, np.int32)
+        names: tuple[str, ...] = ()
         number, first = self.number_of, 0
+        tracks = places = np.zeros(0, np.int64)
         for row, request in zip(table, requests, strict=True):
-            tracks = np.array([number.get(name, -1) for name in request.actors], np.int64)
-            known = tracks >= 0
-            row[tracks[known]] = first + np.flatnonzero(known)
-            first += len(tracks)
+            # The sensors of one instant are mostly requested with the same actors.
+            if names != tuple(request.actors):
+                names = tuple(request.actors)
+                found = np.array([number.get(name, -1) for name in names], np.int64)
+                places = np.flatnonzero(found >= 0)
+                tracks = found[places]
+            row[tracks] = first + places
+            first += len(names)
             hidden = [number[name] for name in request.hidden if name in number]
             if hidden:
                 row[hidden] = HIDDEN

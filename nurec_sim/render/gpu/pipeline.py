@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from nurec_sim.render.cpu.pack import BLOCK, PackedGaussians
+from nurec_sim.render.gpu.batch import Batch
 from nurec_sim.render.gpu.launcher import THREADS, Launcher
-from nurec_sim.render.gpu.views import Batch
 from nurec_sim.render.merging import GROUP
 
 T = TypeVar("T")

@@ -13,10 +13,11 @@ from nurec_sim.compute.turns import rest
 from nurec_sim.errors import TooLargeError
 from nurec_sim.render.cpu.pack import BLOCK, pack
 from nurec_sim.render.cpu.sensor_tables import SensorCache
+from nurec_sim.render.gpu.batch import Batch, make_batch
 from nurec_sim.render.gpu.launcher import THREADS, CudaLauncher, Launcher
 from nurec_sim.render.gpu.moving import MovingLayer
 from nurec_sim.render.gpu.pipeline import Blocks, Drawn, Room, Rooms, draw
-from nurec_sim.render.gpu.views import Batch, GridTensors, make_batch, view_rows
+from nurec_sim.render.gpu.views import GridTensors, view_rows
 from nurec_sim.render.lod import Detail, check_detail
 from nurec_sim.render.requests import (
     CAMERA_OUTPUTS,
@@ -180,7 +181,7 @@ class GpuRenderer(SingleFrames):
     ) -> tuple[Batch, Blocks]:
         """The sensors of a batch, and the moving layer as each of them sees it; one copy to the device."""
         tensors = [self._grids.tables(request.sensor) for request in requests]
-        rows = view_rows(tensors, world_from_sensor)
+        rows = view_rows(tensors)
         rows["detail"] *= self._detail_px
         rows["sky"], rows["sky_size"] = self._sky.data_ptr(), self._sky.shape[1]
         start, end = np.array([(request.start_us, request.end_us) for request in requests], np.int64).T
@@ -195,13 +196,11 @@ class GpuRenderer(SingleFrames):
                 if response is not None:
                     rows["isp"][number] = response.ravel()
         asked = self._moving.asked(requests)
-        parts = [part.reshape(-1).view(np.uint8) for part in (rows, pairs, asked)]
-        ends = np.cumsum([len(part) for part in parts]).tolist()
+        parts = [part.reshape(-1).view(np.uint8) for part in (rows, world_from_sensor, pairs, asked)]
         # One upload of everything that depends on the requests; the parts are addressed by their bytes.
-        uploaded = self._launcher.upload(np.concatenate(parts))
-        batch = make_batch(tensors, rows, uploaded[: ends[0]], self._sky, blocks)
-        placed = self._moving.placed(self._launcher, batch, uploaded[ends[1] :], uploaded[ends[0] : ends[1]])
-        return batch, placed
+        views, of_sensors, of_actors, tracks = self._launcher.upload(np.concatenate(parts)).split(list(map(len, parts)))
+        batch = make_batch(self._launcher, tensors, rows, views, of_sensors, self._sky, blocks)
+        return batch, self._moving.placed(self._launcher, batch, tracks, of_actors)
 
     def _frames(
         self, requests: Sequence[SensorRequest], outputs: Sequence[str], filter: LidarFilter

@@ -1,4 +1,4 @@
-"""The sensors of a batch as the kernels read them: one ``View`` each (``kernels/view.cuh``), one list of tiles for all.
+"""Sensors as the kernels read them: one ``View`` each (``kernels/view.cuh``).
 
 A sensor that moves during its exposure does so at constant speed and turn rate, so six numbers and an instant per ray
 determine where each ray starts and points; nothing is approximated.
@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float64
 
-from nurec_sim import geometry
 from nurec_sim.render.cpu.grid import LENS, LIDAR, Grid
 from nurec_sim.render.cpu.project.charts import (
     AZIMUTH,
@@ -76,7 +74,6 @@ class GridTensors:
     rays: torch.Tensor
     table: torch.Tensor
     beam: torch.Tensor
-    timed: bool
     row: bytes
 
     @classmethod
@@ -105,73 +102,14 @@ class GridTensors:
         row["table_size"], row["reference"], row["detail"] = len(table), grid.reference, ray_spacing(grid.direction)
         row["near_m"], row["field_cos"], row["by_range"] = grid.near_m, grid.field_cos, grid.by_range
         row["kind"], row["intensity"] = grid.kind, grid.kind == LIDAR
-        return cls(grid, tensors[0], tensors[1], tensors[2], bool(np.any(instant != 0)), row.tobytes())
+        # Where all rays have one instant, only the pose at that instant matters.
+        row["moving"] = np.any(instant != 0)
+        return cls(grid, tensors[0], tensors[1], tensors[2], row.tobytes())
 
 
-@dataclass(frozen=True, eq=False)
-class Batch:
-    """Sensors that are rendered together; their rays and tiles are numbered consecutively.
-
-    ``views`` holds the bytes of one ``VIEW`` each; the rays of sensor k begin at ``first_ray[k]``, the last entry is
-    ``ray_count``. Each sensor has ``moving_blocks`` of the moving layer. ``largest_grid`` are the cells of the largest
-    sensor.
-    """
-
-    views: torch.Tensor
-    first_ray: np.ndarray
-    view_count: int
-    ray_count: int
-    tile_count: int
-    largest_grid: int
-    moving_blocks: int
-    keep: tuple[Any, ...]
-    """What owns the tensors whose addresses ``views`` holds."""
-
-
-def view_rows(tensors: Sequence[GridTensors], world_from_sensor: Float64[np.ndarray, "n 2 4 4"]) -> np.ndarray:
-    """A ``VIEW`` per sensor at its poses at both ends of the exposure, [n]."""
+def view_rows(tensors: Sequence[GridTensors]) -> np.ndarray:
+    """A ``VIEW`` per sensor, [n], all but what follows from its poses (``kernels/views.cu``)."""
     rows = np.frombuffer(b"".join([sensor.row for sensor in tensors]), VIEW).copy()
-    start, end = world_from_sensor[:, 0], world_from_sensor[:, 1]
-    reference = geometry.interpolate_pose_pairs(world_from_sensor, rows["reference"])
-    turn = reference[:, :3, :3].transpose(0, 2, 1)
-    rows["eye"], rows["turn"] = reference[:, :3, 3], turn.reshape(-1, 9)
-    # Sweeps report points in the sensor's frame at the end of the exposure.
-    rows["end_from_reference"] = (geometry.inverse(end) @ reference)[:, :3].reshape(-1, 12)
-    moving = np.array([sensor.timed for sensor in tensors]) & (start != end).any(axis=(1, 2))
-    rows["moving"] = moving
-    if moving.any():
-        shift = (end - start)[moving, :3, 3]
-        rows["travel"][moving] = (turn[moving] @ shift[:, :, None])[:, :, 0]
-        # In the sensor's own frame, in which the axis of a constant turn is fixed.
-        rows["swing"][moving] = rotation_vector(start[moving, :3, :3].transpose(0, 2, 1) @ end[moving, :3, :3])
     cells, tiles = rows["rows"] * rows["columns"], rows["tile_rows"] * rows["tile_columns"]
     rows["first_ray"], rows["first_tile"] = np.cumsum(cells) - cells, np.cumsum(tiles) - tiles
     return rows
-
-
-def make_batch(
-    tensors: Sequence[GridTensors], rows: np.ndarray, views: torch.Tensor, sky: torch.Tensor, moving_blocks: int = 0
-) -> Batch:
-    """Put sensors together.
-
-    Args:
-        tensors: their tables.
-        rows: their views, ``view_rows``, with the sky's address.
-        views: the bytes of these on the device.
-        sky: [6,s,s,3] float32 on their device.
-        moving_blocks: of the moving layer, per sensor.
-    """
-    cells = rows["rows"] * rows["columns"]
-    first_ray = np.append(rows["first_ray"], cells[-1] + rows["first_ray"][-1]).astype(np.int64)
-    tile_count = int(rows["first_tile"][-1] + rows["tile_rows"][-1] * rows["tile_columns"][-1])
-    return Batch(views, first_ray, len(rows), int(first_ray[-1]), tile_count, int(cells.max()), moving_blocks,
-                 (*tensors, sky))  # fmt: skip
-
-
-def rotation_vector(rotation: Float64[np.ndarray, "*n 3 3"]) -> Float64[np.ndarray, "*n 3"]:
-    """Axis times angle (at most pi) of rotation matrices."""
-    quat = geometry.quat_from_matrix(rotation)
-    sine = np.linalg.norm(quat[..., 1:], axis=-1, keepdims=True)
-    small = sine <= 1e-12
-    angle = 2 * np.arctan2(sine, quat[..., :1])
-    return quat[..., 1:] * np.where(small, 2.0, angle / np.where(small, 1.0, sine))
