@@ -20,6 +20,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "run": ["run_protocol"],
         "scoring": ["score_window"],
         "summary": ["summarize"],
-        "windows": ["TargetView", "Window"],
+        "windows": ["EvaluationView", "Window"],
     },
 )

@@ -9,7 +9,7 @@ from jaxtyping import Int64
 
 from nurec_sim import geometry
 from nurec_sim.evaluate.views import reduced, reduced_mask
-from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, TargetView
+from nurec_sim.evaluate.windows import ContextClip, EvaluationView, Revolution, Shot
 from nurec_sim.types import CameraModel, Label, Pinhole, Rig, SensorRequest, Trajectory
 from nurec_sim.world import LIDAR_ID, TrueWorld, street_rig, town_plan, true_sweep
 from nurec_sim.world.plan.rig import CAMERA_FROM_RIG_AXES
@@ -67,7 +67,7 @@ class EvaluationWorld:
         # Rendered at most once: methods under comparison read the same frames.
         return Shot(t_us, t_us, request.world_from_sensor, cache(lambda: self.world.view(request).rgb))
 
-    def target(self, name: str, camera_id: str, t_us: int, left_m: float = 0.0, beyond: bool = False) -> TargetView:
+    def target(self, name: str, camera_id: str, t_us: int, left_m: float = 0.0, beyond: bool = False) -> EvaluationView:
         """A target view with its ground truth.
 
         Args:
@@ -81,7 +81,7 @@ class EvaluationWorld:
         seen = self.world.view(request)
         movable = reduced_mask(LABEL_OF_CLASS[seen.surface] == Label.MOVABLE)
         depth_m = np.where(seen.surface == SurfaceClass.SKY, np.float32(0), seen.depth_m)
-        return TargetView(name, request, reduced(seen.rgb, depth_m), movable, left_m, beyond)
+        return EvaluationView(name, request, reduced(seen.rgb, depth_m), movable, left_m, beyond)
 
     def revolutions(self, span_us: tuple[int, int]) -> dict[str, tuple[Revolution, ...]]:
         """Consecutive LiDAR sweeps within a time span."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.procedural import EvaluationWorld, camera_responses, evaluation_rig, held_out_plan
-from nurec_sim.evaluate.windows import ContextClip, TargetView, Window
+from nurec_sim.evaluate.windows import ContextClip, EvaluationView, Window
 from nurec_sim.world import Quality, TrueWorld
 
 PROTOCOLS = ("storm", "clip", "shift")
@@ -37,7 +37,7 @@ NEAR_M, NEAR_SHARE = 1.0, 0.2
 QUALITY = Quality(lidar="rasterised")
 
 Progress = Callable[[str, float], None]
-Made = tuple[ContextClip, list[TargetView]]
+Made = tuple[ContextClip, list[EvaluationView]]
 """Inputs and targets."""
 
 
@@ -189,7 +189,7 @@ def _storm_times(start_us: int) -> tuple[np.ndarray, tuple[int, int]]:
     return start_us + STEP_US * np.arange(STORM_FRAMES), (start_us, start_us + STORM_FRAMES * STEP_US)
 
 
-def _inside_something(target: TargetView) -> bool:
+def _inside_something(target: EvaluationView) -> bool:
     """Whether a shifted view is inside or right in front of an object."""
     depth_m = target.true.depth_m
     return depth_m is not None and float(((depth_m > 0) & (depth_m < NEAR_M)).mean()) > NEAR_SHARE

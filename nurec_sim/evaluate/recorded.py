@@ -15,7 +15,7 @@ from nurec_sim import geometry, sensors
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.log_regions import actor_mask
 from nurec_sim.evaluate.views import ScoredView, reduced, scored_size
-from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot, TargetView, Window
+from nurec_sim.evaluate.windows import ContextClip, EvaluationView, Revolution, Shot, Window
 from nurec_sim.reconstruct.feedforward.inputs.frames import choose_cameras
 from nurec_sim.types import CameraModel, Clip, Rig, SensorRequest
 
@@ -166,7 +166,7 @@ def _nearest_sweep(clip: Clip, exposure_us: Int64[np.ndarray, " 2"]) -> tuple[st
     return None if best is None else best[1:]
 
 
-def _target(clip: Clip, camera_id: str, index: int, sweep: tuple[str, int] | None, beyond: bool) -> TargetView:
+def _target(clip: Clip, camera_id: str, index: int, sweep: tuple[str, int] | None, beyond: bool) -> EvaluationView:
     camera, exposure = clip.rig.cameras[camera_id], clip.camera_times_us(camera_id)[index]
     start, end = int(exposure[0]), max(int(exposure[1]), int(exposure[0]) + 1)
     request = SensorRequest("", camera, start, end, clip.world_from_camera(camera_id, index))
@@ -176,7 +176,7 @@ def _target(clip: Clip, camera_id: str, index: int, sweep: tuple[str, int] | Non
         depth_m = projected_depth(request, camera, clip.sweep(*sweep).xyz_world_m)
     movable = actor_mask(clip, request, scored_size(camera.width_px, camera.height_px)) if clip.tracks else None
     name = f"{camera_id}-{index:04d}"
-    return TargetView(name, request, ScoredView(true.rgb, depth_m), movable, beyond=beyond)
+    return EvaluationView(name, request, ScoredView(true.rgb, depth_m), movable, beyond=beyond)
 
 
 def projected_depth(

@@ -14,7 +14,7 @@ from nurec_sim.evaluate.methods import Built, Contender, build
 from nurec_sim.evaluate.scores.depth import depth_score, least_squares_scale
 from nurec_sim.evaluate.scores.images import masked_psnr, masked_ssim, psnr, ssim
 from nurec_sim.evaluate.views import ScoredView, reduced
-from nurec_sim.evaluate.windows import TargetView, Window
+from nurec_sim.evaluate.windows import EvaluationView, Window
 
 HIGHEST_PSNR_DB = 100.0
 """PSNR of identical images."""
@@ -65,7 +65,7 @@ def score_window(
     return Scored(record, views)
 
 
-def score_view(view: ScoredView, target: TargetView) -> dict[str, Figures | None]:
+def score_view(view: ScoredView, target: EvaluationView) -> dict[str, Figures | None]:
     """Scores of one view: ``full``; with a known dynamic region also ``dynamic`` and ``static``.
 
     ``static`` is the complement of ``dynamic``; either is None if empty. Each has ``psnr_db``, ``ssim``, and with known

@@ -12,7 +12,7 @@ from jaxtyping import Float32, UInt8
 
 from nurec_sim.evaluate.scoring import Scored
 from nurec_sim.evaluate.views import ScoredView
-from nurec_sim.evaluate.windows import TargetView, Window
+from nurec_sim.evaluate.windows import EvaluationView, Window
 from nurec_sim.files.new_files import new_file
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -45,7 +45,7 @@ def draw_sheet(path: Path, window: Window, shown: Mapping[str, Scored]) -> None:
         file.write(cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))[1].tobytes())
 
 
-def chosen_targets(targets: Sequence[TargetView]) -> list[TargetView]:
+def chosen_targets(targets: Sequence[EvaluationView]) -> list[EvaluationView]:
     """The targets on a sheet.
 
     With lateral offsets: on the path, left, right and far off. Otherwise the middle interpolated view of each camera,
@@ -66,7 +66,7 @@ def chosen_targets(targets: Sequence[TargetView]) -> list[TargetView]:
     return picked + after[-1:]
 
 
-def _figures(scored: Scored, target: TargetView) -> dict[str, Any]:
+def _figures(scored: Scored, target: EvaluationView) -> dict[str, Any]:
     return next(row for row in scored.record["targets"] if row["name"] == target.name)
 
 

@@ -88,7 +88,7 @@ def _times(records: Sequence[Shot] | Sequence[Revolution]) -> Int64[np.ndarray, 
 
 
 @dataclass(frozen=True, eq=False)
-class TargetView:
+class EvaluationView:
     """A target view with its ground truth.
 
     Attributes:
@@ -114,7 +114,7 @@ class Window:
 
     id: str
     clip: Clip
-    targets: tuple[TargetView, ...]
+    targets: tuple[EvaluationView, ...]
     about: Mapping[str, str | int | float] = field(default_factory=dict)
 
     @cached_property

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nurec_sim.sim.vehicle import TICK_US, Limits, VehicleState, step
+from nurec_sim.sim.vehicle import TICK_US, VehicleLimits, VehicleState, step
 from nurec_sim.types import Plan
 
 SPEED_GAIN, STATION_GAIN = 2.5, 2.0
@@ -69,10 +69,12 @@ class PlannedPath:
         )
 
 
-Controller = Callable[[PlannedPath, VehicleState, int, float, Limits], VehicleState]
+Controller = Callable[[PlannedPath, VehicleState, int, float, VehicleLimits], VehicleState]
 
 
-def pursuit_pi(path: PlannedPath, state: VehicleState, since_us: int, driven_m: float, limits: Limits) -> VehicleState:
+def pursuit_pi(
+    path: PlannedPath, state: VehicleState, since_us: int, driven_m: float, limits: VehicleLimits
+) -> VehicleState:
     """One tick of pure pursuit (rear axle, lookahead 0.5 s in 3..12 m) and PI speed control with feed-forward.
 
     Args:
@@ -104,7 +106,9 @@ def pursuit_pi(path: PlannedPath, state: VehicleState, since_us: int, driven_m: 
     return step(state, steering, accel, limits)
 
 
-def perfect(path: PlannedPath, state: VehicleState, since_us: int, driven_m: float, limits: Limits) -> VehicleState:
+def perfect(
+    path: PlannedPath, state: VehicleState, since_us: int, driven_m: float, limits: VehicleLimits
+) -> VehicleState:
     """One tick of moving exactly along the plan: isolates the policy from vehicle dynamics.
 
     Args:

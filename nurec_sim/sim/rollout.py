@@ -26,7 +26,7 @@ from nurec_sim.sim.policy_host import PLAN_TIMEOUT_S, PolicyHost, described
 from nurec_sim.sim.policy_sensors import SceneFacts, SensorSuite
 from nurec_sim.sim.recorded import RecordedDrive
 from nurec_sim.sim.scenario import STATE_S, Perturbation, Scenario
-from nurec_sim.sim.vehicle import TICK_US, Limits, VehicleState
+from nurec_sim.sim.vehicle import TICK_US, VehicleLimits, VehicleState
 from nurec_sim.types import EgoState, Event, Matrix4, Observation, Plan, Policy, Rollout, Sense, SensorFrame
 
 STATE_US = int(round(STATE_S * 1e6))
@@ -177,7 +177,7 @@ class _Drive:
         self.progress, self.on_frames = progress, on_frames
         self.recorded = RecordedDrive(facts.ego)
         self.actors = Actors(facts.tracks, {})
-        self.limits = Limits()
+        self.limits = VehicleLimits()
         self.states: list[EgoState] = []
         self.plans: list[tuple[int, Plan]] = []
         self.events: list[Event] = []

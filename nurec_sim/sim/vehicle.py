@@ -10,7 +10,7 @@ TICK_US = 10_000
 
 
 @dataclass(frozen=True)
-class Limits:
+class VehicleLimits:
     """Vehicle limits; defaults as in ``docs/closed_loop.md``."""
 
     wheelbase_m: float = 2.85
@@ -32,12 +32,12 @@ class VehicleState:
     accel_mps2: float = 0.0
     steering_rad: float = 0.0
 
-    def yaw_rate_radps(self, limits: Limits) -> float:
+    def yaw_rate_radps(self, limits: VehicleLimits) -> float:
         """Yaw rate from steering angle and speed."""
         return self.speed_mps * math.tan(self.steering_rad) / limits.wheelbase_m
 
 
-def advance(state: VehicleState, dt_s: float, limits: Limits) -> VehicleState:
+def advance(state: VehicleState, dt_s: float, limits: VehicleLimits) -> VehicleState:
     """Moves for ``dt_s`` with constant steering and acceleration: the rear axle follows an exact circular arc.
 
     A braking car stops within the step and never rolls backwards.
@@ -63,7 +63,9 @@ def advance(state: VehicleState, dt_s: float, limits: Limits) -> VehicleState:
     )
 
 
-def actuate(state: VehicleState, steering_rad: float, accel_mps2: float, dt_s: float, limits: Limits) -> VehicleState:
+def actuate(
+    state: VehicleState, steering_rad: float, accel_mps2: float, dt_s: float, limits: VehicleLimits
+) -> VehicleState:
     """Actuator response to commands: limits, first-order lag, bounded steering rate.
 
     Args:
@@ -84,7 +86,7 @@ def actuate(state: VehicleState, steering_rad: float, accel_mps2: float, dt_s: f
 
 
 def step(
-    state: VehicleState, steering_rad: float, accel_mps2: float, limits: Limits, dt_s: float = TICK_US / 1e6
+    state: VehicleState, steering_rad: float, accel_mps2: float, limits: VehicleLimits, dt_s: float = TICK_US / 1e6
 ) -> VehicleState:
     """One step of the car under commands: actuators first, then the exact arc.
 

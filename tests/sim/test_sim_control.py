@@ -8,11 +8,11 @@ import pytest
 from nurec_sim.errors import PlanError
 from nurec_sim.sim.control import PlannedPath, perfect, pursuit_pi
 from nurec_sim.sim.plans import check_plan
-from nurec_sim.sim.vehicle import Limits, VehicleState
+from nurec_sim.sim.vehicle import VehicleLimits, VehicleState
 from nurec_sim.types import Plan
 
 NOW_US = 3_000_000
-LIMITS = Limits()
+LIMITS = VehicleLimits()
 LAG = 1 - math.exp(-0.1)
 """Share of a command that a lag of 0.1 s lets through within a tick of 10 ms."""
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nurec_sim.sim.vehicle import Limits, VehicleState, actuate, advance, step
+from nurec_sim.sim.vehicle import VehicleLimits, VehicleState, actuate, advance, step
 
-LIMITS = Limits()
+LIMITS = VehicleLimits()
 
 
 @settings(max_examples=60, deadline=None)

@@ -27,7 +27,7 @@ HEADER_BYTES = 512
 Key = tuple[int, ...]
 
 
-class Storage(Protocol):
+class BagFile(Protocol):
     """One file of a bag."""
 
     topics: dict[str, str]
@@ -53,7 +53,7 @@ def is_bag(path: Path) -> bool:
     return path.suffix in SUFFIXES and path.is_file()
 
 
-def open_files(path: Path) -> list[Storage]:
+def open_files(path: Path) -> list[BagFile]:
     """The files of a bag, in order.
 
     Raises:
@@ -97,7 +97,7 @@ def _listed(folder: Path) -> list[Path]:
     return files
 
 
-def _open(file: Path) -> Storage:
+def _open(file: Path) -> BagFile:
     with _damage(file):
         return McapFile(file) if file.suffix == ".mcap" else SqliteFile(file)
 
@@ -127,7 +127,7 @@ class McapFile:
         }
 
     def scan(self, whole: Collection[str], starts: Collection[str]) -> Iterator[tuple[str, Key, bytes]]:
-        """See ``Storage``."""
+        """See ``BagFile``."""
         count: Counter[tuple[str, int]] = Counter()
         with self._lock, _damage(self._file):
             for _, channel, message in self._reader.iter_messages([*whole, *starts], log_time_order=False):
@@ -136,7 +136,7 @@ class McapFile:
                 count[at] += 1
 
     def read(self, topic: str, key: Key) -> bytes:
-        """See ``Storage``."""
+        """See ``BagFile``."""
         time, number = key
         with self._lock, _damage(self._file):
             found = self._reader.iter_messages([topic], starting_at=time, ending_at=time, log_time_order=False)
@@ -167,7 +167,7 @@ class SqliteFile:
             connection.close()
 
     def scan(self, whole: Collection[str], starts: Collection[str]) -> Iterator[tuple[str, Key, bytes]]:
-        """See ``Storage``."""
+        """See ``BagFile``."""
         for topics, column in ((whole, "data"), (starts, f"substr(data, 1, {HEADER_BYTES})")):
             for topic in topics:
                 if topic not in self._ids:
@@ -178,7 +178,7 @@ class SqliteFile:
                         yield topic, (row,), bytes(data)
 
     def read(self, topic: str, key: Key) -> bytes:
-        """See ``Storage``."""
+        """See ``BagFile``."""
         with self._connection() as connection:
             row = connection.execute("SELECT data FROM messages WHERE id = ?", key).fetchone()
         if row is None:

@@ -75,7 +75,7 @@ class _Opening:
 
     path: Path
     settings: Settings
-    files: list[storage.Storage] = field(init=False)
+    files: list[storage.BagFile] = field(init=False)
     topics: dict[str, str] = field(init=False)
     frames: Frames = field(default_factory=Frames)
     infos: dict[str, Any] = field(default_factory=dict)
@@ -287,7 +287,7 @@ def _sweeps(
 class _Messages:
     """The messages of a bag as a ``types.LogSource``."""
 
-    files: list[storage.Storage]
+    files: list[storage.BagFile]
     types: Mapping[str, str]
     topics_of: dict[str, str] = field(default_factory=dict)
     places: dict[str, list[_Message]] = field(default_factory=dict)

@@ -18,7 +18,7 @@ from nurec_sim.errors import RequestError, ScenarioError, SessionError, TooLarge
 from nurec_sim.serving.driver.images import image_size, see_image
 from nurec_sim.serving.driver.motion import ego_states
 from nurec_sim.serving.wire.driving import EncodedImage, SessionStart
-from nurec_sim.serving.wire.driving_paths import Placed, RecordedFuture, Route, moved
+from nurec_sim.serving.wire.driving_paths import Placed, RecordedFuture, RouteWaypoints, moved
 from nurec_sim.serving.wire.driving_states import ReportedState
 from nurec_sim.sim.policy_sensors import find_camera, find_lidar
 from nurec_sim.types import ActorState, EgoState, LidarFrame, Needs, Observation, Rig, Trajectory
@@ -38,7 +38,7 @@ class Question:
     history: tuple[EgoState, ...]
     images: Mapping[str, EncodedImage]
     sweeps: Mapping[str, LidarFrame]
-    route: tuple[Route, Placed] | None
+    route: tuple[RouteWaypoints, Placed] | None
     recorded: tuple[RecordedFuture, Placed] | None
     actors: tuple[ActorState, ...] | None
 
@@ -57,7 +57,7 @@ class Session:
         self._states: list[ReportedState] = []
         self._images: dict[str, list[EncodedImage]] = {}
         self._sweeps: dict[str, list[LidarFrame]] = {}
-        self._route: Route | None = None
+        self._route: RouteWaypoints | None = None
         self._recorded: RecordedFuture | None = None
         self._actors: tuple[int, tuple[ActorState, ...]] | None = None
 
@@ -96,7 +96,7 @@ class Session:
         _check_room(self._images, sweeps)
         self._sweeps = sweeps
 
-    def set_route(self, route: Route) -> None:
+    def set_route(self, route: RouteWaypoints) -> None:
         """The way ahead; replaces the last one."""
         self._route = route
 

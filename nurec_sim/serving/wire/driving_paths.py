@@ -86,7 +86,7 @@ def moved(xyyaw: Poses2, then: Placed, now: Placed) -> Poses2:
 
 
 @dataclass(frozen=True)
-class Route:
+class RouteWaypoints:
     """Way points in the rig frame of ``t_us`` (0: of now); exact and with speeds only where the client says so."""
 
     t_us: int
@@ -117,7 +117,7 @@ def write_route(ego: EgoState, route_m: Points2, speed_mps: Float64[np.ndarray, 
     message.speed_mps.extend(np.asarray(speed_mps, np.float64).tolist())
 
 
-def read_route(message) -> Route:
+def read_route(message) -> RouteWaypoints:
     """The route of a ``Route``, without the way points at its end that are not a number.
 
     AlpaSim pads to 20 points with them once less way is left. All of them is no route: no way points.
@@ -143,7 +143,7 @@ def read_route(message) -> Route:
         _exact(message.exact_xy, count, 2, "route.exact_xy"),
         _exact(message.speed_mps, count, 1, "speed_mps"),
     )
-    return Route(message.timestamp_us, xyz, exact, None if speed is None else speed[:, 0])
+    return RouteWaypoints(message.timestamp_us, xyz, exact, None if speed is None else speed[:, 0])
 
 
 # --------------------------------------------------------------------------------------------------- recorded futures
