@@ -130,7 +130,8 @@ lidars:
         ("lidars: {a: {topic: /top/points, time: {field: q}}}", "no field 'q'; have .*intensity"),
         ("lidars: {a: {topic: /top/points, time: {unit: s}}}", "no times of a sweep in s; name its field and unit"),
         ("lidars: {a: {topic: /top/points, frame: roof}}", "no transforms lead from frame 'roof'.*T_base_sensor"),
-        ("base: car", "no transforms lead from frame .* to 'car'|does not move"),
+        ("base: car", "there is no frame 'car', have .*'base_link'.*names the frame of the car under 'base'"),
+        ("world: front_frame", "frame 'base_link' does not move in 'front_frame'; name the topic of its poses"),
         ("poses: /tf", "topic '/tf' holds no poses; topics with poses are"),
     ],
 )
@@ -146,7 +147,10 @@ def test_lenses_of_cameras_that_show_a_part_at_half_the_resolution(clip):
     lens, width, height = _ros_sensors.lens_of("/info", info, rectified=False)
     assert (width, height, lens.fx_px, lens.cx_px, lens.cy_px) == (24, 20, 30.0, 14.25, 11.25)
     assert _ros_sensors.lens_of("/info", info, rectified=True)[0].radial == Pinhole(1, 1, 0, 0).radial
-    info.distortion_model = "thin"
+    with pytest.raises(ClipError, match="focal lengths of 0.0 and 61.0, it is not calibrated; give a lens"):
+        info.k[0] = 0.0
+        _ros_sensors.lens_of("/info", info, rectified=False)
+    info.k[0], info.distortion_model = 60.0, "thin"
     with pytest.raises(ClipError, match="/info: distortion model 'thin' is unknown; known are plumb_bob"):
         _ros_sensors.lens_of("/info", info, rectified=False)
 
@@ -202,6 +206,15 @@ def test_odometry_gives_poses_where_there_are_no_transforms(ros, clip, tmp_path)
     opened = logs.open_clip(path)
     assert opened.facts["poses"] == "of 'base_link' in 'odom'"
     assert len(list(same(opened, clip))) == 3
+
+
+def test_clouds_in_the_frame_of_the_map_are_no_lidars(ros, clip, tmp_path):
+    rows = list(bag_messages(clip, "t", False, np.asarray))
+    t_us, cloud = points(clip, "top", 0, "")
+    cloud.header.frame_id = "map"
+    path = tmp_path / "a.mcap"
+    write_mcap(path, [*rows, ("/obstacles", _ros_messages.POINTS, cloud, t_us * 1000)])
+    assert list(logs.open_clip(path).rig.lidars) == ["top_points"]
 
 
 def test_headers_are_read_from_the_first_bytes():

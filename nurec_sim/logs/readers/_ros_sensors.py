@@ -55,7 +55,10 @@ def lens_of(where: str, info: Any, rectified: bool) -> tuple[Lens, int, int]:
     matrix = np.array(info.p if rectified else info.k, np.float64).reshape(3, -1)
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
     if not (np.isfinite(matrix).all() and fx > 0 and fy > 0):
-        raise ClipError(f"{where}: the camera is not calibrated, its focal lengths are {fx} and {fy}")
+        raise ClipError(
+            f"{where}: its CameraInfo has focal lengths of {fx} and {fy}, it is not calibrated; give a lens in the "
+            "YAML file, or list the other cameras there"
+        )
     lens = Pinhole(fx, fy, cx, cy) if rectified else _distorted(where, info, fx, fy, cx, cy)
     # K describes the full sensor; images may show a part of it, at a lower resolution.
     roi, step_x, step_y = info.roi, max(1, info.binning_x), max(1, info.binning_y)

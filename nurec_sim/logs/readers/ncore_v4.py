@@ -125,7 +125,7 @@ def _read(loader: Any) -> Clip:
     cameras, images, lidars, sweeps = {}, {}, {}, {}
     sources: dict[str, Any] = {}
     facts: dict[str, Any] = {"dataset": FORMAT}
-    for name in loader.camera_ids:
+    for name in sorted(loader.camera_ids):  # the package has them in the order in which files were opened
         with _reading(f"camera {name!r}"):
             sources[name] = sensor = loader.get_camera_sensor(name)
             cameras[name] = models.camera_model(name, sensor.model_parameters, _mounting(graph, name, ego))
@@ -133,7 +133,7 @@ def _read(loader: Any) -> Clip:
                 ImageRecord(f"{name}/{end}", start, end, _world_from(graph, name, ego, np.array([start, end])))
                 for start, end in sensor.frames_timestamps_us.astype(np.int64).tolist()
             ]
-    for name in loader.lidar_ids:
+    for name in sorted(loader.lidar_ids):
         with _reading(f"LiDAR {name!r}"):
             sources[name] = sensor = loader.get_lidar_sensor(name)
             lidars[name], note = models.lidar_model(name, sensor.model_parameters, _mounting(graph, name, ego))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float64, Int64, UInt8
 
 from nurec_sim import sensors
 from nurec_sim.errors import ClipError
@@ -28,6 +28,9 @@ from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.types import CameraModel, LidarModel, Matrix4, Rig, SweepPoints, Trajectory
 
 STAND_IN_TABLE = "PANDAR128"
+TIMES_LOOKED_AT = 50
+ATTACHED = 0.1
+"""Metres, and about radians, by which a sensor's pose in the car may change."""
 
 
 class RosBagReader:
@@ -94,22 +97,30 @@ class _Opening:
             )
         self._scan([*(each.topic for each in cameras.values()), *(each.topic for each in lidars.values())])
         source = _Messages(self.files, self.topics)
-        world = self.settings.world or next(
-            (name for name in WORLDS if name in self.frames.above(self.settings.base)),
-            self.frames.above(self.settings.base)[-1],
-        )
-        recorded = self.frames.trajectory(world, self.settings.base)
+        base = self.settings.base
+        if base not in self.frames.names:
+            raise ClipError(
+                f"{self.path.name}: there is no frame {base!r}, have {self.frames.names}; "
+                "a YAML file names the frame of the car under 'base'"
+            )
+        above = self.frames.above(base)
+        world = self.settings.world or next((name for name in WORLDS if name in above), above[-1])
+        recorded = self.frames.trajectory(world, base)
         rig_from_base = np.eye(4)
         rig_from_base[2, 3] = -self.settings.ground_z_m
         base_from_rig = np.linalg.inv(rig_from_base)
         ego = Trajectory(recorded.t_us, recorded.world_from_body @ base_from_rig)
+        if self.settings.lidars is None:
+            lidars = {name: each for name, each in lidars.items() if self._attached(name, each, ego.t_us)}
+        if self.settings.cameras is None:
+            cameras = {name: each for name, each in cameras.items() if self.found.get(each.topic)}
         rig_cameras, rig_lidars, images, sweeps = {}, {}, {}, {}
         for name, camera in cameras.items():
             rig_cameras[name] = self._camera(name, camera, source, rig_from_base)
             images[name] = list(_images(camera, rig_cameras[name], self._sorted(camera.topic), ego))
             source.topics_of[name] = camera.topic
             source.places[name] = self._sorted(camera.topic)
-        facts: dict[str, Any] = {"dataset": "ROS 2 bag", "poses": f"of {self.settings.base!r} in {world!r}"}
+        facts: dict[str, Any] = {"dataset": "ROS 2 bag", "poses": f"of {base!r} in {world!r}"}
         for name, lidar in lidars.items():
             source.topics_of[name] = lidar.topic
             source.places[name] = self._sorted(lidar.topic)
@@ -207,16 +218,30 @@ class _Opening:
         found = {each.t_us: each for each in reversed(self.found.get(topic, []))}
         return [found[t] for t in sorted(found)]
 
-    def _mounting(self, name: str, given: CameraSettings | LidarSettings, rig_from_base: Matrix4) -> Matrix4:
+    def _in_base(
+        self, name: str, given: CameraSettings | LidarSettings, t_us: Int64[np.ndarray, " n"]
+    ) -> Float64[np.ndarray, "n 4 4"]:
+        """Poses of a sensor in the base frame."""
         if given.base_from_sensor is not None:
-            return rig_from_base @ given.base_from_sensor
-        rows = self._sorted(given.topic)
-        frame = given.frame or (rows[0].frame if rows else "")
+            return np.broadcast_to(given.base_from_sensor, (len(t_us), 4, 4))
+        rows = self.found.get(given.topic)
         try:
-            times = np.array([rows[len(rows) // 2].t_us if rows else 0], np.int64)
-            return rig_from_base @ self.frames.pose(self.settings.base, frame, times)[0]
+            return self.frames.pose(self.settings.base, given.frame or (rows[0].frame if rows else ""), t_us)
         except ClipError as error:
             raise ClipError(f"{self.path.name}: {name!r}: {error}; or give 'T_base_sensor'") from None
+
+    def _mounting(self, name: str, given: CameraSettings | LidarSettings, rig_from_base: Matrix4) -> Matrix4:
+        rows = self._sorted(given.topic)
+        middle = np.array([rows[len(rows) // 2].t_us if rows else 0], np.int64)
+        pose: Matrix4 = rig_from_base @ self._in_base(name, given, middle)[0]
+        return pose
+
+    def _attached(self, name: str, given: LidarSettings, t_us: Int64[np.ndarray, " n"]) -> bool:
+        """Whether a topic has messages, and their frame keeps its place in the car; that of a map does not."""
+        if not self.found.get(given.topic):
+            return False
+        poses = self._in_base(name, given, t_us[:: 1 + len(t_us) // TIMES_LOOKED_AT])
+        return float(np.abs(poses - poses[0]).max()) < ATTACHED
 
     def _camera(self, name: str, given: CameraSettings, source: _Messages, rig_from_base: Matrix4) -> CameraModel:
         where = f"{self.path.name}: camera {name!r}"
