@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from nurec_sim.cli.console import OnePath, app, out, print_table, progress
+from nurec_sim.cli.inputs import PosesName, with_poses
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable
 
@@ -15,7 +16,7 @@ OutPath = Annotated[Path, tyro.conf.arg(name="out")]
 
 
 @app.command(name="import-log")
-def import_log(log: OnePath, *, out_path: OutPath, overwrite: bool = False) -> None:
+def import_log(log: OnePath, *, out_path: OutPath, poses: PosesName = "recorded", overwrite: bool = False) -> None:
     """Write a driving log of any format as a clip folder of ours (docs/log_formats.md).
 
     Other commands open these formats directly; a clip folder is for editing and moving a log.
@@ -23,9 +24,10 @@ def import_log(log: OnePath, *, out_path: OutPath, overwrite: bool = False) -> N
     Args:
         log: the log, such as the folder of a KITTI drive.
         out_path: the folder to create, or a .zip file.
+        poses: those of the log, or refined by its LiDAR.
         overwrite: replace an existing clip.
     """
-    _convert(log, out_path, None, 0.0, None, (), overwrite)
+    _convert(log, out_path, None, 0.0, None, (), overwrite, poses)
 
 
 @app.command
@@ -59,6 +61,7 @@ def _convert(
     seconds: float | None,
     cameras: tuple[str, ...],
     overwrite: bool,
+    poses: PosesName = "recorded",
 ) -> None:
     from nurec_sim import logs
 
@@ -67,7 +70,7 @@ def _convert(
     if out_path.resolve() == path.resolve():
         raise NurecSimError(f"--out {out_path} is the log itself; give another --out")
     check_writable(out_path, folder=out_path.suffix != ".zip")
-    log = logs.open_clip(path)
+    log = with_poses(logs.open_clip(path), poses)
     with progress(f"writing {out_path.name}") as advance:
         logs.convert_clip(
             log,

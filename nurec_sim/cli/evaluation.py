@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from nurec_sim.cli.console import app, chosen_device, err, out, print_table, progress
+from nurec_sim.cli.inputs import PosesName, with_poses
 from nurec_sim.cli.scenes import NO_FLAGS, MethodName, NetworkFlags, method_settings, refinement
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable, write_file
@@ -38,6 +39,8 @@ class LogFlags:
     """CLIP: the method, as in `nurec-sim reconstruct`."""
     refine: float | None = None
     """CLIP: time budget in seconds for optimising the scene on its input images and sweeps."""
+    poses: PosesName = "recorded"
+    """CLIP: poses of the log, or refined by its LiDAR (docs/log_formats.md)."""
     input_cameras: tuple[str, ...] = ()
     """CLIP: input cameras of the reconstruction; default: all."""
     target_cameras: tuple[str, ...] = ()
@@ -158,6 +161,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
     device = chosen_device(network.device)
     if flags.scene is not None and flags.refine is not None:
         raise NurecSimError("--refine fits a new reconstruction; --scene is finished")
+    log = with_poses(log, flags.poses)
     if flags.method not in ("dense", "selective"):
         network = dataclasses.replace(network, device=NO_FLAGS.device)  # its renderer alone uses it
     with progress("evaluating") as advance:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import tyro
 
 from nurec_sim.cli.console import OnePath, app, chosen_device, out, print_table, progress
+from nurec_sim.cli.inputs import PosesName, with_poses
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
@@ -30,6 +31,7 @@ def reconstruct(
     out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     method: MethodName = "lift",
     cameras: tuple[str, ...] = (),
+    poses: PosesName = "recorded",
     map_from_gaussians: bool = False,
     refine: float | None = None,
     resume: bool = False,
@@ -53,6 +55,7 @@ def reconstruct(
         method: lift, dense, selective, optimized, one of an installed package, or a class (docs/write_a_method.md).
         changes: a setting of the method, repeatable: --set sky_px=256 --set views.levels=48.
         cameras: use only these cameras; default: all, or as many as the network's profile supports.
+        poses: those of the log, or refined by its LiDAR (docs/log_formats.md).
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
         refine: time budget in seconds for optimising the scene on the log's images and sweeps.
@@ -70,6 +73,7 @@ def reconstruct(
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
     settings, fit = _with_checkpoint(method, settings, refinement(refine), target, resume)
     check_writable(target)
+    log = with_poses(log, poses)
     with progress("reconstructing") as advance:
         world_scene = run_method(
             log,

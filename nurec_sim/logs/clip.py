@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
+from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.sweeps import SweepRecord, compensated_sweep
 from nurec_sim.types import CameraModel, LidarModel, LogSource, Matrix4, Rig, RoadMap, Sweep, Track, Trajectory
@@ -133,6 +134,34 @@ class Clip:
     def __repr__(self) -> str:
         return f"Clip({self.id!r}, cameras={list(self.rig.cameras)}, lidars={list(self.rig.lidars)})"
 
+    def corrected(self, correction: Trajectory) -> Clip:
+        """The same log with all poses moved by a correction that varies over time.
+
+        Args:
+            correction: ``refined_from_recorded`` in the world at some times; interpolated in between.
+        """
+
+        def moved(path: Trajectory) -> Trajectory:
+            return Trajectory(path.t_us, _corrected(correction, path.t_us, path.world_from_body))
+
+        def image(record: ImageRecord) -> ImageRecord:
+            times = np.array([record.start_us, record.end_us])
+            return dataclasses.replace(
+                record, world_from_camera=_corrected(correction, times, record.world_from_camera)
+            )
+
+        def sweep(record: SweepRecord) -> SweepRecord:
+            pose = _corrected(correction, np.array([record.t_us]), record.world_from_lidar[None])[0]
+            return dataclasses.replace(record, world_from_lidar=pose)
+
+        return self._with(
+            # Poses of the ego where the correction changes too: in between, both are interpolated.
+            moved(_resampled(self.ego, correction.t_us)),
+            {name: [image(record) for record in rows] for name, rows in self._images.items()},
+            {name: [sweep(record) for record in rows] for name, rows in self._sweeps.items()},
+            [dataclasses.replace(track, path=moved(track.path)) for track in self.tracks],
+        )
+
     def later(self, offset_us: int) -> Clip:
         """The same log with ``offset_us`` added to all times."""
 
@@ -143,20 +172,36 @@ class Clip:
             changed = {name: getattr(record, name) + offset_us for name in _TIMES if hasattr(record, name)}
             return dataclasses.replace(record, **changed)
 
+        clip = self._with(
+            moved(self.ego),
+            {name: [put_off(record) for record in rows] for name, rows in self._images.items()},
+            {name: [put_off(record) for record in rows] for name, rows in self._sweeps.items()},
+            [dataclasses.replace(track, path=moved(track.path)) for track in self.tracks],
+        )
+        clip.time_offset_us += offset_us
+        return clip
+
+    def _with(
+        self,
+        ego: Trajectory,
+        images: Mapping[str, Sequence[ImageRecord]],
+        sweeps: Mapping[str, Sequence[SweepRecord]],
+        tracks: Sequence[Track],
+    ) -> Clip:
+        """The same log with other poses and times."""
         clip = Clip(
             id=self.id,
             rig=self.rig,
-            ego=moved(self.ego),
-            images={name: [put_off(record) for record in rows] for name, rows in self._images.items()},
-            sweeps={name: [put_off(record) for record in rows] for name, rows in self._sweeps.items()},
+            ego=ego,
+            images=images,
+            sweeps=sweeps,
             source=self.source,
-            tracks=[dataclasses.replace(track, path=moved(track.path)) for track in self.tracks],
+            tracks=tracks,
             road_map=self.road_map,
             facts=self.facts,
             rig_from_log=self.rig_from_log,
         )
-        clip.path, clip.format = self.path, self.format
-        clip.time_offset_us = self.time_offset_us + offset_us
+        clip.path, clip.format, clip.time_offset_us = self.path, self.format, self.time_offset_us
         return clip
 
     @property
@@ -292,6 +337,28 @@ class Clip:
             raise error if str(error).startswith(f"{name}: ") else ClipError(f"{name}: {what}: {error}") from None
         except Exception as error:
             raise ClipError(f"{name}: {what} cannot be read: {type(error).__name__}: {error}") from error
+
+
+def _resampled(path: Trajectory, t_us: Int64[np.ndarray, " n"]) -> Trajectory:
+    """A trajectory with poses at further times within its span."""
+    times = np.union1d(path.t_us, t_us[(t_us > path.start_us) & (t_us < path.end_us)])
+    return Trajectory(times, path.at(times))
+
+
+def _corrected(
+    correction: Trajectory, t_us: Int64[np.ndarray, " n"], poses: Float64[np.ndarray, "n 4 4"]
+) -> Float64[np.ndarray, "n 4 4"]:
+    """Poses moved by the correction at their times.
+
+    The correction turns about the origin of the world, which may be far away. Poses moved by the corrections before and
+    after are interpolated instead, in which rotation and translation do not mix.
+    """
+    low = np.clip(np.searchsorted(correction.t_us, t_us, side="right") - 1, 0, max(len(correction.t_us) - 2, 0))
+    ends = np.stack([low, np.minimum(low + 1, len(correction.t_us) - 1)], axis=1)
+    span = np.maximum(np.diff(correction.t_us[ends], axis=1)[:, 0], 1)
+    share = np.clip((t_us - correction.t_us[low]) / span, 0.0, 1.0)
+    pairs = correction.world_from_body[ends] @ poses[:, None]
+    return geometry.interpolate_pose_pairs(pairs, share)
 
 
 def _named(clip_id: str, kind: str, name: str, known: Mapping[str, T]) -> T:

@@ -1,0 +1,62 @@
+"""Points of a sweep that stand still: without those in boxes of what moves, and without the car itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from nurec_sim import geometry
+from nurec_sim.logs.clip import Clip
+from nurec_sim.types import Track
+
+NEAREST_M, FURTHEST_M = 2.5, 80.0
+MARGIN_M = 0.3
+SLOWEST_MPS = 1.0
+"""Boxes that are slower may be parked cars seen from recorded poses that drift."""
+ALWAYS = ("person", "rider", "animal")
+
+Points = Float64[np.ndarray, "n 3"]
+
+
+def moving_tracks(clip: Clip) -> list[Track]:
+    """Tracks whose boxes are left out: those that move, and people and animals, who may."""
+    return [track for track in clip.tracks if track.label in ALWAYS or _speed_mps(track) > SLOWEST_MPS]
+
+
+def _speed_mps(track: Track) -> float:
+    """Largest mean speed over half a second or more."""
+    seconds = (track.path.t_us - track.path.start_us) / 1e6
+    place = track.path.position_m
+    late = np.searchsorted(seconds, seconds + 0.5)
+    early = np.flatnonzero(late < len(seconds))
+    if not len(early):
+        return 0.0
+    late = late[early]
+    return float((np.linalg.norm(place[late] - place[early], axis=1) / (seconds[late] - seconds[early])).max())
+
+
+def static_points(clip: Clip, lidar_id: str, index: int, moving: Sequence[Track]) -> Points:
+    """Points of a sweep in the rig frame at its time, motion compensated, without ``moving`` and the car itself."""
+    sweep = clip.sweep(lidar_id, index)
+    world_from_rig = clip.ego.at(sweep.t_us)
+    points = geometry.transform_points(geometry.inverse(world_from_rig) @ sweep.world_from_lidar, sweep.xyz_m)
+    distance = np.linalg.norm(points, axis=1)
+    body = clip.rig.body
+    outside = ~geometry.points_in_box(points - np.asarray(body.center_m), body.size_m, MARGIN_M)
+    points = points[(distance > NEAREST_M) & (distance < FURTHEST_M) & outside]
+    for track in moving:
+        if track.path.covers(sweep.t_us):
+            box_from_rig = geometry.inverse(track.path.at(sweep.t_us)) @ world_from_rig
+            local = geometry.transform_points(box_from_rig, points)
+            points = points[~geometry.points_in_box(local, track.size_m, MARGIN_M)]
+    return points
+
+
+def thinned(points: Points, cell_m: float) -> Points:
+    """The first point in each cell of a grid, in the order of the points."""
+    cells = np.floor(points / cell_m).astype(np.int64) + (1 << 20)
+    # One number for each cell: sorting triples takes several times as long.
+    _, first = np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2], return_index=True)
+    return points[np.sort(first)]
