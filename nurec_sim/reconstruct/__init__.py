@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Any
 from nurec_sim import plugins
 from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
-from nurec_sim.reconstruct.lift.settings import GroundSettings, LiftSettings, PointSettings, ViewSettings
+from nurec_sim.reconstruct.lift.settings import (
+    ColourSettings,
+    GroundSettings,
+    LiftSettings,
+    PointSettings,
+    ViewSettings,
+)
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 
 if TYPE_CHECKING:
@@ -19,6 +25,7 @@ START_SHARE = 0.15
 """Share of all work, about, that is done before the optimisation starts."""
 
 __all__ = [
+    "ColourSettings",
     "FeedForwardSettings",
     "GroundSettings",
     "LiftSettings",

@@ -66,12 +66,28 @@ class ViewSettings:
 
 
 @dataclass(frozen=True)
+class ColourSettings:
+    """How colours are solved for, once all Gaussians are there."""
+
+    rounds: int = 8
+    """How often an image is taken at most; 0 leaves the colours of single pixels."""
+    images: int = 60
+    """Images taken in all, about: those of a short log several times, those of a long one evenly thinned. Responses of
+    frames between them are interpolated."""
+    trust: float = 0.5
+    """The first colour of a Gaussian counts like this many pixels."""
+    gain_pull: float = 0.01
+    """Weight of a frame's gains being 1, next to that of the errors of all of its pixels; of offsets being 0: more."""
+
+
+@dataclass(frozen=True)
 class LiftSettings:
     """All settings of ``reconstruct(clip, "lift")``."""
 
     points: PointSettings = field(default_factory=PointSettings)
     ground: GroundSettings = field(default_factory=GroundSettings)
     views: ViewSettings = field(default_factory=ViewSettings)
+    colours: ColourSettings = field(default_factory=ColourSettings)
     sky_px: int = 512
     """Edge of a cubemap face."""
     opacity: float = 0.95

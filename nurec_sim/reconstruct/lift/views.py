@@ -106,20 +106,25 @@ def without_ego(tile: Tile, camera: CameraModel, body: Box) -> Tile:
 
     Cameras below ``EGO_HEIGHT_M`` look out of that body, and keep all pixels.
     """
+    u, v = np.meshgrid(np.arange(tile.width) + 0.5, np.arange(tile.height) + 0.5)
+    rays = np.stack([(u - tile.center_px[0]) / tile.focal_px, (v - tile.center_px[1]) / tile.focal_px, u * 0 + 1], -1)
+    return dataclasses.replace(tile, valid=tile.valid & ~shows_ego(rays @ tile.camera_from_tile.T, camera, body))
+
+
+def shows_ego(rays: Float64[np.ndarray, "h w 3"], camera: CameraModel, body: Box) -> Bool[np.ndarray, "h w"]:
+    """Which of a camera's rays, of any length, pass through the lower body of the car; none if it is within."""
     centre, size = np.asarray(body.center_m), np.asarray(body.size_m)
     low, high = centre - size / 2, centre + size / 2
     high[2] = min(high[2], low[2] + EGO_HEIGHT_M)
     origin = camera.rig_from_camera[:3, 3]
     if np.all((origin >= low) & (origin <= high)):
-        return tile
-    u, v = np.meshgrid(np.arange(tile.width) + 0.5, np.arange(tile.height) + 0.5)
-    rays = np.stack([(u - tile.center_px[0]) / tile.focal_px, (v - tile.center_px[1]) / tile.focal_px, u * 0 + 1], -1)
-    rays = rays @ (camera.rig_from_camera[:3, :3] @ tile.camera_from_tile).T
+        return np.zeros(rays.shape[:2], bool)
+    rays = rays @ camera.rig_from_camera[:3, :3].T
     # Slab test against the box; no division by zero for rays along a face.
     rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
     near, far = (low - origin) / rays, (high - origin) / rays
     enter, leave = np.minimum(near, far).max(axis=-1), np.maximum(near, far).min(axis=-1)
-    return dataclasses.replace(tile, valid=tile.valid & ~((enter < leave) & (leave > 0)))
+    return (enter < leave) & (leave > 0)
 
 
 def _pixels_per_radian(camera: CameraModel) -> float:

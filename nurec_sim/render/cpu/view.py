@@ -90,6 +90,13 @@ class ExposureView:
         return ROLLING if travel <= GENTLE_TRAVEL_M and turn <= GENTLE_TURN_RAD else MOVING
 
     @cached_property
+    def directions(self) -> Float32[np.ndarray, "h w 3"]:
+        """Unit rays in the reference frame."""
+        if self.still:
+            return self.grid.direction
+        return np.einsum("hwij,hwj->hwi", self.turns.reshape(-1, 3, 3)[self.grid.line], self.grid.direction)
+
+    @cached_property
     def turns(self) -> Float32[np.ndarray, "l 9"]:
         """Rotation of each line into the reference frame."""
         return np.ascontiguousarray(self.lines[:, :9])

@@ -45,6 +45,9 @@ IMAGE_PLANES = 6
 S_XX, S_XY, S_YY, S_XW, S_YW, S_WX, S_WY, S_WW, S_FLAT, S_FADE, S_FEATURE = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10
 SUMS = 16
 
+COLOURS = 3
+"""An output kind of the backward pass alone: sums of weights times features, and of weights (in S_FADE), no more."""
+
 
 def _carrying_back(mode: int, output_kind: int, check_near: bool) -> Callable[..., Any]:
     @vector_kernel("iiiiiiifff")
@@ -78,6 +81,18 @@ def _carrying_back(mode: int, output_kind: int, check_near: bool) -> Callable[..
         """
         b = v.b
 
+        def by_features(group: RayGroup, weight: Bundle) -> dict[int, Bundle]:
+            return {S_FEATURE + c: weight * group.plane(state, G_FEATURE + c) for c in range(3)}
+
+        def keep(number: ir.Value, sums_of: dict[int, Bundle]) -> None:
+            # Lane k of the result is sum k over the group's rays: one store of SUMS floats per record.
+            totals = [sums_of[k].total() if k in sums_of else v.number(0) for k in range(SUMS)]
+            # 64 bytes a record: SUMS float32.
+            place_of_sums = v.address(sums, b.shl(number, ir.Constant(I64, 6)))
+            for first in range(0, SUMS, LANES):
+                old = v.load(place_of_sums, 4 * first)
+                v.store(old + v.sums(totals[first : first + LANES]), place_of_sums, 4 * first)
+
         def step(
             group: RayGroup, number: ir.Value, coefficient: Callable[[int], Vector], values: list[Bundle]
         ) -> list[Bundle]:
@@ -97,20 +112,23 @@ def _carrying_back(mode: int, output_kind: int, check_near: bool) -> Callable[..
             hit = exponent < CUT
             if check_near:
                 hit = hit & behind_near_plane(v, mode, basis, group, meeting.distance, near)
-            before, left = values
+            before = values[0]
             if output_kind == LIDAR:
                 hit = hit & (before > LIDAR_MIN_TRANSMITTANCE)
             meeting.forget_misses(hit)
             alpha = hit.where(Bundle(fading(exponent.parts)), 0)
             weight = alpha * before
             after = before - weight
+            if output_kind == COLOURS:
+                keep(number, {S_FADE: weight * group.plane(state, G_ALPHA)} | by_features(group, weight))
+                return [after]
 
             # Backwards: q is what a unit of this record's weight changes the loss by, ``rest`` what all behind it add.
             by_mean = group.plane(state, G_DISTANCE)
             q = group.plane(state, G_ALPHA) + by_mean * meeting.distance
             for c in range(3):
                 q = q + group.plane(state, G_FEATURE + c) * coefficient(C_FEATURE + c)
-            rest = left - weight * q
+            rest = values[1] - weight * q
             # A change of alpha changes this record's weight, and scales all weights behind it by 1 / (1 - alpha);
             # opacities are capped at 0.99, so the division is safe.
             by_alpha = before * q - rest * (1 - alpha).reciprocal(False)
@@ -120,24 +138,20 @@ def _carrying_back(mode: int, output_kind: int, check_near: bool) -> Callable[..
                 crossing = (before > 0.5) & (after <= 0.5)
                 by_distance = by_distance + crossing.where(group.plane(state, G_HALF), 0)
             sums_of = [*meeting.sums(by_exponent, by_distance), by_exponent]
-            sums_of += [weight * group.plane(state, G_FEATURE + c) for c in range(3)]
-            # Lane k of the result is sum k over the group's rays: one store of SUMS floats per record.
-            totals = [bundle.total() for bundle in sums_of]
-            totals += [v.number(0)] * (SUMS - len(totals))
-            # 64 bytes a record: SUMS float32.
-            place_of_sums = v.address(sums, b.shl(number, ir.Constant(I64, 6)))
-            for first in range(0, SUMS, LANES):
-                old = v.load(place_of_sums, 4 * first)
-                v.store(old + v.sums(totals[first : first + LANES]), place_of_sums, 4 * first)
+            keep(number, dict(enumerate(sums_of)) | by_features(group, weight))
             return [after, rest]
 
-        return run_records(v, state, REST + 1, numbers, count, coefficients, (x0, y0), output_kind, step)
+        changing = 1 if output_kind == COLOURS else REST + 1
+        return run_records(v, state, changing, numbers, count, coefficients, (x0, y0), output_kind, step)
 
     return carry_back
 
 
 back_affine_camera = _carrying_back(AFFINE, CAMERA, False)
 back_affine_camera_near = _carrying_back(AFFINE, CAMERA, True)
+back_affine_colours = _carrying_back(AFFINE, COLOURS, True)
+back_table_colours = _carrying_back(TABLE, COLOURS, True)
+back_moving_colours = _carrying_back(MOVING, COLOURS, True)
 back_table_camera = _carrying_back(TABLE, CAMERA, True)
 back_table_lidar = _carrying_back(TABLE, LIDAR, True)
 back_moving_camera = _carrying_back(MOVING, CAMERA, True)

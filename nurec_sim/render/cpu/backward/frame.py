@@ -76,23 +76,15 @@ class Frame:
         self, sky: Float32[np.ndarray, "6 s s 3"], clear: Float32[np.ndarray, "h w"] | None = None
     ) -> Float32[np.ndarray, "3 h w"]:
         """Colours of a cubemap behind every ray, or only behind those that let something through (``clear``)."""
-        return draw_sky(self._directions, self.view.world_from_reference[:3, :3], sky, self._workers, clear)
+        return draw_sky(self.view.directions, self.view.world_from_reference[:3, :3], sky, self._workers, clear)
 
     def draw_sky_back(
         self, sky: Float32[np.ndarray, "6 s s 3"], by_behind: Float32[np.ndarray, "3 h w"]
     ) -> tuple[Float64[np.ndarray, "6 s s 3"], Float64[np.ndarray, "4 4"]]:
         """Gradients by the sky and by the reference pose."""
         pose = self.view.world_from_reference
-        by_sky, torque = draw_sky_back(self._directions, pose[:3, :3], sky, by_behind, self._workers)
+        by_sky, torque = draw_sky_back(self.view.directions, pose[:3, :3], sky, by_behind, self._workers)
         return by_sky, pose_gradient(np.zeros(3), torque, pose)
-
-    @cached_property
-    def _directions(self) -> Float32[np.ndarray, "h w 3"]:
-        """Unit rays in the reference frame."""
-        grid, turns = self.sensor.grid, self.view.turns.reshape(-1, 3, 3)
-        if self.view.still:
-            return grid.direction
-        return np.einsum("hwij,hwj->hwi", turns[grid.line], grid.direction)
 
     def draw(
         self,
@@ -168,18 +160,7 @@ class Frame:
             into: arrays to which the gradients by the Gaussians are added; None: new ones.
         """
         picture = self._picture
-        # A slot per record and tile: each is written by one tile only, whatever the number of threads.
-        starts = np.array([first for _, first, _ in picture.runs], np.int64)
-        counts = np.array([count for _, _, count in picture.runs], np.int64)
-        first_slot = self._scratch("first slot", (picture.capacity,), np.int64)
-        pairs = number_slots(picture.projected.spans, starts, counts, first_slot)
-        slots = RecordSlots(first_slot, self._scratch("slots", (pairs, SUMS), np.float32))
-        rays = sensor_rays(picture)
-        self._workers.run(
-            draw_tiles_back,
-            [(rays, picture.projected, picture.binned, picture.output_kind, tiles, self.planes, by_planes, slots)
-             for tiles in tile_ranges(picture, self._workers.threads)],
-        )  # fmt: skip
+        slots = carry_back(picture, picture.output_kind, self.planes, by_planes, self._workers)
         pose, count = self.view.world_from_reference, len(mean)
         shares = zeros_by_gaussian(count) if into is None else into
         # The features are not needed: the image is linear in them.
@@ -196,6 +177,38 @@ class Frame:
 def zeros_by_gaussian(count: int) -> RawGaussians:
     """Gradients of 0 for some Gaussians."""
     return RawGaussians(*(np.zeros((count, *width), np.float32) for width in ((3,), (4,), (3,), (), (3,))))
+
+
+def carry_back(
+    picture: Picture,
+    output_kind: int,
+    planes: Float32[np.ndarray, "6 h w"],
+    gradients: Float32[np.ndarray, "6 h w"],
+    workers: Workers,
+) -> RecordSlots:
+    """Sums of a drawn picture's records, a slot per record and macro tile; valid as long as its scratch memory.
+
+    Args:
+        picture: what has been drawn.
+        output_kind: CAMERA, LIDAR, or COLOURS.
+        planes: what ``draw`` returned.
+        gradients: by ``planes``; 0 where there is no valid ray.
+        workers: threads to run on.
+    """
+    assert len(gradients) == IMAGE_PLANES
+    # A slot per record and tile: each is written by one tile only, whatever the number of threads.
+    starts = np.array([first for _, first, _ in picture.runs], np.int64)
+    counts = np.array([count for _, _, count in picture.runs], np.int64)
+    first_slot = picture.scratch("first slot", (picture.capacity,), np.int64)
+    pairs = number_slots(picture.projected.spans, starts, counts, first_slot)
+    slots = RecordSlots(first_slot, picture.scratch("slots", (pairs, SUMS), np.float32))
+    rays = sensor_rays(picture)
+    workers.run(
+        draw_tiles_back,
+        [(rays, picture.projected, picture.binned, output_kind, tiles, planes, gradients, slots)
+         for tiles in tile_ranges(picture, workers.threads)],
+    )  # fmt: skip
+    return slots
 
 
 def pose_gradient(

@@ -12,13 +12,17 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from nurec_sim.render.cpu.backward.blend import (
+    COLOURS,
     STATE_PLANES,
     SUMS,
     back_affine_camera,
     back_affine_camera_near,
+    back_affine_colours,
     back_moving_camera,
+    back_moving_colours,
     back_moving_lidar,
     back_table_camera,
+    back_table_colours,
     back_table_lidar,
     open_gradients,
 )
@@ -74,13 +78,19 @@ class RecordSlots(NamedTuple):
 def _carry_back(mode, output_kind, close, state, numbers, count, coefficients, rays, basis, sums, x0, y0, near):
     """Carry a block's gradients back with the code for a mode and an output kind; see ``backward.blend``."""
     if mode == AFFINE:
+        if output_kind == COLOURS:
+            return back_affine_colours(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
         if close:
             return back_affine_camera_near(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
         return back_affine_camera(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
     if mode == TABLE:
+        if output_kind == COLOURS:
+            return back_table_colours(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
         if output_kind == CAMERA:
             return back_table_camera(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
         return back_table_lidar(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
+    if output_kind == COLOURS:
+        return back_moving_colours(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
     if output_kind == CAMERA:
         return back_moving_camera(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
     return back_moving_lidar(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
@@ -107,7 +117,7 @@ def draw_tiles_back(rays, projected, binned, output_kind, tiles, planes, gradien
         rays: as ``draw.draw_tiles`` was given, like all up to ``planes``; the mode is AFFINE, TABLE or MOVING.
         projected: see rays.
         binned: see rays.
-        output_kind: CAMERA or LIDAR.
+        output_kind: CAMERA, LIDAR, or COLOURS.
         tiles: numbers of the macro tiles to do.
         planes: [6,h,w] what ``draw.draw_tiles`` made.
         gradients: [6,h,w] gradients of ``planes``; 0 where there is no valid ray.

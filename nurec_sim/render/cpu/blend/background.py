@@ -20,7 +20,8 @@ FACES = np.array(
 
 
 @inner
-def _face(d):
+def find_face(d):
+    """Number of the cubemap's face that a direction meets."""
     # Ties are resolved as in ``composite.sky_lookup``, so that both find the same texel.
     x, y, z = abs(d[0]), abs(d[1]), abs(d[2])
     if x > y and x > z:
@@ -31,7 +32,7 @@ def _face(d):
 
 
 @inner
-def _place(d, size, face):
+def find_place(d, size, face):
     """Texel coordinates on a face, and whether they were clamped."""
     major = abs(d[FACES[face, 0]])
     x = (d[FACES[face, 2]] * FACES[face, 3] / major + 1) / 2 * size - 0.5
@@ -40,7 +41,8 @@ def _place(d, size, face):
 
 
 @inner
-def _turned(direction, row, column, turn, d):
+def turned(direction, row, column, turn, d):
+    """Write a ray's direction in the world to ``d``."""
     for k in range(3):
         d[k] = (
             turn[k, 0] * direction[row, column, 0]
@@ -69,9 +71,9 @@ def look_up(first, last, direction, turn, sky, clear, behind):
                 for c in range(3):
                     behind[c, row, column] = np.float32(0)
                 continue
-            _turned(direction, row, column, turn, d)
-            face = _face(d)
-            x, y, _, _ = _place(d, size, face)
+            turned(direction, row, column, turn, d)
+            face = find_face(d)
+            x, y, _, _ = find_place(d, size, face)
             i, j = np.uint64(x), np.uint64(y)
             i1, j1 = min(i + np.uint64(1), np.uint64(size - 1)), min(j + np.uint64(1), np.uint64(size - 1))
             fx, fy = np.float32(x - i), np.float32(y - j)
@@ -102,9 +104,9 @@ def look_back(first, last, direction, turn, sky, by_behind, by_sky, touched, tor
         for column in range(direction.shape[1]):
             if by_behind[0, row, column] == 0 and by_behind[1, row, column] == 0 and by_behind[2, row, column] == 0:
                 continue
-            _turned(direction, row, column, turn, d)
-            face = _face(d)
-            x, y, inside_x, inside_y = _place(d, size, face)
+            turned(direction, row, column, turn, d)
+            face = find_face(d)
+            x, y, inside_x, inside_y = find_place(d, size, face)
             i, j = np.uint64(x), np.uint64(y)
             i1, j1 = min(i + np.uint64(1), np.uint64(size - 1)), min(j + np.uint64(1), np.uint64(size - 1))
             fx, fy = x - i, y - j

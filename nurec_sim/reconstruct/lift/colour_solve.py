@@ -1,0 +1,245 @@
+"""Colours solved for: those with which the finished Gaussians reproduce the images best.
+
+With geometry and opacities fixed, a rendered colour is linear in the colours of Gaussians, so the best colours are a
+least-squares problem, solved by the simultaneous algebraic reconstruction technique (Andersen and Kak 1984), image
+by image: a colour changes by the mean error of the pixels that it takes part in, weighted by its shares of them. The
+step falls with the pixels that have been taken, so that every image counts alike. Beside it every frame gets a gain and
+an offset per channel, because exposure changes from frame to frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from nurec_sim import sensors
+from nurec_sim.compute.cores import usable_cores
+from nurec_sim.compute.kernels import kernel
+from nurec_sim.reconstruct.lift.settings import LiftSettings
+from nurec_sim.reconstruct.lift.views import shows_ego
+from nurec_sim.reconstruct.optimize.responses import borrowed_responses
+from nurec_sim.render.cpu.backward.colours import spread_errors, spread_sky_errors
+from nurec_sim.render.cpu.backward.frame import SENSORS, ExactView
+from nurec_sim.render.cpu.blend.background import draw_sky
+from nurec_sim.render.cpu.blend.responses import CAMERA
+from nurec_sim.render.cpu.blend.tiles import AFFINE
+from nurec_sim.render.cpu.moving import PackedMoving
+from nurec_sim.render.cpu.pack import BLOCK, COLOUR, pack
+from nurec_sim.render.cpu.pipeline import NO_TABLE, Picture, blocks_in_view, draw
+from nurec_sim.render.cpu.workers import Buffers, Workers
+from nurec_sim.types import CameraModel, Clip, Gaussians, GaussianScene
+
+BRIGHTEST = 1.25
+"""Colours end here: what is white in a dark frame is brighter than white in others."""
+SATURATED = 0.98
+"""Recorded colours above this may stand for any brighter one."""
+GAINS, OFFSETS = (0.5, 2.0), (-0.1, 0.1)
+OFFSET_PULL = 20.0
+"""Offsets are pulled to 0 this much more than gains to 1: fog and glare are rarer than other exposures."""
+FIT_PX = 3
+"""A frame's response is fitted to every so many pixels in each direction."""
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedImage:
+    """A frame at working size: its camera with fewer pixels, its poses, its colours, and what each pixel counts."""
+
+    camera: CameraModel
+    frame: int
+    t_us: int
+    world_from_camera: Float64[np.ndarray, "2 4 4"]
+    rgb: UInt8[np.ndarray, "h w 3"]
+    weight: Float32[np.ndarray, "h w"]
+
+
+def solve_colours(
+    scene: GaussianScene, clip: Clip, cameras: Sequence[str], settings: LiftSettings, progress: Callable[[float], None]
+) -> GaussianScene:
+    """The scene with the colours, sky and responses that fit the images best.
+
+    Args:
+        scene: with geometry, opacities and first colours.
+        clip: its log.
+        cameras: whose images to fit.
+        settings: ``colours``, and the width of working views.
+        progress: called with the fraction that is done.
+    """
+    times = {camera: np.asarray(clip.camera_times_us(camera), np.int64) for camera in clip.rig.cameras}
+    frames = [(camera, k) for camera in cameras for k in range(len(times[camera]))]
+    if not frames or not settings.colours.rounds:
+        return scene
+    step = -(-len(frames) // settings.colours.images)
+    chosen = [(camera, k) for camera in cameras for k in range(0, len(times[camera]), step)]
+    solve = ColourSolve(scene, settings.colours.trust, settings.colours.gain_pull)
+    masks: dict[str, np.ndarray] = {}
+    # In random order: of neighbours in time, which show the same, the later would correct the earlier.
+    random, rounds = np.random.default_rng(0), settings.colours.images // len(chosen)
+    total = len(chosen) * min(max(rounds, 1), settings.colours.rounds)
+    for done in range(total):
+        if done % len(chosen) == 0:
+            order = random.permutation(len(chosen))
+        camera, frame = chosen[order[done % len(chosen)]]
+        solve.step(_read(clip, camera, frame, settings.views.width_px, masks))
+        progress((done + 1) / total)
+    middle = {camera: each.sum(axis=1) // 2 for camera, each in times.items()}
+    responses = {}
+    for camera in {camera for camera, _ in chosen}:
+        known = [k for name, k in chosen if name == camera]
+        flat = np.array([solve.responses[camera, k] for k in known]).reshape(len(known), 12)
+        columns = [np.interp(middle[camera], middle[camera][known], flat[:, c]) for c in range(12)]
+        responses[camera] = np.stack(columns, axis=1).reshape(-1, 3, 4)
+    others = [camera for camera in clip.rig.cameras if camera not in responses]
+    responses |= borrowed_responses(responses, times, clip.rig, others)
+    return replace(solve.scene(), exposures=responses)
+
+
+def _read(clip: Clip, camera: str, frame: int, width_px: int, masks: dict[str, np.ndarray]) -> SolvedImage:
+    """A frame, reduced by a whole number as working views are."""
+    model, image = clip.rig.cameras[camera], clip.image(camera, frame)
+    reduction = max(1, -(-model.width_px // width_px))
+    width, height = model.width_px // reduction, model.height_px // reduction
+    small = cv2.resize(image[: height * reduction, : width * reduction], (width, height), interpolation=cv2.INTER_AREA)
+    scaled = sensors.scaled_camera(model, width, height)
+    if camera not in masks:
+        rays, seen = sensors.pixel_rays(scaled)
+        masks[camera] = (seen & ~shows_ego(rays, model, clip.rig.body)).astype(np.float32)
+    t_us = int(np.asarray(clip.camera_times_us(camera)[frame]).sum()) // 2
+    poses = np.asarray(clip.world_from_camera(camera, frame), np.float64)
+    return SolvedImage(scaled, frame, t_us, poses, small, masks[camera])
+
+
+class ColourSolve:
+    """The colours of a scene while they are solved for.
+
+    Args:
+        scene: what has been built.
+        trust: how many pixels the colours that it comes with count for.
+        gain_pull: see ``ColourSettings``.
+    """
+
+    def __init__(self, scene: GaussianScene, trust: float, gain_pull: float) -> None:
+        self._scene, self._gain_pull = scene, gain_pull
+        self._static, self._moving = pack(scene.static), PackedMoving.of(scene.dynamic, scene.tracks)
+        self._sky = np.array(scene.sky, np.float32)
+        shapes = ((len(self._static), BLOCK), (len(self._moving), BLOCK), self._sky.shape[:3])
+        self._seen = [np.full(shape, trust, np.float32) for shape in shapes]
+        self._workers, self._buffers = Workers(usable_cores()), Buffers()
+        self.responses: dict[tuple[str, int], np.ndarray] = {}
+        """By camera and frame, [3,4]."""
+
+    def step(self, image: SolvedImage) -> float:
+        """Take the errors of an image back to the colours; returns the mean of their squares, before."""
+        with self._buffers.lend() as scratch:
+            sensor = SENSORS.tables(image.camera)
+            view = ExactView.of(sensor.grid, image.world_from_camera)
+            eye, turn = view.world_from_reference[:3, 3], view.world_from_reference[:3, :3]
+            moving = self._moving.at(image.t_us, {}, frozenset(), eye, self._workers, scratch)
+            layers = [(layer, blocks_in_view(view, layer)) for layer in (self._static, moving)]
+            rays = NO_TABLE if view.projection_mode == AFFINE else sensor.rays
+            picture = Picture(view, rays, CAMERA, layers, scratch)
+            planes = draw([picture], self._workers)[0]
+            height, width = image.weight.shape
+            clear = 1 - planes[0, :height, :width]
+            shown = planes[1:4, :height, :width]
+            shown = shown + clear * draw_sky(view.directions, turn, self._sky, self._workers, clear)
+            recorded = image.rgb.transpose(2, 0, 1).astype(np.float32) / np.float32(255)
+            weight = image.weight * (sensor.grid.valid > 0)
+            response = self._fit_response(image, shown, recorded, weight)
+            back = np.linalg.inv(response[:, :3])
+            wanted = np.einsum("ij,jhw->ihw", back, recorded - response[:, 3, None, None]).astype(np.float32)
+            error = wanted - shown
+            right = (recorded > SATURATED) & (error < 0)
+            error[right] = 0
+            weight = (weight * ~right.all(axis=0)).astype(np.float32)
+            shares = spread_errors(picture, planes, weight, error, self._workers)
+            texels = np.zeros((*self._sky.shape[:3], 4), np.float32)
+            spread_sky_errors(view.directions, turn, weight * clear, error, texels)
+            # Placed blocks of the moving layer follow each other as those they were made from.
+            placed = np.flatnonzero(np.isin(self._moving.index[:, 0], moving.index.reshape(-1, BLOCK)[:, 0]))
+            _change_blocks(layers[0][1], layers[0][1], shares[0], self._seen[0], self._static.fields)
+            _change_blocks(layers[1][1], placed[layers[1][1]], shares[1], self._seen[1], self._moving.fields)
+            _change_sky(texels, self._seen[2], self._sky)
+        return float((weight * error**2).mean())
+
+    def _fit_response(
+        self,
+        image: SolvedImage,
+        shown: Float32[np.ndarray, "3 h w"],
+        recorded: Float32[np.ndarray, "3 h w"],
+        weight: Float32[np.ndarray, "h w"],
+    ) -> Float64[np.ndarray, "3 4"]:
+        """The frame's response: its camera's, then a gain and an offset per channel, by robust least squares."""
+        isp = np.asarray(self._scene.isp.get(image.camera.id, np.eye(3, 4)), np.float64)
+        some = (slice(None, None, FIT_PX), slice(None, None, FIT_PX))
+        x = np.einsum("ij,jn->in", isp[:, :3], shown[:, *some].reshape(3, -1)) + isp[:, 3:]
+        y = recorded[:, *some].reshape(3, -1).astype(np.float64)
+        counts = weight[some].ravel() * (y < SATURATED)
+        response = isp.copy()
+        for c in range(3):
+            gain, offset, pull = 1.0, 0.0, self._gain_pull * counts[c].sum() + 1e-9
+            for _ in range(4):
+                # Cauchy weights (iteratively reweighted): what is wrong in the scene must not change the exposure.
+                w = counts[c] / (1 + ((y[c] - gain * x[c] - offset) / 0.1) ** 2)
+                # Normal equations of w (y - gain x - offset)^2 + pull (gain - 1)^2 + OFFSET_PULL pull offset^2.
+                across = (w * x[c]).sum()
+                left = [[(w * x[c] ** 2).sum() + pull, across], [across, w.sum() + OFFSET_PULL * pull]]
+                gain, offset = np.linalg.solve(left, [(w * x[c] * y[c]).sum() + pull, (w * y[c]).sum()])
+            gain, offset = np.clip(gain, *GAINS), np.clip(offset, *OFFSETS)
+            response[c] = gain * isp[c]
+            response[c, 3] += offset
+        self.responses[image.camera.id, image.frame] = response
+        return response
+
+    def scene(self) -> GaussianScene:
+        """The scene with the present colours."""
+        scene, dynamic = self._scene, self._scene.dynamic
+        static = _with_colours(scene.static, self._static.fields, self._static.index)
+        moving = _with_colours(dynamic.gaussians, self._moving.fields, self._moving.index.reshape(-1))
+        return replace(scene, static=static, dynamic=replace(dynamic, gaussians=moving), sky=self._sky.copy())
+
+
+@kernel
+def _change_blocks(drawn, blocks, shares, seen, fields):
+    """Change colours by the errors of one image.
+
+    Args:
+        drawn: [b] numbers of the blocks that have been drawn, by which ``shares`` are numbered.
+        blocks: [b] the same blocks, by which ``seen`` and ``fields`` are numbered.
+        shares: [rows,4] see ``spread_errors``.
+        seen: [blocks,256] pixels that each Gaussian has been changed by; changed.
+        fields: [blocks,21,256] see ``pack``; the colours are changed.
+    """
+    for n in range(len(blocks)):
+        block = blocks[n]
+        for i in range(BLOCK):
+            share = shares[drawn[n] * BLOCK + i]
+            if share[0] > 0:
+                seen[block, i] += share[0]
+                for c in range(3):
+                    colour = fields[block, COLOUR + c, i] + share[1 + c] / seen[block, i]
+                    fields[block, COLOUR + c, i] = min(max(colour, np.float32(0)), np.float32(BRIGHTEST))
+
+
+@kernel
+def _change_sky(shares, seen, sky):
+    """The same for the texels of a sky: [6,s,s,4], [6,s,s] and [6,s,s,3]."""
+    for face in range(len(sky)):
+        for j in range(sky.shape[1]):
+            for i in range(sky.shape[1]):
+                share = shares[face, j, i]
+                if share[0] > 0:
+                    seen[face, j, i] += share[0]
+                    for c in range(3):
+                        colour = sky[face, j, i, c] + share[1 + c] / seen[face, j, i]
+                        sky[face, j, i, c] = min(max(colour, np.float32(0)), np.float32(BRIGHTEST))
+
+
+def _with_colours(gaussians: Gaussians, fields: np.ndarray, index: np.ndarray) -> Gaussians:
+    """Gaussians with the colours of packed ones."""
+    rgb = gaussians.rgb.copy()
+    rgb[index[index >= 0]] = fields[:, COLOUR : COLOUR + 3].transpose(0, 2, 1).reshape(-1, 3)[index >= 0]
+    return replace(gaussians, rgb=rgb)

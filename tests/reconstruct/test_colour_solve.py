@@ -1,0 +1,88 @@
+"""Colours that are solved for: images gain, frames get responses, and what no image shows stays as it was."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from reconstruct_street import Street, camera
+
+from nurec_sim.evaluate.scores.images import psnr
+from nurec_sim.reconstruct import ColourSettings, LiftSettings, ViewSettings, reconstruct
+from nurec_sim.reconstruct.lift import colour_solve
+from nurec_sim.render import CpuRenderer
+from nurec_sim.scene import scene_hash
+from nurec_sim.types import Gaussians, SensorRequest
+
+SETTINGS = LiftSettings(sky_px=32, views=ViewSettings(levels=32), colours=ColourSettings(rounds=0))
+SOLVED = dataclasses.replace(SETTINGS, colours=ColourSettings())
+CROSSING = {"moving": ((4.0, 1.8, 1.5), np.column_stack([np.linspace(12, 16, 4), np.full(4, 2.2)]))}
+
+
+class BrightFrame(Street):
+    """A street whose third image is taken 15 % too bright."""
+
+    def image(self, camera_id, index):
+        image = super().image(camera_id, index)
+        return np.clip(image * (1.15 if index == 2 else 1.0), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def street():
+    return BrightFrame(frames=4, boxes=CROSSING, cameras=(camera(width=128, height=64), camera("beside", 0.5, 128, 64)))
+
+
+@pytest.fixture(scope="module")
+def lifted(street):
+    return reconstruct(street, settings=SETTINGS, cameras=["front"])
+
+
+def solved_from(scene, street):
+    return colour_solve.solve_colours(scene, street, ["front"], SOLVED, lambda fraction: None)
+
+
+@pytest.fixture(scope="module")
+def solved(street, lifted):
+    return solved_from(lifted, street)
+
+
+def mean_psnr(scene, clip, name):
+    scores = []
+    for k in range(clip.frames):
+        t_us = int(clip.t_us[k])
+        request = SensorRequest(scene.id, clip.rig.cameras[name], t_us, t_us + 1, clip.world_from_camera(name, k))
+        frame = CpuRenderer(scene, threads=1).render_camera(request, ("rgb",))
+        scores.append(psnr(frame.rgb, clip.image(name, k)))
+    return np.mean(scores)
+
+
+def test_seen_and_unseen_images_gain(street, lifted, solved):
+    assert mean_psnr(solved, street, "front") > mean_psnr(lifted, street, "front") + 1
+    assert mean_psnr(solved, street, "beside") > mean_psnr(lifted, street, "beside") + 0.5
+
+
+def test_a_frame_taken_brighter_has_a_gain_of_its_own(solved):
+    bright, usual = solved.exposures["front"][2], solved.exposures["front"][1]
+    assert np.diag(bright[:, :3]).mean() / np.diag(usual[:, :3]).mean() == pytest.approx(1.15, abs=0.06)
+    assert solved.exposures["beside"] == pytest.approx(solved.exposures["front"]), "a camera of the same kind"
+
+
+def test_the_method_solves_and_nothing_depends_on_the_number_of_threads(street, solved, monkeypatch):
+    monkeypatch.setattr(colour_solve, "usable_cores", lambda: 3)
+    scene = reconstruct(street, settings=SOLVED, cameras=["front"])
+    assert scene_hash(dataclasses.replace(scene, provenance=solved.provenance)) == scene_hash(solved)
+
+
+def test_what_no_image_shows_keeps_its_colour(street, lifted):
+    behind = dataclasses.replace(lifted.static[:5], mean_m=np.full((5, 3), -30.0, np.float32))
+    more = dataclasses.replace(lifted, static=Gaussians.concatenate([lifted.static, behind]))
+    result = solved_from(more, street)
+    assert np.array_equal(result.static.rgb[-5:], behind.rgb)
+    assert not np.array_equal(result.static.rgb[:-5], lifted.static.rgb)
+    assert (result.static.rgb >= 0).all() and np.array_equal(result.static.mean_m, more.static.mean_m)
+
+
+def test_few_images_are_taken_of_a_long_log_and_the_others_lie_between(street, lifted):
+    settings = dataclasses.replace(SOLVED, colours=ColourSettings(images=2))
+    exposures = colour_solve.solve_colours(lifted, street, ["front"], settings, lambda fraction: None).exposures
+    first, second, third, last = exposures["front"]
+    assert second == pytest.approx((first + third) / 2) and last == pytest.approx(third)
