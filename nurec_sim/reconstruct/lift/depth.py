@@ -59,8 +59,8 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
         cost: [h,w,levels] output.
     """
     height, width, _ = rgb.shape
-    count = len(others)
     focal = view[0]
+    first, second, seen = np.empty(levels), np.empty(levels), np.empty(levels, np.int64)
     for row in range(height):
         for column in range(width):
             if prior[row, column] > 0:
@@ -76,55 +76,62 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
             px = m[0, 0] * ox + m[0, 1] * oy + m[0, 2] * oz + m[0, 3]
             py = m[1, 0] * ox + m[1, 1] * oy + m[1, 2] * oz + m[1, 3]
             pz = m[2, 0] * ox + m[2, 1] * oy + m[2, 2] * oz + m[2, 3]
-            total, number = 0.0, 0
-            for level in range(levels):
+            red, green, blue = (
+                np.int64(rgb[row, column, 0]),
+                np.int64(rgb[row, column, 1]),
+                np.int64(rgb[row, column, 2]),
+            )
+            code = codes[row, column]
+            first[:], second[:], seen[:] = 1e9, 1e9, 0
+            for n in range(len(others)):
+                o = others[n]
                 # X = o + r / w, scaled by w: r + w o. It stays finite at infinity (w = 0), and projection does not
-                # depend on the scale of X.
-                w = level * step
-                first, second, seen = 1e9, 1e9, 0
-                for n in range(count):
-                    o = others[n]
-                    a = o[5] * dx + o[6] * dy + o[7] * dz + w * (o[5] * px + o[6] * py + o[7] * pz + o[14])
-                    b = o[8] * dx + o[9] * dy + o[10] * dz + w * (o[8] * px + o[9] * py + o[10] * pz + o[15])
-                    c = o[11] * dx + o[12] * dy + o[13] * dz + w * (o[11] * px + o[12] * py + o[13] * pz + o[16])
+                # depend on the scale of X. In the other view it is (a, b, c) + w (a1, b1, c1).
+                a0, a1 = o[5] * dx + o[6] * dy + o[7] * dz, o[5] * px + o[6] * py + o[7] * pz + o[14]
+                b0, b1 = o[8] * dx + o[9] * dy + o[10] * dz, o[8] * px + o[9] * py + o[10] * pz + o[15]
+                c0, c1 = o[11] * dx + o[12] * dy + o[13] * dz, o[11] * px + o[12] * py + o[13] * pz + o[16]
+                rolling = o[17] != 0.0 or o[18] != 0.0 or o[19] != 0.0
+                scale, middle_u, middle_v, right, bottom = o[0], o[1], o[2], o[3], o[4]
+                for level in range(levels):
+                    w = level * step
+                    a, b, c = a0 + w * a1, b0 + w * b1, c0 + w * c1
                     if c <= 1e-6:
                         continue
-                    u, v = o[0] * a / c + o[1], o[0] * b / c + o[2]
-                    if o[17] != 0.0 or o[18] != 0.0 or o[19] != 0.0:
+                    inverse = scale / c
+                    u, v = a * inverse + middle_u, b * inverse + middle_v
+                    if rolling:
                         # One fixed-point step for the other view's own shutter: the drift at the row where the point
                         # was first projected (times w, as X is).
                         g = w * min(max(o[20] * u + o[21] * v + o[22], -0.5), 0.5)
-                        d = max(c - o[19] * g, 1e-6)
-                        u, v = o[0] * (a - o[17] * g) / d + o[1], o[0] * (b - o[18] * g) / d + o[2]
-                    u, v = u - 0.5, v - 0.5
-                    iu, iv = int(np.floor(u)), int(np.floor(v))
-                    if iu < 0 or iv < 0 or iu >= int(o[3]) - 1 or iv >= int(o[4]) - 1:
+                        inverse = scale / max(c - o[19] * g, 1e-6)
+                        u, v = (a - o[17] * g) * inverse + middle_u, (b - o[18] * g) * inverse + middle_v
+                    if u < 0 or v < 0 or u >= right or v >= bottom:
                         continue
-                    fu, fv = u - iu, v - iv
-                    difference = 0.0
-                    for k in range(3):
-                        top = other_rgb[n, iv, iu, k] * (1 - fu) + other_rgb[n, iv, iu + 1, k] * fu
-                        low = other_rgb[n, iv + 1, iu, k] * (1 - fu) + other_rgb[n, iv + 1, iu + 1, k] * fu
-                        difference += abs(top * (1 - fv) + low * fv - rgb[row, column, k])
-                    bits = _popcount(codes[row, column] ^ other_codes[n, int(v + 0.5), int(u + 0.5)])
+                    # The nearest pixel: levels are farther apart than pixels.
+                    iu, iv = np.uint64(u), np.uint64(v)
+                    difference = (
+                        abs(np.int64(other_rgb[n, iv, iu, 0]) - red)
+                        + abs(np.int64(other_rgb[n, iv, iu, 1]) - green)
+                        + abs(np.int64(other_rgb[n, iv, iu, 2]) - blue)
+                    )
+                    bits = _popcount(code ^ other_codes[n, iv, iu])
                     # Both terms saturate, so that an occlusion costs no more than a clear mismatch. Census compares the
                     # order of brightness and survives exposure changes; colour tells where there is no texture.
                     value = min(difference * 0.6, 50.0) + min(bits * 2.0, 50.0)
-                    seen += 1
+                    seen[level] += 1
                     # The best two of all neighbours: the others may have the point hidden.
-                    if value < first:
-                        first, second = value, first
-                    elif value < second:
-                        second = value
-                if seen == 0:
-                    cost[row, column, level] = -1.0
-                    continue
-                cost[row, column, level] = first if seen == 1 else 0.5 * (first + second)
-                total, number = total + cost[row, column, level], number + 1
+                    second[level] = min(max(value, first[level]), second[level])
+                    first[level] = min(value, first[level])
+            total, number = 0.0, 0
+            for level in range(levels):
+                if seen[level] > 0:
+                    mean = first[level] if seen[level] == 1 else 0.5 * (first[level] + second[level])
+                    cost[row, column, level] = mean
+                    total, number = total + mean, number + 1
             # A level that no neighbour sees is no better than the mean of those that some see.
             unseen = max(NEUTRAL_COST, total / number) if number > 0 else NEUTRAL_COST
             for level in range(levels):
-                if cost[row, column, level] < 0:
+                if seen[level] == 0:
                     cost[row, column, level] = unseen
 
 
@@ -159,11 +166,11 @@ def smooth_depth(
     cost: Float32[np.ndarray, "h w levels"], gray: UInt8[np.ndarray, "h w"], step: float
 ) -> Float32[np.ndarray, "h w"]:
     """Inverse depth of least cost after semi-global matching along eight paths (``stereo.paths``)."""
-    total, brightness = np.zeros_like(cost), gray.astype(np.float64)
+    total, brightness = np.zeros_like(cost), gray.astype(np.float32)
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
         # Depth is likely to jump where the brightness does, so a jump costs less there.
-        jump = np.maximum(SMOOTH_MANY / (1.0 + brightness_steps(brightness, dy, dx) / 8.0), SMOOTH_ONE + 1)
-        add_path(cost, jump, SMOOTH_ONE, dy, dx, total)
+        jump = np.maximum(SMOOTH_MANY / (1 + brightness_steps(brightness, dy, dx) / 8), SMOOTH_ONE + 1)
+        add_path(cost, jump.astype(np.float32), np.float32(SMOOTH_ONE), dy, dx, total)
     return _least(total, step)
 
 

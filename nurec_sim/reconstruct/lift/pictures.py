@@ -17,6 +17,9 @@ from nurec_sim.reconstruct.lift.settings import THREADS, LiftSettings
 from nurec_sim.reconstruct.lift.splat import draw_surfels, trim_silhouettes
 from nurec_sim.reconstruct.lift.views import WorkingView
 
+OUTLINE_M = 0.6
+"""Unmeasured pixels up to this far outside of a box may show its object."""
+
 
 @dataclass(frozen=True)
 class DepthPicture:
@@ -103,14 +106,20 @@ def _bodies_of_pixels(view: WorkingView, bodies: Sequence[Surfels], dense: np.nd
         for number, surfels in enumerate(bodies[1:], start=1):
             if not surfels.present(view.t_us):
                 continue
-            box = geometry.transform_points(geometry.inverse(surfels.world_from_body(view.t_us)), xyz)
-            size = surfels.box_size_m
+            world_from_box, size = surfels.world_from_body(view.t_us), surfels.box_size_m
+            # Only pixels near the box are taken into its frame: most are far from most boxes.
+            reach = float(np.linalg.norm(np.array(size) / 2 + OUTLINE_M))
+            near = np.flatnonzero((np.abs(xyz - world_from_box[:3, 3]) < reach).all(axis=1))
+            box = geometry.transform_points(geometry.inverse(world_from_box), xyz[near])
             # The lowest 15 cm of a box are road more often than tyre.
             upper = box[:, 2] > -size[2] / 2 + 0.15
             inside = geometry.points_in_box(box, size, 0.1) & upper
-            found[inside & (found <= 0)] = number
+            free = found[near] <= 0
             # Unmeasured pixels just outside a box are its silhouette at a wrong depth: nobody's.
-            found[~inside & (found == 0) & unmeasured & geometry.points_in_box(box, size, 0.6) & upper] = NOBODY
+            rim = ~inside & (found[near] == 0) & unmeasured[near]
+            rim &= geometry.points_in_box(box, size, OUTLINE_M) & upper
+            found[near[inside & free]] = number
+            found[near[rim]] = NOBODY
         body[open_pixels] = found
     return body
 
