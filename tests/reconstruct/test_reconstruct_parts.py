@@ -7,7 +7,7 @@ from reconstruct_street import KERB_M, STEP_M, Street, camera
 from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.lift import colour, depth, lifting, splat
 from nurec_sim.reconstruct.lift.ground import find_ground
-from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, seen_through, spherical_ranges
+from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather
 from nurec_sim.reconstruct.lift.settings import GroundSettings, PointSettings, ViewSettings
 from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
 from nurec_sim.reconstruct.lift.surfaces import footprints, surface_of
@@ -18,7 +18,7 @@ from nurec_sim.types import CameraModel, Fisheye, Pinhole, Shutter
 def cloud_of(xyz, eye=(0.0, 0.0, 5.0), spacing=0.1):
     n = len(xyz)
     return Cloud(np.asarray(xyz, float), np.broadcast_to(np.asarray(eye, float), (n, 3)).copy(),
-                 np.full(n, spacing, np.float32), np.full(n, np.nan, np.float32), np.ones(n, np.int32))  # fmt: skip
+                 np.full(n, spacing, np.float32), np.full(n, np.nan, np.float32))  # fmt: skip
 
 
 def ground_points(kerb_m, seed=0, noise_m=0.01):
@@ -115,14 +115,6 @@ def test_every_point_goes_to_one_body():
     box = clip.tracks[0].path.world_from_body[0]
     local = geometry.transform_points(geometry.inverse(box), gathered.static.xyz_m)
     assert not geometry.points_in_box(local, (4.0, 1.8, 1.5), 0.14).any()
-
-
-def test_ghosts_are_seen_through_and_walls_are_not():
-    directions = np.column_stack([np.cos(a := np.linspace(0, 2 * np.pi, 5000)), np.sin(a), np.zeros(5000)])
-    image = (np.eye(4), spherical_ranges(directions * 20))
-    points = cloud_of([[10.0, 0, 0], [19.9, 0, 0], [25, 0, 0]])
-    assert seen_through(points, [image] * 4, 3).tolist() == [True, False, False]
-    assert not seen_through(points, [image] * 2, 3).any()
 
 
 @pytest.mark.parametrize("lens", ["plain", "distorted", "fisheye"])

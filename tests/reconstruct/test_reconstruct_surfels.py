@@ -6,7 +6,7 @@ from reconstruct_street import Street
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lift import colour, depth, lifting, splat, surfaces
-from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, seen_through, voxel_edge_m
+from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, voxel_edge_m
 from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 
@@ -220,17 +220,16 @@ def test_inverse_depth_lies_at_the_vertex_between_levels():
 # ------------------------------------------------------------------------------------------------------------- points
 
 
-def cloud_of(xyz_m, sweeps):
+def cloud_of(xyz_m):
     n = len(xyz_m)
-    return Cloud(np.array(xyz_m, float), np.zeros((n, 3)), np.full(n, 0.1, np.float32), np.full(n, np.nan, np.float32),
-                 np.array(sweeps, np.int32))  # fmt: skip
+    return Cloud(np.array(xyz_m, float), np.zeros((n, 3)), np.full(n, 0.1, np.float32), np.full(n, np.nan, np.float32))
 
 
 def test_a_scan_line_with_noise_of_its_ranges_faces_the_sensor():
     """Its points spread least across the plane of its beams, which says nothing of the wall that they hit."""
     noise_m = np.random.default_rng(0).normal(0, 0.01, 50)
     line = np.column_stack([np.linspace(-1, 1, 50), 5 + noise_m, np.zeros(50)])
-    _, normal, _ = surfaces.surface_of(cloud_of(line, np.ones(50)))
+    _, normal, _ = surfaces.surface_of(cloud_of(line))
     assert (-normal[:, 1] > 0.95).all()
 
 
@@ -254,19 +253,6 @@ def test_voxels_grow_by_powers_of_two_with_the_distance_from_the_drive():
     aside = np.array([2.0, 11.9, 12.1, 23.0, 25.0, 47.0, 100.0])
     edge = voxel_edge_m(np.column_stack([np.zeros(7), aside, np.zeros(7)]), np.zeros((1, 3)), PointSettings())
     assert edge == pytest.approx([0.06, 0.06, 0.12, 0.12, 0.24, 0.24, 0.48])
-
-
-def test_sweeps_look_through_what_lies_well_before_their_returns():
-    """1.05 times as far away and 0.7 m: 11.2 m for a point at 10 m."""
-    for wall_m, through in ((11.1, False), (11.3, True)):
-        image = (np.eye(4), np.full((160, 1440), wall_m, np.float32))
-        assert seen_through(cloud_of([[10.0, 0, 0]], [1]), [image] * 3, 3).tolist() == [through]
-
-
-def test_what_was_hit_more_than_half_as_often_as_looked_through_stays():
-    image = (np.eye(4), np.full((160, 1440), 20.0, np.float32))
-    clouds = cloud_of([[10.0, 0, 0]] * 3, [1, 2, 3])
-    assert seen_through(clouds, [image] * 4, 3).tolist() == [True, True, False]
 
 
 def test_the_lowest_30_cm_of_a_box_may_be_road():

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from nurec_sim import geometry
+from nurec_sim.reconstruct.free_space import SweepBeams
 from nurec_sim.reconstruct.lift import colour, lifting, surfaces
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.ground import Ground
@@ -128,8 +129,9 @@ def body_gaussians(
     pictures: Sequence[DepthPicture],
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,
+    beams: Sequence[SweepBeams] = (),
 ) -> tuple[Gaussians, int]:
-    """Gaussians of one body in its frame, and how many of them were lifted from pixels.
+    """Gaussians of one body in its frame, and how many of them were lifted from pixels; none where beams passed.
 
     Args:
         body: its measured surface.
@@ -139,6 +141,7 @@ def body_gaussians(
         pictures: their dense depth, in the same order.
         rgb: their canonical colours, 0..255 [h,w,3], in the same order.
         settings: opacity, and the depth levels of the matching.
+        beams: recorded beams; Gaussians in the space that they passed are dropped.
     """
     cloud = body.cloud
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
@@ -152,7 +155,9 @@ def body_gaussians(
     lifted = _owned(pixels, body, views, pictures, rgb, settings)
     if len(lifted):
         parts.append(_lifted_gaussians(lifted, body, ground, settings))
-    return Gaussians.concatenate(parts), len(lifted)
+    gaussians = Gaussians.concatenate(parts)
+    free = body.in_free_space(gaussians, beams)
+    return gaussians[~free], len(lifted) - int(free[len(parts[0]) :].sum())
 
 
 def _owned(

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
+from nurec_sim.reconstruct.free_space import SweepBeams, balls, in_free_space
 from nurec_sim.reconstruct.lift import points, surfaces
 from nurec_sim.reconstruct.lift.ground import Ground, find_ground
 from nurec_sim.reconstruct.lift.points import Actor, Cloud, Gathered
 from nurec_sim.reconstruct.lift.settings import LiftSettings
-from nurec_sim.types import Clip, Label
+from nurec_sim.types import Clip, Gaussians, Label
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,13 @@ class Surfels:
     def world_from_body(self, t_us: int) -> np.ndarray:
         """Where the body is."""
         return np.eye(4) if self.actor is None else self.actor.path.at(t_us)
+
+    def in_free_space(self, gaussians: Gaussians, beams: Sequence[SweepBeams]) -> Bool[np.ndarray, " n"]:
+        """Gaussians of the body, in its frame, that recorded beams passed through."""
+        if self.actor is None:
+            return in_free_space(gaussians, beams)
+        known = lambda t_us: self.world_from_body(t_us) if self.present(t_us) else None  # noqa: E731
+        return in_free_space(gaussians, beams, known, self.box_size_m)
 
     @property
     def box_size_m(self) -> tuple[float, float, float]:
@@ -58,8 +66,8 @@ def surfels_of(
     ground = find_ground(everything, clip.ego.world_from_body, settings.ground)
     static, ghosts = gathered.static, np.zeros(len(gathered.static), bool)
     above = ground.above(static.xyz_m)
-    if settings.points.carve and gathered.sweep_count > settings.points.carve_votes:
-        ghosts = points.seen_through(static, gathered.range_images, settings.points.carve_votes) & ~(above < 0.25)
+    if settings.points.carve:
+        ghosts = in_free_space(balls(static.xyz_m, surfaces.DISC_SIGMA * static.spacing_m), gathered.beams)
     sheet = ground.sheet(static)
     standing = static[~ghosts & ~(np.abs(above) < 0.08)]
     standing, normal, spacing = surfaces.surface_of(standing)

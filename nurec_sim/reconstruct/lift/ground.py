@@ -87,7 +87,7 @@ class Ground:
             intensity = np.where(count > 1e-6, total / count, np.nan)[row, column]
         spacing = (size * self.cell_m).astype(np.float32)
         eye = xyz + (0, 0, 2.0)
-        return Cloud(xyz, eye, spacing, intensity.astype(np.float32), np.ones(len(xyz), np.int32))
+        return Cloud(xyz, eye, spacing, intensity.astype(np.float32))
 
     def normals(self) -> Float64[np.ndarray, "rows columns 3"]:
         """Upward unit normals of the smoothed surface."""

@@ -67,10 +67,11 @@ def lift(
     canonical = [colour.to_canonical(view.rgb, isp[view.camera_id]).astype(np.uint8) for view in views]
     stages.start("lifting")
     static, moving, lifted = Gaussians.empty(), [], 0
+    beams = gathered.beams if settings.points.carve else []
     pixels = body_pixels(bodies, views, pictures, canonical, settings)
     for number, body in enumerate(bodies):
         stages.fraction(number / len(bodies))
-        gaussians, count = body_gaussians(body, pixels[number], ground, views, pictures, canonical, settings)
+        gaussians, count = body_gaussians(body, pixels[number], ground, views, pictures, canonical, settings, beams)
         lifted += count
         if body.actor is None:
             static = gaussians

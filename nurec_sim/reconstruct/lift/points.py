@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from nurec_sim import geometry
-from nurec_sim.compute.kernels import kernel
+from nurec_sim.reconstruct.free_space import SweepBeams, chosen_sweeps, sweep_beams
 from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.types import MOVABLE_LABELS, Clip, Track, Trajectory
 
@@ -22,14 +22,13 @@ class Cloud:
     """Thinned points of one rigid body, in the world or in the box frame.
 
     ``spacing_m`` is the edge of the voxel that each point represents, ``eye_m`` the mean position of the sensor that
-    saw it, ``sweeps`` the number of sweeps that hit it; ``intensity`` is NaN where no sweep recorded one.
+    saw it; ``intensity`` is NaN where no sweep recorded one.
     """
 
     xyz_m: Float64[np.ndarray, "n 3"]
     eye_m: Float64[np.ndarray, "n 3"]
     spacing_m: Float32[np.ndarray, " n"]
     intensity: Float32[np.ndarray, " n"]
-    sweeps: Int32[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.xyz_m)
@@ -45,11 +44,10 @@ class Cloud:
     @classmethod
     def empty(cls) -> Cloud:
         """No points."""
-        return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros(0, np.float32),
-                   np.zeros(0, np.int32))  # fmt: skip
+        return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros(0, np.float32))
 
 
-CLOUD_FIELDS = ("xyz_m", "eye_m", "spacing_m", "intensity", "sweeps")
+CLOUD_FIELDS = ("xyz_m", "eye_m", "spacing_m", "intensity")
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ def actors_of(clip: Clip, settings: PointSettings) -> list[Actor]:
 
 
 class _Voxels:
-    """Running voxel means; each entry of a voxel counts as one sweep."""
+    """Running voxel means."""
 
     def __init__(self) -> None:
         self.keys: list[np.ndarray] = []
@@ -113,10 +111,8 @@ class _Voxels:
         key = ((level << 57) | (cell[:, 0] << 38) | (cell[:, 1] << 19) | cell[:, 2]).astype(np.int64)
         known = np.isfinite(intensity)
         ones = np.ones(len(xyz))
-        rows = np.column_stack([xyz, eye, edge, np.where(known, intensity, 0.0), known, ones, np.zeros(len(xyz))])
+        rows = np.column_stack([xyz, eye, edge, np.where(known, intensity, 0.0), known, ones])
         key, sums = _sum_by_key(key, rows)
-        # The last column counts sweeps, not points: carving compares it with the sweeps that look through.
-        sums[:, -1] = 1
         self.keys.append(key)
         self.sums.append(sums)
         self.pending += len(key)
@@ -138,12 +134,11 @@ class _Voxels:
         mean = sums / sums[:, 9:10]
         with np.errstate(invalid="ignore", divide="ignore"):
             intensity = np.where(sums[:, 8] > 0, sums[:, 7] / sums[:, 8], np.nan)
-        return Cloud(mean[:, :3], mean[:, 3:6], mean[:, 6].astype(np.float32), intensity.astype(np.float32),
-                     sums[:, 10].astype(np.int32))  # fmt: skip
+        return Cloud(mean[:, :3], mean[:, 3:6], mean[:, 6].astype(np.float32), intensity.astype(np.float32))
 
 
 def _unthinned(xyz: np.ndarray, eye: np.ndarray, edge: np.ndarray, intensity: np.ndarray) -> Cloud:
-    return Cloud(xyz, eye, edge.astype(np.float32), intensity.astype(np.float32), np.ones(len(xyz), np.int32))
+    return Cloud(xyz, eye, edge.astype(np.float32), intensity.astype(np.float32))
 
 
 def thinned(cloud: Cloud) -> Cloud:
@@ -165,13 +160,13 @@ class Gathered:
     """What the sweeps gave: the static cloud, one cloud per actor (box frame), and the undecided feet of boxes.
 
     ``feet`` holds, per actor, the points near its box's bottom in the box frame, and their world positions.
-    ``range_images`` are (lidar_from_world, coarse spherical range image) of the sweeps, for carving.
+    ``beams`` are those of the sweeps, at most ``free_space.MOST_SWEEPS`` of them.
     """
 
     static: Cloud
     actors: dict[int, Cloud]
     feet: dict[int, tuple[Cloud, Float64[np.ndarray, "n 3"]]]
-    range_images: list[tuple[Float64[np.ndarray, "4 4"], Float32[np.ndarray, "e a"]]]
+    beams: list[SweepBeams]
     sweep_count: int
     point_count: int
     intensity_known: bool
@@ -208,7 +203,8 @@ def gather(
     static, clouds = _Voxels(), {actor.index: _Voxels() for actor in actors}
     feet: dict[int, list[Cloud]] = {actor.index: [] for actor in actors}
     feet_world: dict[int, list[np.ndarray]] = {actor.index: [] for actor in actors}
-    range_images, sweeps, points, known = [], 0, 0, False
+    beams, sweeps, points, known = [], 0, 0, False
+    carving = set(chosen_sweeps(clip, hold_out))
     jobs = [(lidar, i) for lidar in clip.rig.lidars for i in range(len(clip.sweep_times_us(lidar)))]
     for done, (lidar, i) in enumerate(jobs):
         progress(done / len(jobs))
@@ -223,11 +219,12 @@ def gather(
         keep &= ~geometry.points_in_box(
             geometry.transform_points(rig_from_world, xyz) - body.center_m, body.size_m, 0.3
         )
-        xyz, t_us, local = xyz[keep], sweep.point_t_us[keep], sweep.xyz_m[keep]
+        xyz, t_us = xyz[keep], sweep.point_t_us[keep]
         intensity = np.full(len(xyz), np.nan) if sweep.intensity is None else sweep.intensity[keep].astype(np.float64)
         known |= bool(np.isfinite(intensity).any())
         eye = np.broadcast_to(sweep.world_from_lidar[:3, 3], xyz.shape)
-        range_images.append((geometry.inverse(sweep.world_from_lidar), spherical_ranges(local)))
+        if (lidar, i) in carving:
+            beams.append(sweep_beams(clip, lidar, sweep))
         sweeps, points = sweeps + 1, points + len(xyz)
         free = np.ones(len(xyz), bool)
         for actor in actors:
@@ -246,7 +243,7 @@ def gather(
         static.cloud(),
         {index: voxels.cloud() for index, voxels in clouds.items()},
         {i: (Cloud.concatenate(feet[i]), np.concatenate(feet_world[i])) for i in feet if feet[i]},
-        range_images,
+        beams,
         sweeps,
         points,
         known,
@@ -270,53 +267,3 @@ def _inside(
     near, box, box_from_world = near[hit], box[hit], box_from_world[hit]
     box_eye = np.einsum("nij,nj->ni", box_from_world[:, :3, :3], eye[near]) + box_from_world[:, :3, 3]
     return near, box, box_eye, box[:, 2] < -size[2] / 2 + FOOT_M
-
-
-# ----------------------------------------------------------------------------------------------------- free space
-
-AZIMUTHS, ELEVATIONS, LOWEST_DEG, STEP_DEG = 1440, 160, -30.0, 0.5
-
-
-def spherical_ranges(xyz_lidar_m: Float64[np.ndarray, "n 3"]) -> Float32[np.ndarray, "e a"]:
-    """Smallest range per bin of 0.5 deg elevation by 0.25 deg azimuth; infinite where no return."""
-    distance = np.linalg.norm(xyz_lidar_m, axis=1)
-    azimuth = np.arctan2(xyz_lidar_m[:, 1], xyz_lidar_m[:, 0])
-    elevation = np.degrees(np.arcsin(xyz_lidar_m[:, 2] / np.maximum(distance, 1e-9)))
-    column = np.floor((azimuth / (2 * np.pi) + 0.5) * AZIMUTHS).astype(np.int64) % AZIMUTHS
-    row = np.clip(np.floor((elevation - LOWEST_DEG) / STEP_DEG).astype(np.int64), 0, ELEVATIONS - 1)
-    image = np.full((ELEVATIONS, AZIMUTHS), np.inf, np.float32)
-    np.minimum.at(image, (row, column), distance.astype(np.float32))
-    return image
-
-
-def seen_through(cloud: Cloud, range_images: list[tuple[np.ndarray, np.ndarray]], votes: int) -> Bool[np.ndarray, " n"]:
-    """Points that sweeps look through: at least ``votes`` and twice as many as those that hit them.
-
-    A sweep looks through a point when every return in the 3x3 bins around its direction lies well behind it.
-    """
-    through = np.zeros(len(cloud), np.int32)
-    for lidar_from_world, image in range_images:
-        # Minimum over 3 x 3 bins: a return at the rim of a bin, or on an edge beside the point, must not count as
-        # looking through.
-        nearest = np.minimum(image, np.minimum(np.roll(image, 1, 0), np.roll(image, -1, 0)))
-        nearest = np.minimum(nearest, np.minimum(np.roll(nearest, 1, 1), np.roll(nearest, -1, 1)))
-        _count_through(cloud.xyz_m, lidar_from_world, nearest, through)
-    return (through >= votes) & (through >= 2 * cloud.sweeps)
-
-
-@kernel
-def _count_through(xyz, lidar_from_world, nearest, through):
-    m = lidar_from_world
-    for i in range(len(xyz)):
-        x = m[0, 0] * xyz[i, 0] + m[0, 1] * xyz[i, 1] + m[0, 2] * xyz[i, 2] + m[0, 3]
-        y = m[1, 0] * xyz[i, 0] + m[1, 1] * xyz[i, 1] + m[1, 2] * xyz[i, 2] + m[1, 3]
-        z = m[2, 0] * xyz[i, 0] + m[2, 1] * xyz[i, 1] + m[2, 2] * xyz[i, 2] + m[2, 3]
-        distance = np.sqrt(x * x + y * y + z * z)
-        if distance > 60.0 or distance < 0.5:
-            continue
-        row = int(np.floor((np.degrees(np.arcsin(z / distance)) - LOWEST_DEG) / STEP_DEG))
-        column = int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * AZIMUTHS) % AZIMUTHS
-        if 1 <= row < ELEVATIONS - 1:
-            seen = nearest[row, column]
-            # Behind by 5 % and 0.7 m: range noise and grazing ground must not carve what is there.
-            through[i] += np.isfinite(seen) and seen > 1.05 * distance + 0.7

@@ -22,8 +22,7 @@ class PointSettings:
     """Voxel edge per metre of distance to the driven path, rounded down to a power of two times ``min_voxel_m``."""
     max_range_m: float = 120.0
     carve: bool = True
-    """Drop points that at least ``carve_votes`` sweeps look through: ghosts of unlabelled movers."""
-    carve_votes: int = 3
+    """Drop points, pixels and Gaussians that recorded beams passed through: ghosts of movers, wrong depth."""
 
 
 @dataclass(frozen=True)

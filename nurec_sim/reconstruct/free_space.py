@@ -1,0 +1,230 @@
+"""Free space along recorded LiDAR beams: Gaussians that would have stopped beams which passed are not there.
+
+A recorded beam ends at its return; whatever it crossed before is empty. Every Gaussian is tested with the beams that
+meet its ellipsoid: those that end well behind it speak against it, those that end at it speak for it. So thin and
+grazing footprints are judged by the space that they really occupy, and foliage, of which some beams return, stays.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32
+
+from nurec_sim import geometry
+from nurec_sim.compute.kernels import kernel
+from nurec_sim.types import Clip, Gaussians, Sweep
+
+STEP_RAD = np.radians(0.2)
+"""Cells of a sweep's image: about one beam of a scanner with 64 rows each."""
+COLUMNS = 1800
+BEAM_SHARE = 0.25
+"""A beam that passes a centre this close meets the Gaussian, however small; as a share of the mean angle between beams.
+What lies between beams that all pass is taken for free as well."""
+MEETS = 1.5
+"""Squared Mahalanobis distance within which a beam meets a Gaussian: it would lose half of its light there."""
+MARGIN_M, MARGIN_SHARE = 0.3, 0.02
+"""A beam ends at a Gaussian within this distance along it, plus a share of its range: noise of poses and surfaces."""
+FARTHEST_M = 60.0
+"""Poses and boxes are too inaccurate to carve farther away."""
+VOTES = 3
+"""Fewer beams through a Gaussian do not remove it."""
+ENOUGH, CLEAR = 24, 6
+"""Beams that decide, and those that do if nearly all agree; more are not looked for."""
+MOST_SWEEPS = 64
+"""Sweeps that a log is thinned to, evenly; bounds time and memory."""
+THINNEST_M = 1e-4
+NEAREST_M = 1.0
+MOST_CELLS = 3.0
+"""Beams are looked for this far from the direction of a centre, in cells, and not between the sensor and the car."""
+CHUNK = 8192
+"""Gaussians that are tested together: a sweep then stays in the cache."""
+THREADS = 2
+
+
+@dataclass(frozen=True)
+class SweepBeams:
+    """The beams of one sweep in the axes of its LiDAR at the sweep's reference time, and an image to find them by.
+
+    Attributes:
+        t_us: start and end of the sweep.
+        world_from_lidar: axes at the reference time; the origin is where the sensor was in the middle of the sweep.
+        drift_m: how far the sensor moved during the sweep.
+        beams: unit direction, range (m) and firing time (fraction of the sweep) of each return.
+        image: [rows, COLUMNS] a beam in each angular cell, -1 without.
+        low: elevation of the image's first row, in cells.
+        width_rad: half of the width of a beam.
+        fraction: mean firing time of each column, as a fraction of the sweep.
+    """
+
+    t_us: tuple[int, int]
+    world_from_lidar: Float64[np.ndarray, "4 4"]
+    drift_m: Float64[np.ndarray, " 3"]
+    beams: Float32[np.ndarray, "n 5"]
+    image: Int32[np.ndarray, "rows columns"]
+    low: int
+    width_rad: float
+    fraction: Float64[np.ndarray, " columns"]
+
+
+def sweep_beams(clip: Clip, lidar: str, sweep: Sweep) -> SweepBeams:
+    """The beams of a recorded sweep; each starts where the sensor was when it was fired."""
+    rig_from_lidar = clip.rig.lidars[lidar].rig_from_lidar
+    # The sweep's own pose is the reference; the ego trajectory only adds the motion around it.
+    reference = geometry.inverse(clip.ego.at(sweep.t_us) @ rig_from_lidar)
+    poses = [
+        sweep.world_from_lidar @ reference @ clip.ego.at(t) @ rig_from_lidar for t in (sweep.start_us, sweep.end_us)
+    ]
+    start, end = (pose[:3, 3] for pose in poses)
+    pose = sweep.world_from_lidar.copy()
+    middle = (start + end) / 2
+    drift = (end - start) @ pose[:3, :3]
+    fired = np.clip((sweep.point_t_us - sweep.start_us) / max(sweep.end_us - sweep.start_us, 1), 0, 1)
+    pose[:3, 3] = middle
+    along = sweep.xyz_m + (sweep.world_from_lidar[:3, 3] - middle) @ pose[:3, :3] - (fired - 0.5)[:, None] * drift
+    return _beams((sweep.start_us, sweep.end_us), pose, drift, along, fired)
+
+
+def _beams(t_us, world_from_lidar, drift_m, along, fired) -> SweepBeams:
+    distance = np.linalg.norm(along, axis=1)
+    good = np.isfinite(distance) & (distance > NEAREST_M)
+    along, distance, fired = along[good] / distance[good, None], distance[good], fired[good]
+    row = np.floor(np.arcsin(np.clip(along[:, 2], -1, 1)) / STEP_RAD).astype(np.int64)
+    column = np.floor((np.arctan2(along[:, 1], along[:, 0]) + np.pi) / STEP_RAD).astype(np.int64) % COLUMNS
+    low = int(row.min(initial=0))
+    image = np.full((int(row.max(initial=0)) - low + 1, COLUMNS), -1, np.int32)
+    # The nearest of the beams that share a cell: the far ones would carve what the near ones returned from.
+    far_first = np.argsort(-distance, kind="stable")
+    image[row[far_first] - low, column[far_first]] = far_first
+    count = np.bincount(column, minlength=COLUMNS)
+    mean = np.bincount(column, fired, minlength=COLUMNS) / np.maximum(count, 1)
+    # Columns without returns were fired after the one before them.
+    last = np.maximum.accumulate(np.where(count > 0, np.arange(COLUMNS), -1))
+    last[last < 0] = last[-1]
+    width = BEAM_SHARE * STEP_RAD * np.sqrt(len(image) * np.count_nonzero(count) / max(len(distance), 1))
+    beams = np.column_stack([along, distance, fired]).astype(np.float32)
+    return SweepBeams(t_us, world_from_lidar, drift_m, beams, image, low, width, mean[last])
+
+
+def chosen_sweeps(clip: Clip, hold_out: Collection[int]) -> list[tuple[str, int]]:
+    """LiDAR and index of the sweeps whose beams are used: ``MOST_SWEEPS`` at most, evenly, none of ``hold_out``."""
+    every = [
+        (lidar, i) for lidar in clip.rig.lidars for i in range(len(clip.sweep_times_us(lidar))) if i not in hold_out
+    ]
+    return [
+        every[k] for k in np.unique(np.linspace(0, len(every) - 1, min(MOST_SWEEPS, len(every))).round().astype(int))
+    ]
+
+
+def recorded_beams(clip: Clip, hold_out: Collection[int]) -> list[SweepBeams]:
+    """Beams of the chosen sweeps of a log; empty without LiDAR."""
+    return [sweep_beams(clip, lidar, clip.sweep(lidar, i)) for lidar, i in chosen_sweeps(clip, hold_out)]
+
+
+def balls(xyz_m: Float64[np.ndarray, "n 3"], sigma_m: Float32[np.ndarray, " n"]) -> Gaussians:
+    """Points as round Gaussians, to test them."""
+    one = Gaussians.empty(len(xyz_m))
+    return dataclasses.replace(
+        one, mean_m=xyz_m.astype(np.float32), scale_m=np.repeat(sigma_m.astype(np.float32)[:, None], 3, axis=1)
+    )
+
+
+def in_free_space(
+    gaussians: Gaussians,
+    sweeps: Sequence[SweepBeams],
+    world_from_body: Callable[[int], Float64[np.ndarray, "4 4"] | None] = lambda t_us: np.eye(4),
+    box_m: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Bool[np.ndarray, " n"]:
+    """Gaussians that more recorded beams passed through than ended at.
+
+    Args:
+        gaussians: in the frame of a rigid body.
+        sweeps: recorded beams.
+        world_from_body: where the body is at a time in microseconds; None if unknown. The static world by default.
+        box_m: size of the body's box, if it has one. What lies in it stays: beams pass through the windows of a car and
+            do not return from black paint.
+    """
+    tested = np.flatnonzero((np.abs(gaussians.mean_m) >= np.asarray(box_m) / 2).any(axis=1))
+    passed, stopped = np.zeros(len(tested), np.int32), np.zeros(len(tested), np.int32)
+    xyz, quat = (values[tested].astype(np.float64) for values in (gaussians.mean_m, gaussians.quat_wxyz))
+    scale = np.maximum(gaussians.scale_m[tested].astype(np.float64), THINNEST_M)
+    canonical = np.ascontiguousarray(np.swapaxes(geometry.matrix_from_quat(quat), 1, 2) / scale[:, :, None])
+    reach = scale.max(axis=1, initial=0.0) * np.sqrt(MEETS)
+    jobs = []
+    # Sweeps far apart first: a few beams then show a Gaussian from different sides. The golden ratio spreads best.
+    for k in np.argsort(np.arange(len(sweeps)) * 0.6180339887498949 % 1.0, kind="stable"):
+        sweep = sweeps[k]
+        world = world_from_body(sum(sweep.t_us) // 2)
+        if world is not None:
+            pose = geometry.inverse(sweep.world_from_lidar) @ world
+            jobs.append((pose, sweep.drift_m, sweep.beams, sweep.image, sweep.low, sweep.width_rad, sweep.fraction))
+
+    def count(start: int) -> None:
+        part = slice(start, start + CHUNK)
+        for job in jobs:
+            _count(xyz[part], canonical[part], reach[part], *job, passed[part], stopped[part])
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(count, range(0, len(tested), CHUNK)))
+    free = np.zeros(len(gaussians), bool)
+    free[tested] = (passed >= VOTES) & (passed > stopped)
+    return free
+
+
+@kernel
+def _count(xyz, canonical, reach, pose, drift, beams, image, low, width, fraction, passed, stopped):
+    rows = image.shape[0]
+    turn = np.ascontiguousarray(pose[:3, :3].T)
+    eye, move = -turn @ np.ascontiguousarray(pose[:3, 3]), turn @ drift
+    offset, along = np.zeros(3), np.zeros(3)
+    for i in range(len(xyz)):
+        total = passed[i] + stopped[i]
+        if total >= ENOUGH or (total >= CLEAR and 8 * min(passed[i], stopped[i]) <= total):
+            continue
+        x = pose[0, 0] * xyz[i, 0] + pose[0, 1] * xyz[i, 1] + pose[0, 2] * xyz[i, 2] + pose[0, 3]
+        y = pose[1, 0] * xyz[i, 0] + pose[1, 1] * xyz[i, 1] + pose[1, 2] * xyz[i, 2] + pose[1, 3]
+        z = pose[2, 0] * xyz[i, 0] + pose[2, 1] * xyz[i, 1] + pose[2, 2] * xyz[i, 2] + pose[2, 3]
+        if x * x + y * y + z * z > FARTHEST_M * FARTHEST_M:
+            continue
+        # The sensor moves while it spins; one correction suffices, as it moves little while it turns by the parallax.
+        f = fraction[int((np.arctan2(y, x) + np.pi) / STEP_RAD) % COLUMNS] - 0.5
+        x, y, z = x - f * drift[0], y - f * drift[1], z - f * drift[2]
+        distance = np.sqrt(x * x + y * y + z * z)
+        if distance < NEAREST_M:
+            continue
+        azimuth, elevation = (np.arctan2(y, x) + np.pi) / STEP_RAD, np.arcsin(z / distance) / STEP_RAD - low
+        half = min(max(reach[i] / distance, width) / STEP_RAD, MOST_CELLS)
+        margin = MARGIN_M + MARGIN_SHARE * distance
+        for row in range(max(int(np.floor(elevation - half)), 0), min(int(np.floor(elevation + half)), rows - 1) + 1):
+            for cell in range(int(np.floor(azimuth - half)), int(np.floor(azimuth + half)) + 1):
+                b = image[row, cell % COLUMNS]
+                if b < 0 or beams[b, 3] < distance - margin:
+                    continue
+                # The beam in the body's frame: where is it nearest to the centre?
+                f = beams[b, 4] - 0.5
+                square, t = 0.0, 0.0
+                for k in range(3):
+                    offset[k] = xyz[i, k] - eye[k] - f * move[k]
+                    along[k] = turn[k, 0] * beams[b, 0] + turn[k, 1] * beams[b, 1] + turn[k, 2] * beams[b, 2]
+                    square += offset[k] * offset[k]
+                    t += offset[k] * along[k]
+                if square - t * t > (width * distance) ** 2:
+                    # The same in units of the Gaussian.
+                    aa, ab, bb = 0.0, 0.0, 0.0
+                    for k in range(3):
+                        c = canonical[i, k]
+                        a = c[0] * offset[0] + c[1] * offset[1] + c[2] * offset[2]
+                        e = c[0] * along[0] + c[1] * along[1] + c[2] * along[2]
+                        aa, ab, bb = aa + a * a, ab + a * e, bb + e * e
+                    if aa - ab * ab / bb > MEETS:
+                        continue
+                    t = ab / bb
+                behind = beams[b, 3] - t
+                if behind > margin:
+                    passed[i] += 1
+                elif behind > -margin:
+                    stopped[i] += 1

@@ -1,0 +1,153 @@
+"""Gaussians against recorded beams: a scanner at the origin, or a moving one, in front of walls at known distances."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from reconstruct_street import Street
+
+from nurec_sim import geometry
+from nurec_sim.reconstruct import LiftSettings, reconstruct
+from nurec_sim.reconstruct.free_space import (
+    MOST_SWEEPS,
+    balls,
+    chosen_sweeps,
+    in_free_space,
+    recorded_beams,
+    sweep_beams,
+)
+from nurec_sim.reconstruct.lift.settings import PointSettings
+from nurec_sim.types import Gaussians, Sweep, Trajectory
+
+SIGMA_M = 0.05
+
+
+def directions():
+    """Beams 0.2 degrees apart, 20 degrees to each side and 10 up and down."""
+    azimuth, elevation = np.radians(np.meshgrid(np.arange(-20, 20, 0.2), np.arange(-10, 10, 0.2)))
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
+
+
+def sweep_of(clip, range_m, index=0):
+    """A sweep that returns from ``range_m`` along all beams; the LiDAR is at the origin of the world."""
+    xyz = directions() * np.broadcast_to(range_m, len(directions()))[:, None]
+    start, end = (int(t) for t in clip.sweep_times_us("top")[index])
+    sweep = Sweep(start, start, end, np.eye(4), xyz, None, np.full(len(xyz), start))
+    return sweep_beams(clip, "top", sweep)
+
+
+@pytest.fixture(scope="module")
+def parked():
+    return Street(frames=3, speed_mps=0.0)
+
+
+def at(*places, sigma_m=SIGMA_M):
+    return balls(np.array(places, float), np.full(len(places), sigma_m))
+
+
+def test_what_beams_pass_is_free_and_where_they_end_is_not(parked):
+    gaussians = at([10, 0, 0], [20, 0, 0], [25, 0, 0], [10, 8, 0])
+    assert in_free_space(gaussians, [sweep_of(parked, 20.0)] * 2).tolist() == [True, False, False, False]
+
+
+def test_beams_end_at_what_lies_a_little_before_their_returns(parked):
+    """0.3 m and 2 % of 10 m: returns from 10.45 m count as from there, those from 10.55 m do not."""
+    for wall_m, free in ((10.45, False), (10.55, True)):
+        assert in_free_space(at([10, 0, 0]), [sweep_of(parked, wall_m)] * 3).tolist() == [free]
+
+
+def test_few_beams_remove_nothing(parked):
+    """At 50 m a beam is 5 cm from the centre of a small Gaussian between rows, and one or none meets it per sweep."""
+    small = at([40.0, 0.0, 0.0], sigma_m=0.001)
+    sweep = sweep_of(parked, 60.0)
+    assert in_free_space(small, [sweep] * 2).tolist() == [False]
+    assert in_free_space(small, [sweep] * 3).tolist() == [True]
+
+
+def test_foliage_stays_as_long_as_half_of_the_beams_return(parked):
+    """Every n-th beam passes; a Gaussian of 0.2 m at 10 m is met by some thirty."""
+    beams = np.arange(len(directions()))
+    for passing, free in ((beams % 3 == 0, False), (beams % 3 != 0, True)):
+        sweep = sweep_of(parked, np.where(passing, 30.0, 10.0))
+        assert in_free_space(at([10, 0, 0], sigma_m=0.2), [sweep]).tolist() == [free]
+
+
+def test_a_footprint_is_judged_by_the_space_that_it_fills(parked):
+    """A disc in the plane of grazing beams touches none of them; tipped by 30 degrees it stands in their way."""
+    flat = dataclasses.replace(at([10, 0, -0.1]), scale_m=np.array([[0.5, 0.05, 0.002]], np.float32))
+    half = np.radians(30) / 2
+    tipped = dataclasses.replace(flat, quat_wxyz=np.array([[np.cos(half), 0, np.sin(half), 0]], np.float32))
+    # One row of beams 0.1 m above the disc.
+    row = np.abs(directions()[:, 2]) < 1e-6
+    sweep = sweep_of(parked, np.where(row, 30.0, 1.5))
+    assert in_free_space(flat, [sweep] * 3).tolist() == [False]
+    assert in_free_space(tipped, [sweep] * 3).tolist() == [True]
+
+
+def test_beams_start_where_the_sensor_was_when_it_fired_them():
+    """The car drives 2 m along y during the sweep, and all points are fired at the end, 1 m left of the reference.
+
+    (10, 0.5, 0) is on their way to (20, 0, 0); (10, 0, 0), on the way from the reference, is not.
+    """
+    clip = Street(frames=2, speed_mps=0.0)
+    lidar = clip.rig.lidars["top"].rig_from_lidar
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 1, 3] = -1, 0, 1
+    clip.ego = Trajectory(np.array([0, 1000, 2000]), poses @ geometry.inverse(lidar))
+    ends = np.array([[20.0, 0, z] for z in (0.0, 0.02, 0.04)])
+    sweep = Sweep(1000, 0, 2000, np.eye(4), ends, None, np.full(3, 2000))
+    gaussians = at([10, 0.5, 0], [10, 0, 0], [10, -0.5, 0])
+    assert in_free_space(gaussians, [sweep_beams(clip, "top", sweep)] * 3).tolist() == [True, False, False]
+
+
+def test_what_belongs_to_a_mover_is_tested_where_the_mover_was(parked):
+    """Beams pass 10 m ahead; the body is there, elsewhere, or of unknown place."""
+    gaussians, sweeps = at([0, 0, 0]), [sweep_of(parked, 20.0)] * 3
+
+    def body(x, y):
+        return lambda t_us: geometry.pose_from_xyyaw(x, y, 0.3)
+
+    assert in_free_space(gaussians, sweeps, body(10, 0)).tolist() == [True]
+    assert in_free_space(gaussians, sweeps, body(20, 0)).tolist() == [False]
+    assert in_free_space(gaussians, sweeps, lambda t_us: None).tolist() == [False]
+
+
+def test_glass_in_the_box_of_a_car_stays(parked):
+    gaussians, sweeps = at([0, 0, 0], [1.1, 0, 0]), [sweep_of(parked, 20.0)] * 3
+    there = geometry.pose_from_xyyaw(10, 0, 0)
+    assert in_free_space(gaussians, sweeps, lambda t_us: there, (2.0, 2.0, 2.0)).tolist() == [False, True]
+
+
+def test_nothing_to_test_and_nothing_to_test_with(parked):
+    assert in_free_space(Gaussians.empty(), [sweep_of(parked, 20.0)]).tolist() == []
+    assert in_free_space(at([10, 0, 0]), []).tolist() == [False]
+
+
+def test_held_out_sweeps_do_not_carve_and_long_logs_are_thinned_evenly():
+    clip = Street(frames=200)
+    chosen = [index for _, index in chosen_sweeps(clip, {0, 7})]
+    assert len(chosen) == MOST_SWEEPS and chosen[0] == 1 and chosen[-1] == 199
+    assert set(np.diff(chosen)) <= {3, 4, 5} and 7 not in chosen
+    assert chosen_sweeps(Street(frames=2), {0, 1}) == []
+
+
+def test_lift_keeps_nothing_where_beams_passed():
+    """A box stands in the first frame only and is not labelled: a ghost in front of a wall across the street.
+
+    Beams 1 degree apart are 25 cm apart there: between some of them too few pass to say.
+    """
+    boxes = {
+        "van": ((3.0, 2.0, 2.5), np.array([[14.0, 0.0]] + [[80.0, 0.0]] * 4)),
+        "wall": ((1.0, 16.0, 6.0), np.array([25.0, 0.0])),
+    }
+    clip = Street(frames=5, speed_mps=1.0, boxes=boxes, labelled=False)
+
+    def ghosts(carve):
+        scene = reconstruct(clip, "lift", settings=LiftSettings(points=PointSettings(carve=carve)))
+        inside = geometry.points_in_box(scene.static.mean_m - np.array([14.0, 0, 1.4]), (3.4, 2.4, 2.0), 0.0)
+        return int(inside.sum()), int(in_free_space(scene.static, recorded_beams(clip, set())).sum())
+
+    (kept, free), (carved, left) = ghosts(carve=False), ghosts(carve=True)
+    assert kept > 100 and free > 100
+    assert carved < 0.5 * kept and left == 0
