@@ -14,11 +14,16 @@ def town():
     return first_frames(logs.open_clip(DEMO), frames=3, cameras=2)
 
 
-def write_ros(folder, clip):
-    return write_bag(folder / "town.mcap", clip)
+def write_ros(folder, clip, **options):
+    return write_bag(folder / "town.mcap", clip, **options)
 
 
-@pytest.mark.parametrize("write, needs", [(write_ncore, "ncore"), (write_ros, "mcap_ros2"), (write_waymo, "polars")])
+FORMATS = pytest.mark.parametrize(
+    "write, needs", [(write_ncore, "ncore"), (write_ros, "mcap_ros2"), (write_waymo, "polars")]
+)
+
+
+@FORMATS
 def test_lidar_projects_into_every_camera(town, write, needs, tmp_path):
     pytest.importorskip(needs)
     clip = logs.open_clip(write(tmp_path, town))
@@ -29,8 +34,9 @@ def test_lidar_projects_into_every_camera(town, write, needs, tmp_path):
     assert len(fits) == 2 and all(each.found.startswith("fits at") for each in fits), measures
 
 
-def test_inverted_extrinsics_of_a_foreign_log_are_found(town, tmp_path):
-    pytest.importorskip("ncore")
-    clip = logs.open_clip(write_ncore(tmp_path, first_frames(town, 3), pose_of=geometry.inverse))
+@FORMATS
+def test_inverted_extrinsics_are_found(town, write, needs, tmp_path):
+    pytest.importorskip(needs)
+    clip = logs.open_clip(write(tmp_path, first_frames(town, 2), pose_of=geometry.inverse))
     faults = [fault for each in logs.measure_clip(clip) for fault in each.faults]
     assert any("inverted" in fault for fault in faults), faults
