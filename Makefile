@@ -4,6 +4,9 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs
 
+# With bytecode, whatever the environment says: else each of the many processes that tests start compiles all modules.
+TESTS := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile
+
 .PHONY: demo test test-slow check format docs dist bench bench-serving gpu-parity gpu-bench clean
 
 $(VENV)/.installed: pyproject.toml setup.py constraints.txt
@@ -16,10 +19,10 @@ demo: $(VENV)/.installed ## log -> Gaussian scene -> gRPC server -> closed loop 
 	$(BIN)/nurec-sim demo --out $(OUT)
 
 test: $(VENV)/.installed ## every rule once, some seven minutes on two cores
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	$(TESTS) -m "not slow"
 
 test-slow: $(VENV)/.installed ## tests that take many seconds, and repetitions of quick ones
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow
+	$(TESTS) -m slow
 
 check: $(VENV)/.installed ## format, lint, import arrows, types
 	$(BIN)/ruff format --check .

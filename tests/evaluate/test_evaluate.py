@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from reconstruct_street import Street, camera
+from repetition import slow_after
 
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
@@ -53,6 +54,7 @@ def test_pairs_of_images_are_written(figures):
     assert np.array_equal(picture[:96, :, ::-1], street().image("right", 3))
 
 
+@pytest.mark.slow
 def test_over_grpc_the_figures_are_the_same(figures):
     over = evaluate(street(), input_cameras=["left"], target_cameras=["right"], hold_out_sweeps_every=2, settings=SMALL)
     assert over["via"] == "grpc"
@@ -60,7 +62,7 @@ def test_over_grpc_the_figures_are_the_same(figures):
     assert over["lidar"] == figures[0]["lidar"]
 
 
-@pytest.mark.parametrize("half_width_m, agrees", [(4.0, True), (1.2, False)])
+@pytest.mark.parametrize("half_width_m, agrees", slow_after(1, [(1.2, False), (4.0, True)]))
 def test_road_is_scored_against_the_map_of_the_log(half_width_m, agrees):
     ring = np.array([[-40, -half_width_m], [60, -half_width_m], [60, half_width_m], [-40, half_width_m]])
     clip = Street(frames=5, road_map=RoadMap(((ring,),)))

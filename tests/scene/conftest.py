@@ -1,27 +1,25 @@
 """Fixtures of the tests of archives."""
 
-from xml.etree import ElementTree
+import functools
 
 import pytest
 
-from nurec_sim.scene.interop.validate import alpasim_roads
+from nurec_sim.scene.interop.validate import alpasim_roads, maps
 from nurec_sim.scene.interop.validate.alpasim_map import AlpasimMap
+from nurec_sim.scene.opendrive import reader
+from nurec_sim.scene.opendrive.xml import opendrive_root
 
-_read: dict[bytes, AlpasimMap] = {}
+# Trees that are equal are one tree, and hash by identity.
+_root, _map = functools.cache(opendrive_root), functools.cache(AlpasimMap)
 
 
 @pytest.fixture
 def quick_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests that validate many archives: the map takes most of the time, so that each one is read once.
 
-    Of 200 cars beside the path 30 are compared; ``test_scene_map.py`` compares all.
+    Of 200 cars beside the path 10 are compared; ``test_scene_map.py`` compares all.
     """
-
-    def read_once(root: ElementTree.Element) -> AlpasimMap:
-        key = ElementTree.tostring(root)
-        if key not in _read:
-            _read[key] = AlpasimMap(root)
-        return _read[key]
-
-    monkeypatch.setattr(alpasim_roads, "AlpasimMap", read_once)
-    monkeypatch.setattr(alpasim_roads, "PLACEMENTS", 30)
+    monkeypatch.setattr(alpasim_roads, "AlpasimMap", _map)
+    monkeypatch.setattr(alpasim_roads, "PLACEMENTS", 10)
+    for module in (maps, reader):
+        monkeypatch.setattr(module, "opendrive_root", _root)

@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import shapely
+from repetition import slow_after
 from scene_worlds import curved_path, full_scene
 
 from nurec_sim import geometry
@@ -94,8 +95,8 @@ def test_two_lanes_without_a_gap_contain_a_car_between_them():
 # ------------------------------------------------------------------------------------------------------ what we write
 
 
-@pytest.mark.parametrize(("seed", "split", "template", "kind"), [(1, "train", "x_junction", "crossing"),
-                         (5, "test", "roundabout", "roundabout"), (4, "train", "s_curve", "")])  # fmt: skip
+@pytest.mark.parametrize(("seed", "split", "template", "kind"), slow_after(1, [(1, "train", "x_junction", "crossing"),
+                         (5, "test", "roundabout", "roundabout"), (4, "train", "s_curve", "")]))  # fmt: skip
 def test_towns_have_the_verdicts_of_their_drivable_area(seed, split, template, kind):
     plan = town_plan(seed, split, template)
     assert not kind or any(junction.kind == kind for junction in plan.junctions)

@@ -18,6 +18,7 @@ from driving_calls import (
     opening,
     xy_of,
 )
+from repetition import slow_after
 
 from nurec_sim import geometry
 from nurec_sim.errors import NurecSimError
@@ -28,7 +29,6 @@ from nurec_sim.serving.wire import driving, driving_paths, egodriver
 from nurec_sim.sim.flat_world import demo_rig
 from nurec_sim.types import ActorState, LidarFrame, Needs
 
-REQUESTS = 4000
 STRANGE = [0.0, -0.0, 1.0, -1.0, 1e-45, 5e-324, 1e30, 3.4e38, sys.float_info.max, np.nan, np.inf, -np.inf]
 WHOLE = [0, 1, 2, 255, 8193, NOW_US, NOW_US + 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63, 2**64 - 1]
 TEXTS = ["", "s", "front_wide", "top", "\0", "x" * 300, "ä"]
@@ -161,18 +161,19 @@ async def fuzz(random, count):
     return statuses
 
 
-def test_mutated_requests_get_a_status_of_the_map():
+@pytest.mark.parametrize("count", slow_after(1, [1500, 4000]))
+def test_mutated_requests_get_a_status_of_the_map(count):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        statuses = asyncio.run(fuzz(np.random.default_rng(11), REQUESTS))
+        statuses = asyncio.run(fuzz(np.random.default_rng(11), count))
     codes = collections.Counter()
     for (_, code), count in statuses.items():
         codes[code.name] += count
     assert set(codes) <= {
         "OK", "INVALID_ARGUMENT", "NOT_FOUND", "ALREADY_EXISTS", "FAILED_PRECONDITION", "RESOURCE_EXHAUSTED"
     }  # fmt: skip
-    assert sum(codes.values()) >= REQUESTS and codes["INVALID_ARGUMENT"] > 500 and codes["OK"] > 500
-    assert statuses["drive", grpc.StatusCode.OK] > 50
+    assert sum(codes.values()) >= count and codes["INVALID_ARGUMENT"] > count / 8 and codes["OK"] > count / 8
+    assert statuses["drive", grpc.StatusCode.OK] > count / 80
 
 
 @pytest.mark.parametrize("name", driving.DRIVER_METHODS)

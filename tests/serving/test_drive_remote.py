@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import worlds
 from driving_calls import TIMES, Steady, answering, driver, like_alpasim
+from repetition import slow_after
 from serving_world import scene
 
 from nurec_sim import plugins, runs
@@ -43,7 +44,7 @@ def other_wire(monkeypatch):
 
 
 @pytest.mark.parametrize("world", [worlds.curve(), worlds.hill(), worlds.parked_car_ahead()], ids=lambda w: w.id)
-@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize("name", slow_after(2, POLICIES))
 def test_a_remote_rollout_equals_the_local_one_bit_for_bit(name, world):
     local = rollout(plugins.load_policy(name), world)
     with DriverServer(lambda: plugins.load_policy(name), port=0) as address, RemotePolicy(address) as remote:

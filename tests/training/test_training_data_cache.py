@@ -148,6 +148,7 @@ def test_samples_follow_from_seed_and_number_and_a_resumed_stream_repeats_them(t
         assert next(stream).id != whole[0].id
 
 
+@pytest.mark.slow
 def test_ranks_share_the_samples_and_workers_change_nothing(tmp_path):
     settings = cache_with(tmp_path, 4)
     folder = tmp_path / settings.hash

@@ -39,6 +39,7 @@ def first_step(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_that_was_cut_off_ends_with_the_same_bytes(whole, tmp_path):
     for until in (2, 4, 7, None):
         trainer(tmp_path / "cut").run(until=until)
@@ -68,6 +69,7 @@ def test_a_run_leaves_curves_weights_and_its_recipe(whole):
     assert facts["steps"] == "8" and facts["data"] == "ground" and json.loads(facts["recipe"])["seed"] == 0
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss(tmp_path):
     stage = {"name": "context", "steps": 30, "trains": ["encoder", "context"], "learning_rate": 2e-3, "warm_up": 3}
     trainer(tmp_path, small_config(stages=[stage])).run()

@@ -50,6 +50,7 @@ def test_policies_drive_in_the_true_world(plan):
         assert 1.0 < np.linalg.norm(end - start) < 60.0
 
 
+@pytest.mark.slow
 def test_truth_and_reconstruction_stand_side_by_side_in_one_run(log, tmp_path):
     clip, plan_file = log
     scene = reconstruct(clip, "lift")
