@@ -7,13 +7,13 @@ Poses come from /tf or odometry, calibration from CameraInfo and /tf_static; a Y
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Float64, Int64
 
 from nurec_sim import sensors
 from nurec_sim.errors import ClipError
@@ -24,8 +24,9 @@ from nurec_sim.logs.readers import _ros_sensors as decoding
 from nurec_sim.logs.readers import _ros_storage as storage
 from nurec_sim.logs.readers._ros_frames import WORLDS, Frames
 from nurec_sim.logs.readers._ros_settings import CameraSettings, LidarSettings, Settings, read_settings
+from nurec_sim.logs.readers._ros_source import BagSource, SensorMessages, StoredMessage
 from nurec_sim.logs.sweeps import SweepRecord
-from nurec_sim.types import CameraModel, LidarModel, Matrix4, Rig, SweepPoints, Trajectory
+from nurec_sim.types import CameraModel, LidarModel, Matrix4, Rig, Trajectory
 
 STAND_IN_TABLE = "PANDAR128"
 TIMES_LOOKED_AT = 50
@@ -58,20 +59,6 @@ class RosBagReader:
         return _Opening(bag, settings).clip()
 
 
-@dataclass(frozen=True)
-class _Message:
-    """Where a message is, and what its header says."""
-
-    file: int
-    key: storage.Key
-    stamp_ns: int
-    frame: str
-
-    @property
-    def t_us(self) -> int:
-        return round(self.stamp_ns / 1000)
-
-
 @dataclass
 class _Opening:
     """A bag while its tables are read."""
@@ -82,7 +69,7 @@ class _Opening:
     topics: dict[str, str] = field(init=False)
     frames: Frames = field(default_factory=Frames)
     infos: dict[str, Any] = field(default_factory=dict)
-    found: dict[str, list[_Message]] = field(default_factory=dict)
+    found: dict[str, list[StoredMessage]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.files = storage.open_files(self.path)
@@ -96,7 +83,7 @@ class _Opening:
                 f"{self.path.name}: no images with a CameraInfo and no point clouds; topics are {self.topics}"
             )
         self._scan([*(each.topic for each in cameras.values()), *(each.topic for each in lidars.values())])
-        source = _Messages(self.files, self.topics)
+        source = BagSource(self.files, self.topics)
         base = self.settings.base
         if base not in self.frames.names:
             raise ClipError(
@@ -116,16 +103,15 @@ class _Opening:
             cameras = {name: each for name, each in cameras.items() if self.found.get(each.topic)}
         rig_cameras, rig_lidars, images, sweeps = {}, {}, {}, {}
         for name, camera in cameras.items():
+            rows = self._sorted(camera.topic)
+            source.sensors[name] = SensorMessages(camera.topic, rows)
             rig_cameras[name] = self._camera(name, camera, source, rig_from_base)
-            images[name] = list(_images(camera, rig_cameras[name], self._sorted(camera.topic), ego))
-            source.topics_of[name] = camera.topic
-            source.places[name] = self._sorted(camera.topic)
+            images[name] = list(_images(camera, rig_cameras[name], rows, ego))
         facts: dict[str, Any] = {"dataset": "ROS 2 bag", "poses": f"of {base!r} in {world!r}"}
         for name, lidar in lidars.items():
-            source.topics_of[name] = lidar.topic
-            source.places[name] = self._sorted(lidar.topic)
+            source.sensors[name] = _lidar_messages(lidar, self._sorted(lidar.topic), source)
             rig_lidars[name] = self._lidar(name, lidar, rig_from_base)
-            sweeps[name] = list(_sweeps(name, lidar, source, rig_lidars[name], ego))
+            sweeps[name] = list(_sweeps(lidar, source.sensors[name], rig_lidars[name], ego))
             facts[f"beams of {name}"] = lidar.beams or f"not named; {STAND_IN_TABLE} stands in"
         return Clip(
             id=self.path.stem,
@@ -194,7 +180,7 @@ class _Opening:
                 kind = self.topics[topic]
                 if topic in sensor_topics:
                     stamp_ns, frame = messages.header(data)
-                    self.found.setdefault(topic, []).append(_Message(number, key, stamp_ns, frame.strip("/")))
+                    self.found.setdefault(topic, []).append(StoredMessage(number, key, stamp_ns, frame.strip("/")))
                 elif kind == messages.TRANSFORMS:
                     for each in messages.decode(kind, data).transforms:
                         t_us = None if topic.endswith("static") else _t_us(each.header.stamp)
@@ -213,7 +199,7 @@ class _Opening:
         for parent, child, pose, t_us in given:
             self.frames.add(parent, child, pose.position, pose.orientation, t_us)
 
-    def _sorted(self, topic: str) -> list[_Message]:
+    def _sorted(self, topic: str) -> list[StoredMessage]:
         """The messages of a topic by time; repeated ones are left out."""
         found = {each.t_us: each for each in reversed(self.found.get(topic, []))}
         return [found[t] for t in sorted(found)]
@@ -243,7 +229,7 @@ class _Opening:
         poses = self._in_base(name, given, t_us[:: 1 + len(t_us) // TIMES_LOOKED_AT])
         return float(np.abs(poses - poses[0]).max()) < ATTACHED
 
-    def _camera(self, name: str, given: CameraSettings, source: _Messages, rig_from_base: Matrix4) -> CameraModel:
+    def _camera(self, name: str, given: CameraSettings, source: BagSource, rig_from_base: Matrix4) -> CameraModel:
         where = f"{self.path.name}: camera {name!r}"
         pose = self._mounting(name, given, rig_from_base)
         if given.lens is not None:
@@ -276,7 +262,9 @@ def _info_beside(topic: str, infos: set[str]) -> str | None:
     return next((name for name in names if name in infos), None)
 
 
-def _images(given: CameraSettings, camera: CameraModel, rows: list[_Message], ego: Trajectory) -> Iterator[ImageRecord]:
+def _images(
+    given: CameraSettings, camera: CameraModel, rows: list[StoredMessage], ego: Trajectory
+) -> Iterator[ImageRecord]:
     for each in rows:
         start_us = each.t_us + given.delay_us
         times = np.array([start_us, start_us + given.readout_us], np.int64)
@@ -284,59 +272,22 @@ def _images(given: CameraSettings, camera: CameraModel, rows: list[_Message], eg
         yield ImageRecord(f"{given.topic} at {each.stamp_ns} ns", int(times[0]), int(times[1]), poses)
 
 
-def _sweeps(
-    name: str, given: LidarSettings, source: _Messages, lidar: LidarModel, ego: Trajectory
-) -> Iterator[SweepRecord]:
-    """Records whose extent in time is that of the first sweep, relative to the messages' times."""
-    rows = source.places[name]
-    first_us, last_us = 0, 0
-    if rows:
-        points = decoding.cloud(source.message(given.topic, rows[0]))
-        times = decoding.point_times(given.topic, points, rows[0].stamp_ns, given.time_field, given.time_unit)
-        source.times[name] = times
-        source.scales[name] = given.intensity_scale or decoding.intensity_scale(points)
-        if times is not None:
-            after_us = times.after_us(points, rows[0].stamp_ns)
-            first_us, last_us = int(after_us.min()), int(after_us.max())
-    compensated = given.compensated or first_us == last_us
-    for each in rows:
-        start_us, end_us = each.t_us + first_us, each.t_us + last_us
+def _lidar_messages(given: LidarSettings, rows: list[StoredMessage], source: BagSource) -> SensorMessages:
+    """The messages of a LiDAR; the extent of its sweeps, relative to their messages, is that of the first one."""
+    if not rows:
+        return SensorMessages(given.topic, rows)
+    points = decoding.cloud(source.message(given.topic, rows[0]))
+    times = decoding.point_times(given.topic, points, rows[0].stamp_ns, given.time_field, given.time_unit)
+    after_us = np.zeros(1, np.int64) if times is None else times.after_us(points, rows[0].stamp_ns)
+    scale = given.intensity_scale or decoding.intensity_scale(points)
+    return SensorMessages(given.topic, rows, times, int(after_us.min()), int(after_us.max()), scale)
+
+
+def _sweeps(given: LidarSettings, sensor: SensorMessages, lidar: LidarModel, ego: Trajectory) -> Iterator[SweepRecord]:
+    compensated = given.compensated or sensor.first_us == sensor.last_us
+    for each in sensor.rows:
+        start_us, end_us = each.t_us + sensor.first_us, each.t_us + sensor.last_us
         # Points that are compensated already belong to the time of their message.
         t_us = min(max(each.t_us, start_us), end_us)
-        source.starts[name, each.key] = start_us
         pose = ego.at(t_us) @ lidar.rig_from_lidar
         yield SweepRecord(f"{given.topic} at {each.stamp_ns} ns", t_us, start_us, end_us, pose, compensated)
-
-
-@dataclass
-class _Messages:
-    """The messages of a bag as a ``types.LogSource``."""
-
-    files: list[storage.BagFile]
-    types: Mapping[str, str]
-    topics_of: dict[str, str] = field(default_factory=dict)
-    places: dict[str, list[_Message]] = field(default_factory=dict)
-    times: dict[str, decoding.PointTimes | None] = field(default_factory=dict)
-    scales: dict[str, float] = field(default_factory=dict)
-    starts: dict[tuple[str, storage.Key], int] = field(default_factory=dict)
-
-    def message(self, topic: str, at: _Message) -> Any:
-        """A decoded message."""
-        return messages.decode(self.types[topic], self.files[at.file].read(topic, at.key))
-
-    def image(self, camera_id: str, index: int) -> UInt8[np.ndarray, "h w 3"]:
-        """One RGB frame."""
-        return decoding.picture(self.message(self.topics_of[camera_id], self.places[camera_id][index]))
-
-    def sweep(self, lidar_id: str, index: int) -> SweepPoints:
-        """The points of one sweep."""
-        at, times = self.places[lidar_id][index], self.times[lidar_id]
-        points = decoding.cloud(self.message(self.topics_of[lidar_id], at))
-        dt_us = None
-        if times is not None:
-            dt_us = at.t_us + times.after_us(points, at.stamp_ns) - self.starts[lidar_id, at.key]
-        return decoding.sweep_points(points, self.scales[lidar_id], dt_us)
-
-    def ego_mask(self, camera_id: str) -> None:
-        """Bags have none."""
-        return None
