@@ -20,10 +20,11 @@ from nurec_sim.sensors.lidar import (
     column_fraction,
     compensate_sweep,
 )
-from nurec_sim.sensors.lidar_tables import LIDAR_TABLES, LidarTable, lidar_model
+from nurec_sim.sensors.lidar_tables import LIDAR_TABLES, STAND_IN_TABLE, LidarTable, lidar_model
 
 __all__ = [
     "LIDAR_TABLES",
+    "STAND_IN_TABLE",
     "LidarTable",
     "beam_coordinates",
     "beam_directions",

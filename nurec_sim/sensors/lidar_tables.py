@@ -90,6 +90,9 @@ LIDAR_TABLES: dict[str, LidarTable] = {
     "VLP-16": LidarTable(15.0 - 2.0 * np.arange(16), columns=1808, range_m=(0.5, 100.0)),
 }
 
+STAND_IN_TABLE = "PANDAR128"
+"""The device that stands in for LiDARs whose beams a log does not give, for rendering."""
+
 
 def lidar_model(name: str, rig_from_lidar: Matrix4, id: str | None = None, columns: int | None = None) -> LidarModel:
     """A LiDAR from its table.

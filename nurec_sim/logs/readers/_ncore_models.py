@@ -17,7 +17,6 @@ from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Lens, Pinhole
 from nurec_sim.logs import calibration
 from nurec_sim.types import CameraModel, LidarModel, Matrix4, Shutter, Spin, Windshield, WindshieldReference
 
-STAND_IN_TABLE = "PANDAR128"
 _SHUTTERS = {
     "ROLLING_TOP_TO_BOTTOM": Shutter.TOP_TO_BOTTOM,
     "ROLLING_LEFT_TO_RIGHT": Shutter.LEFT_TO_RIGHT,
@@ -125,8 +124,8 @@ def lidar_model(id: str, parameters: Any, rig_from_lidar: Matrix4) -> tuple[Lida
         ClipError: the model is of an unknown kind, or a parameter is wrong.
     """
     if parameters is None:
-        lidar = sensors.lidar_model(STAND_IN_TABLE, rig_from_lidar, id=id)
-        return lidar, f"no table of its beams is given; {STAND_IN_TABLE} stands in"
+        lidar = sensors.lidar_model(sensors.STAND_IN_TABLE, rig_from_lidar, id=id)
+        return lidar, f"no table of its beams is given; {sensors.STAND_IN_TABLE} stands in"
     if parameters.type() != "row-offset-spinning":
         raise ClipError(f"LiDAR {id!r}: model {parameters.type()!r} is unknown; known is 'row-offset-spinning'")
     lidar = LidarModel(

@@ -28,7 +28,6 @@ SCHEMA = "realdata-pack-1"
 LIDAR_ID = "lidar"
 FULL_BYTE = 255.0
 LATEST_S = 1e12
-STAND_IN_TABLE = "PANDAR128"
 _TABLE_OF_WORDS = {
     "hdl-64": "HDL-64",
     "hdl-32": "HDL-32",
@@ -132,9 +131,9 @@ def _lidar(row: Any, rig_from_ego: Matrix4, rate_hz: float) -> tuple[LidarModel,
     table = next((table for word, table in _TABLE_OF_WORDS.items() if word in model.lower()), None)
     note = f"{model}: nominal {table} table"
     if table is None:
-        note = f"{model}: no table of its beams is known; {STAND_IN_TABLE} stands in"
+        note = f"{model}: no table of its beams is known; {sensors.STAND_IN_TABLE} stands in"
     rig_from_lidar = rig_from_file @ geometry.inverse(lidar_from_file)
-    lidar = sensors.lidar_model(table or STAND_IN_TABLE, rig_from_lidar, id=LIDAR_ID)
+    lidar = sensors.lidar_model(table or sensors.STAND_IN_TABLE, rig_from_lidar, id=LIDAR_ID)
     return dataclasses.replace(lidar, frequency_hz=rate_hz), lidar_from_file, note
 
 

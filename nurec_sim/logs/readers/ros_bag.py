@@ -28,7 +28,6 @@ from nurec_sim.logs.readers._ros_source import BagSource, SensorMessages, Stored
 from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.types import CameraModel, LidarModel, Matrix4, Rig, Trajectory
 
-STAND_IN_TABLE = "PANDAR128"
 TIMES_LOOKED_AT = 50
 ATTACHED = 0.1
 """Metres, and about radians, by which a sensor's pose in the car may change."""
@@ -112,7 +111,7 @@ class _Opening:
             source.sensors[name] = _lidar_messages(lidar, self._sorted(lidar.topic), source)
             rig_lidars[name] = self._lidar(name, lidar, rig_from_base)
             sweeps[name] = list(_sweeps(lidar, source.sensors[name], rig_lidars[name], ego))
-            facts[f"beams of {name}"] = lidar.beams or f"not named; {STAND_IN_TABLE} stands in"
+            facts[f"beams of {name}"] = lidar.beams or f"not named; {sensors.STAND_IN_TABLE} stands in"
         return Clip(
             id=self.path.stem,
             rig=Rig(rig_cameras, rig_lidars),
@@ -248,7 +247,7 @@ class _Opening:
 
     def _lidar(self, name: str, given: LidarSettings, rig_from_base: Matrix4) -> LidarModel:
         pose = self._mounting(name, given, rig_from_base)
-        return sensors.lidar_model(given.beams or STAND_IN_TABLE, pose, id=name)
+        return sensors.lidar_model(given.beams or sensors.STAND_IN_TABLE, pose, id=name)
 
 
 def _t_us(stamp: Any) -> int:
