@@ -18,17 +18,16 @@ from llvmlite import ir
 
 from nurec_sim.render.cpu.blend.responses import (
     CAMERA,
-    CUT,
     LIDAR,
     LIDAR_MIN_TRANSMITTANCE,
     VALID,
     VECTORS,
     Bundle,
+    Coefficient,
     RayGroup,
     T,
-    behind_near_plane,
     fading,
-    meeting_of,
+    hits_of,
     run_records,
 )
 from nurec_sim.render.cpu.blend.tiles import AFFINE, C_FEATURE, MOVING, RAYS, TABLE, WIDE
@@ -93,25 +92,12 @@ def _carrying_back(mode: int, output_kind: int, check_near: bool) -> Callable[..
                 old = v.load(place_of_sums, 4 * first)
                 v.store(old + v.sums(totals[first : first + LANES]), place_of_sums, 4 * first)
 
-        def step(
-            group: RayGroup, number: ir.Value, coefficient: Callable[[int], Vector], values: list[Bundle]
-        ) -> list[Bundle]:
+        def step(group: RayGroup, number: ir.Value, coefficient: Coefficient, values: list[Bundle]) -> list[Bundle]:
             # Forwards once more: the same responses, so the same rays are hit and T is what it was.
-            """One more record: adds its gradients to ``sums``.
-
-            Args:
-                group: the rays.
-                number: the record's number in the batch.
-                coefficient: gives a row of the record's coefficients in all lanes.
-                values: transmittance before the record, and G less what has been added so far.
-
-            Returns:
-                The same after the record.
-            """
-            meeting, exponent = meeting_of(mode, group, coefficient, rays, output_kind == LIDAR)
-            hit = exponent < CUT
-            if check_near:
-                hit = hit & behind_near_plane(v, mode, basis, group, meeting.distance, near)
+            """One more record; ``values``: transmittance before it, and G less what has been added so far."""
+            meeting, exponent, hit = hits_of(
+                v, mode, output_kind, group, coefficient, rays, basis, near if check_near else None
+            )
             before = values[0]
             if output_kind == LIDAR:
                 hit = hit & (before > LIDAR_MIN_TRANSMITTANCE)

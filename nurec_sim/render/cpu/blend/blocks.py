@@ -13,18 +13,17 @@ from llvmlite import ir
 
 from nurec_sim.render.cpu.blend.responses import (
     CAMERA,
-    CUT,
     LIDAR,
     LIDAR_MIN_TRANSMITTANCE,
     NORMALS,
     VALID,
     VECTORS,
     Bundle,
+    Coefficient,
     RayGroup,
     T,
-    behind_near_plane,
     fading,
-    meeting_of,
+    hits_of,
     run_records,
 )
 from nurec_sim.render.cpu.blend.tiles import AFFINE, C_FEATURE, C_NORMAL, C_TAG, MOVING, RAYS, TABLE, WIDE
@@ -71,21 +70,11 @@ def _blending(mode: int, output_kind: int, check_near: bool) -> Callable[..., An
         """
         b = v.b
 
-        def step(
-            group: RayGroup, number: ir.Value, coefficient: Callable[[int], Vector], sums: list[Bundle]
-        ) -> list[Bundle]:
-            """The rays' sums after one more record.
-
-            Args:
-                group: the rays.
-                number: the record's number in the batch; not used.
-                coefficient: gives a row of the record's coefficients in all lanes.
-                sums: planes of the block's state.
-            """
-            meeting, exponent = meeting_of(mode, group, coefficient, rays, output_kind == LIDAR)
-            hit = exponent < CUT
-            if check_near:
-                hit = hit & behind_near_plane(v, mode, basis, group, meeting.distance, near)
+        def step(group: RayGroup, number: ir.Value, coefficient: Coefficient, sums: list[Bundle]) -> list[Bundle]:
+            """The rays' sums (planes of the block's state) after one more record."""
+            meeting, exponent, hit = hits_of(
+                v, mode, output_kind, group, coefficient, rays, basis, near if check_near else None
+            )
             distance = hit.where(meeting.distance, 0)  # no NaN from a miss
             alpha, before = Bundle(fading(exponent.parts)), sums[T]
             if output_kind == LIDAR:

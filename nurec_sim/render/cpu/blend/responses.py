@@ -234,8 +234,12 @@ class MovingMeeting(StillMeeting):
         ]
 
 
+Coefficient = Callable[[int], Vector]
+"""Gives a row of a record's coefficients (``tiles``) in all lanes."""
+
+
 def meeting_of(
-    mode: int, group: RayGroup, coefficient: Callable[[int], Vector], rays: ir.Value, refined: bool
+    mode: int, group: RayGroup, coefficient: Coefficient, rays: ir.Value, refined: bool
 ) -> tuple[StillMeeting, Bundle]:
     """A record along the rays of a group, and its exponent with the fading of its opacity: Q1 / Q2 + FADE.
 
@@ -286,13 +290,36 @@ def behind_near_plane(
     return distance * length >= v.spread(near)
 
 
+def hits_of(
+    v: Lanes, mode: int, output_kind: int, group: RayGroup, coefficient: Coefficient, rays: ir.Value, basis: ir.Value,
+    near: ir.Value | None,
+) -> tuple[StillMeeting, Bundle, Bundle]:  # fmt: skip
+    """A record along the rays of a group, its exponent (``meeting_of``), and which rays it hits.
+
+    Args:
+        v: vectors.
+        mode: AFFINE, TABLE or MOVING.
+        output_kind: the distances of LIDAR are refined.
+        group: the rays.
+        coefficient: see ``meeting_of``.
+        rays: address of the block's [RAY_PLANES,32].
+        basis: address of the tile's basis.
+        near: near plane (m); None where no record reaches it.
+    """
+    meeting, exponent = meeting_of(mode, group, coefficient, rays, output_kind == LIDAR)
+    hit = exponent < CUT
+    if near is not None:
+        hit = hit & behind_near_plane(v, mode, basis, group, meeting.distance, near)
+    return meeting, exponent, hit
+
+
 def still_open(transmittance: list[Vector], output_kind: int) -> ir.Value:
     """An int64: 1 while any of the rays is not yet opaque, by the limit of the output kind, else 0."""
     most = functools.reduce(Vector.max, transmittance)
     return (most > (LIDAR_MIN_TRANSMITTANCE if output_kind == LIDAR else MIN_TRANSMITTANCE)).any()
 
 
-Step = Callable[[RayGroup, ir.Value, Callable[[int], Vector], list[Bundle]], list[Bundle]]
+Step = Callable[[RayGroup, ir.Value, Coefficient, list[Bundle]], list[Bundle]]
 """(rays, the record's number in the batch, its coefficients, sums so far) -> sums with the record."""
 
 
