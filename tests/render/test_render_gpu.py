@@ -16,6 +16,7 @@ from render_scenes import LENSES, LIDARS, START_US, camera, cloud, moved, moving
 from nurec_sim import geometry
 from nurec_sim.errors import NurecSimError, RequestError, TooLargeError
 from nurec_sim.render import CpuRenderer, spec
+from nurec_sim.render.gpu.moving import HIDDEN, NOT_ASKED, MovingLayer
 from nurec_sim.render.gpu.pipeline import Room
 from nurec_sim.render.gpu.renderer import GpuRenderer
 from nurec_sim.render.requests import CAMERA_OUTPUTS
@@ -183,6 +184,16 @@ class Counting(EmulatedLauncher):
     def read(self, tensor):
         self.reads += 1
         return super().read(tensor)
+
+
+def test_sensors_of_a_batch_move_actors_of_their_own():
+    """Pairs of poses are numbered over all requests: 0 is the first one's "b", 1 to 3 are those of the second."""
+    layer = MovingLayer.of(moving_cloud(), [track("a"), track("b")], torch.device("cpu"))
+    still = np.stack([np.eye(4)] * 2)
+    actors = [{"b": still}, {"unknown": still, "b": still, "a": still}, {}, {"a": still}]
+    asked = [request(camera(), actors=each) for each in actors]
+    asked[2] = dataclasses.replace(asked[2], hidden=frozenset({"b"}))
+    assert layer.asked(asked).tolist() == [[NOT_ASKED, 0], [3, 2], [NOT_ASKED, HIDDEN], [4, NOT_ASKED]]
 
 
 @pytest.mark.parametrize("sensors", [2, 4])
