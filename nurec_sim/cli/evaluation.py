@@ -108,7 +108,7 @@ def evaluate(
     contact sheets and report.html.
 
     Args:
-        clip: a clip folder, or a .zip of one.
+        clip: a driving log (docs/log_formats.md).
         protocol: evaluation protocol.
         hold_out_every: hold out every N-th image of a log for scoring; default: none of CLIP, every second frame in
             protocol `clip`.
@@ -143,7 +143,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
     """Scores one method, or one finished scene, on one log.
 
     Args:
-        path: a clip folder, or a .zip of one.
+        path: the log.
         flags: options for one log.
         hold_out_every: hold out every N-th image; 0: none.
         network: network settings; its device also renders.

@@ -23,7 +23,7 @@ def inspect(source: OnePath, *, overlay: Path | None = None, time_s: float | Non
     fault as one line. Exit status 1 if there are faults.
 
     Args:
-        source: a clip folder, or a .zip of one (docs/clip_format.md), or a scene archive (.usdz).
+        source: a driving log of any format (docs/log_formats.md), or a scene archive (.usdz).
         overlay: write a PNG with LiDAR points (red near, blue far) and boxes over the image of each camera; clips only.
         time_s: time of the overlay in seconds after the start of the clip; default: the middle.
     """

@@ -50,7 +50,7 @@ def reconstruct(
     best result so far; the same command with --resume goes on from there, also after a kill.
 
     Args:
-        clip: a driving log, such as a clip folder or a .zip of one.
+        clip: a driving log, such as a clip folder or a KITTI drive (docs/log_formats.md).
         out_path: the archive to write; default: CLIP's name with .usdz in the current folder.
         method: lift, dense, selective, optimized, one of an installed package, or a class (docs/write_a_method.md).
         changes: a setting of the method, repeatable: --set sky_px=256 --set views.levels=48.
