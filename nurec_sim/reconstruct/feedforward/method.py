@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from nurec_sim import network
@@ -25,6 +26,7 @@ from nurec_sim.reconstruct.feedforward.merging.merge import merge_chunks
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.reconstruct.feedforward.tracks.clusters import group_into_tracks
 from nurec_sim.reconstruct.feedforward.tracks.labelled import scene_actors
+from nurec_sim.reconstruct.feedforward.tracks.rigid import rigid_once
 from nurec_sim.reconstruct.feedforward.tracks.standing import standing_pixels
 from nurec_sim.reconstruct.lift.actors import tracks_of
 from nurec_sim.types import Clip, DynamicGaussians, GaussianScene, Track
@@ -72,7 +74,11 @@ def feedforward(
         fits.append(chunk_fit)
     merged = merge_chunks(layers, settings, lambda stage, fraction: progress(stage, CHUNKS_SHARE + 0.07 * fraction))
     progress("tracks", CHUNKS_SHARE + 0.07)
-    tracks, dynamic = _tracks(clip, merged.dynamic)
+    dynamic = merged.dynamic
+    if settings.merge == "ownership":
+        chunk_of = np.repeat(np.arange(len(layers)), [len(each.dynamic) for each in layers])
+        dynamic = rigid_once(dynamic, chunk_of, scene_actors(clip), clip.span_us)
+    tracks, dynamic = _tracks(clip, dynamic)
     progress("tracks", 1.0)
     provenance = {
         "method": method,
@@ -82,7 +88,9 @@ def feedforward(
         "held_out_sweeps": sorted(hold_out),
         "chunks": [{"span_us": list(w.span_us), "frames": {c: list(f) for c, f in w.frames.items()}} for w in windows],
         "lidar_depth": [fit.report() for fit in fits if fit is not None],
-        "counts": dict(merged.counts) | {"tracks_found": len(tracks) - len(clip.tracks)},
+        "counts": dict(merged.counts)
+        | {"dynamic_merged": len(merged.dynamic), "dynamic": len(dynamic)}
+        | {"tracks_found": len(tracks) - len(clip.tracks)},
         "unknown": _unknown(clip, settings, len(tracks) - len(clip.tracks)),
     }
     return GaussianScene(

@@ -26,8 +26,8 @@ class FeedForwardSettings:
             that keep the cameras' aspect can have others.
         max_chunks: refuse longer clips instead of running for hours.
         min_opacity: Gaussians below are dropped (paper section 3.4).
-        merge: ``ownership`` keeps each static Gaussian only where its chunk saw it from nearest; ``concatenate`` keeps
-            all of them.
+        merge: ``ownership`` keeps each static Gaussian only where its chunk saw it from nearest, and each vehicle with
+            a box once; ``concatenate`` keeps all Gaussians of all images.
         ownership_tolerance_m: how much farther than the nearest chunk an owner may be.
         max_gaussians: static Gaussians are merged into voxels until at most so many are left; None keeps all.
         lidar_depth: how predicted depth is fitted to the log's sweeps, per frame: not at all (``off``), by a factor
