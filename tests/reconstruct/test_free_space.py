@@ -16,6 +16,9 @@ from nurec_sim.reconstruct.free_space import (
     recorded_beams,
     sweep_beams,
 )
+from nurec_sim.reconstruct.lift.bake import on_ground
+from nurec_sim.reconstruct.lift.ground import Ground
+from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.types import Gaussians, Sweep, Trajectory
 
@@ -151,3 +154,18 @@ def test_lift_keeps_nothing_where_beams_passed():
     (kept, free), (carved, left) = ghosts(carve=False), ghosts(carve=True)
     assert kept > 100 and free > 100
     assert carved < 0.5 * kept and left == 0
+
+
+def test_pixels_low_over_the_road_are_moved_down_to_it_along_their_rays():
+    """From 1.5 m above the road at 45 degrees: 0.2 m over it is 0.2 m before it, and pixels grow with the depth."""
+    flat, up = np.zeros((100, 100)), np.ones((100, 100), bool)
+    ground = Ground(np.array([-1.0, -5.0]), 0.1, flat.astype(np.float32), up, up, up, np.ones((100, 100), np.uint8))
+    steep, level = np.array([1.0, 0, -1]) / np.sqrt(2), np.array([1.0, 0, -0.01])
+    xyz = np.array([[1.3, 0, 0.2], [1.3, 0, 0.6], [1.3, 0, 0.2]])
+    depth, pixel, rgb = np.full(3, 1.3 * np.sqrt(2)), np.full(3, 0.01), np.zeros((3, 3), np.float32)
+    rays, four = np.stack([steep, steep, level]), np.full(3, 4, np.int32)
+    lifted = Lifted(xyz, np.zeros((3, 3)), rays, depth, pixel, rgb, four, four)
+    moved = on_ground(lifted, ground)
+    assert moved.xyz_m == pytest.approx(np.array([[1.5, 0, 0]]), abs=1e-6)
+    assert moved.depth_m == pytest.approx([1.5 * np.sqrt(2)]) and moved.pixel_m == pytest.approx([0.01 * 1.5 / 1.3])
+    assert moved.normal.tolist() == [[0, 0, 1]] and moved.surfel.tolist() == [-1]

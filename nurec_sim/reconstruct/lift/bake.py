@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -20,6 +21,8 @@ from nurec_sim.types import Gaussians, Label
 
 GROUND_M = 0.12
 """Points so near to the ground belong to it."""
+LOW_M, GRAZING = 0.5, 0.03
+"""Pixels wrongly this low over the ground show the ground, unless their rays are flatter than this slope."""
 KEPT_SHARE = 0.4
 """Share of the pixels of all views that owns a surface, about; to meet the budget before ownership is known."""
 
@@ -148,16 +151,39 @@ def body_gaussians(
     shown = colour.fill_unseen(cloud.xyz_m, seen_rgb / 255, np.isfinite(pixel), cloud.intensity)
     # A view replaces surfels by its pixels unless it sees them so obliquely that surfels are the finer of the two.
     keep = (pixel > 3 * body.spacing_m) & (np.isfinite(pixel) | (through == 0))
-    parts = [
-        surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.spacing_m[keep], shown[keep], cloud.intensity[keep],
-                       body.label[keep], settings.opacity)
-    ]  # fmt: skip
+    discs = surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.spacing_m[keep], shown[keep],
+                           cloud.intensity[keep], body.label[keep], settings.opacity)  # fmt: skip
+    parts = [discs[~body.in_free_space(discs, beams)]]
     lifted = _owned(pixels, body, views, pictures, rgb, settings)
     if len(lifted):
-        parts.append(_lifted_gaussians(lifted, body, ground, settings))
-    gaussians = Gaussians.concatenate(parts)
-    free = body.in_free_space(gaussians, beams)
-    return gaussians[~free], len(lifted) - int(free[len(parts[0]) :].sum())
+        footprints = _lifted_gaussians(lifted, body, ground, settings)
+        free = body.in_free_space(footprints, beams)
+        parts.append(footprints[~free])
+        if body.actor is None:
+            # What hovers low over the road shows the road: dropped, it would leave a hole.
+            footprints = _lifted_gaussians(on_ground(lifted[free], ground), body, ground, settings)
+            parts.append(footprints[~body.in_free_space(footprints, beams)])
+    return Gaussians.concatenate(parts), sum(map(len, parts[1:]))
+
+
+def on_ground(lifted: Lifted, ground: Ground) -> Lifted:
+    """Lifted points low over the ground, moved along their rays down to it; all others are left out."""
+    moved = lifted[(ground.above(lifted.xyz_m) < LOW_M) & (lifted.ray[:, 2] < -GRAZING)]
+    step = np.zeros(len(moved))
+    for _ in range(3):  # the ground is not level
+        above = ground.above(moved.xyz_m + step[:, None] * moved.ray)
+        step += np.where(np.isfinite(above), above, 0.0) / -moved.ray[:, 2]
+    xyz = moved.xyz_m + step[:, None] * moved.ray
+    row, column, _ = ground.cells(xyz)
+    depth = moved.depth_m + step
+    return dataclasses.replace(
+        moved,
+        xyz_m=xyz,
+        normal=ground.normals()[row, column],
+        depth_m=depth,
+        pixel_m=moved.pixel_m * depth / moved.depth_m,
+        surfel=np.full(len(moved), -1, np.int32),
+    )[(np.abs(ground.above(xyz)) < GROUND_M) & (depth > 0)]
 
 
 def _owned(
