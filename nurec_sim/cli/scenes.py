@@ -59,7 +59,8 @@ def reconstruct(
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
         refine: time budget in seconds for optimising the scene on the log's images and sweeps.
-        resume: go on with an optimisation that was interrupted, from its state in OUT.refine.npz.
+        resume: go on with an optimisation that was interrupted, from its state in OUT.refine.npz; its archive is
+            replaced.
         overwrite: replace an existing archive.
         network: network settings.
     """
@@ -91,11 +92,13 @@ def reconstruct(
         told = {"map_xodr": "drivable area from the road-class Gaussians, lane along the recorded path; not surveyed"}
         world_scene = dataclasses.replace(world_scene, provenance={**world_scene.provenance, **told})
     with progress(f"writing {target.name}"):
-        scene.write_scene(world_scene, target, overwrite=overwrite, derived_map=derived)
+        scene.write_scene(world_scene, target, overwrite=overwrite or resume, derived_map=derived)
     print_table(f"scene {world_scene.id}", scene.summary(world_scene))
     for text in world_scene.provenance.get("unknown", ()):
         out.print(f"not known: {text}", markup=False)
     out.print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+    if (kept := _checkpoint_of(target)).exists():
+        out.print(f"the optimisation was interrupted: the same command with --resume goes on ({kept})", soft_wrap=True)
 
 
 @app.command
@@ -194,13 +197,18 @@ def refinement(seconds: float | None) -> OptimizeSettings | None:
         raise NurecSimError(f"--refine: {error}") from None
 
 
+def _checkpoint_of(target: Path) -> Path:
+    """Where the state of an optimisation lies while it runs."""
+    return target.with_name(f"{target.name}.refine.npz")
+
+
 def _with_checkpoint(
     method: str, settings: Any, fit: OptimizeSettings | None, target: Path, resume: bool
 ) -> tuple[Any, OptimizeSettings | None]:
     """Settings of the method and of the optimisation, which keeps its state beside the archive."""
     from nurec_sim.reconstruct import load_method
 
-    kept: dict[str, Any] = {"checkpoint": target.with_name(f"{target.name}.refine.npz"), "resume": resume}
+    kept: dict[str, Any] = {"checkpoint": _checkpoint_of(target), "resume": resume}
     if fit is not None:
         return settings, dataclasses.replace(fit, **kept)
     if load_method(method).settings is OptimizeSettings:

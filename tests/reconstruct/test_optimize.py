@@ -2,18 +2,20 @@
 
 import dataclasses
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
 from reconstruct_street import Street, camera
 from skimage.metrics import structural_similarity
 
-from nurec_sim import geometry
+from nurec_sim import cli, geometry
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.scores.images import psnr
 from nurec_sim.reconstruct import LiftSettings, OptimizeSettings, ViewSettings, reconstruct
 from nurec_sim.reconstruct.optimize import method
-from nurec_sim.reconstruct.optimize.adam import MEAN, QUAT
+from nurec_sim.reconstruct.optimize.adam import MEAN, OPACITY, QUAT, SCALE
+from nurec_sim.reconstruct.optimize.checkpoint import write_checkpoint
 from nurec_sim.reconstruct.optimize.compositing import Composite
 from nurec_sim.reconstruct.optimize.depth_loss import depth_loss
 from nurec_sim.reconstruct.optimize.image_loss import colour_loss
@@ -334,6 +336,19 @@ def test_gradients_in_the_world_go_back_to_the_box(lifted):
     assert parameters.first[row, QUAT : QUAT + 4] == pytest.approx([0.07071, 0, 0, 0.07071], abs=1e-5)
 
 
+def test_opacity_and_scale_are_pulled_down_where_there_is_a_gradient(lifted):
+    parameters = Parameters(lifted)
+    drawn = parameters.at(lifted.span_us[0])
+    parameters.gradients.mean[0] = (1e-9, 0, 0)
+    rows = np.array([0, 1], np.int32)
+    opacity, scale = drawn.world.opacity[0].copy(), drawn.world.scale[0].copy()
+    parameters.step(drawn, rows, rate_columns(0, 0, 0, 0, 0), 1.0, opacity=0.2, scale=0.4)
+    # d sigmoid(x) / dx = s (1 - s), d exp(x) / dx = exp(x); means over two Gaussians; a tenth in the first moment.
+    assert parameters.first[0, OPACITY] == pytest.approx(0.1 * 0.2 / 2 * opacity * (1 - opacity), rel=1e-4)
+    assert parameters.first[0, SCALE : SCALE + 3] == pytest.approx(0.1 * 0.4 / 2 * scale, rel=1e-4)
+    assert not parameters.first[1].any()
+
+
 def test_responses_are_borrowed_at_the_same_instant_from_a_camera_of_the_same_kind():
     front, beside, other = camera(), camera("beside", 0.5), camera("other", width=96)
     back = dataclasses.replace(front, id="back", rig_from_camera=front.rig_from_camera @ np.diag([-1.0, 1, -1, 1]))
@@ -381,3 +396,24 @@ def test_gradients_of_the_shown_image_are_those_of_differences():
     step = np.zeros_like(sky)
     step[texel] = 0.01
     assert by_sky[texel] == pytest.approx((loss(sky + step) - loss(sky - step)) / 0.02, rel=1e-3)
+
+
+def test_reconstruct_keeps_the_state_beside_its_output_and_resumes_only_an_optimisation(
+    street, lifted, tmp_path, monkeypatch, capsys
+):
+    def interrupted(log, method, *, refine, **others):
+        write_checkpoint(refine.checkpoint, "key", {})
+        asked.append(refine)
+        return lifted
+
+    asked = []
+    monkeypatch.setattr("nurec_sim.reconstruct.reconstruct", interrupted)
+    monkeypatch.setattr("nurec_sim.logs.open_clip", lambda path: street)
+    monkeypatch.chdir(tmp_path)
+    cli.main(["reconstruct", "street", "--refine", "60", "--out", "a.usdz"])
+    assert "--resume goes on" in capsys.readouterr().out and (tmp_path / "a.usdz.refine.npz").exists()
+    cli.main(["reconstruct", "street", "--refine", "60", "--out", "a.usdz", "--resume"])
+    assert [each.resume for each in asked] == [False, True] and asked[0].checkpoint == Path("a.usdz.refine.npz")
+    with pytest.raises(SystemExit):
+        cli.main(["reconstruct", "street", "--resume"])
+    assert "--resume goes on with an optimisation; give --refine" in capsys.readouterr().err

@@ -20,7 +20,9 @@ SMALLEST_M = 1e-3
 
 
 @kernel
-def adam_step(rows, values, first, second, visits, corrections, turns, row_turn, by, scale, opacity, rates, largest_m):
+def adam_step(
+    rows, values, first, second, visits, corrections, turns, row_turn, by, scale, opacity, rates, pulls, largest_m
+):
     """One step on some Gaussians; those without any gradient, which others hide, are left as they are.
 
     Args:
@@ -37,6 +39,7 @@ def adam_step(rows, values, first, second, visits, corrections, turns, row_turn,
         scale: [n,3] standard deviations as rendered.
         opacity: [n] opacities as rendered.
         rates: [14] float32 learning rates.
+        pulls: [2] float32 weights of a Gaussian's opacity, and of the sum of its standard deviations, in the loss.
         largest_m: standard deviations end here.
     """
     gradient = np.zeros(VALUES, np.float32)
@@ -59,6 +62,9 @@ def adam_step(rows, values, first, second, visits, corrections, turns, row_turn,
             size += abs(gradient[k])
         if not (size > 0 and size < np.inf):
             continue
+        gradient[OPACITY] += pulls[0] * opacity[i] * (np.float32(1) - opacity[i])
+        for k in range(3):
+            gradient[SCALE + k] += pulls[1] * scale[i, k]
         turn = row_turn[i]
         if turn >= 0:
             # mean_world = R mean + t and quat_world = r quat, so gradients go back by R^T and by conj(r).

@@ -245,7 +245,7 @@ class Optimization:
         if self.settings.correct_poses:
             self.poses.step(number, frame.view.world_from_reference, by_pose + by_pose_too, rate)
         columns = rate * rate_columns(rates.mean_m, rates.quat, rates.log_scale, rates.logit_opacity, rates.rgb)
-        self.parameters.step(drawn, frame.drawn_rows, columns, self.settings.largest_m)
+        self.parameters.step(drawn, frame.drawn_rows, columns, self.settings.largest_m, weights.opacity, weights.scale)
         self._sky_adam.step(self.sky, by_sky, rate * rates.sky)
         self.responses.step(view.camera.id, view.frame, by_response, rate * rates.response, weights.response)
         self.steps += 1

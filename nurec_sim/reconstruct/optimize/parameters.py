@@ -99,7 +99,13 @@ class Parameters:
         return Drawn(self._world, self._packed, turns)
 
     def step(
-        self, drawn: Drawn, rows: Int32[np.ndarray, " k"], rates: Float64[np.ndarray, " 14"], largest_m: float
+        self,
+        drawn: Drawn,
+        rows: Int32[np.ndarray, " k"],
+        rates: Float64[np.ndarray, " 14"],
+        largest_m: float,
+        opacity: float = 0.0,
+        scale: float = 0.0,
     ) -> None:
         """One step of Adam on the Gaussians ``rows`` that a frame has rendered, by ``gradients``, which end as 0.
 
@@ -108,11 +114,14 @@ class Parameters:
             rows: which of them it shows.
             rates: learning rate of each value.
             largest_m: standard deviations end here.
+            opacity: weight of their mean opacity in the loss.
+            scale: weight of their mean sum of standard deviations (m) in the loss.
         """
+        pulls = np.array([opacity, scale], np.float32) / max(len(rows), 1)
         self._parts(
             adam_step, rows,
             (self.values, self.first, self.second, self.visits, self._corrections, drawn.turns, self._row_turn,
-             self.gradients, drawn.world.scale, drawn.world.opacity, rates.astype(np.float32), largest_m),
+             self.gradients, drawn.world.scale, drawn.world.opacity, rates.astype(np.float32), pulls, largest_m),
         )  # fmt: skip
         self._place(rows[rows < self.static_count])
 

@@ -32,6 +32,10 @@ class LossWeights:
     """1 - alpha at LiDAR returns."""
     sky: float = 0.02
     """Alpha where the start of the optimisation shows the sky."""
+    opacity: float = 0.0
+    """Mean opacity of the Gaussians in view (Kheradmand et al. 2024, with 0.01)."""
+    scale: float = 0.0
+    """Mean over the Gaussians in view of the sum of their standard deviations in metres (as above)."""
     response: float = 1e-3
     """Squares of a frame's log gains and offsets: how far a frame may differ from its camera."""
 
