@@ -66,10 +66,16 @@ def test_a_frame_taken_brighter_has_a_gain_of_its_own(solved):
     assert solved.exposures["beside"] == pytest.approx(solved.exposures["front"]), "a camera of the same kind"
 
 
-def test_the_method_solves_and_nothing_depends_on_the_number_of_threads(street, solved, monkeypatch):
+def test_results_do_not_depend_on_the_number_of_threads(street, lifted, solved, monkeypatch):
     monkeypatch.setattr(colour_solve, "usable_cores", lambda: 3)
+    assert scene_hash(solved_from(lifted, street)) == scene_hash(solved)
+
+
+def test_the_method_solves(street, solved):
     scene = reconstruct(street, settings=SOLVED, cameras=["front"])
-    assert scene_hash(dataclasses.replace(scene, provenance=solved.provenance)) == scene_hash(solved)
+    # What ``solved`` started from had been rounded to half floats, as archives keep them.
+    assert np.abs(scene.static.rgb - solved.static.rgb).max() < 0.01
+    assert scene.exposures["front"] == pytest.approx(solved.exposures["front"], abs=0.01)
 
 
 def test_what_no_image_shows_keeps_its_colour(street, lifted):

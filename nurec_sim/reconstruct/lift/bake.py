@@ -9,13 +9,14 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from nurec_sim import geometry
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.reconstruct.free_space import SweepBeams
 from nurec_sim.reconstruct.lift import colour, lifting, surfaces
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
-from nurec_sim.reconstruct.lift.settings import THREADS, LiftSettings
+from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.views import WorkingView
 from nurec_sim.types import Gaussians, Label
 
@@ -59,8 +60,8 @@ def _look_up(xyz, normal, views, pictures, rgb, body: Surfels | None) -> tuple[n
         return np.zeros((len(xyz), 3), np.float32), np.full(len(xyz), np.inf, np.float32), np.zeros(len(xyz), np.int32)
     packed, present = _packed(views, body)
     depths, stack = lifting.stacked([p.inverse_depth for p in pictures]), lifting.stacked(rgb)
-    parts = np.array_split(np.arange(len(xyz)), THREADS)
-    with ThreadPoolExecutor(THREADS) as pool:
+    parts = np.array_split(np.arange(len(xyz)), usable_cores())
+    with ThreadPoolExecutor(usable_cores()) as pool:
         results = list(
             pool.map(
                 lambda part: colour.seen_colours(xyz[part], normal[part], packed, depths, stack, present, 0.002), parts
@@ -200,9 +201,9 @@ def _owned(
     packed, present = _packed(views, body)
     step = 1 / settings.views.min_depth_m / (settings.views.levels - 1)
     depth_stack, rgb_stack = lifting.stacked([picture.inverse_depth for picture in pictures]), lifting.stacked(rgb)
-    middle = len(everything) // 2
-    chunks = [slice(0, middle), slice(middle, None)]
-    with ThreadPoolExecutor(THREADS) as pool:
+    cuts = np.linspace(0, len(everything), usable_cores() + 1).astype(np.int64)
+    chunks = [slice(first, last) for first, last in zip(cuts[:-1], cuts[1:], strict=True)]
+    with ThreadPoolExecutor(usable_cores()) as pool:
         jobs = [
             pool.submit(
                 lifting.owned,

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import WorkingView
@@ -107,7 +108,7 @@ def fill_unseen(
     result[unseen] = grey[unseen, None]
     if seen.any():
         source = np.flatnonzero(seen)
-        distance, index = cKDTree(xyz_m[source]).query(xyz_m[unseen], k=min(4, len(source)), workers=2)
+        distance, index = cKDTree(xyz_m[source]).query(xyz_m[unseen], k=min(4, len(source)), workers=usable_cores())
         distance, index = distance.reshape(len(unseen), -1), index.reshape(len(unseen), -1)
         near = distance[:, 0] < reach_m
         weight = 1 / (distance[near] + 0.05)

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from nurec_sim import geometry
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.reconstruct.lift import depth, lifting
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
-from nurec_sim.reconstruct.lift.settings import THREADS, LiftSettings
+from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.splat import draw_surfels, trim_silhouettes
 from nurec_sim.reconstruct.lift.views import WorkingView
 
@@ -50,7 +51,7 @@ def depth_pictures(
         float(np.percentile(np.concatenate([v.rgb[::8, ::8].mean(axis=-1).ravel() for v in views]), 98)) if views else 0
     )
     grays = [v.rgb.mean(axis=-1).astype(np.uint8) for v in views]
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         codes = list(pool.map(depth.census, grays))
 
         def one(k: int) -> DepthPicture:

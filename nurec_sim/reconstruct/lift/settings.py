@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-THREADS = 2
-"""Of the compiled kernels; results do not depend on it."""
-
 
 @dataclass(frozen=True)
 class PointSettings:
