@@ -103,9 +103,9 @@ def find_reader(path: Path) -> LogReader:
     if not path.exists():
         raise _nothing_at(path)
     raise ClipError(
-        f"{path.name}: no log reader knows this format; it is {_looks(path)}. Known are "
-        + "; ".join([*known, *broken])
-        + ". docs/write_a_log_reader.md says how to read others"
+        f"{path.name}: no log reader knows this format; it is {_looks(path)}. Known are\n"
+        + "".join(f"  {line}\n" for line in [*known, *broken])
+        + "docs/log_formats.md describes them, docs/write_a_log_reader.md says how to read others"
     )
 
 

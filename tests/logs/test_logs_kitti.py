@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import published_logs as published
 import pytest
+from scipy.spatial.transform import Rotation
 
 from nurec_sim import geometry, logs
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.checks.calibration import check_calibration
 from nurec_sim.logs.checks.sampling import sample_sweeps
+from nurec_sim.logs.readers import kitti_raw
 from nurec_sim.logs.readers.kitti_odometry import KittiOdometryReader
 from nurec_sim.logs.readers.kitti_raw import KittiRawReader
 
@@ -75,6 +77,12 @@ def test_poses_are_those_of_the_gps_in_metres_around_the_first(root, demo):
     given = clip.ego.at(t_us + published.EPOCH_US)
     assert np.allclose(given[0, :2, 3], [-0.05 * -1, -0.32], atol=1e-3)  # the GPS/IMU unit itself starts at the origin
     assert np.allclose(geometry.inverse(given[0]) @ given, geometry.inverse(wanted[0]) @ wanted, atol=2e-3)
+
+
+def test_rotations_are_yaw_after_pitch_after_roll():
+    roll, pitch, yaw = np.array([0.1, -0.3]), np.array([0.2, 0.05]), np.array([0.7, -2.0])
+    wanted = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1)).as_matrix()
+    assert np.allclose(kitti_raw._rotations(roll, pitch, yaw), wanted)
 
 
 def test_tracklets_become_tracks(root, demo):
