@@ -240,7 +240,8 @@ def test_paths_that_are_no_clips_are_named(tmp_path):
     with pytest.raises(ClipError, match="no clip at .*nowhere': give a log, such as a clip folder or a .zip of one"):
         logs.open_clip(tmp_path / "nowhere")
     with pytest.raises(
-        ClipError, match="no log reader knows this format; it is an empty folder. Known are\n(  .*\n)*  nurec-sim-clip: "
+        ClipError,
+        match="no log reader knows this format; it is an empty folder. Known are\n(  .*\n)*  nurec-sim-clip: ",
     ):
         logs.open_clip(tmp_path)
     (tmp_path / "file").write_text("hello")
