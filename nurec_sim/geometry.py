@@ -248,7 +248,9 @@ def points_in_box(
     points_box_m: Float64[np.ndarray, "n 3"], size_m: tuple[float, float, float], margin_m: float = 0.0
 ) -> Bool[np.ndarray, " n"]:
     """Which points, given in the box frame, lie in a box grown by ``margin_m`` on every side."""
-    return np.all(np.abs(points_box_m) <= np.asarray(size_m) / 2 + margin_m, axis=-1)
+    # Axis by axis: a reduction over rows of three takes several times as long.
+    x, y, z = (np.abs(points_box_m[..., k]) <= size_m[k] / 2 + margin_m for k in range(3))
+    return x & y & z
 
 
 def arc_length(points: Float64[np.ndarray, "k d"]) -> Float64[np.ndarray, " k"]:

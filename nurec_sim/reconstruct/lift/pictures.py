@@ -110,7 +110,7 @@ def _bodies_of_pixels(view: WorkingView, bodies: Sequence[Surfels], dense: np.nd
             world_from_box, size = surfels.world_from_body(view.t_us), surfels.box_size_m
             # Only pixels near the box are taken into its frame: most are far from most boxes.
             reach = float(np.linalg.norm(np.array(size) / 2 + OUTLINE_M))
-            near = np.flatnonzero((np.abs(xyz - world_from_box[:3, 3]) < reach).all(axis=1))
+            near = np.flatnonzero(geometry.points_in_box(xyz - world_from_box[:3, 3], (0.0, 0.0, 0.0), reach))
             box = geometry.transform_points(geometry.inverse(world_from_box), xyz[near])
             # The lowest 15 cm of a box are road more often than tyre.
             upper = box[:, 2] > -size[2] / 2 + 0.15

@@ -258,7 +258,7 @@ def _inside(
     # A cheap world-aligned test first: poses at the points' own times are only evaluated near the path.
     radius = np.linalg.norm(size) / 2 + margin_m
     low, high = actor.path.position_m.min(axis=0) - radius, actor.path.position_m.max(axis=0) + radius
-    near = np.flatnonzero(free & np.all((xyz > low) & (xyz < high), axis=1) & actor.present(t_us))
+    near = np.flatnonzero(free & geometry.points_in_box(xyz - (low + high) / 2, high - low) & actor.present(t_us))
     if not len(near):
         return near, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)
     box_from_world = geometry.inverse(actor.path.at(t_us[near]))
