@@ -97,7 +97,7 @@ def test_the_map_has_areas_and_the_middle_of_lanes_for_cars(clip, demo):
 
 def test_inverted_extrinsics_are_found(demo, tmp_path):
     clip = logs.open_clip(published.argoverse2(tmp_path, demo, invert=True))
-    rows = check_calibration(clip, sample_sweeps(clip))
+    rows = check_calibration(clip, sample_sweeps(clip)[1:3])
     assert [len(row.faults) for row in rows] == [1, 1]
 
 

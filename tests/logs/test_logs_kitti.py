@@ -103,7 +103,7 @@ def test_tracklets_become_tracks(root, demo):
 
 def test_inverted_extrinsics_are_found(demo, tmp_path):
     clip = logs.open_clip(published.kitti_raw(tmp_path, demo, invert=True))
-    (row,) = check_calibration(clip, sample_sweeps(clip))
+    (row,) = check_calibration(clip, sample_sweeps(clip)[1:3])
     assert len(row.faults) == 1 and "camera 'image_02'" in row.faults[0]
 
 

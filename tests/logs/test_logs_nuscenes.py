@@ -94,7 +94,7 @@ def test_a_server_takes_a_scene_by_its_path(root):
 
 def test_inverted_extrinsics_are_found(demo, tmp_path):
     clip = logs.open_clip(published.nuscenes(tmp_path, demo, invert=True) / "scene-0007")
-    assert [len(row.faults) for row in check_calibration(clip, sample_sweeps(clip))] == [1, 1]
+    assert [len(row.faults) for row in check_calibration(clip, sample_sweeps(clip)[1:3])] == [1, 1]
 
 
 def edit(table: list[dict], row: int, **values) -> list[dict]:
