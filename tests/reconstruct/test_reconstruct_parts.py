@@ -8,7 +8,7 @@ from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.lift import colour, depth, lifting, splat
 from nurec_sim.reconstruct.lift.ground import find_ground
 from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather
-from nurec_sim.reconstruct.lift.settings import GroundSettings, PointSettings, ViewSettings
+from nurec_sim.reconstruct.lift.settings import GroundSettings, LiftSettings, PointSettings, ViewSettings
 from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
 from nurec_sim.reconstruct.lift.surfaces import footprints, surface_of
 from nurec_sim.reconstruct.lift.views import choose_frames, read_views, tiles_of
@@ -222,3 +222,21 @@ def test_isp_of_cameras_that_share_points():
 def test_sky_without_any_view_is_grey():
     sky = make_sky([], [], [], 8)
     assert sky.shape == (6, 8, 8, 3) and (sky == sky[0, 0, 0]).all()
+
+
+@pytest.mark.parametrize(
+    ("path_m", "duration_s", "lengths"),
+    [
+        (20.0, 5.0, 1.0),  # a short log has all limits as they are
+        (125.0, 5.0, 2.5),  # the longer of path and duration counts
+        (0.0, 30.0, 3.0),
+        (5000.0, 600.0, 8.0),  # no more than this
+    ],
+)
+def test_limits_follow_the_length_of_the_log(path_m, duration_s, lengths):
+    given = LiftSettings(views=ViewSettings(max_views=40, max_frames=240, budget=900_000, width_px=640))
+    longer = given.for_log(path_m, duration_s)
+    views = longer.views
+    assert (views.max_views, views.max_frames, views.budget) == (40 * lengths, 240 * lengths, 900_000 * lengths)
+    assert longer.colours.images == 60 * lengths
+    assert views.width_px == 640 and longer.points == given.points

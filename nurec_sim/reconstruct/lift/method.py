@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from nurec_sim.errors import ReconstructError
+from nurec_sim.geometry import arc_length
 from nurec_sim.reconstruct.lift import actors as actor_layer
 from nurec_sim.reconstruct.lift import colour, points
 from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels, camera_isp
@@ -45,6 +46,8 @@ def lift(
     Raises:
         ReconstructError: the clip has no LiDAR sweep to build from.
     """
+    path_m, span_us = float(arc_length(clip.ego.world_from_body[:, :3, 3])[-1]), clip.span_us[1] - clip.span_us[0]
+    given, settings = settings, settings.for_log(path_m, span_us / 1e6)
     stages = _Stages(progress)
     stages.start("sweeps")
     actors = points.actors_of(clip, settings.points)
@@ -91,7 +94,7 @@ def lift(
     }
     provenance = {
         "method": "lift",
-        "settings": dataclasses.asdict(settings),
+        "settings": dataclasses.asdict(given),
         "cameras": list(cameras),
         "held_out_sweeps": sorted(hold_out),
         "counts": counts,

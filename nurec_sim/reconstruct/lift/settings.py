@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,11 @@ class ColourSettings:
 
 @dataclass(frozen=True)
 class LiftSettings:
-    """All settings of ``reconstruct(clip, "lift")``."""
+    """All settings of ``reconstruct(clip, "lift")``.
+
+    The limits ``max_views``, ``max_frames`` and ``budget`` of ``views``, and ``images`` of ``colours``, are for logs of
+    up to ``path_m`` and ``duration_s``; longer ones get more (``for_log``).
+    """
 
     points: PointSettings = field(default_factory=PointSettings)
     ground: GroundSettings = field(default_factory=GroundSettings)
@@ -87,3 +91,19 @@ class LiftSettings:
     sky_px: int = 512
     """Edge of a cubemap face."""
     opacity: float = 0.95
+    path_m: float = 50.0
+    duration_s: float = 10.0
+    most_lengths: float = 8.0
+    """Limits grow no further than this, which bounds time and memory."""
+
+    def for_log(self, path_m: float, duration_s: float) -> LiftSettings:
+        """The settings for a log of this length: limits in proportion to it, so that detail does not depend on it.
+
+        Args:
+            path_m: length of the driven path, metres.
+            duration_s: of the recording; where the car stands others move.
+        """
+        lengths = min(max(path_m / self.path_m, duration_s / self.duration_s, 1.0), self.most_lengths)
+        views = {name: round(lengths * getattr(self.views, name)) for name in ("max_views", "max_frames", "budget")}
+        colours = replace(self.colours, images=round(lengths * self.colours.images))
+        return replace(self, views=replace(self.views, **views), colours=colours)
