@@ -78,9 +78,9 @@ def owned(views, own_view=0, own_rgb=100.0, depth_m=10.0):
     inverse_depth = np.stack([np.full((9, 9), w, np.float32) for _, w, _ in views])
     pictures = np.stack([np.full((9, 9, 3), grey, np.uint8) for _, _, grey in views])
     rgb = np.full((1, 3), own_rgb, np.float32)
-    keep = lifting.owned(np.array([[0.0, 0.0, 10.0]]), np.array([depth_m]), np.array([own_view], np.int32), rgb, packed,
-                         inverse_depth, pictures, np.ones(len(views), bool), 0.002, lifting.OWNER_RING,
-                         lifting.OWNER_BORDER)  # fmt: skip
+    one = np.array([[0.0, 0.0, 10.0]]), np.array([depth_m]), np.array([own_view], np.int32), np.zeros(1, bool)
+    keep = lifting.owned(*one, rgb, packed, inverse_depth, pictures, np.ones(len(views), bool), 0.002,
+                         lifting.OWNER_RING, lifting.OWNER_BORDER)  # fmt: skip
     return bool(keep[0]), rgb[0, 0]
 
 

@@ -201,6 +201,8 @@ def _owned(
     packed, present = _packed(views, body)
     step = 1 / settings.views.min_depth_m / (settings.views.levels - 1)
     depth_stack, rgb_stack = lifting.stacked([picture.inverse_depth for picture in pictures]), lifting.stacked(rgb)
+    # Boxes are not exact enough to tell from afar whether a view looks through an actor.
+    matched = (everything.surfel < 0) & (body.actor is None)
     cuts = np.linspace(0, len(everything), usable_cores() + 1).astype(np.int64)
     chunks = [slice(first, last) for first, last in zip(cuts[:-1], cuts[1:], strict=True)]
     with ThreadPoolExecutor(usable_cores()) as pool:
@@ -210,6 +212,7 @@ def _owned(
                 everything.xyz_m[part],
                 everything.depth_m[part],
                 everything.view[part],
+                matched[part],
                 everything.rgb[part],
                 packed,
                 depth_stack,

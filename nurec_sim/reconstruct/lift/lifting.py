@@ -17,6 +17,8 @@ OWNER_RING = 0.1
 """Views own by rings of distance, each larger by exp of this."""
 MIXING = 0.3
 """Weight of another view's colour for a surface, next to 1 for the owner's."""
+FARTHER = 1.5
+"""Views this many times as far away as the own view resolve a surface too badly to be asked about it as others are."""
 OWNER_BORDER = 0.04
 """Views own nothing in this part of their width at the border, where nothing checks their depth."""
 
@@ -106,18 +108,21 @@ def normals_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> 
 
 
 @kernel
-def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, tolerance, ring, border):
+def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, pictures, present, tolerance, ring, border):
     """Which points no other view owns, and that few views look through.
 
     The owner of a surface is the view in the nearest ring of distance, rings growing by the factor ``exp(ring)``, and
     the first of these; a strict order, so that exactly one view owns it. A view agrees with a point that projects well
     inside it if its inverse depth there is the same within ``tolerance`` plus 10 %; it looks through the point if it is
-    clearly smaller. Points are dropped if more than half as many views look through them as agree.
+    clearly smaller. Points are dropped if more than half as many views look through them as agree. Matched points that
+    no other view agrees with are dropped if any view looks through them, from however far: wrong depth at the edges of
+    trees puts points in front of the sky, which often only views from farther back see past.
 
     Args:
         xyz: [n,3] points in the body's frame, metres.
         depth: [n] depth in their own view, metres.
         own_view: [n] index of that view.
+        matched: [n] whether the depth is matched; only then views from ``FARTHER`` are asked.
         rgb: [n,3] colours 0..255; changed: those of kept points are mixed with the colours that agreeing views show,
             weighted by nearness, which evens out exposure drift and reflections.
         packed: [k,23] projections from the points' frame into the views.
@@ -134,6 +139,7 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
     keep = np.ones(len(xyz), np.bool_)
     for i in range(len(xyz)):
         agree, through, total = 0, 0, 1.0
+        far_agree, far_through = 0, 0
         # Rings instead of plain distance: neighbouring pixels then share one owner, and the surface does not become a
         # patchwork of views with slightly different depth.
         own_ring = np.floor(np.log(depth[i]) / ring)
@@ -143,10 +149,17 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
                 continue
             view = packed[k]
             u, v, z = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
-            if z <= 0.3 or z > 1.5 * depth[i] or u < 0 or v < 0 or u >= view[3] or v >= view[4]:
+            if z <= 0.3 or u < 0 or v < 0 or u >= view[3] or v >= view[4]:
+                continue
+            farther = z > FARTHER * depth[i]
+            if farther and not matched[i]:
                 continue
             here, w = 1.0 / z, inverse_depth[k, int(v), int(u)]
-            if abs(w - here) < tolerance + 0.1 * here:
+            agrees = abs(w - here) < tolerance + 0.1 * here
+            if farther:
+                far_agree += agrees
+                far_through += not agrees and w < here
+            elif agrees:
                 agree += 1
                 margin = border * view[3]
                 inside = margin < u < view[3] - margin and 0.5 * margin < v < view[4] - 0.5 * margin
@@ -160,7 +173,7 @@ def owned(xyz, depth, own_view, rgb, packed, inverse_depth, pictures, present, t
                     mixed[c] += share * pictures[k, int(v), int(u), c]
             elif w < here:
                 through += 1
-        if 2 * through > agree:
+        if 2 * through > agree or (far_through > 0 and agree + far_agree == 0):
             keep[i] = False
         rgb[i] = mixed / total
     return keep
