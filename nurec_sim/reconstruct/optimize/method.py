@@ -39,6 +39,8 @@ SEEN_SKY = 0.05
 """Pixels with less alpha than this at the start show the sky."""
 CHECK_SHARE = 0.05
 """The images held out are looked at once in this share of the budget."""
+WARM_UP_STEPS = 20
+"""Learning rates rise to their full size over so many steps."""
 
 
 def refine(
@@ -120,7 +122,7 @@ class Optimization:
         for view in views:
             frames[view.camera.id] += 1
         self.poses = PoseCorrections(views, settings.poses)
-        self.responses = FrameResponses(scene.isp, frames)
+        self.responses = FrameResponses(scene, frames)
         every = settings.check_every
         self.checked = [
             number for number, view in enumerate(views)
@@ -145,7 +147,9 @@ class Optimization:
                     saved = time.perf_counter()
                 if interrupted:
                     break
-                loss = self.step(next(order), self.settings.final_rate**spent)
+                # Adam's first steps are of full size however small the gradient: they would undo what was solved for.
+                warmth = min(1.0, (self.steps + 1) / WARM_UP_STEPS)
+                loss = self.step(next(order), warmth * self.settings.final_rate**spent)
                 smooth = loss if smooth != smooth else 0.95 * smooth + 0.05 * loss
                 progress(f"fitting, {self._text(smooth)}", spent)
         if file is not None and not interrupted:

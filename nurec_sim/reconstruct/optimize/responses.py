@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from nurec_sim.reconstruct.optimize.adam import RowAdam
-from nurec_sim.types import Rig
+from nurec_sim.types import GaussianScene, Rig
 
 GAINS = (0.5, 2.0)
 """A frame's gains begin within these."""
@@ -17,12 +17,16 @@ GAINS = (0.5, 2.0)
 class FrameResponses:
     """Logarithms of gains and offsets per channel of every frame, [2,3], and their moments.
 
-    Shown colour = ``exp(gain) * (isp[:, :3] @ colour + isp[:, 3]) + offset``. They are pulled towards 0, the response
-    of the camera, so that a scene keeps its colours.
+    Shown colour = ``exp(gain) * (given[:, :3] @ colour + given[:, 3]) + offset``, where ``given`` is the response that
+    the scene comes with: of the frame, else of its camera. They are pulled towards 0, so that colours are kept.
     """
 
-    def __init__(self, isp: Mapping[str, np.ndarray], frames: Mapping[str, int]) -> None:
-        self._isp = {name: np.asarray(isp.get(name, np.eye(3, 4)), np.float64) for name in frames}
+    def __init__(self, scene: GaussianScene, frames: Mapping[str, int]) -> None:
+        isp, self._exposures = scene.isp, scene.exposures
+        self._given = {
+            name: np.asarray(scene.exposures.get(name, [isp.get(name, np.eye(3, 4))] * count), np.float64)
+            for name, count in frames.items()
+        }
         self.values = {name: np.zeros((count, 2, 3)) for name, count in frames.items()}
         self.adam = {name: RowAdam(values.shape) for name, values in self.values.items()}
 
@@ -35,14 +39,14 @@ class FrameResponses:
             before = fitted[max(after - 1, 0)] if fitted[after] > frame else fitted[after]
             share = np.clip((frame - before) / max(fitted[after] - before, 1), 0, 1)
             gain, offset = values[before] * (1 - share) + values[fitted[after]] * share
-        shown = np.exp(gain)[:, None] * self._isp[camera]
+        shown = np.exp(gain)[:, None] * self._given[camera][frame]
         shown[:, 3] += offset
         return shown
 
     def start(
         self, camera: str, frame: int, shown: Float32[np.ndarray, "h w 3"], recorded: Float32[np.ndarray, "h w 3"]
     ) -> None:
-        """Set the gains of a frame to the ratio of the images' mean colours.
+        """Set the gains of a frame without a given response to the ratio of the images' mean colours.
 
         Args:
             camera: id of the camera.
@@ -50,6 +54,8 @@ class FrameResponses:
             shown: the rendered image.
             recorded: the image of the log.
         """
+        if camera in self._exposures:
+            return
         ratio = recorded.mean(axis=(0, 1), dtype=np.float64) / np.maximum(shown.mean(axis=(0, 1)), 1e-3)
         self.values[camera][frame, 0] = np.log(np.clip(ratio, *GAINS))
 
