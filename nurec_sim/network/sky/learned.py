@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import math
 
 import torch
@@ -46,7 +47,7 @@ class SkyUpsampling(nn.Module):
         return self.decode_head(self.reassemble([feature] * 4, 1.0), (edge_px, edge_px))
 
 
-class SkyQueries(nn.Module):
+class SkyQueries(nn.Module, abc.ABC):
     """Shared by both sky decoders: the directions of the cubemap, and image tokens with their rays."""
 
     query_rays: Tensor
@@ -80,11 +81,11 @@ class SkyQueries(nn.Module):
         tokens = tokens + self.patch_embed_ray(directions.flatten(0, 1))
         return self.decode(*self.kv_projector(tokens.reshape(len(rgb), -1, self.size.width)))
 
+    @abc.abstractmethod
     def decode(
         self, k: Float[Tensor, "b heads m d"], values: Float[Tensor, "b heads m d"]
     ) -> Float[Tensor, "b 6 s s 3"]:
         """The sky from keys and values of the clip's patches."""
-        raise NotImplementedError
 
 
 class SkyDecoder(SkyQueries):
