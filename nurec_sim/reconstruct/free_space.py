@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from nurec_sim import geometry
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.types import Clip, Gaussians, Sweep
 
@@ -43,7 +44,6 @@ MOST_CELLS = 3.0
 """Beams are looked for this far from the direction of a centre, in cells, and not between the sensor and the car."""
 CHUNK = 8192
 """Gaussians that are tested together: a sweep then stays in the cache."""
-THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def in_free_space(
         for job in jobs:
             _count(xyz[part], canonical[part], reach[part], *job, passed[part], stopped[part])
 
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         list(pool.map(count, range(0, len(tested), CHUNK)))
     free = np.zeros(len(gaussians), bool)
     free[tested] = (passed >= VOTES) & (passed > stopped)

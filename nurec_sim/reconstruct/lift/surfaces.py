@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from nurec_sim import geometry
+from nurec_sim.compute.cores import usable_cores
 from nurec_sim.reconstruct.lift.points import Cloud
 from nurec_sim.types import Gaussians, Label
 
@@ -47,7 +48,7 @@ def surface_of(cloud: Cloud, chunk: int = 200_000) -> tuple[Cloud, np.ndarray, n
     tree = cKDTree(cloud.xyz_m)
     for start in range(0, n, chunk):
         part = slice(start, min(start + chunk, n))
-        distance, index = tree.query(cloud.xyz_m[part], k=k + 1, workers=2)
+        distance, index = tree.query(cloud.xyz_m[part], k=k + 1, workers=usable_cores())
         offset = cloud.xyz_m[index] - cloud.xyz_m[part][:, None]
         # Neighbours across a gap belong to another surface.
         close = distance < np.maximum(4 * distance[:, 3:4], 4 * cloud.spacing_m[part, None])
