@@ -22,6 +22,7 @@ from nurec_sim.types import (
     Windshield,
     WindshieldReference,
 )
+from nurec_sim.world.plan.rig import street_rig
 
 CAMERA_AXES = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.6], [0, 0, 0, 1]])
 """rig_from_camera of a camera 1.6 m above the ground that looks forward."""
@@ -104,6 +105,8 @@ SENSORS: dict[str, SensorCase] = {
     ),
     "lidar-128": SensorCase((lidar("PANDAR128"),), "128 x 1800 beams, driving"),
     "lidar-128-standing": SensorCase((lidar("PANDAR128"),), "128 x 1800 beams, standing", standing=True),
+    "lidar-64-sparse": SensorCase((lidar("HDL-64", 600),), "64 x 600 beams, driving"),
+    "lidar-48-sparse": SensorCase(tuple(street_rig().lidars.values()), "48 x 600 beams, driving"),
     "lidar-64": SensorCase((lidar("HDL-64"),), "64 x 1800 beams, driving"),
     "tick": SensorCase((*SURROUND, lidar("PANDAR128")), "four cameras and a LiDAR in one call"),
 }

@@ -23,8 +23,10 @@ FIRST_FRAME_ROW = "driving pinhole-960 drive"
 HEADLINES = ("pinhole-640", "pinhole-960", "pinhole-1920", "rolling-960", "ftheta-1920", "lidar-128")
 OTHER_SCENES = ("pinhole-960", "rolling-960", "ftheta-1920", "lidar-128")
 LARGE_SCENES = ("pinhole-960", "pinhole-1920", "lidar-128")
-SCENE_SENSORS: dict[str, tuple[str, ...]] = {"driving": tuple(SENSORS), "2m": LARGE_SCENES, "6m": LARGE_SCENES}
-FEWER_FRAMES = {"2m": 0.5, "6m": 0.25}
+SCANNERS = ("lidar-64-sparse", "lidar-48-sparse", "lidar-64", "lidar-128")
+SCENE_SENSORS: dict[str, tuple[str, ...]] = {"driving": tuple(SENSORS), "2m": LARGE_SCENES, "6m": LARGE_SCENES,
+                                             "lifted": SCANNERS}  # fmt: skip
+FEWER_FRAMES = {"2m": 0.5, "6m": 0.25, "lifted": 0.5}
 ALL_PATHS_SENSOR = "pinhole-960"
 """The sensor that is driven along every path of a scene; all others along the first one."""
 DETAIL_SENSORS = ("pinhole-960", "pinhole-1920")
@@ -99,7 +101,7 @@ def quick(options: Options) -> Options:
 
 def build(name: str, options: Options, progress: Callable[[str, float], None]) -> BenchScene:
     """A scene by name; seeded scenes with another number of Gaussians if requested."""
-    if name == "real":
+    if name in ("real", "lifted"):
         return SCENES[name](progress)
     return SCENES[name]() if options.gaussians is None else SCENES[name](options.gaussians)
 

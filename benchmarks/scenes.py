@@ -18,6 +18,7 @@ START_US = 2_000_000
 PATH_S = 2.0
 """Every path takes this long."""
 ROOT = Path(__file__).parent.parent
+DEMO_LOG = ROOT / "scenarios" / "demo_clip.zip"
 Progress = Callable[[str, float], None]
 
 
@@ -131,11 +132,20 @@ def large(count: int) -> BenchScene:
 
 def real_log(progress: Progress | None = None) -> BenchScene:
     """A recorded log lifted to Gaussians: a real one where there is one, else the one that ships with the package."""
+    folder = Path(os.environ.get("NUREC_SIM_REALDATA", ROOT.parent / "shared" / "realdata"))
+    choices = [folder / "kitti_raw_0009", folder / "ddad_6cam", DEMO_LOG]
+    return lifted(next(path for path in choices if path.exists()), progress)
+
+
+def demo_log(progress: Progress | None = None) -> BenchScene:
+    """The log that ships with the package, lifted to nearly two million Gaussians, some of them moving."""
+    return lifted(DEMO_LOG, progress)
+
+
+def lifted(clip: Path, progress: Progress | None) -> BenchScene:
+    """A log lifted to Gaussians; the archive is kept in ``build/bench_scenes``."""
     from nurec_sim.serving.store import SceneStore
 
-    folder = Path(os.environ.get("NUREC_SIM_REALDATA", ROOT.parent / "shared" / "realdata"))
-    choices = [folder / "kitti_raw_0009", folder / "ddad_6cam", ROOT / "scenarios" / "demo_clip.zip"]
-    clip = next(path for path in choices if path.exists())
     store = SceneStore([clip], cache_dir=ROOT / "build" / "bench_scenes")
     scene = store.get(store.ids[0], progress=progress).scene
     paths = {name: log_path(scene.ego, beside) for name, beside in LOG_PATHS.items()}
@@ -149,6 +159,7 @@ SCENES: dict[str, Callable[[], BenchScene]] = {
     "haze": haze,
     "sky": open_sky,
     "real": real_log,
+    "lifted": demo_log,
     "2m": lambda: large(2_000_000),
     "6m": lambda: large(6_000_000),
 }

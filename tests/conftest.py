@@ -1,3 +1,4 @@
+import gc
 import os
 from pathlib import Path
 
@@ -16,29 +17,41 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.pop("COLUMNS", None)
 
 
+def pytest_collection_finish() -> None:
+    """What is imported stays: the garbage collector need not look at it again and again."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_waiting_for_the_disk():
+    """Files of tests need not survive a power failure, and each of thousands of synchronisations takes milliseconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda handle: None)
+        yield
+
+
+def _folder(variable: str, beside: str, what: str) -> Path:
+    """A folder named by a variable or beside the repository; skips where it is not."""
+    folder = Path(os.environ.get(variable, Path(__file__).parents[2] / "shared" / beside))
+    if not folder.is_dir():
+        pytest.skip(f"no {what} at {folder}; set {variable} to their folder")
+    return folder
+
+
 @pytest.fixture(scope="session")
 def realdata() -> Path:
     """Folder of the real driving packs, which are not part of the repository."""
-    folder = Path(os.environ.get("NUREC_SIM_REALDATA", Path(__file__).parents[2] / "shared" / "realdata"))
-    if not folder.is_dir():
-        pytest.skip(f"no real driving packs at {folder}; set NUREC_SIM_REALDATA to their folder")
-    return folder
+    return _folder("NUREC_SIM_REALDATA", "realdata", "real driving packs")
 
 
 @pytest.fixture(scope="session")
 def rawlogs() -> Path:
     """Folder of real logs in their publishers' layouts, which are not part of the repository."""
-    folder = Path(os.environ.get("NUREC_SIM_RAWLOGS", Path(__file__).parents[2] / "shared" / "rawlogs"))
-    if not folder.is_dir():
-        pytest.skip(f"no published logs at {folder}; set NUREC_SIM_RAWLOGS to their folder")
-    return folder
+    return _folder("NUREC_SIM_RAWLOGS", "rawlogs", "published logs")
 
 
 @pytest.fixture(scope="session")
 def alpasim_messages() -> Path:
     """Folder of all recorded AlpaSim messages; those of the demo log alone are part of the repository."""
-    shared = Path(__file__).parents[2] / "shared" / "alpasim_messages"
-    folder = Path(os.environ.get("NUREC_SIM_ALPASIM_MESSAGES", shared))
-    if not folder.is_dir():
-        pytest.skip(f"no AlpaSim messages at {folder}; set NUREC_SIM_ALPASIM_MESSAGES to their folder")
-    return folder
+    return _folder("NUREC_SIM_ALPASIM_MESSAGES", "alpasim_messages", "AlpaSim messages")

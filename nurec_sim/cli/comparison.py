@@ -38,7 +38,7 @@ def compare(
         json_path: also write all figures here.
     """
     from nurec_sim import logs, scene
-    from nurec_sim.evaluate import compare_scenes, hold_out, render_comparison, side_by_side
+    from nurec_sim.evaluate import compare_scenes, render_comparison, side_by_side
 
     if len(scenes) < 2:
         raise NurecSimError(f"a comparison needs two scenes or more, got {[str(path) for path in scenes]}")
@@ -56,7 +56,7 @@ def compare(
         found = compare_scenes(
             log,
             {name: lambda path=path: scene.read_scene(path) for name, path in names.items()},
-            hold_out(log, cameras, images_every=hold_out_every, sweeps_every=hold_out_sweeps),
+            logs.hold_out(log, cameras, images_every=hold_out_every, sweeps_every=hold_out_sweeps),
             target_cameras=target_cameras or None,
             device=chosen_device(device),
             progress=advance,

@@ -7,9 +7,9 @@ import inspect
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -25,11 +25,9 @@ from nurec_sim.cli.console import (
     print_table,
     progress,
 )
+from nurec_sim.cli.scenes import refinement
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable
-
-if TYPE_CHECKING:
-    from nurec_sim.types import GaussianScene, Sense
 
 
 @app.command
@@ -44,11 +42,17 @@ def run(
     address: str | None = None,
     true_world: Path | None = None,
     cache: Path | None = None,
+    methods: tuple[str, ...] = (),
+    hold_out: int = 10,
+    clip: Path | None = None,
     video: bool = True,
     plan_timeout: float = 60.0,
     device: str = "auto",
+    refine: float | None = None,
 ) -> None:
     """Run policies closed-loop in scenes, compute metrics, and write a report; exit status 1 if a rollout failed.
+
+    With --methods, or with several archives of one log, the reconstructions are compared side by side.
 
     Starts its own server unless --address is given. The run folder has report.html, metrics.parquet,
     metrics.csv and one folder per rollout; runs/latest points to the newest.
@@ -64,11 +68,19 @@ def run(
         true_world: also drive in the original town of the clip, given by the plan.json of its ground truth folder; the
             report shows it as reconstruction `truth` (docs/world.md).
         cache: where reconstructed clips are kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
+        methods: reconstruct each log by all of these methods, such as `lift dense`, and compare them; default: lift.
+        hold_out: with --methods, keep every N-th image and the sweeps taken with it out of the reconstructions, to
+            measure them by; 0 for none.
+        clip: the log of the given archives, to measure them by and to show beside them.
         video: also record the front camera of every rollout.
         plan_timeout: time limit in seconds for creating a policy and for each plan.
         device: render device without --address: auto (a GPU if available), cpu, cuda or cuda:N.
+        refine: time budget in seconds for optimising the reconstruction of each clip on its images and sweeps.
     """
-    drive(sources, scenario, policies, seeds, out_path, resume, address, cache, video, true_world, plan_timeout, device)
+    drive(
+        sources, scenario, policies, seeds, out_path, resume, address, cache, video, true_world, plan_timeout, device,
+        methods, hold_out if methods else 0, clip, refine,
+    )  # fmt: skip
 
 
 @app.command
@@ -78,6 +90,7 @@ def demo(
     resume: Path | None = None,
     cache: Path | None = None,
     device: str = "auto",
+    refine: float | None = None,
 ) -> None:
     """Run the whole chain on the bundled demo log: about five minutes on two cores.
 
@@ -86,8 +99,9 @@ def demo(
         resume: resume this run folder; finished rollouts are kept.
         cache: where the reconstructed scene is kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
         device: render device: auto (a GPU if available), cpu, cuda or cuda:N.
+        refine: time budget in seconds for optimising the reconstruction on the log's images and sweeps.
     """
-    drive((), "demo", (), (), out_path, resume, None, cache, True, device=device)
+    drive((), "demo", (), (), out_path, resume, None, cache, True, device=device, refine=refine)
 
 
 @app.command
@@ -140,6 +154,10 @@ def drive(
     true_world: Path | None = None,
     plan_timeout_s: float = 60.0,
     device: str = "auto",
+    methods: Sequence[str] = (),
+    hold_out_every: int = 0,
+    clip: Path | None = None,
+    refine: float | None = None,
 ) -> None:
     """Policies, scenes, server, rollouts and report, for `run` and `demo`.
 
@@ -156,8 +174,13 @@ def drive(
         true_world: ``plan.json`` of the procedural town behind the only scene, to drive in it as well.
         plan_timeout_s: time limit of each call of a policy.
         device: rendering device of the server in this process.
+        methods: reconstruction methods of logs; default: ``lift``.
+        hold_out_every: every N-th image of a log is kept out of its reconstructions.
+        clip: log of the archives.
+        refine: seconds for optimising each reconstructed clip.
     """
-    from nurec_sim import runs, sim
+    from nurec_sim import logs, runs, sim
+    from nurec_sim.evaluate import measure_fidelity
     from nurec_sim.serving.client import RemoteSensors
     from nurec_sim.serving.server import SensorServer
     from nurec_sim.serving.store import SceneStore
@@ -167,49 +190,66 @@ def drive(
     scenario = sim.load_scenario(scenario_path)
     if not sources and scenario.clip is None:
         raise NurecSimError(f"scenario {scenario.name!r} has no clip; give clips or scenes")
+    fit = refinement(refine)
+    if fit is not None and address is not None:
+        raise NurecSimError("--refine cannot be used with --address: the scenes are those of the running server")
     loaded = runs.load_policies(policy_names or scenario.policies, plan_timeout_s)
     if address is not None:
         with RemoteSensors(address) as sensors:
             sensors.version()  # fails here if there is no server
     device = "cpu" if address is not None else chosen_device(device)
-    store = SceneStore(sources or [scenario_path.parent / str(scenario.clip)], cache_dir=cache, device=device)
-    for fault in store.faults.values():
-        raise NurecSimError(fault)
+    store = SceneStore(cache_dir=cache, device=device)
+    offers = runs.offer_all(store, sources or [scenario_path.parent / str(scenario.clip)], methods, hold_out_every, fit)
+    if fit is not None and (finished := [offer.scene_id for offer in offers if offer.clip is None]):
+        raise NurecSimError(f"--refine optimises reconstructions of clips; {', '.join(finished)} is a finished archive")
+    if len(offers) > len({offer.scene_id for offer in offers}) and address is not None:
+        raise NurecSimError("several reconstructions of one log need a server of their own: leave out --address")
+    paths = {offer.scene_id: offer.clip or clip for offer in offers}
+    opened = {scene_id: logs.open_clip(path) for scene_id, path in paths.items() if path is not None}
     check_writable(resume or out_dir, folder=True)
     with progress("loading") as advance:
-        scenes = [
-            store.get(scene_id, part_of(advance, index, len(store.ids), scene_id)).scene
-            for index, scene_id in enumerate(store.ids)
-        ]
+        loaded_scenes = runs.load_all(store, offers, advance)
+    scenes = [scene for _, scene in loaded_scenes]
+    served = {(scene.id, runs.reconstruction_of(scene)): offer for offer, scene in loaded_scenes}
     with contextlib.ExitStack() as stack:
         if address is None:
             address = stack.enter_context(SensorServer(store, port=0))
-        server = address
-        worlds: list[tuple[str, Sequence[GaussianScene], Callable[[str], Sense]]] = [
-            ("driving", scenes, lambda scene_id: stack.enter_context(RemoteSensors(server, scene_id)).sense)
-        ]
+        server, senses = address, {}
+        for key, offer in served.items():
+            senses[key] = stack.enter_context(RemoteSensors(server, offer.served_as)).sense
+        logs_by_id = {scene.id: opened[offer.scene_id] for offer, scene in loaded_scenes if offer.scene_id in opened}
+        fidelity: dict[tuple[str, str], dict[str, Any]] = {}
+        if len(served) > len({scene.id for scene in scenes}) or clip is not None:
+            with progress("comparing with the log") as advance:
+                for scene in scenes:
+                    key = scene.id, runs.reconstruction_of(scene)
+                    if scene.id in logs_by_id:
+                        part = part_of(advance, len(fidelity), len(scenes), key[1])
+                        every = served[key].hold_out_every
+                        fidelity[key] = measure_fidelity(logs_by_id[scene.id], scene, senses[key], every, part)
         if true_world is not None:
-            if len(scenes) != 1:
+            if len({scene.id for scene in scenes}) != 1:
                 raise NurecSimError(f"--true-world needs exactly one clip or scene, got {len(scenes)}")
             scene, sense = stack.enter_context(runs.true_world(true_world, scenes[0]))
-            worlds.append(("driving in the original world", [scene], lambda scene_id: sense))
-        out.print(f"sensors from {address}; {len(scenes)} scene(s), scenario {scenario.name}")
-        folder = resume
-        for title, driven, sense_for in worlds:
-            with progress(title) as advance:
-                folder = runs.execute(
-                    driven,
-                    scenario,
-                    loaded,
-                    sense_for,
-                    out_dir,
-                    seeds=seeds or scenario.seeds,
-                    resume=folder,
-                    video=video,
-                    progress=advance,
-                    notice=_notice,
-                )
-    assert folder is not None
+            # First, because the others are compared with it.
+            scenes.insert(0, scene)
+            senses[scene.id, runs.reconstruction_of(scene)] = sense
+        out.print(f"sensors from {server}; {len(scenes)} scene(s), scenario {scenario.name}")
+        with progress("driving") as advance:
+            folder = runs.execute(
+                scenes,
+                scenario,
+                loaded,
+                lambda scene: senses[scene.id, runs.reconstruction_of(scene)],
+                out_dir,
+                logs=logs_by_id,
+                fidelity=fidelity,
+                seeds=seeds or scenario.seeds,
+                resume=resume,
+                video=video,
+                progress=advance,
+                notice=_notice,
+            )
     heading, *rows = runs.headline(folder)
     print_table("means over rollouts", rows, heading)
     out.print(f"{time.monotonic() - started:.0f} s. Report: {(folder / 'report.html').resolve()}", soft_wrap=True)

@@ -195,7 +195,8 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
 
 
 def _score_archive(log: Clip, flags: LogFlags, hold_out_every: int, device: str, advance: Report) -> dict[str, Any]:
-    from nurec_sim.evaluate import hold_out, score_scene
+    from nurec_sim.evaluate import score_scene
+    from nurec_sim.logs import hold_out
     from nurec_sim.scene import read_scene
 
     assert flags.scene is not None

@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING
 from nurec_sim.cli.console import OnePath, app, out, print_faults, print_table, progress
 from nurec_sim.cli.validation import inspect_scene
 from nurec_sim.errors import NurecSimError
-from nurec_sim.files.new_files import new_file
+from nurec_sim.files.new_files import check_writable, new_file, write_file
 
 if TYPE_CHECKING:
     from nurec_sim.logs import Clip
 
 
 @app.command
-def inspect(source: OnePath, *, overlay: Path | None = None, time_s: float | None = None) -> None:
+def inspect(
+    source: OnePath, *, overlay: Path | None = None, time_s: float | None = None, html: Path | None = None
+) -> None:
     """Show the contents of a driving log or a scene archive, and check it.
 
     Prints a table of sensors, rates, spans and boxes; the consistency of ground, cameras, LiDARs and boxes; then every
@@ -25,6 +27,7 @@ def inspect(source: OnePath, *, overlay: Path | None = None, time_s: float | Non
     Args:
         source: a driving log of any format (docs/log_formats.md), or a scene archive (.usdz).
         overlay: write a PNG with LiDAR points (red near, blue far) and boxes over the image of each camera; clips only.
+        html: write a page with all of it, and with timeline, map and images; clips only.
         time_s: time of the overlay in seconds after the start of the clip; default: the middle.
     """
     from nurec_sim import logs
@@ -38,7 +41,11 @@ def inspect(source: OnePath, *, overlay: Path | None = None, time_s: float | Non
     if is_archive(source):
         if overlay is not None:
             raise NurecSimError(f"--overlay draws over the images of a clip; {source} is a scene archive")
+        if html is not None:
+            raise NurecSimError(f"--html shows a clip; {source} is a scene archive")
         return inspect_scene(source)
+    if html is not None:
+        check_writable(html)
     log = logs.open_clip(source)
     summary = logs.describe_clip(log)
     print_table(f"clip {log.id}", summary.facts)
@@ -51,6 +58,12 @@ def inspect(source: OnePath, *, overlay: Path | None = None, time_s: float | Non
         measures = logs.measure_clip(log)
     if measures:
         print_table("consistency", [(each.what, each.found) for each in measures])
+    if html is not None:
+        from nurec_sim.report.log_page import log_page
+
+        with progress(f"writing {html.name}"):
+            write_file(html, log_page(log, faults, measures))
+        out.print(f"wrote {html}", soft_wrap=True)
     print_faults([*faults, *(fault for each in measures for fault in each.faults)])
     out.print("no faults")
 

@@ -17,11 +17,13 @@ from nurec_sim.cli import (  # noqa: F401  (each registers its commands)
     evaluation,
     exchange,
     inspection,
+    lidar,
     remote,
     scenes,
     serving,
     training,
     validation,
+    viewing,
     weights,
     worlds,
 )

@@ -11,8 +11,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     submod_attrs={
         "comparison": ["compare_scenes"],
         "comparison_page": ["render_comparison"],
-        "held_out": ["HeldOut", "hold_out", "without_images"],
-        "lidar_scores": ["as_fired"],
+        "fidelity": ["measure_fidelity"],
         "log": ["evaluate", "score_scene", "sensing"],
         "log_tables": ["figure_rows", "side_by_side"],
         "methods": ["CHOICES", "Contender", "contenders"],

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import io
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -13,17 +13,17 @@ import numpy as np
 from jaxtyping import UInt8
 
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate.held_out import HeldOut
 from nurec_sim.evaluate.image_scores import image_request
 from nurec_sim.evaluate.log import score_scene, sensing
 from nurec_sim.evaluate.scores.flip import flip_map
+from nurec_sim.logs.held_out import HeldOut
+from nurec_sim.runs.video import write_video
 from nurec_sim.types import CameraFrame, Clip, GaussianScene, Sense
 
 WIDTH_PX = 480
 """Width of one image in a row of the video and of the worst frames."""
 WORST = 4
 FRAMES_PER_S = 5
-CODEC_OPTIONS = {"preset": "veryfast", "crf": "26", "threads": "1"}
 BAR_PX = 20
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -159,18 +159,8 @@ def _captioned(picture: Picture, text: str) -> Picture:
 
 def _video(pictures: Sequence[Picture]) -> bytes:
     """An H.264 video in MP4; empty without pictures."""
-    import av
-
-    if not pictures:
-        return b""
-    file = io.BytesIO()
-    with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=FRAMES_PER_S, options=CODEC_OPTIONS)
-        stream.height, stream.width = pictures[0].shape[:2]
-        stream.pix_fmt, stream.time_base = "yuv420p", Fraction(1, FRAMES_PER_S)
-        for index, picture in enumerate(pictures):
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-            frame.pts = index
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return file.getvalue()
+    # Through a file: its index is moved to the front once it is finished, which needs a name.
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "frames.mp4"
+        write_video(file, pictures, FRAMES_PER_S)
+        return file.read_bytes() if file.exists() else b""

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from nurec_sim.evaluate.held_out import HeldOut
 from nurec_sim.evaluate.log_regions import AROUND_PX, RANGES_M, actor_mask, range_name, seen_points
 from nurec_sim.evaluate.scores.flip import flip
 from nurec_sim.evaluate.scores.images import psnr, ssim
 from nurec_sim.evaluate.scores.sharpness import OCTAVES, sharpness
 from nurec_sim.files.new_files import write_file
+from nurec_sim.logs.held_out import HeldOut
 from nurec_sim.types import CameraFrame, Clip, Sense, SensorRequest
 
 HOLE_ALPHA = 0.5
@@ -107,7 +107,7 @@ def image_request(clip: Clip, camera: str, index: int) -> SensorRequest:
     """The request that repeats a recorded image."""
     start, end = (int(t) for t in clip.camera_times_us(camera)[index])
     poses = clip.world_from_camera(camera, index)
-    return SensorRequest(clip.id, clip.rig.cameras[camera], start, max(end, start + 1), poses)
+    return SensorRequest(clip.id, clip.rig.cameras[camera], start, max(end, start + 1), poses, show_ego=True)
 
 
 def summarized(frames: Sequence[FrameScore]) -> dict[str, object]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float64
 
 from nurec_sim import geometry
 from nurec_sim.evaluate.log_regions import RANGES_M, range_name
-from nurec_sim.evaluate.scores.free_space import FARTHEST_M, FiredSweep, RecordedBeams, false_obstacles
-from nurec_sim.evaluate.scores.lidar import LidarScore, scanner_along, score_sweep
-from nurec_sim.sensors.lidar_tables import lidar_model
-from nurec_sim.types import Clip, LidarFrame, Sense, SensorRequest, Sweep
+from nurec_sim.evaluate.scores.free_space import FARTHEST_M, FiredSweep, RecordedBeams, false_obstacles, in_boxes
+from nurec_sim.evaluate.scores.lidar import CloudScore, LidarScore, scanner_along, score_sweep
+from nurec_sim.evaluate.scores.surfaces import KINDS, surfaces_of
+from nurec_sim.logs.fired import as_fired, fired_fraction
+from nurec_sim.sensors import lidar_model, range_map
+from nurec_sim.types import Clip, LidarFrame, LidarModel, Sense, SensorRequest
 
 LEFT_M = (0.0, 1.0, 2.0, 3.0)
 """Lateral offsets from the path at which false obstacles are counted, on both sides."""
@@ -25,57 +27,120 @@ MOST_BEAM_SWEEPS = 60
 Report = Callable[[str, float], None]
 
 
-def score_sweeps(clip: Clip, held: Sequence[int], sense: Sense, report: Report) -> dict[str, object]:
-    """Scores of held-out sweeps: range errors, also by range bin, and Chamfer distances.
+def score_sweeps(
+    clip: Clip, scanners: Mapping[str, LidarModel], held: Sequence[int], sense: Sense, report: Report
+) -> dict[str, object]:
+    """Scores of held-out sweeps, by the names of their conventions (docs/evaluation.md).
+
+    Along recorded beams: errors of range and intensity, by range and by what the returns lie on. Of whole sweeps:
+    Chamfer distances, number of returns, and, where the log's beams are known, which of them return.
 
     Args:
         clip: the log.
+        scanners: the LiDARs as the scene has them.
         held: indices of the sweeps of every LiDAR to score.
         sense: renders the scene.
         report: called with a stage and the share of it done.
     """
-    scores, names = [], []
+    scores, names, clouds, drops = [], [], [], []
     jobs = [(lidar, i) for lidar in clip.rig.lidars for i in held if i < len(clip.sweep_times_us(lidar))]
     for done, (lidar, index) in enumerate(jobs):
         report("held-out sweeps", done / len(jobs))
         sweep = clip.sweep(lidar, index)
         fired, poses = as_fired(clip, lidar, sweep)
-        scanner = scanner_along(clip.rig.lidars[lidar], fired)
+        times = sweep.start_us, max(sweep.end_us, sweep.start_us + 1)
+        up = np.linalg.inv(sweep.world_from_lidar)[:3, 2]
+        surface = surfaces_of(fired, up, in_boxes(sweep.xyz_world_m, clip.tracks, sweep.t_us))
         # Simulated beam by beam: from the same moving sensor, at the elevations of the recorded returns.
-        request = SensorRequest(clip.id, scanner, sweep.start_us, max(sweep.end_us, sweep.start_us + 1), poses)
-        frame = sense([request])[0]
-        assert isinstance(frame, LidarFrame)
-        scores.append(score_sweep(frame, fired))
+        along = scanner_along(clip.rig.lidars[lidar], fired)
+        scanner = scanners.get(lidar, clip.rig.lidars[lidar])
+        frame, whole = sense([SensorRequest(clip.id, each, *times, poses) for each in (along, scanner)])
+        assert isinstance(frame, LidarFrame) and isinstance(whole, LidarFrame)
+        scores.append(score_sweep(frame, fired, sweep.intensity, surface))
+        seen = geometry.transform_points(poses[1], whole.xyz_m.astype(np.float64))
+        clouds.append(CloudScore.of(seen, sweep.xyz_world_m))
+        drops.append(_drop_agreement(clip.rig.lidars[lidar], scanner, fired, whole))
         names.append({"lidar": lidar, "sweep": index})
     report("held-out sweeps", 1.0)
     total = LidarScore.pooled(scores)
-    clouds = np.array([score.chamfer() for score in scores]).reshape(-1, 2)
-    precision, coverage = np.nanmean(clouds, axis=0) if np.isfinite(clouds).any() else (np.nan, np.nan)
-    bins = zip(RANGES_M[:-1], RANGES_M[1:], strict=True)
+    bins = [(range_name(k), RANGES_M[k], RANGES_M[k + 1]) for k in range(len(RANGES_M) - 1)]
     return {
         **_figures(total),
-        "by_range": {range_name(k): _figures(total.within(low, high)) for k, (low, high) in enumerate(bins)},
-        "cd_l1_sum": _known(precision + coverage),
-        "precision_m": _known(precision),
-        "coverage_m": _known(coverage),
+        "by_range": {name: _figures(total.within(low, high)) for name, low, high in bins},
+        "by_surface": {
+            kind: {
+                **_figures(total.on(kind)),
+                "by_range": {name: _figures(total.on(kind).within(low, high)) for name, low, high in bins},
+            }
+            for kind in KINDS
+        },
+        **_means([cloud.figures() for cloud in clouds]),
+        **_means(drops),
         "per_sweep": [
-            {**name, "median_abs_range_error_m": _known(s.median_abs_error_m), "return_recall": _known(s.recall)}
-            for name, s in zip(names, scores, strict=True)
+            {
+                **name,
+                "median_abs_range_error_m": _known(s.median_abs_error_m),
+                "return_recall": _known(s.recall),
+                "count_ratio": cloud.figures().get("count_ratio"),
+            }
+            for name, s, cloud in zip(names, scores, clouds, strict=True)
         ],
     }
 
 
+def _means(rows: list[dict[str, float]]) -> dict[str, float | None]:
+    """Mean of each figure over the sweeps that have it."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    values = {name: [row[name] for row in rows if np.isfinite(row.get(name, np.nan))] for name in names}
+    return {name: float(np.mean(found)) if found else None for name, found in values.items()}
+
+
+def _drop_agreement(
+    nominal: LidarModel, scanner: LidarModel, fired: Float64[np.ndarray, "n 3"], simulated: LidarFrame
+) -> dict[str, float]:
+    """Accuracy, and F1 of drops, over the recorded beams; empty if the log's beams, or the scanner's, are others."""
+    beams = range_map(nominal, fired)
+    rows, columns = len(scanner.elevation_rad), len(scanner.azimuth_rad)
+    if not beams.known or beams.point.shape[0] != rows:
+        return {}
+    kept = np.zeros((rows, columns), bool)
+    kept.reshape(-1)[simulated.beam] = True
+    # The number of columns differs by some between turns.
+    column = np.rint(np.arange(beams.point.shape[1]) * columns / beams.point.shape[1]).astype(np.int64) % columns
+    dropped, recorded = ~kept[:, column], beams.point < 0
+    both = np.count_nonzero(dropped & recorded)
+    either = np.count_nonzero(dropped) + np.count_nonzero(recorded)
+    return {
+        "raydrop_acc": float(np.mean(dropped == recorded)),
+        "raydrop_f1": 2 * both / either if either else float("nan"),
+    }
+
+
 def _figures(score: LidarScore) -> dict[str, object]:
-    error = score.abs_error_m
+    error, away = score.abs_error_m, score.abs_perpendicular_m
+    away = away[np.isfinite(away)]
+    intensity = np.zeros(0) if score.intensity_error is None else np.abs(score.intensity_error)
+    intensity = intensity[np.isfinite(intensity)]
+    recorded = score.recorded_m[score.returned]
     return {
         "median_abs_range_error_m": _known(score.median_abs_error_m),
-        "mean_abs_range_error_m": _known(error.mean() if len(error) else np.nan),
+        "mean_abs_range_error_m": _mean(error),
         "p95_abs_range_error_m": _known(np.percentile(error, 95) if len(error) else np.nan),
+        "depth_median_l2": _known(np.median(error**2) if len(error) else np.nan),
+        "depth_mean_rel_l2": _mean((error / recorded) ** 2),
+        "median_perpendicular_m": _known(np.median(away) if len(away) else np.nan),
+        "mean_perpendicular_m": _mean(away),
+        "intensity_mae": _mean(intensity),
+        "intensity_rmse": _known(np.sqrt(np.mean(intensity**2)) if len(intensity) else np.nan),
         "return_recall": _known(score.recall),
         "within_0.1_m": _within(score, 0.1),
         "within_0.5_m": _within(score, 0.5),
         "beams": score.beams,
     }
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(np.mean(values)) if len(values) else None
 
 
 def _within(score: LidarScore, limit_m: float) -> float | None:
@@ -127,7 +192,7 @@ def _recorded_beams(clip: Clip) -> RecordedBeams:
     for lidar, index in _chosen_sweeps(clip):
         sweep = clip.sweep(lidar, index)
         xyz, poses = as_fired(clip, lidar, sweep)
-        fired.append(FiredSweep(xyz, _fraction(sweep), poses))
+        fired.append(FiredSweep(xyz, fired_fraction(sweep), poses))
         ends.append(sweep.xyz_world_m)
     return RecordedBeams(fired, np.concatenate(ends))
 
@@ -136,18 +201,3 @@ def _chosen_sweeps(clip: Clip) -> list[tuple[str, int]]:
     every = [(name, index) for name in clip.rig.lidars for index in range(len(clip.sweep_times_us(name)))]
     chosen = np.unique(np.linspace(0, len(every) - 1, min(MOST_BEAM_SWEEPS, len(every))).round().astype(int))
     return [every[k] for k in chosen]
-
-
-def _fraction(sweep: Sweep) -> Float64[np.ndarray, " n"]:
-    return np.clip((sweep.point_t_us - sweep.start_us) / max(sweep.end_us - sweep.start_us, 1), 0, 1)
-
-
-def as_fired(clip: Clip, lidar: str, sweep: Sweep) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "2 4 4"]]:
-    """Undoes motion compensation: returns in the sensor frame at firing time, and the poses at sweep start and end."""
-    rig_from_lidar = clip.rig.lidars[lidar].rig_from_lidar
-    # The sweep's own pose in the log is the reference; the ego trajectory only contributes the motion around it.
-    fix = sweep.world_from_lidar @ geometry.inverse(clip.ego.at(sweep.t_us) @ rig_from_lidar)
-    times = np.array([sweep.start_us, sweep.end_us])
-    poses = np.einsum("ij,njk->nik", fix, clip.ego.at(times) @ rig_from_lidar)
-    inverse = geometry.inverse(geometry.interpolate_pose_pair(poses, _fraction(sweep)))
-    return np.einsum("nij,nj->ni", inverse[:, :3, :3], sweep.xyz_world_m) + inverse[:, :3, 3], poses

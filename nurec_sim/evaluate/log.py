@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate.held_out import HeldOut, hold_out, without_images
 from nurec_sim.evaluate.image_scores import score_images
 from nurec_sim.evaluate.lidar_scores import score_free_space, score_sweeps
+from nurec_sim.logs.held_out import HeldOut, hold_out, without_images
 from nurec_sim.metrics.offroad import offroad_agreement
 from nurec_sim.metrics.offroad_grid import scene_offroad_grid
 from nurec_sim.render import make_renderer
@@ -140,7 +140,11 @@ def score_scene(
         image = score_images(clip, inputs, targets, held, sense, probe, images_dir, _part(report, 0.0, 0.75))
         seconds["images"] = round(time.perf_counter() - started, 3)
         started = time.perf_counter()
-        lidar = score_sweeps(clip, sorted(held.sweeps), sense, _part(report, 0.75, 0.9)) if held.sweeps else None
+        lidar = (
+            score_sweeps(clip, scene.rig.lidars, sorted(held.sweeps), sense, _part(report, 0.75, 0.9))
+            if held.sweeps
+            else None
+        )
         free = score_free_space(clip, sense, _part(report, 0.9, 1.0))
         seconds["lidar"] = round(time.perf_counter() - started, 3)
     return {
@@ -154,7 +158,7 @@ def score_scene(
         "image": image,
         "lidar": lidar,
         "free_space": free,
-        "road": _score_road(scene),
+        "road": score_road(scene),
         "seconds": seconds,
         "counts": {"static": len(scene.static), "dynamic": len(scene.dynamic)}
         | dict(scene.provenance.get("counts", {})),
@@ -229,7 +233,8 @@ def sensing(scene: GaussianScene, via_grpc: bool, device: str) -> Iterator[Sense
         yield remote.sense
 
 
-def _score_road(scene: GaussianScene) -> dict[str, object] | None:
+def score_road(scene: GaussianScene) -> dict[str, object] | None:
+    """How off-road from Gaussians agrees with the log's map (``metrics.offroad_agreement``); None without a map."""
     if scene.road_map is None or not scene.road_map.drivable:
         return None
     try:

@@ -34,14 +34,7 @@ def figure_rows(figures: Mapping[str, Any]) -> list[Row]:
         if frames := figures["image"].get(key):
             rows += _image_rows(f"Images: {title}", frames)
     if lidar := figures["lidar"]:
-        for name, part in [("all ranges", lidar), *lidar["by_range"].items()]:
-            rows += [
-                Row("LiDAR: sweeps held out", f"median error, {name} (m)", part["median_abs_range_error_m"], 3, -1),
-                Row("LiDAR: sweeps held out", f"mean error, {name} (m)", part["mean_abs_range_error_m"], 2, -1),
-                Row("LiDAR: sweeps held out", f"95th percentile, {name} (m)", part["p95_abs_range_error_m"], 2, -1),
-                Row("LiDAR: sweeps held out", f"beams that return, {name}", part["return_recall"], 3, 1),
-            ]
-        rows.append(Row("LiDAR: sweeps held out", "Chamfer: precision + coverage (m)", lidar["cd_l1_sum"], 3, -1))
+        rows += _lidar_rows(lidar)
     if free := figures["free_space"]:
         for left, share in free["false_obstacles"].items():
             percent = None if share is None else 100 * share
@@ -54,6 +47,39 @@ def figure_rows(figures: Mapping[str, Any]) -> list[Row]:
     ]
     if (seconds := figures["seconds"].get("reconstruct")) is not None:
         rows.append(Row("Scene", "reconstruction (s)", seconds, 1, -1))
+    return rows
+
+
+def _lidar_rows(lidar: Mapping[str, Any]) -> list[Row]:
+    """Sweeps as wholes first, then beams by range, then by what they hit; medians never without what they hide."""
+    group = "LiDAR: sweeps held out"
+    rows = [
+        Row(group, "returns, simulated / recorded", lidar.get("count_ratio"), 3),
+        Row(group, "Chamfer: precision + coverage (m)", lidar.get("cd_l1_sum"), 3, -1),
+        Row(group, "precision (m)", lidar.get("precision_m"), 3, -1),
+        Row(group, "coverage (m)", lidar.get("coverage_m"), 3, -1),
+        Row(group, "F-score at 0.1 m", lidar.get("fscore@0.10"), 3, 1),
+        Row(group, "intensity, mean error", lidar["intensity_mae"], 3, -1),
+        Row(group, "beams that return or not as recorded", lidar.get("raydrop_acc"), 3, 1),
+    ]
+    for name, part in [("all ranges", lidar), *lidar["by_range"].items()]:
+        rows += [
+            Row(group, f"mean error, {name} (m)", part["mean_abs_range_error_m"], 2, -1),
+            Row(group, f"95th percentile, {name} (m)", part["p95_abs_range_error_m"], 2, -1),
+            Row(group, f"median error, {name} (m)", part["median_abs_range_error_m"], 3, -1),
+            Row(group, f"within 0.1 m, {name}", part["within_0.1_m"], 3, 1),
+            Row(group, f"recorded beams that return, {name}", part["return_recall"], 3, 1),
+        ]
+    for kind, parts in lidar["by_surface"].items():
+        what, key = ("perpendicular", "perpendicular_m") if kind == "ground" else ("range", "abs_range_error_m")
+        for name, part in [("all ranges", parts), *parts["by_range"].items()]:
+            if part["beams"]:
+                title = f"{kind}, {name}"
+                rows += [
+                    Row(f"LiDAR: {kind}", f"median {what} error, {title} (m)", part[f"median_{key}"], 3, -1),
+                    Row(f"LiDAR: {kind}", f"mean {what} error, {title} (m)", part[f"mean_{key}"], 2, -1),
+                ]
+        rows.append(Row(f"LiDAR: {kind}", f"beams, {kind}", parts["beams"], 0))
     return rows
 
 

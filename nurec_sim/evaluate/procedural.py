@@ -9,7 +9,8 @@ from jaxtyping import Int64
 
 from nurec_sim import geometry
 from nurec_sim.evaluate.views import reduced, reduced_mask
-from nurec_sim.evaluate.windows import ContextClip, EvaluationView, Revolution, Shot
+from nurec_sim.evaluate.windows import EvaluationView
+from nurec_sim.logs.selection import ContextClip, Revolution, Shot
 from nurec_sim.types import CameraModel, Label, Pinhole, Rig, SensorRequest, Trajectory
 from nurec_sim.world import LIDAR_ID, TrueWorld, street_rig, town_plan, true_sweep
 from nurec_sim.world.plan.rig import CAMERA_FROM_RIG_AXES

@@ -19,7 +19,8 @@ import numpy as np
 
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.procedural import EvaluationWorld, camera_responses, evaluation_rig, held_out_plan
-from nurec_sim.evaluate.windows import ContextClip, EvaluationView, Window
+from nurec_sim.evaluate.windows import EvaluationView, Window
+from nurec_sim.logs.selection import ContextClip
 from nurec_sim.world import Quality, TrueWorld
 
 PROTOCOLS = ("storm", "clip", "shift")

@@ -15,7 +15,8 @@ from nurec_sim import geometry, sensors
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.log_regions import actor_mask
 from nurec_sim.evaluate.views import ScoredView, reduced, scored_size
-from nurec_sim.evaluate.windows import ContextClip, EvaluationView, Revolution, Shot, Window
+from nurec_sim.evaluate.windows import EvaluationView, Window
+from nurec_sim.logs.selection import ContextClip, Revolution, Shot
 from nurec_sim.reconstruct.feedforward.inputs.frames import choose_cameras
 from nurec_sim.types import CameraModel, Clip, Rig, SensorRequest
 

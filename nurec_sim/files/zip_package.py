@@ -7,6 +7,7 @@ equal content gives equal bytes.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import mmap
@@ -14,7 +15,7 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
 from nurec_sim.errors import ArchiveError
@@ -79,6 +80,19 @@ def name_fault(name: str) -> str | None:
     return None
 
 
+@contextlib.contextmanager
+def archive_errors(name: object) -> Iterator[None]:
+    """What opening a ZIP file raises becomes an ``ArchiveError`` with the file's name."""
+    try:
+        yield
+    except TooMuchError as error:
+        raise ArchiveError(f"{name} {error}") from None
+    except OSError as error:
+        raise ArchiveError(f"{name}: cannot be opened ({error.strerror or error})") from error
+    except (zipfile.BadZipFile, NotImplementedError, struct.error, ValueError) as error:
+        raise ArchiveError(f"{name}: not a readable ZIP archive, or cut short ({error})") from error
+
+
 class Package(Closing):
     """An open package; members are views of the memory-mapped file, nothing is extracted or decompressed.
 
@@ -90,7 +104,7 @@ class Package(Closing):
     def __init__(self, path: Path) -> None:
         self.path = path
         self._spans: dict[str, tuple[int, int]] = {}
-        try:
+        with archive_errors(path):
             with path.open("rb") as file:
                 self._size = os.fstat(file.fileno()).st_size
                 if not 22 <= self._size <= MAX_PACKAGE_BYTES:
@@ -101,12 +115,6 @@ class Package(Closing):
                 with zipfile.ZipFile(file) as archive:
                     entries = archive.infolist()
                 self._bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        except TooMuchError as error:
-            raise ArchiveError(f"{path} {error}") from None
-        except OSError as error:
-            raise ArchiveError(f"{path}: cannot be opened ({error.strerror or error})") from error
-        except (zipfile.BadZipFile, NotImplementedError, struct.error, ValueError) as error:
-            raise ArchiveError(f"{path}: not a readable ZIP archive, or cut short ({error})") from error
         try:
             self._index(entries)
         except ArchiveError:

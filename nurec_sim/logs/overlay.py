@@ -12,7 +12,7 @@ from nurec_sim import geometry, sensors
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.checks.sampling import pose_at
 from nurec_sim.logs.clip import Clip
-from nurec_sim.types import CameraModel, Matrix4, Sweep, Track
+from nurec_sim.types import CameraModel, Matrix4, Sweep
 
 TILE_PX = 960
 COLUMNS = 3
@@ -46,7 +46,7 @@ def draw_overlay(clip: Clip, t_us: int) -> Image:
             f"clip {clip.id!r} lasts {(end_us - start_us) / 1e6:.3f} s; "
             f"there is nothing to draw {(t_us - start_us) / 1e6:.3f} s after its start"
         )
-    tiles = [_tile(clip, name, t_us) for name in clip.rig.cameras]
+    tiles = [draw_camera(clip, name, t_us) for name in clip.rig.cameras]
     columns = min(COLUMNS, int(np.ceil(np.sqrt(len(tiles)))))
     height = max(tile.shape[0] for tile in tiles)
     sheet = np.zeros((-(-len(tiles) // columns) * height, columns * TILE_PX, 3), np.uint8)
@@ -56,8 +56,8 @@ def draw_overlay(clip: Clip, t_us: int) -> Image:
     return sheet
 
 
-def _tile(clip: Clip, camera_id: str, t_us: int) -> Image:
-    """One camera's overlaid image below its caption, ``TILE_PX`` wide."""
+def draw_camera(clip: Clip, camera_id: str, t_us: int) -> Image:
+    """One camera's overlaid image below its caption, ``TILE_PX`` wide; see ``draw_overlay``."""
     import cv2
 
     camera = clip.rig.cameras[camera_id]
@@ -77,12 +77,12 @@ def _tile(clip: Clip, camera_id: str, t_us: int) -> Image:
     poses = clip.world_from_camera(camera_id, index)
     told = [f"{camera_id} frame {index}, {(times[index] - clip.span_us[0]) / 1e6:.3f} s"]
     for name, sweep in _sweeps(clip, times[index]):
-        _draw_points(image, shown, poses, sweep)
+        draw_points(image, shown, poses, sweep.xyz_world_m)
         told.append(f"{name} {(sweep.t_us - times[index]) / 1e3:+.0f} ms")
     for track in clip.tracks:
         world_from_box = pose_at(track, int(times[index]))
         if world_from_box is not None:
-            _draw_box(image, shown, poses, track, world_from_box)
+            draw_box(image, shown, poses, track.size_m, world_from_box)
     return _captioned(", ".join(told), image)
 
 
@@ -97,13 +97,21 @@ def _sweeps(clip: Clip, t_us: float) -> Iterator[tuple[str, Sweep]]:
                 continue
 
 
-def _draw_points(image: Image, camera: CameraModel, poses: Float64[np.ndarray, "2 4 4"], sweep: Sweep) -> None:
-    """Draws points as dots, farthest first, so that near ones cover them."""
-    points = sweep.xyz_world_m
-    uv, valid, _ = sensors.project_rolling(camera, poses, points)
+def draw_points(
+    image: Image, camera: CameraModel, poses: Float64[np.ndarray, "2 4 4"], xyz_world_m: Float64[np.ndarray, "n 3"]
+) -> None:
+    """Draws points into a camera's image as dots coloured by depth, farthest first, so that near ones cover them.
+
+    Args:
+        image: what is drawn into, of the camera's size.
+        camera: its lens and shutter.
+        poses: ``world_from_camera`` at the start and the end of the exposure.
+        xyz_world_m: the points.
+    """
+    uv, valid, _ = sensors.project_rolling(camera, poses, xyz_world_m)
     seen = np.flatnonzero(valid & sensors.in_image(camera, uv))
     # Depth at the start of the exposure is enough for a colour.
-    depth = geometry.transform_points(geometry.inverse(poses[0]), points[seen])[:, 2]
+    depth = geometry.transform_points(geometry.inverse(poses[0]), xyz_world_m[seen])[:, 2]
     order = np.argsort(-depth)
     columns, rows = np.floor(uv[seen[order]]).astype(np.int64).T
     rgb = depth_rgb(depth[order])
@@ -121,26 +129,50 @@ def depth_rgb(depth_m: Float64[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
     return np.ascontiguousarray(bgr[:, 0, ::-1])
 
 
-def _draw_box(
-    image: Image, camera: CameraModel, poses: Float64[np.ndarray, "2 4 4"], track: Track, world_from_box: Matrix4
+def draw_box(
+    image: Image,
+    camera: CameraModel,
+    poses: Float64[np.ndarray, "2 4 4"],
+    size_m: tuple[float, float, float],
+    world_from_box: Matrix4,
+    rgb: tuple[int, int, int] = BOX_RGB,
 ) -> None:
-    """Draws twelve edges and a cross on the front face, in short segments: lenses bend straight lines."""
-    import cv2
-
+    """Draws a box's twelve edges and a cross on its front face; arguments as those of ``draw_lines``."""
     front = [index for index, corner in enumerate(_CORNERS) if corner[0] > 0]
-    ends = _CORNERS[[*_EDGES, (front[0], front[3]), (front[1], front[2])]] * np.array(track.size_m)
+    ends = _CORNERS[[*_EDGES, (front[0], front[3]), (front[1], front[2])]] * np.array(size_m)
     share = np.linspace(0, 1, EDGE_STEPS + 1)[:, None]
     lines = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])
-    uv, valid, _ = sensors.project_rolling(
-        camera, poses, geometry.transform_points(world_from_box, lines.reshape(-1, 3))
-    )
-    seen = (valid & sensors.in_image(camera, uv)).reshape(len(lines), -1)
+    draw_lines(image, camera, poses, geometry.transform_points(world_from_box, lines), rgb)
+
+
+def draw_lines(
+    image: Image,
+    camera: CameraModel,
+    poses: Float64[np.ndarray, "2 4 4"],
+    lines_m: Float64[np.ndarray, "k s 3"],
+    rgb: tuple[int, int, int],
+    width_px: int = 1,
+) -> None:
+    """Draws polylines into a camera's image; lenses bend straight lines, so long ones need many points.
+
+    Args:
+        image: what is drawn into, of the camera's size.
+        camera: its lens and shutter.
+        poses: ``world_from_camera`` at the start and the end of the exposure.
+        lines_m: k lines of s points in the world.
+        rgb: their colour.
+        width_px: their width.
+    """
+    import cv2
+
+    uv, valid, _ = sensors.project_rolling(camera, poses, lines_m.reshape(-1, 3))
+    seen = (valid & sensors.in_image(camera, uv)).reshape(lines_m.shape[:2])
     # OpenCV counts pixel centres as whole numbers.
-    place = np.rint(np.where(seen[..., None], uv.reshape(len(lines), -1, 2), 0) - 0.5).astype(np.int64)
+    place = np.rint(np.where(seen[..., None], uv.reshape(*seen.shape, 2), 0) - 0.5).astype(np.int64)
     # Only segments with both ends in the image: a point behind the camera has no meaningful pixel.
     for line, step in zip(*np.nonzero(seen[:, 1:] & seen[:, :-1]), strict=True):
         one, two = place[line, step].tolist(), place[line, step + 1].tolist()
-        cv2.line(image, one, two, BOX_RGB, 1, cv2.LINE_AA)
+        cv2.line(image, one, two, rgb, width_px, cv2.LINE_AA)
 
 
 def _captioned(text: str, image: Image) -> Image:

@@ -9,6 +9,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "aggregate": ["rollout_values", "summarize"],
+        "agreement": ["compare_worlds", "holm", "noise_ceiling", "paired_means", "policy_differences"],
         "collision": ["Contact", "find_contacts"],
         "offroad": ["Agreement", "judge_footprints", "offroad_agreement"],
         "offroad_grid": ["GridSettings", "OffroadGrid", "build_offroad_grid", "scene_offroad_grid"],

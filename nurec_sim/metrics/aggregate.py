@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nurec_sim.metrics.agreement import percentile_interval, scene_draws
 from nurec_sim.metrics.collision import check_profile
 from nurec_sim.metrics.series import METRICS
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 CENSOR_M = 4.0
 MAX_UNKNOWN_FRAC = 0.2
 """Scenes with a larger fraction of unknown states are excluded from ``offroad`` for every policy."""
-BOOTSTRAP = 10_000
-CONFIDENCE = 0.95
 ROLLOUT_KEYS = (
     "clipgt_id", "world", "reconstruction", "policy", "trial", "seed", "rollout_id", "status", "error",
 )  # fmt: skip
@@ -39,10 +38,16 @@ DERIVED: dict[str, tuple[str, str]] = {
 """Rollout-level metrics in addition to ``METRICS``: unit and meaning."""
 
 
-def rollout_values(table: pl.DataFrame, profile: str = "strict") -> pl.DataFrame:
+def rollout_values(table: pl.DataFrame, profile: str = "strict", offroad: str = "offroad") -> pl.DataFrame:
     """One row per rollout and metric: ``ROLLOUT_KEYS``, ``name, unit, value`` (null if not valid), ``valid``.
 
     A failed rollout keeps its rows, with null values and its error.
+
+    Args:
+        table: of ``metric_table``.
+        profile: ``strict`` or ``alpasim``.
+        offroad: the series that decides ``offroad``: ``offroad`` (the road-class Gaussians) or ``offroad_true`` (the
+            log's map).
     """
     import polars as pl
 
@@ -54,6 +59,8 @@ def rollout_values(table: pl.DataFrame, profile: str = "strict") -> pl.DataFrame
             name[0]: (rows_["timestamps_us"].to_numpy(), rows_["values"].to_numpy(), rows_["valid"].to_numpy())
             for name, rows_ in part.partition_by("name", as_dict=True).items()
         }
+        if offroad in series:
+            series["offroad"] = series[offroad]
         values = _rollout_numbers(series, profile) if keys["status"] == "ok" else {}
         units = {name: metric.unit for name, metric in METRICS.items()} | {name: u for name, (u, _) in DERIVED.items()}
         for name, unit in units.items():
@@ -62,7 +69,8 @@ def rollout_values(table: pl.DataFrame, profile: str = "strict") -> pl.DataFrame
             rows.append({**keys, "name": name, "unit": unit, "value": float(value) if valid else None, "valid": valid})
     own = {"name": pl.String(), "unit": pl.String(), "value": pl.Float64(), "valid": pl.Boolean()}
     schema = pl.Schema({name: table.schema[name] for name in ROLLOUT_KEYS} | own)
-    return _without_unseen_scenes(pl.DataFrame(rows, schema=schema))
+    frame = pl.DataFrame(rows, schema=schema)
+    return _without_unseen_scenes(frame) if offroad == "offroad" else frame
 
 
 def summarize(values: pl.DataFrame, seed: int = 0) -> pl.DataFrame:
@@ -75,11 +83,7 @@ def summarize(values: pl.DataFrame, seed: int = 0) -> pl.DataFrame:
     import polars as pl
 
     scenes = sorted(values["clipgt_id"].unique().to_list())
-    # Resampling n scenes with replacement is multinomial: counts per scene instead of indices, so that one matrix
-    # product gives all resampled means. The scene is the unit because trials of one scene are not independent.
-    draws = np.random.default_rng(seed).multinomial(
-        len(scenes), np.full(len(scenes), 1 / max(len(scenes), 1)), BOOTSTRAP
-    )
+    draws = scene_draws(len(scenes), seed)
     rows = []
     for (world, reconstruction, policy, name), part in values.group_by(
         "world", "reconstruction", "policy", "name", maintain_order=True
@@ -119,8 +123,7 @@ def _interval(means: np.ndarray, draws: np.ndarray) -> tuple[float | None, float
     weight = draws[:, known]
     total = weight.sum(axis=1)
     drawn = (weight @ means[known])[total > 0] / total[total > 0]
-    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return float(low), float(high)
+    return percentile_interval(drawn)
 
 
 def _rollout_numbers(series: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]], profile: str) -> dict[str, float]:

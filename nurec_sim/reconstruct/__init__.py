@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from nurec_sim import plugins
 from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
@@ -107,14 +109,19 @@ def reconstruct(
         clip, settings, cameras=cameras, hold_out_sweeps=held, progress=lambda stage, done: report(stage, share * done)
     )
     scene = _with_provenance(scene, clip, made.name, chosen)
-    if refine is None:
-        return archived(scene)
-    from nurec_sim.reconstruct.optimize.method import refine as fit_to_log
+    if refine is not None:
+        from nurec_sim.reconstruct.optimize.method import refine as fit_to_log
 
-    used = list(scene.provenance["cameras"])
-    return archived(
-        fit_to_log(scene, clip, used, held, lambda stage, done: report(stage, share + (1 - share) * done), refine)
-    )
+        used = list(scene.provenance["cameras"])
+        scene = fit_to_log(
+            scene, clip, used, held, lambda stage, done: report(stage, share + (1 - share) * done), refine
+        )
+    # Surfaces that LiDAR gave their intensity are also told how often beams return from them.
+    if scene.static.ray_drop is None and np.isfinite(scene.static.intensity).any():
+        from nurec_sim.reconstruct.ray_drop import with_ray_drop
+
+        scene = with_ray_drop(scene, clip, held, lambda done: report("ray drop", 1.0))
+    return archived(scene)
 
 
 def _with_provenance(scene: GaussianScene, clip: Clip, method: str, cameras: list[str]) -> GaussianScene:

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from nurec_sim import geometry
-from nurec_sim.compute.cores import usable_cores
+from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.types import Clip, Gaussians, Sweep
 
@@ -110,19 +109,12 @@ def _beams(t_us, world_from_lidar, drift_m, along, fired) -> SweepBeams:
     return SweepBeams(t_us, world_from_lidar, drift_m, beams, image, low, width, mean[last])
 
 
-def chosen_sweeps(clip: Clip, hold_out: Collection[int]) -> list[tuple[str, int]]:
-    """LiDAR and index of the sweeps whose beams are used: ``MOST_SWEEPS`` at most, evenly, none of ``hold_out``."""
+def chosen_sweeps(clip: Clip, hold_out: Collection[int], most: int = MOST_SWEEPS) -> list[tuple[str, int]]:
+    """LiDAR and index of the sweeps whose beams are used: ``most`` at most, evenly, none of ``hold_out``."""
     every = [
         (lidar, i) for lidar in clip.rig.lidars for i in range(len(clip.sweep_times_us(lidar))) if i not in hold_out
     ]
-    return [
-        every[k] for k in np.unique(np.linspace(0, len(every) - 1, min(MOST_SWEEPS, len(every))).round().astype(int))
-    ]
-
-
-def recorded_beams(clip: Clip, hold_out: Collection[int]) -> list[SweepBeams]:
-    """Beams of the chosen sweeps of a log; empty without LiDAR."""
-    return [sweep_beams(clip, lidar, clip.sweep(lidar, i)) for lidar, i in chosen_sweeps(clip, hold_out)]
+    return [every[k] for k in np.unique(np.linspace(0, len(every) - 1, min(most, len(every))).round().astype(int))]
 
 
 def balls(xyz_m: Float64[np.ndarray, "n 3"], sigma_m: Float32[np.ndarray, " n"]) -> Gaussians:
@@ -139,21 +131,34 @@ def in_free_space(
     world_from_body: Callable[[int], Float64[np.ndarray, "4 4"] | None] = lambda t_us: np.eye(4),
     box_m: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Bool[np.ndarray, " n"]:
-    """Gaussians that more recorded beams passed through than ended at.
+    """Gaussians that at least ``VOTES`` recorded beams passed through, and more than ended there; see ``count_beams``.
+
+    What lies in the body's box stays: beams pass through the windows of a car and do not return from black paint.
+    """
+    return is_free(*count_beams(gaussians, sweeps, world_from_body, box_m))
+
+
+def is_free(passed: Int32[np.ndarray, " n"], stopped: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Whether the beams that passed and those that ended say that nothing is there."""
+    return (passed >= VOTES) & (passed > stopped)
+
+
+def count_beams(
+    gaussians: Gaussians,
+    sweeps: Sequence[SweepBeams],
+    world_from_body: Callable[[int], Float64[np.ndarray, "4 4"] | None] = lambda t_us: np.eye(4),
+    box_m: Sequence[float] = (0.0, 0.0, 0.0),
+) -> tuple[Int32[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
+    """How many recorded beams passed through each Gaussian, and how many ended at it; both up to about ``ENOUGH``.
 
     Args:
         gaussians: in the frame of a rigid body.
         sweeps: recorded beams.
         world_from_body: where the body is at a time in microseconds; None if unknown. The static world by default.
-        box_m: size of the body's box, if it has one. What lies in it stays: beams pass through the windows of a car and
-            do not return from black paint.
+        box_m: size of the body's box, if it has one; what lies in it is not tested.
     """
     tested = np.flatnonzero((np.abs(gaussians.mean_m) >= np.asarray(box_m) / 2).any(axis=1))
     passed, stopped = np.zeros(len(tested), np.int32), np.zeros(len(tested), np.int32)
-    xyz, quat = (values[tested].astype(np.float64) for values in (gaussians.mean_m, gaussians.quat_wxyz))
-    scale = np.maximum(gaussians.scale_m[tested].astype(np.float64), THINNEST_M)
-    canonical = np.ascontiguousarray(np.swapaxes(geometry.matrix_from_quat(quat), 1, 2) / scale[:, :, None])
-    reach = scale.max(axis=1, initial=0.0) * np.sqrt(MEETS)
     jobs = []
     # Sweeps far apart first: a few beams then show a Gaussian from different sides. The golden ratio spreads best.
     for k in np.argsort(np.arange(len(sweeps)) * 0.6180339887498949 % 1.0, kind="stable"):
@@ -165,14 +170,19 @@ def in_free_space(
 
     def count(start: int) -> None:
         part = slice(start, start + CHUNK)
+        mine = tested[part]
+        xyz, quat = (values[mine].astype(np.float64) for values in (gaussians.mean_m, gaussians.quat_wxyz))
+        scale = np.maximum(gaussians.scale_m[mine].astype(np.float64), THINNEST_M)
+        canonical = np.ascontiguousarray(np.swapaxes(geometry.matrix_from_quat(quat), 1, 2) / scale[:, :, None])
+        reach = scale.max(axis=1, initial=0.0) * np.sqrt(MEETS)
         for job in jobs:
-            _count(xyz[part], canonical[part], reach[part], *job, passed[part], stopped[part])
+            _count(xyz, canonical, reach, *job, passed[part], stopped[part])
 
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        list(pool.map(count, range(0, len(tested), CHUNK)))
-    free = np.zeros(len(gaussians), bool)
-    free[tested] = (passed >= VOTES) & (passed > stopped)
-    return free
+    for _ in in_order(count, range(0, len(tested), CHUNK)):
+        pass
+    counts = np.zeros((2, len(gaussians)), np.int32)
+    counts[:, tested] = passed, stopped
+    return counts[0], counts[1]
 
 
 @kernel

@@ -21,7 +21,7 @@ NEAR_M = 0.2
 
 @dataclass(frozen=True, eq=False)
 class RayGrid:
-    """Rays of a sensor in its own frame; those that are not valid point along z.
+    """Rays of a sensor in its own frame; a camera's that are not valid point along z.
 
     ``fraction`` is the place of each ray's instant in the exposure, 0 at its start and 1 at its end; ``reference``
     the fraction at which Gaussians are sorted, culled and, where they move, placed: the middle, or the one instant of
@@ -42,7 +42,7 @@ def ray_grid(sensor: CameraModel | LidarModel) -> RayGrid:
     if isinstance(sensor, LidarModel):
         direction = np.asarray(sensors.beam_directions(sensor), np.float64)
         fraction = np.broadcast_to(sensors.column_fraction(sensor), direction.shape[:2])
-        valid = np.ones(direction.shape[:2], bool)
+        valid = ~sensors.blocked_beams(sensor)
         return RayGrid(direction, valid, fraction, reference_fraction(fraction), True, max(NEAR_M, sensor.range_m[0]))
     direction, valid = sensors.pixel_rays(sensor)
     shared, by_column = line_fractions(sensor)

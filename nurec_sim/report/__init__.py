@@ -3,7 +3,7 @@
 ``render_report(RunReport) -> str`` is all of it; ``nurec_sim.runs`` gathers what goes in and writes the file.
 """
 
-from nurec_sim.report.data import ReportRollout, ReportScene, RunReport
+from nurec_sim.report.data import Comparison, ReportRollout, ReportScene, RunReport, Video
 from nurec_sim.report.page import render_report
 
-__all__ = ["ReportRollout", "ReportScene", "RunReport", "render_report"]
+__all__ = ["Comparison", "ReportRollout", "ReportScene", "RunReport", "Video", "render_report"]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nurec_sim.report.data import ReportRollout
-from nurec_sim.report.figure import ALARM, EGO, RECORDED, base_layout, plain, rounded
+from nurec_sim.report.data import Comparison, ReportRollout
+from nurec_sim.report.events import first_offroad_us
+from nurec_sim.report.figure import ALARM, EGO, RECORDED, base_layout, plain, rounded, world_colour
 from nurec_sim.types import Rollout, Series
 
 if TYPE_CHECKING:
@@ -16,20 +18,31 @@ if TYPE_CHECKING:
 CLASS_COLOURS = {"front": "#d55e00", "lateral": "#e69f00", "rear": "#0072b2"}  # Okabe-Ito palette, colour-blind safe
 
 
-def time_view(entry: ReportRollout) -> dict[str, Any]:
-    """Speed, acceleration, reach beyond the road and gap to the nearest actor over time."""
-    rollout = entry.rollout
+def time_view(group: Sequence[ReportRollout]) -> dict[str, Any]:
+    """Speed, acceleration, reach beyond the road and gap to the nearest actor over time.
+
+    Args:
+        group: one rollout, or the same one in several reconstructions.
+    """
+    rollout = max((entry.rollout for entry in group), key=lambda rollout: len(rollout.states))
     t_us = rollout.t_us
     zero_us = int(t_us[0])
     seconds = (t_us - zero_us) / 1e6
-    recorded_speed = _recorded_speed(rollout)
-    speed = np.array([state.speed_mps for state in rollout.states])
     rows: list[tuple[str, list[tuple[str, np.ndarray, str, str | None]]]] = [
-        ("speed, m/s", [("ego", speed, EGO, None), ("recorded", recorded_speed, RECORDED, "dash")]),
-        ("acceleration, m/s2", [("ego", np.array([s.accel_mps2 for s in rollout.states]), EGO, None)]),
-        ("beyond the road, m", [("ego", _values_of(entry.series.get("offroad_max_excursion_m")), EGO, None)]),
-        ("gap to actors, m", [("ego", _values_of(entry.series.get("min_distance_to_obstacle_m")), EGO, None)]),
+        ("speed, m/s", [("recorded", _recorded_speed(rollout), RECORDED, "dash")]),
+        ("acceleration, m/s2", []), ("beyond the road, m", []), ("gap to actors, m", []),
     ]  # fmt: skip
+    for place, entry in enumerate(group):
+        name = entry.rollout.reconstruction if len(group) > 1 else "ego"
+        colour = world_colour(place) if len(group) > 1 else EGO
+        states = entry.rollout.states
+        curves = (
+            np.array([state.speed_mps for state in states]), np.array([state.accel_mps2 for state in states]),
+            _values_of(entry.series.get("offroad_max_excursion_m")),
+            _values_of(entry.series.get("min_distance_to_obstacle_m")),
+        )  # fmt: skip
+        for (_, lines), values in zip(rows, curves, strict=True):
+            lines.append((name, values, colour, None))
     layout, data = base_layout(560), []
     layout["xaxis"] |= {
         "title": {"text": "seconds since the start"},
@@ -51,14 +64,52 @@ def time_view(entry: ReportRollout) -> dict[str, Any]:
         for name, values, colour, dash in lines:
             style = {"color": colour, "width": 2} | ({"dash": dash} if dash else {})
             data.append(
-                {"type": "scatter", "mode": "lines", "name": name, "x": rounded(seconds), "y": rounded(values),
-                 "xaxis": "x", "yaxis": axis, "line": style, "connectgaps": False}
+                {"type": "scatter", "mode": "lines", "name": name, "x": rounded(seconds[: len(values)]),
+                 "y": rounded(values), "xaxis": "x", "yaxis": axis, "line": style, "connectgaps": False}
             )  # fmt: skip
-    layout["shapes"] = _spans(entry, zero_us) + [
+    layout["shapes"] = (_spans(group[0], zero_us) if len(group) == 1 else []) + [
         {"type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1,
          "line": {"color": colour, "width": 1.5, "dash": dash}}
-        for at, colour, dash in _moments(entry, zero_us)
+        for at, colour, dash in _moments(group, zero_us)
     ]  # fmt: skip
+    return {"data": data, "layout": layout}
+
+
+BARS = {"collision_any": "Collision C", "offroad": "Off-road O", "scene_score": "Scene score"}
+
+
+def comparison_bars(comparison: Comparison, metric: str) -> dict[str, Any]:
+    """One metric of every policy as one bar per reconstruction, with intervals.
+
+    Args:
+        comparison: the comparison.
+        metric: a key of ``BARS``.
+    """
+    import polars as pl
+
+    layout, data = base_layout(0), []
+    table = comparison.summary.filter(pl.col("name") == metric)
+    policies = sorted(table["policy"].unique().to_list())
+    for place, world in enumerate(comparison.worlds):
+        rows = {row["policy"]: row for row in table.filter(reconstruction=world).iter_rows(named=True)}
+        cells = [rows[policy] for policy in policies]
+        percent = [
+            [None if cell[end] is None else 100 * cell[end] for cell in cells] for end in ("mean", "low", "high")
+        ]
+        means, low, high = (np.array(values, np.float64) for values in percent)
+        data.append(
+            {"type": "bar", "orientation": "h", "name": plain(world), "y": [plain(policy) for policy in policies],
+             "x": rounded(means), "marker": {"color": world_colour(place)},
+             "text": ["unknown" if np.isnan(mean) else f"{mean:.0f} %" for mean in means],
+             "textposition": "outside", "cliponaxis": False, "textfont": {"size": 10},
+             "error_x": {"type": "data", "array": rounded(high - means), "arrayminus": rounded(means - low),
+                         "visible": bool(np.isfinite(low).any()), "color": "#1e293b", "thickness": 1.2},
+             "hovertemplate": "%{y}: %{text}<extra>" + plain(world) + "</extra>"}
+        )  # fmt: skip
+    layout["height"] = 80 + (14 + 16 * len(comparison.worlds)) * len(policies)
+    layout |= {"barmode": "group", "bargap": 0.3, "showlegend": False}
+    layout["xaxis"] |= {"range": [0, 118], "ticksuffix": " %", "nticks": 4}
+    layout["yaxis"] |= {"autorange": "reversed", "automargin": True}
     return {"data": data, "layout": layout}
 
 
@@ -110,10 +161,14 @@ def _recorded_speed(rollout: Rollout) -> np.ndarray:
     return np.where(t_us <= recorded.end_us, np.interp(t_us, middle, steps), np.nan)
 
 
-def _moments(entry: ReportRollout, zero_us: int) -> list[tuple[float, str, str]]:
-    """Vertical lines: take-over, contacts."""
-    lines = [((entry.rollout.first_closed_loop_us - zero_us) / 1e6, "#64748b", "dot")]
-    lines += [((contact.t_us - zero_us) / 1e6, ALARM, "solid") for contact in entry.contacts]
+def _moments(group: Sequence[ReportRollout], zero_us: int) -> list[tuple[float, str, str]]:
+    """Vertical lines: take-over, contacts, and where reconstructions are compared also the first off-road state."""
+    lines = [((group[0].rollout.first_closed_loop_us - zero_us) / 1e6, "#64748b", "dot")]
+    for place, entry in enumerate(group):
+        colour = world_colour(place) if len(group) > 1 else ALARM
+        times = [contact.t_us for contact in entry.contacts]
+        times += [t for t in (first_offroad_us(entry),) if t is not None and len(group) > 1]
+        lines += [((t_us - zero_us) / 1e6, colour, "solid") for t_us in times]
     return [(round(at, 3), colour, dash) for at, colour, dash in lines if at > 0]
 
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 EGO, RECORDED, ACTOR, PARKED, ALARM = "#1d4ed8", "#475569", "#b45309", "#94a3b8", "#dc2626"
+WORLD_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+"""Colours of compared reconstructions: the Okabe-Ito palette, safe for the colour-blind."""
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": "#1e293b"}
 
 
@@ -20,6 +22,11 @@ def base_layout(height: int) -> dict[str, Any]:
         "plot_bgcolor": "#ffffff", "hovermode": "closest", "xaxis": dict(axis), "yaxis": dict(axis),
         "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0, "font": {"size": 11}},
     }  # fmt: skip
+
+
+def world_colour(place: int) -> str:
+    """Colour of a reconstruction by its place in the comparison."""
+    return WORLD_COLOURS[place % len(WORLD_COLOURS)]
 
 
 def plain(text: str) -> str:

@@ -11,8 +11,10 @@ from nurec_sim.metrics.aggregate import CENSOR_M, DERIVED, MAX_UNKNOWN_FRAC
 from nurec_sim.metrics.collision import AT_FAULT_RULE
 from nurec_sim.metrics.series import METRICS
 from nurec_sim.report.cells import by_policy, count_of, escape, fact_list, full_name, list_items, meaning, summary_cell
-from nurec_sim.report.charts import collision_bars, time_view
+from nurec_sim.report.charts import BARS, collision_bars, comparison_bars, time_view
+from nurec_sim.report.comparison_sections import fidelity, rank_agreement, trust, what_differs
 from nurec_sim.report.data import ReportScene, RunReport
+from nurec_sim.report.events import grouped
 from nurec_sim.report.plan import PlanAxes, plan_view
 from nurec_sim.report.rollout_card import rollout_card
 from nurec_sim.report.template import SCRIPT, STYLE
@@ -37,32 +39,45 @@ def render_report(report: RunReport) -> str:
 
     figures: dict[str, object] = {"collisions": collision_bars(report.summary)}
     images: dict[str, object] = {}
-    embed = sum(e.video.stat().st_size for e in report.rollouts if e.video is not None) < MAX_EMBEDDED_BYTES
+    comparison = report.comparison
+    worlds = comparison.worlds if comparison is not None else ()
+    groups = grouped(report.rollouts, worlds)
+    embed = _video_bytes(report) < MAX_EMBEDDED_BYTES
     scenes = {(scene.id, scene.reconstruction): scene for scene in report.scenes}
     views: dict[tuple[str, str], PlanAxes] = {}
     cards = []
-    for index, entry in enumerate(report.rollouts):
-        key = (entry.rollout.scene_id, entry.rollout.reconstruction)
+    for index, group in enumerate(groups):
+        first = group[0].rollout
+        key = (first.scene_id, first.reconstruction)
         scene = scenes.get(key, ReportScene(*key))
-        if entry.rollout.states:
-            view = views.setdefault(key, PlanAxes(entry.rollout.recorded))
+        if any(entry.rollout.states for entry in group):
+            view = views.setdefault(key, PlanAxes(first.recorded))
             image_key = "/".join(key) if scene.grid is not None else None
             if scene.grid is not None and image_key not in images:
                 images["/".join(key)] = view.grid_image(scene.grid)
-            figures[f"plan{index}"] = plan_view(entry, view, image_key, scene.road_map)
-            figures[f"time{index}"] = time_view(entry)
-        cards.append(rollout_card(index, entry, report, embed))
+            driven = [entry for entry in group if entry.rollout.states]
+            figures[f"plan{index}"] = plan_view(driven, view, image_key, scene.road_map)
+            figures[f"time{index}"] = time_view(driven)
+        cards.append(rollout_card(index, group, scene, report, embed))
+    opening = []
+    if comparison is not None:
+        figures |= {f"bars-{metric}": comparison_bars(comparison, metric) for metric in BARS}
+        opening = [
+            what_differs(report, comparison, groups), rank_agreement(comparison), fidelity(report.scenes, worlds)
+        ]  # fmt: skip
+    rollouts = [
+        "<h2>Rollouts</h2>",
+        f'<p class="soft">{"The most different" if comparison else "The worst"} first. Click one to open it. In top '
+        "views the recorded drive goes to the right.</p>",
+        *cards,
+        trust(report.rollouts, worlds or sorted({entry.rollout.reconstruction for entry in report.rollouts})),
+    ]
+    tables = [_headline(report), _collisions(), _unknown(report), _failures(report)]
     stored = json.dumps({"figures": figures, "images": images}, separators=(",", ":"), allow_nan=False)
     stored = stored.replace("<", "\\u003c")  # so that no text can close the script element
     body = [
         _header(report),
-        _headline(report),
-        _collisions(),
-        _unknown(report),
-        _failures(report),
-        "<h2>Rollouts</h2>",
-        '<p class="soft">Click a rollout to open it. In top views the recorded drive goes to the right.</p>',
-        *cards,
+        *(opening + rollouts + tables if comparison is not None else tables + rollouts),
         _all_metrics(report.summary),
         _reconstructions(report.scenes),
         _definitions(report),
@@ -76,6 +91,14 @@ def render_report(report: RunReport) -> str:
         + f'\n</main><script type="application/json" id="figures">{stored}</script>\n'
         f"<script>{get_plotlyjs()}</script>\n<script>{SCRIPT}</script></body></html>\n"
     )
+
+
+def _video_bytes(report: RunReport) -> int:
+    """Bytes of all videos; those of a recorded drive appear once per policy and seed."""
+    policies = max(1, len({(entry.rollout.policy, entry.rollout.seed) for entry in report.rollouts}))
+    recorded = {video.path for scene in report.scenes for video in scene.recorded}
+    own = sum(video.path.stat().st_size for entry in report.rollouts for video in entry.videos)
+    return own + policies * sum(path.stat().st_size for path in recorded)
 
 
 def _header(report: RunReport) -> str:
@@ -101,6 +124,7 @@ def _headline(report: RunReport) -> str:
         f'<th class="n" title="{escape(meaning(name))}">{escape(text)}</th>' for name, text in HEADLINE.items()
     )
     many = report.summary["reconstruction"].n_unique() > 1
+    title = "Headline" if report.comparison is None else "Headline, each by its own road"
     rows = []
     for (reconstruction, policy), cells in by_policy(report.summary):
         first = next(iter(cells.values()))
@@ -115,7 +139,7 @@ def _headline(report: RunReport) -> str:
         else "Brackets: 95 % bootstrap interval over scenes, with the same resamples for every policy."
     )
     return (
-        '<h2>Headline</h2><div class="card scroll"><table><thead><tr><th>Policy</th><th class="n">Rollouts</th>'
+        f'<h2>{title}</h2><div class="card scroll"><table><thead><tr><th>Policy</th><th class="n">Rollouts</th>'
         f"{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
         f'<p class="key">Below each value: rollouts with a known value, of all. {interval} '
         "A value that cannot be computed is <i>unknown</i>, never 0. A rollout is evaluated up to its first "

@@ -15,7 +15,19 @@ from nurec_sim import geometry
 from nurec_sim.metrics.boxes import BoxPath, actor_boxes, ego_boxes
 from nurec_sim.metrics.offroad_grid import Cell, OffroadGrid
 from nurec_sim.report.data import ReportRollout
-from nurec_sim.report.figure import ACTOR, ALARM, EGO, PARKED, RECORDED, base_layout, line_trace, plain, rounded
+from nurec_sim.report.events import first_offroad_us
+from nurec_sim.report.figure import (
+    ACTOR,
+    ALARM,
+    EGO,
+    PARKED,
+    RECORDED,
+    base_layout,
+    line_trace,
+    plain,
+    rounded,
+    world_colour,
+)
 from nurec_sim.types import RoadMap, Trajectory
 
 CELL_COLOURS = {Cell.ROAD: (203, 213, 225), Cell.NONROAD: (240, 226, 205), Cell.UNKNOWN: (255, 255, 255)}
@@ -64,17 +76,20 @@ class PlanAxes:
         }  # fmt: skip
 
 
-def plan_view(entry: ReportRollout, view: PlanAxes, image_key: str | None, road_map: RoadMap | None) -> dict[str, Any]:
+def plan_view(
+    group: Sequence[ReportRollout], view: PlanAxes, image_key: str | None, road_map: RoadMap | None
+) -> dict[str, Any]:
     """Road grid, recorded and driven path, ego and actor boxes every second, events, as a plotly figure.
 
     Args:
-        entry: the rollout with its metrics and contacts.
+        group: one rollout, or the same one in several reconstructions, which share actors and recorded path.
         view: axes of the recorded drive.
         image_key: key of the shared image of the road grid; None without a grid.
         road_map: the true map; its road edges are added if given.
     """
-    rollout = entry.rollout
-    ego, boxes = ego_boxes(rollout), actor_boxes(rollout)
+    entry = max(group, key=lambda entry: len(entry.rollout.states))
+    rollout, alone = entry.rollout, len(group) == 1
+    boxes = actor_boxes(rollout)
     data: list[dict[str, Any]] = []
     if image_key is not None:
         for cell, name in ((Cell.ROAD, "road"), (Cell.NONROAD, "not road"), (Cell.UNKNOWN, "unknown")):
@@ -98,9 +113,17 @@ def plan_view(entry: ReportRollout, view: PlanAxes, image_key: str | None, road_
     data.append(_outlines("moving actors, each second", moving, ACTOR, width=1))
     line = view.points(rollout.recorded.position_m)
     data.append(line_trace("recorded path", line, RECORDED, dash="dash", width=1.5))
-    data.append(line_trace("driven path", view.points(rollout.world_from_rig[:, :2, 3]), EGO, width=2.5))
-    data.append(_outlines("ego, each second", [_outline(view, ego, index) for index in seconds], EGO, width=1))
-    moment, marks = _first_event(entry), _event_marks(entry, view)
+    now, marks = [], []
+    for place, each in enumerate(group):
+        ego, driven = ego_boxes(each.rollout), view.points(each.rollout.world_from_rig[:, :2, 3])
+        colour = EGO if alone else world_colour(place)
+        name = "driven path" if alone else f"driven in {each.rollout.reconstruction}"
+        data.append(line_trace(name, driven, colour, width=2.5))
+        outlines = [_outline(view, ego, index) for index in seconds if index < len(driven)]
+        data.append(_outlines("ego, each second", outlines, colour, width=1))
+        now.append({"colour": colour, "x": rounded(driven[:, 0]), "y": rounded(driven[:, 1])})
+        marks += _event_marks(each, view, "" if alone else f"{each.rollout.reconstruction}: ")
+    moment = _first_event(entry) if alone else None
     if moment is not None:
         hit = [_outline(view, box, moment) for box in movers if box.present[moment]]
         data.append(_outlines("moving actors at the first event", hit, ACTOR, width=2, fill="rgba(180,83,9,0.25)"))
@@ -109,7 +132,7 @@ def plan_view(entry: ReportRollout, view: PlanAxes, image_key: str | None, road_
         )
     data += marks
     traces = [trace for trace in data if trace["x"]]
-    reach = np.vstack([view.points(rollout.world_from_rig[:, :2, 3]), line])
+    reach = np.vstack([*(view.points(each.rollout.world_from_rig[:, :2, 3]) for each in group), line])
     low, high = reach.min(axis=0) - 10, reach.max(axis=0) + 10
     layout = base_layout(460)
     layout["xaxis"] |= {"title": {"text": "metres along the recorded drive"}, "range": rounded([low[0], high[0]])}
@@ -117,7 +140,7 @@ def plan_view(entry: ReportRollout, view: PlanAxes, image_key: str | None, road_
     layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
     if image_key is not None:
         layout["images"] = [{"image_key": image_key}]
-    return {"data": traces, "layout": layout}
+    return {"data": traces, "layout": layout, "now": now}
 
 
 def _outlines(
@@ -150,23 +173,22 @@ def _first_event(entry: ReportRollout) -> int | None:
     return min(found) if found else None
 
 
-def _event_marks(entry: ReportRollout, view: PlanAxes) -> list[dict[str, Any]]:
+def _event_marks(entry: ReportRollout, view: PlanAxes, prefix: str) -> list[dict[str, Any]]:
     rollout = entry.rollout
     marks: list[tuple[int, str, str, str]] = [
         (contact.t_us, f"{contact.side} contact with {contact.actor}", ALARM, "x") for contact in entry.contacts
     ]
-    offroad = entry.series.get("offroad")
-    if offroad is not None and (hits := np.flatnonzero(offroad.valid & (offroad.values > 0.5))).size:
-        marks.append((int(offroad.t_us[hits[0]]), "off-road", "#c026d3", "triangle-up"))
+    if (left_us := first_offroad_us(entry)) is not None:
+        marks.append((left_us, "off-road", "#c026d3", "triangle-up"))
     marks += [(event.t_us, f"{event.kind}: {event.text}"[:120], "#334155", "diamond") for event in rollout.events]
     traces = []
     for t_us, text, colour, symbol in marks:
         place = view.points(geometry.interpolate_poses(rollout.t_us, rollout.world_from_rig, t_us)[None, :2, 3])[0]
         at_s = (t_us - rollout.states[0].t_us) / 1e6
         traces.append(
-            {"type": "scatter", "mode": "markers", "name": plain(text[:40]),
+            {"type": "scatter", "mode": "markers", "name": plain((prefix + text)[:40]),
              "x": rounded(place[:1]), "y": rounded(place[1:]),
              "marker": {"color": colour, "symbol": symbol, "size": 11, "line": {"color": "#ffffff", "width": 1}},
-             "text": [plain(f"{at_s:.1f} s: {text}")], "hoverinfo": "text"}
+             "text": [plain(f"{at_s:.1f} s: {prefix}{text}")], "hoverinfo": "text"}
         )  # fmt: skip
     return traces

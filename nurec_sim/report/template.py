@@ -33,6 +33,18 @@ dl { display:grid; grid-template-columns:max-content 1fr; gap:3px 16px; margin:8
 dd { margin:0; overflow-wrap:anywhere; }
 .columns { columns:2; column-gap:28px; } .columns table { break-inside:avoid; }
 .key { font-size:13px; color:var(--soft); margin:4px 0 0; }
+.dot { display:inline-block; width:10px; height:10px; border-radius:50%; margin-right:5px; }
+.world { display:inline-block; margin-left:10px; font-weight:400; }
+.videos { display:grid; grid-template-columns:repeat(auto-fit,minmax(min(280px,45%),1fr)); gap:10px; margin-top:12px; }
+.panels { display:grid; grid-template-columns:repeat(auto-fit,minmax(min(320px,100%),1fr)); gap:4px 14px; }
+.panels > div, .pair > div { min-width:0; } .panels h3 { margin:10px 0 0; }
+.videos .name { font-weight:600; font-size:13px; margin-bottom:3px; } .videos video { margin-bottom:6px; }
+.player { display:flex; gap:10px; align-items:center; margin:8px 0; } .player input { flex:1; }
+.player button { border:1px solid var(--line); background:#fff; border-radius:6px; padding:4px 12px; cursor:pointer; }
+.player output { width:4.5em; text-align:right; font-variant-numeric:tabular-nums; }
+.curves { position:relative; } .cursor { position:absolute; top:24px; bottom:42px; width:0; display:none;
+  border-left:2px solid #0f172a; pointer-events:none; }
+a { color:#1d4ed8; } .card h3:first-child { margin-top:0; }
 @media (max-width:900px) { .pair { grid-template-columns:minmax(0,1fr); } .columns { columns:1; }
   main { padding:14px 10px 40px; } }
 @media print { details.card { break-inside:avoid; } }
@@ -51,15 +63,91 @@ SCRIPT = """
         sizing: 'stretch', layer: 'below'}, stored);
     });
     if (element.clientWidth < 560) figure.layout.showlegend = false;
+    if (figure.now) {
+      const cars = figure.now.map(function (car) { return car.colour; });
+      figure.data.push({type: 'scatter', mode: 'markers', name: 'now', x: [], y: [], hoverinfo: 'skip',
+        showlegend: false, marker: {size: 13, color: cars, line: {color: '#0f172a', width: 2}}});
+    }
     Plotly.newPlot(element, figure.data, figure.layout, {responsive: true, displayModeBar: false});
   }
   function drawInside(root) { root.querySelectorAll('.plot').forEach(draw); }
+  // One time for a card: its videos, the cursor over its curves, and the cars in its top view.
+  function wire(card) {
+    const bar = card.querySelector('.player input');
+    if (!bar) return;
+    const button = card.querySelector('.player button'), clock = card.querySelector('.player output');
+    const videos = Array.from(card.querySelectorAll('video')), cursor = card.querySelector('.cursor');
+    const last = parseFloat(bar.max);
+    let now = 0, playing = false, before = 0;
+    function show(seek) {
+      bar.value = now;
+      clock.textContent = now.toFixed(1) + ' s';
+      videos.forEach(function (video) {
+        if (seek || Math.abs(video.currentTime - now) > 0.15) video.currentTime = Math.min(now, video.duration || now);
+      });
+      const curves = card.querySelector('.curves .plot'), plan = card.querySelector('.plot[id^=plan]');
+      if (curves && curves._fullLayout && curves._fullLayout.xaxis) {
+        const axis = curves._fullLayout.xaxis;
+        cursor.style.display = 'block';
+        cursor.style.left = (axis._offset + axis.l2p(now)) + 'px';
+      }
+      const cars = plan && store.figures[plan.id].now;
+      if (cars && plan._fullLayout) {
+        const index = cars.map(function (car) { return Math.min(Math.round(now * 10), car.x.length - 1); });
+        const xs = [cars.map(function (car, k) { return car.x[index[k]]; })];
+        const ys = [cars.map(function (car, k) { return car.y[index[k]]; })];
+        Plotly.restyle(plan, {x: xs, y: ys}, [plan.data.length - 1]);
+      }
+    }
+    function go(time) { now = Math.max(0, Math.min(last, time)); show(true); }
+    function play(wanted) {
+      playing = wanted;
+      button.innerHTML = playing ? '&#10074;&#10074;' : '&#9654;';
+      videos.forEach(function (video) { if (playing) video.play().catch(function () {}); else video.pause(); });
+      before = performance.now();
+      if (playing) requestAnimationFrame(tick);
+    }
+    let shown = 0;
+    function tick(at) {
+      if (!playing) return;
+      now += Math.max(0, at - before) / 1000;
+      before = at;
+      if (now >= last) { play(false); now = last; }
+      if (at - shown > 90 || !playing) { shown = at; show(false); }
+      if (playing) requestAnimationFrame(tick);
+    }
+    button.addEventListener('click', function () { if (!playing && now >= last) go(0); play(!playing); });
+    bar.addEventListener('input', function () { play(false); go(parseFloat(bar.value)); });
+    card.querySelectorAll('a.seek').forEach(function (link) {
+      link.addEventListener('click', function (event) {
+        event.preventDefault(); play(false); go(parseFloat(link.dataset.t));
+        (card.querySelector('.videos') || bar).scrollIntoView({block: 'nearest', behavior: 'smooth'});
+      });
+    });
+    const curves = card.querySelector('.curves .plot');
+    if (curves && curves.on) curves.on('plotly_click', function (event) { play(false); go(event.points[0].x); });
+    videos.forEach(function (video) { video.addEventListener('loadedmetadata', function () { show(true); }); });
+    window.addEventListener('resize', function () { show(false); });
+    const first = card.querySelector('a.seek'), apart = parseFloat(card.querySelector('.player').dataset.start);
+    go(apart || (first ? parseFloat(first.dataset.t) : 0));
+  }
+  function openCard(card) {
+    drawInside(card);
+    if (card.classList.contains('rollout') && !card.dataset.wired) { card.dataset.wired = '1'; wire(card); }
+  }
+  document.querySelectorAll('a.jump').forEach(function (link) {
+    link.addEventListener('click', function () {
+      const card = document.querySelector(link.getAttribute('href'));
+      if (card) card.open = true;
+    });
+  });
   document.querySelectorAll('details').forEach(function (details) {
-    details.addEventListener('toggle', function () { if (details.open) drawInside(details); });
+    details.addEventListener('toggle', function () { if (details.open) openCard(details); });
   });
   document.querySelectorAll('.plot').forEach(function (element) {
     const closed = element.closest('details:not([open])');
     if (!closed) draw(element);
   });
+  document.querySelectorAll('details[open]').forEach(openCard);
 })();
 """

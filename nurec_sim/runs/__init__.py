@@ -12,6 +12,8 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "policies": ["load_policies"],
         "results": ["headline", "write_report"],
         "rollout_file": ["load_rollout", "save_rollout"],
+        "scene_file": ["reconstruction_of"],
+        "sources": ["load_all", "offer_all"],
         "truth": ["true_world"],
         "video": ["record_video"],
     },

@@ -5,27 +5,25 @@ from __future__ import annotations
 import datetime
 import json
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 import nurec_sim
-from nurec_sim.errors import NurecSimError, RunError, ScenarioError, WriteError
-from nurec_sim.files.new_files import writing
+from nurec_sim.errors import RunError, ScenarioError
 from nurec_sim.runs import folder as layout
 from nurec_sim.runs.policies import LoadedPolicy, load_policies
+from nurec_sim.runs.recording import Recorder, record_recording
 from nurec_sim.runs.results import write_report
 from nurec_sim.runs.rollout_file import load_rollout, save_rollout
-from nurec_sim.runs.scene_file import SceneRecord, record_scene, save_scene_record
-from nurec_sim.runs.video import record_video
+from nurec_sim.runs.scene_file import SceneRecord, reconstruction_of, record_scene, save_scene_record
 from nurec_sim.sim import Scenario, run_rollout
-from nurec_sim.sim.actors import Actors
 from nurec_sim.sim.policy_host import PLAN_TIMEOUT_S
-from nurec_sim.sim.policy_sensors import find_camera
-from nurec_sim.types import GaussianScene, Policy, Rollout, Sense
+from nurec_sim.types import Clip, GaussianScene, Policy, Rollout, Sense
 
 Progress = Callable[[str, float], None]
 Notice = Callable[[str], None]
@@ -43,6 +41,8 @@ class _Job:
     seed: int
     scenario: Scenario
     target: Path
+    compared: bool
+    """Whether the run has other reconstructions of the same log."""
 
     @property
     def scenario_text(self) -> str:
@@ -88,9 +88,11 @@ def execute(
     scenes: Sequence[GaussianScene],
     scenario: Scenario,
     policies: Sequence[str | Policy | LoadedPolicy],
-    sense_for: Callable[[str], Sense],
+    sense_for: Callable[[GaussianScene], Sense],
     out_dir: Path | str,
     *,
+    logs: Mapping[str, Clip] | None = None,
+    fidelity: Mapping[tuple[str, str], Mapping[str, Any]] | None = None,
     seeds: Sequence[int] | None = None,
     resume: Path | str | None = None,
     video: bool = True,
@@ -106,11 +108,14 @@ def execute(
     damaged, or belong to another scenario or scene.
 
     Args:
-        scenes: the scenes.
+        scenes: the scenes. Several of one id are reconstructions of one log, to be compared with the first; they should
+            have the same facts (``common_truth.with_common_truth``).
         scenario: the scenario.
         policies: references for ``plugins.load_policy``, policies, or results of ``load_policies``.
-        sense_for: scene id -> the renderer of that scene; called once per scene, on first use.
+        sense_for: scene -> its renderer; called once per scene, on first use.
         out_dir: parent folder of run folders.
+        logs: logs by scene id, for videos of what was recorded beside those of reconstructions.
+        fidelity: results of ``evaluate.measure_fidelity`` by scene id and reconstruction, for the report.
         seeds: default: those of the scenario.
         resume: run folder to resume.
         video: also record the front camera of every rollout.
@@ -139,8 +144,12 @@ def execute(
             run = layout.existing_run_folder(Path(resume))
         with layout.owned(run):
             layout.point_latest(run)
-            jobs = _jobs(run, scenes, scenario, loaded, seeds, say)
+            jobs = _jobs(run, scenes, scenario, loaded, seeds, fidelity or {}, say)
             _drive_all(jobs, sense_for, video, say, tell)
+            if video:
+                for job in {job.scene.id: job for job in jobs if job.compared}.values():
+                    if (clip := (logs or {}).get(job.scene.id)) is not None:
+                        record_recording(clip, job.scene, scenario, job.target.parents[2])
             say("scoring", 0.95)
             write_report(run, progress=lambda stage, share: say(stage, 0.95 + 0.05 * share))
     finally:
@@ -153,51 +162,57 @@ def execute(
 
 def _jobs(
     run: Path, scenes: Sequence[GaussianScene], scenario: Scenario, policies: Sequence[LoadedPolicy],
-    seeds: Sequence[int], say: Progress,
+    seeds: Sequence[int], fidelity: Mapping[tuple[str, str], Mapping[str, Any]], say: Progress,
 ) -> list[_Job]:  # fmt: skip
     """All rollouts of the run; also writes the scene records."""
     jobs = []
     for index, scene in enumerate(scenes):
         say(f"reading the road of {scene.id}", 0.05 * index / len(scenes))
-        record = record_scene(scene)
+        ids = [other.id for other in scenes]
+        record = record_scene(scene, fidelity.get((scene.id, reconstruction_of(scene))), ids[:index].count(scene.id))
         save_scene_record(record, layout.scene_folder(run, record.id, record.reconstruction))
         for policy in policies:
             for seed in seeds:
                 target = layout.rollout_folder(run, scene.id, record.reconstruction, policy.name, seed)
-                jobs.append(_Job(scene, record, policy, seed, scenario, target))
+                jobs.append(_Job(scene, record, policy, seed, scenario, target, compared=ids.count(scene.id) > 1))
     return jobs
 
 
 def _drive_all(
-    jobs: Sequence[_Job], sense_for: Callable[[str], Sense], video: bool, say: Progress, tell: Notice
+    jobs: Sequence[_Job], sense_for: Callable[[GaussianScene], Sense], video: bool, say: Progress, tell: Notice
 ) -> None:
     """Runs all unfinished rollouts."""
-    senses: dict[str, Sense] = {}
+    senses: dict[tuple[str, str], Sense] = {}
     for index, job in enumerate(jobs):
 
         def advance(share: float, job: _Job = job, index: int = index) -> None:
             done = min(0.05 + 0.9 * (index + share) / len(jobs), 0.95)
-            say(f"{job.policy.name} in {job.scene.id}, seed {job.seed}", done)
+            where = f"{job.scene.id} ({job.record.reconstruction})" if job.compared else job.scene.id
+            say(f"{job.policy.name} in {where}, seed {job.seed}", done)
 
         advance(0.0)
         wants_video = video and bool(job.scene.rig.cameras)
         done = job.finished(tell)
         if done is not None and (not wants_video or (job.target / layout.VIDEO).exists()):
             continue
-        if job.scene.id not in senses:
-            senses[job.scene.id] = sense_for(job.scene.id)
-        rollout = _drive(job, senses[job.scene.id], wants_video, done, advance)
+        key = job.scene.id, job.record.reconstruction
+        if key not in senses:
+            senses[key] = sense_for(job.scene)
+        rollout = _drive(job, senses[key], wants_video, done, advance)
         if rollout.status != "ok":
             tell(f"{job.title} failed: {rollout.error}")
 
 
 def _drive(job: _Job, sense: Sense, video: bool, driven: Rollout | None, advance: Callable[[float], None]) -> Rollout:
     """Runs one job (or only renders its missing video) and moves its folder into place."""
-    rollout = driven
+    rollout, recorder = driven, None
+    if video:
+        needs = job.policy.host.needs
+        recorder = Recorder(job.scene, job.scenario, needs, job.record.grid, with_lidar=job.compared)
     if rollout is None:
         rollout = run_rollout(
             job.scenario, job.policy.host, sense, job.scene, reconstruction=job.record.reconstruction, seed=job.seed,
-            progress=lambda share: advance(share * (DRIVING_SHARE if video else 1.0)),
+            progress=lambda share: advance(share * (DRIVING_SHARE if video else 1.0)), on_frames=recorder,
         )  # fmt: skip
     with layout.written_at_once(job.target) as part:
         save_rollout(rollout, part / layout.ROLLOUT)
@@ -205,37 +220,15 @@ def _drive(job: _Job, sense: Sense, video: bool, driven: Rollout | None, advance
         (part / layout.VERSIONS).write_text(job.versions_text, encoding="utf-8")
         if rollout.status != "ok":
             (part / layout.ERROR).write_text(rollout.error + "\n", encoding="utf-8")
-        elif video:
-            _record(job, rollout, sense, part, lambda share: advance(DRIVING_SHARE + share * (1 - DRIVING_SHARE)))
+        elif recorder is not None:
+            recorder.write(rollout, sense, part, lambda share: advance(DRIVING_SHARE + share * (1 - DRIVING_SHARE)))
     return rollout
-
-
-def _record(job: _Job, rollout: Rollout, sense: Sense, part: Path, advance: Callable[[float], None]) -> None:
-    """Records the front camera; a renderer failure does not fail the rollout."""
-    try:
-        camera = find_camera(job.scene.rig, "front")
-        actors = Actors(job.scene.tracks, job.scenario.actors)
-        with writing(part / layout.VIDEO):
-            record_video(
-                rollout,
-                sense,
-                camera,
-                part / layout.VIDEO,
-                grid=job.record.grid,
-                overrides=actors.overrides,
-                progress=advance,
-            )
-    except WriteError:
-        raise
-    except NurecSimError as error:
-        (part / layout.VIDEO).unlink(missing_ok=True)
-        (part / layout.VIDEO_ERROR).write_text(f"{error}\n", encoding="utf-8")
 
 
 def _check_scenes(scenes: Sequence[GaussianScene]) -> None:
     if not scenes:
         raise ScenarioError("no scene to run in")
-    names = [layout.folder_name(scene.id) for scene in scenes]
-    twice = sorted({name for name in names if names.count(name) > 1})
+    names = [(layout.folder_name(scene.id), layout.folder_name(reconstruction_of(scene))) for scene in scenes]
+    twice = sorted({"/".join(name) for name in names if names.count(name) > 1})
     if twice:
-        raise ScenarioError(f"scene ids must be unique; repeated: {twice}")
+        raise ScenarioError(f"scenes of one id need reconstruction names of their own; repeated: {twice}")

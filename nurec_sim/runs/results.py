@@ -12,8 +12,9 @@ from nurec_sim.metrics.aggregate import rollout_values, summarize
 from nurec_sim.metrics.collision import find_contacts
 from nurec_sim.metrics.score import score_rollout
 from nurec_sim.metrics.table import metric_table, read_table, write_table
-from nurec_sim.report import ReportRollout, ReportScene, RunReport, render_report
+from nurec_sim.report import ReportRollout, ReportScene, RunReport, Video, render_report
 from nurec_sim.runs import folder as layout
+from nurec_sim.runs.compared import compare_reconstructions
 from nurec_sim.runs.rollout_file import load_rollout
 from nurec_sim.runs.scene_file import SceneRecord, load_scene_record
 from nurec_sim.types import Rollout, Series
@@ -36,7 +37,7 @@ def write_report(run: Path | str, progress: Callable[[str, float], None] | None 
     if not places:
         raise RunError(f"run folder {run} has no rollout")
     records = {place: load_scene_record(place) for place in layout.scene_folders(run)}
-    scored, entries = [], []
+    scored = []
     for index, place in enumerate(places):
         say("scoring", 0.6 * index / len(places))
         record = records.get(place.parent.parent)
@@ -45,19 +46,22 @@ def write_report(run: Path | str, progress: Callable[[str, float], None] | None 
         rollout = load_rollout(place / layout.ROLLOUT)
         series = score_rollout(rollout, record.grid, record.road_map, profile=PROFILE, actors_known=record.actors_known)
         scored.append((rollout, series))
-        entries.append(_report_entry(run, place, rollout, series))
     table = metric_table(scored, run.name)
     write_table(table, run)
     values = rollout_values(table, PROFILE)
+    compared = compare_reconstructions(scored, list(records.values()), PROFILE)
+    comparison, judged = compared or (None, scored)
+    entries = [_report_entry(run, place, *each) for place, each in zip(places, judged, strict=True)]
     say("writing the report", 0.7)
     report = RunReport(
         title=run.name,
         profile=PROFILE,
-        scenes=tuple(_report_scene(record) for record in records.values()),
+        scenes=tuple(_report_scene(run, place, record) for place, record in records.items()),
         rollouts=tuple(entries),
         values=values,
         summary=summarize(values),
         versions=_versions(places),
+        comparison=comparison,
     )
     path = run / layout.REPORT
     write_file(path, render_report(report))
@@ -90,23 +94,28 @@ def headline(run: Path | str) -> list[tuple[str, ...]]:
 
 
 def _report_entry(run: Path, place: Path, rollout: Rollout, series: Iterable[Series]) -> ReportRollout:
-    video, video_error = place / layout.VIDEO, place / layout.VIDEO_ERROR
+    video_error = place / layout.VIDEO_ERROR
     return ReportRollout(
         rollout=rollout,
         series={one.name: one for one in series},
         contacts=tuple(find_contacts(rollout, PROFILE)),
-        video=video if video.exists() else None,
-        video_link=video.relative_to(run).as_posix(),
+        videos=_videos(run, place / layout.VIDEO, place / layout.LIDAR),
         video_error=video_error.read_text(encoding="utf-8").strip() if video_error.exists() else "",
         scenario=(place / layout.SCENARIO).read_text(encoding="utf-8") if (place / layout.SCENARIO).exists() else "",
     )
 
 
-def _report_scene(record: SceneRecord) -> ReportScene:
+def _report_scene(run: Path, place: Path, record: SceneRecord) -> ReportScene:
     return ReportScene(
         id=record.id, reconstruction=record.reconstruction, sha256=record.sha256, counts=record.counts,
         provenance=record.provenance, unknown=record.unknown, road_map=record.road_map, grid=record.grid,
+        fidelity=record.fidelity,
+        recorded=_videos(run, place.parent / layout.RECORDED, place.parent / layout.RECORDED_LIDAR),
     )  # fmt: skip
+
+
+def _videos(run: Path, *paths: Path) -> tuple[Video, ...]:
+    return tuple(Video(path, path.relative_to(run).as_posix()) for path in paths if path.exists())
 
 
 def _versions(places: list[Path]) -> tuple[dict[str, object], ...]:

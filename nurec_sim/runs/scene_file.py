@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,8 @@ class SceneRecord:
     """Scene data for metrics and report.
 
     ``unknown`` lists missing information of log or reconstruction; ``road_error`` is the reason for a missing grid.
-    ``sha256`` is the hash of the whole scene.
+    ``sha256`` is the hash of the whole scene. ``fidelity`` is the result of ``evaluate.measure_fidelity``, empty if not
+    measured. ``place`` is the position among the reconstructions of a run: others are compared with the first.
     """
 
     id: str
@@ -38,15 +40,23 @@ class SceneRecord:
     road_map: RoadMap | None = None
     grid: OffroadGrid | None = field(default=None, compare=False)
     road_error: str = ""
+    fidelity: Mapping[str, Any] = field(default_factory=dict)
+    place: int = 0
 
 
 def reconstruction_of(scene: GaussianScene) -> str:
-    """Name of the method that created a scene."""
-    return str(scene.provenance.get("method", "unknown"))
+    """Name of a reconstruction in a run: its own, or the method that created it."""
+    return str(scene.provenance.get("reconstruction", scene.provenance.get("method", "unknown")))
 
 
-def record_scene(scene: GaussianScene) -> SceneRecord:
-    """Hashes a scene, counts its contents and builds its road grid."""
+def record_scene(scene: GaussianScene, fidelity: Mapping[str, Any] | None = None, place: int = 0) -> SceneRecord:
+    """Hashes a scene, counts its contents and builds its road grid.
+
+    Args:
+        scene: the scene.
+        fidelity: see ``SceneRecord``.
+        place: see ``SceneRecord``.
+    """
     listed = scene.provenance.get("unknown", ())
     unknown = tuple(str(text) for text in listed) if isinstance(listed, (list, tuple)) else (str(listed),)
     no_boxes = any(word in text.lower() for text in unknown for word in ("box", "actor", "track"))
@@ -80,7 +90,7 @@ def record_scene(scene: GaussianScene) -> SceneRecord:
     provenance = json.loads(codec.dump(dict(scene.provenance), "provenance"))
     return SceneRecord(
         scene.id, reconstruction_of(scene), scene_hash(scene), counts, provenance, unknown, actors_known,
-        scene.road_map, grid, road_error,
+        scene.road_map, grid, road_error, dict(fidelity or {}), place,
     )  # fmt: skip
 
 

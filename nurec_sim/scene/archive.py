@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nurec_sim.errors import ArchiveError
-from nurec_sim.files.decoding import LIMITS
+from nurec_sim.files.decoding import LIMITS, image_pixels
 from nurec_sim.files.npy import array_from_npy, npy_bytes
 from nurec_sim.files.zip_package import Package, write_package
 from nurec_sim.scene import codec, knots
@@ -45,6 +45,7 @@ FORMAT_VERSION = 2
 MANIFEST = "nurec_sim/manifest.json"
 FACTS, ISP, SKY = "nurec_sim/scene.json", "nurec_sim/isp.json", "nurec_sim/sky_cubemap.npy"
 EXPOSURES = "nurec_sim/exposures.json"
+EGO_IMAGES = "nurec_sim/ego_images"
 IN_BOX = "nurec_sim/dynamic_in_box.npy"
 TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY)
 """Members required by ``read_archive`` besides those of ``scene.knots`` and the optional ``IN_BOX`` and ``EXPOSURES``;
@@ -91,6 +92,8 @@ def write_scene(
     }
     if scene.exposures:
         members[EXPOSURES] = codec.dump(scene.exposures, EXPOSURES)
+    for camera, image in scene.ego_images.items():
+        members[f"{EGO_IMAGES}/{camera}.png"] = _png(image)
     if scene.dynamic.in_box is not None:
         members[IN_BOX] = npy_bytes(scene.dynamic.in_box)
     members[MANIFEST] = codec.dump(_manifest(scene, digest, members), MANIFEST, indent=2)
@@ -136,6 +139,7 @@ def read_archive(path: Path | str) -> GaussianScene:
             sky=_array(package, SKY, "f").astype(np.float32),
             isp=isp,
             exposures=_exposures(package, manifest),
+            ego_images=_ego_images(package, manifest),
             **facts,
         )
     try:
@@ -241,6 +245,30 @@ def _exposures(package: Package, manifest: dict[str, Any]) -> dict[str, np.ndarr
     where = f"{package.path}: {EXPOSURES}"
     raw = codec.load(package.read(EXPOSURES, LIMITS.json_bytes), where)
     return codec.from_json(codec.mapping(codec.array(np.float64, -1, 3, 4)), raw, where)
+
+
+def _png(image: np.ndarray) -> bytes:
+    import cv2
+
+    return bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))[1])
+
+
+def _ego_images(package: Package, manifest: dict[str, Any]) -> dict[str, np.ndarray]:
+    """What the cameras see of the ego vehicle, if anything."""
+    import cv2
+
+    names = [name for name in manifest["sha256"] if name.startswith(f"{EGO_IMAGES}/")]
+    _check_hashes(package, manifest, tuple(names))
+    images = {}
+    for name in names:
+        try:
+            bgra = image_pixels(package.read(name), cv2.IMREAD_UNCHANGED)
+        except ValueError as error:
+            raise ArchiveError(f"{package.path}: {name} is not a readable PNG") from error
+        if bgra.ndim != 3 or bgra.shape[2] != 4 or bgra.dtype != np.uint8:
+            raise ArchiveError(f"{package.path}: {name} must be RGBA with 8 bits, got {bgra.dtype} {bgra.shape}")
+        images[name.removeprefix(f"{EGO_IMAGES}/").removesuffix(".png")] = cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGBA)
+    return images
 
 
 def _array(package: Package, name: str, kinds: str) -> np.ndarray:

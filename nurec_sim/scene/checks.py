@@ -46,6 +46,10 @@ def check_scene(scene: GaussianScene) -> None:
         _check_array(frames, f"exposures[{camera_id!r}]", np.float64, (len(scene.camera_times_us[camera_id]), 3, 4))
         if not np.isfinite(frames).all():
             raise ArchiveError(f"exposures[{camera_id!r}] are not finite")
+    for camera_id, image in scene.ego_images.items():
+        if (camera := scene.rig.cameras.get(camera_id)) is None:
+            raise ArchiveError(f"ego_images[{camera_id!r}]: the rig has no such camera; have {list(scene.rig.cameras)}")
+        _check_array(image, f"ego_images[{camera_id!r}]", np.uint8, (camera.height_px, camera.width_px, 4))
     _check_facts(scene)
 
 

@@ -238,7 +238,7 @@ _FIELDS: dict[type, dict[str, Decoder]] = {
     LidarModel: {
         "id": text, "elevation_rad": array(np.float64, -1), "azimuth_rad": array(np.float64, -1),
         "row_azimuth_offset_rad": array(np.float64, -1), "rig_from_lidar": array(np.float64, 4, 4),
-        "spin": choice(Spin), "frequency_hz": number, "range_m": numbers(2),
+        "spin": choice(Spin), "frequency_hz": number, "range_m": numbers(2), "blocked": array(np.int64, -1),
     },
     Box: {"center_m": numbers(3), "size_m": numbers(3)},
     Rig: {"cameras": mapping(record(CameraModel)), "lidars": mapping(record(LidarModel)), "body": record(Box)},
@@ -252,7 +252,10 @@ _FIELDS: dict[type, dict[str, Decoder]] = {
 }  # fmt: skip
 
 
-_ADDED: dict[type, dict[str, Any]] = {Track: {"labelled": True, "actor": True}}
+_ADDED: dict[type, dict[str, Any]] = {
+    Track: {"labelled": True, "actor": True},
+    LidarModel: {"blocked": []},
+}
 """Fields missing in older archives, with defaults; written only if different."""
 
 

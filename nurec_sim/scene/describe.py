@@ -20,6 +20,7 @@ def scene_arrays(scene: GaussianScene) -> dict[str, np.ndarray]:
     arrays |= {f"dynamic.{name}": getattr(dynamic, name) for name in ("knot_t_us", "knot_m", "track")}
     if dynamic.in_box is not None:
         arrays["dynamic.in_box"] = dynamic.in_box
+    arrays |= {f"ego.{camera}": image for camera, image in scene.ego_images.items()}
     return arrays | {"sky": scene.sky}
 
 

@@ -15,19 +15,25 @@ from nurec_sim.sensors.ftheta_fit import fill_ftheta, fit_ftheta
 from nurec_sim.sensors.lidar import (
     beam_coordinates,
     beam_directions,
+    beam_sectors,
+    blocked_beams,
     check_lidar,
     check_rig,
     column_fraction,
     compensate_sweep,
 )
 from nurec_sim.sensors.lidar_tables import LIDAR_TABLES, STAND_IN_TABLE, LidarTable, lidar_model
+from nurec_sim.sensors.range_map import RangeMap, range_map
 
 __all__ = [
     "LIDAR_TABLES",
     "STAND_IN_TABLE",
     "LidarTable",
+    "RangeMap",
     "beam_coordinates",
     "beam_directions",
+    "beam_sectors",
+    "blocked_beams",
     "check_camera",
     "check_lidar",
     "check_rig",
@@ -41,6 +47,7 @@ __all__ = [
     "pixel_rays",
     "project",
     "project_rolling",
+    "range_map",
     "scaled_camera",
     "shutter_fraction",
     "unproject",

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from nurec_sim import geometry
 from nurec_sim.sensors.camera import check_camera, check_pose
-from nurec_sim.types import LidarModel, Matrix4, Rig, Spin
+from nurec_sim.types import LIDAR_SECTORS, LidarModel, Matrix4, Rig, Spin
 
 Values = Float64[np.ndarray, " n"]
 
@@ -18,6 +18,20 @@ def beam_directions(lidar: LidarModel) -> Float64[np.ndarray, "rows columns 3"]:
     elevation = np.broadcast_to(lidar.elevation_rad[:, None], azimuth.shape)
     flat = np.cos(elevation)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+
+
+def blocked_beams(lidar: LidarModel) -> Bool[np.ndarray, "rows columns"]:
+    """Beams that never return; see ``LidarModel.blocked``."""
+    table = np.zeros((len(lidar.elevation_rad), LIDAR_SECTORS), bool)
+    table.reshape(-1)[lidar.blocked] = True
+    return np.take_along_axis(table, beam_sectors(lidar), axis=1)
+
+
+def beam_sectors(lidar: LidarModel) -> Int64[np.ndarray, "rows columns"]:
+    """The sector of azimuth of each beam, counter-clockwise from straight behind."""
+    azimuth = lidar.azimuth_rad[None, :] + lidar.row_azimuth_offset_rad[:, None]
+    sector = np.floor((azimuth + np.pi) / (2 * np.pi) * LIDAR_SECTORS + 1e-9).astype(np.int64)
+    return sector % LIDAR_SECTORS
 
 
 def column_fraction(lidar: LidarModel) -> Float64[np.ndarray, " columns"]:
@@ -116,6 +130,9 @@ def check_lidar(lidar: LidarModel) -> None:
         raise ValueError(
             f"{name}: azimuth_rad must run {lidar.spin.value} from column to column, over one turn at most"
         )
+    most = len(elevation) * LIDAR_SECTORS
+    if lidar.blocked.ndim != 1 or not ((lidar.blocked >= 0) & (lidar.blocked < most)).all():
+        raise ValueError(f"{name}: blocked must list numbers below {most}, rows times {LIDAR_SECTORS} sectors")
     near, far = lidar.range_m
     if not 0 <= near < far:
         raise ValueError(f"{name}: range_m must be (near, far) with 0 <= near < far, got {lidar.range_m}")

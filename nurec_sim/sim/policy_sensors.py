@@ -74,6 +74,8 @@ class SensorSuite:
     def __init__(self, needs: Needs, settings: SensorSettings, facts: SceneFacts) -> None:
         width = settings.image_width_px or needs.image_width_px
         self._scene_id = facts.id
+        # Scenes know whether a camera sees the ego vehicle; clips, whose true world has no ego vehicle, do not.
+        self._sees_ego = frozenset(getattr(facts, "ego_images", ()))
         self._span_us = facts.span_us
         self._policy_names = {*needs.cameras, *needs.lidars}
         self.cameras = {
@@ -135,7 +137,8 @@ class SensorSuite:
         # An instant is [t, t + 1), as in NuRec clients; both ends lie inside the half-open span.
         end_us = max(t_us, start_us + 1)
         poses = np.stack([pose_at(start_us), pose_at(t_us)]) @ rig_from_sensor
-        return SensorRequest(self._scene_id, sensor, start_us, end_us, poses, actors(start_us, t_us))
+        return SensorRequest(self._scene_id, sensor, start_us, end_us, poses, actors(start_us, t_us),
+                             show_ego=sensor.id in self._sees_ego)  # fmt: skip
 
 
 def find_camera(rig: Rig, name: str) -> CameraModel:

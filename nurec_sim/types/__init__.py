@@ -41,6 +41,7 @@ from nurec_sim.types.scenes import (
     Label,
 )
 from nurec_sim.types.sensors import (
+    LIDAR_SECTORS,
     Box,
     CameraModel,
     LidarModel,
@@ -74,6 +75,7 @@ __all__ = [
     "Lens",
     "LidarFilter",
     "LidarFrame",
+    "LIDAR_SECTORS",
     "LidarModel",
     "LogReader",
     "LogSource",

@@ -19,7 +19,8 @@ class SensorRequest:
 
     ``actors`` maps track ids to ``world_from_box`` at start and end; all other tracks follow their recorded paths.
     Tracks in ``hidden`` are not rendered, even if they are in ``actors``; unknown ids are ignored. ``apply_isp``
-    enables the scene's colour correction for the camera.
+    enables the scene's colour correction for the camera, ``show_ego`` puts the ego vehicle over its image as the
+    recording camera saw it (``GaussianScene.ego_images``); other outputs than colours show the street behind it.
     """
 
     scene_id: str
@@ -30,6 +31,7 @@ class SensorRequest:
     actors: Mapping[str, Float64[np.ndarray, "2 4 4"]] = field(default_factory=dict)
     hidden: Set[str] = frozenset()
     apply_isp: bool = True
+    show_ego: bool = False
 
     @property
     def middle_us(self) -> int:

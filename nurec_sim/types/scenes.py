@@ -182,6 +182,8 @@ class GaussianScene:
     ``isp`` maps a camera id to ``[3,4]``: shown colour = ``isp[:, :3] @ colour + isp[:, 3]``, after sky compositing.
     ``exposures`` maps a camera id to per-frame responses, ``[frames,3,4]`` at the midpoints of ``camera_times_us``;
     where a camera has them they replace ``isp``, interpolated linearly in time.
+    ``ego_images`` maps the id of a camera that sees the ego vehicle to that picture, RGBA of the camera's size, with
+    alpha 0 where it sees the street.
     ``provenance`` is plain JSON: method, settings, missing information (no map, no boxes, ...).
     """
 
@@ -198,6 +200,7 @@ class GaussianScene:
     camera_times_us: Mapping[str, Int64[np.ndarray, "frames 2"]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     exposures: Mapping[str, Float64[np.ndarray, "frames 3 4"]] = field(default_factory=dict)
+    ego_images: Mapping[str, UInt8[np.ndarray, "h w 4"]] = field(default_factory=dict)
 
     def response(self, camera_id: str, t_us: int) -> Float64[np.ndarray, "3 4"] | None:
         """The colour response of a camera at an instant; None if the scene has none for it."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import cast
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from nurec_sim.lenses import Lens, Pinhole
 from nurec_sim.types.trajectories import Matrix4
@@ -72,6 +72,10 @@ class Spin(enum.Enum):
     COUNTERCLOCKWISE = "counterclockwise"
 
 
+LIDAR_SECTORS = 180
+"""Sectors of azimuth in which beams of a row are blocked or not."""
+
+
 @dataclass(frozen=True, eq=False)
 class LidarModel:
     """A spinning LiDAR as a grid of beams: rows from high to low, columns in firing order.
@@ -79,6 +83,9 @@ class LidarModel:
     The beam of row r and column c has elevation ``elevation_rad[r]`` and azimuth
     ``azimuth_rad[c] + row_azimuth_offset_rad[r]`` (counter-clockwise from x forward). Column c fires at the fraction
     ``c / (columns - 1)`` of the sweep.
+
+    ``blocked`` names beams that never return, because the car's own body is in their way or their laser is weak:
+    ``row * LIDAR_SECTORS + sector``, sectors of azimuth counter-clockwise from straight behind (-pi).
     """
 
     id: str
@@ -89,6 +96,7 @@ class LidarModel:
     spin: Spin = Spin.CLOCKWISE
     frequency_hz: float = 10.0
     range_m: tuple[float, float] = (0.5, 200.0)
+    blocked: Int64[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,15 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from reconstruct_street import Street, camera
 
-from nurec_sim import logs, scene
+from nurec_sim import cli, logs, scene
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate import compare_scenes, figure_rows, hold_out, render_comparison, side_by_side
+from nurec_sim.evaluate import compare_scenes, figure_rows, render_comparison, side_by_side
+from nurec_sim.logs import hold_out
 from nurec_sim.reconstruct import LiftSettings, ViewSettings, reconstruct
 
 SMALL = LiftSettings(sky_px=32, views=ViewSettings(levels=32))
@@ -63,18 +62,20 @@ def test_one_scene_is_no_comparison():
         compare_scenes(Street(frames=2), {"a": lambda: None})
 
 
-def test_the_verb_writes_a_report_and_names_what_is_wrong(comparison, tmp_path):
+def test_the_verb_writes_a_report_and_names_what_is_wrong(comparison, tmp_path, monkeypatch, capsys):
     clip, good, dark, _ = comparison
+    monkeypatch.chdir(tmp_path)
     write_street(clip, tmp_path / "log")
     scene.write_scene(good, tmp_path / "a.usdz")
     scene.write_scene(dark, tmp_path / "b.usdz")
-    done = verb(tmp_path, "a.usdz", "b.usdz", "--clip", "log", "--out", "r.html", "--json", "r.json")
-    assert done.returncode == 0, done.stderr
-    assert "PSNR (dB)" in done.stdout and "wrote r.html" in done.stdout
+    cli.main(["compare", "a.usdz", "b.usdz", "--clip", "log", "--out", "r.html", "--json", "r.json"])
+    told = capsys.readouterr().out
+    assert "PSNR (dB)" in told and "wrote r.html" in told
     assert set(json.loads((tmp_path / "r.json").read_text())) == {"a", "b"}
     assert "data:video/mp4" in (tmp_path / "r.html").read_text()
-    alone = verb(tmp_path, "a.usdz", "--clip", "log")
-    assert alone.returncode == 1 and "a comparison needs two scenes or more, got ['a.usdz']" in alone.stderr
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["compare", "a.usdz", "--clip", "log"])
+    assert stop.value.code == 1 and "a comparison needs two scenes or more, got ['a.usdz']" in capsys.readouterr().err
 
 
 def write_street(clip, path):
@@ -82,9 +83,3 @@ def write_street(clip, path):
               for k, times in enumerate(clip.camera_times_us("left"))]  # fmt: skip
     frames += [logs.LidarEntry("top", clip.sweep("top", k)) for k in range(len(clip.sweep_times_us("top")))]
     logs.write_clip(path, id=clip.id, rig=clip.rig, ego=clip.ego, frames=frames, tracks=clip.tracks)
-
-
-def verb(folder, *words):
-    return subprocess.run(
-        [sys.executable, "-m", "nurec_sim.cli", "compare", *words], cwd=folder, capture_output=True, text=True
-    )

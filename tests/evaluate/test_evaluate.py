@@ -9,8 +9,9 @@ from repetition import slow_after
 
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate import HeldOut, as_fired, evaluate, hold_out, log
+from nurec_sim.evaluate import evaluate, log
 from nurec_sim.evaluate.scores.lidar import LidarScore, scanner_along, score_sweep
+from nurec_sim.logs import HeldOut, as_fired, hold_out
 from nurec_sim.reconstruct import LiftSettings, ViewSettings
 from nurec_sim.types import LidarFrame, RoadMap
 
@@ -86,6 +87,21 @@ def test_which_sweeps_are_held_out():
         evaluate(street(), hold_out_sweeps_every=-1)
     with pytest.raises(ReconstructError, match=r"no camera \['up'\]; have \['left', 'right'\]"):
         evaluate(street(), target_cameras=["up"])
+
+
+def test_the_reconstruction_never_gets_what_is_held_out(monkeypatch):
+    class AskedError(Exception):
+        pass
+
+    def asked(clip, method, *, cameras, hold_out_sweeps, progress):
+        raise AskedError(len(clip.camera_times_us("left")), hold_out_sweeps)
+
+    monkeypatch.setattr("nurec_sim.reconstruct.reconstruct", asked)
+    with pytest.raises(AskedError) as caught:
+        evaluate(street(), input_cameras=["left"], hold_out_every=2, hold_out_sweeps=[0])
+    held = hold_out(street(), ["left"], images_every=2, sweeps=[0])
+    assert held.images == {"left": {1, 3}} and len(held.sweeps) > 1
+    assert caught.value.args == (3, sorted(held.sweeps))
 
 
 def test_score_of_a_perfect_and_of_a_short_sweep():

@@ -7,11 +7,24 @@ from feedforward_clip import clip_of, frame_times, pinhole
 
 from nurec_sim import sensors
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate import Protocol
+from nurec_sim.evaluate import Protocol, procedural
 from nurec_sim.evaluate.recorded import clip_window, recorded_window, storm_windows
 from nurec_sim.logs import open_clip
 
 SMALL = {"size_px": (48, 32), "backend": "rays"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _bare_towns():
+    """Towns without scenery are built in half the time."""
+    whole = procedural.town_plan
+
+    def bare(*given, **more):
+        return dataclasses.replace(whole(*given, **more), buildings=(), props=())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(procedural, "town_plan", bare)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -6,15 +6,17 @@ from reconstruct_street import Street, camera
 
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate import hold_out, score_scene, without_images
+from nurec_sim.evaluate import lidar_scores, log, score_scene
 from nurec_sim.evaluate.image_scores import image_request
 from nurec_sim.evaluate.log_regions import actor_mask, seen_points
 from nurec_sim.evaluate.scores.flip import flip, flip_map
 from nurec_sim.evaluate.scores.free_space import FiredSweep, RecordedBeams, false_obstacles
-from nurec_sim.evaluate.scores.lidar import LidarScore
+from nurec_sim.evaluate.scores.lidar import CloudScore, LidarScore
 from nurec_sim.evaluate.scores.sharpness import octave_energy, sharpness
+from nurec_sim.evaluate.scores.surfaces import KINDS, surfaces_of
+from nurec_sim.logs import hold_out, without_images
 from nurec_sim.reconstruct import LiftSettings, ViewSettings, reconstruct
-from nurec_sim.types import MOVABLE_LABELS, Track, Trajectory
+from nurec_sim.types import MOVABLE_LABELS, LidarFrame, Track, Trajectory
 
 SMALL = LiftSettings(sky_px=32, views=ViewSettings(levels=32))
 
@@ -104,16 +106,58 @@ def test_a_sweep_fired_on_the_move_is_compared_where_each_beam_was_fired():
     assert beams.passed(behind + [2.0, 0, 0]) == [1]
 
 
-def test_ranges_are_scored_apart_and_clouds_by_their_distances():
+def test_ranges_are_scored_apart():
     xyz = np.array([[5.0, 0, 0], [0, 15.0, 0], [0, 0, 30.0]])
     score = LidarScore(xyz, np.array([5.5, np.nan, 33.0]))
     assert score.within(0, 10).median_abs_error_m == pytest.approx(0.5)
     assert score.within(0, 10).beams == 1
     assert score.within(10, 20).recall == 0
-    # Simulated (5.5, 0, 0) and (0, 0, 33): 0.5 and 3 m off; recorded (0, 15, 0) is nearest to (5.5, 0, 0).
-    precision, coverage = score.chamfer()
-    assert precision == pytest.approx((0.5 + 3) / 2)
-    assert coverage == pytest.approx((0.5 + np.hypot(15, 5.5) + 3) / 3)
+
+
+def test_clouds_are_scored_by_the_distances_between_them():
+    simulated, recorded = np.array([[5.5, 0, 0], [0, 0, 33.0]]), np.array([[5.0, 0, 0], [0, 15.0, 0], [0, 0, 30.0]])
+    # The nearest of (5.5, 0, 0) and (0, 0, 33) are 0.5 and 3 m away; (0, 15, 0) is nearest to (5.5, 0, 0).
+    far = np.hypot(15, 5.5)
+    figures = CloudScore.of(simulated, recorded).figures()
+    assert figures["precision_m"] == pytest.approx((0.5 + 3) / 2)
+    assert figures["coverage_m"] == pytest.approx((0.5 + far + 3) / 3)
+    assert figures["cd_l1_sum"] == pytest.approx(3.5 / 2 + (3.5 + far) / 3)
+    assert figures["cd_l2sq_sum"] == pytest.approx(9.25 / 2 + (9.25 + far**2) / 3)
+    assert figures["cd_l2sq_gtnorm"] == pytest.approx((9.25 + 9.25 + far**2) / 3)
+    assert figures["count_ratio"] == pytest.approx(2 / 3)
+    near = CloudScore.of(recorded + [0.07, 0, 0], recorded).figures()
+    assert (near["fscore@0.05"], near["fscore@0.10"], near["fscore@0.20"]) == (0, 1, 1)
+    assert np.isnan(CloudScore.of(np.zeros((0, 3)), recorded).figures()["cd_l1_sum"])
+
+
+def test_errors_on_grazing_ground_are_also_given_along_its_normal():
+    """Beams at 3 degrees below the horizon, ground 2 m below, simulated 0.03 m too high; beside it a wall at 10 m."""
+    elevation, azimuth = np.meshgrid(np.radians(np.arange(-4, -2, 0.2)), np.radians(np.arange(-20, 20, 0.2)))
+    down = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1)
+    ground = (down * (2.0 / -down[..., 2:])).reshape(-1, 3)
+    wall = (down * (10.0 / down[..., :1])).reshape(-1, 3) * (1, 1, -1)
+    xyz = np.concatenate([ground, wall])
+    surface = surfaces_of(xyz, np.array([0.0, 0, 1]), np.zeros(len(xyz), bool))
+    level = np.arange(len(xyz)) < len(ground)
+    assert np.mean(surface.kind[level] == KINDS.index("ground")) > 0.95
+    assert np.mean(surface.kind[~level] == KINDS.index("standing")) > 0.95
+    distance = np.linalg.norm(xyz, axis=1)
+    score = LidarScore(xyz, np.where(level, distance * (1.97 / 2.0), distance + 0.04), None, surface)
+    on_ground = score.on("ground")
+    assert np.median(on_ground.abs_perpendicular_m) == pytest.approx(0.03, abs=0.001)
+    assert on_ground.median_abs_error_m > 0.4
+    assert score.on("standing").median_abs_error_m == pytest.approx(0.04)
+    moving = surfaces_of(xyz, np.array([0.0, 0, 1]), level)
+    assert (moving.kind[level] == KINDS.index("actors")).all()
+
+
+def test_points_of_one_row_and_of_a_tree_fix_no_plane():
+    azimuth = np.radians(np.arange(0, 90, 0.2))
+    row = np.column_stack([10 * np.cos(azimuth), 10 * np.sin(azimuth), -0.5 * np.ones_like(azimuth)])
+    tree = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) + (0, -8, 1)
+    for xyz in (row, tree):
+        kind = surfaces_of(xyz, np.array([0.0, 0, 1]), np.zeros(len(xyz), bool)).kind
+        assert np.mean(kind == KINDS.index("rough")) > 0.9
 
 
 def street():
@@ -194,6 +238,39 @@ def test_no_false_obstacles_on_the_path_but_before_a_board_in_the_way(figures):
     blocked = dataclasses.replace(scene, static=joined([scene.static, board]))
     after = score_scene(clip, blocked, target_cameras=["left"], via_grpc=False)["free_space"]["false_obstacles"]
     assert after["0 m"] > scores["free_space"]["false_obstacles"]["0 m"] + 0.01
+
+
+def test_false_obstacles_are_looked_for_on_both_sides_of_the_path_and_added_up(monkeypatch):
+    clip, places, found = street(), [], iter([(1, 4), (2, 4)] + [(0, 4)] * 12)
+
+    def sense(requests):
+        (request,) = requests
+        car = clip.ego.at(request.start_us) @ clip.rig.lidars["top"].rig_from_lidar
+        places.append(geometry.inverse(car) @ request.world_from_sensor[0])
+        nothing = np.zeros(0, np.float32)
+        return [LidarFrame(request.sensor, request.start_us, request.end_us, np.zeros((0, 3), np.float32), nothing,
+                           nothing, nothing.astype(np.int32))]  # fmt: skip
+
+    monkeypatch.setattr(lidar_scores, "SCANS", 2)
+    monkeypatch.setattr(lidar_scores, "false_obstacles", lambda *given: next(found))
+    shares = lidar_scores.score_free_space(clip, sense, lambda stage, fraction: None)["false_obstacles"]
+    assert shares == {"0 m": 3 / 8, "1 m": 0.0, "2 m": 0.0, "3 m": 0.0}
+    assert sorted(pose[1, 3].round(6) for pose in places) == sorted([-3, -2, -1, 0, 1, 2, 3] * 2)
+    assert all(np.allclose(pose[[0, 2], 3], 0) and np.allclose(pose[:3, :3], np.eye(3)) for pose in places)
+
+
+@pytest.mark.parametrize("via_grpc", [False, True])
+def test_frames_come_from_where_they_were_asked_for(figures, via_grpc, monkeypatch):
+    class AskedError(Exception):
+        pass
+
+    def sensing(scene, *given):
+        raise AskedError(given)
+
+    monkeypatch.setattr(log, "sensing", sensing)
+    with pytest.raises(AskedError) as caught:
+        score_scene(figures[0], figures[1], via_grpc=via_grpc, device="cpu")
+    assert caught.value.args == ((via_grpc, "cpu"),)
 
 
 def test_a_scene_of_another_path_is_refused(figures):

@@ -27,6 +27,7 @@ from nurec_sim.errors import NurecSimError, WriteError
 from nurec_sim.files.new_files import check_writable, new_file, write_file, writing
 from nurec_sim.network.profiles import PROFILES
 from nurec_sim.runs.folder import written_at_once
+from nurec_sim.runs.video import CODEC_OPTIONS
 from nurec_sim.scene import write_scene
 from nurec_sim.training.checkpoint import Position, save_checkpoint
 from nurec_sim.training.data import cache as cache_module
@@ -182,6 +183,7 @@ def one_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 ORDERS = {
     "render": ["render", "street.usdz", "--out", "OUT.png"],
+    "lidar": ["lidar", "street.usdz", "--model", "VLP-16", "--columns", "60", "--out", "OUT.npz"],
     "reconstruct": ["reconstruct", "clip.zip", "--overwrite", "--out", "OUT.usdz"],
     "export": ["export", "street.usdz", "--overwrite", "--out", "OUT.ply"],
     "import": ["import", "old.ply", "--overwrite", "--out", "OUT.usdz"],
@@ -234,7 +236,10 @@ def test_a_place_that_cannot_be_written_is_one_line_before_the_work(
 
 
 @pytest.mark.parametrize("video", [False, True])
-def test_a_run_on_a_full_disk_ends_with_one_line_and_goes_on_later(video: bool, place: Path, capsys) -> None:
+def test_a_run_on_a_full_disk_ends_with_one_line_and_goes_on_later(
+    video: bool, place: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.setitem(CODEC_OPTIONS, "crf", "0")  # the video is the first file beyond the limit
     order = ["run", "street.usdz", "--scenario", "brief.yaml", "--video" if video else "--no-video"]
     cli.main([*order, "--out", "warm"])  # what is compiled now writes no caches later
     capsys.readouterr()

@@ -9,6 +9,7 @@ import numpy as np
 from nurec_sim import geometry, sensors
 from nurec_sim.lenses import Fisheye, FTheta, FThetaReference, Pinhole
 from nurec_sim.types import (
+    LIDAR_SECTORS,
     CameraModel,
     DynamicGaussians,
     Gaussians,
@@ -43,11 +44,15 @@ LIDARS = {
         azimuth_rad=np.linspace(-1, 2 * np.pi - 1, 200, endpoint=False),
         spin=Spin.COUNTERCLOCKWISE,
     ),
+    "blocked": dataclasses.replace(
+        sensors.lidar_model("VLP-16", np.eye(4), columns=240),
+        blocked=np.arange(9 * LIDAR_SECTORS + 60, 11 * LIDAR_SECTORS),
+    ),
     "sector with offsets": dataclasses.replace(
         sensors.lidar_model("AT128", np.eye(4), columns=100), row_azimuth_offset_rad=np.tile([0.02, -0.03], 64)
     ),
 }
-"""Spinning LiDARs of all kinds: full turns and sectors, either way round, rows with offsets."""
+"""Spinning LiDARs of all kinds: full turns and sectors, either way round, rows with offsets, blocked beams."""
 
 
 def gaussians(mean, scale=0.1, opacity=0.9, rgb=(0.5, 0.5, 0.5), label=0, intensity=np.nan, quat=(1, 0, 0, 0)):

@@ -51,11 +51,13 @@ def test_a_sound_log_fits_together(demo):
     found = {each.what: each.found for each in measures}
     assert list(found) == [
         "ground below the rear axle, LiDAR 'lidar_top'",
+        "beams of LiDAR 'lidar_top'",
         *(f"LiDAR in camera {name!r}" for name in demo.rig.cameras),
         "boxes that hold LiDAR points",
     ]
     height = float(found["ground below the rear axle, LiDAR 'lidar_top'"].split("z = ")[1].split()[0])
     assert abs(height) < 0.05
+    assert found["beams of LiDAR 'lidar_top'"].startswith("48 x 600, 100.0 % of the points have one of their own")
     for name in demo.rig.cameras:
         words = found[f"LiDAR in camera {name!r}"].split()
         # "fits at 18.8 standard errors, turned or inverted at most 2.7"

@@ -248,3 +248,14 @@ def test_lidar_points_fall_on_what_the_camera_sees(realdata):
 
     best = max(range(-30, 31, 2), key=on_edges)
     assert abs(best) <= 4
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("index", [0, 4, 9])
+def test_points_as_fired_are_those_of_the_file_also_at_the_ends_of_the_log(realdata, index):
+    """The first and the last sweep reach beyond the recorded poses; both ways extrapolate them alike."""
+    clip = logs.open_clip(realdata / "kitti_raw_0002")
+    with np.load(realdata / f"kitti_raw_0002/lidar/{index:04d}.npz") as stored:
+        raw = np.cumsum(stored["dxyz_mm"], axis=1, dtype=np.int64).T / 1000
+    fired, _ = logs.as_fired(clip, "lidar", clip.sweep("lidar", index))
+    assert np.abs(fired - raw).max() < 0.002

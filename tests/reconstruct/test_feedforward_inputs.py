@@ -39,7 +39,7 @@ def camera_with(lens: str, shutter: Shutter, size: str, glass: bool = False) -> 
 def made_chunk(clip: MadeClip, profile=SMALL, **changes):
     settings = FeedForwardSettings(**changes)
     (window,) = chunk_windows(clip, list(clip.cameras), profile, settings)
-    return chunk_inputs(clip, profile, window, settings)
+    return chunk_inputs(clip, profile, window, settings, {})
 
 
 # ------------------------------------------------------------------------------------------------ resizing, cropping
@@ -304,7 +304,7 @@ def test_the_demo_log_becomes_two_chunks():
     first, last = chunk_windows(clip, cameras, TINY, FeedForwardSettings())
     assert len(set(first.frames["camera_front"]) & set(last.frames["camera_front"])) == 4
     few = dataclasses.replace(last, frames={camera: frames[-2:] for camera, frames in last.frames.items()})
-    chunk = chunk_inputs(clip, TINY, few, FeedForwardSettings())
+    chunk = chunk_inputs(clip, TINY, few, FeedForwardSettings(), {})
     assert chunk.tensors.rgb.shape == (1, 6, 224, 406, 3) and chunk.index == 1
     # The car drives ahead: the second frame lies along z of the first.
     ahead = chunk.tensors.c2w[0, 1, :3, 3]
@@ -361,7 +361,7 @@ def test_real_logs_become_inputs(realdata, pack, views, frames, count, profile):
     assert len(cameras) == (1 if profile is FRONT else views)
     settings = FeedForwardSettings(frames=frames)
     windows = chunk_windows(clip, cameras, profile, settings)
-    chunk = chunk_inputs(clip, profile, windows[-1], settings)
+    chunk = chunk_inputs(clip, profile, windows[-1], settings, {})
     alone = profile is TINY and len(cameras) == 1 and frames is None  # 0.9 s, eight times a second
     assert len(chunk.images) == len(cameras) * (2 * count if alone else count)
     for field in given_fields(chunk.tensors):

@@ -84,7 +84,7 @@ def world(request):
         log.tracks = tuple(track for track in log.tracks if track.id == "car")
     settings = FeedForwardSettings(sky_px=64, image_pixels=336 * 196)
     window = ChunkWindow(0, (int(log.t_us[0]), int(log.t_us[-1])), {"front": tuple(range(0, FRAMES, 2))})
-    chunk = chunk_inputs(log, PROFILES["tiny"], window, settings)
+    chunk = chunk_inputs(log, PROFILES["tiny"], window, settings, {})
     with torch.inference_mode():
         outputs = true_outputs(log, chunk)
     layers = chunk_layers(log, chunk, outputs, settings)

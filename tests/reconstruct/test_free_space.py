@@ -13,13 +13,18 @@ from nurec_sim.reconstruct.free_space import (
     balls,
     chosen_sweeps,
     in_free_space,
-    recorded_beams,
     sweep_beams,
 )
-from nurec_sim.reconstruct.lift.bake import on_ground
+from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels
+from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.footprints import marked_free, on_ground, outside_free_space
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
-from nurec_sim.reconstruct.lift.settings import PointSettings
+from nurec_sim.reconstruct.lift.pictures import DepthPicture
+from nurec_sim.reconstruct.lift.points import Cloud
+from nurec_sim.reconstruct.lift.settings import PointSettings, ViewSettings
+from nurec_sim.reconstruct.lift.surfaces import PIXEL_SIGMA
+from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 from nurec_sim.types import Gaussians, Sweep, Trajectory
 
 SIGMA_M = 0.05
@@ -149,23 +154,73 @@ def test_lift_keeps_nothing_where_beams_passed():
     def ghosts(carve):
         scene = reconstruct(clip, "lift", settings=LiftSettings(points=PointSettings(carve=carve)))
         inside = geometry.points_in_box(scene.static.mean_m - np.array([14.0, 0, 1.4]), (3.4, 2.4, 2.0), 0.0)
-        return int(inside.sum()), int(in_free_space(scene.static, recorded_beams(clip, set())).sum())
+        beams = [sweep_beams(clip, lidar, clip.sweep(lidar, i)) for lidar, i in chosen_sweeps(clip, set())]
+        return int(inside.sum()), int(in_free_space(scene.static, beams).sum())
 
     (kept, free), (carved, left) = ghosts(carve=False), ghosts(carve=True)
     assert kept > 100 and free > 100
     assert carved < 0.5 * kept and left == 0
 
 
+def level_ground():
+    """At z = 0, x from -1 to 9 m."""
+    flat, up = np.zeros((100, 100)), np.ones((100, 100), bool)
+    return Ground(np.array([-1.0, -5.0]), 0.1, flat.astype(np.float32), up, up, up, np.ones((100, 100), np.uint8))
+
+
+def body_of(xyz_m, normal):
+    cloud = dataclasses.replace(Cloud.empty(), xyz_m=xyz_m, intensity=np.full(len(xyz_m), 0.5, np.float32))
+    return Surfels(None, cloud, normal, np.full(len(xyz_m), 0.5, np.float32), np.zeros(len(xyz_m), np.uint8))
+
+
 def test_pixels_low_over_the_road_are_moved_down_to_it_along_their_rays():
     """From 1.5 m above the road at 45 degrees: 0.2 m over it is 0.2 m before it, and pixels grow with the depth."""
-    flat, up = np.zeros((100, 100)), np.ones((100, 100), bool)
-    ground = Ground(np.array([-1.0, -5.0]), 0.1, flat.astype(np.float32), up, up, up, np.ones((100, 100), np.uint8))
     steep, level = np.array([1.0, 0, -1]) / np.sqrt(2), np.array([1.0, 0, -0.01])
     xyz = np.array([[1.3, 0, 0.2], [1.3, 0, 0.6], [1.3, 0, 0.2]])
     depth, pixel, rgb = np.full(3, 1.3 * np.sqrt(2)), np.full(3, 0.01), np.zeros((3, 3), np.float32)
     rays, four = np.stack([steep, steep, level]), np.full(3, 4, np.int32)
-    lifted = Lifted(xyz, np.zeros((3, 3)), rays, depth, pixel, rgb, four, four)
-    moved = on_ground(lifted, ground)
+    lifted = Lifted(xyz, np.zeros((3, 3)), rays, depth, pixel, rgb, four, four, four)
+    moved = on_ground(lifted, level_ground())
     assert moved.xyz_m == pytest.approx(np.array([[1.5, 0, 0]]), abs=1e-6)
     assert moved.depth_m == pytest.approx([1.5 * np.sqrt(2)]) and moved.pixel_m == pytest.approx([0.01 * 1.5 / 1.3])
     assert moved.normal.tolist() == [[0, 0, 1]] and moved.surfel.tolist() == [-1]
+
+
+def test_a_pixel_in_free_space_leaves_its_place_to_the_surfels_behind_it(parked):
+    """A wall at 10.7 m. Matching puts the right half of the picture at 10 m, where the surfel there agrees with it.
+
+    Every second pixel is lifted, and those between them follow the nearest, up to the edge of depth.
+    """
+    wall = np.array([[10.7, -1.0, 0.0], [10.7, 1.0, 0.0]])
+    body = body_of(wall, np.tile(np.float32([-1, 0, 0]), (2, 1)))
+    shape, turn = (4, 8), np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    tile = Tile(8, 4, 16.0, (4.0, 2.0), np.eye(3), 1, None, np.ones(shape, bool), np.zeros(3))
+    rgb = np.full((*shape, 3), 99, np.uint8)
+    view = WorkingView("front", 0, 1_000_000, True, tile, geometry.pose(turn, np.zeros(3)), np.zeros(3), rgb)
+    depth = np.tile(np.float32([1 / 10.7] * 4 + [0.1] * 4), (4, 1))
+    picture = DepthPicture(depth, np.zeros(shape, np.int32), np.full(shape, -1, np.int32), *np.zeros((2, *shape), bool))
+    settings = LiftSettings(views=ViewSettings(budget=7), opacity=0.5)
+    pixels = body_pixels([body], [view], [picture], [rgb], settings)[0]
+    for beams, left, discs in (([], 16, 0), ([sweep_of(parked, 10.7 / directions()[:, 0])] * 3, 8, 1)):
+        gaussians, lifted = body_gaussians(body, pixels, level_ground(), [view], [picture], [rgb], settings, beams)
+        assert lifted == left and len(gaussians) - lifted == discs
+    assert gaussians.mean_m[-1] == pytest.approx(wall[0])
+    wrong = pixels[pixels.depth_m < 10.5]
+    assert (
+        len(pixels) == 16 and marked_free([picture], pixels, wrong)[0].free.tolist() == [[False] * 4 + [True] * 4] * 4
+    )
+
+
+def test_a_footprint_that_is_only_too_long_is_made_round(parked):
+    """Five times as long as wide: beams to 50 m pass its ends, and stop at its centre or not."""
+    one, four = np.ones(1), np.full(1, 4, np.int32)
+    grazing, normal = np.array([[0.2, np.sqrt(0.96), 0]]), np.array([[-1.0, 0, 0]])
+    lifted = Lifted(np.array([[30.0, 0, 0]]), normal, grazing, 10 * one, 0.17 * one, np.zeros((1, 3), np.float32),
+                    four - 5, four, four)  # fmt: skip
+    near = np.linalg.norm(directions() * 30 - [30, 0, 0], axis=1) < 0.16
+    for ranges, round_one in ((np.where(near, 30.0, 50.0), 1), (50.0, 0)):
+        sweeps = [sweep_of(parked, ranges)] * 3
+        body = body_of(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+        kept, dropped = outside_free_space(lifted, body, level_ground(), LiftSettings(), sweeps)
+        assert (len(kept), len(dropped)) == (round_one, 1 - round_one)
+        assert kept.scale_m[:, :2] == pytest.approx(np.full((round_one, 2), PIXEL_SIGMA * 0.17), rel=1e-5)

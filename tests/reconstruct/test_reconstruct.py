@@ -5,6 +5,7 @@ import pytest
 from reconstruct_street import KERB_M, Street, camera
 
 from nurec_sim import geometry
+from nurec_sim.compute import cores
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.scores.images import psnr
 from nurec_sim.reconstruct import LiftSettings, ViewSettings, reconstruct
@@ -110,7 +111,8 @@ def test_provenance_is_plain_json(scene):
     assert any(text.startswith("no map") for text in facts["unknown"])
 
 
-def test_same_clip_same_scene(street, scene):
+def test_same_clip_same_scene_by_any_number_of_threads(street, scene, monkeypatch):
+    monkeypatch.setattr(cores, "usable_cores", lambda: 3)
     again = reconstruct(street, settings=SMALL)
     assert scene_hash(again) == scene_hash(scene)
 
@@ -177,6 +179,7 @@ def test_progress_names_stages_in_order(street):
     stages = list(dict.fromkeys(stage for stage, _ in seen))
     assert stages == [
         "sweeps", "ground and surfaces", "images", "depth", "colours", "lifting", "sky", "solving colours",
+        "ray drop",
     ]  # fmt: skip
     told = [fraction for _, fraction in seen]
     assert told == sorted(told) and (told[0], told[-1]) == (0.0, 1.0)

@@ -100,7 +100,9 @@ def test_pixels_go_to_the_frame_of_their_body_and_normals_are_computed_once_per_
     t_us = (1_200_000, 2_200_000)
     views = [WorkingView("front", 0, t, True, tile, geometry.pose(turn, np.zeros(3)), np.zeros(3), rgb) for t in t_us]
     body = np.repeat(np.arange(8) < 4, 4).reshape(8, 4).T.astype(np.int32)
-    picture = DepthPicture(np.full(shape, 0.1, np.float32), body, np.full(shape, -1, np.int32), np.zeros(shape, bool))
+    picture = DepthPicture(
+        np.full(shape, 0.1, np.float32), body, np.full(shape, -1, np.int32), *np.zeros((2, *shape), bool)
+    )
     world, box = body_pixels(bodies, views, [picture] * 2, [rgb] * 2, LiftSettings())
     assert len(calls) == 2 and len(world) == len(box) == 32
     assert np.allclose(world.xyz_m[:, 0], 10) and (world.xyz_m[:, 1] < 0).all() and np.allclose(world.depth_m, 10)

@@ -127,7 +127,7 @@ def test_views_project_like_their_camera(lens):
         front = CameraModel("front", 320, 160, Fisheye(100, 100, 160, 80, max_angle_rad=1.6), front.rig_from_camera)
     clip = Street(frames=1, cameras=(front,))
     options = ViewSettings()
-    views = read_views(clip, ["front"], options)
+    views = read_views(clip, ["front"], {}, options)
     assert len(views) == len(tiles_of(front, options)) and (lens != "fisheye" or len(views) >= 2)
     world_from_camera = clip.world_from_camera("front", 0)[0]
     errors = []
@@ -159,7 +159,7 @@ def test_rolling_shutter_points_project_back():
             return pair
 
     clip = Rolling(frames=1, cameras=(rolling,))
-    (view,) = read_views(clip, ["front"], ViewSettings())
+    (view,) = read_views(clip, ["front"], {}, ViewSettings())
     assert np.linalg.norm(view.drift_m) == pytest.approx(0.3)
     points = lifting.points_of(view, np.full((96, 192), 0.2, np.float32))
     uv, seen, _ = sensors.project_rolling(rolling, clip.world_from_camera("front", 0), points[::9, ::17].reshape(-1, 3))
@@ -176,7 +176,7 @@ def test_frames_are_thinned_evenly():
 
 def test_depth_is_found_by_matching_where_nothing_was_measured():
     clip = Street(frames=3)
-    views = read_views(clip, ["front"], ViewSettings())
+    views = read_views(clip, ["front"], {}, ViewSettings())
     step, levels = 1 / 3.5 / 47, 48
     empty = np.zeros((96, 192), np.float32)
     around = [(v.packed, v.rgb, depth.census(v.rgb.mean(axis=-1).astype(np.uint8))) for v in views[1:]]
@@ -193,7 +193,7 @@ def test_depth_is_found_by_matching_where_nothing_was_measured():
 
 def test_measured_depth_stays():
     prior = np.full((20, 30), 0.123, np.float32)
-    view = read_views(Street(frames=1, cameras=(camera(width=30, height=20),)), ["front"], ViewSettings())[0]
+    view = read_views(Street(frames=1, cameras=(camera(width=30, height=20),)), ["front"], {}, ViewSettings())[0]
     found = depth.dense_inverse_depth(view.packed, view.world_from_view, view.rgb, prior, prior > 1, [], 32, 0.01)
     assert np.array_equal(found, prior)
 
@@ -240,3 +240,13 @@ def test_limits_follow_the_length_of_the_log(path_m, duration_s, lengths):
     assert (views.max_views, views.max_frames, views.budget) == (40 * lengths, 240 * lengths, 900_000 * lengths)
     assert longer.colours.images == 60 * lengths
     assert views.width_px == 640 and longer.points == given.points
+
+
+def test_short_logs_of_large_images_are_worked_on_in_more_detail():
+    """8 million pixels: 12 images of 1936 x 1216 fit at half their size; 300 do not even at a quarter, nor does 640."""
+    settings = ViewSettings()
+    assert settings.for_images([(1936, 1216, 2)] * 6).width_px == 968
+    assert settings.for_images([(1936, 1216, 50)] * 6) == settings
+    assert settings.for_images([(1242, 375, 51)]) == settings  # 23.8 million at full size, 5.9 at half
+    assert settings.for_images([(1600, 900, 1)] * 5).width_px == 1600  # 7.2 million
+    assert settings.for_images([(320, 192, 10)]) == settings and settings.for_images([]) == settings

@@ -147,15 +147,27 @@ def test_sky_is_bright_or_clearly_blue_and_above_the_horizon(rgb, sky):
 # ------------------------------------------------------------------------------------------------------------- colours
 
 
+def seen_colours(depths_m, free=(False, False)):
+    """A point 10 m from one view and 20 m from another one behind it, grey of 100 and 200."""
+    packed = np.stack([looking_ahead(), looking_ahead(10.0)])
+    inverse_depth = np.stack([np.full((9, 9), 1 / depth_m, np.float32) for depth_m in depths_m])
+    wrong = np.stack([np.full((9, 9), each) for each in free])
+    pictures = np.stack([np.full((9, 9, 3), grey, np.uint8) for grey in (100, 200)])
+    return colour.seen_colours(np.array([[0.0, 0.0, 10.0]]), TOWARDS, packed, inverse_depth, wrong, pictures,
+                               np.ones(2, bool), 0.002)  # fmt: skip
+
+
 def test_views_colour_a_point_by_the_inverse_square_of_their_distance():
     """10 and 20 m away: four to one."""
-    packed = np.stack([looking_ahead(), looking_ahead(10.0)])
-    inverse_depth = np.stack([np.full((9, 9), w, np.float32) for w in (1 / 10, 1 / 20)])
-    pictures = np.stack([np.full((9, 9, 3), grey, np.uint8) for grey in (100, 200)])
-    rgb, pixel_m, through = colour.seen_colours(np.array([[0.0, 0.0, 10.0]]), TOWARDS, packed, inverse_depth, pictures,
-                                                np.ones(2, bool), 0.002)  # fmt: skip
+    rgb, pixel_m, through = seen_colours((10, 20))
     assert rgb[0] == pytest.approx([(4 * 100 + 200) / 5] * 3)
     assert pixel_m[0] == pytest.approx(10.0 / 10.0) and through[0] == 0
+
+
+def test_what_lies_well_behind_a_depth_that_beams_passed_is_not_seen_there():
+    """0.3 m and 2 % of 10 m behind it: 9.4 m hides the point, 9.6 m does not."""
+    for depth_m, grey in ((9.4, 200), (9.6, (4 * 100 + 200) / 5)):
+        assert seen_colours((depth_m, 20), (True, False))[0][0] == pytest.approx([grey] * 3)
 
 
 def test_unseen_points_take_the_colours_of_seen_ones_within_two_metres():
@@ -163,14 +175,16 @@ def test_unseen_points_take_the_colours_of_seen_ones_within_two_metres():
     x = np.array([0.0, 0.45, -0.95, -3.0])
     rgb = np.array([[0] * 3, [0.3] * 3, [0.9] * 3, [0] * 3], np.float32)
     seen, none = np.array([False, True, True, False]), np.full(4, np.nan, np.float32)
-    filled = colour.fill_unseen(np.column_stack([x, np.zeros((4, 2))]), rgb, seen, none)
+    filled = colour.fill_unseen(np.column_stack([x, np.zeros((4, 2))]), rgb, seen, ~seen, none)
     assert filled[:, 0] == pytest.approx([(2 * 0.3 + 0.9) / 3, 0.3, 0.9, 0.4])
 
 
 def test_unseen_points_far_from_seen_ones_are_grey_by_their_intensity():
     """From 0.2 to 0.6, reached at the ninth decile of the known intensities; unknown ones count as half of that."""
     intensity = np.array([*range(11), np.nan], np.float32)
-    filled = colour.fill_unseen(np.zeros((12, 3)), np.zeros((12, 3), np.float32), np.zeros(12, bool), intensity)
+    filled = colour.fill_unseen(
+        np.zeros((12, 3)), np.zeros((12, 3), np.float32), np.zeros(12, bool), np.ones(12, bool), intensity
+    )
     assert filled[[0, 3, 9, 10, 11], 1] == pytest.approx([0.2, 0.2 + 0.4 / 3, 0.6, 0.6, 0.4])
 
 

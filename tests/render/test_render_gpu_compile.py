@@ -16,6 +16,17 @@ def needs_compiler():
     pytest.importorskip("cuda.core", reason="the extra 'gpu' is not installed")
 
 
+@pytest.fixture
+def nvrtc():
+    from cuda.pathfinder import DynamicLibNotFoundError, load_nvidia_dynamic_lib
+
+    try:
+        load_nvidia_dynamic_lib("nvrtc")
+    except DynamicLibNotFoundError as error:
+        pytest.skip(f"NVRTC, which compiles the kernels, is not found: {error}")
+
+
+@pytest.mark.usefixtures("nvrtc")
 @pytest.mark.parametrize("architecture", ["sm_80", "sm_90", "sm_120"])
 def test_compiles_without_warnings_spills_or_local_memory(architecture):
     cubin, log = compiler.compile_cubin(architecture)
@@ -35,6 +46,7 @@ def test_unknown_architecture():
         compiler.compile_cubin("sm_7")
 
 
+@pytest.mark.usefixtures("nvrtc")
 def test_cubins_are_kept_by_source_and_architecture(tmp_path, monkeypatch):
     calls = []
 
@@ -52,6 +64,7 @@ def test_cubins_are_kept_by_source_and_architecture(tmp_path, monkeypatch):
     assert calls == ["sm_90", "sm_120", "sm_90"]
 
 
+@pytest.mark.usefixtures("nvrtc")
 def test_a_folder_that_cannot_be_used_costs_a_compilation_only(tmp_path, monkeypatch):
     monkeypatch.setattr(compiler, "compile_cubin", lambda architecture: (b"code", ""))
     blocked = tmp_path / "file"

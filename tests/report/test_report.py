@@ -20,7 +20,7 @@ from metrics_worlds import (
 from nurec_sim import geometry
 from nurec_sim.metrics import build_offroad_grid, find_contacts, metric_table, rollout_values, score_rollout, summarize
 from nurec_sim.metrics.series import METRICS
-from nurec_sim.report import ReportRollout, ReportScene, RunReport, render_report
+from nurec_sim.report import ReportRollout, ReportScene, RunReport, Video, render_report
 from nurec_sim.report.plan import PlanAxes, plan_view
 from nurec_sim.types import Trajectory
 
@@ -121,19 +121,19 @@ def test_texts_of_others_cannot_break_the_page(report):
     entries = (*report.rollouts[:1], dataclasses.replace(entry, rollout=run), *report.rollouts[2:])
     text = render_report(dataclasses.replace(report, rollouts=entries, scenes=(scene,)))
     assert "<script>alert" not in text
-    assert any("&lt;/script&gt;" in json.dumps(trace) for trace in figures(text)["figures"]["plan1"]["data"])
+    assert any("&lt;/script&gt;" in json.dumps(trace) for trace in figures(text)["figures"]["plan0"]["data"])
 
 
 def test_plans_show_road_boxes_path_and_events(text):
     stored = figures(text)
-    drifter = stored["figures"]["plan1"]
+    drifter = stored["figures"]["plan2"]  # after a failure and a collision: the worst come first
     names = {trace["name"] for trace in drifter["data"]}
     assert {"road", "not road", "unknown", "recorded path", "driven path", "static actors", "off-road"} <= names
     assert {"moving actors, each second", "ego at the first event", "true road edge"} <= names
     (image,) = drifter["layout"]["images"]
     assert stored["images"][image["image_key"]]["source"].startswith("data:image/png;base64,")
-    assert "plan2" not in stored["figures"], "nothing to draw for a rollout without states"
-    shades = [shape["fillcolor"] for shape in stored["figures"]["time1"]["layout"]["shapes"] if shape["type"] == "rect"]
+    assert "plan0" not in stored["figures"], "nothing to draw for a rollout without states"
+    shades = [shape["fillcolor"] for shape in stored["figures"]["time2"]["layout"]["shapes"] if shape["type"] == "rect"]
     assert shades[0] == "rgba(220,38,38,0.15)"
 
 
@@ -145,7 +145,7 @@ def test_the_drive_goes_to_the_right_whatever_its_heading(report):
     grid = report.scenes[0].grid
     image = PlanAxes(EGO).grid_image(grid)
     assert image["x"] == pytest.approx(PlanAxes(EGO).low[0] - 25) and image["sizex"] > 100
-    figure = plan_view(report.rollouts[0], PlanAxes(EGO), None, None)
+    figure = plan_view(report.rollouts[:1], PlanAxes(EGO), None, None)
     assert "images" not in figure["layout"]
 
 
@@ -166,7 +166,7 @@ def test_grid_image_lies_where_the_path_is(report):
 def test_videos_are_embedded_or_linked(report, tmp_path, monkeypatch):
     video = tmp_path / "front.mp4"
     video.write_bytes(b"not really a video")
-    entry = dataclasses.replace(report.rollouts[0], video=video, video_link="street/lift/a/0/front.mp4")
+    entry = dataclasses.replace(report.rollouts[0], videos=(Video(video, "street/lift/a/0/front.mp4"),))
     with_video = dataclasses.replace(report, rollouts=(entry, *report.rollouts[1:]))
     assert 'src="data:video/mp4;base64,bm90IHJlYWxseSBhIHZpZGVv"' in render_report(with_video)
     monkeypatch.setattr("nurec_sim.report.page.MAX_EMBEDDED_BYTES", 10)

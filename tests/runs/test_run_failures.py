@@ -1,5 +1,6 @@
 """`nurec-sim run` where things fail: hostile policies, a server that dies or freezes; real sockets and processes."""
 
+import io
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from nurec_sim import cli, runs, sim
 from nurec_sim.errors import ScenarioError, ServerError
 from nurec_sim.metrics import read_table
 from nurec_sim.runs.rollout_file import load_rollout
+from nurec_sim.runs.video import write_video
 from nurec_sim.scene import write_scene
 from nurec_sim.serving.client import RemoteSensors
 from nurec_sim.serving.connection import Connection
@@ -200,6 +202,13 @@ def test_an_address_without_a_server_ends_the_run_before_anything_is_made(place,
     assert capsys.readouterr().err.strip() == "nurec-sim: 127.0.0.1:9: the server cannot be reached within 0.3 s"
 
 
+def test_a_finished_archive_is_not_refined(place, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["run", str(place / "street.usdz"), "--refine", "5", "--out", str(place / "none")])
+    assert stop.value.code == 1 and not (place / "none").exists()
+    assert "--refine optimises reconstructions of clips; clipgt-street is a finished archive" in capsys.readouterr().err
+
+
 def test_a_real_interrupt_ends_a_run_with_130(place):
     """Ctrl-C while a policy hangs."""
     (place / "sleeps.py").write_text(
@@ -231,3 +240,16 @@ def test_a_real_interrupt_ends_a_run_with_130(place):
             process.kill()
     assert asleep and process.returncode == 130, said
     assert "interrupted; finished rollouts are kept" in said
+
+
+def test_a_film_that_cannot_be_finished_is_an_error_not_a_wait():
+    pictures = [np.zeros((36, 64, 3), np.uint8)] * 5
+
+    class Full(io.BytesIO):
+        def write(self, data):
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError):
+        write_video(Full(), pictures)
+    with pytest.raises(OSError):
+        write_video("/nowhere/film.mp4", pictures * 10)  # more than may wait

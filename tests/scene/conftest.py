@@ -1,9 +1,11 @@
 """Fixtures of the tests of archives."""
 
 import functools
+import pickle
 
 import pytest
 
+from nurec_sim.scene import sidecars
 from nurec_sim.scene.interop.validate import alpasim_roads, maps
 from nurec_sim.scene.interop.validate.alpasim_map import AlpasimMap
 from nurec_sim.scene.opendrive import reader
@@ -11,6 +13,23 @@ from nurec_sim.scene.opendrive.xml import opendrive_root
 
 # Trees that are equal are one tree, and hash by identity.
 _root, _map = functools.cache(opendrive_root), functools.cache(AlpasimMap)
+_written: dict[bytes, bytes | None] = {}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _equal_maps_are_written_once():
+    """Most archives of these tests hold the same map; tests of the map itself call ``opendrive_map``."""
+    write = sidecars.opendrive_map
+
+    def once(*given):
+        key = pickle.dumps(given)
+        if key not in _written:
+            _written[key] = write(*given)
+        return _written[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sidecars, "opendrive_map", once)
+        yield
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from nurec_sim.scene import archive_faults, read_scene, scene_hash, summary, wri
 from nurec_sim.scene.describe import scene_arrays
 from nurec_sim.scene.precision import archived
 from nurec_sim.sensors import lidar_model
-from nurec_sim.types import DynamicGaussians, Gaussians, Label, Rig, Trajectory
+from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, Rig, Trajectory
 
 KNOT_FIELDS = ("knot_t_us", "knot_m", "track")
 
@@ -332,3 +332,25 @@ def test_the_faces_of_the_sky_are_archived_in_their_order(tmp_path):
         kept = np.load(io.BytesIO(package.read("nurec_sim/sky_cubemap.npy")))
     assert kept[:, 0, 0, 0].tolist() == [0, 0.125, 0.25, 0.375, 0.5, 0.625]
     assert np.array_equal(read_scene(tmp_path / "a.usdz").sky, sky)
+
+
+def scene_with_bonnet(shape=(720, 1280, 4)) -> GaussianScene:
+    image = np.zeros(shape, np.uint8)
+    image[-4:] = (200, 30, 40, 255)
+    image[-4, :, 3] = 128
+    return dataclasses.replace(full_scene(), ego_images={"front": image})
+
+
+def test_images_of_the_ego_vehicle_are_kept_exactly(tmp_path):
+    scene = scene_with_bonnet()
+    assert_same(scene, read_scene(write_scene(scene, tmp_path / "a.usdz")))
+    assert scene_hash(scene) != scene_hash(full_scene())
+
+
+def test_images_of_the_ego_vehicle_must_fit_their_camera(tmp_path):
+    with pytest.raises(ArchiveError, match=r"ego_images\['front'\].*\(720, 1280, 4\).*\(4, 1280, 4\)"):
+        write_scene(scene_with_bonnet((4, 1280, 4)), tmp_path / "a.usdz")
+    stray = dataclasses.replace(scene_with_bonnet(), ego_images={"back": np.zeros((2, 2, 4), np.uint8)})
+    with pytest.raises(ArchiveError, match=r"ego_images\['back'\]: the rig has no such camera"):
+        write_scene(stray, tmp_path / "b.usdz")
+    assert not list(tmp_path.iterdir())

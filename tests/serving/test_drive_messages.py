@@ -43,12 +43,18 @@ def angle_between(a, b):
     return np.abs(geometry.wrap_angle(np.asarray(a) - b)).max()
 
 
-@PROPERTY
-@given(egos(), POSES2)
-def test_plans_travel_exactly_and_nearly_without_our_additions(ego, xyyaw):
+def written_plan(ego, xyyaw):
+    """A plan of a pose every 0.1 s, and the reply that holds it."""
     plan = Plan(NOW_US + 100_000 * np.arange(1, len(xyyaw) + 1), xyyaw)
     message = egodriver.DriveResponse()
     driving_paths.write_plan(ego, plan, message)
+    return plan, message
+
+
+@PROPERTY
+@given(egos(), POSES2)
+def test_plans_travel_exactly_and_nearly_without_our_additions(ego, xyyaw):
+    plan, message = written_plan(ego, xyyaw)
     found = driving_paths.read_plan(ego, message)
     assert found.t_us.tolist() == plan.t_us.tolist() and np.array_equal(found.pose, plan.pose)
     rounded = driving_paths.read_plan(ego, like_alpasim(message))
@@ -59,9 +65,7 @@ def test_plans_travel_exactly_and_nearly_without_our_additions(ego, xyyaw):
 @PROPERTY
 @given(egos(), POSES2)
 def test_plans_lie_on_the_plane_of_the_car_and_start_at_it(ego, xyyaw):
-    plan = Plan(NOW_US + 100_000 * np.arange(1, len(xyyaw) + 1), xyyaw)
-    message = egodriver.DriveResponse()
-    driving_paths.write_plan(ego, plan, message)
+    _, message = written_plan(ego, xyyaw)
     poses = np.array([np.array(p.pose.exact).reshape(4, 4) for p in message.trajectory.poses])
     np.testing.assert_allclose(poses[0], ego.world_from_rig, atol=1e-9)
     inside = geometry.transform_points(geometry.inverse(ego.world_from_rig), poses[:, :3, 3])

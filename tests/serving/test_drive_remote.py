@@ -24,7 +24,7 @@ from nurec_sim.sim.conformance import check_policy
 from nurec_sim.types import Needs, Plan
 
 POLICIES = ("camera_road_follower", "lidar_aeb", "route_follower", "log_replay", "constant_velocity")
-SHORT = make_scenario({"name": "short", "duration_s": 3.0})
+SHORT = make_scenario({"name": "short", "duration_s": 2.0})
 
 
 def rollout(policy, world, scenario=SHORT):

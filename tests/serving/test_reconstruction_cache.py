@@ -19,7 +19,7 @@ from serving_world import scene
 import nurec_sim.logs
 import nurec_sim.reconstruct
 from nurec_sim.errors import ReconstructError, WeightsError
-from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, ViewSettings
+from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, OptimizeSettings, ViewSettings
 from nurec_sim.render import CpuRenderer
 from nurec_sim.serving.store import Recipe, SceneStore, content_key
 
@@ -73,9 +73,10 @@ def test_the_name_depends_on_method_settings_cameras_and_weights(clip, tmp_path)
         Recipe("lift", cameras=("front",)),
         *(Recipe("dense", FeedForwardSettings(random_weights=seed)) for seed in (1, 2)),
         Recipe("selective", FeedForwardSettings(random_weights=1)),
+        *(Recipe("lift", refine=OptimizeSettings(seconds=seconds)) for seconds in (10.0, 20.0)),
     ]
     keys += [content_key(clip, recipe) for recipe in recipes]
-    assert len(set(keys)) == len(keys) == 8
+    assert len(set(keys)) == len(keys) == 10
     assert keys == [*keys[:2], *(content_key(clip, recipe) for recipe in recipes)]
 
 
@@ -100,6 +101,12 @@ def test_settings_and_cameras_reach_the_method(clip, made, tmp_path):
     assert method == "dense" and chosen["settings"].random_weights == 3 and chosen["cameras"] == ("front",)
     assert plain == "lift" and "settings" not in nothing and "cameras" not in nothing
     assert len(list((tmp_path / "cache").iterdir())) == 2
+
+
+def test_a_clip_is_refined_before_it_is_kept_and_not_kept_if_interrupted(clip, made, tmp_path):
+    store_of(clip, tmp_path / "cache", refine=OptimizeSettings(seconds=5.0)).get("tiny")
+    ((method, chosen),) = made
+    assert method == "lift" and chosen["refine"] == OptimizeSettings(seconds=5.0, keep_interrupted=False)
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "flipped"])

@@ -176,22 +176,25 @@ def test_when_its_deadline_passes_the_work_ends(client, clip, method, store):
     wait_until(lambda: store.ids == ("clipgt-street", "clipgt-stored"))
 
 
-def test_who_waits_for_the_scene_gets_it_though_the_other_leaves(client, address, clip, method, store):
-    frames, begun = [], threading.Event()
+def asks_until(left, address, clip):
+    """A client that asks for the scene and leaves once ``left`` is set."""
 
-    def first(stage, fraction):
-        if begun.is_set():
+    def progress(stage, fraction):
+        if left.is_set():
             raise InterruptedError
 
-    def leaver():
-        with SceneClient(address) as other, pytest.raises(InterruptedError):
-            other.reconstruct(path=str(clip), progress=first)
+    with SceneClient(address) as other, pytest.raises(InterruptedError):
+        other.reconstruct(path=str(clip), progress=progress)
+
+
+def test_who_waits_for_the_scene_gets_it_though_the_other_leaves(client, address, clip, method, store):
+    frames, begun = [], threading.Event()
 
     def waiter():
         with store.lease("tiny") as loaded:
             frames.append(CpuRenderer(loaded.scene, threads=1).render_camera(camera_request()))
 
-    threads = [threading.Thread(target=leaver)]
+    threads = [threading.Thread(target=asks_until, args=(begun, address, clip))]
     threads[0].start()
     wait_until(lambda: method.begun)
     threads.append(threading.Thread(target=waiter))
@@ -208,16 +211,8 @@ def test_who_waits_for_the_scene_gets_it_though_the_other_leaves(client, address
 def test_of_two_clients_the_second_gets_the_scene_though_the_first_leaves(client, address, clip, method, store):
     leave = threading.Event()
 
-    def cancel(stage, fraction):
-        if leave.is_set():
-            raise InterruptedError
-
-    def first():
-        with SceneClient(address) as other, pytest.raises(InterruptedError):
-            other.reconstruct(path=str(clip), progress=cancel)
-
     with ThreadPoolExecutor(2) as pool:
-        leaving = pool.submit(first)
+        leaving = pool.submit(asks_until, leave, address, clip)
         wait_until(lambda: method.begun)
         heard = []
         staying = pool.submit(client.reconstruct, path=str(clip), progress=lambda *step: heard.append(step))

@@ -1,5 +1,7 @@
 """What the server tells of its scenes and itself, and how other clients find it."""
 
+import dataclasses
+
 import cv2
 import grpc
 import numpy as np
@@ -132,3 +134,19 @@ def test_ego_masks_are_listed_and_laid_over(tmp_path):
         message.ego_mask_id.CopyFrom(entry.ego_mask_id)
         covered = pixels(stub.render_rgb(message))
     assert (covered[120:] == (5, 10, 20)).all() and np.array_equal(covered[:118], plain[:118])
+
+
+def test_without_a_named_mask_the_scene_shows_what_it_knows_of_the_ego_vehicle():
+    """The bonnet that the scene keeps is laid over if asked for; scenes that know none are shown as they are."""
+    image = np.zeros((180, 320, 4), np.uint8)
+    image[120:] = (5, 10, 20, 255)
+    driven = dataclasses.replace(scene("driven"), ego_images={"front": image})
+    message = camera_message(scene_id="driven")
+    message.insert_ego_mask = True
+    with street_stub(driven) as stub:
+        covered, plain = pixels(stub.render_rgb(message)), pixels(stub.render_rgb(camera_message(scene_id="driven")))
+        message.scene_id = "street"
+        unknown, street = pixels(stub.render_rgb(message)), pixels(stub.render_rgb(camera_message()))
+    assert (covered[120:] == (5, 10, 20)).all() and np.array_equal(covered[:120], plain[:120])
+    assert not (plain[120:] == (5, 10, 20)).all()
+    np.testing.assert_array_equal(unknown, street)

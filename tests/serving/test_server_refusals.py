@@ -92,9 +92,9 @@ BAD_CAMERA_REQUESTS = {
         "dynamic_objects['car-1'].pose_pair.end_pose must be finite",
     ),
     "an ego mask that is not there": (
-        lambda m: setattr(m, "insert_ego_mask", True),
+        lambda m: (setattr(m, "insert_ego_mask", True), setattr(m.ego_mask_id, "rig_config_id", "van")),
         Code.INVALID_ARGUMENT,
-        "there is no ego mask for (rig, camera) ('', 'front'); have []",
+        "there is no ego mask for (rig, camera) ('van', 'front'); have []",
     ),
     "an archive that is not one": (
         lambda m: setattr(m, "scene_id", "clipgt-broken"),

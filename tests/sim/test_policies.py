@@ -87,9 +87,9 @@ def test_the_camera_follows_a_curve_it_only_sees():
 def test_the_camera_reads_nothing_but_its_image():
     world = worlds.parked_car_ahead()
     elsewhere = replace(worlds.straight_road(), tracks=())
-    seen = run_rollout(Scenario(name="a", duration_s=6.0), load_policy("camera_road_follower"), world.sense, world)
+    seen = run_rollout(Scenario(name="a", duration_s=3.0), load_policy("camera_road_follower"), world.sense, world)
     fooled = run_rollout(
-        Scenario(name="a", duration_s=6.0), load_policy("camera_road_follower"), world.sense, elsewhere
+        Scenario(name="a", duration_s=3.0), load_policy("camera_road_follower"), world.sense, elsewhere
     )
     assert seen.world_from_rig.tobytes() == fooled.world_from_rig.tobytes()
 

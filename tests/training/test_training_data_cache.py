@@ -16,6 +16,7 @@ from nurec_sim.errors import ClipError
 from nurec_sim.network.profiles import PROFILES
 from nurec_sim.network.tensors import SemanticClass
 from nurec_sim.training.data import cache as cache_module
+from nurec_sim.training.data import stream as stream_module
 from nurec_sim.training.data.cache import ClipCache
 from nurec_sim.training.data.clips import UNFINISHED_PREFIX
 from nurec_sim.training.data.generate import ClipSettings, clip_ids, generate_town
@@ -87,6 +88,25 @@ def test_refreshing_drops_the_oldest_clips(tmp_path):
     assert cache.clip_ids() == ["train-000000-0", "train-000001-1"]
 
 
+def test_step_n_of_rank_r_is_sample_n_times_ranks_plus_r(tmp_path, monkeypatch):
+    monkeypatch.setattr(stream_module, "ready_clips", lambda folder: ["clip"])
+    monkeypatch.setattr(stream_module, "draw_sample", lambda folder, settings, seed, index: (seed, index))
+    for rank in range(3):
+        with SampleStream(tmp_path, WINDOWS, seed=5, start=4, rank=rank, world_size=3) as stream:
+            assert [next(stream) for _ in range(3)] == [(5, 12 + rank), (5, 15 + rank), (5, 18 + rank)]
+
+
+def test_each_sample_has_its_clip_and_random_numbers_of_its_own(tmp_path, monkeypatch):
+    names = [f"train-{k:06d}-0" for k in range(9)]
+    monkeypatch.setattr(stream_module, "ready_clips", lambda folder: names)
+    monkeypatch.setattr(stream_module, "CachedClip", lambda path: path.name)
+    monkeypatch.setattr(stream_module, "sample_window", lambda rng, clip, settings: (clip, rng.random()))
+    samples = [draw_sample(tmp_path, WINDOWS, 2, index) for index in range(12)]
+    assert [clip for clip, _ in samples] == [clip_order(2, index, names)[0] for index in range(12)]
+    assert len({number for _, number in samples}) == 12
+    assert draw_sample(tmp_path, WINDOWS, 2, 5) == samples[5] != draw_sample(tmp_path, WINDOWS, 3, 5)
+
+
 def test_a_failing_worker_is_reported_and_ends(tmp_path, monkeypatch):
     monkeypatch.setattr(cache_module, "TRIALS", 1)
     lines = []
@@ -97,7 +117,7 @@ def test_a_failing_worker_is_reported_and_ends(tmp_path, monkeypatch):
     assert len(lines) == 1 and "status 1" in lines[0]
 
 
-def test_a_process_fills_the_cache_a_second_run_goes_on_and_another_draws_the_same_bytes(tmp_path):
+def test_a_process_fills_the_cache_and_a_second_run_goes_on(tmp_path):
     seen = []
     ClipCache(tmp_path, SETTINGS, 1, TOWN).fill(
         progress=lambda done, wanted: seen.append((done, wanted)), backend="rays"
@@ -110,6 +130,12 @@ def test_a_process_fills_the_cache_a_second_run_goes_on_and_another_draws_the_sa
     clip = cache.clip("train-000007-0")
     assert len(clip.plan_hash) == 64 and len(cache.data_hash()) == 64
     check_drawn_clip(clip)
+
+
+@pytest.mark.slow
+def test_a_town_has_the_same_bytes_in_every_process(tmp_path):
+    cache = ClipCache(tmp_path, SETTINGS, 1, TOWN)
+    cache.fill(backend="rays")
     (again,) = generate_town(TOWN, SETTINGS, tmp_path / "again", "rays")
     files = sorted(path.name for path in again.iterdir())
     assert len(files) >= 12

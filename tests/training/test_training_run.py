@@ -1,6 +1,7 @@
 import csv
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -39,14 +40,39 @@ def first_step(tmp_path_factory):
     return folder
 
 
+def assert_same_state(folder, other):
+    """Networks, moving averages and moments of two runs, bit for bit."""
+    state = [safetensors.torch.load_file(each / CHECKPOINT) for each in (folder, other)]
+    assert state[0].keys() == state[1].keys()
+    assert all(torch.equal(state[0][name], state[1][name]) for name in state[0])
+
+
+def test_a_run_goes_on_bit_for_bit_within_a_stage(first_step, tmp_path):
+    shutil.copytree(first_step, tmp_path / "cut")
+    for name in ("cut", "straight"):
+        trainer(tmp_path / name).run(until=2)
+    assert_same_state(tmp_path / "cut", tmp_path / "straight")
+
+
+def test_after_the_first_step_the_average_holds_a_tenth_of_the_random_weights(first_step):
+    """The decay at step n is the smaller of the recipe's and (1 + n) / (10 + n)."""
+    name = "encoder.vit.blocks.0.attn.qkv.weight"
+    saved = safetensors.torch.load_file(first_step / CHECKPOINT)
+    random = network.build("tiny", seed=0).state_dict()[name]
+    assert not torch.equal(saved[f"model/{name}"], random)
+    torch.testing.assert_close(saved[f"average/{name}"], 0.9 * saved[f"model/{name}"] + 0.1 * random)
+
+
+def test_a_stage_begins_with_moments_of_its_own(whole):
+    assert not [name for name in safetensors.torch.load_file(whole / CHECKPOINT) if name.startswith(("count", "exp_"))]
+
+
 @pytest.mark.slow
 def test_a_run_that_was_cut_off_ends_with_the_same_bytes(whole, tmp_path):
     for until in (2, 4, 7, None):
         trainer(tmp_path / "cut").run(until=until)
+    assert_same_state(whole, tmp_path / "cut")
     folders = (whole, tmp_path / "cut")
-    state = [safetensors.torch.load_file(folder / CHECKPOINT) for folder in folders]
-    assert state[0].keys() == state[1].keys()
-    assert all(torch.equal(state[0][name], state[1][name]) for name in state[0])
     metadata = [read_metadata(folder / WEIGHTS) for folder in folders]
     assert metadata[0].pop("seconds") and metadata[1].pop("seconds") and metadata[0] == metadata[1]
     # The header has the seconds, with as many digits as they have, and is padded to whole 8 bytes.

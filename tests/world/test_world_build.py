@@ -12,6 +12,7 @@ from nurec_sim.world.model.assemble import FAR_M, build_town
 from nurec_sim.world.model.builder import DECAL_ALPHA, DECAL_GROUP
 from nurec_sim.world.plan.layout import town_plan
 from nurec_sim.world.plan.surface import LABEL_OF_CLASS, SurfaceClass
+from nurec_sim.world.sense import simulator
 
 GROUND = [SurfaceClass.ROAD, SurfaceClass.MARKING, SurfaceClass.KERB, SurfaceClass.SIDEWALK, SurfaceClass.ISLAND,
           SurfaceClass.GRASS]  # fmt: skip
@@ -140,7 +141,7 @@ def test_rays_straight_down_meet_the_surface_of_the_network(town, data):
 
 
 @pytest.mark.needs_gl
-def test_drawn_from_anywhere_there_is_no_sky_below_the_horizon(town):
+def test_drawn_from_anywhere_there_is_no_sky_below_the_horizon(town, monkeypatch):
     """OpenGL leaves out back faces, so what is wound wrongly or lacks a side is a hole; seen from lawns as well."""
     backend = pick_backend()
     if backend == "rays":
@@ -152,6 +153,7 @@ def test_drawn_from_anywhere_there_is_no_sky_below_the_horizon(town):
     around = rng.uniform(low - 10, high + 10, (40, 2))
     houses = [shapely.Point(h.x_m, h.y_m).buffer(np.hypot(h.width_m, h.depth_m) / 2) for h in town.plan.buildings]
     places = np.concatenate([places, around[~shapely.contains_xy(shapely.union_all(houses), *around.T)][:12]])
+    monkeypatch.setattr(simulator, "build_town", lambda plan: town)
     with TrueWorld(town.plan, backend) as world:
         for place, yaw in zip(places, rng.uniform(-np.pi, np.pi, len(places)), strict=True):
             rig = geometry.pose_from_xyyaw(*place, yaw, float(town.plan.terrain.height_m(place)) + 0.2)

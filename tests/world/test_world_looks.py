@@ -1,4 +1,5 @@
 import dataclasses
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from nurec_sim.world.assets.vehicle_meshes import vehicle_parts
 from nurec_sim.world.model.sky import Sky
 from nurec_sim.world.model.weather import add_fog, illumination
 from nurec_sim.world.plan import splits
-from nurec_sim.world.plan.town import PROP_KINDS, SIGNS, Prop, Weather
+from nurec_sim.world.plan.town import SIGNS, Prop, PropKind, Weather
 
 WEATHER = Weather("clear", 0.4, 0.7, 0.4, 0.0, 0.0, 0.0)
 
@@ -194,7 +195,7 @@ def test_branches_leave_room_below_them():
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in PROP_KINDS if kind not in ("tree", "bush", "hedge")])
+@pytest.mark.parametrize("kind", [kind for kind in get_args(PropKind) if kind not in ("tree", "bush", "hedge")])
 def test_every_fixture_has_parts_that_stand_on_the_ground(kind):
     parts = list(fixture_parts(Prop(kind, 0.0, 0.0, 0.0, length_m=5.0)))
     points = np.concatenate([mesh.points for mesh, _, _ in parts])

@@ -161,6 +161,5 @@ def test_terrain_gradient_is_the_slope_of_its_height():
         ahead = xy + step * np.eye(2)[axis]
         slope = (terrain.height_m(ahead) - terrain.height_m(xy)) / step
         np.testing.assert_allclose(terrain.gradient(xy)[:, axis], slope, atol=1e-5)
-    assert np.linalg.norm(terrain.gradient(xy), axis=1).max() <= terrain.max_slope
     poses = terrain.poses(xy, np.linspace(-3, 3, 50), np.full(50, 0.7))
     assert all(geometry.is_rotation(pose[:3, :3], 1e-9) for pose in poses)

@@ -127,7 +127,7 @@ def false_obstacles(
         tracks: labelled actors; returns in their boxes are not counted, since free space there changes over time.
         t_us: time of the simulated sweep.
     """
-    counted = ~_in_boxes(xyz_world_m, tracks, t_us)
+    counted = ~in_boxes(xyz_world_m, tracks, t_us)
     return int(beams.free(xyz_world_m[counted]).sum()), int(counted.sum())
 
 
@@ -141,7 +141,8 @@ def _cells(
     return np.linalg.norm(xyz_m, axis=1), np.floor(elevation / STEP_RAD).astype(np.int64), column
 
 
-def _in_boxes(xyz_world_m: Float64[np.ndarray, "n 3"], tracks: Sequence[Track], t_us: int) -> Bool[np.ndarray, " n"]:
+def in_boxes(xyz_world_m: Float64[np.ndarray, "n 3"], tracks: Sequence[Track], t_us: int) -> Bool[np.ndarray, " n"]:
+    """Points in the boxes of movable objects at an instant, with a margin."""
     inside = np.zeros(len(xyz_world_m), bool)
     for track in tracks:
         if track.label in MOVABLE_LABELS and track.path.covers(t_us):

@@ -16,6 +16,7 @@ from nurec_sim.network.checkpoints.download import find_weights
 from nurec_sim.network.checkpoints.state_dicts import load_weights
 from nurec_sim.network.model import InstantNuRec, Precision
 from nurec_sim.network.sky.background import is_static
+from nurec_sim.reconstruct.ego_images import find_ego_images
 from nurec_sim.reconstruct.feedforward.chunks import ChunkLayers
 from nurec_sim.reconstruct.feedforward.inputs.frames import ChunkWindow, choose_cameras, chunk_windows
 from nurec_sim.reconstruct.feedforward.inputs.window import chunk_inputs
@@ -66,10 +67,11 @@ def feedforward(
     windows = chunk_windows(clip, chosen, profile, settings)
     progress("weights", 0.0)
     model, weights = _model(settings, device)
+    ego_images = find_ego_images(clip, chosen)
     layers, fits = [], []
     for window in windows:
         chunk_progress = _within(progress, window.index, len(windows))
-        chunk, chunk_fit = _chunk(clip, model, window, hold_out, settings, chunk_progress)
+        chunk, chunk_fit = _chunk(clip, model, window, ego_images, hold_out, settings, chunk_progress)
         layers.append(chunk)
         fits.append(chunk_fit)
     merged = merge_chunks(layers, settings, lambda stage, fraction: progress(stage, CHUNKS_SHARE + 0.07 * fraction))
@@ -106,6 +108,7 @@ def feedforward(
         span_us=clip.span_us,
         camera_times_us={camera: clip.camera_times_us(camera) for camera in clip.rig.cameras},
         provenance=provenance,
+        ego_images=ego_images,
     )
 
 
@@ -164,6 +167,7 @@ def _chunk(
     clip: Clip,
     model: InstantNuRec,
     window: ChunkWindow,
+    ego_images: Mapping[str, np.ndarray],
     hold_out: set[int],
     settings: FeedForwardSettings,
     progress: Progress,
@@ -171,7 +175,7 @@ def _chunk(
     """Layers of one chunk: images in, one forward pass, Gaussians out."""
     device = next(model.parameters()).device
     progress("images", 0.0)
-    chunk = chunk_inputs(clip, model.profile, window, settings)
+    chunk = chunk_inputs(clip, model.profile, window, settings, ego_images)
     progress("network", 0.2)
     with torch.inference_mode():
         outputs = model(chunk.tensors.to(device))

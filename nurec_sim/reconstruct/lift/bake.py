@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from nurec_sim import geometry
-from nurec_sim.compute.cores import usable_cores
+from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.free_space import SweepBeams
 from nurec_sim.reconstruct.lift import colour, lifting, surfaces
 from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.footprints import marked_free, outside_free_space, parts_of
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.views import WorkingView
-from nurec_sim.types import Gaussians, Label
+from nurec_sim.types import Gaussians
 
-GROUND_M = 0.12
-"""Points so near to the ground belong to it."""
-LOW_M, GRAZING = 0.5, 0.03
-"""Pixels wrongly this low over the ground show the ground, unless their rays are flatter than this slope."""
 KEPT_SHARE = 0.4
 """Share of the pixels of all views that owns a surface, about; to meet the budget before ownership is known."""
 
@@ -50,7 +45,7 @@ def camera_isp(
         mine = [k for k, view in enumerate(views) if view.camera_id == camera]
         rgb, pixel, _ = _look_up(world.cloud.xyz_m[some], world.normal[some], [views[k] for k in mine],
                               [pictures[k] for k in mine], [views[k].rgb for k in mine], None)  # fmt: skip
-        colours[camera] = rgb / 255, np.isfinite(pixel)
+        colours[camera] = rgb / 255, np.isfinite(pixel) & (rgb.max(axis=1) < 255 * colour.SATURATED)
     return colour.solve_isp(cameras, colours)
 
 
@@ -59,14 +54,12 @@ def _look_up(xyz, normal, views, pictures, rgb, body: Surfels | None) -> tuple[n
     if not views or not len(xyz):
         return np.zeros((len(xyz), 3), np.float32), np.full(len(xyz), np.inf, np.float32), np.zeros(len(xyz), np.int32)
     packed, present = _packed(views, body)
-    depths, stack = lifting.stacked([p.inverse_depth for p in pictures]), lifting.stacked(rgb)
-    parts = np.array_split(np.arange(len(xyz)), usable_cores())
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        results = list(
-            pool.map(
-                lambda part: colour.seen_colours(xyz[part], normal[part], packed, depths, stack, present, 0.002), parts
-            )
-        )
+    depths, free = (lifting.stacked([getattr(p, name) for p in pictures]) for name in ("inverse_depth", "free"))
+    stack = lifting.stacked(rgb)
+    results = in_order(
+        lambda part: colour.seen_colours(xyz[part], normal[part], packed, depths, free, stack, present, 0.002),
+        parts_of(len(xyz)),
+    )
     return tuple(np.concatenate(items) for items in zip(*results, strict=True))
 
 
@@ -99,7 +92,9 @@ def body_pixels(
     parts = [[Lifted.empty()] for _ in bodies]
     pixels = sum(view.rgb.shape[0] * view.rgb.shape[1] for view in views)
     thinning = 2 ** max(0, int(np.ceil(np.log2(max(KEPT_SHARE * pixels / settings.views.budget, 1)))))
-    for k, (view, picture) in enumerate(zip(views, pictures, strict=True)):
+
+    def lift(k: int) -> list[tuple[int, Lifted]]:
+        view, picture = views[k], pictures[k]
         near = (picture.inverse_depth > 1 / settings.views.max_depth_m) & view.tile.valid
         near &= lifting.lattice(near.shape, thinning)
         # These are of the whole view, so they are computed before the loop over bodies.
@@ -107,21 +102,28 @@ def body_pixels(
             lifting.points_of(view, picture.inverse_depth),
             lifting.normals_of(view, picture.inverse_depth),
         )
-        rays = lifting.rays_of(view)
+        rays, found = lifting.rays_of(view), []
         for number in np.unique(picture.body[near & (picture.body >= 0)]):
             body, mask = bodies[number], near & (picture.body == number)
             body_from_world = geometry.inverse(body.world_from_body(view.t_us))
             xyz = geometry.transform_points(body_from_world, points[mask])
             surfel = picture.surfel[mask]
-            normal = normals[mask] @ body_from_world[:3, :3].T
+            normal = geometry.rotate_vectors(body_from_world[:3, :3], normals[mask])
             normal = np.where((surfel >= 0)[:, None], body.normal[surfel] if len(body.cloud) else normal, normal)
             ray = rays[mask]
             ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-            ray = ray @ (body_from_world @ view.world_from_view)[:3, :3].T
+            ray = geometry.rotate_vectors((body_from_world @ view.world_from_view)[:3, :3], ray)
             z = 1 / picture.inverse_depth[mask].astype(np.float64)
             pixel_m = np.sqrt(thinning) * z / view.tile.focal_px
             mine = np.full(len(z), k, np.int32)
-            parts[number].append(Lifted(xyz, normal, ray, z, pixel_m, rgb[k][mask].astype(np.float32), surfel, mine))
+            place = np.flatnonzero(mask).astype(np.int32)
+            shown = rgb[k][mask].astype(np.float32)
+            found.append((number, Lifted(xyz, normal, ray, z, pixel_m, shown, surfel, mine, place)))
+        return found
+
+    for found in in_order(lift, range(len(views))):
+        for number, lifted in found:
+            parts[number].append(lifted)
     return [Lifted.concatenate(each) for each in parts]
 
 
@@ -147,44 +149,24 @@ def body_gaussians(
         settings: opacity, and the depth levels of the matching.
         beams: recorded beams; Gaussians in the space that they passed are dropped.
     """
+    stays = _owned(pixels, body, views, pictures, rgb, settings)
+    shown, dropped = outside_free_space(pixels[stays], body, ground, settings, beams)
+    parts = [shown]
+    if len(dropped):
+        # Where a pixel's depth is wrong, those of other views take over, and the surfels behind it.
+        pictures = marked_free(pictures, pixels, dropped)
+        rest = pixels[~stays]
+        rest = rest[_owned(rest, body, views, pictures, rgb, settings)]
+        parts.append(outside_free_space(rest, body, ground, settings, beams)[0])
     cloud = body.cloud
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
-    shown = colour.fill_unseen(cloud.xyz_m, seen_rgb / 255, np.isfinite(pixel), cloud.intensity)
     # A view replaces surfels by its pixels unless it sees them so obliquely that surfels are the finer of the two.
     keep = (pixel > 3 * body.spacing_m) & (np.isfinite(pixel) | (through == 0))
-    discs = surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.spacing_m[keep], shown[keep],
+    colours = colour.fill_unseen(cloud.xyz_m, seen_rgb / 255, np.isfinite(pixel), keep, cloud.intensity)
+    discs = surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.spacing_m[keep], colours[keep],
                            cloud.intensity[keep], body.label[keep], settings.opacity)  # fmt: skip
-    parts = [discs[~body.in_free_space(discs, beams)]]
-    lifted = _owned(pixels, body, views, pictures, rgb, settings)
-    if len(lifted):
-        footprints = _lifted_gaussians(lifted, body, ground, settings)
-        free = body.in_free_space(footprints, beams)
-        parts.append(footprints[~free])
-        if body.actor is None:
-            # What hovers low over the road shows the road: dropped, it would leave a hole.
-            footprints = _lifted_gaussians(on_ground(lifted[free], ground), body, ground, settings)
-            parts.append(footprints[~body.in_free_space(footprints, beams)])
-    return Gaussians.concatenate(parts), sum(map(len, parts[1:]))
-
-
-def on_ground(lifted: Lifted, ground: Ground) -> Lifted:
-    """Lifted points low over the ground, moved along their rays down to it; all others are left out."""
-    moved = lifted[(ground.above(lifted.xyz_m) < LOW_M) & (lifted.ray[:, 2] < -GRAZING)]
-    step = np.zeros(len(moved))
-    for _ in range(3):  # the ground is not level
-        above = ground.above(moved.xyz_m + step[:, None] * moved.ray)
-        step += np.where(np.isfinite(above), above, 0.0) / -moved.ray[:, 2]
-    xyz = moved.xyz_m + step[:, None] * moved.ray
-    row, column, _ = ground.cells(xyz)
-    depth = moved.depth_m + step
-    return dataclasses.replace(
-        moved,
-        xyz_m=xyz,
-        normal=ground.normals()[row, column],
-        depth_m=depth,
-        pixel_m=moved.pixel_m * depth / moved.depth_m,
-        surfel=np.full(len(moved), -1, np.int32),
-    )[(np.abs(ground.above(xyz)) < GROUND_M) & (depth > 0)]
+    parts.append(discs[~body.in_free_space(discs, beams)])
+    return Gaussians.concatenate(parts), sum(map(len, parts[:-1]))
 
 
 def _owned(
@@ -194,53 +176,31 @@ def _owned(
     pictures: Sequence[DepthPicture],
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,
-) -> Lifted:
-    """The pixels of a body that no other view owns."""
+) -> np.ndarray:
+    """Which pixels of a body no other view owns; those of wrong depth (``DepthPicture.free``) own nothing."""
     if not len(everything):
-        return everything
+        return np.zeros(0, bool)
     packed, present = _packed(views, body)
     step = 1 / settings.views.min_depth_m / (settings.views.levels - 1)
-    depth_stack, rgb_stack = lifting.stacked([picture.inverse_depth for picture in pictures]), lifting.stacked(rgb)
+    depths = [np.where(picture.free, np.float32(np.nan), picture.inverse_depth) for picture in pictures]
+    depth_stack, rgb_stack = lifting.stacked(depths), lifting.stacked(rgb)
     # Boxes are not exact enough to tell from afar whether a view looks through an actor.
     matched = (everything.surfel < 0) & (body.actor is None)
-    cuts = np.linspace(0, len(everything), usable_cores() + 1).astype(np.int64)
-    chunks = [slice(first, last) for first, last in zip(cuts[:-1], cuts[1:], strict=True)]
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        jobs = [
-            pool.submit(
-                lifting.owned,
-                everything.xyz_m[part],
-                everything.depth_m[part],
-                everything.view[part],
-                matched[part],
-                everything.rgb[part],
-                packed,
-                depth_stack,
-                rgb_stack,
-                present,
-                0.3 * step,
-                lifting.OWNER_RING,
-                lifting.OWNER_BORDER,
-            )
-            for part in chunks
-        ]
-        kept = [job.result() for job in jobs]  # fmt: skip
-    return everything[np.concatenate(kept)]
-
-
-def _lifted_gaussians(lifted: Lifted, body: Surfels, ground: Ground, settings: LiftSettings) -> Gaussians:
-    """Footprint Gaussians; label and intensity from the surfel that gave the depth, or from the ground below."""
-    from_surfel = lifted.surfel >= 0
-    n = len(lifted)
-    label = np.full(n, Label.OTHER if body.actor is None else Label.MOVABLE, np.uint8)
-    intensity = np.full(n, np.nan, np.float32)
-    if len(body.cloud):
-        label = np.where(from_surfel, body.label[lifted.surfel], label)
-        intensity = np.where(from_surfel, body.cloud.intensity[lifted.surfel], intensity)
-    stretch = np.full(n, surfaces.MOST_STRETCH)
-    if body.actor is None:
-        flat = np.abs(ground.above(lifted.xyz_m)) < GROUND_M
-        stretch = np.where(flat, surfaces.MOST_STRETCH_OF_GROUND, stretch)
-        label = np.where(~from_surfel & ground.is_road(lifted.xyz_m), Label.ROAD, label)
-    return surfaces.footprints(lifted.xyz_m, lifted.normal, lifted.ray, lifted.pixel_m, lifted.rgb / 255, intensity,
-                               label, settings.opacity, stretch)  # fmt: skip
+    kept = in_order(
+        lambda part: lifting.owned(
+            everything.xyz_m[part],
+            everything.depth_m[part],
+            everything.view[part],
+            matched[part],
+            everything.rgb[part],
+            packed,
+            depth_stack,
+            rgb_stack,
+            present,
+            0.3 * step,
+            lifting.OWNER_RING,
+            lifting.OWNER_BORDER,
+        ),
+        parts_of(len(everything)),
+    )
+    return np.concatenate(list(kept))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from nurec_sim.reconstruct.free_space import SweepBeams, balls, in_free_space
+from nurec_sim.reconstruct.free_space import SweepBeams, balls, count_beams, in_free_space, is_free
 from nurec_sim.reconstruct.lift import points, surfaces
 from nurec_sim.reconstruct.lift.ground import Ground, find_ground
 from nurec_sim.reconstruct.lift.points import Actor, Cloud, Gathered
@@ -30,12 +30,16 @@ class Surfels:
         """Where the body is."""
         return np.eye(4) if self.actor is None else self.actor.path.at(t_us)
 
+    def count_beams(self, gaussians: Gaussians, beams: Sequence[SweepBeams]) -> tuple[np.ndarray, np.ndarray]:
+        """Recorded beams that passed through Gaussians of the body, in its frame, and that ended at them."""
+        if self.actor is None:
+            return count_beams(gaussians, beams)
+        known = lambda t_us: self.world_from_body(t_us) if self.present(t_us) else None  # noqa: E731
+        return count_beams(gaussians, beams, known, self.box_size_m)
+
     def in_free_space(self, gaussians: Gaussians, beams: Sequence[SweepBeams]) -> Bool[np.ndarray, " n"]:
         """Gaussians of the body, in its frame, that recorded beams passed through."""
-        if self.actor is None:
-            return in_free_space(gaussians, beams)
-        known = lambda t_us: self.world_from_body(t_us) if self.present(t_us) else None  # noqa: E731
-        return in_free_space(gaussians, beams, known, self.box_size_m)
+        return is_free(*self.count_beams(gaussians, beams))
 
     @property
     def box_size_m(self) -> tuple[float, float, float]:

@@ -7,17 +7,21 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
+from nurec_sim import geometry
 from nurec_sim.compute.cores import usable_cores
 from nurec_sim.compute.kernels import kernel
+from nurec_sim.reconstruct.free_space import MARGIN_M, MARGIN_SHARE
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import WorkingView
 
+SATURATED = 0.98
+"""Recorded colours above this may stand for any brighter one."""
 ENOUGH_SHARED = 300
 """Points that two cameras must share before their colours are compared."""
 
 
 @kernel
-def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, tolerance):
+def seen_colours(xyz, normal, packed, inverse_depth, free, pictures, present, tolerance):
     """Colour of each point as its three best views show it, and how well the best of them resolves it.
 
     A view counts if it sees the point: inside the picture, and the picture's inverse depth agrees within ``tolerance``
@@ -28,6 +32,7 @@ def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, toleranc
         normal: [n,3] unit normals in that frame.
         packed: [k,23] projections into the views (``packed_views``).
         inverse_depth: [k,h,w] of the views, 1/m; NaN where a pixel is masked.
+        free: [k,h,w] whether it is wrong, because beams passed there; a point well behind it is then not seen.
         pictures: [k,h,w,3] colours of the views, 0..255.
         present: [k] whether the body is there at each view's time.
         tolerance: 1/m, see above.
@@ -50,6 +55,8 @@ def seen_colours(xyz, normal, packed, inverse_depth, pictures, present, toleranc
             if z <= 0.3 or u < 1 or v < 1 or u >= view[3] - 1 or v >= view[4] - 1:
                 continue
             row, column = int(v), int(u)
+            if free[k, row, column] and z - 1.0 / inverse_depth[k, row, column] > MARGIN_M + MARGIN_SHARE * z:
+                continue
             # Written so that a masked pixel, NaN, neither agrees nor is looked through.
             if not abs(inverse_depth[k, row, column] - 1.0 / z) <= tolerance + 0.08 / z:
                 through[i] += inverse_depth[k, row, column] < 1.0 / z
@@ -83,6 +90,7 @@ def fill_unseen(
     xyz_m: Float64[np.ndarray, "n 3"],
     rgb: Float32[np.ndarray, "n 3"],
     seen: Bool[np.ndarray, " n"],
+    wanted: Bool[np.ndarray, " n"],
     intensity: Float32[np.ndarray, " n"],
     reach_m: float = 2.0,
 ) -> Float32[np.ndarray, "n 3"]:
@@ -90,15 +98,16 @@ def fill_unseen(
 
     Args:
         xyz_m: points, metres.
-        rgb: colours 0..1; those of unseen points are replaced.
+        rgb: colours 0..1; those of wanted unseen points are replaced.
         seen: whether a view saw the point.
+        wanted: whether the point's colour matters.
         intensity: LiDAR intensity in any unit; NaN where unknown.
-        reach_m: how near the nearest seen point must be for its colour to be used.
+        reach_m: how near a seen point must be for its colour to be used.
     """
     from scipy.spatial import cKDTree
 
     result = rgb.copy()
-    unseen = np.flatnonzero(~seen)
+    unseen = np.flatnonzero(wanted & ~seen)
     if not len(unseen):
         return result
     known = np.isfinite(intensity)
@@ -108,11 +117,14 @@ def fill_unseen(
     result[unseen] = grey[unseen, None]
     if seen.any():
         source = np.flatnonzero(seen)
-        distance, index = cKDTree(xyz_m[source]).query(xyz_m[unseen], k=min(4, len(source)), workers=usable_cores())
-        distance, index = distance.reshape(len(unseen), -1), index.reshape(len(unseen), -1)
-        near = distance[:, 0] < reach_m
+        # Bounded, or points far from all that is seen would search the whole tree. Farther neighbours come as infinity.
+        distance, index = cKDTree(xyz_m[source]).query(
+            xyz_m[unseen], k=[1, 2, 3, 4], distance_upper_bound=reach_m, workers=usable_cores()
+        )
+        near = np.isfinite(distance[:, 0])
         weight = 1 / (distance[near] + 0.05)
-        mixed = np.einsum("nk,nkc->nc", weight, rgb[source][index[near]]) / weight.sum(axis=1, keepdims=True)
+        nearest = rgb[source[np.minimum(index[near], len(source) - 1)]]
+        mixed = np.einsum("nk,nkc->nc", weight, nearest) / weight.sum(axis=1, keepdims=True)
         result[unseen[near]] = mixed
     return result
 
@@ -174,15 +186,13 @@ def _affine(canonical: np.ndarray, shown: np.ndarray, rounds: int = 6) -> np.nda
 def to_canonical(rgb: np.ndarray, isp: Float64[np.ndarray, "3 4"]) -> np.ndarray:
     """Colours 0..255 of a camera as canonical colours 0..255."""
     shown = rgb.astype(np.float64) / 255 - isp[:, 3]
-    return np.clip(shown @ np.linalg.inv(isp[:, :3]).T * 255, 0, 255)
+    return np.clip(geometry.rotate_vectors(np.linalg.inv(isp[:, :3]), shown) * 255, 0, 255)
 
 
 def packed_views(
     views: Sequence[WorkingView], body_poses: Sequence[np.ndarray] | None = None
 ) -> Float64[np.ndarray, "k 23"]:
     """Packed projections of views from the world, or from a body with the given ``world_from_body`` at each view."""
-    from nurec_sim import geometry
-
     if body_poses is None:
         return np.stack([view.packed for view in views])
     return np.stack(

@@ -17,10 +17,12 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from nurec_sim import sensors
-from nurec_sim.compute.cores import usable_cores
+from nurec_sim.compute.cores import in_order, usable_cores
 from nurec_sim.compute.kernels import kernel
+from nurec_sim.reconstruct.ego_images import shows_ego
+from nurec_sim.reconstruct.lift.colour import SATURATED
 from nurec_sim.reconstruct.lift.settings import LiftSettings
-from nurec_sim.reconstruct.lift.views import shows_ego
+from nurec_sim.reconstruct.lift.views import border_weight
 from nurec_sim.reconstruct.optimize.responses import borrowed_responses
 from nurec_sim.render.cpu.backward.colours import spread_errors, spread_sky_errors
 from nurec_sim.render.cpu.backward.frame import SENSORS, ExactView
@@ -35,8 +37,6 @@ from nurec_sim.types import CameraModel, Clip, Gaussians, GaussianScene
 
 BRIGHTEST = 1.25
 """Colours end here: what is white in a dark frame is brighter than white in others."""
-SATURATED = 0.98
-"""Recorded colours above this may stand for any brighter one."""
 GAINS, OFFSETS = (0.5, 2.0), (-0.1, 0.1)
 OFFSET_PULL = 20.0
 """Offsets are pulled to 0 this much more than gains to 1: fog and glare are rarer than other exposures."""
@@ -75,16 +75,16 @@ def solve_colours(
     step = -(-len(frames) // settings.colours.images)
     chosen = [(camera, k) for camera in cameras for k in range(0, len(times[camera]), step)]
     solve = ColourSolve(scene, settings.colours.trust, settings.colours.gain_pull)
-    masks: dict[str, np.ndarray] = {}
+    weights = {camera: _sees_street(scene, camera, settings.views.width_px) for camera in cameras}
+    if len(cameras) > 1:
+        weights = {camera: weight * border_weight(*weight.shape) for camera, weight in weights.items()}
     # In random order: of neighbours in time, which show the same, the later would correct the earlier.
     random, rounds = np.random.default_rng(0), settings.colours.images // len(chosen)
-    total = len(chosen) * min(max(rounds, 1), settings.colours.rounds)
-    for done in range(total):
-        if done % len(chosen) == 0:
-            order = random.permutation(len(chosen))
-        camera, frame = chosen[order[done % len(chosen)]]
-        solve.step(_read(clip, camera, frame, settings.views.width_px, masks))
-        progress((done + 1) / total)
+    order = [random.permutation(len(chosen)) for _ in range(min(max(rounds, 1), settings.colours.rounds))]
+    images = [chosen[k] for k in np.concatenate(order)]
+    for done, image in enumerate(in_order(lambda each: _read(clip, each[0], each[1], weights[each[0]]), images)):
+        solve.step(image)
+        progress((done + 1) / len(images))
     middle = {camera: each.sum(axis=1) // 2 for camera, each in times.items()}
     responses = {}
     for camera in {camera for camera, _ in chosen}:
@@ -97,19 +97,27 @@ def solve_colours(
     return replace(solve.scene(), exposures=responses)
 
 
-def _read(clip: Clip, camera: str, frame: int, width_px: int, masks: dict[str, np.ndarray]) -> SolvedImage:
-    """A frame, reduced by a whole number as working views are."""
-    model, image = clip.rig.cameras[camera], clip.image(camera, frame)
+def _sees_street(scene: GaussianScene, camera: str, width_px: int) -> Float32[np.ndarray, "h w"]:
+    """1 where a camera sees neither the ego vehicle nor past its lens, at its width divided by a whole number."""
+    model = scene.rig.cameras[camera]
     reduction = max(1, -(-model.width_px // width_px))
     width, height = model.width_px // reduction, model.height_px // reduction
+    rays, seen = sensors.pixel_rays(sensors.scaled_camera(model, width, height))
+    if (image := scene.ego_images.get(camera)) is None:
+        return (seen & ~shows_ego(rays, model, scene.rig.body)).astype(np.float32)
+    cover = cv2.resize(image[..., 3].astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    return (seen & (cover == 0)).astype(np.float32)
+
+
+def _read(clip: Clip, camera: str, frame: int, weight: Float32[np.ndarray, "h w"]) -> SolvedImage:
+    """A frame, reduced to the size of its weights by a whole number, as working views are."""
+    model, image = clip.rig.cameras[camera], clip.image(camera, frame)
+    height, width = weight.shape
+    reduction = model.width_px // width
     small = cv2.resize(image[: height * reduction, : width * reduction], (width, height), interpolation=cv2.INTER_AREA)
-    scaled = sensors.scaled_camera(model, width, height)
-    if camera not in masks:
-        rays, seen = sensors.pixel_rays(scaled)
-        masks[camera] = (seen & ~shows_ego(rays, model, clip.rig.body)).astype(np.float32)
     t_us = int(np.asarray(clip.camera_times_us(camera)[frame]).sum()) // 2
     poses = np.asarray(clip.world_from_camera(camera, frame), np.float64)
-    return SolvedImage(scaled, frame, t_us, poses, small, masks[camera])
+    return SolvedImage(sensors.scaled_camera(model, width, height), frame, t_us, poses, small, weight)
 
 
 class ColourSolve:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
+from nurec_sim import geometry
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import WorkingView
@@ -28,7 +29,8 @@ class Lifted:
     """Points lifted from views, in the frame of their body: world or box.
 
     ``ray`` is the unit direction from the camera, ``depth_m`` the depth along its axis, ``pixel_m`` the width of one
-    pixel there, ``surfel`` the row of the surfel that gave the depth, or -1.
+    pixel there, ``surfel`` the row of the surfel that gave the depth, or -1, ``pixel`` the index of the pixel in the
+    picture of ``view``, row by row.
     """
 
     xyz_m: Float64[np.ndarray, "n 3"]
@@ -39,18 +41,19 @@ class Lifted:
     rgb: Float32[np.ndarray, "n 3"]
     surfel: Int32[np.ndarray, " n"]
     view: Int32[np.ndarray, " n"]
+    pixel: Int32[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.xyz_m)
 
-    def __getitem__(self, index: np.ndarray) -> Lifted:
+    def __getitem__(self, index: np.ndarray | slice) -> Lifted:
         return Lifted(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     @classmethod
     def empty(cls) -> Lifted:
         """No points."""
         some = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0)
-        return cls(*some, np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int32))
+        return cls(*some, np.zeros((0, 3), np.float32), *(np.zeros(0, np.int32) for _ in range(3)))
 
     @classmethod
     def concatenate(cls, parts: Sequence[Lifted]) -> Lifted:
@@ -75,8 +78,7 @@ def points_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> F
         v, u = np.mgrid[0 : view.tile.height, 0 : view.tile.width] + 0.5
         a, b, c = view.tile.fraction
         local = local + np.clip(a * u + b * v + c, -0.5, 0.5)[..., None] * view.drift_m
-    pose = view.world_from_view
-    return local @ pose[:3, :3].T + pose[:3, 3]
+    return geometry.transform_points(view.world_from_view, local)
 
 
 def normals_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
@@ -104,7 +106,7 @@ def normals_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> 
     unit_ray = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     smooth = (bend < 0.05 * w) & (size[..., 0] > 1e-9)
     normal = np.where(smooth[..., None], normal / np.maximum(size, 1e-12), unit_ray)
-    return -normal @ view.world_from_view[:3, :3].T
+    return geometry.rotate_vectors(-view.world_from_view[:3, :3], normal)
 
 
 @kernel
@@ -175,7 +177,8 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, pictures, p
                 through += 1
         if 2 * through > agree or (far_through > 0 and agree + far_agree == 0):
             keep[i] = False
-        rgb[i] = mixed / total
+        if keep[i]:
+            rgb[i] = mixed / total
     return keep
 
 

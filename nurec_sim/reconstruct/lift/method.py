@@ -16,6 +16,7 @@ import numpy as np
 
 from nurec_sim.errors import ReconstructError
 from nurec_sim.geometry import arc_length
+from nurec_sim.reconstruct.ego_images import find_ego_images
 from nurec_sim.reconstruct.lift import actors as actor_layer
 from nurec_sim.reconstruct.lift import colour, points
 from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels, camera_isp
@@ -25,7 +26,7 @@ from nurec_sim.reconstruct.lift.pictures import DepthPicture, depth_pictures
 from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
-from nurec_sim.reconstruct.lift.views import WorkingView, read_views
+from nurec_sim.reconstruct.lift.views import WorkingView, border_weight, read_views
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene
 
 Progress = Callable[[str, float], None]
@@ -48,6 +49,9 @@ def lift(
     """
     path_m, span_us = float(arc_length(clip.ego.world_from_body[:, :3, 3])[-1]), clip.span_us[1] - clip.span_us[0]
     given, settings = settings, settings.for_log(path_m, span_us / 1e6)
+    images = [(model.width_px, model.height_px, len(clip.camera_times_us(camera)))
+              for camera, model in clip.rig.cameras.items() if camera in cameras]  # fmt: skip
+    settings = dataclasses.replace(settings, views=settings.views.for_images(images))
     stages = _Stages(progress)
     stages.start("sweeps")
     actors = points.actors_of(clip, settings.points)
@@ -60,7 +64,8 @@ def lift(
     stages.start("ground and surfaces")
     bodies, ground = surfels_of(clip, actors, gathered, settings)
     stages.start("images")
-    views = read_views(clip, cameras, settings.views, stages.fraction)
+    ego_images = find_ego_images(clip, cameras, stages.fraction)
+    views = read_views(clip, cameras, ego_images, settings.views, stages.fraction)
     stages.start("depth")
     pictures = depth_pictures(views, bodies, settings, stages.fraction)
     views = [view for view in views if view.key]
@@ -113,6 +118,7 @@ def lift(
         span_us=clip.span_us,
         camera_times_us={camera: clip.camera_times_us(camera) for camera in clip.rig.cameras},
         provenance=provenance,
+        ego_images=ego_images,
     )
     stages.start("solving colours")
     scene = solve_colours(scene, clip, cameras, settings, stages.fraction)
@@ -123,7 +129,7 @@ def lift(
 def _sky_weight(picture: DepthPicture, view: WorkingView, settings: LiftSettings) -> np.ndarray:
     """Weight of each pixel in the sky: 1 if it is far and looks like sky, little if it is merely far."""
     far = (picture.inverse_depth < 1 / settings.views.max_depth_m) & view.tile.valid
-    return np.where(far, np.where(picture.sky, 1.0, 0.02), 0.0)
+    return np.where(far, np.where(picture.sky, 1.0, 0.02), 0.0) * border_weight(*far.shape)
 
 
 _ENDS = {

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from nurec_sim import geometry
-from nurec_sim.compute.cores import usable_cores
+from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.lift import depth, lifting
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
@@ -24,12 +23,16 @@ OUTLINE_M = 0.6
 
 @dataclass(frozen=True)
 class DepthPicture:
-    """Inverse depth of a view; the body that each pixel shows, the surfel that gave its depth (-1: none); sky."""
+    """Inverse depth of a view; the body that each pixel shows, the surfel that gave its depth (-1: none); sky.
+
+    ``free``: the depth is wrong, because recorded beams passed there.
+    """
 
     inverse_depth: Float32[np.ndarray, "h w"]
     body: Int32[np.ndarray, "h w"]
     surfel: Int32[np.ndarray, "h w"]
     sky: Bool[np.ndarray, "h w"]
+    free: Bool[np.ndarray, "h w"]
 
 
 def depth_pictures(
@@ -50,32 +53,31 @@ def depth_pictures(
     bright = (
         float(np.percentile(np.concatenate([v.rgb[::8, ::8].mean(axis=-1).ravel() for v in views]), 98)) if views else 0
     )
-    grays = [v.rgb.mean(axis=-1).astype(np.uint8) for v in views]
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        codes = list(pool.map(depth.census, grays))
+    grays = list(in_order(lambda view: view.rgb.mean(axis=-1).astype(np.uint8), views))
+    codes = list(in_order(depth.census, grays))
 
-        def one(k: int) -> DepthPicture:
-            view = views[k]
-            prior, index, body = _draw(view, bodies)
-            trim_silhouettes(prior, index, grays[k])
-            sky = lifting.sky_coloured(view, prior, bright)
-            around = [(views[n].packed, views[n].rgb, codes[n]) for n in neighbours_of(views, k, options.neighbours)]
-            dense = depth.dense_inverse_depth(
-                view.packed, view.world_from_view, view.rgb, prior, sky, around, options.levels, step
-            )
-            # Pixels that show nothing of the world neither agree with a point nor look through it.
-            dense[~view.tile.valid] = np.nan
-            # Where smoothing overruled the splatted surfel, the pixel does not show that surfel.
-            index[dense != prior] = -1
-            drawn = np.where(index >= 0, body, STATIC)
-            body = _bodies_of_pixels(view, bodies, dense, drawn)
-            index[body != drawn] = -1
-            return DepthPicture(dense, body, index, sky)
+    def one(k: int) -> DepthPicture:
+        view = views[k]
+        prior, index, body = _draw(view, bodies)
+        trim_silhouettes(prior, index, grays[k])
+        sky = lifting.sky_coloured(view, prior, bright)
+        around = [(views[n].packed, views[n].rgb, codes[n]) for n in neighbours_of(views, k, options.neighbours)]
+        dense = depth.dense_inverse_depth(
+            view.packed, view.world_from_view, view.rgb, prior, sky, around, options.levels, step
+        )
+        # Pixels that show nothing of the world neither agree with a point nor look through it.
+        dense[~view.tile.valid] = np.nan
+        # Where smoothing overruled the splatted surfel, the pixel does not show that surfel.
+        index[dense != prior] = -1
+        drawn = np.where(index >= 0, body, STATIC)
+        body = _bodies_of_pixels(view, bodies, dense, drawn)
+        index[body != drawn] = -1
+        return DepthPicture(dense, body, index, sky, np.zeros(dense.shape, bool))
 
-        pictures = []
-        for done, picture in enumerate(pool.map(one, keys)):
-            progress(done / len(keys))
-            pictures.append(picture)
+    pictures = []
+    for done, picture in enumerate(in_order(one, keys)):
+        progress(done / len(keys))
+        pictures.append(picture)
     return pictures
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from nurec_sim import geometry
+from nurec_sim.compute.cores import in_order
+from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.free_space import SweepBeams, chosen_sweeps, sweep_beams
 from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.types import MOVABLE_LABELS, Clip, Track, Trajectory
@@ -94,25 +96,8 @@ class _Voxels:
         self.sums: list[np.ndarray] = []
         self.pending = 0
 
-    def add(self, xyz: np.ndarray, eye: np.ndarray, edge: np.ndarray, intensity: np.ndarray) -> None:
-        """Add the points of one sweep.
-
-        Args:
-            xyz: [n,3] points, metres.
-            eye: [n,3] where the sensor was, in the same frame.
-            edge: [n] voxel edge of each point in metres, a power of two times a constant.
-            intensity: [n] NaN where unknown.
-        """
-        if not len(xyz):
-            return
-        cell = np.floor(xyz / edge[:, None]).astype(np.int64) + (1 << 18)
-        level = np.clip(np.round(np.log2(edge / 0.001)).astype(np.int64), 0, 31)
-        # One int64 per voxel (5 bits of level, 19 per axis) sorts far faster than rows of four columns.
-        key = ((level << 57) | (cell[:, 0] << 38) | (cell[:, 1] << 19) | cell[:, 2]).astype(np.int64)
-        known = np.isfinite(intensity)
-        ones = np.ones(len(xyz))
-        rows = np.column_stack([xyz, eye, edge, np.where(known, intensity, 0.0), known, ones])
-        key, sums = _sum_by_key(key, rows)
+    def add(self, key: np.ndarray, sums: np.ndarray) -> None:
+        """Add what ``_voxel_sums`` returns."""
         self.keys.append(key)
         self.sums.append(sums)
         self.pending += len(key)
@@ -144,15 +129,63 @@ def _unthinned(xyz: np.ndarray, eye: np.ndarray, edge: np.ndarray, intensity: np
 def thinned(cloud: Cloud) -> Cloud:
     """One point per voxel of the cloud's own spacing."""
     voxels = _Voxels()
-    voxels.add(cloud.xyz_m, cloud.eye_m, cloud.spacing_m.astype(np.float64), cloud.intensity.astype(np.float64))
+    voxels.add(*_voxel_sums(cloud.xyz_m, cloud.eye_m, cloud.spacing_m.astype(np.float64), cloud.intensity))
     return voxels.cloud()
+
+
+def _voxel_sums(
+    xyz: np.ndarray, eye: np.ndarray, edge: np.ndarray, intensity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Keys of the voxels that hold points, ascending, and sums over the points in each.
+
+    Args:
+        xyz: [n,3] points, metres.
+        eye: [n,3] where the sensor was, in the same frame.
+        edge: [n] voxel edge of each point in metres, a power of two times a constant.
+        intensity: [n] NaN where unknown.
+
+    Returns:
+        Keys [m], and [m,10]: point, eye, edge, intensity, points with intensity, points.
+    """
+    cell = np.floor(xyz / edge[:, None]).astype(np.int64) + (1 << 18)
+    level = np.clip(np.round(np.log2(edge / 0.001)).astype(np.int64), 0, 31)
+    # One int64 per voxel (5 bits of level, 19 per axis) sorts far faster than rows of four columns.
+    key = ((level << 57) | (cell[:, 0] << 38) | (cell[:, 1] << 19) | cell[:, 2]).astype(np.int64)
+    known = np.isfinite(intensity)
+    rows = np.column_stack([xyz, eye, edge, np.where(known, intensity, 0.0), known, np.ones(len(xyz))])
+    return _sum_by_key(key, rows)
 
 
 def _sum_by_key(key: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(key, kind="stable")
-    key = key[order]
-    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-    return key[first], np.add.reduceat(rows[order], first, axis=0)
+    in_order_of_key = key[order]
+    place = np.cumsum(in_order_of_key[1:] != in_order_of_key[:-1])
+    place = np.concatenate([np.zeros(min(len(key), 1), np.int64), place])
+    keys = np.zeros(int(place[-1]) + 1 if len(key) else 0, np.int64)
+    keys[place] = in_order_of_key
+    sums = np.zeros((len(keys), rows.shape[1]))
+    _add_rows(order, place, rows, sums)
+    return keys, sums
+
+
+@kernel
+def _add_rows(order, place, rows, sums):
+    """Add row ``order[i]`` to ``sums[place[i]]``, one after the other."""
+    for i in range(len(order)):
+        for c in range(rows.shape[1]):
+            sums[place[i], c] += rows[order[i], c]
+
+
+@kernel
+def _between(xyz, low, high):
+    """Indices of the points [n,3] in a box along the axes."""
+    found = np.empty(len(xyz), np.int64)
+    count = 0
+    for i in range(len(xyz)):
+        if low[0] <= xyz[i, 0] <= high[0] and low[1] <= xyz[i, 1] <= high[1] and low[2] <= xyz[i, 2] <= high[2]:
+            found[count] = i
+            count += 1
+    return found[:count]
 
 
 @dataclass(frozen=True)
@@ -199,46 +232,23 @@ def gather(
         settings: ranges, box margin and voxel sizes.
         progress: called with the fraction of the sweeps that is done.
     """
-    path = clip.ego.position_m
     static, clouds = _Voxels(), {actor.index: _Voxels() for actor in actors}
     feet: dict[int, list[Cloud]] = {actor.index: [] for actor in actors}
     feet_world: dict[int, list[np.ndarray]] = {actor.index: [] for actor in actors}
     beams, sweeps, points, known = [], 0, 0, False
     carving = set(chosen_sweeps(clip, hold_out))
-    jobs = [(lidar, i) for lidar in clip.rig.lidars for i in range(len(clip.sweep_times_us(lidar)))]
-    for done, (lidar, i) in enumerate(jobs):
+    every = [(lidar, i) for lidar in clip.rig.lidars for i in range(len(clip.sweep_times_us(lidar)))]
+    jobs = [(lidar, i, (lidar, i) in carving) for lidar, i in every if i not in hold_out]
+    for done, parts in enumerate(in_order(lambda job: _split(clip, actors, settings, *job), jobs)):
         progress(done / len(jobs))
-        if i in hold_out:
-            continue
-        sweep = clip.sweep(lidar, i)
-        distance = np.linalg.norm(sweep.xyz_m, axis=1)
-        keep = np.isfinite(sweep.xyz_m).all(axis=1) & (distance < settings.max_range_m) & (distance > 0.5)
-        xyz = sweep.xyz_world_m
-        rig_from_world = geometry.inverse(clip.ego.at(sweep.t_us))
-        body = clip.rig.body
-        keep &= ~geometry.points_in_box(
-            geometry.transform_points(rig_from_world, xyz) - body.center_m, body.size_m, 0.3
-        )
-        xyz, t_us = xyz[keep], sweep.point_t_us[keep]
-        intensity = np.full(len(xyz), np.nan) if sweep.intensity is None else sweep.intensity[keep].astype(np.float64)
-        known |= bool(np.isfinite(intensity).any())
-        eye = np.broadcast_to(sweep.world_from_lidar[:3, 3], xyz.shape)
-        if (lidar, i) in carving:
-            beams.append(sweep_beams(clip, lidar, sweep))
-        sweeps, points = sweeps + 1, points + len(xyz)
-        free = np.ones(len(xyz), bool)
-        for actor in actors:
-            inside, box_xyz, box_eye, foot = _inside(actor, xyz, eye, t_us, free, settings.box_margin_m)
-            if not len(inside):
-                continue
-            # Every point belongs to one actor at most: to the first whose box holds it.
-            free[inside] = False
-            edge = np.full(len(inside), settings.min_voxel_m)
-            up = ~foot
-            clouds[actor.index].add(box_xyz[up], box_eye[up], edge[up], intensity[inside][up])
-            feet[actor.index].append(_unthinned(box_xyz[foot], box_eye[foot], edge[foot], intensity[inside][foot]))
-            feet_world[actor.index].append(xyz[inside][foot])
-        static.add(xyz[free], eye[free], voxel_edge_m(xyz[free], path, settings), intensity[free])
+        sweeps, points, known = sweeps + 1, points + parts.count, known or parts.intensity_known
+        if parts.beams is not None:
+            beams.append(parts.beams)
+        static.add(*parts.static)
+        for index, (sums, foot, foot_world) in parts.actors.items():
+            clouds[index].add(*sums)
+            feet[index].append(foot)
+            feet_world[index].append(foot_world)
     return Gathered(
         static.cloud(),
         {index: voxels.cloud() for index, voxels in clouds.items()},
@@ -250,6 +260,54 @@ def gather(
     )
 
 
+@dataclass(frozen=True)
+class _SweepParts:
+    """One sweep: voxel sums of the static world; per actor its voxel sums and its feet, in the box and the world."""
+
+    static: tuple[np.ndarray, np.ndarray]
+    actors: dict[int, tuple[tuple[np.ndarray, np.ndarray], Cloud, np.ndarray]]
+    beams: SweepBeams | None
+    count: int
+    intensity_known: bool
+
+
+def _split(
+    clip: Clip, actors: Sequence[Actor], settings: PointSettings, lidar: str, index: int, carving: bool
+) -> _SweepParts:
+    sweep = clip.sweep(lidar, index)
+    distance = np.linalg.norm(sweep.xyz_m, axis=1)
+    keep = np.isfinite(sweep.xyz_m).all(axis=1) & (distance < settings.max_range_m) & (distance > 0.5)
+    xyz = sweep.xyz_world_m
+    rig_from_world = geometry.inverse(clip.ego.at(sweep.t_us))
+    body = clip.rig.body
+    keep &= ~geometry.points_in_box(geometry.transform_points(rig_from_world, xyz) - body.center_m, body.size_m, 0.3)
+    xyz, t_us = xyz[keep], sweep.point_t_us[keep]
+    intensity = np.full(len(xyz), np.nan) if sweep.intensity is None else sweep.intensity[keep].astype(np.float64)
+    eye = np.broadcast_to(sweep.world_from_lidar[:3, 3], xyz.shape)
+    free, parts = np.ones(len(xyz), bool), {}
+    for actor in actors:
+        inside, box_xyz, box_eye, foot = _inside(actor, xyz, eye, t_us, free, settings.box_margin_m)
+        if not len(inside):
+            continue
+        # Every point belongs to one actor at most: to the first whose box holds it.
+        free[inside] = False
+        edge = np.full(len(inside), settings.min_voxel_m)
+        up = ~foot
+        parts[actor.index] = (
+            _voxel_sums(box_xyz[up], box_eye[up], edge[up], intensity[inside][up]),
+            _unthinned(box_xyz[foot], box_eye[foot], edge[foot], intensity[inside][foot]),
+            xyz[inside][foot],
+        )
+    edge = voxel_edge_m(xyz[free], clip.ego.position_m, settings)
+    return _SweepParts(
+        _voxel_sums(xyz[free], eye[free], edge, intensity[free]),
+        parts,
+        sweep_beams(clip, lidar, sweep) if carving else None,
+        len(xyz),
+        bool(np.isfinite(intensity).any()),
+    )
+
+
 def _inside(
     actor: Actor, xyz: np.ndarray, eye: np.ndarray, t_us: np.ndarray, free: np.ndarray, margin_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -258,7 +316,8 @@ def _inside(
     # A cheap world-aligned test first: poses at the points' own times are only evaluated near the path.
     radius = np.linalg.norm(size) / 2 + margin_m
     low, high = actor.path.position_m.min(axis=0) - radius, actor.path.position_m.max(axis=0) + radius
-    near = np.flatnonzero(free & geometry.points_in_box(xyz - (low + high) / 2, high - low) & actor.present(t_us))
+    near = _between(xyz, low, high)
+    near = near[free[near] & actor.present(t_us[near])]
     if not len(near):
         return near, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)
     box_from_world = geometry.inverse(actor.path.at(t_us[near]))

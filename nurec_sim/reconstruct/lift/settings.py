@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 
@@ -43,7 +44,10 @@ class ViewSettings:
     """The pinhole working views, their depth and the pixels lifted from them."""
 
     width_px: int = 640
-    """Working views have at most this width, by a whole-number reduction of the image."""
+    """Working views have at most this width, by a whole-number reduction of the image; wider ones in short logs
+    (``for_images``)."""
+    pixels: int = 8_000_000
+    """Working views are wider as long as all images together have at most this many pixels."""
     max_field_deg: float = 110.0
     """Wider lenses are cut into several views."""
     max_views: int = 40
@@ -59,6 +63,20 @@ class ViewSettings:
     """Surfaces farther than this belong to the sky cubemap."""
     neighbours: int = 4
     """Views that each view is matched against; 0 turns matching off."""
+
+    def for_images(self, sizes: Sequence[tuple[int, int, int]]) -> ViewSettings:
+        """The settings with the largest ``width_px`` that ``pixels`` allows, but no smaller one.
+
+        Args:
+            sizes: of each camera: width and height in pixels, and its number of images.
+        """
+        share = min(1.0, self.max_frames / max(sum(count for _, _, count in sizes), 1))
+        for reduction in range(1, max((width for width, _, _ in sizes), default=1) // self.width_px + 1):
+            pixels = share * sum((width // reduction) * (height // reduction) * n for width, height, n in sizes)
+            if pixels <= self.pixels:
+                widest = max(width for width, _, _ in sizes)
+                return replace(self, width_px=max(self.width_px, -(-widest // reduction)))
+        return self
 
 
 @dataclass(frozen=True)

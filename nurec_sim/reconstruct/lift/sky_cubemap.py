@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry
+from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.lift.lifting import rays_of
 from nurec_sim.reconstruct.lift.views import WorkingView
 from nurec_sim.reconstruct.sky_fill import fill_unseen
@@ -28,17 +29,21 @@ def make_sky(
         size: edge of a cubemap face, texels.
     """
     total, count = np.zeros((6 * size * size, 3)), np.zeros(6 * size * size)
-    for view, rgb, weight in zip(views, colours, weights, strict=True):
-        mask = weight > 0
-        if not mask.any():
-            continue
-        direction = rays_of(view)[mask] @ view.world_from_view[:3, :3].T
+
+    def texels(k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Texels that a view shows, and the sums of weight and of weighted colour in each."""
+        view, mask = views[k], weights[k] > 0
+        direction = geometry.rotate_vectors(view.world_from_view[:3, :3], rays_of(view)[mask])
         face, s, t = geometry.cubemap_coordinates(direction)
         column, row = (np.clip((x * size).astype(np.int64), 0, size - 1) for x in (s, t))
-        texel = (face * size + row) * size + column
-        count += np.bincount(texel, weights=weight[mask], minlength=len(count))
-        for k in range(3):
-            total[:, k] += np.bincount(texel, weights=weight[mask] * rgb[mask][:, k] / 255, minlength=len(count))
+        shown, place = np.unique((face * size + row) * size + column, return_inverse=True)
+        weight, rgb = weights[k][mask], colours[k][mask] / 255
+        sums = [np.bincount(place, values, len(shown)) for values in (weight, *(weight[:, None] * rgb).T)]
+        return shown, np.stack(sums, axis=1)
+
+    for shown, sums in in_order(texels, range(len(views))):
+        count[shown] += sums[:, 0]
+        total[shown] += sums[:, 1:]
     known = count > 0
     colour = np.where(known[:, None], total / np.maximum(count, 1e-9)[:, None], 0.0)
     seen = known.reshape(6, size, size).astype(np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from nurec_sim import geometry
-from nurec_sim.compute.cores import usable_cores
+from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.lift.points import Cloud
 from nurec_sim.types import Gaussians, Label
 
@@ -28,7 +28,7 @@ THINNEST_M = 0.003
 """Thicker discs would catch grazing LiDAR beams far in front of the ground."""
 
 
-def surface_of(cloud: Cloud, chunk: int = 200_000) -> tuple[Cloud, np.ndarray, np.ndarray]:
+def surface_of(cloud: Cloud, chunk: int = 16_384) -> tuple[Cloud, np.ndarray, np.ndarray]:
     """The cloud moved onto its local planes, unit normals that face the sensor, and the spacing between points (m).
 
     Sweeps of a moving car disagree by centimetres, so that walls are thick; a grazing beam would end at their near
@@ -46,9 +46,10 @@ def surface_of(cloud: Cloud, chunk: int = 200_000) -> tuple[Cloud, np.ndarray, n
         return cloud, to_eye.astype(np.float32), spacing
     k = min(NEIGHBOURS, n - 1)
     tree = cKDTree(cloud.xyz_m)
-    for start in range(0, n, chunk):
+
+    def fit(start: int) -> None:
         part = slice(start, min(start + chunk, n))
-        distance, index = tree.query(cloud.xyz_m[part], k=k + 1, workers=usable_cores())
+        distance, index = tree.query(cloud.xyz_m[part], k=k + 1)
         offset = cloud.xyz_m[index] - cloud.xyz_m[part][:, None]
         # Neighbours across a gap belong to another surface.
         close = distance < np.maximum(4 * distance[:, 3:4], 4 * cloud.spacing_m[part, None])
@@ -73,6 +74,9 @@ def surface_of(cloud: Cloud, chunk: int = 200_000) -> tuple[Cloud, np.ndarray, n
         normals[part] = np.where(flip[:, None], -normal, normal)
         # The fourth neighbour, not the first: its distance is steadier where sampling is uneven.
         spacing[part] = np.clip(distance[:, min(4, k)] * 0.7, cloud.spacing_m[part], 3 * cloud.spacing_m[part])
+
+    for _ in in_order(fit, range(0, n, chunk)):
+        pass
     return dataclasses.replace(cloud, xyz_m=xyz), normals, spacing
 
 

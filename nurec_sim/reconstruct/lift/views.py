@@ -7,19 +7,20 @@ moves during the exposure is kept as ``drift_m``, scaled by a shutter fraction t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from nurec_sim import geometry, sensors
+from nurec_sim.reconstruct.ego_images import shows_ego
 from nurec_sim.reconstruct.lift.settings import ViewSettings
 from nurec_sim.types import Box, CameraModel, Clip, Shutter
 
-EGO_HEIGHT_M = 0.75
-"""Bonnet and boot of a car lie at about this height: what is lower within its outline is the car itself."""
+BORDER, LEAST_WEIGHT = 0.2, 0.4
+"""Part of an image's shorter side over which ``border_weight`` falls, and the weight at its border."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,20 +112,20 @@ def without_ego(tile: Tile, camera: CameraModel, body: Box) -> Tile:
     return dataclasses.replace(tile, valid=tile.valid & ~shows_ego(rays @ tile.camera_from_tile.T, camera, body))
 
 
-def shows_ego(rays: Float64[np.ndarray, "h w 3"], camera: CameraModel, body: Box) -> Bool[np.ndarray, "h w"]:
-    """Which of a camera's rays, of any length, pass through the lower body of the car; none if it is within."""
-    centre, size = np.asarray(body.center_m), np.asarray(body.size_m)
-    low, high = centre - size / 2, centre + size / 2
-    high[2] = min(high[2], low[2] + EGO_HEIGHT_M)
-    origin = camera.rig_from_camera[:3, 3]
-    if np.all((origin >= low) & (origin <= high)):
-        return np.zeros(rays.shape[:2], bool)
-    rays = rays @ camera.rig_from_camera[:3, :3].T
-    # Slab test against the box; no division by zero for rays along a face.
-    rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
-    near, far = (low - origin) / rays, (high - origin) / rays
-    enter, leave = np.minimum(near, far).max(axis=-1), np.maximum(near, far).min(axis=-1)
-    return (enter < leave) & (leave > 0)
+def border_weight(height: int, width: int) -> Float32[np.ndarray, "h w"]:
+    """1 in the middle of an image, less at its border.
+
+    Where images of several cameras end on each other, their different vignettes would leave an edge.
+    """
+    rows, columns = (np.minimum(np.arange(n) + 0.5, n - np.arange(n) - 0.5) for n in (height, width))
+    inside = np.minimum(rows[:, None], columns) / (BORDER * min(height, width))
+    return np.clip(inside, LEAST_WEIGHT, 1).astype(np.float32)
+
+
+def without_pixels(tile: Tile, mask: Bool[np.ndarray, "h w"]) -> Tile:
+    """The tile without the pixels of a mask of the camera's size."""
+    masked = _resample(mask.astype(np.uint8) * 255, tile)
+    return dataclasses.replace(tile, valid=tile.valid & (masked == 0))
 
 
 def _pixels_per_radian(camera: CameraModel) -> float:
@@ -198,6 +199,7 @@ def choose_frames(
 def read_views(
     clip: Clip,
     cameras: Sequence[str],
+    ego_images: Mapping[str, UInt8[np.ndarray, "h w 4"]],
     settings: ViewSettings,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[WorkingView]:
@@ -206,13 +208,18 @@ def read_views(
     Args:
         clip: the driving log.
         cameras: ids of the cameras.
+        ego_images: what cameras see of the ego vehicle; these pixels are not valid.
         settings: size of the views and how many.
         progress: called with the fraction of the frames that is read.
     """
     tiles = {}
     for camera in cameras:
         model = clip.rig.cameras[camera]
-        tiles[camera] = [without_ego(tile, model, clip.rig.body) for tile in tiles_of(model, settings)]
+        ego = ego_images.get(camera)
+        tiles[camera] = [
+            without_ego(tile, model, clip.rig.body) if ego is None else without_pixels(tile, ego[..., 3] > 0)
+            for tile in tiles_of(model, settings)
+        ]
     frames = choose_frames(clip, cameras, sum(map(len, tiles.values())), settings)
     views = []
     for done, (camera, frame, key) in enumerate(frames):
@@ -231,7 +238,7 @@ def read_views(
     return views
 
 
-def _resample(image: UInt8[np.ndarray, "h w 3"], tile: Tile) -> UInt8[np.ndarray, "h w 3"]:
+def _resample(image: UInt8[np.ndarray, "h w *c"], tile: Tile) -> UInt8[np.ndarray, "h w *c"]:
     k = tile.reduction
     height, width = image.shape[0] // k, image.shape[1] // k
     small = cv2.resize(image[: height * k, : width * k], (width, height), interpolation=cv2.INTER_AREA)

@@ -83,7 +83,9 @@ def refine(
 
 def _key(scene: GaussianScene, cameras: Sequence[str], hold_out: set[int], settings: OptimizeSettings) -> str:
     """What a checkpoint must have in common with the optimisation that resumes it: all but the budget."""
-    same = dataclasses.replace(settings, seconds=None, steps=1, checkpoint=None, checkpoint_s=0.0, resume=False)
+    same = dataclasses.replace(
+        settings, seconds=None, steps=1, checkpoint=None, checkpoint_s=0.0, resume=False, keep_interrupted=True
+    )
     text = f"{scene_hash(scene)} {list(cameras)} {sorted(hold_out)} {same}"
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -137,7 +139,9 @@ class Optimization:
         """Spend the budget; end with the best state."""
         started, smooth, order = time.perf_counter(), float("nan"), self._order()
         saved, checked, file = started, self._spent(self._seconds_before), self.settings.checkpoint
-        with _whole_steps() as interrupted, contextlib.suppress(KeyboardInterrupt):
+        keep = self.settings.keep_interrupted
+        whole: contextlib.AbstractContextManager[list[int]] = _whole_steps() if keep else contextlib.nullcontext([])
+        with whole as interrupted, contextlib.suppress(*[KeyboardInterrupt] * keep):
             while (spent := self._spent(seconds := self._seconds_before + time.perf_counter() - started)) < 1:
                 if spent >= checked + CHECK_SHARE:
                     checked = spent
@@ -176,7 +180,8 @@ class Optimization:
         frame = Frame(SENSORS.tables(view.camera), self.poses.pair(number), False)
         frame.draw_packed(self.parameters.at(view.t_us).packed)
         shown = Composite(frame, self.sky).shown(self.responses.of(view.camera.id, view.frame))
-        error = np.square(np.clip(shown, 0, 1) - view.colours).mean(dtype=np.float64)
+        shown = np.clip(shown, 0, 1)
+        error = np.square(shown - view.colours_beside(shown)).mean(dtype=np.float64)
         return -10 * float(np.log10(max(error, 1e-12)))
 
     def _result(self) -> dict[str, np.ndarray]:
@@ -222,13 +227,13 @@ class Optimization:
         frame = Frame(SENSORS.tables(view.camera), self.poses.pair(number), False)
         drawn = self.parameters.at(view.t_us)
         alpha, distance = frame.draw_packed(drawn.packed)[[0, 4], :height, :width]
-        composite, recorded = Composite(frame, self.sky), view.colours
+        composite = Composite(frame, self.sky)
         if self.responses.is_new(view.camera.id, view.frame):
             before = composite.shown(self.responses.of(view.camera.id, view.frame))
-            self.responses.start(view.camera.id, view.frame, before, recorded)
+            self.responses.start(view.camera.id, view.frame, before, view.colours_beside(before))
         response = self.responses.of(view.camera.id, view.frame)
         shown = composite.shown(response)
-        loss, by_shown = colour_loss(shown, recorded, weights.dssim)
+        loss, by_shown = colour_loss(shown, view.colours_beside(shown), weights.dssim)
 
         by_planes, by_sky, by_pose, by_response = composite.back(response, shown, by_shown)
         by_alpha, by_distance = by_planes[0, :height, :width], by_planes[4, :height, :width]
@@ -266,7 +271,7 @@ class Optimization:
             "settings": {
                 name: value
                 for name, value in dataclasses.asdict(self.settings).items()
-                if name not in ("checkpoint", "checkpoint_s", "resume")
+                if name not in ("checkpoint", "checkpoint_s", "resume", "keep_interrupted")
             },
             "cameras": sorted({view.camera.id for view in self.views}),
             "steps": self.best_steps if self.best else self.steps,

@@ -10,9 +10,9 @@ from pathlib import Path
 class LearningRates:
     """Step sizes at the start; all fall by ``OptimizeSettings.final_rate`` until the end of the budget."""
 
-    mean_m: float = 0.002
-    quat: float = 0.005
-    log_scale: float = 0.01
+    mean_m: float = 0.004
+    quat: float = 0.02
+    log_scale: float = 0.04
     logit_opacity: float = 0.05
     rgb: float = 0.02
     sky: float = 0.01
@@ -26,7 +26,7 @@ class LossWeights:
 
     dssim: float = 0.2
     """Share of 1 - SSIM in the loss of colour; the rest is the absolute difference (Kerbl et al. 2023, eq. 7)."""
-    depth: float = 0.1
+    depth: float = 0.5
     """Relative error of the rendered inverse depth at LiDAR returns."""
     solid: float = 0.02
     """1 - alpha at LiDAR returns."""
@@ -68,6 +68,7 @@ class OptimizeSettings:
         checkpoint: file for the state, written every ``checkpoint_s`` seconds and removed at the end; None: none.
         checkpoint_s: see checkpoint.
         resume: go on from the state in ``checkpoint``; budgets count from the very start.
+        keep_interrupted: whether Ctrl-C ends the optimisation with the best state so far; else it is not caught.
         correct_poses: whether to correct the poses of images and the clocks of cameras.
         poses: how much.
     """
@@ -83,6 +84,7 @@ class OptimizeSettings:
     checkpoint: Path | None = None
     checkpoint_s: float = 60.0
     resume: bool = False
+    keep_interrupted: bool = True
     correct_poses: bool = False
     poses: PosePriors = field(default_factory=PosePriors)
 

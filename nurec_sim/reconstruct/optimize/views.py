@@ -42,6 +42,7 @@ class TrainingView:
         world_from_camera: poses at the start and the end of the exposure.
         image: what was recorded.
         returns: LiDAR returns that it can see, measured within half a sweep of it.
+        ego: where it shows the ego vehicle, which is not part of the scene; None if nowhere.
     """
 
     camera: CameraModel
@@ -50,11 +51,14 @@ class TrainingView:
     world_from_camera: Float64[np.ndarray, "2 4 4"]
     image: UInt8[np.ndarray, "h w 3"]
     returns: Returns
+    ego: Bool[np.ndarray, "h w"] | None = None
 
-    @property
-    def colours(self) -> Float32[np.ndarray, "h w 3"]:
-        """The image, 0..1."""
-        return self.image.astype(np.float32) / np.float32(255)
+    def colours_beside(self, shown: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+        """The image, 0..1, with the colours ``shown`` of the scene where it shows the ego vehicle: no error there."""
+        colours = self.image.astype(np.float32) / np.float32(255)
+        if self.ego is not None:
+            colours[self.ego] = shown[self.ego]
+        return colours
 
 
 def training_views(
@@ -72,10 +76,11 @@ def training_views(
     views = []
     for name in cameras:
         camera = clip.rig.cameras[name]
+        ego = scene.ego_images[name][..., 3] > 0 if name in scene.ego_images else None
         for frame, (start_us, end_us) in enumerate(clip.camera_times_us(name).tolist()):
             t_us, pair = (start_us + end_us) // 2, np.asarray(clip.world_from_camera(name, frame), np.float64)
             seen = returns_in(camera, pair, sweeps.near(t_us))
-            views.append(TrainingView(camera, frame, t_us, pair, clip.image(name, frame), seen))
+            views.append(TrainingView(camera, frame, t_us, pair, clip.image(name, frame), seen, ego))
     return views
 
 

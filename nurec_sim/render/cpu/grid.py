@@ -55,7 +55,12 @@ def grid_key(sensor: CameraModel | LidarModel) -> tuple:
     """What a grid depends on, as something hashable."""
     if isinstance(sensor, LidarModel):
         arrays = (sensor.elevation_rad, sensor.azimuth_rad, sensor.row_azimuth_offset_rad)
-        return (sensor.spin, sensor.range_m, *(np.asarray(a, np.float64).tobytes() for a in arrays))
+        return (
+            sensor.spin,
+            sensor.range_m,
+            sensor.blocked.tobytes(),
+            *(np.asarray(a, np.float64).tobytes() for a in arrays),
+        )
     return (sensor.width_px, sensor.height_px, sensor.lens, sensor.shutter, sensor.windshield)
 
 
@@ -102,7 +107,7 @@ def _lidar_grid(lidar: LidarModel) -> Grid:
     return Grid(
         kind=LIDAR,
         direction=direction,
-        valid=np.ones((rows, columns), np.uint8),
+        valid=np.ascontiguousarray(rays.valid[row, fired], np.uint8),
         line=fired.astype(np.int32),
         line_fraction=np.asarray(sensors.column_fraction(lidar), np.float64),
         beam=(row * columns + fired).astype(np.int32),

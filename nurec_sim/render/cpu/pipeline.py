@@ -1,4 +1,4 @@
-"""The stages of frames on the CPU: cull, project, sort, bin, blend; identical for cameras and LiDARs.
+"""The stages of frames on the CPU: cull, project, bin, sort and blend; identical for cameras and LiDARs.
 
 Several frames go through each stage together, so that all threads have work until the last tile. Kernels release the
 interpreter lock. Every stage splits its work into ranges whose results do not depend on how many there are, so frames
@@ -13,10 +13,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Int64
 
-from nurec_sim.render.cpu.blend.binning import count_tiles, depth_cuts, fill_tiles, sort_by_depth
-from nurec_sim.render.cpu.blend.draw import TileLists, draw_tiles, record_normals
+from nurec_sim.render.cpu.blend.beams import draw_beams
+from nurec_sim.render.cpu.blend.binning import TileLists, count_tiles, fill_tiles
+from nurec_sim.render.cpu.blend.draw import draw_tiles, record_normals
 from nurec_sim.render.cpu.blend.rays import RayTiles, SensorRays
 from nurec_sim.render.cpu.blend.responses import LIDAR, NORMALS
 from nurec_sim.render.cpu.blend.tiles import AFFINE, ROLLING
@@ -30,8 +31,8 @@ from nurec_sim.render.cpu.simd import LANES
 from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.cpu.workers import SPLIT, Scratch, Workers
 
-SLICE_PAIRS, SLICE_BLOCKS, SLICE_RECORDS = 8192, 512, 200_000
-"""Pairs of records and macro tiles, blocks of Gaussians, and records in one call of a kernel, at most about; a few
+SLICE_PAIRS, SLICE_BLOCKS = 8192, 512
+"""Pairs of records and macro tiles, and blocks of Gaussians, in one call of a kernel, at most about; a few
 milliseconds of work: the machine is shared out between calls (``turns``)."""
 NO_TABLE = RayTiles(np.zeros((1, 1, 1, 1), np.float32), np.zeros((1, 1, 1), np.int16), np.zeros((1, 1, 1), np.float32))
 """What a pinhole has instead of a table of rays."""
@@ -66,8 +67,6 @@ class Picture:
     scratch: Scratch
     projected: Projected = field(init=False)
     runs: list[tuple[int, int, int]] = field(init=False)
-    order: Int32[np.ndarray, " m"] = field(init=False)
-    sorted_spans: np.ndarray = field(init=False)
     binned: TileLists = field(init=False)
     stats: FrameStats = field(default_factory=FrameStats)
 
@@ -104,7 +103,8 @@ class Picture:
 def draw(pictures: Sequence[Picture], workers: Workers) -> list[Float32[np.ndarray, "p h w"]]:
     """Blended planes of each picture, see ``draw.draw_tiles``; their sides are rounded up to whole blocks."""
     bin_pictures(pictures, workers)
-    results, calls, counts = [], [], []
+    results, counts = [], []
+    calls: list[tuple] = []
     with _timed("blend", pictures):
         for picture in pictures:
             planes, rays, normals = _empty_planes(picture), sensor_rays(picture), _record_normals(picture)
@@ -112,6 +112,9 @@ def draw(pictures: Sequence[Picture], workers: Workers) -> list[Float32[np.ndarr
             for tiles in tile_ranges(picture, workers.threads):
                 done = np.zeros(1, np.int64)
                 counts.append((picture, done))
+                if picture.output_kind == LIDAR:
+                    calls.append((draw_beams, rays, picture.projected, picture.binned, tiles, planes, done))
+                    continue
                 calls.append((draw_tiles, rays, picture.projected, picture.binned, normals, picture.output_kind, tiles,
                               planes, done))  # fmt: skip
         workers.run_calls(calls)
@@ -124,8 +127,6 @@ def bin_pictures(pictures: Sequence[Picture], workers: Workers) -> None:
     """All stages before blending: fill in the pictures' records and the lists of their macro tiles."""
     with _timed("project", pictures):
         _project(pictures, workers)
-    with _timed("sort", pictures):
-        _sort(pictures, workers)
     with _timed("bin", pictures):
         _bin(pictures, workers)
 
@@ -200,54 +201,28 @@ def view_eye(picture: Picture) -> np.ndarray:
     return picture.view.world_from_reference[:3, 3].copy()
 
 
-def _sort(pictures: Sequence[Picture], workers: Workers) -> None:
-    calls = []
-    for picture in pictures:
-        starts = np.array([first for _, first, _ in picture.runs], np.int64)
-        counts = np.array([count for _, _, count in picture.runs], np.int64)
-        total = int(counts.sum())
-        picture.stats.visible = total
-        picture.order = picture.scratch("order", (total,), np.int32)
-        picture.sorted_spans = picture.scratch("sorted spans", (total, 4), np.int16)
-        spare = picture.scratch("sorting", (2, total), np.uint64)
-        near, made = np.float32(picture.view.grid.near_m), picture.projected
-        # With fewer frames than threads, each frame's sort is divided as well.
-        cuts = depth_cuts(
-            picture.projected.keys, starts, counts, workers.threads if len(pictures) < workers.threads else 1
-        )
-        calls += [
-            (sort_by_depth, made.keys, starts, counts, near, low, high, made.spans, picture.order,
-             picture.sorted_spans, spare)
-            for low, high in zip(cuts[:-1], cuts[1:], strict=True)
-        ]  # fmt: skip
-    workers.run_calls(calls)
-
-
 def _bin(pictures: Sequence[Picture], workers: Workers) -> None:
-    splits = [workers.ranges(len(picture.order), 20_000, SLICE_RECORDS) for picture in pictures]
-    counts = [
-        np.zeros((len(ranges), picture.tiles), np.int64) for picture, ranges in zip(pictures, splits, strict=True)
-    ]
+    counts = [np.zeros((len(picture.runs), picture.tiles), np.int64) for picture in pictures]
     workers.run_calls(
-        [(count_tiles, picture.sorted_spans, first, last, picture.tile_columns, count[k])
-         for picture, ranges, count in zip(pictures, splits, counts, strict=True)
-         for k, (first, last) in enumerate(ranges)],
+        [(count_tiles, picture.projected.spans, first, first + many, picture.tile_columns, count[k])
+         for picture, count in zip(pictures, counts, strict=True)
+         for k, (_, first, many) in enumerate(picture.runs)],
     )  # fmt: skip
     calls = []
-    for picture, ranges, count in zip(pictures, splits, counts, strict=True):
-        # Each range fills its own part of every tile's list, after those of earlier ranges: the order is that of one
-        # thread.
+    for picture, count in zip(pictures, counts, strict=True):
+        # Each run fills its own part of every tile's list, so that runs can be handed out side by side.
         starts = np.zeros(picture.tiles + 1, np.int64)
         np.cumsum(count.sum(axis=0), out=starts[1:])
         position = starts[:-1] + np.cumsum(count, axis=0) - count
-        picture.stats.pairs = int(starts[-1])
+        picture.stats.visible, picture.stats.pairs = sum(many for _, _, many in picture.runs), int(starts[-1])
+        items = picture.scratch("items", (picture.stats.pairs,), np.uint64)
         lists = picture.scratch("lists", (picture.stats.pairs + LANES,), np.int32)
-        picture.binned = TileLists(starts, lists)
+        picture.binned = TileLists(starts, items, lists)
+        made = picture.projected
         calls += [
-            (fill_tiles, picture.sorted_spans, picture.order, first, last, picture.tile_columns, position[k],
-             lists)
-            for k, (first, last) in enumerate(ranges)
-        ]  # fmt: skip
+            (fill_tiles, made.spans, made.keys, first, first + many, picture.tile_columns, position[k], items)
+            for k, (_, first, many) in enumerate(picture.runs)
+        ]
     workers.run_calls(calls)
 
 

@@ -47,7 +47,8 @@ STEP = 4 * LANES
 TURN, EYE_HIGH, EYE_LOW, NEAR, BY_RANGE, TRAVEL, SWING, INTRINSICS, CELLS = 0, 9, 12, 15, 16, 17, 18, 19, 23
 VIEW = 25
 
-MACRO = 32
+MACRO_BITS = 5
+MACRO = 1 << MACRO_BITS
 """Side of the tiles that records are handed out to, in cells."""
 
 
@@ -59,7 +60,7 @@ class Projected(NamedTuple):
     keys: Float32[np.ndarray, " n"]
     """Depth to sort by (m): z of the centre, or its distance."""
     spans: Int16[np.ndarray, "n 4"]
-    """First and last column, first and last row of the macro tiles that may see it."""
+    """First and last column, first and last row of the cells that may see it."""
     sources: Int32[np.ndarray, " n"]
     """Its packed row: 256 times the block plus the place in it."""
 
@@ -244,6 +245,21 @@ def lowest_bit(v: Lanes, mask: ir.Value) -> ir.Value:
 
 
 @inner
+def tiles_of(spans, i):
+    """First and last column, first and last row of the macro tiles of span i."""
+    # A shift is cheaper than a division that rounds down.
+    return (np.int64(spans[i, 0]) >> MACRO_BITS, np.int64(spans[i, 1]) >> MACRO_BITS,
+            np.int64(spans[i, 2]) >> MACRO_BITS, np.int64(spans[i, 3]) >> MACRO_BITS)  # fmt: skip
+
+
+@inner
+def tile_count(spans, i):
+    """Number of macro tiles of span i."""
+    left, right, top, bottom = tiles_of(spans, i)
+    return (right - left + 1) * (bottom - top + 1)
+
+
+@inner
 def emit(mask, rows, scratch, box, source, n, output):
     """Write some records of a group; returns the row after the last.
 
@@ -251,7 +267,7 @@ def emit(mask, rows, scratch, box, source, n, output):
         mask: the lanes to write.
         rows: [LANES,16] what ``build_records`` left.
         scratch: [SCRATCH,LANES] what ``place`` left.
-        box: [4,LANES] first and last macro tile column, first and last row.
+        box: [4,LANES] first and last column, first and last row of cells.
         source: packed row of lane 0.
         n: first row to write.
         output: see ``Projected``.

@@ -22,6 +22,7 @@ from nurec_sim.render.cpu.pipeline import NO_TABLE, FrameStats, Picture, blocks_
 from nurec_sim.render.cpu.sensor_tables import SensorCache, SensorTables
 from nurec_sim.render.cpu.view import ExposureView
 from nurec_sim.render.cpu.workers import Buffers, Scratch, Workers
+from nurec_sim.render.ego import EgoOverlays
 from nurec_sim.render.lod import Detail, check_detail
 from nurec_sim.render.rays import actors_at, reference_pose
 from nurec_sim.render.requests import SENSED_OUTPUTS, check_outputs, check_request
@@ -73,6 +74,7 @@ class CpuRenderer(SingleFrames):
         self._moving = PackedMoving.of(scene.dynamic, scene.tracks)
         self._sky = np.ascontiguousarray(scene.sky, np.float32)
         self._sensors = SensorCache(SensorTables)
+        self._ego = EgoOverlays(scene.ego_images, scene.rig)
 
     def sense(self, requests: Sequence[SensorRequest], outputs: Sequence[str] = SENSED_OUTPUTS) -> list[SensorFrame]:
         """One frame per request, in order: ``types.Sense``; cameras with ``rgb`` and what else ``outputs`` names.
@@ -172,7 +174,7 @@ class CpuRenderer(SingleFrames):
             [(first, last, planes, rays, self._sky, isp, pixels)
              for first, last in self._workers.ranges(height, 16, SLICE_RAYS // width)],
         )  # fmt: skip
-        return CameraFrame(
+        frame = CameraFrame(
             camera=request.sensor,
             start_us=request.start_us,
             end_us=request.end_us,
@@ -182,6 +184,7 @@ class CpuRenderer(SingleFrames):
             label=pixels.label if "label" in outputs else None,
             normal=pixels.normal if "normal" in outputs else None,
         )
+        return self._ego.over(frame) if request.show_ego else frame
 
     def _lidar_frame(
         self, request: SensorRequest, picture: Picture, planes: np.ndarray, filter: LidarFilter
@@ -202,7 +205,7 @@ class CpuRenderer(SingleFrames):
             np.empty((rows * columns, 3), np.float32),
             np.empty(rows * columns, np.int32),
         )
-        rays = SweepRays(grid.direction, grid.beam, grid.line, np.ascontiguousarray(end_from_line[:, :3]))
+        rays = SweepRays(grid.direction, grid.valid, grid.beam, grid.line, np.ascontiguousarray(end_from_line[:, :3]))
         limits = SweepFilter(*map(float, thresholds))
         parts = self._workers.ranges(rows, 4, SLICE_RAYS // columns)
         counts = self._workers.run(

@@ -13,6 +13,7 @@ from nurec_sim.compute.turns import rest
 from nurec_sim.errors import TooLargeError
 from nurec_sim.render.cpu.pack import BLOCK, pack
 from nurec_sim.render.cpu.sensor_tables import SensorCache
+from nurec_sim.render.ego import EgoOverlays
 from nurec_sim.render.gpu.batch import Batch, make_batch
 from nurec_sim.render.gpu.launcher import THREADS, CudaLauncher, Launcher
 from nurec_sim.render.gpu.moving import MovingLayer
@@ -114,6 +115,7 @@ class GpuRenderer(SingleFrames):
         self._static = Blocks.of(packed, self.device)
         self._detail_px = detail_px
         self._moving = MovingLayer.of(scene.dynamic, scene.tracks, self.device)
+        self._ego = EgoOverlays(scene.ego_images, scene.rig)
         self._sky = torch.from_numpy(np.ascontiguousarray(scene.sky, np.float32)).to(self.device)
         self._rooms = Rooms()
         self._checked: set[tuple | None] = set()
@@ -212,9 +214,8 @@ class GpuRenderer(SingleFrames):
         for k, request in enumerate(requests):
             part = slice(images.first_ray[k], images.first_ray[k + 1])
             if isinstance(request.sensor, CameraModel):
-                frames.append(
-                    _camera_frame(request, request.sensor, {name: plane[part] for name, plane in host.items()})
-                )
+                frame = _camera_frame(request, request.sensor, {name: plane[part] for name, plane in host.items()})
+                frames.append(self._ego.over(frame) if request.show_ego else frame)
             else:
                 frames.append(_lidar_frame(request, request.sensor, host["returns"][part]))
         return frames

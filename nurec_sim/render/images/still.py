@@ -69,7 +69,7 @@ def render_still(
     moved = geometry.pose_from_xyyaw(0.0, left_m, np.radians(yaw_deg))
     poses = scene.ego.at(np.array([start_us, end_us])) @ moved @ camera.rig_from_camera
     # An exposure must end after it starts; an instant becomes a microsecond.
-    request = SensorRequest(scene.id, camera, start_us, max(end_us, start_us + 1), poses)
+    request = SensorRequest(scene.id, camera, start_us, max(end_us, start_us + 1), poses, show_ego=True)
     shown = picture(renderer.render_camera(request, ("rgb", layer)), layer)
     write_file(path, encode_image(shown))
 

@@ -14,6 +14,7 @@ from nurec_sim.compute.turns import aside, rest
 from nurec_sim.errors import RequestError
 from nurec_sim.files.decoding import image_pixels
 from nurec_sim.render.cpu.workers import Workers
+from nurec_sim.render.ego import Overlay
 from nurec_sim.serving import wire
 from nurec_sim.serving.sensor_service.render_queue import LARGE_RAYS
 from nurec_sim.serving.wire import sensorsim
@@ -43,6 +44,10 @@ class EgoMasks:
         """(rig, camera) of every mask."""
         return tuple(self._paths)
 
+    def has(self, camera: str) -> bool:
+        """Whether there is a mask of a camera, of any rig."""
+        return any(camera == name for _, name in self._paths)
+
     def find(self, key: tuple[str, str]) -> tuple[str, str]:
         """The (rig, camera) of the mask that is meant: ``key``, or with an empty rig the only one that has the camera.
 
@@ -58,13 +63,11 @@ class EgoMasks:
 
     def overlay(self, rgb: UInt8[np.ndarray, "h w 3"], key: tuple[str, str]) -> UInt8[np.ndarray, "h w 3"]:
         """A copy of an image with the mask, scaled to its size, overlaid."""
-        picture, cover = _scaled_mask(self._paths[self.find(key)], rgb.shape[1], rgb.shape[0])
-        return np.rint(rgb + cover * (picture - rgb)).astype(np.uint8)
+        return _scaled_mask(self._paths[self.find(key)], rgb.shape[1], rgb.shape[0]).over(rgb)
 
 
 @lru_cache(maxsize=32)
-def _scaled_mask(path: Path, width_px: int, height_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colour [h,w,3] and alpha [h,w,1] of a mask in float32."""
+def _scaled_mask(path: Path, width_px: int, height_px: int) -> Overlay:
     import cv2
 
     try:
@@ -77,9 +80,7 @@ def _scaled_mask(path: Path, width_px: int, height_px: int) -> tuple[np.ndarray,
     cover = bgra[..., 3:4] / 255 if bgra.shape[2] == 4 else (rgb.max(axis=2, keepdims=True) > 0).astype(np.float32)
     # Premultiplied alpha while scaling, so that colours of transparent pixels do not bleed in.
     layers = np.concatenate([rgb * cover, cover], axis=2)
-    layers = cv2.resize(layers, (width_px, height_px), interpolation=cv2.INTER_AREA)
-    cover = layers[..., 3:4]
-    return layers[..., :3] / np.maximum(cover, 1e-6), cover
+    return Overlay.of(cv2.resize(layers, (width_px, height_px), interpolation=cv2.INTER_AREA))
 
 
 class ImageReplies:

@@ -142,6 +142,9 @@ class Rendering(ServiceCore):
 
     def _read_camera(self, message, loaded: LoadedScene) -> CameraJob:
         request, options = wire.read_camera_request(message, loaded.scene.rig.cameras)
+        if options.ego_mask == ("", request.sensor.id) and not self._masks.has(request.sensor.id):
+            # No mask is named: what the scene itself knows of the ego vehicle, which may be nothing.
+            request, options = replace(request, show_ego=True), replace(options, ego_mask=None)
         if options.ego_mask:
             options = replace(options, ego_mask=self._masks.find(options.ego_mask))
         camera = request.sensor

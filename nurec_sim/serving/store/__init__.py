@@ -2,7 +2,7 @@
 
 from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats
 from nurec_sim.serving.store.recipes import Recipe, content_key
-from nurec_sim.serving.store.sources import default_cache_dir, find_sources
+from nurec_sim.serving.store.sources import default_cache_dir, find_sources, is_archive, own_id
 from nurec_sim.serving.store.store import SceneEntry, SceneStore
 from nurec_sim.serving.store.uploads import Upload, UploadFolder
 
@@ -18,4 +18,6 @@ __all__ = [
     "content_key",
     "default_cache_dir",
     "find_sources",
+    "is_archive",
+    "own_id",
 ]

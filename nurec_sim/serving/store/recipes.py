@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import nurec_sim
-from nurec_sim.reconstruct import load_method
-from nurec_sim.types import GaussianScene, Method, Progress
+from nurec_sim.reconstruct import OptimizeSettings, load_method
+from nurec_sim.types import Clip, GaussianScene, Method, Progress
 
 _CODE = ("reconstruct", "network")
 
@@ -26,6 +26,8 @@ class Recipe:
         method: a reference as ``reconstruct.load_method`` takes it.
         settings: of that method; None for its defaults.
         cameras: ids of the cameras to use; empty for what the method takes by itself.
+        refine: settings of an optimisation after the method; None for none.
+        hold_out_every: every N-th image, and the sweeps taken with it, are kept out; 0 for none.
 
     Raises:
         ReconstructError: no such method.
@@ -34,6 +36,8 @@ class Recipe:
     method: str = "lift"
     settings: Any = None
     cameras: tuple[str, ...] = ()
+    refine: OptimizeSettings | None = None
+    hold_out_every: int = 0
 
     def __post_init__(self) -> None:
         load_method(self.method)
@@ -44,7 +48,7 @@ class Recipe:
         Raises:
             ClipError, ReconstructError, WeightsError: see ``reconstruct.reconstruct``.
         """
-        from nurec_sim.logs import open_clip
+        from nurec_sim.logs import hold_out, open_clip, without_images
         from nurec_sim.reconstruct import reconstruct
 
         chosen: dict[str, Any] = {}
@@ -52,7 +56,14 @@ class Recipe:
             chosen["settings"] = self.settings
         if self.cameras:
             chosen["cameras"] = self.cameras
-        return reconstruct(open_clip(clip_path), self.method, progress=progress, **chosen)
+        if self.refine is not None:
+            # A scene that an interruption cut short must not be kept under the name of the whole.
+            chosen["refine"] = dataclasses.replace(self.refine, keep_interrupted=False)
+        clip: Clip = open_clip(clip_path)
+        if self.hold_out_every:
+            held = hold_out(clip, self.cameras or list(clip.rig.cameras), images_every=self.hold_out_every)
+            clip, chosen["hold_out_sweeps"] = without_images(clip, held), sorted(held.sweeps)
+        return reconstruct(clip, self.method, progress=progress, **chosen)
 
     def text(self) -> str:
         """Method, settings, cameras and weights as JSON; files by content, not by path."""
@@ -61,7 +72,10 @@ class Recipe:
             settings = {name: _plain(value) for name, value in settings.items()}
         method = load_method(self.method)
         files = [files_hash(path) for path in method.files(method.settings() if settings is None else self.settings)]
-        said = {"method": self.method, "settings": settings, "cameras": self.cameras, "files": files}
+        said: dict[str, Any] = {"method": self.method, "settings": settings, "cameras": self.cameras, "files": files}
+        said |= {"hold_out_every": self.hold_out_every} if self.hold_out_every else {}
+        if self.refine is not None:
+            said["refine"] = dataclasses.asdict(self.refine)
         return json.dumps(said | {"code": _foreign_code(method)}, sort_keys=True, default=str)
 
 

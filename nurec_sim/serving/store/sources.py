@@ -85,19 +85,25 @@ def identify(source: GaussianScene | str | Path, name: str = "", recipe: Recipe 
 
     if isinstance(source, GaussianScene):
         return Source(alpasim_id(source.id), source, (source.id,))
-    from nurec_sim.logs import is_log, open_clip
-
     path = Path(source)
-    if not path.exists() and not is_log(path):
-        raise ArchiveError(f"{path} does not exist")
-    others: tuple[str, ...] = ()
-    if is_archive(path):
-        own_id, others = _archive_id(path), _metadata_id(path)
-    else:
-        own_id = open_clip(path).id
+    own = own_id(path)
     if name:
         return Source(alpasim_id(name), path, (name,), recipe)
-    return Source(alpasim_id(own_id), path, (own_id, path.stem, alpasim_id(path.stem), *others), recipe)
+    others = _metadata_id(path) if is_archive(path) else ()
+    return Source(alpasim_id(own), path, (own, path.stem, alpasim_id(path.stem), *others), recipe)
+
+
+def own_id(path: Path) -> str:
+    """The id that an archive or a log gives itself.
+
+    Raises:
+        ArchiveError, ClipError: it cannot be opened.
+    """
+    from nurec_sim.logs import is_log, open_clip
+
+    if not path.exists() and not is_log(path):
+        raise ArchiveError(f"{path} does not exist")
+    return _archive_id(path) if is_archive(path) else open_clip(path).id
 
 
 def is_archive(path: Path) -> bool:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from nurec_sim.errors import SceneInUseError
-from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings
+from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, OptimizeSettings
 from nurec_sim.render.device import Renderer
 from nurec_sim.render.device import make_renderer as renderer_on
 from nurec_sim.serving.store.memory import Lease, LoadedScene, MemoryStats, SceneMemory, half_of_memory
@@ -52,6 +52,7 @@ class SceneStore(SceneCatalog):
         cache_dir: where reconstructed clips are kept, by content; None for ``default_cache_dir()``.
         method: reconstruction method of clips.
         settings: of the method; None for its defaults.
+        refine: settings of an optimisation of every reconstructed clip; None for none.
         device: that renders; see ``render.choose_device``.
         threads: render threads on a CPU, None for all cores.
         make_renderer: makes the renderer of a scene; None for ``render.make_renderer`` with these two.
@@ -67,6 +68,7 @@ class SceneStore(SceneCatalog):
         cache_dir: Path | None = None,
         method: str = "lift",
         settings: LiftSettings | FeedForwardSettings | None = None,
+        refine: OptimizeSettings | None = None,
         device: str = "auto",
         threads: int | None = None,
         make_renderer: Callable[[GaussianScene], Renderer] | None = None,
@@ -79,7 +81,7 @@ class SceneStore(SceneCatalog):
         super().__init__()
         self.memory = SceneMemory(capacity, half_of_memory() if max_bytes is None else max_bytes)
         self._kept = ReconstructionCache(cache_dir or default_cache_dir(), on_progress or (lambda text: None))
-        self._recipe = Recipe(method, settings)
+        self._recipe = Recipe(method, settings, refine=refine)
         self._make_renderer = make_renderer or partial(renderer_on, device=device, threads=threads)
         for source in sources:
             self.add(source)

@@ -49,6 +49,7 @@ def write_camera_request(request: SensorRequest, message, *, scene_id: str) -> N
     message.image_format = ImageFormat.RGB_UINT8_PLANAR
     if not request.apply_isp:
         message.apply_isp = False
+    message.insert_ego_mask = request.show_ego
     _write_frame(request, message, scene_id)
 
 

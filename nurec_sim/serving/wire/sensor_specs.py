@@ -255,6 +255,7 @@ def write_lidar(lidar: LidarModel, message) -> None:
     model.spin = CustomSpin[lidar.spin.name]
     model.frequency_hz = lidar.frequency_hz
     model.min_range_m, model.max_range_m = lidar.range_m
+    model.blocked.extend(lidar.blocked.tolist())
 
 
 def read_lidar(message) -> LidarModel:
@@ -275,6 +276,7 @@ def read_lidar(message) -> LidarModel:
         Spin[_member(CustomSpin, model.spin, "spin").name],
         model.frequency_hz or 10.0,
         (model.min_range_m, model.max_range_m or 200.0),
+        np.array(model.blocked, np.int64),
     )
     try:
         check_lidar(lidar)

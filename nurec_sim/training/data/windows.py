@@ -81,7 +81,7 @@ def sample_window(rng: np.random.Generator, clip: TrueClip, settings: WindowSett
     reframed, how = _reframed(rng, clip, names, settings)
     shown = np.concatenate([reframed.camera_times_us(name)[list(context)] for name in names])
     window = ChunkWindow(0, (int(shown[:, 0].min()), int(shown[:, 1].max())), dict.fromkeys(names, context))
-    chunk = chunk_inputs(reframed, settings.profile, window, FeedForwardSettings())
+    chunk = chunk_inputs(reframed, settings.profile, window, FeedForwardSettings(), {})
     sample = TrainingSample(
         id=f"{clip.id}/{len(names)}x{count}@{first}+{step}{how}",
         inputs=chunk.tensors,

@@ -42,11 +42,6 @@ class Terrain:
             gradient += steep[..., None] * np.array([np.cos(wave.direction_rad), np.sin(wave.direction_rad)])
         return gradient
 
-    @property
-    def max_slope(self) -> float:
-        """An upper bound of the rise per metre anywhere."""
-        return float(sum(abs(wave.amplitude_m) * 2 * np.pi / wave.length_m for wave in self.waves))
-
     def poses(
         self,
         xy: Float64[np.ndarray, "n 2"],

@@ -8,7 +8,7 @@ from the centre line to the right, driving with growing stations; 1, 2 to the le
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
@@ -27,7 +27,6 @@ PropKind = Literal[
     "tree", "bush", "hedge", "lamp", "sign", "traffic_light", "bin", "bench", "bus_stop", "fence", "cone", "billboard",
     "bollard", "hydrant",
 ]  # fmt: skip
-PROP_KINDS: tuple[str, ...] = get_args(PropKind)
 SIGNS = ("speed", "stop", "yield", "priority", "crossing", "narrow", "no_parking", "roundabout")
 """Sign types, in the order of ``Prop.variant``."""
 Rule = Literal["priority", "yield", "stop", "red", "green"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
 from nurec_sim.errors import ReconstructError
 from nurec_sim.files.decoding import image_pixels
@@ -17,17 +17,24 @@ from nurec_sim.types import Clip
 FAINTEST_COVER = 1e-3
 
 
-def ego_masks(folder: Path | None, clip: Clip, crops: Mapping[str, Crop]) -> dict[str, Bool[np.ndarray, "h w"]]:
+def ego_masks(
+    folder: Path | None,
+    images: Mapping[str, UInt8[np.ndarray, "h w 4"]],
+    clip: Clip,
+    crops: Mapping[str, Crop],
+) -> dict[str, Bool[np.ndarray, "h w"]]:
     """Where the car covers the view of each camera in ``crops``; nowhere for cameras without a mask.
 
-    Without a folder, masks are those of the log (``Clip.ego_mask``). A mask ``<folder>/<camera>.png`` may have any size
-    and is stretched over the whole image. One with an alpha channel covers where alpha is not 0, one without where it
-    is not black; a pixel is covered as soon as a part of it is.
+    Without a folder, what is not transparent in ``images`` is covered. A mask ``<folder>/<camera>.png`` may have any
+    size and is stretched over the whole image. One with an alpha channel covers where alpha is not 0, one without where
+    it is not black; a pixel is covered as soon as a part of it is.
 
     Raises:
         ReconstructError: the folder does not exist or has no mask for any camera of the clip, or a file is broken.
     """
-    own = {camera: clip.ego_mask(camera) for camera in crops} if folder is None else _masks_in(folder, clip, crops)
+    own = {name: rgba[..., 3] > 0 for name, rgba in images.items()}
+    if folder is not None:
+        own = _masks_in(folder, clip, crops)
     return {
         camera: np.zeros(crop.size[::-1], bool) if (mask := own.get(camera)) is None else _scaled(mask, crop)
         for camera, crop in crops.items()

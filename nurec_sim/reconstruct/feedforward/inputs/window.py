@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from torch import Tensor
 
 from nurec_sim import geometry
@@ -48,7 +48,13 @@ class _View:
     field_rad: tuple[float, float]
 
 
-def chunk_inputs(clip: Clip, profile: Profile, window: ChunkWindow, settings: FeedForwardSettings) -> ChunkInputs:
+def chunk_inputs(
+    clip: Clip,
+    profile: Profile,
+    window: ChunkWindow,
+    settings: FeedForwardSettings,
+    ego_images: Mapping[str, UInt8[np.ndarray, "h w 4"]],
+) -> ChunkInputs:
     """Read, resize and crop the frames of a window, and compute their geometry in its scene frame.
 
     Poses stay float64 and times integers up to the scene frame; the same input gives the same bits. ``ego`` of the
@@ -59,6 +65,7 @@ def chunk_inputs(clip: Clip, profile: Profile, window: ChunkWindow, settings: Fe
         profile: size of the input images.
         window: frame indices per camera, and the chunk's time span.
         settings: ``image_pixels`` and ``ego_masks`` are used.
+        ego_images: what cameras see of the ego vehicle, used where ``ego_masks`` names no folder.
 
     Raises:
         ReconstructError: an ego mask or a lens cannot be used, or the profile has no images of the wanted size.
@@ -67,7 +74,7 @@ def chunk_inputs(clip: Clip, profile: Profile, window: ChunkWindow, settings: Fe
     cameras = [clip.rig.cameras[name] for name in window.frames]
     size = input_size(profile, cameras[0], settings.image_pixels)
     crops = {camera.id: plan_crop(profile, camera, size) for camera in cameras}
-    masks = ego_masks(settings.ego_masks, clip, crops)
+    masks = ego_masks(settings.ego_masks, ego_images, clip, crops)
     views = [_view(camera, crops[camera.id], masks[camera.id]) for camera in cameras]
     images = [image for view in views for image in _context_images(clip, view, window)]
     camera_idxs = [k for k, frames in enumerate(window.frames.values()) for _ in frames]

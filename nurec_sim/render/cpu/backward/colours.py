@@ -15,6 +15,7 @@ from nurec_sim.render.cpu.blend.background import find_face, find_place, turned
 from nurec_sim.render.cpu.kernel import kernel
 from nurec_sim.render.cpu.pack import BLOCK
 from nurec_sim.render.cpu.pipeline import Picture
+from nurec_sim.render.cpu.records import tile_count
 from nurec_sim.render.cpu.workers import Workers
 
 
@@ -31,7 +32,7 @@ def _gather(first, count, projected, slots, shares):
     """
     spans = projected.spans
     for i in range(first, first + count):
-        tiles = (np.int64(spans[i, 1]) - spans[i, 0] + 1) * (np.int64(spans[i, 3]) - spans[i, 2] + 1)
+        tiles = tile_count(spans, i)
         row = projected.sources[i]
         for slot in range(slots.first[i], slots.first[i] + tiles):
             shares[row, 0] += slots.sums[slot, S_FADE]

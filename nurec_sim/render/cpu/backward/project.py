@@ -37,7 +37,7 @@ from nurec_sim.render.cpu.backward.blend import (
 )
 from nurec_sim.render.cpu.kernel import inner, kernel
 from nurec_sim.render.cpu.pack import BLOCK, MAX_OPACITY, MIN_SCALE_M
-from nurec_sim.render.cpu.records import XROW
+from nurec_sim.render.cpu.records import XROW, tile_count
 
 
 @inner
@@ -111,7 +111,7 @@ def project_back(first, count, projected, slots, gaussians, world_from_sensor, b
     mean, quat, scale, opacity, _ = gaussians
     spans = projected.spans
     for i in range(first, first + count):
-        tiles = (np.int64(spans[i, 1]) - spans[i, 0] + 1) * (np.int64(spans[i, 3]) - spans[i, 2] + 1)
+        tiles = tile_count(spans, i)
         sums[:] = 0.0
         for slot in range(slots.first[i], slots.first[i] + tiles):
             for k in range(SUMS):

@@ -44,7 +44,7 @@ from nurec_sim.render.cpu.blend.tiles import (
     WIDE,
 )
 from nurec_sim.render.cpu.kernel import f4, inner, keep_alive, kernel
-from nurec_sim.render.cpu.records import MACRO
+from nurec_sim.render.cpu.records import MACRO, tile_count, tiles_of
 
 
 @kernel
@@ -52,7 +52,7 @@ def number_slots(spans, starts, counts, first_slot):
     """The first slot of every record, a slot per macro tile of its span; returns how many there are.
 
     Args:
-        spans: [n,4] first and last macro tile column, first and last row.
+        spans: see ``records.Projected``.
         starts: [runs] first row of each run of records.
         counts: [runs] their lengths.
         first_slot: [n] int64 output.
@@ -61,7 +61,7 @@ def number_slots(spans, starts, counts, first_slot):
     for run in range(len(starts)):
         for i in range(starts[run], starts[run] + counts[run]):
             first_slot[i] = slot
-            slot += (np.int64(spans[i, 1]) - spans[i, 0] + 1) * (np.int64(spans[i, 3]) - spans[i, 2] + 1)
+            slot += tile_count(spans, i)
     return slot
 
 
@@ -101,9 +101,9 @@ def _keep_sums(sums, lists, first, last, spans, slots, row, column):
     """Write a batch's sums to the slots of its records for the macro tile at a row and a column."""
     for j in range(first, last):
         i = np.uint64(lists[j])
-        across = np.int64(spans[i, 1]) - spans[i, 0] + 1
+        left, right, top, _ = tiles_of(spans, i)
         # Slots of a record are numbered row by row over its span of tiles.
-        slot = np.uint64(slots.first[i] + (row - spans[i, 2]) * across + column - spans[i, 0])
+        slot = np.uint64(slots.first[i] + (row - top) * (right - left + 1) + column - left)
         entry = np.uint64(j - first)
         for k in range(SUMS):
             slots.sums[slot, np.uint64(k)] = sums[entry, np.uint64(k)]

@@ -14,7 +14,6 @@ from llvmlite import ir
 from nurec_sim.render.cpu.blend.responses import (
     CAMERA,
     LIDAR,
-    LIDAR_MIN_TRANSMITTANCE,
     NORMALS,
     VALID,
     VECTORS,
@@ -36,7 +35,7 @@ PLANES = {CAMERA: 6, NORMALS: 9, LIDAR: 6}
 """T, 3 features, (3 more,) distance, and the largest weight or the half distance."""
 MOST_PLANES = 9
 _COLOURS, _NORMALS = [C_FEATURE + k for k in range(3)], [C_NORMAL + k for k in range(3)]
-FEATURE_ROWS = {CAMERA: _COLOURS, NORMALS: _COLOURS + _NORMALS, LIDAR: _COLOURS}
+FEATURE_ROWS = {CAMERA: _COLOURS, NORMALS: _COLOURS + _NORMALS}
 """Rows of the coefficients that are summed up, by output kind."""
 
 
@@ -77,28 +76,20 @@ def _blending(mode: int, output_kind: int, check_near: bool) -> Callable[..., An
             )
             distance = hit.where(meeting.distance, 0)  # no NaN from a miss
             alpha, before = Bundle(fading(exponent.parts)), sums[T]
-            if output_kind == LIDAR:
-                # A LiDAR's rays end one by one, as in ``spec``; a camera's rays continue until the whole block is
-                # opaque, which adds at most 1e-4 to a ray.
-                hit = hit & (before > LIDAR_MIN_TRANSMITTANCE)
-            # Front to back: a record's weight is its alpha times what the nearer ones have let through.
+            # Front to back: a record's weight is its alpha times what the nearer ones have let through. Rays continue
+            # until the whole block is opaque, which adds at most 1e-4 to a ray.
             weight = hit.where(alpha * before, 0)
             after = before - weight
             result = [after]
             for plane, feature in zip(sums[FEATURES:-2], FEATURE_ROWS[output_kind], strict=True):
                 result.append(plane + weight * coefficient(feature))
             result.append(sums[-2] + weight * distance)
-            if output_kind == LIDAR:
-                # An echo comes from the surface that stops half of the beam, not from the mean of several.
-                crossing = (before > 0.5) & (after <= 0.5)
-                result.append(crossing.where(distance, sums[-1]))
-            else:
-                # The label replaces the lowest bits of the weight, so that one maximum finds weight and label.
-                label = b.and_(coefficient(C_TAG).bits(), ir.Constant(INTS, [LABEL_BITS] * LANES))
-                # 8 of 23 mantissa bits: weights are compared to 1 part in 2^15.
-                keep = ir.Constant(INTS, [~LABEL_BITS] * LANES)
-                tagged = [v.from_bits(b.or_(b.and_(w.bits(), keep), label)) for w in weight.parts]
-                result.append(Bundle(p.max(w) for p, w in zip(sums[-1].parts, tagged, strict=True)))
+            # The label replaces the lowest bits of the weight, so that one maximum finds weight and label.
+            label = b.and_(coefficient(C_TAG).bits(), ir.Constant(INTS, [LABEL_BITS] * LANES))
+            # 8 of 23 mantissa bits: weights are compared to 1 part in 2^15.
+            keep = ir.Constant(INTS, [~LABEL_BITS] * LANES)
+            tagged = [v.from_bits(b.or_(b.and_(w.bits(), keep), label)) for w in weight.parts]
+            result.append(Bundle(p.max(w) for p, w in zip(sums[-1].parts, tagged, strict=True)))
             return result
 
         return run_records(v, state, PLANES[output_kind], numbers, count, coefficients, (x0, y0), output_kind, step)
@@ -111,10 +102,8 @@ blend_affine_camera_near = _blending(AFFINE, CAMERA, True)
 blend_affine_normals = _blending(AFFINE, NORMALS, True)
 blend_table_camera = _blending(TABLE, CAMERA, True)
 blend_table_normals = _blending(TABLE, NORMALS, True)
-blend_table_lidar = _blending(TABLE, LIDAR, True)
 blend_moving_camera = _blending(MOVING, CAMERA, True)
 blend_moving_normals = _blending(MOVING, NORMALS, True)
-blend_moving_lidar = _blending(MOVING, LIDAR, True)
 
 
 @vector_kernel("iii")

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from jaxtyping import Int32, Int64
 
+from nurec_sim.render.cpu.blend.binning import longest_list, sort_tile
 from nurec_sim.render.cpu.blend.blocks import (
     MOST_PLANES,
     blend_affine_camera,
     blend_affine_camera_near,
     blend_affine_normals,
     blend_moving_camera,
-    blend_moving_lidar,
     blend_moving_normals,
     blend_table_camera,
-    blend_table_lidar,
     blend_table_normals,
     open_block,
     write_block_6,
     write_block_9,
 )
 from nurec_sim.render.cpu.blend.rays import moving_tile, pinhole_basis, rolling_basis
-from nurec_sim.render.cpu.blend.responses import CAMERA, LIDAR, NORMALS, RAY_PLANES
+from nurec_sim.render.cpu.blend.responses import CAMERA, NORMALS, RAY_PLANES
 from nurec_sim.render.cpu.blend.tiles import (
     ACROSS,
     AFFINE,
@@ -65,15 +61,6 @@ def aligned(count):
     return memory[skip : skip + count]
 
 
-class TileLists(NamedTuple):
-    """Which records each macro tile may see, front to back."""
-
-    starts: Int64[np.ndarray, " tiles+1"]
-    """Where each tile's list starts."""
-    lists: Int32[np.ndarray, " pairs"]
-    """Numbers of records, tile after tile; LANES more entries than used."""
-
-
 @inner
 def _prepare(mode, ids, records, count, alive, basis, coefficients, lists, counts, entry):
     """The preparation of a projection mode; see ``tiles``."""
@@ -92,7 +79,7 @@ def prepare_batch(mode, lists, first, last, end, records_at, alive, basis_at, co
 
     Args:
         mode: projection mode.
-        lists: see ``TileLists``.
+        lists: see ``binning.TileLists``.
         first: first entry of the batch.
         last: one behind its last.
         end: one behind the tile's last.
@@ -165,14 +152,10 @@ def _blend_block(mode, output_kind, close, state, numbers, count, coefficients, 
     if mode == TABLE:
         if output_kind == CAMERA:
             return blend_table_camera(state, numbers, count, coefficients, rays, basis, x0, y0, near)
-        if output_kind == NORMALS:
-            return blend_table_normals(state, numbers, count, coefficients, rays, basis, x0, y0, near)
-        return blend_table_lidar(state, numbers, count, coefficients, rays, basis, x0, y0, near)
+        return blend_table_normals(state, numbers, count, coefficients, rays, basis, x0, y0, near)
     if output_kind == CAMERA:
         return blend_moving_camera(state, numbers, count, coefficients, rays, basis, x0, y0, near)
-    if output_kind == NORMALS:
-        return blend_moving_normals(state, numbers, count, coefficients, rays, basis, x0, y0, near)
-    return blend_moving_lidar(state, numbers, count, coefficients, rays, basis, x0, y0, near)
+    return blend_moving_normals(state, numbers, count, coefficients, rays, basis, x0, y0, near)
 
 
 @kernel
@@ -182,24 +165,24 @@ def draw_tiles(rays, projected, binned, normals, output_kind, tiles, planes, cou
     Args:
         rays: see ``rays.SensorRays``.
         projected: see ``records.Projected``.
-        binned: see ``TileLists``.
+        binned: see ``binning.TileLists``.
         normals: [n,4] a normal per record (NORMALS).
-        output_kind: CAMERA, NORMALS or LIDAR.
+        output_kind: CAMERA or NORMALS.
         tiles: numbers of the macro tiles to do.
-        planes: [6 or 9,h,w] output, sides rounded up to whole blocks: alpha, features, distance, tagged weight or half.
+        planes: [6 or 9,h,w] output, sides rounded up to whole blocks: alpha, features, distance, tagged weight.
         counts: [1] int64, the number of responses evaluated is added.
     """
     count_planes = 9 if output_kind == NORMALS else 6
     state, turned = aligned(BLOCKS * MOST_PLANES * RAYS), aligned(BLOCKS * RAY_PLANES * RAYS)
     coefficients = aligned(COEFFICIENTS * BATCH).reshape(COEFFICIENTS, BATCH)
     basis = np.zeros((BANDS, BASIS), np.float32)
-    batch = BATCH if output_kind == LIDAR else CAMERA_BATCH
     chosen, listed = np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
     block_bytes = 4 * count_planes * RAYS
     state_at, coefficients_at, chosen_at = state.ctypes.data, coefficients.ctypes.data, chosen.ctypes.data
     records_at, lists = projected.records.ctypes.data, binned.lists
     evaluations = 0
+    spare, starts = np.empty(longest_list(binned, tiles), np.uint64), np.empty((2, 2049), np.int64)
     for index in range(tiles.shape[0]):
         tile = np.int64(tiles[index])
         row, column, rays_at, basis_at, inside = tile_geometry(
@@ -208,10 +191,11 @@ def draw_tiles(rays, projected, binned, normals, output_kind, tiles, planes, cou
         for block in range(BLOCKS):
             open_block(state_at + block * block_bytes, count_planes, rays_at + block * RAY_BYTES if rays_at else 0)
         alive = inside
+        sort_tile(binned, tile, spare, starts)
         first, end = np.int64(binned.starts[tile]), np.int64(binned.starts[tile + 1])
         # A tile is done when its list ends, or when all of its rays are opaque.
         while first < end and alive != 0:
-            last = min(end, first + batch)
+            last = min(end, first + CAMERA_BATCH)
             close = prepare_batch(
                 rays.mode, lists, first, last, end, records_at, alive, basis_at, coefficients, chosen, listed
             )

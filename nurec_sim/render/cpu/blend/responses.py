@@ -251,7 +251,8 @@ def meeting_of(
         refined: whether distances need more than 14 bits (LiDARs).
     """
     rows = [[coefficient(start + k) for k in range(3)] for start in (C_X, C_Y, C_W)]
-    flat, fade = Bundle([coefficient(C_FLAT)] * AT_ONCE), coefficient(C_FADE)
+    many = len(group.offsets)
+    flat, fade = Bundle([coefficient(C_FLAT)] * many), coefficient(C_FADE)
     if mode == AFFINE:
         # Values at the tile's centre, per cell along x, and per cell along y. The part along x is shared by the group's
         # vectors, whose cells differ in y only.
@@ -261,7 +262,7 @@ def meeting_of(
         x, y, w = (d[0] * row[0] + d[1] * row[1] + d[2] * row[2] for row in rows)
     if mode == MOVING:
         # The rows of the record times the sensor's velocity: the same for all rays of a tile, hence a coefficient.
-        drift = [Bundle([coefficient(C_DRIFT + c)] * AT_ONCE) for c in range(3)]
+        drift = [Bundle([coefficient(C_DRIFT + c)] * many) for c in range(3)]
         meeting: StillMeeting = MovingMeeting(x, y, w, flat, group.plane(rays, PLACE), drift, refined)
     else:
         meeting = StillMeeting(x, y, w, flat, refined)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32, UInt8
 
 from nurec_sim.render.cpu.kernel import kernel
 
@@ -19,6 +19,8 @@ class SweepRays(NamedTuple):
 
     direction: Float32[np.ndarray, "h w 3"]
     """Unit rays in the sensor's frame."""
+    valid: UInt8[np.ndarray, "h w"]
+    """0 for blocked beams."""
     beam: Int32[np.ndarray, "h w"]
     """Number of each cell's beam; a row's beams are those of its cells, rolled."""
     line: Int32[np.ndarray, "h w"]
@@ -65,7 +67,7 @@ def sweep_returns(first, last, planes, rays, limits, returns):
         Number of returns, written one after the other from row ``first``'s place on.
     """
     # A row's range of output is its own, so rows can be finished in any order and by any thread.
-    direction, beam, line, end_from_line = rays
+    direction, valid, beam, line, end_from_line = rays
     columns = beam.shape[1]
     moving = end_from_line.shape[0] > 1
     n = first * columns
@@ -78,7 +80,7 @@ def sweep_returns(first, last, planes, rays, limits, returns):
         for k in range(columns):
             x = start + k if start + k < columns else start + k - columns
             alpha = np.float64(planes[ALPHA, y, x])
-            if not alpha > limits.least_opacity:
+            if not alpha > limits.least_opacity or not valid[y, x]:
                 continue
             # The planes hold weighted sums; float64 from here on, as in ``spec``.
             mean = np.float64(planes[DISTANCE, y, x]) / max(alpha, MIN_ALPHA)

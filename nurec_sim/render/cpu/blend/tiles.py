@@ -266,8 +266,7 @@ def _preparation(mode: int) -> Callable[..., Any]:
                 reach = base[B_HALF] + base[B_MIDDLE].abs()
                 limit, sideways = _widened(column, drift, base, flat, reach)
                 # Shifted by the band's middle place; the spread about it becomes slack.
-                middle = at[0][2] * base[B_MIDDLE]
-                at[0] = [at[0][0] + middle * drift[0], at[0][1] + middle * drift[1], at[0][2]]
+                at = [[x + w * base[B_MIDDLE] * drift[0], y + w * base[B_MIDDLE] * drift[1], w] for x, y, w in at]
                 slack = slack + base[B_HALF] * sideways * widest.max(0)
                 slack = slack + reach * drift[2].abs() * (limit.min(1e6).sqrt() * widest.max(0))
             # 1 % for float32: a block too many costs time, one too few would be a hole.

@@ -69,7 +69,7 @@ def lidar_boxes(v: Lanes, scratch: ir.Value, params: ir.Value, rows: ir.Value, v
         view: address of ``records.view_parameters``.
         box: address of [4,LANES] output, see ``outlines.CellBox``.
     """
-    # Columns within half a turn of the grid's middle; ``lidar_tiles`` adds what a full turn shifts back into the grid.
+    # Columns within half a turn of the grid's middle; ``lidar_cells`` adds what a full turn shifts back into the grid.
     cone = LidarCone(LidarChart(v, params, rows), Outline(v, scratch), v.broadcast(view, 4 * CELLS) * 0.5)
     CellBox(cone.columns, cone.rows(0.0)).store(v, box)
 
@@ -79,24 +79,24 @@ def _cells(low: Vector, high: Vector, count: Vector) -> tuple[Vector, Vector]:
     return (low - 0.5).ceil().max(0), (high - 0.5).floor().min(count - 1)
 
 
-def _store_tiles(v: Lanes, ends: tuple[Vector, ...], tiles: ir.Value) -> None:
+def _store_cells(v: Lanes, ends: tuple[Vector, ...], cells: ir.Value) -> None:
     for k, end in enumerate(ends):
-        v.store(end, tiles, STEP * k)
+        v.store(end.max(0), cells, STEP * k)
 
 
 def _tile(cell: Vector) -> Vector:
-    return (cell.max(0) * (1 / MACRO)).floor()
+    return (cell * (1 / MACRO)).floor()
 
 
 @vector_kernel("iii")
-def lens_tiles(v: Lanes, box: ir.Value, view: ir.Value, tiles: ir.Value) -> ir.Value:
-    """Macro tiles of boxes.
+def lens_cells(v: Lanes, box: ir.Value, view: ir.Value, cells: ir.Value) -> ir.Value:
+    """Whole cells of boxes.
 
     Args:
         v: vectors.
         box: address of [4,LANES], see ``outlines.CellBox``.
         view: address of ``records.view_parameters``.
-        tiles: address of [4,LANES] output: first and last column, first and last row of macro tiles.
+        cells: address of [4,LANES] output: first and last column, first and last row of cells.
 
     Returns:
         The mask of the boxes that hold the centre of a cell.
@@ -104,24 +104,24 @@ def lens_tiles(v: Lanes, box: ir.Value, view: ir.Value, tiles: ir.Value) -> ir.V
     ends = [v.load(box, STEP * k) for k in range(4)]
     x0, x1 = _cells(ends[0], ends[1], v.broadcast(view, 4 * CELLS))
     y0, y1 = _cells(ends[2], ends[3], v.broadcast(view, 4 * (CELLS + 1)))
-    _store_tiles(v, (_tile(x0), _tile(x1), _tile(y0), _tile(y1)), tiles)
+    _store_cells(v, (x0, x1, y0, y1), cells)
     return ((x0 <= x1) & (y0 <= y1)).integer()
 
 
 @vector_kernel("iiiii")
-def lidar_tiles(
-    v: Lanes, box: ir.Value, view: ir.Value, params: ir.Value, tiles: ir.Value, others: ir.Value
+def lidar_cells(
+    v: Lanes, box: ir.Value, view: ir.Value, params: ir.Value, cells: ir.Value, others: ir.Value
 ) -> ir.Value:
-    """Macro tiles of boxes, and of the same boxes a full turn away.
+    """Whole cells of boxes, and of the same boxes a full turn away.
 
-    What leaves one side of the grid enters at the other. The two never share a tile.
+    What leaves one side of the grid enters at the other. The two never share a macro tile.
 
     Args:
         v: vectors.
         box: address of [4,LANES], see ``outlines.CellBox``.
         view: address of ``records.view_parameters``.
         params: address of the chart's parameters.
-        tiles: address of [4,LANES] output: first and last column, first and last row of macro tiles.
+        cells: address of [4,LANES] output: first and last column, first and last row of cells.
         others: address of the same for the boxes a full turn away.
 
     Returns:
@@ -137,11 +137,10 @@ def lidar_tiles(
     p0, p1 = _cells(left + shift, right + shift, width)
     rows = y0 <= y1
     first, second = (x0 <= x1) & rows, (p0 <= p1) & rows & ~whole
-    x0, x1, p0, p1 = _tile(x0), _tile(x1), _tile(p0), _tile(p1)
-    # Both parts of a Gaussian in one tile would be blended twice: join them to one record.
-    touch = first & second & (p0 <= x1) & (x0 <= p1)
-    _store_tiles(v, (touch.where(x0.min(p0), x0), touch.where(x1.max(p1), x1), _tile(y0), _tile(y1)), tiles)
-    _store_tiles(v, (p0, p1, _tile(y0), _tile(y1)), others)
+    # Both parts of a Gaussian in one tile would have two sums of gradients there: join them to one record.
+    touch = first & second & (_tile(p0) <= _tile(x1)) & (_tile(x0) <= _tile(p1))
+    _store_cells(v, (touch.where(x0.min(p0), x0), touch.where(x1.max(p1), x1), y0, y1), cells)
+    _store_cells(v, (p0, p1, y0, y1), others)
     return masks(v, first, second & ~touch)
 
 
@@ -166,7 +165,7 @@ def project_general(layer, first, last, view, is_lidar, chart, path, output, bas
     scratch, local = np.empty((SCRATCH, LANES), np.float32), np.empty((SCRATCH, LANES), np.float32)
     rows = np.empty((LANES, RECORD), np.float32)
     box, other_box = np.empty((4, LANES), np.float32), np.empty((4, LANES), np.float32)
-    tiles, other_tiles = np.empty((4, LANES), np.float32), np.empty((4, LANES), np.float32)
+    span, other_span = np.empty((4, LANES), np.float32), np.empty((4, LANES), np.float32)
     here, there, around = scratch.ctypes.data, local.ctypes.data, view.ctypes.data
     params, table, bend = chart.params.ctypes.data, chart.places.ctypes.data, chart.bends.ctypes.data
     motion, poses = path.motion.ctypes.data, path.lines.ctypes.data
@@ -206,7 +205,7 @@ def project_general(layer, first, last, view, is_lidar, chart, path, output, bas
                             add_lidar_part(part, fast, there, params, table, motion, around, cells)
                 else:
                     lidar_boxes(here, params, table, around, cells)
-                both = lidar_tiles(cells, around, params, tiles.ctypes.data, other_tiles.ctypes.data)
+                both = lidar_cells(cells, around, params, span.ctypes.data, other_span.ctypes.data)
                 again = mask & (both >> APART)  # what a full turn brings back in at the other side of the grid
                 mask &= both
             else:
@@ -227,14 +226,14 @@ def project_general(layer, first, last, view, is_lidar, chart, path, output, bas
                             add_lens_part(part, fast, there, params, table, bend, motion, around, cells)
                 else:
                     mask &= lens_boxes(here, params, table, bend, cells)
-                mask &= lens_tiles(cells, around, tiles.ctypes.data)
+                mask &= lens_cells(cells, around, span.ctypes.data)
             if mask | again == 0:
                 continue
             take_features(block, layer.sh_rest, number, lane, around, here, is_lidar)
             build_records(here, rows.ctypes.data, around)
             source = number * BLOCK + lane
-            n = emit(mask, rows, scratch, tiles, source, n, output)
-            n = emit(again, rows, scratch, other_tiles, source, n, output)
+            n = emit(mask, rows, scratch, span, source, n, output)
+            n = emit(again, rows, scratch, other_span, source, n, output)
     # The kernels above only see addresses; Numba must not free the arrays before the last call.
     keep_alive(local)
     keep_alive(box)

@@ -16,7 +16,6 @@ from nurec_sim.render.cpu.records import (
     INTRINSICS,
     LOG_255,
     LOG_P,
-    MACRO,
     RECORD,
     ROTATION,
     SCRATCH,
@@ -114,14 +113,14 @@ def pinhole_box(v: Lanes, centre: list[Vector], axes: list[list[Vector]], k2: Ve
     return PixelBox(u0, u1, v0, v1, crosses & gone)
 
 
-def macro_tiles(v: Lanes, box: PixelBox, view: ir.Value, target: ir.Value) -> ir.Value:
-    """Store the macro tiles of boxes.
+def store_cells(v: Lanes, box: PixelBox, view: ir.Value, target: ir.Value) -> ir.Value:
+    """Store the cells of boxes.
 
     Args:
         v: vectors.
         box: the boxes, in pixels.
         view: address of ``records.view_parameters``.
-        target: address of [4,LANES] output: first and last column, first and last row of macro tiles.
+        target: address of [4,LANES] output: first and last column, first and last row of cells.
 
     Returns:
         The mask of the boxes that hold the centre of a cell.
@@ -133,7 +132,7 @@ def macro_tiles(v: Lanes, box: PixelBox, view: ir.Value, target: ir.Value) -> ir
     x0, x1 = cells(box.u0, box.u1, v.broadcast(view, 4 * CELLS))
     y0, y1 = cells(box.v0, box.v1, v.broadcast(view, 4 * (CELLS + 1)))
     for k, cell in enumerate((x0, x1, y0, y1)):
-        v.store((cell.max(0) * (1 / MACRO)).floor(), target, STEP * k)
+        v.store(cell.max(0), target, STEP * k)
     return ((x0 <= x1) & (y0 <= y1) & ~box.gone).integer()
 
 
@@ -147,25 +146,25 @@ def _ellipsoid(v: Lanes, scratch: ir.Value) -> tuple[list[Vector], list[list[Vec
 
 @vector_kernel("iii")
 def pinhole_boxes(v: Lanes, scratch: ir.Value, view: ir.Value, target: ir.Value) -> ir.Value:
-    """Macro tiles of Gaussians seen from the reference pose.
+    """Cells of Gaussians seen from the reference pose.
 
     Args:
         v: vectors.
         scratch: address of the group that ``place`` left.
         view: address of ``records.view_parameters``.
-        target: address of [4,LANES] output, see ``macro_tiles``.
+        target: address of [4,LANES] output, see ``store_cells``.
 
     Returns:
         The mask of those seen.
     """
-    return macro_tiles(v, pinhole_box(v, *_ellipsoid(v, scratch), view), view, target)
+    return store_cells(v, pinhole_box(v, *_ellipsoid(v, scratch), view), view, target)
 
 
 @vector_kernel("iiiiff")
 def rolling_boxes(
     v: Lanes, scratch: ir.Value, view: ir.Value, ends: ir.Value, target: ir.Value, first: ir.Value, step: ir.Value
 ) -> ir.Value:
-    """Macro tiles of Gaussians seen through a shutter that rolls along y.
+    """Cells of Gaussians seen through a shutter that rolls along y.
 
     Gaussians are boxed from the poses at both ends of the exposure; in between, edges move almost evenly. A Gaussian is
     seen by the rows of its boxes only, that is during the part of the exposure from row v0 to row v1.
@@ -175,7 +174,7 @@ def rolling_boxes(
         scratch: address of the group that ``place`` left.
         view: address of ``records.view_parameters``.
         ends: address of [2,LINE_POSE]: line_from_reference at both ends of the exposure.
-        target: address of [4,LANES] output, see ``macro_tiles``.
+        target: address of [4,LANES] output, see ``store_cells``.
         first: place of row 0 on the sensor's way, which leads from -0.5 to 0.5.
         step: the same per row.
 
@@ -213,7 +212,7 @@ def rolling_boxes(
         moved(start.v1, stop.v1, True),
         start.gone & stop.gone,
     )
-    return macro_tiles(v, union, view, target)
+    return store_cells(v, union, view, target)
 
 
 @inner

@@ -55,6 +55,7 @@ finish_beams(const View* views, long long rays, const float* planes, float opaci
     back = back && plane[2 * rays] <= drop_threshold * alpha;
     back = back && (distance_threshold < 0 || fabsf(range - mean) <= distance_threshold);
     Ray ray = ray_of(view, cell);
+    back = back && dot(ray.direction, ray.direction) > 0;  // blocked beams have no direction
     float3 point = ray.instant * load3(view.travel) + range * ray.direction;
     point = toned(view.end_from_reference, point);
     float* out = returns + 6 * ((long long)view.first_ray + view.beam[cell]);

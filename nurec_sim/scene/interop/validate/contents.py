@@ -17,7 +17,7 @@ import numpy as np
 from nurec_sim.errors import ArchiveError
 from nurec_sim.files.closing import Closing
 from nurec_sim.files.decoding import LIMITS, TooMuchError, check_directory, json_value, unpacked_limit
-from nurec_sim.files.zip_package import MAX_MEMBERS
+from nurec_sim.files.zip_package import MAX_MEMBERS, archive_errors
 
 MAX_MEMBER_BYTES = 2 * 2**30
 
@@ -41,16 +41,10 @@ class Contents(Closing):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
+        with archive_errors(path.name):
             with path.open("rb") as file:
                 check_directory(file)
             self._zip = zipfile.ZipFile(path)
-        except TooMuchError as error:
-            raise ArchiveError(f"{path.name} {error}") from None
-        except OSError as error:
-            raise ArchiveError(f"{path.name} cannot be opened ({error.strerror or error})") from error
-        except (zipfile.BadZipFile, NotImplementedError, struct.error, ValueError) as error:
-            raise ArchiveError(f"{path.name} is no readable ZIP, or is cut short ({error})") from error
         self.entries = self._zip.infolist()
         self.names = {entry.filename: entry for entry in self.entries}
         if len(self.entries) > MAX_MEMBERS:

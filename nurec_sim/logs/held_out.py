@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from nurec_sim.errors import ReconstructError
-from nurec_sim.evaluate.windows import ContextClip, Revolution, Shot
+from nurec_sim.logs.selection import ContextClip, Revolution, Shot
 from nurec_sim.types import Clip
 
 

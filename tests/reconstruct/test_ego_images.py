@@ -1,0 +1,101 @@
+"""The ego vehicle in the frames of a log: found where it stays while the street moves, and not lifted."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+from feedforward_clip import MadeClip, clip_of, frame_times, pinhole
+
+from nurec_sim import geometry, sensors
+from nurec_sim.reconstruct.ego_images import find_ego_images
+from nurec_sim.reconstruct.lift.settings import ViewSettings
+from nurec_sim.reconstruct.lift.views import read_views
+from nurec_sim.types import Trajectory
+
+CAMERA = pinhole("front", width=400, height=240, field_deg=80.0)
+
+
+def texture(shape: tuple[int, int], seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 255, shape).astype(np.float32)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.5), None, 30, 220, cv2.NORM_MINMAX)
+
+
+GROUND, VEHICLE = texture((2000, 2000), 1), texture((240, 400), 2)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GroundClip(MadeClip):
+    """A car that drives straight over textured ground, 1.5 m a frame; its bonnet is a trapezoid of textured paint."""
+
+    bonnet: bool = True
+    step_m: float = 1.5
+
+    @property
+    def ego(self) -> Trajectory:
+        t_us = self.times["front"][:, 0]
+        return Trajectory(t_us, np.stack([geometry.pose(np.eye(3), np.array([self.step_m * k, 0.0, 0.0]))
+                                          for k in range(len(t_us))]))  # fmt: skip
+
+    def image(self, camera_id: str, index: int) -> np.ndarray:
+        camera = self.cameras[camera_id]
+        rays, _ = sensors.pixel_rays(camera)
+        pose = self.world_from_camera(camera_id, index)[0]
+        rays = rays @ pose[:3, :3].T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            place = pose[:3, 3] + np.where(rays[..., 2:] < 0, -pose[2, 3] / rays[..., 2:], np.nan) * rays
+        cells = np.nan_to_num(place[..., :2] * 20 + 1000, nan=-1e4).astype(np.float32)
+        grey = cv2.remap(GROUND, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderValue=128)
+        if self.bonnet:
+            grey = np.where(bonnet_mask(), VEHICLE, grey)
+        return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
+
+
+def bonnet_mask() -> np.ndarray:
+    rows, columns = np.indices((240, 400))
+    return (rows > 190) & (abs(columns - 200) < 60 + 2.0 * (rows - 190))
+
+
+def driving(**options) -> GroundClip:
+    plain = clip_of(CAMERA, times=frame_times(6, 100_000))
+    return GroundClip(plain.cameras, plain.times, **options)
+
+
+def test_the_bonnet_is_found_to_its_edge_and_keeps_its_colours():
+    (image,) = find_ego_images(driving(), ["front"]).values()
+    found, true = image[..., 3] > 127, bonnet_mask()
+    assert (found & true).sum() / (found | true).sum() > 0.9
+    inside = cv2.erode((found & true).astype(np.uint8), np.ones((9, 9))) > 0
+    np.testing.assert_array_equal(image[inside, 0], VEHICLE[inside].astype(np.uint8))
+
+
+def test_a_street_without_a_bonnet_has_none():
+    assert find_ego_images(driving(bonnet=False), ["front"]) == {}
+
+
+def test_of_a_car_that_stands_its_outline_is_taken():
+    """The camera is 1.4 m high, 1.5 m before the origin; the front of the car, 0.75 m high, ends its outline."""
+    clip = driving(step_m=0.0)
+    (image,) = find_ego_images(clip, ["front"]).values()
+    focal_px = 200 / np.tan(np.radians(40))
+    front_m = clip.rig.body.center_m[0] + clip.rig.body.size_m[0] / 2
+    row = 120 + focal_px * (1.4 - 0.75) / (front_m - 1.5)
+    assert 160 < row < 220 and not image[: int(row) - 4, 200, 3].any() and (image[int(row) + 5 :, 200, 3] == 255).all()
+
+
+def test_the_masks_of_the_log_come_first():
+    class Masked(GroundClip):
+        def ego_mask(self, camera_id: str) -> np.ndarray:
+            mask = np.zeros((240, 400), bool)
+            mask[100:140, 20:60] = True
+            return mask
+
+    clip = driving()
+    (image,) = find_ego_images(Masked(clip.cameras, clip.times), ["front"]).values()
+    assert (image[105:135, 25:55, 3] == 255).all() and not image[150:, :, 3].any()
+
+
+def test_its_pixels_are_not_lifted():
+    clip = driving()
+    images = find_ego_images(clip, ["front"])
+    view = read_views(clip, ["front"], images, ViewSettings())[0]
+    np.testing.assert_array_equal(view.tile.valid, images["front"][..., 3] == 0)
