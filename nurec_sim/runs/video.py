@@ -25,7 +25,7 @@ WIDTH_PX = 480
 FRAMES_PER_CALL = 4
 FRAMES_PER_S = 10
 CODEC_OPTIONS = {"preset": "veryfast", "crf": "24", "threads": "1", "mbtree": "0"}
-"""One thread, and no macroblock-tree rate control: x264's reads memory it never wrote, so its bytes vary from run to run."""
+"""One thread; no macroblock-tree rate control, as x264's reads memory it never wrote: bytes vary between runs."""
 WAITING_PICTURES = 2 * FRAMES_PER_CALL
 """Pictures that may wait for the encoder."""
 Overrides = Callable[[int, int], Mapping[str, Float64[np.ndarray, "2 4 4"]]]

@@ -56,14 +56,12 @@ print(hashlib.sha256(target.getvalue()).hexdigest())
 
 
 def test_the_bytes_of_a_video_do_not_depend_on_what_memory_held_before():
-    """glibc fills allocated memory with MALLOC_PERTURB_: an encoder that reads what it never wrote differs between the two."""
+    """glibc fills allocated memory with MALLOC_PERTURB_: an encoder that reads what it never wrote gives two."""
+    command = [sys.executable, "-c", ENCODES]
     digests = {
-        subprocess.run(
-            [sys.executable, "-c", ENCODES], env={**os.environ, "MALLOC_PERTURB_": fill}, capture_output=True, text=True,
-            check=True,
-        ).stdout
+        subprocess.run(command, env={**os.environ, "MALLOC_PERTURB_": fill}, capture_output=True, check=True).stdout
         for fill in ("85", "170")
-    }  # fmt: skip
+    }
     assert len(digests) == 1
 
 
