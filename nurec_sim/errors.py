@@ -4,6 +4,7 @@
 
     NurecSimError
     ├── ClipError        a driving log is missing something or contradicts itself
+    │   └── UnknownFormatError  no log reader knows what lies there
     ├── ArchiveError     a scene archive cannot be read, or must not be
     ├── ReconstructError a clip lacks what the reconstruction method needs
     ├── WeightsError     weights of the network are missing, damaged, or of another network
@@ -38,6 +39,10 @@ class NurecSimError(Exception):
 
 class ClipError(NurecSimError):
     """A driving log is missing something or contradicts itself."""
+
+
+class UnknownFormatError(ClipError):
+    """No log reader knows what lies at a path."""
 
 
 class ArchiveError(NurecSimError):

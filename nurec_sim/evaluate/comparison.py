@@ -12,9 +12,11 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from nurec_sim import display
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.image_scores import image_request
 from nurec_sim.evaluate.log import score_scene, sensing
+from nurec_sim.evaluate.log_tables import side_by_side
 from nurec_sim.evaluate.scores.flip import flip_map
 from nurec_sim.logs.held_out import HeldOut
 from nurec_sim.runs.video import write_video
@@ -46,6 +48,18 @@ class Comparison:
     figures: Mapping[str, Mapping[str, Any]]
     worst: Sequence[tuple[str, Picture]]
     video: bytes
+
+    def _repr_html_(self) -> str:
+        """All figures side by side and the worst frames, for notebooks."""
+        rows = [
+            (group, name, *("" if cell is None else cell.text for cell in cells))
+            for group, name, cells in side_by_side(self.figures)
+        ]
+        pictures = (
+            display.table(caption, []) + display.image_tag(display.jpeg(display.thumbnail(picture, 960)))
+            for caption, picture in self.worst
+        )
+        return display.table(f"log {self.clip}", rows, ("", "figure", *self.figures)) + "".join(pictures)
 
 
 def compare_scenes(

@@ -14,8 +14,9 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from nurec_sim import geometry
+from nurec_sim import display, geometry
 from nurec_sim.errors import ClipError
+from nurec_sim.logs.describe import SENSOR_COLUMNS, describe_clip
 from nurec_sim.logs.sweeps import SweepRecord, compensated_sweep
 from nurec_sim.types import CameraModel, LidarModel, LogSource, Matrix4, Rig, RoadMap, Sweep, Track, Trajectory
 
@@ -133,6 +134,18 @@ class Clip:
 
     def __repr__(self) -> str:
         return f"Clip({self.id!r}, cameras={list(self.rig.cameras)}, lidars={list(self.rig.lidars)})"
+
+    def _repr_html_(self) -> str:
+        """Contents, and the first image of each camera, for notebooks."""
+        summary = describe_clip(self)
+        parts = [display.table(f"clip {self.id}", summary.facts), display.table("", summary.sensors, SENSOR_COLUMNS)]
+        for camera_id in self.rig.cameras:
+            if self.frame_count(camera_id):
+                try:
+                    parts.append(display.image_tag(display.jpeg(display.thumbnail(self.image(camera_id, 0)))))
+                except ClipError as error:
+                    parts.append(display.table("", [(str(error),)]))
+        return "".join(parts)
 
     def corrected(self, correction: Trajectory) -> Clip:
         """The same log with all poses moved by a correction that varies over time.

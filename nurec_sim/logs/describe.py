@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Int64
 
 from nurec_sim import sensors
-from nurec_sim.logs.clip import Clip
 from nurec_sim.types import CameraModel, Spin
+
+if TYPE_CHECKING:
+    from nurec_sim.logs.clip import Clip
 
 SENSOR_COLUMNS = ("sensor", "model", "size", "frames", "rate Hz", "span s", "shutter")
 

@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 
 from nurec_sim import plugins
-from nurec_sim.errors import ClipError, NurecSimError
+from nurec_sim.errors import ClipError, NurecSimError, UnknownFormatError
 from nurec_sim.logs.clip import Clip
 from nurec_sim.logs.consistency import EARLIEST_US, table_faults
 from nurec_sim.types import LogReader
@@ -102,7 +102,7 @@ def find_reader(path: Path) -> LogReader:
         raise damaged
     if not path.exists():
         raise _nothing_at(path)
-    raise ClipError(
+    raise UnknownFormatError(
         f"{path.name}: no log reader knows this format; it is {_looks(path)}. Known are\n"
         + "".join(f"  {line}\n" for line in [*known, *broken])
         + "docs/log_formats.md describes them, docs/write_a_log_reader.md says how to read others"

@@ -12,6 +12,8 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "cpu.renderer": ["CpuRenderer"],
         "device": ["Renderer", "choose_device", "make_renderer"],
         "images.encode": ["encode_image"],
+        "images.still": ["render_view"],
+        "images.sweep": ["render_sweep"],
         "requests": ["check_request"],
     },
 )

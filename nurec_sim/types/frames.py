@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
+from nurec_sim import display
 from nurec_sim.errors import RequestError
 from nurec_sim.types.sensors import CameraModel, LidarModel
 
@@ -56,6 +57,10 @@ class CameraFrame:
     label: UInt8[np.ndarray, "h w"] | None = None
     normal: Float32[np.ndarray, "h w 3"] | None = None
 
+    def _repr_jpeg_(self) -> bytes:
+        """The image, for notebooks."""
+        return display.jpeg(self.rgb)
+
 
 @dataclass(frozen=True)
 class LidarFilter:
@@ -95,6 +100,10 @@ class LidarFrame:
     range_m: Float32[np.ndarray, " n"]
     intensity: Float32[np.ndarray, " n"]
     beam: Int32[np.ndarray, " n"]
+
+    def _repr_png_(self) -> bytes:
+        """The points from above, for notebooks."""
+        return display.sweep_png(self.xyz_m)
 
 
 SensorFrame = CameraFrame | LidarFrame

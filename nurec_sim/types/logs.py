@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from nurec_sim import geometry
+from nurec_sim import display, geometry
 from nurec_sim.types.sensors import Rig
 from nurec_sim.types.trajectories import Matrix4, Trajectory
 
@@ -59,6 +59,10 @@ class Sweep:
     def xyz_world_m(self) -> Float64[np.ndarray, "n 3"]:
         """Points in the world."""
         return geometry.transform_points(self.world_from_lidar, self.xyz_m)
+
+    def _repr_png_(self) -> bytes:
+        """The points from above, for notebooks."""
+        return display.sweep_png(self.xyz_m)
 
 
 class Clip(Protocol):

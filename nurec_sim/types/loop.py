@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from nurec_sim import display
 from nurec_sim.types.frames import CameraFrame, LidarFrame
 from nurec_sim.types.sensors import Rig
 from nurec_sim.types.trajectories import Matrix4, Trajectory
@@ -144,6 +145,16 @@ class Rollout:
             f"  {', '.join(f'{len(items)} {name}' for name, items in counts.items())}"
         )
 
+    def _repr_html_(self) -> str:
+        """Result, events and the driven path beside the recorded one, for notebooks."""
+        title, *facts = repr(self).split("\n")
+        start_us = self.states[0].t_us if self.states else 0
+        rows = [(fact.strip(), "") for fact in facts]
+        rows += [(f"{(event.t_us - start_us) / 1e6:.1f} s: {event.kind}", event.text) for event in self.events]
+        driven, recorded = self.world_from_rig[:, :2, 3], self.recorded.position_m[:, :2]
+        lines = {"recorded": (recorded, "#94a3b8"), f"driven by {self.policy}": (driven, "#2563eb")}
+        return display.table(title, rows) + display.paths(lines)
+
     @property
     def t_us(self) -> Int64[np.ndarray, " t"]:
         """Times of the states."""
@@ -175,6 +186,13 @@ class Series:
     values: Float64[np.ndarray, " t"]
     valid: np.ndarray
     reduce: Reduce
+
+    def _repr_html_(self) -> str:
+        """The reduced value and the valid values over time, for notebooks."""
+        valid = np.asarray(self.valid, bool)
+        row = (f"{self.value():.4g}", self.unit, self.reduce.value, f"{valid.sum()} of {len(valid)} values valid")
+        drawn = display.spark(np.asarray(self.t_us, np.float64)[valid], np.asarray(self.values, np.float64)[valid])
+        return display.table(self.name, [row]) + drawn
 
     def value(self) -> float:
         """The reduced series; NaN if no value is valid."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
+from nurec_sim import display
 from nurec_sim.types.logs import RoadMap, Track
 from nurec_sim.types.sensors import Rig
 from nurec_sim.types.trajectories import Trajectory
@@ -96,6 +97,8 @@ class Gaussians:
 
 GAUSSIAN_FIELDS = ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal", "label", "intensity")
 OPTIONAL_GAUSSIAN_FIELDS = ("sh_rest", "ray_drop")
+SHOWN_BESIDE_M, SHOWN_ABOVE_M = 20.0, 3.0
+"""What a scene shows of itself in notebooks: so far beside the recorded path, up to this height above it."""
 RIGID_LIFE_US = 10**12
 """Knot spacing of rigid Gaussians, long enough that they do not fade during a log."""
 
@@ -226,3 +229,15 @@ class GaussianScene:
             f"{'no ' if self.road_map is None else ''}road map\n"
             f"  cameras: {', '.join(self.rig.cameras) or 'none'}; LiDARs: {', '.join(self.rig.lidars) or 'none'}"
         )
+
+    def _repr_html_(self) -> str:
+        """Facts, and the static Gaussians around the recorded path from above, for notebooks."""
+        title, *facts = repr(self).split("\n")
+        path_m = self.ego.position_m
+        low, high = path_m.min(axis=0) - SHOWN_BESIDE_M, path_m.max(axis=0) + SHOWN_BESIDE_M
+        mean_m = self.static.mean_m
+        # Roofs and crowns of trees would hide the street.
+        shown = (self.static.opacity > 0.3) & (mean_m[:, 2] < path_m[:, 2].max() + SHOWN_ABOVE_M)
+        rgb = np.rint(255 * np.clip(self.static.rgb[shown], 0, 1)).astype(np.uint8)
+        picture = display.png(display.from_above(mean_m[shown], rgb, low.tolist(), high.tolist()))
+        return display.table(title, [(fact.strip(),) for fact in facts]) + display.image_tag(picture, "png")

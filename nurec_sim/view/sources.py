@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from nurec_sim.errors import ArchiveError, NurecSimError, RequestError, RunError
+from nurec_sim.errors import ArchiveError, NurecSimError, RequestError, RunError, UnknownFormatError
 from nurec_sim.logs import Clip, open_clip
 from nurec_sim.render.images.still import Layer
 from nurec_sim.runs.folder import ROLLOUT, rollout_folders
@@ -26,6 +26,7 @@ from nurec_sim.types import GaussianScene, Rig, Rollout, SensorFrame, SensorRequ
 LAYERS: tuple[Layer, ...] = ("rgb", "depth", "alpha", "label", "normal")
 SAME_PLACE_M = 5.0
 """Paths of two reconstructions of one log differ by less: refined poses move by a metre or two."""
+MOST_NAMED = 5
 _ADDRESS = re.compile(r"(?P<server>[\w.-]+:\d+|\[[0-9a-fA-F:]+\]:\d+)(/(?P<scene>.+))?")
 
 Progress = Callable[[str, float], None]
@@ -110,7 +111,10 @@ def open_sources(
         if address:
             worlds.append(_remote(address["server"], address["scene"], stack))
             continue
-        name = store.offer(Path(source), name=f"source {index}")
+        try:
+            name = store.offer(Path(source), name=f"source {index}")
+        except UnknownFormatError:
+            raise RequestError(_not_viewable(Path(source))) from None
         worlds.append(local_world(store.get(name, say)))
         if clip is None and not is_archive(Path(source)):
             clip = Path(source)
@@ -129,6 +133,18 @@ def open_sources(
             f"the run was driven in scene {first.scene_id!r} ({first.reconstruction}), which is not among those given"
         )
     return Opened(_named(worlds), log, rollouts, tuple(notes))
+
+
+def _not_viewable(path: Path) -> str:
+    """What the viewer takes, and what of that lies in a folder."""
+    told = f"{path} is nothing to view: give scene archives (.usdz), logs (docs/log_formats.md), "
+    told += "a run folder (such as runs/latest), or HOST:PORT of a server"
+    within = sorted(path.iterdir()) if path.is_dir() else []
+    able = [each for each in within if is_archive(each) or _is_run(each)]
+    if able:
+        more = " and others" if len(able) > MOST_NAMED else ""
+        told += f". In it: {', '.join(map(str, able[:MOST_NAMED]))}{more}"
+    return told
 
 
 def local_world(loaded: LoadedScene) -> World:

@@ -128,6 +128,16 @@ def test_what_cannot_be_opened_is_said(archives, tmp_path):
         opened(tmp_path / "missing.usdz")
 
 
+def test_a_folder_of_other_things_is_told_what_can_be_viewed(archives, tmp_path):
+    (tmp_path / "notes.txt").write_text("hello")
+    takes = r"give scene archives \(.usdz\), logs \(docs/log_formats.md\), a run folder"
+    with pytest.raises(RequestError, match=f"notes.txt is nothing to view: {takes}"):
+        opened(tmp_path / "notes.txt")
+    within = archives[0].parent
+    with pytest.raises(RequestError, match=f"{takes}.*HOST:PORT of a server. In it: .*{archives[0].name}"):
+        opened(within)
+
+
 def test_a_run_opens_with_its_scene(archives, tmp_path):
     rollout, made = view_worlds.rollout(), scene.read_scene(archives[0])
     folder = tmp_path / "run" / "street" / "lift"

@@ -1,7 +1,8 @@
-"""One image of a scene as a PNG: recorded time, recorded or shifted pose, any layer."""
+"""One image of a scene, or a PNG of it: recorded time, recorded or shifted pose, any layer."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -11,9 +12,9 @@ from jaxtyping import UInt8
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
 from nurec_sim.files.new_files import write_file
-from nurec_sim.render.device import Renderer
+from nurec_sim.render.device import Renderer, make_renderer
 from nurec_sim.render.images.encode import encode_image
-from nurec_sim.types import CameraFrame, Label, SensorRequest
+from nurec_sim.types import CameraFrame, GaussianScene, Label, SensorRequest
 
 Layer = Literal["rgb", "depth", "alpha", "label", "normal"]
 FAR_M = 80.0
@@ -26,36 +27,49 @@ LABEL_RGB = {
 }
 
 
-def render_still(
-    renderer: Renderer,
-    path: Path,
+def render_view(
+    scene: GaussianScene | Renderer,
+    camera: str | None = None,
+    frame: int = 0,
+    *,
+    left_m: float = 0.0,
+    yaw_deg: float = 0.0,
+    width_px: int | None = None,
+    outputs: Sequence[str] = ("rgb",),
+) -> CameraFrame:
+    """What a camera of the car sees at a recorded time, with the car at its recorded pose or beside it.
+
+    Args:
+        scene: a scene, or its renderer (``make_renderer``), which need not be prepared again for every image.
+        camera: a camera of the scene's rig; the first if None.
+        frame: index of the camera's recorded time; the ego pose is that of the recording.
+        left_m: the car moved to its left.
+        yaw_deg: the car turned to its left.
+        width_px: image width, height follows; the camera's own size if None.
+        outputs: ``rgb``, ``depth``, ``alpha``, ``label``, ``normal``: what the frame holds.
+
+    Raises:
+        RequestError: no such camera, frame or output, or an offset that is not finite.
+    """
+    renderer = make_renderer(scene) if isinstance(scene, GaussianScene) else scene
+    request = view_request(renderer.scene, camera, frame, left_m=left_m, yaw_deg=yaw_deg, width_px=width_px)
+    return renderer.render_camera(request, tuple(outputs))
+
+
+def view_request(
+    scene: GaussianScene,
     camera_id: str | None = None,
     frame: int = 0,
     *,
     left_m: float = 0.0,
     yaw_deg: float = 0.0,
-    layer: Layer = "rgb",
     width_px: int | None = None,
-) -> None:
-    """Write one image.
-
-    Args:
-        renderer: of the world.
-        path: the PNG to write.
-        camera_id: a camera of the scene's rig; the first if None.
-        frame: index of the camera's recorded time; the ego pose is that of the recording.
-        left_m: the car moved to its left.
-        yaw_deg: the car turned to its left.
-        layer: what to show; depth is grey from near to ``FAR_M``, normals are coloured by x, y and z in the world.
-        width_px: image width, height follows; the camera's own size if None.
-
-    Raises:
-        RequestError: no such camera or frame.
-        WriteError: the file cannot be written; one that was there is as it was.
-    """
-    scene = renderer.scene
+) -> SensorRequest:
+    """The request behind ``render_view``; arguments and errors are the same."""
     if not scene.rig.cameras:
         raise RequestError(f"scene {scene.id!r} has no cameras")
+    if not np.isfinite([left_m, yaw_deg]).all():
+        raise RequestError(f"left_m and yaw_deg must be finite, got {left_m} and {yaw_deg}")
     camera_id = camera_id or next(iter(scene.rig.cameras))
     if camera_id not in scene.rig.cameras:
         raise RequestError(f"scene {scene.id!r} has no camera {camera_id!r}; have {list(scene.rig.cameras)}")
@@ -69,9 +83,40 @@ def render_still(
     moved = geometry.pose_from_xyyaw(0.0, left_m, np.radians(yaw_deg))
     poses = scene.ego.at(np.array([start_us, end_us])) @ moved @ camera.rig_from_camera
     # An exposure must end after it starts; an instant becomes a microsecond.
-    request = SensorRequest(scene.id, camera, start_us, max(end_us, start_us + 1), poses, show_ego=True)
-    shown = picture(renderer.render_camera(request, ("rgb", layer)), layer)
-    write_file(path, encode_image(shown))
+    return SensorRequest(scene.id, camera, start_us, max(end_us, start_us + 1), poses, show_ego=True)
+
+
+def render_still(
+    renderer: Renderer,
+    path: Path,
+    camera_id: str | None = None,
+    frame: int = 0,
+    *,
+    left_m: float = 0.0,
+    yaw_deg: float = 0.0,
+    layer: Layer = "rgb",
+    width_px: int | None = None,
+) -> None:
+    """Write one image; the other arguments are those of ``render_view``.
+
+    Args:
+        renderer: of the world.
+        path: the PNG to write.
+        camera_id: a camera of the scene's rig; the first if None.
+        frame: index of the camera's recorded time.
+        left_m: the car moved to its left.
+        yaw_deg: the car turned to its left.
+        layer: what to show; depth is grey from near to ``FAR_M``, normals are coloured by x, y and z in the world.
+        width_px: image width, height follows; the camera's own size if None.
+
+    Raises:
+        RequestError: see ``render_view``.
+        WriteError: the file cannot be written; one that was there is as it was.
+    """
+    shown = render_view(
+        renderer, camera_id, frame, left_m=left_m, yaw_deg=yaw_deg, width_px=width_px, outputs=("rgb", layer)
+    )
+    write_file(path, encode_image(picture(shown, layer)))
 
 
 def picture(frame: CameraFrame, layer: Layer) -> UInt8[np.ndarray, "h w 3"]:

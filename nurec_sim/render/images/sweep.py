@@ -14,7 +14,7 @@ from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
 from nurec_sim.files.new_files import write_file
 from nurec_sim.logs.overlay import depth_rgb
-from nurec_sim.render.device import Renderer
+from nurec_sim.render.device import Renderer, make_renderer
 from nurec_sim.render.images.encode import encode_image
 from nurec_sim.render.rays import ray_grid, world_rays
 from nurec_sim.types import GaussianScene, LidarFrame, LidarModel, Matrix4, SensorRequest
@@ -99,6 +99,40 @@ def sweep_request(scene: GaussianScene, lidar: LidarModel, place: SweepPlace) ->
     ends = np.array([start_us, start_us if place.standing else start_us + turn_us])
     poses = scene.ego.at(ends) @ moved @ lidar.rig_from_lidar
     return SensorRequest(scene.id, lidar, start_us, start_us + turn_us, poses)
+
+
+def render_sweep(
+    scene: GaussianScene | Renderer,
+    lidar: str | None = None,
+    *,
+    model: str | None = None,
+    columns: int | None = None,
+    time_s: float = 0.0,
+    left_m: float = 0.0,
+    ahead_m: float = 0.0,
+    yaw_deg: float = 0.0,
+    standing: bool = False,
+) -> LidarFrame:
+    """One turn of a LiDAR of the car, or of another device in its place, on the recorded drive or beside it.
+
+    Args:
+        scene: a scene, or its renderer (``make_renderer``), which need not be prepared again for every sweep.
+        lidar: a LiDAR of the rig; the first if None.
+        model: a key of ``sensors.LIDAR_TABLES``; the rig's own LiDAR if None.
+        columns: firings per turn of that device; its own number if None.
+        time_s: see ``SweepPlace``, as the four that follow.
+        left_m: lateral offset of the car.
+        ahead_m: offset of the car along its heading.
+        yaw_deg: yaw offset of the car, left positive.
+        standing: take the whole sweep from its first pose.
+
+    Raises:
+        RequestError: no such LiDAR or device, or the sweep does not lie within the recording.
+    """
+    renderer = make_renderer(scene) if isinstance(scene, GaussianScene) else scene
+    place = SweepPlace(time_s, left_m, ahead_m, yaw_deg, standing)
+    chosen = choose_lidar(renderer.scene, lidar, model, columns)
+    return renderer.render_lidar(sweep_request(renderer.scene, chosen, place))
 
 
 def write_sweep(
