@@ -22,9 +22,9 @@ from scenes import ROOT
 from nurec_sim.cli.console import err, out
 from nurec_sim.errors import TrainingError
 from nurec_sim.evaluate import Contender, Protocol, run_protocol
+from nurec_sim.evaluate.cells import Table
 from nurec_sim.evaluate.run import settings_of
 from nurec_sim.evaluate.summary import interval
-from nurec_sim.evaluate.tables import Table
 from nurec_sim.files.new_files import write_file
 from nurec_sim.reconstruct import FeedForwardSettings
 from nurec_sim.training.ablations import ABLATIONS, ablated, scaled

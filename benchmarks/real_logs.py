@@ -21,11 +21,11 @@ import tyro
 from nurec_sim import logs, scene
 from nurec_sim.cli.console import err, out, print_table
 from nurec_sim.errors import NurecSimError
+from nurec_sim.evaluate.cells import number
 from nurec_sim.evaluate.methods import Contender, build
 from nurec_sim.evaluate.recorded import front_cameras, recorded_window
 from nurec_sim.evaluate.scores.images import psnr
 from nurec_sim.evaluate.scoring import score_view
-from nurec_sim.evaluate.tables import number
 from nurec_sim.evaluate.views import reduced
 from nurec_sim.evaluate.windows import Window
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings

@@ -22,13 +22,14 @@ if TYPE_CHECKING:
     from nurec_sim.cli.progress import Report
     from nurec_sim.types import Clip
 
-ProtocolName = Literal["storm", "clip", "shift"]
+ProtocolName = Literal["storm", "clip", "shift", "lidar"]
 USUAL_METHODS: dict[str, tuple[str, ...]] = {
     "storm": ("dense", "dense-lidar", "selective", "lift", "copy"),
     "clip": ("dense", "dense-lidar", "dense-concatenated", "lift", "copy"),
     "shift": ("dense", "dense-lidar", "selective", "lift", "copy"),
+    "lidar": ("lift", "optimized"),
 }
-USUAL_WORLDS = {"storm": 12, "clip": 3, "shift": 6}
+USUAL_WORLDS = {"storm": 12, "clip": 3, "shift": 6, "lidar": 4}
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class ProtocolFlags:
     """Protocol: methods to compare: dense, dense-lidar, dense-concatenated, selective, lift, optimized, copy, or any
     other method that `nurec-sim reconstruct` accepts; default: those of the protocol."""
     worlds: int | None = None
-    """Protocol: number of procedural worlds; default: 12 for storm, 3 for clip, 6 for shift."""
+    """Protocol: number of procedural worlds; default: 12 for storm, 3 for clip, 6 for shift, 4 for lidar."""
     seed: int = 0
     """Protocol: seed of the first procedural world; the others follow consecutively."""
     clips: tuple[Path, ...] = ()
@@ -104,8 +105,8 @@ def evaluate(
 
     `evaluate CLIP` compares with the recording: images of target cameras, held-out LiDAR sweeps.
     `evaluate --protocol NAME` prints the paper's tables: `storm` is 2 s with four input frames (Table 1), `clip` a
-    whole log through the chunked pipeline (Table 2), `shift` views at lateral offsets. evaluations/latest has tables,
-    contact sheets and report.html.
+    whole log through the chunked pipeline (Table 2), `shift` views at lateral offsets, `lidar` held-out sweeps of a
+    Pandar128 on the path and beside it (Table 3). evaluations/latest has tables, contact sheets and report.html.
 
     Args:
         clip: a driving log (docs/log_formats.md).
@@ -119,7 +120,7 @@ def evaluate(
     if protocol is None:
         _refuse(given(side_by_side, NO_PROTOCOL_FLAGS), "without --protocol")
         if clip is None:
-            raise NurecSimError("nothing to evaluate: give a clip, or --protocol storm, clip or shift")
+            raise NurecSimError("nothing to evaluate: give a clip, or --protocol storm, clip, shift or lidar")
         evaluate_log(clip, log, hold_out_every or 0, network)
         return
     _refuse(given(log, NO_LOG_FLAGS), "with --protocol")

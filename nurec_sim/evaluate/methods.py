@@ -15,7 +15,7 @@ from nurec_sim.errors import ReconstructError, WeightsError
 from nurec_sim.evaluate.windows import Window
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, OptimizeSettings, load_method
 from nurec_sim.render import make_renderer
-from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, SensorRequest
+from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, Sense, SensorRequest
 
 Show = Callable[[SensorRequest], CameraFrame]
 """Renders a camera image; without ``depth_m`` if the method has no depth."""
@@ -50,11 +50,12 @@ class Contender:
 
 @dataclass(frozen=True)
 class Built:
-    """Result of a method on a log: a view renderer, the scene if any, and the seconds taken."""
+    """Result of a method on a log: a view renderer, the scene and its renderer if any, and the seconds taken."""
 
     show: Show
     scene: GaussianScene | None
     seconds: float
+    sense: Sense | None = None
 
     @property
     def gaussians(self) -> int | None:
@@ -171,7 +172,7 @@ def build(contender: Contender, window: Window, device: str = "auto") -> Built:
     started = time.perf_counter()
     scene = reconstruct(window.clip, contender.method, cameras=window.cameras, settings=contender.settings)
     renderer, spent = make_renderer(scene, device), time.perf_counter() - started
-    return Built(lambda request: renderer.render_camera(request, ("rgb", "depth")), scene, spent)
+    return Built(lambda request: renderer.render_camera(request, ("rgb", "depth")), scene, spent, renderer.sense)
 
 
 def _sees_lidar(contender: Contender) -> bool:

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from nurec_sim.errors import RunError
+from nurec_sim.evaluate.cells import Table
 from nurec_sim.evaluate.methods import CHOICES
-from nurec_sim.evaluate.tables import Table
 from nurec_sim.report.cells import count_of
 from nurec_sim.report.figure import base_layout, plain
 from nurec_sim.report.template import SCRIPT, STYLE
@@ -24,8 +24,10 @@ TITLES = {
     "storm": "2 s windows, four input frames",
     "clip": "Whole clips through the chunked pipeline",
     "shift": "Views at lateral offsets",
+    "lidar": "Held-out LiDAR sweeps on the driven path and beside it",
 }
 CURVES = {"psnr_db": "PSNR (dB)", "abs_rel": "AbsRel (aligned)", "abs_rel_metric": "AbsRel (metres)"}
+SWEEP_CURVES = {"cd_l1_sum": "Chamfer distance (m)", "median_abs_range_error_m": "median range error (m)"}
 COLOURS = ("#1d4ed8", "#b45309", "#15803d", "#7e22ce", "#64748b")
 MORE_STYLE = "img { max-width:100%; border-radius:6px; display:block; } .plots { display:grid; gap:16px; }"
 
@@ -105,13 +107,14 @@ def _sheet(path: Path, windows: Sequence[Mapping[str, Any]]) -> str:
 
 def _curves(methods: Mapping[str, Any]) -> dict[str, Any]:
     """Metrics over the offset from the path, if available."""
-    if not any(row["curve"] for row in methods.values()):
+    part, columns = ("sweeps", SWEEP_CURVES) if any(row["sweeps"] for row in methods.values()) else ("curve", CURVES)
+    if not any(row[part] for row in methods.values()):
         return {}
     figures = {}
-    for column, title in CURVES.items():
+    for column, title in columns.items():
         traces = []
         for number, (name, row) in enumerate(methods.items()):
-            points = [(float(at), values[column]) for at, values in row["curve"].items() if values[column] is not None]
+            points = [(float(at), values[column]) for at, values in row[part].items() if values[column] is not None]
             if points:
                 colour = COLOURS[number % len(COLOURS)]
                 traces.append({

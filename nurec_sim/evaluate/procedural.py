@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -11,6 +12,7 @@ from nurec_sim import geometry
 from nurec_sim.evaluate.views import reduced, reduced_mask
 from nurec_sim.evaluate.windows import EvaluationView
 from nurec_sim.logs.selection import ContextClip, Revolution, Shot
+from nurec_sim.sensors import lidar_model
 from nurec_sim.types import CameraModel, Label, Pinhole, Rig, SensorRequest, Trajectory
 from nurec_sim.world import LIDAR_ID, TrueWorld, street_rig, town_plan, true_sweep
 from nurec_sim.world.plan.rig import CAMERA_FROM_RIG_AXES
@@ -25,8 +27,8 @@ FIELD_DEG, HEIGHT_M, AHEAD_M = 50.0, 1.8, 1.5
 """Field of view as for the front cameras of the public protocol; mounted on the roof."""
 
 
-def evaluation_rig(cameras: int = 1, width_px: int = 480, height_px: int = 320) -> Rig:
-    """A front camera, optionally two side cameras, and a LiDAR."""
+def evaluation_rig(cameras: int = 1, width_px: int = 480, height_px: int = 320, lidar: str | None = None) -> Rig:
+    """A front camera, optionally two side cameras, and a LiDAR: the demo rig's, or a device of ``LIDAR_TABLES``."""
     focal = width_px / 2 / np.tan(np.deg2rad(FIELD_DEG) / 2)
     lens = Pinhole(focal, focal, width_px / 2, height_px / 2)
     models = {}
@@ -34,7 +36,10 @@ def evaluation_rig(cameras: int = 1, width_px: int = 480, height_px: int = 320) 
         turn = geometry.rotation_from_yaw(np.deg2rad(yaw_deg))
         place = np.array([AHEAD_M, 0.0, HEIGHT_M]) + turn @ np.array([0.1, 0.0, 0.0])
         models[name] = CameraModel(name, width_px, height_px, lens, geometry.pose(turn @ CAMERA_FROM_RIG_AXES, place))
-    return Rig(models, {LIDAR_ID: street_rig().lidars[LIDAR_ID]})
+    scanner = street_rig().lidars[LIDAR_ID]
+    if lidar is not None:
+        scanner = lidar_model(lidar, scanner.rig_from_lidar, LIDAR_ID)
+    return Rig(models, {LIDAR_ID: scanner})
 
 
 def camera_responses(rig: Rig, seed: int) -> dict[str, CameraResponse]:
@@ -48,9 +53,12 @@ class EvaluationWorld:
     Frames and sweeps are rendered on first use, while the world must be open.
     """
 
-    def __init__(self, world: TrueWorld, rig: Rig) -> None:
+    def __init__(self, world: TrueWorld, rig: Rig, left_m: float = 0.0) -> None:
         self.world, self.rig = world, rig
-        self.ego: Trajectory = world.plan.ego_trajectory()
+        ego = world.plan.ego_trajectory()
+        beside = geometry.pose(np.eye(3), np.array([0.0, left_m, 0.0]))
+        self.ego = Trajectory(ego.t_us, ego.world_from_body @ beside)
+        """The recorded drive, or one beside it."""
 
     def request(self, camera_id: str, t_us: int, left_m: float = 0.0) -> SensorRequest:
         """A request for an instantaneous camera image, with the car shifted to its left."""
@@ -94,18 +102,25 @@ class EvaluationWorld:
         measured = cache(lambda: true_sweep(self.world, self.ego, lidar, start_us))
         return Revolution(start_us, start_us + SPIN_US, measured)
 
-    def clip(self, id: str, times_us: Int64[np.ndarray, " n"], span_us: tuple[int, int], boxes: bool) -> ContextClip:
-        """A log of frames at given times and of all sweeps of a span.
+    def clip(
+        self, id: str, times_us: Int64[np.ndarray, " n"], span_us: tuple[int, int], boxes: bool,
+        sweeps: Callable[[int], bool] = lambda index: True,
+    ) -> ContextClip:  # fmt: skip
+        """A log of frames at given times and of the sweeps of a span.
 
         Args:
             id: name of the log.
             times_us: instants of the frames of every camera, microseconds.
             span_us: [start, end) of the log and of its sweeps.
             boxes: whether the log has labelled boxes.
+            sweeps: which sweeps the log has, by their index in the span; all by default.
         """
         tracks = self.world.plan.tracks() if boxes else ()
-        shots, turns = self.shots(times_us), self.revolutions(span_us)
-        return ContextClip(id, self.rig, self.ego, span_us, shots, turns, tracks)
+        turns = {
+            lidar: tuple(turn for index, turn in enumerate(every) if sweeps(index))
+            for lidar, every in self.revolutions(span_us).items()
+        }
+        return ContextClip(id, self.rig, self.ego, span_us, self.shots(times_us), turns, tracks)
 
 
 def held_out_plan(seed: int, seconds: float) -> TownPlan:

@@ -3,17 +3,19 @@
 ``storm``  2 s at 10 Hz; frames 0, 5, 10 and 15 are inputs, the other 16 targets (paper section 5.1, Table 1).
 ``clip``   a whole log through the chunked pipeline; every k-th frame is a target, the rest are inputs (Table 2).
 ``shift``  as ``storm``, but with targets at lateral offsets, in procedural worlds only.
+``lidar``  as ``shift``, but the targets are sweeps of a ``SCANNER`` that are held out (Table 3).
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -23,8 +25,8 @@ from nurec_sim.evaluate.windows import EvaluationView, Window
 from nurec_sim.logs.selection import ContextClip
 from nurec_sim.world import Quality, TrueWorld
 
-PROTOCOLS = ("storm", "clip", "shift")
-ProtocolName = Literal["storm", "clip", "shift"]
+PROTOCOLS = ("storm", "clip", "shift", "lidar")
+ProtocolName = Literal["storm", "clip", "shift", "lidar"]
 
 STEP_US = 100_000
 STORM_FRAMES, STORM_CONTEXT = 20, (0, 5, 10, 15)
@@ -33,13 +35,21 @@ START_S = 1.0
 SHIFTS_M = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
 SHIFT_FRAMES = (3, 8, 13)
 """Target frames for lateral offsets: each about halfway between two input frames."""
+SCANNER, SWEEP_SHIFTS_M = "PANDAR128", (1.0, 2.0, 3.0)
+"""The LiDAR of the paper's section on LiDAR, and the lateral offsets at which its sweeps are simulated."""
 NEAR_M, NEAR_SHARE = 1.0, 0.2
-"""A camera with more than this fraction of pixels nearer than this is inside an object."""
+"""A sensor with more than this fraction of pixels or returns nearer than this is inside an object."""
 QUALITY = Quality(lidar="rasterised")
 
 Progress = Callable[[str, float], None]
-Made = tuple[ContextClip, list[EvaluationView]]
-"""Inputs and targets."""
+
+
+class Made(NamedTuple):
+    """Input log, target views, and logs of target sweeps by lateral offset."""
+
+    clip: ContextClip
+    targets: list[EvaluationView]
+    beside: Mapping[float, ContextClip] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -82,8 +92,10 @@ class Protocol:
             raise ReconstructError("a protocol runs on procedural worlds or on recorded logs: give seeds or clips")
         if min(self.seeds, default=0) < 0 or len(set(self.seeds)) < len(self.seeds):
             raise ReconstructError(f"seeds must not be negative, and each may be given once, got {self.seeds}")
-        if self.clips and self.name == "shift":
-            raise ReconstructError("protocol 'shift' needs procedural worlds: logs have no views at lateral offsets")
+        if self.clips and self.name in ("shift", "lidar"):
+            raise ReconstructError(
+                f"protocol {self.name!r} needs procedural worlds: logs have no sensors at lateral offsets"
+            )
         if not 2 <= self.seconds <= 20 or not 1 <= self.rate_hz <= 10 or self.hold_out_every < 2:
             raise ReconstructError(
                 "a clip lasts 2..20 seconds at 1..10 Hz and holds out every second frame or fewer, got "
@@ -126,13 +138,14 @@ class Protocol:
         report("building the world", 0.0)
         long_s = self.seconds if self.name == "clip" else STORM_FRAMES * STEP_US / 1e6
         plan = held_out_plan(self.seeds[index], long_s + START_S + 0.5)
-        rig = evaluation_rig(self.cameras if self.name == "clip" else 1, *self.size_px)
+        scanner = SCANNER if self.name == "lidar" else None
+        rig = evaluation_rig(self.cameras if self.name == "clip" else 1, *self.size_px, lidar=scanner)
         responses = camera_responses(rig, plan.seed) if self.name == "clip" else {}
         with TrueWorld(plan, self.backend, responses, QUALITY) as world:
             source = EvaluationWorld(world, rig)
             report("rendering", 0.1)
-            clip, targets = _MAKERS[self.name](self, source, name, plan.span_us[0] + round(START_S * 1e6), report)
-            yield Window(name, clip, tuple(targets), _about(source, clip.span_us))
+            made = _MAKERS[self.name](self, source, name, plan.span_us[0] + round(START_S * 1e6), report)
+            yield Window(name, made.clip, tuple(made.targets), _about(source, made.clip.span_us), made.beside)
 
 
 def _storm(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, report: Progress) -> Made:
@@ -145,7 +158,7 @@ def _storm(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, 
         if frame not in STORM_CONTEXT:
             beyond = frame > STORM_CONTEXT[-1]
             targets.append(source.target(f"{frame:02d}", camera, int(times[frame]), beyond=beyond))
-    return clip, targets
+    return Made(clip, targets)
 
 
 def _shift(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, report: Progress) -> Made:
@@ -160,7 +173,7 @@ def _shift(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, 
             target = source.target(f"{frame:02d}{left_m:+.1f}", camera, int(times[frame]), left_m)
             if not _inside_something(target):
                 targets.append(target)
-    return clip, targets
+    return Made(clip, targets)
 
 
 def _clip(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, report: Progress) -> Made:
@@ -176,13 +189,38 @@ def _clip(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, r
         for camera in source.rig.cameras:
             beyond = frame > seen[-1]
             targets.append(source.target(f"{camera}-{frame:03d}", camera, int(times[frame]), beyond=beyond))
-    return clip, targets
+    return Made(clip, targets)
+
+
+def _lidar(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, report: Progress) -> Made:
+    times, span_us = _storm_times(start_us)
+    none = times[:0]
+    clip = source.clip(id, times[list(STORM_CONTEXT)], span_us, protocol.boxes, lambda k: k not in SHIFT_FRAMES)
+    beside = {}
+    for left_m in (0.0, *(side * shift for shift in SWEEP_SHIFTS_M for side in (1, -1))):
+        driven = EvaluationWorld(source.world, source.rig, left_m)
+        beside[left_m] = driven.clip(id, none, span_us, protocol.boxes, lambda k: k in SHIFT_FRAMES)
+        report("scanning", 0.1 + 0.9 * len(beside) / (2 * len(SWEEP_SHIFTS_M) + 1))
+        beside[left_m] = _with_free_sensor(beside[left_m])
+    return Made(clip, [], beside)
+
+
+def _with_free_sensor(clip: ContextClip) -> ContextClip:
+    """The log without sweeps from inside or right in front of an object."""
+    free = {
+        lidar: tuple(
+            turn for turn in turns if np.mean(np.linalg.norm(turn.sweep().xyz_m, axis=1) < NEAR_M) <= NEAR_SHARE
+        )
+        for lidar, turns in clip.revolutions.items()
+    }
+    return replace(clip, revolutions=free)
 
 
 _MAKERS: dict[ProtocolName, Callable[[Protocol, EvaluationWorld, str, int, Progress], Made]] = {
     "storm": _storm,
     "shift": _shift,
     "clip": _clip,
+    "lidar": _lidar,
 }
 
 

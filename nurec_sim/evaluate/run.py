@@ -20,6 +20,7 @@ from nurec_sim.errors import ReconstructError, RunError
 from nurec_sim.evaluate.methods import Contender, describe
 from nurec_sim.evaluate.page import render_page
 from nurec_sim.evaluate.protocols import Protocol
+from nurec_sim.evaluate.scans import draw_scans
 from nurec_sim.evaluate.scoring import Scored, score_window
 from nurec_sim.evaluate.sheet import draw_sheet
 from nurec_sim.evaluate.summary import summarize
@@ -104,7 +105,11 @@ def _window(
         }
         if folder is not None:
             shown = {n: s for n, s in scored.items() if isinstance(s, Scored)}
-            draw_sheet(folder / "sheets" / f"{name}.png", window, shown)
+            sheet = folder / "sheets" / f"{name}.png"
+            if window.beside:
+                draw_scans(sheet, window.beside, {method: scored.sweeps for method, scored in shown.items()})
+            else:
+                draw_sheet(sheet, window, shown)
             write_file(folder / "windows" / f"{name}.json", _json(record))
     return record
 

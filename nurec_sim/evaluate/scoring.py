@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 
 from nurec_sim.evaluate.methods import Built, Contender, build
+from nurec_sim.evaluate.scans import score_beside
 from nurec_sim.evaluate.scores.depth import depth_score, least_squares_scale
 from nurec_sim.evaluate.scores.images import masked_psnr, masked_ssim, psnr, ssim
 from nurec_sim.evaluate.views import ScoredView, reduced
@@ -24,10 +25,11 @@ Figures = dict[str, float | None]
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A method's record of a window (plain JSON) and its views by target name."""
+    """A method's record of a window (plain JSON), its views by target name, and a sweep by lateral offset."""
 
     record: dict[str, Any]
     views: dict[str, ScoredView]
+    sweeps: dict[float, Float64[np.ndarray, "n 3"]] = field(default_factory=dict)
 
 
 def score_window(
@@ -43,7 +45,8 @@ def score_window(
 
     Returns:
         The record: ``gaussians``, ``seconds`` (``reconstruct``; ``render`` per view), ``unknown``, and per target
-        ``name``, ``left_m``, ``beyond``, ``full``, ``dynamic`` and ``static`` (see ``score_view``).
+        ``name``, ``left_m``, ``beyond``, ``full``, ``dynamic`` and ``static`` (see ``score_view``). Windows with target
+        sweeps also have ``sweeps`` (see ``scans.score_beside``).
 
     Raises:
         ReconstructError, WeightsError: see ``methods.build``.
@@ -62,7 +65,12 @@ def score_window(
     seconds = {"reconstruct": round(built.seconds, 3), "render": round(rendering / max(len(rows), 1), 4)}
     unknown = [] if built.scene is None else list(built.scene.provenance.get("unknown", ()))
     record = {"gaussians": built.gaussians, "seconds": seconds, "unknown": unknown, "targets": rows}
-    return Scored(record, views)
+    if not window.beside:
+        return Scored(record, views)
+    record["sweeps"], sweeps = score_beside(
+        built, window.beside, lambda fraction: report(f"{contender.name} scans", 0.3 + 0.7 * fraction)
+    )
+    return Scored(record, views, sweeps)
 
 
 def score_view(view: ScoredView, target: EvaluationView) -> dict[str, Figures | None]:

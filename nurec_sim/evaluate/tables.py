@@ -2,40 +2,15 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
+from nurec_sim.evaluate.cells import NOT_KNOWN, Table, number, percent
+from nurec_sim.evaluate.scans import scan_tables
 from nurec_sim.report.cells import count_of
 
-NOT_KNOWN = "-"
 PAPER_HEADING = ("PSNR", "SSIM", "AbsRel", "δ1")
 PAPER_COLUMNS = ("psnr_db", "ssim", "abs_rel", "delta1")
-
-
-@dataclass(frozen=True)
-class Table:
-    """Heading and rows of text, with an explanatory ``note``."""
-
-    name: str
-    title: str
-    heading: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
-
-    def markdown(self) -> str:
-        """Markdown with title and note."""
-        lines = [self.heading, ["---"] + ["---:"] * (len(self.heading) - 1), *self.rows]
-        body = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
-        return f"## {self.title}\n\n{body}\n" + (f"\n{self.note}\n" if self.note else "")
-
-    def csv(self) -> str:
-        """As CSV."""
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([self.heading, *self.rows])
-        return text.getvalue()
 
 
 def tables(results: Mapping[str, Any]) -> list[Table]:
@@ -49,6 +24,8 @@ def tables(results: Mapping[str, Any]) -> list[Table]:
             _curve(methods, "abs_rel", "AbsRel", 3),
             _doubling(methods),
         ]
+    elif name == "lidar":
+        return [*scan_tables(methods), _cost(methods), *_failures(results["windows"])]
     else:
         made.append(_paper_table(results))
         if name == "storm":
@@ -56,15 +33,17 @@ def tables(results: Mapping[str, Any]) -> list[Table]:
     made += [_metric_depth(methods, ", on the path" if name == "shift" else ""), _cost(methods)]
     if summary["differences"]:
         made.append(_differences(summary["differences"]))
+    return made + _failures(results["windows"])
+
+
+def _failures(windows: Sequence[Mapping[str, Any]]) -> list[Table]:
     failed = [
         (window["id"], method, record["error"])
-        for window in results["windows"]
+        for window in windows
         for method, record in window["methods"].items()
         if "error" in record
     ]
-    if failed:
-        made.append(Table("failures", "Failures", ("window", "method", "error"), tuple(failed)))
-    return made
+    return [Table("failures", "Failures", ("window", "method", "error"), tuple(failed))] if failed else []
 
 
 def _paper_table(results: Mapping[str, Any]) -> Table:
@@ -184,15 +163,3 @@ def _differences(differences: Sequence[Mapping[str, Any]]) -> Table:
 
 def _interval(ends: Sequence[float] | None) -> str:
     return NOT_KNOWN if ends is None else f"{ends[0]:+.2f} to {ends[1]:+.2f}"
-
-
-def number(value: float | None, digits: int, sign: bool = False) -> str:
-    """A value with fixed decimals; a dash if unknown."""
-    if value is None:
-        return NOT_KNOWN
-    return f"{value:+,.{digits}f}" if sign else f"{value:,.{digits}f}"
-
-
-def percent(value: float | None) -> str:
-    """A fraction in percent; a dash if unknown."""
-    return NOT_KNOWN if value is None else f"{100 * value:.1f} %"

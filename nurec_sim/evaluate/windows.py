@@ -36,12 +36,21 @@ class EvaluationView:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """One sample of an evaluation; ``about`` describes it in plain JSON."""
+    """One sample of an evaluation.
+
+    Attributes:
+        id: unique within its protocol.
+        clip: the input log.
+        targets: the target views.
+        about: describes the sample in plain JSON.
+        beside: logs of the target sweeps, by the lateral offset in metres at which they were measured, left positive.
+    """
 
     id: str
     clip: Clip
     targets: tuple[EvaluationView, ...]
     about: Mapping[str, str | int | float] = field(default_factory=dict)
+    beside: Mapping[float, Clip] = field(default_factory=dict)
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:

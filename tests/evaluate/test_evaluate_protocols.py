@@ -5,7 +5,7 @@ import pytest
 from evaluation_worlds import BOX, street
 from feedforward_clip import clip_of, frame_times, pinhole
 
-from nurec_sim import sensors
+from nurec_sim import sensors, world
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate import Protocol, procedural
 from nurec_sim.evaluate.recorded import clip_window, recorded_window, storm_windows
@@ -76,6 +76,32 @@ def test_shift_moves_the_car_to_its_left_and_skips_what_is_inside_of_things():
     assert 0.0 in offsets and {1.0, -1.0} & offsets and max(offsets) <= 3.5
 
 
+@pytest.fixture(scope="module")
+def lidar():
+    small = world.street_rig(lidar_rows=6, lidar_columns=40).lidars["lidar_top"]
+    with pytest.MonkeyPatch.context() as patch:
+        asked = []
+        patch.setattr(procedural, "lidar_model", lambda name, mount, id: asked.append(name) or small)
+        with Protocol("lidar", (5,), **SMALL).window(0) as window:
+            yield window, asked
+
+
+def test_lidar_holds_out_sweeps_and_measures_them_beside_the_path_too(lidar):
+    window, asked = lidar
+    assert asked == ["PANDAR128"] and window.targets == ()
+    start_us = window.clip.span_us[0]
+    given = (window.clip.sweep_times_us("lidar_top")[:, 0] - start_us) // 100_000
+    assert given.tolist() == [k for k in range(20) if k not in (3, 8, 13)]
+    assert sorted(window.beside) == [-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0]
+    targets = (window.beside[0.0].sweep_times_us("lidar_top")[:, 0] - start_us) // 100_000
+    assert targets.tolist() == [3, 8, 13]
+    for left_m, clip in window.beside.items():
+        moved = np.linalg.inv(window.clip.ego.at(start_us)) @ clip.ego.at(start_us)
+        assert np.allclose(moved[:3, 3], (0, left_m, 0), atol=1e-6)
+        for index in range(len(clip.sweep_times_us("lidar_top"))):
+            assert np.mean(np.linalg.norm(clip.sweep("lidar_top", index).xyz_m, axis=1) < 1) <= 0.2
+
+
 def test_clip_holds_out_every_kth_frame_of_all_cameras():
     protocol = Protocol("clip", (5,), seconds=2.0, rate_hz=3.0, hold_out_every=3, boxes=True, **SMALL)
     with protocol.window(0) as window:
@@ -92,7 +118,7 @@ def test_clip_holds_out_every_kth_frame_of_all_cameras():
         ({"name": "drive", "seeds": (1,)}, "no protocol 'drive'; have"),
         ({"name": "storm"}, "give seeds or clips"),
         ({"name": "storm", "seeds": (1, 1)}, "each may be given once"),
-        ({"name": "shift", "clips": ("log",)}, "logs have no views at lateral offsets"),
+        ({"name": "shift", "clips": ("log",)}, "logs have no sensors at lateral offsets"),
         ({"name": "clip", "seeds": (1,), "hold_out_every": 1}, "holds out every second frame or fewer"),
         ({"name": "clip", "seeds": (1,), "cameras": 2}, "1 or 3 cameras, got 2"),
     ],
