@@ -21,7 +21,7 @@ from nurec_sim.policies._ground_view import (
     ground_view,
     room_beside,
 )
-from nurec_sim.policies._paths import make_plan, pursue, toward_speed
+from nurec_sim.policies._paths import AccelOf, make_plan, pursue, toward_speed
 from nurec_sim.types import Needs, Observation, Plan, Rig
 
 CAR_HALF_WIDTH_M, SPARE_M = 1.25, 0.9
@@ -52,6 +52,11 @@ class CameraRoadFollower:
 
     def plan(self, observation: Observation) -> Plan:
         """Five seconds along the best path."""
+        path, accel_of = self.decide(observation)
+        return make_plan(observation, pursue(path, observation.ego.speed_mps, accel_of))
+
+    def decide(self, observation: Observation) -> tuple[Float64[np.ndarray, "k 2"], AccelOf]:
+        """The best path, and the acceleration along it; call it once per plan."""
         if self.cruise_mps == 0.0:
             self.cruise_mps = max(observation.ego.speed_mps, START_SPEED_MPS)
         seen, colours = ground_view(observation.cameras["front"])
@@ -62,7 +67,7 @@ class CameraRoadFollower:
             safe = math.sqrt(2 * BRAKE_MPS2 * max(0.0, to_stop - driven_m))
             return max(-6.0, 4 * (safe - speed)) if safe < speed else toward_speed(min(self.cruise_mps, safe), speed)
 
-        return make_plan(observation, pursue(path, observation.ego.speed_mps, accel_of))
+        return path, accel_of
 
     def roomiest(
         self, blocked: Bool[np.ndarray, "x y"], seen: Bool[np.ndarray, "x y"]

@@ -42,23 +42,32 @@ class LidarAeb:
 
     def plan(self, observation: Observation) -> Plan:
         """Five seconds along the route, braking for obstacles."""
-        speed = observation.ego.speed_mps
-        points = points_in_rig(observation.lidars["any"])
-        distance = self.free_distance(points, extended(observation.route_m))
-        lead_speed = self.speed_of_obstacle(observation, distance)
-        self.last = None if distance is None else (observation.t_us, distance)
-        brake = 0.0
-        if distance is not None:
-            closing = speed - lead_speed
-            too_soon = closing > 0.1 and distance / closing < TTC_S
-            braking_m = max(0.0, speed**2 - lead_speed**2) / (2 * BRAKE_MPS2) + STOP_GAP_M
-            if too_soon or distance < braking_m:
-                brake = min(max(speed**2 / (2 * max(distance - STOP_GAP_M / 2, 0.5)), BRAKE_MPS2), 8.0)
+        brake = self.brake_for(observation, extended(observation.route_m))
 
         def accel_of(t_s: float, driven_m: float, now: float) -> float:
             return -brake if brake else toward_speed(route_speed(observation, driven_m), now)
 
-        return make_plan(observation, pursue(observation.route_m, speed, accel_of))
+        return make_plan(observation, pursue(observation.route_m, observation.ego.speed_mps, accel_of))
+
+    def brake_for(self, observation: Observation, line: Float64[np.ndarray, "k 2"]) -> float:
+        """Deceleration (m/s^2) for the nearest obstacle along a path; 0 if none is needed."""
+        speed = observation.ego.speed_mps
+        distance, lead_speed = self.obstacle(observation, line)
+        if distance is None:
+            return 0.0
+        closing = speed - lead_speed
+        too_soon = closing > 0.1 and distance / closing < TTC_S
+        braking_m = max(0.0, speed**2 - lead_speed**2) / (2 * BRAKE_MPS2) + STOP_GAP_M
+        if not (too_soon or distance < braking_m):
+            return 0.0
+        return min(max(speed**2 / (2 * max(distance - STOP_GAP_M / 2, 0.5)), BRAKE_MPS2), 8.0)
+
+    def obstacle(self, observation: Observation, line: Float64[np.ndarray, "k 2"]) -> tuple[float | None, float]:
+        """Metres to the nearest obstacle along a path (None when free) and its speed; call it once per plan."""
+        distance = self.free_distance(points_in_rig(observation.lidars["any"]), line)
+        speed = self.speed_of_obstacle(observation, distance)
+        self.last = None if distance is None else (observation.t_us, distance)
+        return distance, speed
 
     def free_distance(self, points: Float64[np.ndarray, "n 3"], line: Float64[np.ndarray, "k 2"]) -> float | None:
         """Metres from the front bumper to the nearest obstacle in the corridor along ``line``; None when free."""

@@ -58,9 +58,7 @@ def test_faults_of_a_file_are_told(tmp_path, text, said):
 
 
 def test_unknown_names_list_what_there_is():
-    with pytest.raises(
-        ScenarioError, match=r"unknown policy 'log_reply'; have \['camera_road_follower'.*my_policy.py:Class"
-    ):
+    with pytest.raises(ScenarioError, match=r"unknown policy 'log_reply'; have \['blind_route'.*my_policy.py:Class"):
         plugins.load_policy("log_reply")
     with pytest.raises(ScenarioError, match=r"policy file 'nowhere.py' does not exist"):
         plugins.load_policy("nowhere.py:Mine")

@@ -21,6 +21,7 @@ from nurec_sim.cli import (  # noqa: F401  (each registers its commands)
     remote,
     scenes,
     serving,
+    studies,
     training,
     validation,
     viewing,
@@ -33,6 +34,7 @@ from nurec_sim.errors import NurecSimError
 KEPT = {
     "run": "finished rollouts are kept: resume with --resume runs/latest (or your run folder)",
     "demo": "finished rollouts are kept: resume with --resume runs/latest (or your run folder)",
+    "study": "finished rollouts are kept: give the same command again",
     "evaluate": "finished windows of a protocol are kept: resume with --resume evaluations/latest (or your run folder)",
 }
 """Messages after Ctrl-C."""

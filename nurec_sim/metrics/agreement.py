@@ -247,6 +247,25 @@ def mmrv(truth: Float64[np.ndarray, " policies"], other: Float64[np.ndarray, " p
     return float(np.where(violated, np.abs(gap), 0.0).max(axis=1).mean()) if len(truth) else math.nan
 
 
+def tau_b_drop(reference: Means, better: Means, worse: Means) -> Estimate:
+    """By how much tau-b with the reference falls from one world to another, with a paired interval.
+
+    Args:
+        reference: means [policies, scenes] in the world that both are measured by.
+        better: means in the one world.
+        worse: means in the other.
+    """
+    count, draws = reference.shape[1], scene_draws(reference.shape[1])
+    # A world in which all policies are tied ranks none: no agreement.
+    taus = [np.nan_to_num(tau_b(reference.mean(axis=1), world.mean(axis=1))) for world in (better, worse)]
+    value = float(taus[0] - taus[1])
+    if count < 2:
+        return Estimate(value)
+    of_scenes = draws @ reference.T / count
+    drawn = [np.nan_to_num(tau_b(of_scenes, draws @ world.T / count)) for world in (better, worse)]
+    return Estimate(value, *percentile_interval(drawn[0] - drawn[1]))
+
+
 def pair_counts(policies: Sequence[str], reference: Means, other: Means, draws: Draws) -> PairCounts:
     """Counts pairs of policies by whether their order is resolved in one world, in both, and the same in both."""
     same, opposite, one, none = 0, [], 0, 0

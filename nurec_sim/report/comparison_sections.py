@@ -43,7 +43,7 @@ def what_differs(report: RunReport, comparison: Comparison, groups: Sequence[Seq
         f"judged by {escape(comparison.road)}.</p><ul>{list_items(_sentences(comparison, groups))}</ul>"
         f'<div class="panels">{bars}</div><p class="key">{_interval_text(report)} Collision and off-road: share of '
         "rollouts, lower is better. Scene score: 100 % is a drive without fault to the end.</p></div>"
-        f"{_differences(comparison)}"
+        f"{differences(comparison)}"
     )
 
 
@@ -99,8 +99,8 @@ def _interval_text(report: RunReport) -> str:
     return f"Whiskers: {100 * CONFIDENCE:.0f} % bootstrap intervals over {scenes} scenes."
 
 
-def _differences(comparison: Comparison) -> str:
-    """Per policy: each other reconstruction minus the first one."""
+def differences(comparison: Comparison) -> str:
+    """Per policy: each other reconstruction minus the first one, as a table."""
     metrics = [metric for metric in SHOWN if any(key[0] == metric for key in comparison.agreements)]
     heads = "".join(f'<th class="n">{escape(SHOWN[metric])}</th>' for metric in metrics)
     rows = []
@@ -124,10 +124,11 @@ def _difference_cell(found: Agreement | None, policy: str) -> str:
     if found is None or policy not in found.policies:
         return '<td class="n"><span class="none">unknown</span></td>'
     difference = found.differences[found.policies.index(policy)]
-    return f'<td class="n">{_points(difference.estimate)}<small>{_judged(difference)}</small></td>'
+    return f'<td class="n">{points_cell(difference.estimate)}<small>{_judged(difference)}</small></td>'
 
 
-def _points(estimate: Estimate) -> str:
+def points_cell(estimate: Estimate) -> str:
+    """A difference in percentage points with its interval."""
     interval = ""
     if estimate.low is not None and estimate.high is not None:
         interval = f"<small>[{100 * estimate.low:+.0f}, {100 * estimate.high:+.0f}]</small>"
@@ -193,13 +194,14 @@ def _agreement_row(name: str, found: Agreement) -> str:
     pairs = found.pairs
     bad = ' class="n bad"' if pairs.opposite else ' class="n"'
     return (
-        f'<tr><td>{name}</td><td class="n">{_rank(found.tau_b)}</td><td class="n">{_rank(found.spearman)}</td>'
+        f'<tr><td>{name}</td><td class="n">{rank_cell(found.tau_b)}</td><td class="n">{rank_cell(found.spearman)}</td>'
         f'<td class="n">{100 * found.mmrv:.1f}</td><td class="n">{pairs.same}</td><td{bad}>{pairs.opposite}</td>'
         f'<td class="n">{pairs.resolved_in_one}</td><td class="n">{pairs.unresolved}</td></tr>'
     )
 
 
-def _rank(estimate: Estimate) -> str:
+def rank_cell(estimate: Estimate) -> str:
+    """A rank correlation with its interval."""
     if estimate.value != estimate.value:
         return '<span class="none">all tied</span>'
     interval = f"<small>[{estimate.low:.2f}, {estimate.high:.2f}]</small>" if estimate.low is not None else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from nurec_sim.metrics.aggregate import rollout_values, summarize
 from nurec_sim.metrics.agreement import compare_worlds, noise_ceiling, paired_means
@@ -12,6 +13,9 @@ from nurec_sim.metrics.table import metric_table
 from nurec_sim.report import Comparison
 from nurec_sim.runs.scene_file import SceneRecord
 from nurec_sim.types import Rollout, Series
+
+if TYPE_CHECKING:
+    import polars as pl
 
 COMPARED = ("collision_any", "offroad", "collision_offroad_mean", "scene_score", "progress")
 
@@ -46,6 +50,17 @@ def compare_reconstructions(
             for rollout, record in ((rollout, first[rollout.scene_id]) for rollout, _ in scored)
         ]
     values = rollout_values(metric_table(judged, "comparison"), profile, road)
+    return comparison_of(values, worlds, name), judged
+
+
+def comparison_of(values: pl.DataFrame, worlds: Sequence[str], road: str) -> Comparison:
+    """Every world against the first one.
+
+    Args:
+        values: rows of ``rollout_values``, judged by the same road and actors in all worlds.
+        worlds: names of reconstructions, two or more.
+        road: name of that road.
+    """
     agreements, ceilings = {}, {}
     notes: dict[str, None] = {}
     for metric in COMPARED:
@@ -59,7 +74,7 @@ def compare_reconstructions(
                 means = paired.by_world
                 agreements[metric, other] = compare_worlds(metric, paired.policies, means[worlds[0]], means[other])
         ceilings[metric] = noise_ceiling(values, metric, worlds[0])
-    return Comparison(worlds, name, values, summarize(values), agreements, ceilings, tuple(notes)), judged
+    return Comparison(tuple(worlds), road, values, summarize(values), agreements, ceilings, tuple(notes))
 
 
 def _by_map(series: Sequence[Series]) -> list[Series]:

@@ -32,8 +32,8 @@ DRIVING_SHARE = 0.6
 
 
 @dataclass(frozen=True)
-class _Job:
-    """One rollout to run."""
+class RolloutJob:
+    """One rollout to run: what is driven, by whom, and the folder that it is written to."""
 
     scene: GaussianScene
     record: SceneRecord
@@ -163,7 +163,7 @@ def execute(
 def _jobs(
     run: Path, scenes: Sequence[GaussianScene], scenario: Scenario, policies: Sequence[LoadedPolicy],
     seeds: Sequence[int], fidelity: Mapping[tuple[str, str], Mapping[str, Any]], say: Progress,
-) -> list[_Job]:  # fmt: skip
+) -> list[RolloutJob]:  # fmt: skip
     """All rollouts of the run; also writes the scene records."""
     jobs = []
     for index, scene in enumerate(scenes):
@@ -174,18 +174,18 @@ def _jobs(
         for policy in policies:
             for seed in seeds:
                 target = layout.rollout_folder(run, scene.id, record.reconstruction, policy.name, seed)
-                jobs.append(_Job(scene, record, policy, seed, scenario, target, compared=ids.count(scene.id) > 1))
+                jobs.append(RolloutJob(scene, record, policy, seed, scenario, target, compared=ids.count(scene.id) > 1))
     return jobs
 
 
 def _drive_all(
-    jobs: Sequence[_Job], sense_for: Callable[[GaussianScene], Sense], video: bool, say: Progress, tell: Notice
+    jobs: Sequence[RolloutJob], sense_for: Callable[[GaussianScene], Sense], video: bool, say: Progress, tell: Notice
 ) -> None:
     """Runs all unfinished rollouts."""
     senses: dict[tuple[str, str], Sense] = {}
     for index, job in enumerate(jobs):
 
-        def advance(share: float, job: _Job = job, index: int = index) -> None:
+        def advance(share: float, job: RolloutJob = job, index: int = index) -> None:
             done = min(0.05 + 0.9 * (index + share) / len(jobs), 0.95)
             where = f"{job.scene.id} ({job.record.reconstruction})" if job.compared else job.scene.id
             say(f"{job.policy.name} in {where}, seed {job.seed}", done)
@@ -198,12 +198,14 @@ def _drive_all(
         key = job.scene.id, job.record.reconstruction
         if key not in senses:
             senses[key] = sense_for(job.scene)
-        rollout = _drive(job, senses[key], wants_video, done, advance)
+        rollout = drive_job(job, senses[key], wants_video, done, advance)
         if rollout.status != "ok":
             tell(f"{job.title} failed: {rollout.error}")
 
 
-def _drive(job: _Job, sense: Sense, video: bool, driven: Rollout | None, advance: Callable[[float], None]) -> Rollout:
+def drive_job(
+    job: RolloutJob, sense: Sense, video: bool, driven: Rollout | None, advance: Callable[[float], None]
+) -> Rollout:
     """Runs one job (or only renders its missing video) and moves its folder into place."""
     rollout, recorder = driven, None
     if video:

@@ -127,7 +127,7 @@ def test_readme_uses_only_verbs_that_exist() -> None:
     ("arguments", "text"),
     [
         (["serve", "nowhere.usdz"], "nothing to serve: nowhere.usdz does not exist"),
-        (["run", "--scenario", "nope"], "no scenario named 'nope'; have ['demo', 'short']"),
+        (["run", "--scenario", "nope"], "no scenario named 'nope'; have ['demo', 'short', 'study_drive']"),
         (["run", "--scenario", "short"], "has no clip"),
         (["demo", "--refine", "0"], "--refine: seconds must be positive and finite, got 0.0"),
         (["run", "--scenario", "demo", "--refine", "5", "--address", "127.0.0.1:9"], "--refine cannot be used with"),
@@ -137,7 +137,7 @@ def test_readme_uses_only_verbs_that_exist() -> None:
         (["lidar", "nowhere.usdz", "--noise", "-1"], "--noise is a standard deviation in metres, at least 0; got -1"),
         (["lidar", "nowhere.usdz", "--left-m", "inf"], "--left-m, --ahead-m and --yaw-deg must be finite"),
         (["evaluate", "nowhere"], "no clip at 'nowhere'"),
-        (["policies", "nobody"], "unknown policy 'nobody'; have ['camera_road_follower'"),
+        (["policies", "nobody"], "unknown policy 'nobody'; have ['blind_route'"),
         (["world", "--out", "a.zip", "--seconds", "100"], "1..30 seconds"),
     ],
 )

@@ -11,7 +11,7 @@ from nurec_sim import geometry
 from nurec_sim.plugins import available_policies, load_policy
 from nurec_sim.sim import Scenario, run_rollout
 from nurec_sim.sim.conformance import check_policy
-from nurec_sim.types import Needs, Plan
+from nurec_sim.types import ActorState, Needs, Plan, Rig
 
 
 def drive(name, world, **keys):
@@ -52,7 +52,7 @@ def test_the_kit_finds_what_is_wrong():
     assert check_policy(Bad()) == ["name must be a non-empty string", "needs must be a nurec_sim.types.Needs"]
 
 
-@pytest.mark.parametrize("name", ["route_follower", "lidar_aeb"])
+@pytest.mark.parametrize("name", ["route_follower", "lidar_aeb", "blind_route"])
 def test_route_drivers_keep_to_the_route_in_a_curve(name):
     world = worlds.curve()
     rollout = drive(name, world)
@@ -60,16 +60,17 @@ def test_route_drivers_keep_to_the_route_in_a_curve(name):
     assert geometry.arc_length(rollout.world_from_rig[:, :2, 3])[-1] > 50
 
 
-@pytest.mark.parametrize("name", ["route_follower", "lidar_aeb"])
+@pytest.mark.parametrize("name", ["route_follower", "lidar_aeb", "lidar_cruise"])
 def test_a_parked_car_stops_who_keeps_to_the_route(name):
     rollout = drive(name, worlds.parked_car_ahead())
     gap = 45.0 - 2.25 - 3.85 - rollout.world_from_rig[-1, 0, 3]
     assert rollout.status == "ok" and rollout.states[-1].speed_mps < 0.5 and 0.3 < gap < 6.0
 
 
-def test_the_camera_brakes_for_a_parked_car():
+@pytest.mark.parametrize("name", ["camera_road_follower", "camera_brake", "fusion"])
+def test_the_camera_brakes_for_a_parked_car(name):
     world = worlds.parked_car_ahead()
-    rollout = drive("camera_road_follower", world, duration_s=5.0)
+    rollout = drive(name, world, duration_s=5.0)
     gap = 45.0 - 2.25 - 3.85 - rollout.world_from_rig[:, 0, 3]
     speed = np.array([state.speed_mps for state in rollout.states])
     assert rollout.status == "ok" and gap.min() > 0.0
@@ -123,6 +124,49 @@ def test_route_follower_waits_for_a_crossing_pedestrian():
     ahead = boxes[:, 0] - rollout.world_from_rig[:, 0, 3]
     inside = (np.abs(boxes[:, 1]) < 1.25) & (ahead > -1.4) & (ahead < 4.15)
     assert not inside.any() and min(state.speed_mps for state in rollout.states) < 6.0
+
+
+def test_the_blind_one_drives_into_a_parked_car():
+    rollout = drive("blind_route", worlds.parked_car_ahead())
+    assert rollout.world_from_rig[-1, 0, 3] > 45.0 and rollout.states[-1].speed_mps > 9.0
+
+
+def test_a_line_beside_another_is_to_its_left():
+    from nurec_sim.policies.blind_route_noisy import beside
+
+    assert beside(np.array([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0]]), 0.5)[:, 1] == pytest.approx([0.5] * 3)
+    assert beside(np.array([[0.0, 0.0], [0.0, 2.0]]), 0.5)[:, 0] == pytest.approx([-0.5] * 2)
+
+
+def test_errors_of_the_noisy_driver_wander_as_an_ornstein_uhlenbeck_process():
+    """Variance 1; correlation exp(-t / 2 s) after t; given by the seed alone."""
+    policy = load_policy("blind_route_noisy")
+
+    def errors(seed):
+        policy.reset(None, seed)
+        found = []
+        for k in range(8000):
+            policy.wander(500_000 * k)
+            found.append(policy.errors.copy())
+        return np.array(found)
+
+    first = errors(4)
+    assert first.std(axis=0) == pytest.approx([1, 1], abs=0.1) and first.mean(axis=0) == pytest.approx([0, 0], abs=0.15)
+    assert (first[1:] * first[:-1]).mean(axis=0) == pytest.approx([np.exp(-0.25)] * 2, abs=0.1)
+    assert (first[4:] * first[:-4]).mean(axis=0) == pytest.approx([np.exp(-1)] * 2, abs=0.1)
+    assert (errors(4)[:50] == first[:50]).all() and (errors(5)[0] != first[0]).all()
+
+
+def test_a_bad_detector_overlooks_and_misplaces():
+    policy = load_policy("noisy_perception")
+    policy.reset(Rig({}, {}), 1)
+    car = ActorState("car", "automobile", (4.5, 1.8, 1.5), np.eye(4), np.zeros(2))
+    seen = [policy.detected(car, 100_000 * k) for k in range(2000)]
+    place = np.array([actor.rig_from_box[:3, 3] for actor in seen if actor is not None])
+    assert len(place) / 2000 == pytest.approx(0.7, abs=0.04)
+    assert place.std(axis=0) == pytest.approx([0.5, 0.5, 0.0], abs=0.04)
+    again = policy.detected(car, 100_000 * 3)
+    assert again is None if seen[3] is None else (again.rig_from_box == seen[3].rig_from_box).all()
 
 
 def test_the_documents_policy_keeps_the_contract():

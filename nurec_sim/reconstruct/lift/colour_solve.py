@@ -87,7 +87,7 @@ def solve_colours(
         progress((done + 1) / len(images))
     middle = {camera: each.sum(axis=1) // 2 for camera, each in times.items()}
     responses = {}
-    for camera in {camera for camera, _ in chosen}:
+    for camera in dict.fromkeys(camera for camera, _ in chosen):
         known = [k for name, k in chosen if name == camera]
         flat = np.array([solve.responses[camera, k] for k in known]).reshape(len(known), 12)
         columns = [np.interp(middle[camera], middle[camera][known], flat[:, c]) for c in range(12)]

@@ -1,0 +1,130 @@
+"""The statistics and the report of studies whose answer is known."""
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+
+from nurec_sim.metrics.aggregate import DERIVED
+from nurec_sim.metrics.agreement import tau_b_drop
+from nurec_sim.metrics.series import METRICS
+from nurec_sim.study import make_study
+from nurec_sim.study.page import render_study
+from nurec_sim.study.results import agreement_rows, as_json, results_of
+
+SCENES = 10
+POLICIES = ("blind_a", "blind_b", "sees_a", "sees_b")
+SEEING = ("sees_a", "sees_b")
+CONFIG = make_study(
+    {
+        "name": "known",
+        "families": [{"name": "bend", "seeds": list(range(SCENES))}],
+        "policies": list(POLICIES),
+        "worlds": ["truth", "lift"],
+        "controls": {"of": "lift", "how": ["faint"]},
+        "trials": 2,
+    }
+)  # fmt: skip
+SHOWN = ("collision_any", "offroad", "offroad_unknown_frac", "progress", "collision_offroad_mean",
+         "offroad_or_collision", "scene_score")  # fmt: skip
+TRUE_FRACTIONS = (0.9, 0.6, 0.8, 0.1)
+
+
+def values(by_world, failed=()):
+    """Rows as ``rollout_values`` gives them; policy p has an event in the first ``fraction`` of the scenes."""
+    rows = []
+    units = {name: metric.unit for name, metric in METRICS.items()} | {
+        name: unit for name, (unit, _) in DERIVED.items()
+    }
+    for world, fractions in by_world.items():
+        for policy, fraction in zip(POLICIES, fractions, strict=True):
+            for scene_id, _, town in CONFIG.scenes:
+                for trial, seed in enumerate(CONFIG.seeds(town)):
+                    event = float(town < round(fraction * SCENES))
+                    key = (world, policy, scene_id, seed)
+                    ok = key not in failed
+                    for name, unit in units.items():
+                        found = {"offroad": event, "collision_offroad_mean": event / 2, "offroad_or_collision": event,
+                                 "scene_score": 1 - event}  # fmt: skip
+                        rows.append((scene_id, "reconstruction", world, policy, trial, seed, "/".join(map(str, key)),
+                                     "ok" if ok else "failed", "" if ok else "lens <cap> on", name, unit,
+                                     found.get(name, 0.0) if ok else None, ok))  # fmt: skip
+    columns = ["clipgt_id", "world", "reconstruction", "policy", "trial", "seed", "rollout_id", "status", "error",
+               "name", "unit", "value", "valid"]  # fmt: skip
+    return pl.DataFrame(rows, columns, orient="row", infer_schema_length=None)
+
+
+GOOD = {"truth": TRUE_FRACTIONS, "lift": TRUE_FRACTIONS, "lift-faint": (0.9, 0.6, 0.1, 0.8)}
+
+
+@pytest.fixture(scope="module")
+def good():
+    return results_of(CONFIG, values(GOOD), SEEING)
+
+
+def test_a_perfect_reconstruction_and_a_control_that_swaps_two_policies(good):
+    """Four policies have six pairs; to swap 0.8 and 0.1 puts three of them in the other order: tau (3 - 3) / 6."""
+    found = as_json(good)
+    assert found["agreement"]["lift/scene_score"]["tau_b"]["value"] == pytest.approx(1.0)
+    assert found["agreement"]["lift-faint/scene_score"]["tau_b"]["value"] == pytest.approx(0.0)
+    assert found["agreement_of_policies_that_see"]["lift-faint/scene_score"]["tau_b"]["value"] == pytest.approx(-1.0)
+    assert found["controls"]["faint/scene_score"]["value"] == pytest.approx(1.0)
+    assert found["noise_ceiling"]["scene_score"]["tau_b"]["value"] == pytest.approx(1.0)
+    assert found["failed"] == 0 and found["rollouts"] == SCENES * 3 * 4 * 2
+    assert ("lift-faint", "scene_score", "0.00") in [row[:3] for row in agreement_rows(json.loads(json.dumps(found)))]
+
+
+def test_the_drop_of_tau_by_hand():
+    """Three policies that both worlds and every resample order alike, against one that reverses them."""
+    truth = np.repeat([[0.1], [0.5], [0.9]], 5, axis=1)
+    drop = tau_b_drop(truth, truth, 1 - truth)
+    assert (drop.value, drop.low, drop.high) == (2.0, 2.0, 2.0) and drop.resolved
+    assert tau_b_drop(truth, truth, np.ones_like(truth)).value == 1.0, "a world that ties all ranks none"
+    assert tau_b_drop(truth[:, :1], truth[:, :1], truth[:, :1]).low is None
+
+
+def test_controls_that_rank_as_well_show_that_the_study_cannot_discriminate(good):
+    same = results_of(CONFIG, values(GOOD | {"lift-faint": TRUE_FRACTIONS}), SEEING)
+    assert good.discriminates is True and same.discriminates is False
+    assert "This study cannot discriminate" in render_study(same)
+    assert "The study discriminates" in render_study(good)
+    without = CONFIG.model_copy(update={"controls": CONFIG.controls.model_copy(update={"how": ()})})
+    assert results_of(without, values({"truth": TRUE_FRACTIONS, "lift": TRUE_FRACTIONS}), SEEING).discriminates is None
+
+
+def test_blind_policies_that_drive_differently_are_named(good):
+    assert good.differing == ()
+    odd = values(GOOD | {"lift": (0.9, 0.5, 0.8, 0.1)})
+    found = results_of(CONFIG, odd, SEEING)
+    assert found.differing == ("blind_b",)
+    assert "fault of the simulator" in render_study(found)
+
+
+def test_a_blind_policy_judged_by_another_road_is_no_difference():
+    other = values(GOOD).with_columns(
+        pl.when((pl.col("reconstruction") == "lift") & (pl.col("name") == "offroad_unknown_frac"))
+        .then(0.5).otherwise(pl.col("value")).alias("value")
+    )  # fmt: skip
+    assert results_of(CONFIG, other, SEEING).differing == ()
+
+
+def test_failed_rollouts_are_counted_and_escaped():
+    failed = {("lift", "sees_a", "bend-0", 0), ("lift", "sees_b", "bend-0", 0)}
+    found = results_of(CONFIG, values(GOOD, failed), SEEING)
+    assert found.failed == 2
+    page = render_study(found)
+    assert "2 failed" in page and "lens &lt;cap&gt; on" in page and "lens <cap>" not in page
+
+
+def test_the_same_values_give_the_same_page(good):
+    page = render_study(good)
+    assert page == render_study(results_of(CONFIG, values(GOOD), SEEING))
+    for text in (
+        "Noise ceiling",
+        "What the scenes expose",
+        "Pairs of policies",
+        "No rollout ends differently",
+        "none failed",
+    ):
+        assert text in page, text
