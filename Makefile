@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUT ?= runs
 
 # With bytecode, whatever the environment says: else each of the many processes that tests start compiles all modules.
-TESTS := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile
+TESTS := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-slow check format docs dist bench bench-serving gpu-parity gpu-bench clean
 

@@ -1,8 +1,14 @@
 import gc
 import os
+from collections import Counter
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# Property tests draw the same examples in every run; --hypothesis-profile=default draws new ones.
+settings.register_profile("repeatable", derandomize=True)
+settings.load_profile("repeatable")
 
 # Tests compare bytes of frames: "auto" is the CPU, on a machine with a GPU too.
 os.environ.setdefault("NUREC_SIM_DEVICE", "cpu")
@@ -15,6 +21,32 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     # Workers are told a terminal's width, which they have not got.
     os.environ.pop("COLUMNS", None)
+
+
+TESTS = Path(__file__).parent
+BEGIN = (
+    "render/test_render_parity.py",
+    "world/test_world_write.py",
+    "scene/test_scene_validate.py",
+    "world/test_world_plan.py",
+    "render/test_render_gradients.py",
+    "logs/test_logs_checks.py",
+    "logs/test_logs_faults.py",
+    "reconstruct/test_reconstruct.py",
+    "world/test_world_sense.py",
+    "world/test_world_lens.py",
+    "reconstruct/test_optimize.py",
+)
+"""Files that workers begin with, in this order. While one of them compiles the kernels of a room, the other gets files
+that need none; else both would compile the same ones, where none are on disk yet."""
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items) -> None:
+    """What takes long comes first, so that no worker is left with it alone: ``BEGIN``, then files of many tests."""
+    sizes = Counter(item.path for item in items)
+    place = {TESTS / name: k for k, name in enumerate(BEGIN)}
+    items.sort(key=lambda item: (place.get(item.path, len(BEGIN)), 0 if item.path in place else -sizes[item.path]))
 
 
 def pytest_collection_finish() -> None:

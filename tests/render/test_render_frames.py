@@ -77,7 +77,7 @@ def test_lidar_threshold_range_and_unknown_intensity():
 
 
 def test_lidar_reports_the_surface_and_no_mean_of_two():
-    lidar = sensors.lidar_model("VLP-16", np.eye(4), columns=360)
+    lidar = sensors.lidar_model("VLP-16", np.eye(4), columns=180)
     veil = dataclasses.replace(wall(6.0), opacity=np.full(len(wall()), 0.12, np.float32))
     both = scene(Gaussians.concatenate([veil, wall(12.0)]))
     for frame in (CpuRenderer(both).render_lidar(request(lidar)), spec.render_lidar(both, request(lidar))):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from render_scenes import START_US, request, scene
+from repetition import slow_after
 
 from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.lift import surfaces
@@ -54,7 +55,7 @@ def plane(request):
 
 
 @pytest.mark.parametrize("device", ["HDL-64", "PANDAR128"])
-@pytest.mark.parametrize("thick_m", [0.001, 0.003, 0.005])
+@pytest.mark.parametrize("thick_m", slow_after(2, [0.001, 0.005, 0.003]))
 def test_ranges_on_flat_ground(plane, thick_m, device):
     scale = plane.scale_m.copy()
     scale[:, 2] = thick_m

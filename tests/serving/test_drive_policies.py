@@ -5,7 +5,6 @@ import threading
 import time
 from dataclasses import replace
 
-import grpc
 import numpy as np
 import pytest
 from driving_calls import (
@@ -22,10 +21,10 @@ from driving_calls import (
     wait_until,
     xy_of,
 )
+from grpc import StatusCode as Code
 
 from nurec_sim.types import Plan
 
-Code = grpc.StatusCode
 NOTHING = np.zeros((0, 3))
 
 
@@ -129,17 +128,24 @@ def slow():
     Slow.gate.set()
 
 
+def miss_deadline(stub, slow, session="s"):
+    """Calls whose time is up before their plan is made, until one of them has been begun."""
+    begun = slow.planning
+    while slow.planning == begun:
+        assert status(stub.drive, drive_message(session=session), timeout=0.3)[0] is Code.DEADLINE_EXCEEDED
+
+
 def test_a_slow_policy_misses_its_deadline_holds_up_nobody_and_goes_on(slow):
     with driver(slow) as stub:
         ready(stub)
         ready(stub, "other")
         began = time.monotonic()
-        assert status(stub.drive, drive_message(), timeout=0.3)[0] is Code.DEADLINE_EXCEEDED
+        miss_deadline(stub, slow)
         assert time.monotonic() - began < 5
         stub.submit_egomotion_observation(ego_message(), timeout=5)
         # One call that was cancelled before its turn is never planned; the thread of the session is still busy.
         assert status(stub.drive, drive_message(), timeout=0.3)[0] is Code.DEADLINE_EXCEEDED
-        assert status(stub.drive, drive_message(session="other"), timeout=0.3)[0] is Code.DEADLINE_EXCEEDED
+        miss_deadline(stub, slow, "other")
         assert slow.planning == 2
         slow.gate.set()
         assert len(stub.drive(drive_message(), timeout=10).trajectory.poses) == 51
@@ -158,9 +164,9 @@ def test_a_policy_may_think_only_so_long(slow):
 def test_a_policy_that_hangs_does_not_keep_the_server(slow):
     with driver(slow) as stub:
         ready(stub)
-        assert status(stub.drive, drive_message(), timeout=0.2)[0] is Code.DEADLINE_EXCEEDED
+        miss_deadline(stub, slow)
         began = time.monotonic()
-    assert time.monotonic() - began < 3
+    assert time.monotonic() - began < 10  # the policy would hang for longer
     slow.gate.set()
     wait_until(lambda: not [t for t in threading.enumerate() if t.name.startswith("policy-")])
 

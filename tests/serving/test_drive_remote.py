@@ -11,7 +11,7 @@ import grpc
 import numpy as np
 import pytest
 import worlds
-from driving_calls import TIMES, Steady, answering, driver, like_alpasim
+from driving_calls import TIMES, Steady, answering, driver, like_alpasim, wait_until
 from repetition import slow_after
 from serving_world import scene
 
@@ -151,7 +151,7 @@ def test_many_rollouts_at_once_do_not_mix():
 
 
 def test_a_driver_that_forgot_the_session_refuses():
-    with driver(Steady, idle_s=0.1) as stub, RemotePolicy(stub.address) as remote:
+    with driver(Steady, idle_s=0.5) as stub, RemotePolicy(stub.address) as remote:
         world = worlds.straight_road()
 
         class Pausing:
@@ -160,7 +160,8 @@ def test_a_driver_that_forgot_the_session_refuses():
 
             def plan(self, observation):
                 plan = remote.plan(observation)
-                threading.Event().wait(0.4)
+                # The thread of a session ends with it.
+                wait_until(lambda: not [t for t in threading.enumerate() if t.name.startswith("policy-")])
                 return plan
 
         found = rollout(Pausing(), world)

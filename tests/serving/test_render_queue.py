@@ -83,7 +83,7 @@ def test_kernels_stop_soon_after_their_client_has_left(rests):
         await until(lambda: ended)
         return ended[0] - left
 
-    assert run(1, main) < 1.0  # a kernel's call is over in milliseconds; the machine may be busy
+    assert run(1, main) < 10  # a kernel's call is over in milliseconds, the frame in minutes
 
 
 def test_a_deadline_ends_work_that_rests():

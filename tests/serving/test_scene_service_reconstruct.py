@@ -170,8 +170,9 @@ def test_when_the_client_leaves_the_work_ends(client, clip, method, store):
 
 
 def test_when_its_deadline_passes_the_work_ends(client, clip, method, store):
-    with pytest.raises(Exception, match="DEADLINE_EXCEEDED"):
-        client.reconstruct(path=str(clip), timeout_s=0.5)
+    while not method.begun:  # a busy machine may not begin it in time
+        with pytest.raises(Exception, match="DEADLINE_EXCEEDED"):
+            client.reconstruct(path=str(clip), timeout_s=0.5)
     wait_until(lambda: method.ended)
     wait_until(lambda: store.ids == ("clipgt-street", "clipgt-stored"))
 

@@ -5,10 +5,11 @@ import resource
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import grpc
 import pytest
 from grpc import StatusCode as Code
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from serving_calls import Gated, Stub, camera_message, refusal, wait_until
+from serving_calls import Gated, Stub, camera_message, wait_until
 from serving_metrics import metric
 from serving_world import camera_request, scene
 from slow_reader import SlowReader
@@ -27,12 +28,13 @@ FRAME_BYTES = 320 * 180 * 3
 
 @contextlib.contextmanager
 def gated_server():
-    """A server whose renderer waits to be let through, raw calls to it, and the renderer."""
+    """A server whose renderer waits to be let through, raw calls to it, the renderer, and where its metrics are."""
     gated, options = Gated(scene()), ServiceOptions(render_workers=2)
     store = SceneStore([scene()], make_renderer=lambda _: gated)
-    with SensorServer(store, port=0, options=options) as address, Stub(address) as stub:
+    server = SensorServer(store, port=0, options=options, server_options=ServerOptions(metrics_port=0))
+    with server as address, Stub(address) as stub:
         try:
-            yield stub, gated
+            yield stub, gated, server.metrics_address
         finally:
             gated.gate.set()
 
@@ -153,18 +155,23 @@ def test_a_thousand_connections_are_answered_and_one_more_is_served():
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
+def outcome(procedure, message):
+    """The code of a call, and what it says if it is refused."""
+    try:
+        procedure(message, timeout=30)
+    except grpc.RpcError as error:
+        return error.code(), error.details()
+    return Code.OK, ""
+
+
 def test_calls_in_progress_have_a_limit():
     gated = Gated(scene())
     store = SceneStore([scene()], make_renderer=lambda _: gated)
     server = SensorServer(store, port=0, server_options=ServerOptions(max_calls=3))
     with server as address, Stub(address) as stub:
         held = [stub.render_rgb.future(camera_message(), timeout=60) for _ in range(3)]
-        wait_until(lambda: gated.begun)
-        time.sleep(0.2)  # until all three are inside
-        assert refusal(stub.get_version, common.Empty()) == (
-            Code.RESOURCE_EXHAUSTED,
-            "3 calls are in progress; try again later",
-        )
+        full = (Code.RESOURCE_EXHAUSTED, "3 calls are in progress; try again later")
+        wait_until(lambda: outcome(stub.get_version, common.Empty()) == full)  # all three are inside
         gated.gate.set()
         assert all(call.result().image_bytes for call in held)
         assert stub.get_version(common.Empty(), timeout=10).version_id
@@ -174,14 +181,14 @@ def test_calls_in_progress_have_a_limit():
 
 
 def test_the_rest_of_a_batch_is_not_rendered_for_a_client_that_left():
-    with gated_server() as (stub, gated):
+    with gated_server() as (stub, gated, metrics):
         batch = sensorsim.BatchRGBRenderRequest()
         for k in range(8):
             batch.items.add(camera_name=str(k), request=camera_message(camera_request(t_us=5_100_000 + k)))
         call = stub.batch_render_rgb.future(batch)
         wait_until(lambda: gated.begun)
         call.cancel()
-        time.sleep(0.3)
+        wait_until(lambda: metric(metrics, "requests_in_progress") == 0)
         before = len(gated.begun)
         gated.gate.set()
         assert stub.render_rgb(camera_message(camera_request(t_us=6_000_000)), timeout=30).image_bytes
@@ -189,11 +196,12 @@ def test_the_rest_of_a_batch_is_not_rendered_for_a_client_that_left():
 
 
 def test_a_deadline_shorter_than_the_render_ends_the_call_and_nothing_more_is_begun_for_it():
-    with gated_server() as (stub, gated):
+    with gated_server() as (stub, gated, metrics):
         begin = time.monotonic()
         calls = [stub.render_rgb.future(camera_message(), timeout=0.3) for _ in range(6)]
         assert {call.exception().code() for call in calls} == {Code.DEADLINE_EXCEEDED}
         assert time.monotonic() - begin < 10
+        wait_until(lambda: metric(metrics, "requests_in_progress") == 0)
         begun = len(gated.begun)
         gated.gate.set()
         assert stub.render_rgb(camera_message(), timeout=30).image_bytes

@@ -39,6 +39,13 @@ def long_batch():
     return batch
 
 
+def begun_batch(stub):
+    """A long batch that the server has begun: it reads a connection's calls in the order in which they were sent."""
+    batch = stub.batch_render_rgb.future(long_batch(), timeout=60)
+    stub.get_version(common.Empty(), timeout=60)
+    return batch
+
+
 def test_a_signal_under_load_lets_calls_finish_and_takes_no_new_ones(archive):
     outcomes, begun = [], threading.Event()
 
@@ -46,7 +53,7 @@ def test_a_signal_under_load_lets_calls_finish_and_takes_no_new_ones(archive):
         with Stub(address) as stub:
             for k in range(10_000):
                 try:
-                    reply = stub.render_rgb(camera_message(camera_request(t_us=5_100_000 + k % 50)), timeout=60)
+                    reply = stub.render_rgb(camera_message(camera_request(t_us=5_100_000 + k % 50)), timeout=300)
                     outcomes.append(len(reply.image_bytes))
                 except grpc.RpcError as error:
                     outcomes.append(error.code())
@@ -57,9 +64,8 @@ def test_a_signal_under_load_lets_calls_finish_and_takes_no_new_ones(archive):
         clients = [threading.Thread(target=keep_asking, args=(address,)) for _ in range(8)]
         for client in clients:
             client.start()
-        assert begun.wait(60)
-        batch = stub.batch_render_rgb.future(long_batch(), timeout=60)
-        time.sleep(0.3)
+        assert begun.wait(300)  # the first frame of all may have to wait for kernels to be compiled
+        batch = begun_batch(stub)
         process.send_signal(signal.SIGTERM)
         reply = batch.result(timeout=60)
         assert len(reply.items) == BATCH and all(item.success for item in reply.items)
@@ -76,9 +82,7 @@ def test_a_second_signal_ends_the_process_at_once(archive):
     words = ("serve", archive, "--port", "0", "--grace", "60", "--health-port", "0", "--log-level", "info")
     with serving(*words) as (process, address), Stub(address) as stub:
         health = process.stderr.readline().rsplit(" ", 1)[1].strip()
-        stub.get_version(common.Empty(), timeout=60)
-        batch = stub.batch_render_rgb.future(long_batch(), timeout=60)
-        time.sleep(0.3)
+        batch = begun_batch(stub)
         process.send_signal(signal.SIGTERM)
         with grpc.insecure_channel(health) as channel:
             check = health_pb2_grpc.HealthStub(channel).Check
@@ -87,7 +91,7 @@ def test_a_second_signal_ends_the_process_at_once(archive):
         process.send_signal(signal.SIGINT)
         begin = time.monotonic()
         assert ended(process)[0] == -signal.SIGINT
-        assert time.monotonic() - begin < 1.5
+        assert time.monotonic() - begin < 10  # of the 60 s of grace
         assert batch.exception(timeout=10).code() == Code.UNAVAILABLE
 
 
