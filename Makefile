@@ -7,7 +7,7 @@ OUT ?= runs
 # With bytecode, whatever the environment says: else each of the many processes that tests start compiles all modules.
 TESTS := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow check format docs dist bench bench-serving gpu-parity gpu-bench clean
+.PHONY: demo test test-slow check format docs docs-check dist bench bench-serving gpu-parity gpu-bench clean
 
 $(VENV)/.installed: pyproject.toml setup.py constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(f"nurec_sim needs Python 3.11 or newer; $(PYTHON) is {sys.version.split()[0]}. Try: make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
@@ -37,6 +37,9 @@ format: $(VENV)/.installed ## rewrite the code in house style
 docs: $(VENV)/.installed-docs ## these pages and an API reference as a site with search, in build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "build/site: python3 -m http.server --directory build/site"
+
+docs-check: $(VENV)/.installed-docs ## run the notebooks, and the commands in the tutorial
+	$(BIN)/python docs/check.py
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[docs]'

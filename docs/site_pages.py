@@ -1,4 +1,4 @@
-"""Pages of the site that do not lie in docs/: some of the repository's other pages, and an API reference.
+"""Pages of the site that do not lie in docs/: other pages of the repository, the notebooks, and an API reference.
 
 A hook of mkdocs. The reference has a page for each public part of ``nurec_sim``, the names of its ``__all__``, and for
 each package and module below it that has an ``__all__`` of its own. A page shows the names listed there, with their
@@ -7,11 +7,13 @@ docstrings.
 
 import ast
 import importlib
+import json
 import os
 import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -24,6 +26,7 @@ PAGES = {
     "tests/README.md": "testing.md",
 }
 """Pages of the repository outside docs/, and what they are called on the site."""
+NOTEBOOKS = sorted((REPO / "docs" / "notebooks").glob("*.ipynb"))
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -39,9 +42,43 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the pages that lie elsewhere and those of the reference."""
     for source, target in PAGES.items():
         files.append(File.generated(config, target, content=from_docs(REPO / source)))
+    for path in NOTEBOOKS:
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=from_notebook(path)))
     for name, path in public_modules().items():
         files.append(File.generated(config, _page(name), content=reference(name, path)))
     return files
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Leads links to notebooks to their pages."""
+    return re.sub(r"(\]\([\w./-]+)\.ipynb(?=[)#])", r"\1.md", markdown)
+
+
+def from_notebook(path: Path) -> str:
+    """The page of a notebook: its texts, its code, and what the code gave when it was last executed."""
+    parts = []
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        parts.append(f"```python\n{source}\n```")
+        parts += [shown for output in cell["outputs"] if (shown := _shown(output))]
+    return "\n\n".join(parts) + "\n"
+
+
+def _shown(output: dict[str, Any]) -> str:
+    """One output of a cell: HTML and pictures as they are, else its text."""
+    data = output.get("data", {"text/plain": output.get("text", "")} if output.get("name") == "stdout" else {})
+    for kind in ("image/jpeg", "image/png"):
+        if kind in data:
+            code = "".join(data[kind]).strip()
+            return f'<img src="data:{kind};base64,{code}" alt="">'
+    if "text/html" in data:
+        # Markdown ends a block of HTML at an empty line.
+        return re.sub(r"\n\s*\n", "\n", "".join(data["text/html"]))
+    text = "".join(data.get("text/plain", ""))
+    return f"```text\n{text.rstrip()}\n```" if text else ""
 
 
 def from_docs(page: Path) -> str:

@@ -93,9 +93,9 @@ def sweep_png(xyz_m: Float[np.ndarray, "n 3"]) -> bytes:
     return png(from_above(xyz_m, colours(xyz_m[:, 2], low, high), [-SWEEP_M, -SWEEP_M], [SWEEP_M, SWEEP_M]))
 
 
-def image_tag(data: bytes, kind: str = "jpeg") -> str:
-    """An image inside HTML."""
-    return f'<img src="data:image/{kind};base64,{base64.b64encode(data).decode()}" style="margin:2px">'
+def image_tag(data: bytes) -> str:
+    """A JPEG inside HTML."""
+    return f'<img src="data:image/jpeg;base64,{base64.b64encode(data).decode()}" style="margin:2px">'
 
 
 def table(title: str, rows: Sequence[Sequence[object]], heading: Sequence[str] = ()) -> str:

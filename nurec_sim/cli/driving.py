@@ -27,7 +27,7 @@ from nurec_sim.cli.console import (
 )
 from nurec_sim.cli.scenes import refinement
 from nurec_sim.errors import NurecSimError
-from nurec_sim.files.new_files import check_writable
+from nurec_sim.files.new_files import check_writable, write_file
 
 
 @app.command
@@ -88,6 +88,7 @@ def demo(
     *,
     out_path: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs"),
     resume: Path | None = None,
+    save_log: Path | None = None,
     cache: Path | None = None,
     device: str = "auto",
     refine: float | None = None,
@@ -95,13 +96,34 @@ def demo(
     """Run the whole chain on the bundled demo log: about five minutes on two cores.
 
     Args:
+        save_log: only write the demo log to this .zip file, to try other commands on it.
         out_path: parent folder of run folders.
         resume: resume this run folder; finished rollouts are kept.
         cache: where the reconstructed scene is kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
         device: render device: auto (a GPU if available), cpu, cuda or cuda:N.
         refine: time budget in seconds for optimising the reconstruction on the log's images and sweeps.
     """
+    if save_log is not None:
+        return _save_demo_log(save_log)
     drive((), "demo", (), (), out_path, resume, None, cache, True, device=device, refine=refine)
+
+
+def _save_demo_log(path: Path) -> None:
+    """Copy the bundled log to a file.
+
+    Raises:
+        NurecSimError: the file exists, does not end in .zip, or cannot be written.
+    """
+    from nurec_sim import sim
+
+    if path.suffix.lower() != ".zip":
+        raise NurecSimError(f"--save-log writes a .zip file, got {str(path)!r}")
+    if path.exists():
+        raise NurecSimError(f"{path} exists; give --save-log another name")
+    scenario_path = sim.scenario_file("demo")
+    log = scenario_path.parent / str(sim.load_scenario(scenario_path).clip)
+    write_file(path, log.read_bytes())
+    out.print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
 
 
 @app.command

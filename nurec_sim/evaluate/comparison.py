@@ -25,6 +25,8 @@ from nurec_sim.types import CameraFrame, Clip, GaussianScene, Sense
 WIDTH_PX = 480
 """Width of one image in a row of the video and of the worst frames."""
 WORST = 4
+SHOWN_PX = 800
+"""Width of a row in a notebook."""
 FRAMES_PER_S = 5
 BAR_PX = 20
 
@@ -49,15 +51,18 @@ class Comparison:
     worst: Sequence[tuple[str, Picture]]
     video: bytes
 
+    def __repr__(self) -> str:
+        return f"Comparison({', '.join(self.figures)} on {self.clip!r}, video of {len(self.video) / 1e6:.1f} MB)"
+
     def _repr_html_(self) -> str:
-        """All figures side by side and the worst frames, for notebooks."""
+        """All figures side by side and the two worst frames, for notebooks."""
         rows = [
             (group, name, *("" if cell is None else cell.text for cell in cells))
             for group, name, cells in side_by_side(self.figures)
         ]
         pictures = (
-            display.table(caption, []) + display.image_tag(display.jpeg(display.thumbnail(picture, 960)))
-            for caption, picture in self.worst
+            display.table(caption, []) + display.image_tag(display.jpeg(display.thumbnail(picture, SHOWN_PX), 80))
+            for caption, picture in self.worst[:2]
         )
         return display.table(f"log {self.clip}", rows, ("", "figure", *self.figures)) + "".join(pictures)
 

@@ -57,6 +57,11 @@ class CameraFrame:
     label: UInt8[np.ndarray, "h w"] | None = None
     normal: Float32[np.ndarray, "h w 3"] | None = None
 
+    def __repr__(self) -> str:
+        planes = [name for name in ("rgb", "depth_m", "alpha", "label", "normal") if getattr(self, name) is not None]
+        size = f"{self.camera.width_px}x{self.camera.height_px}"
+        return f"CameraFrame({self.camera.id!r}, {size}, {self.start_us} to {self.end_us} us: {', '.join(planes)})"
+
     def _repr_jpeg_(self) -> bytes:
         """The image, for notebooks."""
         return display.jpeg(self.rgb)
@@ -100,6 +105,9 @@ class LidarFrame:
     range_m: Float32[np.ndarray, " n"]
     intensity: Float32[np.ndarray, " n"]
     beam: Int32[np.ndarray, " n"]
+
+    def __repr__(self) -> str:
+        return f"LidarFrame({self.lidar.id!r}, {self.start_us} to {self.end_us} us: {len(self.beam):,} returns)"
 
     def _repr_png_(self) -> bytes:
         """The points from above, for notebooks."""

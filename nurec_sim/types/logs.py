@@ -60,6 +60,9 @@ class Sweep:
         """Points in the world."""
         return geometry.transform_points(self.world_from_lidar, self.xyz_m)
 
+    def __repr__(self) -> str:
+        return f"Sweep({self.start_us} to {self.end_us} us, moved to {self.t_us} us: {len(self.xyz_m):,} points)"
+
     def _repr_png_(self) -> bytes:
         """The points from above, for notebooks."""
         return display.sweep_png(self.xyz_m)

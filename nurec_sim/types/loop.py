@@ -187,6 +187,10 @@ class Series:
     valid: np.ndarray
     reduce: Reduce
 
+    def __repr__(self) -> str:
+        valid = f"{np.count_nonzero(self.valid)} of {len(self.valid)} valid"
+        return f"Series({self.name!r}, {self.reduce.value} {self.value():.4g} {self.unit}, {valid})"
+
     def _repr_html_(self) -> str:
         """The reduced value and the valid values over time, for notebooks."""
         valid = np.asarray(self.valid, bool)

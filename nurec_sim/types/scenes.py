@@ -239,5 +239,5 @@ class GaussianScene:
         # Roofs and crowns of trees would hide the street.
         shown = (self.static.opacity > 0.3) & (mean_m[:, 2] < path_m[:, 2].max() + SHOWN_ABOVE_M)
         rgb = np.rint(255 * np.clip(self.static.rgb[shown], 0, 1)).astype(np.uint8)
-        picture = display.png(display.from_above(mean_m[shown], rgb, low.tolist(), high.tolist()))
-        return display.table(title, [(fact.strip(),) for fact in facts]) + display.image_tag(picture, "png")
+        picture = display.jpeg(display.from_above(mean_m[shown], rgb, low.tolist(), high.tolist()))
+        return display.table(title, [(fact.strip(),) for fact in facts]) + display.image_tag(picture)

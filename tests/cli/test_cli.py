@@ -12,6 +12,8 @@ import nurec_sim
 import nurec_sim.evaluate
 import nurec_sim.render
 from nurec_sim import cli
+from nurec_sim.cli import driving
+from nurec_sim.errors import NurecSimError
 from nurec_sim.serving.driver import RemotePolicy
 
 REPO = Path(__file__).parents[2]
@@ -117,10 +119,27 @@ def test_a_missing_clip_is_one_clear_line(tmp_path: Path) -> None:
     assert "Traceback" not in result.stderr
 
 
-def test_readme_uses_only_verbs_that_exist() -> None:
-    used = set(re.findall(r"^nurec-sim ([\w-]+)", (REPO / "README.md").read_text(), flags=re.MULTILINE))
+@pytest.mark.parametrize("page", ["README.md", "docs/commands.md", "docs/tutorial.md"])
+def test_pages_use_only_verbs_that_exist(page: str) -> None:
+    used = set(re.findall(r"^nurec-sim ([\w-]+)", (REPO / page).read_text(), flags=re.MULTILINE))
     assert used
     assert used <= set(VERBS)
+
+
+def test_the_demo_log_can_be_had_as_a_file(tmp_path: Path) -> None:
+    result = run_cli("demo", "--save-log", str(tmp_path / "log.zip"))
+    assert result.returncode == 0 and "wrote" in result.stdout
+    assert (tmp_path / "log.zip").read_bytes() == (REPO / "scenarios" / "demo_clip.zip").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("log.tar", "--save-log writes a .zip file, got"), ("there.zip", "there.zip exists; give")]
+)
+def test_a_demo_log_is_not_written_elsewhere(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / "there.zip").write_text("mine")
+    with pytest.raises(NurecSimError, match=text):
+        driving.demo(save_log=tmp_path / name)
+    assert (tmp_path / "there.zip").read_text() == "mine"
 
 
 @pytest.mark.parametrize(

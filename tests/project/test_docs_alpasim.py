@@ -85,7 +85,7 @@ def test_our_commands_have_these_flags(command, capsys):
     assert {word.split("=")[0] for word in command[2:] if word.startswith("--")} <= known
 
 
-@pytest.mark.parametrize("path", [DOCS / "alpasim.md", DOCS / "egodriver.md", DOCS.parent / "README.md"], ids=str)
+@pytest.mark.parametrize("path", [DOCS / "alpasim.md", DOCS / "egodriver.md", DOCS / "commands.md"], ids=str)
 def test_policies_that_are_served_to_alpasim_can_drive_it(path):
     served = re.findall(r"^nurec-sim drive-grpc (\w+)", path.read_text(), re.MULTILINE)
     assert served

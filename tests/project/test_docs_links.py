@@ -1,6 +1,7 @@
 """The pages: every one is in the site's navigation, and every link leads to a file and a heading that are there."""
 
 import ast
+import json
 import re
 from pathlib import Path
 
@@ -12,7 +13,17 @@ SITE = ast.parse((REPO / "docs" / "site_pages.py").read_text()).body
 (OUTSIDE,) = [ast.literal_eval(node.value) for node in SITE if ast.unparse(node).startswith("PAGES =")]
 """Pages outside docs/, and their names on the site."""
 IN_DOCS = sorted((REPO / "docs").glob("*.md"))
-PAGES = [*IN_DOCS, *(REPO / name for name in OUTSIDE)]
+NOTEBOOKS = sorted((REPO / "docs" / "notebooks").glob("*.ipynb"))
+PAGES = [*IN_DOCS, *(REPO / name for name in OUTSIDE), *NOTEBOOKS]
+
+
+def text_of(page):
+    """A page, or the texts of a notebook."""
+    if page.suffix != ".ipynb":
+        return page.read_text()
+    return "\n\n".join(
+        "".join(cell["source"]) for cell in json.loads(page.read_text())["cells"] if cell["cell_type"] == "markdown"
+    )
 
 
 def outside_code(text):
@@ -22,14 +33,14 @@ def outside_code(text):
 
 def anchors(page):
     """What a link may name after ``#``: headings as mkdocs and GitHub turn them into ids."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"^```.*?^```", "", text_of(page), flags=re.DOTALL | re.MULTILINE)
     headings = re.findall(r"^#+ (.*)", text, flags=re.MULTILINE)
     return {re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower()) for heading in headings}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPO)))
 def test_links_lead_somewhere(page):
-    links = re.findall(r"\]\(([^)\s]+)\)", outside_code(page.read_text()))
+    links = re.findall(r"\]\(([^)\s]+)\)", outside_code(text_of(page)))
     for link in links:
         path, _, anchor = link.partition("#")
         if path.startswith(("http://", "https://")):
@@ -50,9 +61,22 @@ def named_in(nav):
 
 def test_every_page_is_once_in_the_navigation():
     site = yaml.safe_load((REPO / "mkdocs.yml").read_text())
-    assert sorted(named_in(site["nav"])) == sorted([*OUTSIDE.values(), *(page.name for page in IN_DOCS)])
+    assert sorted(named_in(site["nav"])) == sorted(
+        [*OUTSIDE.values(), *(page.name for page in IN_DOCS), *(f"notebooks/{page.stem}.md" for page in NOTEBOOKS)]
+    )
 
 
-def test_the_readme_leads_to_every_page():
-    linked = set(re.findall(r"\]\(docs/([a-z0-9_]+\.md)\)", (REPO / "README.md").read_text()))
-    assert linked == {page.name for page in IN_DOCS}
+def links_of(page):
+    """Files that a page links to."""
+    found = re.findall(r"\]\(([^)\s#]+)[^)\s]*\)", outside_code(text_of(page)))
+    return {(page.parent / link).resolve() for link in found if "://" not in link}
+
+
+def test_every_page_can_be_reached_from_the_readme():
+    """Without the site's navigation, as people read on a code host."""
+    seen, ahead = set(), [REPO / "README.md"]
+    while ahead:
+        page = ahead.pop()
+        seen.add(page)
+        ahead += [each for each in links_of(page) if each in PAGES and each not in seen]
+    assert not set(PAGES) - seen
