@@ -14,7 +14,7 @@ from nurec_sim.runs import folder as layout
 from nurec_sim.runs.top_view import record_lidar, record_log_lidar
 from nurec_sim.runs.video import WIDTH_PX, Picture, record_log, record_video
 from nurec_sim.sim import Scenario
-from nurec_sim.sim.actors import Actors
+from nurec_sim.sim.actors import edited_actors
 from nurec_sim.sim.policy_sensors import find_camera, find_lidar
 from nurec_sim.sim.rollout import STATE_US, timeline
 from nurec_sim.types import CameraFrame, Clip, GaussianScene, LidarFrame, Needs, Rollout, Sense, SensorFrame
@@ -66,7 +66,10 @@ class Recorder:
             progress: called with the fraction done.
         """
         try:
-            overrides = Actors(self._scene.tracks, self._scenario.actors).overrides
+            scene, start_us = self._scene, timeline(self._scenario, self._scene).start_us
+            overrides = edited_actors(
+                self._scenario, scene.id, scene.ego, scene.tracks, start_us, rollout.seed
+            ).overrides
             with writing(folder / layout.VIDEO):
                 record_video(
                     rollout, sense, self._camera, folder / layout.VIDEO, grid=self._grid, overrides=overrides,

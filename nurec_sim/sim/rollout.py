@@ -20,7 +20,7 @@ import numpy as np
 
 from nurec_sim import geometry
 from nurec_sim.errors import PlanError, PolicyError, ScenarioError
-from nurec_sim.sim.actors import Actors
+from nurec_sim.sim.actors import Actors, edited_actors
 from nurec_sim.sim.control import CONTROLLERS, PlannedPath
 from nurec_sim.sim.policy_host import PLAN_TIMEOUT_S, PolicyHost, described
 from nurec_sim.sim.policy_sensors import SceneFacts, SensorSuite
@@ -197,7 +197,9 @@ class _Drive:
         """Warm-up, then closed loop to the end of the scenario."""
         try:
             times = timeline(self.scenario, self.facts)
-            self.actors = Actors(self.facts.tracks, self.scenario.actors)
+            self.actors = edited_actors(
+                self.scenario, self.facts.id, self.facts.ego, self.facts.tracks, times.start_us, self.seed
+            )
         except ScenarioError as error:
             self.states.append(self.logged_state(self.facts.ego.start_us))
             raise _Failure("scenario_error", str(error)) from None

@@ -33,11 +33,17 @@ class _Strict(BaseModel):
 
 
 class Perturbation(_Strict):
-    """Standard deviations of the initial ego state, sampled once per scene and seed for all policies; default 0."""
+    """Standard deviations, sampled once per scene and seed for all policies; default 0.
+
+    The first three are of the initial ego state. ``actor_delay_s`` and ``actor_along_m`` are of every controllable
+    actor: how much later it drives its recorded path, and how far ahead of its recorded place along its own axis.
+    """
 
     lateral_m: float = Field(0.0, ge=0, le=3)
     yaw_deg: float = Field(0.0, ge=0, le=30)
     speed_fraction: float = Field(0.0, ge=0, le=0.5)
+    actor_delay_s: float = Field(0.0, ge=0, le=5)
+    actor_along_m: float = Field(0.0, ge=0, le=10)
 
 
 class SensorSettings(_Strict):
@@ -53,19 +59,28 @@ class SensorSettings(_Strict):
     interval_s: Seconds | None = Field(None, ge=STATE_S, le=2)
 
 
+class Brake(_Strict):
+    """An actor brakes on its recorded path, ``at_s`` after the start of the rollout, until it stands."""
+
+    at_s: float = Field(ge=0, le=MAX_DURATION_S)
+    decel_mps2: float = Field(gt=0, le=12)
+
+
 class ActorEdit(_Strict):
-    """Edits a recorded actor: shifted along its own axes, delayed, or hidden."""
+    """Edits a recorded actor: shifted along its own axes, delayed, braked, or hidden."""
 
     shift_m: tuple[float, float] = (0.0, 0.0)
     delay_s: float = Field(0.0, ge=-20, le=20)
     hide: bool = False
+    brake: Brake | None = None
 
 
 class Scenario(_Strict):
     """One scenario. Every key except ``name`` has a default; durations are multiples of 0.1 s.
 
     ``clip`` is a clip or scene (path or name), optional if given on the command line. ``warm_up_s`` of
-    ``duration_s`` follow the log before the policy drives.
+    ``duration_s`` follow the log before the policy drives. ``actors`` are edits by track id; ``lead`` is the nearest
+    actor ahead in the lane of the recorded drive when it brakes, or at the start if it does not.
     """
 
     name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")
@@ -160,4 +175,5 @@ def _fields_at(location: list[str]) -> list[str]:
     """Allowed keys at a location in the file."""
     parts: dict[str, type[BaseModel]] = {"sensors": SensorSettings, "perturbation": Perturbation, "actors": ActorEdit}
     model = parts.get(location[0], Scenario) if location else Scenario
+    model = Brake if location[-1:] == ["brake"] else model
     return sorted(model.model_fields)

@@ -44,7 +44,11 @@ def test_a_scenario_survives_writing_and_reading():
     [
         ("name: a\nduraton_s: 3\n", "unknown key 'duraton_s'; allowed: actors, clip, controller, duration_s"),
         ("name: a\nsensors: {fps: 3}\n", "unknown key 'sensors.fps'; allowed: image_width_px, interval_s"),
-        ("name: a\nactors: {'7': {jump: 1}}\n", "unknown key 'actors.7.jump'; allowed: delay_s, hide, shift_m"),
+        ("name: a\nactors: {'7': {jump: 1}}\n", "unknown key 'actors.7.jump'; allowed: brake, delay_s, hide, shift_m"),
+        (
+            "name: a\nactors: {lead: {brake: {at: 1}}}\n",
+            "unknown key 'actors.lead.brake.at'; allowed: at_s, decel_mps2",
+        ),
         ("duration_s: 3\n", "key 'name' is missing"),
         ("name: a\nduration_s: 30\n", "key 'duration_s': should be less than or equal to 20, got 30"),
         ("name: a\nduration_s: 1.234\n", "key 'duration_s': must be a multiple of 0.1 s, got 1.234"),
@@ -67,5 +71,5 @@ def test_faults_are_named_with_file_and_key(tmp_path, text, said):
 def test_missing_files_and_names():
     with pytest.raises(ScenarioError, match=r"scenario file 'nowhere.yaml' does not exist"):
         load_scenario("nowhere.yaml")
-    with pytest.raises(ScenarioError, match=r"no scenario named 'nowhere'; have \['demo', 'short'"):
+    with pytest.raises(ScenarioError, match=r"no scenario named 'nowhere'; have \['demo', 'hard_brake', 'short'"):
         load_scenario("nowhere")
