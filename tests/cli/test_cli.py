@@ -36,6 +36,7 @@ VERBS = [
     "run",
     "serve",
     "serve-grpc",
+    "study",
     "train",
     "trim",
     "upload",

@@ -80,3 +80,10 @@ def test_every_page_can_be_reached_from_the_readme():
         seen.add(page)
         ahead += [each for each in links_of(page) if each in PAGES and each not in seen]
     assert not set(PAGES) - seen
+
+
+def test_pictures_are_small_and_shown_somewhere():
+    shown = set().union(*(links_of(page) for page in PAGES))
+    for picture in sorted((REPO / "docs" / "images").iterdir()):
+        assert picture.stat().st_size <= 200_000, f"{picture.name} has more than 200 kB"
+        assert picture in shown, f"no page shows {picture.name}"
