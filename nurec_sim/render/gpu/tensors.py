@@ -6,19 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nurec_sim.render.cpu.pack import (
-    BLOCK,
-    COLOUR,
-    FIELDS,
-    INTENSITY,
-    LOG_OPACITY,
-    MAX_OPACITY,
-    MEAN,
-    MIN_SCALE_M,
-    NEVER_SEEN,
-    QUAT,
-    SCALE,
-)
+from nurec_sim.render.cpu import pack
 from nurec_sim.render.gpu.pipeline import SPHERE, Blocks
 
 EVERYWHERE_M = 1e30
@@ -43,25 +31,25 @@ def blocks_of(
         features: what cameras sum as the colour, and LiDARs as intensity, whether it is known, and drop.
         device: where to.
     """
-    blocks = max(1, -(-len(mean_m) // BLOCK))
+    blocks = max(1, -(-len(mean_m) // pack.BLOCK))
     parts = (mean_m, quat_wxyz, scale_m, features, opacity[:, None])
     given = torch.cat([part.detach().to(device, torch.float32) for part in parts], dim=1)
     length = given[:, 3:7].norm(dim=1)
     sound = torch.isfinite(given).all(dim=1) & (length > 1e-12)
     sound &= (given[:, 7:10] > 0).all(dim=1) & (given[:, 13] >= 1 / 255)
-    # Rows that are never seen still pass through the kernels' arithmetic: finite values, opacity NEVER_SEEN.
+    # Rows that are never seen still pass through the kernels' arithmetic: finite values, opacity pack.NEVER_SEEN.
     given = torch.where(sound[:, None], given, 1.0)
-    columns = torch.zeros((blocks * BLOCK, FIELDS), device=device)
-    columns[:, LOG_OPACITY] = NEVER_SEEN
-    columns[:, [QUAT, SCALE, SCALE + 1, SCALE + 2]] = 1
+    columns = torch.zeros((blocks * pack.BLOCK, pack.FIELDS), device=device)
+    columns[:, pack.LOG_OPACITY] = pack.NEVER_SEEN
+    columns[:, [pack.QUAT, pack.SCALE, pack.SCALE + 1, pack.SCALE + 2]] = 1
     rows = columns[: len(mean_m)]
-    rows[:, MEAN : MEAN + 3] = given[:, 0:3]
-    rows[:, QUAT : QUAT + 4] = given[:, 3:7] / given[:, 3:7].norm(dim=1, keepdim=True)
-    rows[:, SCALE : SCALE + 3] = given[:, 7:10].clamp(min=MIN_SCALE_M)
-    rows[:, COLOUR : COLOUR + 3] = given[:, 10:13]
-    rows[:, INTENSITY : INTENSITY + 3] = given[:, 10:13]
-    rows[:, LOG_OPACITY] = torch.where(sound, given[:, 13].clamp(max=MAX_OPACITY).log(), NEVER_SEEN)
-    fields = columns.reshape(blocks, BLOCK, FIELDS).transpose(1, 2).contiguous()
+    rows[:, pack.MEAN : pack.MEAN + 3] = given[:, 0:3]
+    rows[:, pack.QUAT : pack.QUAT + 4] = given[:, 3:7] / given[:, 3:7].norm(dim=1, keepdim=True)
+    rows[:, pack.SCALE : pack.SCALE + 3] = given[:, 7:10].clamp(min=pack.MIN_SCALE_M)
+    rows[:, pack.COLOUR : pack.COLOUR + 3] = given[:, 10:13]
+    rows[:, pack.INTENSITY : pack.INTENSITY + 3] = given[:, 10:13]
+    rows[:, pack.LOG_OPACITY] = torch.where(sound, given[:, 13].clamp(max=pack.MAX_OPACITY).log(), pack.NEVER_SEEN)
+    fields = columns.reshape(blocks, pack.BLOCK, pack.FIELDS).transpose(1, 2).contiguous()
     spheres = torch.zeros((blocks, SPHERE), device=device)
     # Unbounded, so no block is culled; parent -1: a single level of detail.
     spheres[:, 3] = EVERYWHERE_M

@@ -17,14 +17,13 @@ from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs, ContextImage
 from nurec_sim.reconstruct.feedforward.inputs.crop import (
     Crop,
     crop_camera,
-    crop_exposure,
     crop_image,
     input_size,
     plan_crop,
 )
 from nurec_sim.reconstruct.feedforward.inputs.frames import ChunkWindow
 from nurec_sim.reconstruct.feedforward.inputs.rays import camera_rays, scene_rays
-from nurec_sim.reconstruct.feedforward.inputs.window import span_fractions
+from nurec_sim.reconstruct.feedforward.inputs.window import context_image, span_fractions
 from nurec_sim.training.data.clips import FrameTruth, TrueClip
 from nurec_sim.training.data.sample import TargetView, TrueMaps
 from nurec_sim.types import CameraModel, Label, Matrix4, Shutter
@@ -84,15 +83,13 @@ def target_view(
     """
     original = clip.rig.cameras[camera_id]
     crop = plan_crop(profile, original, input_size(profile, clip.rig.cameras[chunk.camera_ids[0]]))
-    start_us, end_us = (int(t) for t in clip.camera_times_us(camera_id)[frame])
-    t_us, poses = crop_exposure(original, crop, (start_us, end_us), clip.world_from_camera(camera_id, frame))
-    image = ContextImage(crop_camera(original, crop), frame, t_us, (0, 0), poses)
+    image = context_image(clip, crop_camera(original, crop), crop, frame)
     truth = _cropped(clip.truth(camera_id, frame), original, image.camera, crop)
     hidden = ~camera_rays(image.camera)[1]
     return TargetView(
         camera=image.camera,
         camera_idx=chunk.camera_ids.index(camera_id),
-        scene_from_camera=geometry.inverse(chunk.world_from_scene) @ poses,
+        scene_from_camera=geometry.inverse(chunk.world_from_scene) @ image.world_from_camera,
         time=float(span_fractions(np.array([image.centre_t_us], np.int64), window)[0]),
         rgb=crop_image(clip.image(camera_id, frame), crop),
         depth_m=torch.from_numpy(np.where(hidden, 0, truth.depth_m).astype(np.float32)),

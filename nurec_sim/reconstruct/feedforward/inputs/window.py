@@ -116,18 +116,20 @@ def _view(camera: CameraModel, crop: Crop, mask: Bool[np.ndarray, "h w"]) -> _Vi
     return _View(cropped, crop, rays, mask | ~usable, pinhole_field_rad(cropped))
 
 
+def context_image(clip: Clip, camera: CameraModel, crop: Crop, frame: int) -> ContextImage:
+    """A frame of a cropped camera, without target times."""
+    start_us, end_us = (int(t) for t in clip.camera_times_us(camera.id)[frame])
+    poses = clip.world_from_camera(camera.id, frame)
+    t_us, poses = crop_exposure(clip.rig.cameras[camera.id], crop, (start_us, end_us), poses)
+    return ContextImage(camera, frame, t_us, (0, 0), poses)
+
+
 def _context_images(clip: Clip, view: _View, window: ChunkWindow) -> list[ContextImage]:
     """The frames of one camera, each with the times of its neighbours in the chunk as targets.
 
     At the ends of the chunk the gap to the one neighbour counts for both sides; a lone frame looks 0.5 s each way.
     """
-    frames, original = window.frames[view.camera.id], clip.rig.cameras[view.camera.id]
-    exposures = clip.camera_times_us(view.camera.id)
-    images = []
-    for frame in frames:
-        whole = (int(exposures[frame, 0]), int(exposures[frame, 1]))
-        t_us, poses = crop_exposure(original, view.crop, whole, clip.world_from_camera(view.camera.id, frame))
-        images.append(ContextImage(view.camera, frame, t_us, (0, 0), poses))
+    images = [context_image(clip, view.camera, view.crop, frame) for frame in window.frames[view.camera.id]]
     taken = [image.centre_t_us for image in images]
     gaps = [after - before for before, after in itertools.pairwise(taken)] or [LONE_FRAME_GAP_US]
     targets = [(t - gaps[max(k - 1, 0)], t + gaps[min(k, len(gaps) - 1)]) for k, t in enumerate(taken)]

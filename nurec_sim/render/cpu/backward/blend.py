@@ -20,14 +20,11 @@ from nurec_sim.render.cpu.blend.responses import (
     CAMERA,
     LIDAR,
     LIDAR_MIN_TRANSMITTANCE,
-    VALID,
-    VECTORS,
     Bundle,
     Coefficient,
     RayGroup,
-    T,
-    fading,
     hits_of,
+    initial_transmittance,
     run_records,
 )
 from nurec_sim.render.cpu.blend.tiles import AFFINE, C_FEATURE, MOVING, RAYS, TABLE, WIDE
@@ -95,14 +92,14 @@ def _carrying_back(mode: int, output_kind: int, check_near: bool) -> Callable[..
         def step(group: RayGroup, number: ir.Value, coefficient: Coefficient, values: list[Bundle]) -> list[Bundle]:
             # Forwards once more: the same responses, so the same rays are hit and T is what it was.
             """One more record; ``values``: transmittance before it, and G less what has been added so far."""
-            meeting, exponent, hit = hits_of(
+            meeting, alpha, hit = hits_of(
                 v, mode, output_kind, group, coefficient, rays, basis, near if check_near else None
             )
             before = values[0]
             if output_kind == LIDAR:
                 hit = hit & (before > LIDAR_MIN_TRANSMITTANCE)
             meeting.forget_misses(hit)
-            alpha = hit.where(Bundle(fading(exponent.parts)), 0)
+            alpha = hit.where(alpha, 0)
             weight = alpha * before
             after = before - weight
             if output_kind == COLOURS:
@@ -167,8 +164,6 @@ def open_gradients(
     """
     b = v.b
     half = ir.VectorType(F32, WIDE)
-    table = b.icmp_signed("!=", rays, ir.Constant(I64, 0))
-    source = b.select(table, b.add(rays, ir.Constant(I64, 4 * RAYS * VALID)), state)
 
     def cells(base: ir.Value, plane: int, k: int) -> Vector:
         """Vector k of a block, from rows of 8 cells of an image."""
@@ -183,7 +178,7 @@ def open_gradients(
         lanes = ir.Constant(ir.VectorType(I32, LANES), list(range(LANES)))
         return Vector(b, b.shuffle_vector(pieces[0], pieces[1], lanes))
 
-    for k in range(VECTORS):
+    for k, transmittance in enumerate(initial_transmittance(v, state, rays)):
         offset = 4 * LANES * k
         image = [cells(planes, plane, k) for plane in range(IMAGE_PLANES)]
         gradient = [cells(gradients, plane, k) for plane in range(IMAGE_PLANES)]
@@ -192,10 +187,6 @@ def open_gradients(
         total = v.number(0)
         for plane in range(IMAGE_PLANES - 1):
             total = total + image[plane] * gradient[plane]
-        valid = v.load(source, offset)
-        one = b.select(table, valid.value, v.number(1).value)
-        values = [Vector(b, one), total, *gradient]
-        for plane, value in zip(
-            (T, REST, G_ALPHA, *(G_FEATURE + c for c in range(3)), G_DISTANCE, G_HALF), values, strict=True
-        ):
+        # Planes of the state in order; the gradients are in the order of the image's planes.
+        for plane, value in enumerate([transmittance, total, *gradient]):
             v.store(value, state, 4 * RAYS * plane + offset)

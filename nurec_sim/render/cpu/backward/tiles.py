@@ -26,17 +26,14 @@ from nurec_sim.render.cpu.backward.blend import (
     back_table_lidar,
     open_gradients,
 )
-from nurec_sim.render.cpu.blend.draw import RAY_BYTES, aligned, prepare_batch, tile_geometry
-from nurec_sim.render.cpu.blend.responses import CAMERA, LIDAR, RAY_PLANES
+from nurec_sim.render.cpu.blend.draw import RAY_BYTES, aligned, batch_scratch, prepare_batch, tile_geometry
+from nurec_sim.render.cpu.blend.responses import CAMERA, LIDAR
 from nurec_sim.render.cpu.blend.tiles import (
     ACROSS,
     AFFINE,
-    BANDS,
-    BASIS,
     BATCH,
     BLOCKS,
     CAMERA_BATCH,
-    COEFFICIENTS,
     HIGH,
     LIST,
     RAYS,
@@ -123,11 +120,8 @@ def draw_tiles_back(rays, projected, binned, output_kind, tiles, planes, gradien
         gradients: [6,h,w] gradients of ``planes``; 0 where there is no valid ray.
         slots: output, see ``RecordSlots``: all slots of the tiles' records are written.
     """
-    state, turned = aligned(BLOCKS * STATE_PLANES * RAYS), aligned(BLOCKS * RAY_PLANES * RAYS)
-    coefficients = aligned(COEFFICIENTS * BATCH).reshape(COEFFICIENTS, BATCH)
-    basis = np.zeros((BANDS, BASIS), np.float32)
-    sums = aligned(BATCH * SUMS).reshape(BATCH, SUMS)
-    chosen, listed = np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
+    state, sums = aligned(BLOCKS * STATE_PLANES * RAYS), aligned(BATCH * SUMS).reshape(BATCH, SUMS)
+    turned, basis, coefficients, chosen, listed = batch_scratch()
     batch = BATCH if output_kind == LIDAR else CAMERA_BATCH
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
     block_bytes = 4 * STATE_PLANES * RAYS
@@ -135,9 +129,7 @@ def draw_tiles_back(rays, projected, binned, output_kind, tiles, planes, gradien
     records_at, sums_at, lists = projected.records.ctypes.data, sums.ctypes.data, binned.lists
     for index in range(tiles.shape[0]):
         tile = np.int64(tiles[index])
-        row, column, rays_at, basis_at, alive = tile_geometry(
-            rays, tile, turned.reshape(BLOCKS, RAY_PLANES, RAYS), basis
-        )
+        row, column, rays_at, basis_at, alive = tile_geometry(rays, tile, turned, basis)
         for block in range(BLOCKS):
             if (alive >> block) & 1:
                 y, x = row * MACRO + block // ACROSS * HIGH, column * MACRO + block % ACROSS * WIDE

@@ -24,7 +24,6 @@ from nurec_sim.render.cpu.blend.responses import (
     Bundle,
     RayGroup,
     T,
-    fading,
     hits_of,
     still_open,
 )
@@ -77,10 +76,10 @@ def _beaming(mode: int) -> Callable[..., Any]:
                 return v.broadcast(drift, 4 * (row - C_DRIFT))
             return v.broadcast(record, 4 * places.get(row, row))
 
-        meeting, exponent, hit = hits_of(v, mode, LIDAR, group, coefficient, rays, rays, near)
+        meeting, alpha, hit = hits_of(v, mode, LIDAR, group, coefficient, rays, rays, near)
         distance = hit.where(meeting.distance, 0)  # no NaN from a miss
         sums = [group.plane(state, plane) for plane in range(PLANES[LIDAR])]
-        alpha, before = Bundle(fading(exponent.parts)), sums[T]
+        before = sums[T]
         # Beams end one by one, as in ``spec``.
         hit = hit & (before > LIDAR_MIN_TRANSMITTANCE)
         weight = hit.where(alpha * before, 0)

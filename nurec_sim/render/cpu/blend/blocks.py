@@ -15,19 +15,18 @@ from nurec_sim.render.cpu.blend.responses import (
     CAMERA,
     LIDAR,
     NORMALS,
-    VALID,
     VECTORS,
     Bundle,
     Coefficient,
     RayGroup,
     T,
-    fading,
     hits_of,
+    initial_transmittance,
     run_records,
 )
 from nurec_sim.render.cpu.blend.tiles import AFFINE, C_FEATURE, C_NORMAL, C_TAG, MOVING, RAYS, TABLE, WIDE
 from nurec_sim.render.cpu.records import LABEL_BITS
-from nurec_sim.render.cpu.simd import I32, I64, INTS, LANES, Lanes, Vector, spread, vector_kernel
+from nurec_sim.render.cpu.simd import I32, I64, INTS, LANES, Lanes, Vector, vector_kernel
 
 FEATURES = 1
 """The plane of a block's state that follows T: the first feature."""
@@ -71,11 +70,11 @@ def _blending(mode: int, output_kind: int, check_near: bool) -> Callable[..., An
 
         def step(group: RayGroup, number: ir.Value, coefficient: Coefficient, sums: list[Bundle]) -> list[Bundle]:
             """The rays' sums (planes of the block's state) after one more record."""
-            meeting, exponent, hit = hits_of(
+            meeting, alpha, hit = hits_of(
                 v, mode, output_kind, group, coefficient, rays, basis, near if check_near else None
             )
             distance = hit.where(meeting.distance, 0)  # no NaN from a miss
-            alpha, before = Bundle(fading(exponent.parts)), sums[T]
+            before = sums[T]
             # Front to back: a record's weight is its alpha times what the nearer ones have let through. Rays continue
             # until the whole block is opaque, which adds at most 1e-4 to a ray.
             weight = hit.where(alpha * before, 0)
@@ -117,13 +116,8 @@ def open_block(v: Lanes, state: ir.Value, planes: ir.Value, rays: ir.Value) -> N
         rays: address of the block's [RAY_PLANES,32]; 0 where every cell has a ray.
     """
     b = v.b
-    table = b.icmp_signed("!=", rays, ir.Constant(I64, 0))
-    # Without a table any readable address will do: the values are not used.
-    source = b.select(table, b.add(rays, ir.Constant(I64, 4 * RAYS * VALID)), state)
-    for k in range(VECTORS):
-        valid = v.load(source, 4 * LANES * k)
-        one = b.select(spread(b, table, ir.VectorType(ir.IntType(1), LANES)), valid.value, v.number(1).value)
-        v.store(Vector(b, one), state, 4 * LANES * k)
+    for k, transmittance in enumerate(initial_transmittance(v, state, rays)):
+        v.store(transmittance, state, 4 * LANES * k)
 
     def clear(i: ir.Value, values: list[Vector]) -> list[Vector]:
         v.store(v.number(0), state, b.mul(b.add(i, ir.Constant(I64, VECTORS)), ir.Constant(I64, 4 * LANES)))

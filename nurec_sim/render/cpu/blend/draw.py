@@ -62,6 +62,20 @@ def aligned(count):
 
 
 @inner
+def batch_scratch():
+    """Scratch of a thread that goes through the batches of macro tiles.
+
+    Returns:
+        ``turned`` and ``basis`` for ``tile_geometry``; ``coefficients``, ``chosen`` and ``listed`` for
+        ``prepare_batch``.
+    """
+    turned = aligned(BLOCKS * RAY_PLANES * RAYS).reshape(BLOCKS, RAY_PLANES, RAYS)
+    basis = np.zeros((BANDS, BASIS), np.float32)
+    coefficients = aligned(COEFFICIENTS * BATCH).reshape(COEFFICIENTS, BATCH)
+    return turned, basis, coefficients, np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
+
+
+@inner
 def _prepare(mode, ids, records, count, alive, basis, coefficients, lists, counts, entry):
     """The preparation of a projection mode; see ``tiles``."""
     if mode == AFFINE:
@@ -173,10 +187,8 @@ def draw_tiles(rays, projected, binned, normals, output_kind, tiles, planes, cou
         counts: [1] int64, the number of responses evaluated is added.
     """
     count_planes = 9 if output_kind == NORMALS else 6
-    state, turned = aligned(BLOCKS * MOST_PLANES * RAYS), aligned(BLOCKS * RAY_PLANES * RAYS)
-    coefficients = aligned(COEFFICIENTS * BATCH).reshape(COEFFICIENTS, BATCH)
-    basis = np.zeros((BANDS, BASIS), np.float32)
-    chosen, listed = np.empty((BLOCKS, LIST), np.uint8), np.zeros(BLOCKS, np.int64)
+    state = aligned(BLOCKS * MOST_PLANES * RAYS)
+    turned, basis, coefficients, chosen, listed = batch_scratch()
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
     block_bytes = 4 * count_planes * RAYS
     state_at, coefficients_at, chosen_at = state.ctypes.data, coefficients.ctypes.data, chosen.ctypes.data
@@ -185,9 +197,7 @@ def draw_tiles(rays, projected, binned, normals, output_kind, tiles, planes, cou
     spare, starts = np.empty(longest_list(binned, tiles), np.uint64), np.empty((2, 2049), np.int64)
     for index in range(tiles.shape[0]):
         tile = np.int64(tiles[index])
-        row, column, rays_at, basis_at, inside = tile_geometry(
-            rays, tile, turned.reshape(BLOCKS, RAY_PLANES, RAYS), basis
-        )
+        row, column, rays_at, basis_at, inside = tile_geometry(rays, tile, turned, basis)
         for block in range(BLOCKS):
             open_block(state_at + block * block_bytes, count_planes, rays_at + block * RAY_BYTES if rays_at else 0)
         alive = inside

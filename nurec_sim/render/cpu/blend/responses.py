@@ -295,7 +295,7 @@ def hits_of(
     v: Lanes, mode: int, output_kind: int, group: RayGroup, coefficient: Coefficient, rays: ir.Value, basis: ir.Value,
     near: ir.Value | None,
 ) -> tuple[StillMeeting, Bundle, Bundle]:  # fmt: skip
-    """A record along the rays of a group, its exponent (``meeting_of``), and which rays it hits.
+    """A record along the rays of a group, its alpha, and which rays it hits; alpha is undefined on all others.
 
     Args:
         v: vectors.
@@ -311,7 +311,22 @@ def hits_of(
     hit = exponent < CUT
     if near is not None:
         hit = hit & behind_near_plane(v, mode, basis, group, meeting.distance, near)
-    return meeting, exponent, hit
+    return meeting, Bundle(fading(exponent.parts)), hit
+
+
+def initial_transmittance(v: Lanes, state: ir.Value, rays: ir.Value) -> list[Vector]:
+    """The vectors of a block's transmittance before any record: 1 where there is a ray, else 0.
+
+    Args:
+        v: vectors.
+        state: address of the block's state.
+        rays: address of the block's [RAY_PLANES,32]; 0 where every cell has a ray.
+    """
+    b = v.b
+    table = b.icmp_signed("!=", rays, ir.Constant(I64, 0))
+    # Without a table any readable address will do: the values are not used.
+    source = b.select(table, b.add(rays, ir.Constant(I64, 4 * RAYS * VALID)), state)
+    return [Vector(b, b.select(table, v.load(source, 4 * LANES * k).value, v.number(1).value)) for k in range(VECTORS)]
 
 
 def still_open(transmittance: list[Vector], output_kind: int) -> ir.Value:
