@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Float64, Int32
 
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
-from nurec_sim.compute.kernels import kernel
+from nurec_sim.compute.kernels import inner, kernel
 from nurec_sim.types import Clip, Gaussians, Sweep
 
 STEP_RAD = np.radians(0.2)
@@ -55,6 +55,7 @@ class SweepBeams:
         drift_m: how far the sensor moved during the sweep.
         beams: unit direction, range (m) and firing time (fraction of the sweep) of each return.
         image: [rows, COLUMNS] a beam in each angular cell, -1 without.
+        reach_m: [rows, COLUMNS] its range, metres; -1 without.
         low: elevation of the image's first row, in cells.
         width_rad: half of the width of a beam.
         fraction: mean firing time of each column, as a fraction of the sweep.
@@ -65,6 +66,7 @@ class SweepBeams:
     drift_m: Float64[np.ndarray, " 3"]
     beams: Float32[np.ndarray, "n 5"]
     image: Int32[np.ndarray, "rows columns"]
+    reach_m: Float32[np.ndarray, "rows columns"]
     low: int
     width_rad: float
     fraction: Float64[np.ndarray, " columns"]
@@ -96,9 +98,7 @@ def _beams(t_us, world_from_lidar, drift_m, along, fired) -> SweepBeams:
     column = np.floor((np.arctan2(along[:, 1], along[:, 0]) + np.pi) / STEP_RAD).astype(np.int64) % COLUMNS
     low = int(row.min(initial=0))
     image = np.full((int(row.max(initial=0)) - low + 1, COLUMNS), -1, np.int32)
-    # The nearest of the beams that share a cell: the far ones would carve what the near ones returned from.
-    far_first = np.argsort(-distance, kind="stable")
-    image[row[far_first] - low, column[far_first]] = far_first
+    _fill_image(row - low, column, distance, image)
     count = np.bincount(column, minlength=COLUMNS)
     mean = np.bincount(column, fired, minlength=COLUMNS) / np.maximum(count, 1)
     # Columns without returns were fired after the one before them.
@@ -106,7 +106,17 @@ def _beams(t_us, world_from_lidar, drift_m, along, fired) -> SweepBeams:
     last[last < 0] = last[-1]
     width = BEAM_SHARE * STEP_RAD * np.sqrt(len(image) * np.count_nonzero(count) / max(len(distance), 1))
     beams = np.column_stack([along, distance, fired]).astype(np.float32)
-    return SweepBeams(t_us, world_from_lidar, drift_m, beams, image, low, width, mean[last])
+    reach = np.where(image >= 0, beams[image, 3], np.float32(-1)) if len(beams) else np.full_like(image, -1, np.float32)
+    return SweepBeams(t_us, world_from_lidar, drift_m, beams, image, reach, low, width, mean[last])
+
+
+@kernel
+def _fill_image(row, column, distance, image):
+    """The nearest of the beams that share a cell: the far ones would carve what the near ones returned from."""
+    for i in range(len(distance)):
+        there = image[row[i], column[i]]
+        if there < 0 or distance[i] <= distance[there]:
+            image[row[i], column[i]] = i
 
 
 def chosen_sweeps(clip: Clip, hold_out: Collection[int], most: int = MOST_SWEEPS) -> list[tuple[str, int]]:
@@ -166,17 +176,18 @@ def count_beams(
         world = world_from_body(sum(sweep.t_us) // 2)
         if world is not None:
             pose = geometry.inverse(sweep.world_from_lidar) @ world
-            jobs.append((pose, sweep.drift_m, sweep.beams, sweep.image, sweep.low, sweep.width_rad, sweep.fraction))
+            found = sweep.beams, sweep.image, sweep.reach_m
+            jobs.append((pose, sweep.drift_m, *found, sweep.low, sweep.width_rad, sweep.fraction))
 
     def count(start: int) -> None:
         part = slice(start, start + CHUNK)
         mine = tested[part]
         xyz, quat = (values[mine].astype(np.float64) for values in (gaussians.mean_m, gaussians.quat_wxyz))
         scale = np.maximum(gaussians.scale_m[mine].astype(np.float64), THINNEST_M)
-        canonical = np.ascontiguousarray(np.swapaxes(geometry.matrix_from_quat(quat), 1, 2) / scale[:, :, None])
-        reach = scale.max(axis=1, initial=0.0) * np.sqrt(MEETS)
+        axes = np.ascontiguousarray(np.swapaxes(geometry.matrix_from_quat(quat), 1, 2))
+        canonical, extent = axes / scale[:, :, None], axes * (np.sqrt(MEETS) * scale)[:, :, None]
         for job in jobs:
-            _count(xyz, canonical, reach, *job, passed[part], stopped[part])
+            _count(xyz, canonical, extent, *job, passed[part], stopped[part])
 
     for _ in in_order(count, range(0, len(tested), CHUNK)):
         pass
@@ -185,54 +196,99 @@ def count_beams(
     return counts[0], counts[1]
 
 
+@inner
+def _angle(y, x):
+    """Angle of the direction (x, y) within 2e-8 rad, by Abramowitz and Stegun 4.4.49; a fifth of ``arctan2``'s time."""
+    wide, high = abs(x), abs(y)
+    t = min(wide, high) / max(wide, high, 1e-300)
+    q = t * t
+    angle = ((0.0028662257 * q - 0.0161657367) * q + 0.0429096138) * q - 0.0752896400
+    angle = (((angle * q + 0.1065626393) * q - 0.1420889944) * q + 0.1999355085) * q - 0.3333314528
+    angle = t * (angle * q + 1.0)
+    if high > wide:
+        angle = 0.5 * np.pi - angle
+    if x < 0:
+        angle = np.pi - angle
+    return -angle if y < 0 else angle
+
+
+@inner
+def _turned(turn, x, y, z):
+    return (
+        turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z,
+        turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z,
+        turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z,
+    )
+
+
+@inner
+def _half_width(axes, u, v, w):
+    """Half of the width along a unit vector of an ellipsoid with the given half axes (rows)."""
+    square = 0.0
+    for k in range(3):
+        part = axes[k, 0] * u + axes[k, 1] * v + axes[k, 2] * w
+        square += part * part
+    return np.sqrt(square)
+
+
+@inner
+def _meeting(canonical, o, d):
+    """Where along a beam d it is nearest to a Gaussian, and the squared Mahalanobis distance there."""
+    aa, ab, bb = 0.0, 0.0, 0.0
+    for k in range(3):
+        c = canonical[k]
+        a = c[0] * o[0] + c[1] * o[1] + c[2] * o[2]
+        e = c[0] * d[0] + c[1] * d[1] + c[2] * d[2]
+        aa, ab, bb = aa + a * a, ab + a * e, bb + e * e
+    return ab / bb, aa - ab * ab / bb
+
+
 @kernel
-def _count(xyz, canonical, reach, pose, drift, beams, image, low, width, fraction, passed, stopped):
+def _count(xyz, canonical, extent, pose, drift, beams, image, reach_m, low, width, fraction, passed, stopped):
     rows = image.shape[0]
     turn = np.ascontiguousarray(pose[:3, :3].T)
-    eye, move = -turn @ np.ascontiguousarray(pose[:3, 3]), turn @ drift
-    offset, along = np.zeros(3), np.zeros(3)
     for i in range(len(xyz)):
         total = passed[i] + stopped[i]
         if total >= ENOUGH or (total >= CLEAR and 8 * min(passed[i], stopped[i]) <= total):
             continue
-        x = pose[0, 0] * xyz[i, 0] + pose[0, 1] * xyz[i, 1] + pose[0, 2] * xyz[i, 2] + pose[0, 3]
-        y = pose[1, 0] * xyz[i, 0] + pose[1, 1] * xyz[i, 1] + pose[1, 2] * xyz[i, 2] + pose[1, 3]
-        z = pose[2, 0] * xyz[i, 0] + pose[2, 1] * xyz[i, 1] + pose[2, 2] * xyz[i, 2] + pose[2, 3]
-        if x * x + y * y + z * z > FARTHEST_M * FARTHEST_M:
+        px, py, pz = _turned(pose, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+        px, py, pz = px + pose[0, 3], py + pose[1, 3], pz + pose[2, 3]
+        if px * px + py * py + pz * pz > FARTHEST_M * FARTHEST_M:
             continue
         # The sensor moves while it spins; one correction suffices, as it moves little while it turns by the parallax.
-        f = fraction[int((np.arctan2(y, x) + np.pi) / STEP_RAD) % COLUMNS] - 0.5
-        x, y, z = x - f * drift[0], y - f * drift[1], z - f * drift[2]
-        distance = np.sqrt(x * x + y * y + z * z)
-        if distance < NEAREST_M:
+        f = fraction[int((_angle(py, px) + np.pi) / STEP_RAD) % COLUMNS] - 0.5
+        x, y, z = px - f * drift[0], py - f * drift[1], pz - f * drift[2]
+        level, distance = np.sqrt(x * x + y * y), np.sqrt(x * x + y * y + z * z)
+        # No scanner looks straight up or down.
+        if distance < NEAREST_M or level < 0.1 * distance:
             continue
-        azimuth, elevation = (np.arctan2(y, x) + np.pi) / STEP_RAD, np.arcsin(z / distance) / STEP_RAD - low
-        half = min(max(reach[i] / distance, width) / STEP_RAD, MOST_CELLS)
+        azimuth, elevation = (_angle(y, x) + np.pi) / STEP_RAD, _angle(z, level) / STEP_RAD - low
+        # Seen along the beams a grazing footprint is as small as others, however long.
+        up, back = level / distance, -z / (level * distance)
+        across = _half_width(extent[i], *_turned(turn, -y / level, x / level, 0.0)) / level
+        upward = _half_width(extent[i], *_turned(turn, back * x, back * y, up)) / distance
+        across = min(max(across, width) / STEP_RAD, MOST_CELLS)
+        upward = min(max(upward, width) / STEP_RAD, MOST_CELLS)
         margin = MARGIN_M + MARGIN_SHARE * distance
-        for row in range(max(int(np.floor(elevation - half)), 0), min(int(np.floor(elevation + half)), rows - 1) + 1):
-            for cell in range(int(np.floor(azimuth - half)), int(np.floor(azimuth + half)) + 1):
-                b = image[row, cell % COLUMNS]
-                if b < 0 or beams[b, 3] < distance - margin:
+        for row in range(
+            max(int(np.floor(elevation - upward)), 0), min(int(np.floor(elevation + upward)), rows - 1) + 1
+        ):
+            for cell in range(int(np.floor(azimuth - across)), int(np.floor(azimuth + across)) + 1):
+                column = cell % COLUMNS
+                if reach_m[row, column] < distance - margin:
                     continue
-                # The beam in the body's frame: where is it nearest to the centre?
+                b = image[row, column]
+                if b < 0:
+                    continue
+                # The beam and the centre as seen from where the beam was fired.
                 f = beams[b, 4] - 0.5
-                square, t = 0.0, 0.0
-                for k in range(3):
-                    offset[k] = xyz[i, k] - eye[k] - f * move[k]
-                    along[k] = turn[k, 0] * beams[b, 0] + turn[k, 1] * beams[b, 1] + turn[k, 2] * beams[b, 2]
-                    square += offset[k] * offset[k]
-                    t += offset[k] * along[k]
-                if square - t * t > (width * distance) ** 2:
-                    # The same in units of the Gaussian.
-                    aa, ab, bb = 0.0, 0.0, 0.0
-                    for k in range(3):
-                        c = canonical[i, k]
-                        a = c[0] * offset[0] + c[1] * offset[1] + c[2] * offset[2]
-                        e = c[0] * along[0] + c[1] * along[1] + c[2] * along[2]
-                        aa, ab, bb = aa + a * a, ab + a * e, bb + e * e
-                    if aa - ab * ab / bb > MEETS:
+                ox, oy, oz = px - f * drift[0], py - f * drift[1], pz - f * drift[2]
+                dx, dy, dz = beams[b, 0], beams[b, 1], beams[b, 2]
+                t = ox * dx + oy * dy + oz * dz
+                if ox * ox + oy * oy + oz * oz - t * t > (width * distance) ** 2:
+                    t, square = _meeting(canonical[i], _turned(turn, ox, oy, oz), _turned(turn, dx, dy, dz))
+                    if square > MEETS:
                         continue
-                    t = ab / bb
                 behind = beams[b, 3] - t
                 if behind > margin:
                     passed[i] += 1

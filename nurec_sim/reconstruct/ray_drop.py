@@ -42,6 +42,8 @@ PRIOR_VOTES = 2.0
 BOX_MARGIN_M = 0.3
 RIDGE = 1.0
 """Pull of the regression's coefficients to 0, in votes."""
+SETTLED = 1e-9
+"""The regression ends when no coefficient changes by more."""
 LEAST_MOVED_M = 5.0
 """Only a car that moves can tell blocked beams from dark surfaces beside it."""
 MEETING, BLOCKED = 0.5, 0.1
@@ -264,7 +266,10 @@ def _logistic(features: np.ndarray, dropped: np.ndarray) -> np.ndarray:
         p = _sigmoid(features @ weights)
         gradient = features.T @ (dropped - p) - RIDGE * weights
         curvature = (features * (p * (1 - p))[:, None]).T @ features + RIDGE * np.eye(len(weights))
-        weights = weights + np.linalg.solve(curvature, gradient)
+        step = np.linalg.solve(curvature, gradient)
+        weights = weights + step
+        if np.abs(step).max() < SETTLED:
+            break
     return weights
 
 
@@ -302,7 +307,9 @@ def _drop_probabilities(
     share = (dropped + PRIOR_VOTES * expected) / (count + PRIOR_VOTES)
     shift = _shift(share[where], int(votes.dropped.sum()))
     share = _sigmoid(_logit(share) - shift)
-    eyes = np.unique(np.round(votes.eye_m[votes.body < 0], 3), axis=0)
+    eyes = np.round(votes.eye_m[votes.body < 0], 3)
+    # Votes of one sweep follow each other: sorting all of them would take long.
+    eyes = np.unique(eyes[np.append(np.ones(min(len(eyes), 1), bool), (eyes[1:] != eyes[:-1]).any(axis=1))], axis=0)
     out = []
     for (gaussians, body), key in zip(layers, keys, strict=True):
         place = np.minimum(np.searchsorted(voxel, key), len(voxel) - 1)

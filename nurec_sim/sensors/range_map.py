@@ -214,8 +214,10 @@ def _cones(row: Int64[np.ndarray, " n"], height: Values, across: Values) -> tupl
             continue
         weight = 1 / rho
         for _ in range(5):
-            lines = np.column_stack([weight, weight * rho])
-            a, slope = np.linalg.lstsq(lines, weight * z, rcond=None)[0]
+            # Normal equations of weight (z - a - slope rho).
+            one, by_rho = weight * weight, weight * weight * rho
+            left = [[one.sum(), by_rho.sum()], [by_rho.sum(), by_rho @ rho]]
+            a, slope = np.linalg.solve(left, [one @ z, by_rho @ z])
             # Weights approach those of the smallest sum of absolute angles.
             weight = 1 / rho / np.sqrt(np.maximum(np.abs(z - a - slope * rho) / rho, 1e-4))
         apex[k] = a if abs(a) < HIGHEST_APEX_M else np.nan

@@ -269,6 +269,14 @@ def test_voxels_grow_by_powers_of_two_with_the_distance_from_the_drive():
     assert edge == pytest.approx([0.06, 0.06, 0.12, 0.12, 0.24, 0.24, 0.48])
 
 
+def test_distances_from_a_long_drive_are_those_from_its_nearest_place():
+    random = np.random.default_rng(0)
+    path, points = np.cumsum(random.normal(0.2, 0.3, (100, 3)), axis=0), random.uniform(-30, 30, (500, 3))
+    settings = PointSettings(min_voxel_m=1e-6, max_voxel_m=1e6, voxel_per_distance=1.0)
+    nearest = np.linalg.norm(points[:, None] - path, axis=2).min(axis=1)
+    assert voxel_edge_m(points, path, settings) == pytest.approx(1e-6 * 2 ** np.floor(np.log2(nearest / 1e-6)))
+
+
 def test_the_lowest_30_cm_of_a_box_may_be_road():
     clip = Street(frames=2, boxes={"a": ((4.0, 1.8, 1.5), np.array([12.0, -2.0]))})
     found = gather(clip, actors_of(clip, PointSettings()), set(), PointSettings())

@@ -176,6 +176,42 @@ def _add_rows(order, place, rows, sums):
             sums[place[i], c] += rows[order[i], c]
 
 
+PATH_PART = 16
+"""Places of the path that are tested together."""
+
+
+def _path_parts(path_m: Float64[np.ndarray, "k 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The path in parts of consecutive places [p,PATH_PART,3], and their bounding spheres: [p,3] and [p] metres."""
+    count = -(-len(path_m) // PATH_PART)
+    parts = np.asarray(path_m, np.float64)[np.minimum(np.arange(count * PATH_PART), len(path_m) - 1)]
+    parts = parts.reshape(count, PATH_PART, 3)
+    centre = parts.mean(axis=1)
+    return parts, centre, np.linalg.norm(parts - centre[:, None], axis=2).max(axis=1)
+
+
+@kernel
+def _distance_m(xyz, parts, centre, radius):
+    """Distance [n] of points [n,3] from the nearest place of the path (``_path_parts``)."""
+    result = np.empty(len(xyz))
+    nearest = 0
+    for i in range(len(xyz)):
+        best = np.inf
+        # That of the point before comes first: beams fired one after the other end near each other.
+        for n in range(-1, len(parts)):
+            k = nearest if n < 0 else n
+            a, b, c = xyz[i, 0] - centre[k, 0], xyz[i, 1] - centre[k, 1], xyz[i, 2] - centre[k, 2]
+            reach = np.sqrt(best) + radius[k]
+            if a * a + b * b + c * c >= reach * reach:
+                continue
+            for j in range(PATH_PART):
+                a, b, c = xyz[i, 0] - parts[k, j, 0], xyz[i, 1] - parts[k, j, 1], xyz[i, 2] - parts[k, j, 2]
+                square = a * a + b * b + c * c
+                if square < best:
+                    best, nearest = square, k
+        result[i] = np.sqrt(best)
+    return result
+
+
 @kernel
 def _between(xyz, low, high):
     """Indices of the points [n,3] in a box along the axes."""
@@ -209,9 +245,7 @@ def voxel_edge_m(
     xyz_m: Float64[np.ndarray, "n 3"], path_m: Float64[np.ndarray, "k 3"], settings: PointSettings
 ) -> Float64[np.ndarray, " n"]:
     """Edge of the voxel that a point falls into: larger far from the driven path, in powers of two."""
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(path_m).query(xyz_m)
+    distance = _distance_m(np.asarray(xyz_m, np.float64), *_path_parts(path_m))
     edge = np.clip(settings.voxel_per_distance * distance, settings.min_voxel_m, settings.max_voxel_m)
     return settings.min_voxel_m * 2.0 ** np.floor(np.log2(edge / settings.min_voxel_m) + 1e-9)
 
