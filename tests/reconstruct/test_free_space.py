@@ -9,15 +9,17 @@ from reconstruct_street import Street
 from nurec_sim import geometry
 from nurec_sim.reconstruct import LiftSettings, reconstruct
 from nurec_sim.reconstruct.free_space import (
+    MEETS,
     MOST_SWEEPS,
     balls,
     chosen_sweeps,
+    count_beams,
     in_free_space,
     sweep_beams,
 )
 from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels
 from nurec_sim.reconstruct.lift.bodies import Surfels
-from nurec_sim.reconstruct.lift.footprints import marked_free, on_ground, outside_free_space
+from nurec_sim.reconstruct.lift.footprints import footprints_of, marked_free, on_ground, outside_free_space
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
@@ -57,6 +59,37 @@ def at(*places, sigma_m=SIGMA_M):
 def test_what_beams_pass_is_free_and_where_they_end_is_not(parked):
     gaussians = at([10, 0, 0], [20, 0, 0], [25, 0, 0], [10, 8, 0])
     assert in_free_space(gaussians, [sweep_of(parked, 20.0)] * 2).tolist() == [True, False, False, False]
+
+
+def test_beams_that_meet_an_ellipsoid_are_found_whatever_its_place_and_turn(parked):
+    """Counts against all beams of the image: within 1.5 of squared Mahalanobis distance, or near the centre."""
+    random, count = np.random.default_rng(0), 60
+    far = random.uniform(12, 16, (count, 1)) * random.permutation(directions())[:count] + random.normal(
+        0, 0.02, (count, 3)
+    )
+    quat = geometry.quat_normalize(random.normal(size=(count, 4)))
+    gaussians = dataclasses.replace(at(*far), scale_m=random.uniform(0.002, 0.08, (count, 3)).astype(np.float32),
+                                    quat_wxyz=quat.astype(np.float32))  # fmt: skip
+    sweep = sweep_of(parked, 30.0)
+    beams = sweep.beams[sweep.image[sweep.image >= 0], :3].astype(np.float64)
+    passed, stopped = count_beams(gaussians, [sweep])
+    centre = gaussians.mean_m.astype(np.float64)
+    whiten = geometry.matrix_from_quat(gaussians.quat_wxyz.astype(np.float64)) / gaussians.scale_m[:, None]
+    o, d = np.einsum("nji,nj->ni", whiten, centre)[:, None], np.einsum("nji,bj->nbi", whiten, beams)
+    mahalanobis = (o**2).sum(-1) - (o * d).sum(-1) ** 2 / (d**2).sum(-1)
+    aside = (centre**2).sum(-1)[:, None] - (centre @ beams.T) ** 2
+    width_m = sweep.width_rad * np.linalg.norm(centre, axis=1)[:, None]
+    meets = ((mahalanobis <= MEETS) | (aside <= width_m**2)).sum(axis=1)
+    assert meets.max() > 3
+    assert np.abs(passed - meets).sum() <= 0.01 * meets.sum()
+    assert not stopped.any()
+
+
+def test_of_beams_in_one_cell_the_nearest_is_found():
+    clip, ends = Street(frames=3, speed_mps=0.0), np.array([[30.0, 0, 0], [10.0, 0, 0], [20.0, 0, 0]]) + 0.001
+    sweep = sweep_beams(clip, "top", Sweep(0, 0, 1, np.eye(4), ends, None, np.zeros(3, np.int64)))
+    assert sweep.image.max() == 1
+    assert sweep.reach_m.max() == pytest.approx(10, abs=0.01)
 
 
 def test_beams_end_at_what_lies_a_little_before_their_returns(parked):
@@ -224,3 +257,17 @@ def test_a_footprint_that_is_only_too_long_is_made_round(parked):
         kept, dropped = outside_free_space(lifted, body, level_ground(), LiftSettings(), sweeps)
         assert (len(kept), len(dropped)) == (round_one, 1 - round_one)
         assert kept.scale_m[:, :2] == pytest.approx(np.full((round_one, 2), PIXEL_SIGMA * 0.17), rel=1e-5)
+
+
+def test_footprints_on_level_surfaces_stretch_as_far_as_they_are_seen_flat_and_others_do_not():
+    """Rays fall 1 in 20, so footprints are 20 times as long as wide; on walls, and on slopes of 30 degrees, only 5."""
+    three, four = np.ones(3), np.full(3, 4, np.int32)
+    slope = np.array([-np.sin(np.radians(30)), 0, np.cos(np.radians(30))])
+    normal = np.array([[0.0, 0, 1], slope, [-1.0, 0, 0]])
+    along = np.cross(normal, [0.0, 1, 0])
+    ray = np.sqrt(1 - 1 / 400) * along - normal / 20
+    far = np.array([[500.0, 0, 0]] * 3)
+    lifted = Lifted(far, normal, ray, 40 * three, 0.1 * three, np.zeros((3, 3), np.float32), four - 5, four, four)
+    body = body_of(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    made = footprints_of(lifted, body, level_ground(), LiftSettings())
+    assert made.scale_m[:, 0] / made.scale_m[:, 1] == pytest.approx([20, 5, 5], rel=1e-4)

@@ -21,6 +21,8 @@ from nurec_sim.types import Gaussians, Label
 
 GROUND_M = 0.12
 """Points so near to the ground belong to it."""
+LEVEL = 0.97
+"""Vertical part of a normal from which a surface counts as level, as ground is that lies beyond the height grid."""
 LOW_M, GRAZING = 0.5, 0.03
 """Pixels wrongly this low over the ground show the ground, unless their rays are flatter than this slope."""
 EDGE = 0.1
@@ -141,6 +143,7 @@ def _footprints(
     stretch = np.full(n, surfaces.MOST_STRETCH)
     if body.actor is None:
         flat = np.abs(ground.above(lifted.xyz_m)) < GROUND_M
+        flat |= lifted.normal[:, 2] > LEVEL
         stretch = np.where(flat, surfaces.MOST_STRETCH_OF_GROUND, stretch)
         label = np.where(~from_surfel & ground.is_road(lifted.xyz_m), Label.ROAD, label)
     return surfaces.footprints(lifted.xyz_m, lifted.normal, lifted.ray, lifted.pixel_m, lifted.rgb / 255, intensity,

@@ -18,6 +18,8 @@ BAND_M, BAND_SLOPE = 0.4, 0.08
 FILL_M = 3.0
 """Holes are filled up to this far from measured ground."""
 
+ENOUGH_SHARE, ENOUGH_CELLS = 0.12, 3.0
+"""A hole is filled with the mean under the narrowest Gaussian that holds this share of measured cells, or as many."""
 SEEN_M = 0.4
 """Ground this close to a measured cell counts as seen."""
 
@@ -191,7 +193,8 @@ def _fill(height: np.ndarray, known: np.ndarray) -> np.ndarray:
         small = [cv2.resize(a, size, interpolation=cv2.INTER_AREA) for a in (value, weight)]
         small = [cv2.GaussianBlur(a, (0, 0), sigma / shrink, borderType=cv2.BORDER_CONSTANT) for a in small]
         total, mass = (cv2.resize(a, value.shape[::-1], interpolation=cv2.INTER_LINEAR) for a in small)
-        take = ~done & (mass > 0.12)
+        # Beams are sparse far away: a share of the cells would never be reached there, a number of them is.
+        take = ~done & (mass > min(ENOUGH_SHARE, ENOUGH_CELLS / (2 * np.pi * sigma**2)))
         result[take], done = total[take] / mass[take], done | take
     if done.any() and not done.all():
         result[~done] = np.median(result[done])

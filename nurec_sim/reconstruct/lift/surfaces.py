@@ -22,8 +22,8 @@ DISC_SIGMA = 0.45
 PIXEL_SIGMA = 0.6
 """The same for footprints of pixels, whose lattice shears where the surface is curved."""
 MOST_STRETCH, MOST_STRETCH_OF_GROUND = 5.0, 30.0
-"""Length over width of a footprint at most. The ground is known to be flat; from a camera at 1.65 m it is stretched by
-15 at 25 m."""
+"""Length over width of a footprint at most. The ground and other level surfaces are known to be flat; from a camera at
+1.65 m they are stretched by 15 at 25 m."""
 THINNEST_M = 0.003
 """Thicker discs would catch grazing LiDAR beams far in front of the ground."""
 
