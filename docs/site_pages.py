@@ -75,8 +75,8 @@ def _shown(output: dict[str, Any]) -> str:
             code = "".join(data[kind]).strip()
             return f'<img src="data:{kind};base64,{code}" alt="">'
     if "text/html" in data:
-        # Markdown ends a block of HTML at an empty line.
-        return re.sub(r"\n\s*\n", "\n", "".join(data["text/html"]))
+        # Markdown ends a block of HTML at an empty line, and takes only what is in a block tag as it is.
+        return "<div>" + re.sub(r"\n\s*\n", "\n", "".join(data["text/html"])) + "</div>"
     text = "".join(data.get("text/plain", ""))
     return f"```text\n{text.rstrip()}\n```" if text else ""
 
