@@ -83,15 +83,6 @@ def _multiply(a, b, out):
 
 
 @inner
-def _blurred(k, x, y, out):
-    """What the k-th blur is of: x, y, x^2, y^2 or x y."""
-    if k < 2:
-        out[:] = x if k == 0 else y
-    else:
-        _multiply(y if k == 3 else x, x if k == 2 else y, out)
-
-
-@inner
 def _terms(x, y, xx, yy, xy):
     """Numerators and denominators of SSIM from the blurs of x, y, x^2, y^2 and x y."""
     # Var = E[x^2] - E[x]^2 with the Gaussian window as weights.
@@ -152,10 +143,17 @@ def _band(first, last, x, y, per_value, dssim, gradient):
     # The gradient in a row needs SSIM in 5 rows on both sides, which needs 5 more rows of the images.
     for v in range(first - 2 * REACH_PX, last + 2 * REACH_PX):
         if 0 <= v < height:
-            # One call in a loop is compiled once, five calls five times.
-            for k in range(5):
-                _blurred(k, x[v], y[v], row[15 : 15 + size])
-                _across(row, means[k, v % RING])
+            inside = row[15 : 15 + size]
+            inside[:] = x[v]
+            _across(row, means[0, v % RING])
+            inside[:] = y[v]
+            _across(row, means[1, v % RING])
+            _multiply(x[v], x[v], inside)
+            _across(row, means[2, v % RING])
+            _multiply(y[v], y[v], inside)
+            _across(row, means[3, v % RING])
+            _multiply(x[v], y[v], inside)
+            _across(row, means[4, v % RING])
         else:
             means[:, v % RING] = f4(0)
         middle = v - REACH_PX
