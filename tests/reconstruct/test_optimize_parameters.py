@@ -80,8 +80,8 @@ def test_gradients_in_the_world_go_back_to_the_box(lifted):
     assert not by.mean.any() and not by.quat.any(), "the next frame adds to zeros"
     assert parameters.visits[row] == 1 and parameters.visits[row + 1] == 0, "no gradient, no step"
     assert parameters.first[row, MEAN : MEAN + 3] == pytest.approx([0.1, 0, 0], abs=1e-6)
-    # q_world = (c w - s z, .., .., c z + s w), so its last component's gradient is s by w and c by z.
-    assert parameters.first[row, QUAT : QUAT + 4] == pytest.approx([0.07071, 0, 0, 0.07071], abs=1e-5)
+    # q_world = (c w - s z, .., .., c z + s w): the gradient is s by w and c by z, and a turn t about z gives z = t / 2.
+    assert parameters.first[row, QUAT : QUAT + 4] == pytest.approx([0, 0, 0, 0.035355], abs=1e-5)
 
 
 def test_opacity_and_scale_are_pulled_down_where_there_is_a_gradient(lifted):
@@ -144,3 +144,37 @@ def test_gradients_of_the_shown_image_are_those_of_differences():
     step = np.zeros_like(sky)
     step[texel] = 0.01
     assert by_sky[texel] == pytest.approx((loss(sky + step) - loss(sky - step)) / 0.02, rel=1e-3)
+
+
+def test_a_mean_moves_along_the_axes_in_proportion_to_its_standard_deviations(lifted):
+    """Turned by 90 degrees about z: its x axis lies along the world's y, its y axis along -x."""
+    parameters = Parameters(lifted)
+    parameters.values[0, QUAT : QUAT + 4] = (np.sqrt(0.5), 0, 0, np.sqrt(0.5))
+    parameters.values[0, SCALE : SCALE + 3] = np.log([0.5, 0.1, 0.002])
+    parameters.values_changed()
+    before = parameters.values[0, MEAN : MEAN + 3].copy()
+    parameters.gradients.mean[0] = (-3e-4, 2e-4, 1e-4)
+    drawn = parameters.at(lifted.span_us[0])
+    parameters.step(drawn, np.array([0], np.int32), rate_columns(0.2, 0, 0, 0, 0), 1.0)
+    # Adam's first step is the rate against the gradient's sign: a fifth of 0.1, 0.5 and 0.002 m.
+    moved = parameters.values[0, MEAN : MEAN + 3] - before
+    assert moved == pytest.approx([0.02, -0.1, -0.0004], rel=1e-3, abs=1e-6)
+
+
+def test_a_disc_is_tilted_less_the_thinner_it_is(lifted):
+    """Its normal is its z axis: turns about z are free, those about x and y tilt it."""
+    parameters, half = Parameters(lifted), np.sqrt(0.5)
+    parameters.values[0, QUAT : QUAT + 4] = (half, 0, half, 0)
+    parameters.values[0, SCALE : SCALE + 3] = np.log([0.08, 0.08, 0.002])
+    parameters.values_changed()
+    before = geometry.matrix_from_quat(parameters.values[0, QUAT : QUAT + 4].astype(float))
+    # By a turn about an axis the quaternion changes by q (0, axis / 2): the gradient of the sum of all three turns.
+    turn = np.array([[0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
+    quat = np.array([half, 0, half, 0])
+    parameters.gradients.quat[0] = -sum(geometry.quat_multiply(quat, each) for each in turn)
+    drawn = parameters.at(lifted.span_us[0])
+    parameters.step(drawn, np.array([0], np.int32), rate_columns(0, 0.02, 0, 0, 0), 1.0)
+    after = geometry.matrix_from_quat(parameters.values[0, QUAT : QUAT + 4].astype(float))
+    turned = before.T @ after
+    tilt = 0.02 * 0.002 / 0.08
+    assert [turned[2, 1], turned[0, 2], turned[1, 0]] == pytest.approx([tilt, tilt, 0.02], rel=2e-2)

@@ -1,6 +1,11 @@
 """Kernel that takes one step of Adam (Kingma and Ba 2015) on the Gaussians that an image shows.
 
 A Gaussian's moments rest while it is out of view; its bias correction counts the images that showed it.
+
+Adam takes steps of nearly the same size however small a gradient is. So that they leave surfaces where LiDAR has put
+them, a step is measured in the Gaussian itself: a mean moves along each axis in proportion to the standard deviation
+there, and turns are limited where they would change a thin disc most. Seen at a grazing angle, a disc of 6 cm that is
+tilted by 5 degrees shifts a beam's return by decimetres.
 """
 
 from __future__ import annotations
@@ -8,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
-from nurec_sim.compute.kernels import kernel
+from nurec_sim.compute.kernels import inner, kernel
 
 VALUES = 14
 MEAN, QUAT, SCALE, OPACITY, RGB = 0, 3, 7, 10, 11
@@ -17,6 +22,65 @@ BETA1, BETA2 = 0.9, 0.99
 EPSILON = 1e-15
 KEEP1, KEEP2, TINY = np.float32(1 - BETA1), np.float32(1 - BETA2), np.float32(EPSILON)
 SMALLEST_M = 1e-3
+
+
+@inner
+def _to_own_axes(quat, axes, gradient):
+    """Turn the gradients by the mean and by the quaternion into those along and about a Gaussian's own axes.
+
+    Args:
+        quat: unit quaternion.
+        axes: [3,3] output; its columns are the axes.
+        gradient: [14]; of the four of the quaternion the first becomes 0, the others are by a turn about each axis.
+    """
+    w, x, y, z = quat[0], quat[1], quat[2], quat[3]
+    one, two = np.float32(1), np.float32(2)
+    axes[0, 0], axes[0, 1], axes[0, 2] = one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)
+    axes[1, 0], axes[1, 1], axes[1, 2] = two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x)
+    axes[2, 0], axes[2, 1], axes[2, 2] = two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)
+    a, b, c = gradient[MEAN], gradient[MEAN + 1], gradient[MEAN + 2]
+    for k in range(3):
+        gradient[MEAN + k] = axes[0, k] * a + axes[1, k] * b + axes[2, k] * c
+    # A small turn t about the own axes gives quat (1, t / 2), so its gradient is half of conj(quat) times theirs.
+    half = np.float32(0.5)
+    p, q, r, s = gradient[QUAT], gradient[QUAT + 1], gradient[QUAT + 2], gradient[QUAT + 3]
+    gradient[QUAT] = np.float32(0)
+    gradient[QUAT + 1] = half * (w * q - x * p - y * s + z * r)
+    gradient[QUAT + 2] = half * (w * r + x * s - y * p - z * q)
+    gradient[QUAT + 3] = half * (w * s - x * r + y * q - z * p)
+
+
+@inner
+def _move(quat, axes, scale, change, mean):
+    """Take a step of mean and quaternion, in units of the Gaussian itself (``adam_step``).
+
+    Args:
+        quat: changed, no longer of unit length.
+        axes: see ``_to_own_axes``.
+        scale: standard deviations along the axes.
+        change: [14] what to subtract, means in standard deviations, turns (rad) before they are limited.
+        mean: changed.
+    """
+    a, b, c = change[MEAN] * scale[0], change[MEAN + 1] * scale[1], change[MEAN + 2] * scale[2]
+    for k in range(3):
+        mean[k] -= axes[k, 0] * a + axes[k, 1] * b + axes[k, 2] * c
+    half = np.float32(0.5)
+    a = half * change[QUAT + 1] * _freedom(scale[1], scale[2])
+    b = half * change[QUAT + 2] * _freedom(scale[2], scale[0])
+    c = half * change[QUAT + 3] * _freedom(scale[0], scale[1])
+    w, x, y, z = quat[0], quat[1], quat[2], quat[3]
+    quat[0], quat[1] = w + x * a + y * b + z * c, x - w * a - y * c + z * b
+    quat[2], quat[3] = y - w * b + x * c - z * a, z - w * c - x * b + y * a
+
+
+@inner
+def _freedom(a, b):
+    """Share of a turn in the plane of two axes that is taken.
+
+    Turning by t changes the Gaussian as much as shifting it by t abs(a^2 - b^2) / (a b) standard deviations does
+    (Fisher's metric), so a disc is tilted in proportion to its thickness.
+    """
+    return min(np.float32(1), a * b / max(abs(a * a - b * b), TINY))
 
 
 @kernel
@@ -38,11 +102,12 @@ def adam_step(
             ``backward.repack.RawGaussians``; those of ``rows`` are set to 0 again.
         scale: [n,3] standard deviations as rendered.
         opacity: [n] opacities as rendered.
-        rates: [14] float32 learning rates.
+        rates: [14] float32 learning rates: of means in standard deviations; of the four of the quaternion the first is
+            not used, the others are of turns (rad) about the Gaussian's axes before they are limited (``_freedom``).
         pulls: [2] float32 weights of a Gaussian's opacity, and of the sum of its standard deviations, in the loss.
         largest_m: standard deviations end here.
     """
-    gradient = np.zeros(VALUES, np.float32)
+    gradient, change, axes = np.zeros(VALUES, np.float32), np.zeros(VALUES, np.float32), np.zeros((3, 3), np.float32)
     low, high = np.float32(np.log(SMALLEST_M)), np.float32(np.log(largest_m))
     for row in range(rows.shape[0]):
         i = rows[row]
@@ -81,13 +146,18 @@ def adam_step(
         visits[i] += 1
         correction = corrections[min(visits[i], corrections.shape[0] - 1)]
         c1, c2 = correction[0], correction[1]
+        quat = values[i, QUAT : QUAT + 4]
+        _to_own_axes(quat, axes, gradient)
         # Float32 throughout, so that the fourteen values are a vector.
         for k in range(VALUES):
             g = gradient[k]
             m = first[i, k] + KEEP1 * (g - first[i, k])
             v = second[i, k] + KEEP2 * (g * g - second[i, k])
             first[i, k], second[i, k] = m, v
-            values[i, k] -= rates[k] * (m * c1) / (np.sqrt(v * c2) + TINY)
+            change[k] = rates[k] * (m * c1) / (np.sqrt(v * c2) + TINY)
+        _move(quat, axes, scale[i], change, values[i, MEAN : MEAN + 3])
+        for k in range(SCALE, VALUES):
+            values[i, k] -= change[k]
         # Bounds: a scale near 0 makes the covariance singular, a huge one covers the view from inside.
         for k in range(SCALE, SCALE + 3):
             values[i, k] = min(max(values[i, k], low), high)

@@ -2,7 +2,7 @@
 
 Per step a view is drawn with all layers at its instant; the loss compares its colours with the image (``image_loss``)
 and its depth with the LiDAR returns in it (``depth_loss``); gradients go back to Gaussians, sky and the frame's
-response. Only Gaussians in view take part.
+response. Only Gaussians in view take part. What a fit brings into free space is taken out now and then (``free``).
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ import contextlib
 import dataclasses
 import hashlib
 import itertools
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from types import FrameType
 
 import numpy as np
 
 from nurec_sim.errors import ReconstructError
+from nurec_sim.reconstruct.free_space import SweepBeams
 from nurec_sim.reconstruct.optimize.adam import SkyAdam
 from nurec_sim.reconstruct.optimize.checkpoint import read_checkpoint, write_checkpoint
 from nurec_sim.reconstruct.optimize.compositing import Composite
 from nurec_sim.reconstruct.optimize.depth_loss import depth_loss
+from nurec_sim.reconstruct.optimize.free import CLEARINGS, recorded_beams, take_out
 from nurec_sim.reconstruct.optimize.image_loss import colour_loss
+from nurec_sim.reconstruct.optimize.interruption import whole_steps
 from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
 from nurec_sim.reconstruct.optimize.poses import PoseCorrections
 from nurec_sim.reconstruct.optimize.responses import FrameResponses, borrowed_responses
@@ -72,7 +72,7 @@ def refine(
     views = training_views(clip, scene, cameras, hold_out)
     if not views:
         raise ReconstructError(f"clip {clip.id!r}: an optimisation needs images; cameras {list(cameras)} have none")
-    run = Optimization(scene, views, settings)
+    run = Optimization(scene, views, settings, recorded_beams(clip, hold_out))
     if settings.checkpoint is not None:
         run.key = _key(scene, cameras, hold_out, settings)
         if settings.resume:
@@ -90,33 +90,17 @@ def _key(scene: GaussianScene, cameras: Sequence[str], hold_out: set[int], setti
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-@contextlib.contextmanager
-def _whole_steps() -> Iterator[list[int]]:
-    """Ctrl-C fills the list, so that a step is not torn apart; the second one raises KeyboardInterrupt."""
-    interrupted: list[int] = []
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        if interrupted:
-            raise KeyboardInterrupt
-        interrupted.append(number)
-
-    usual = signal.getsignal(signal.SIGINT)
-    # Handlers belong to the main thread; a caller that handles or ignores Ctrl-C itself is left alone.
-    if threading.current_thread() is not threading.main_thread() or usual is not signal.default_int_handler:
-        yield interrupted
-        return
-    signal.signal(signal.SIGINT, interrupt)
-    try:
-        yield interrupted
-    finally:
-        signal.signal(signal.SIGINT, usual)
-
-
 class Optimization:
     """What changes while a scene is fitted."""
 
-    def __init__(self, scene: GaussianScene, views: Sequence[TrainingView], settings: OptimizeSettings) -> None:
-        self.settings, self.views, self.key = settings, views, ""
+    def __init__(
+        self,
+        scene: GaussianScene,
+        views: Sequence[TrainingView],
+        settings: OptimizeSettings,
+        beams: Sequence[SweepBeams] = (),
+    ) -> None:
+        self.settings, self.views, self.beams, self.key = settings, views, beams, ""
         self.parameters = Parameters(scene)
         self.sky = scene.sky.astype(np.float32).copy()
         self._sky_adam = SkyAdam(self.sky)
@@ -131,7 +115,7 @@ class Optimization:
             if every and frames[view.camera.id] >= 2 * every and view.frame % every == every // 2
         ]  # fmt: skip
         self._clear: dict[int, np.ndarray] = {}
-        self.steps, self._seconds_before = 0, 0.0
+        self.steps, self._seconds_before, self._cleared = 0, 0.0, 0
         self.best: dict[str, np.ndarray] = {}
         self.best_psnr_db, self.best_steps = -np.inf, 0
 
@@ -140,9 +124,11 @@ class Optimization:
         started, smooth, order = time.perf_counter(), float("nan"), self._order()
         saved, checked, file = started, self._spent(self._seconds_before), self.settings.checkpoint
         keep = self.settings.keep_interrupted
-        whole: contextlib.AbstractContextManager[list[int]] = _whole_steps() if keep else contextlib.nullcontext([])
+        whole: contextlib.AbstractContextManager[list[int]] = whole_steps() if keep else contextlib.nullcontext([])
         with whole as interrupted, contextlib.suppress(*[KeyboardInterrupt] * keep):
             while (spent := self._spent(seconds := self._seconds_before + time.perf_counter() - started)) < 1:
+                if spent >= (self._cleared + 1) / CLEARINGS:
+                    self._clear_free_space()
                 if spent >= checked + CHECK_SHARE:
                     checked = spent
                     self._check()
@@ -160,6 +146,12 @@ class Optimization:
             file.unlink(missing_ok=True)
         self._check()
         self._restore(self.best)
+        self._clear_free_space()
+
+    def _clear_free_space(self) -> None:
+        """Take out what recorded beams have passed through."""
+        self._cleared += 1
+        take_out(self.parameters, self.beams)
 
     def _text(self, loss: float) -> str:
         known = f", best {self.best_psnr_db:.2f} dB" if self.best else ""
@@ -200,15 +192,15 @@ class Optimization:
 
     def state(self, seconds: float) -> dict[str, np.ndarray]:
         """Everything that a later run needs to go on exactly; ``seconds`` have been spent."""
-        numbers = np.array([self.steps, seconds, self.best_steps, self.best_psnr_db])
+        numbers = np.array([self.steps, seconds, self.best_steps, self.best_psnr_db, self._cleared])
         best = {f"best {name}": array for name, array in self.best.items()}
         clear = {f"clear {number}": rows for number, rows in self._clear.items()}
         return self._result() | self._moments() | best | clear | {"numbers": numbers}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on from a state."""
-        steps, self._seconds_before, best_steps, self.best_psnr_db = state["numbers"].tolist()
-        self.steps, self.best_steps = int(steps), int(best_steps)
+        steps, self._seconds_before, best_steps, self.best_psnr_db, cleared = state["numbers"].tolist()
+        self.steps, self.best_steps, self._cleared = int(steps), int(best_steps), int(cleared)
         self.best = {name.removeprefix("best "): a for name, a in state.items() if name.startswith("best ")}
         self._clear = {int(name.split()[1]): a for name, a in state.items() if name.startswith("clear ")}
         self._restore({name: state[name] for name in self._result() | self._moments()})
@@ -253,7 +245,7 @@ class Optimization:
         )
         if self.settings.correct_poses:
             self.poses.step(number, frame.view.world_from_reference, by_pose + by_pose_too, rate)
-        columns = rate * rate_columns(rates.mean_m, rates.quat, rates.log_scale, rates.logit_opacity, rates.rgb)
+        columns = rate * rate_columns(rates.mean, rates.turn_rad, rates.log_scale, rates.logit_opacity, rates.rgb)
         self.parameters.step(drawn, frame.drawn_rows, columns, self.settings.largest_m, weights.opacity, weights.scale)
         self._sky_adam.step(self.sky, by_sky, rate * rates.sky)
         self.responses.step(view.camera.id, view.frame, by_response, rate * rates.response, weights.response)

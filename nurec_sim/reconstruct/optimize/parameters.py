@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32, Int64
 
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
@@ -138,6 +138,10 @@ class Parameters:
         workers = shared_workers(None)
         workers.run(kernel, [(rows[low:high], *arguments) for low, high in workers.ranges(len(rows), 4096)])
 
+    def static_gaussians(self, rows: Int64[np.ndarray, " k"]) -> Gaussians:
+        """Some static Gaussians with their present values."""
+        return _with_values(self._scene.static[rows], self.values[rows])
+
     def scene(self) -> GaussianScene:
         """The scene with the present values."""
         everything, count = self.values, self.static_count
@@ -151,17 +155,17 @@ class Parameters:
         )
 
 
-def rate_columns(mean_m: float, quat: float, log_scale: float, logit_opacity: float, rgb: float) -> np.ndarray:
+def rate_columns(mean: float, turn_rad: float, log_scale: float, logit_opacity: float, rgb: float) -> np.ndarray:
     """Learning rates per value, [14], in the order of ``adam.MEAN`` and the others.
 
     Args:
-        mean_m: of means.
-        quat: of quaternions.
+        mean: of means, in standard deviations.
+        turn_rad: of turns.
         log_scale: of log standard deviations.
         logit_opacity: of opacity logits.
         rgb: of colours.
     """
-    return np.repeat([mean_m, quat, log_scale, logit_opacity, rgb], [3, 4, 3, 1, 3]).astype(np.float64)
+    return np.repeat([mean, turn_rad, log_scale, logit_opacity, rgb], [3, 4, 3, 1, 3]).astype(np.float64)
 
 
 def _values(gaussians: Gaussians) -> Float32[np.ndarray, "n 14"]:

@@ -10,8 +10,10 @@ from pathlib import Path
 class LearningRates:
     """Step sizes at the start; all fall by ``OptimizeSettings.final_rate`` until the end of the budget."""
 
-    mean_m: float = 0.004
-    quat: float = 0.02
+    mean: float = 0.2
+    """Of means along the axes of their Gaussian, in its standard deviations along them."""
+    turn_rad: float = 0.15
+    """Of turns about the axes of a Gaussian; of a tilt of a disc, as much less as it is thin (``adam``)."""
     log_scale: float = 0.04
     logit_opacity: float = 0.05
     rgb: float = 0.02
