@@ -171,7 +171,7 @@ def rank_agreement(comparison: Comparison) -> str:
         "The noise ceiling compares odd with even seeds of the reference: no reconstruction can be expected to agree "
         "better."
         if any(comparison.ceilings.values())
-        else "With one seed the noise ceiling is not known: repeat with --seeds 0 1 2 3."
+        else "With one seed per scene the noise ceiling is not known: repeat with several."
     )
     return (
         '<h2>Do they rank the policies alike?</h2><div class="card scroll"><table><thead><tr><th>Metric</th>'

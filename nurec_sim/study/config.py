@@ -129,7 +129,7 @@ def load_study(name: str | Path) -> StudyConfig:
         ScenarioError: a scenario that it names cannot be loaded.
     """
     path = Path(name)
-    if not path.suffix and not path.exists():
+    if not path.suffix and not path.is_file():  # a folder of that name, such as the study's own, does not count
         bundled = resources.files("nurec_sim.study") / "tiers" / f"{path}.yaml"
         if not bundled.is_file():
             raise RunError(f"no study named '{path}'; have {shipped_studies()}, or give a YAML file")

@@ -16,6 +16,8 @@ from nurec_sim.report.template import SCRIPT, STYLE
 from nurec_sim.study.results import RANKED_BY, StudyResults
 
 MOST_SCENES = 10
+ENOUGH_SCENES = 10
+"""Below this the report warns: the percentile bootstrap undercovers with few clusters."""
 
 
 def render_study(results: StudyResults) -> str:
@@ -76,6 +78,12 @@ def _verdict(results: StudyResults) -> str:
         items.append(
             f"Noise ceiling: the truth agrees with itself, odd against even trials, with tau-b "
             f"{_interval(ceiling.tau_b)}; no reconstruction can be expected to do better."
+        )
+    scenes = len(results.config.scenes)
+    if scenes < ENOUGH_SCENES:
+        items.append(
+            f'<span class="bad">Only {count_of(scenes, "scene")}</span>: bootstrap intervals over fewer than '
+            f"{ENOUGH_SCENES} are too narrow to rely on, and so are the tests below."
         )
     items.append(_discrimination(results))
     if results.differing:
@@ -176,7 +184,9 @@ def _families(results: StudyResults) -> str:
         for row in truth.group_by("family", "policy").agg(pl.col("value").mean()).iter_rows(named=True)
     }
     policies = sorted(truth["policy"].unique().to_list())
-    heads = "".join(f"<th>{escape(each.name)}<small>{escape(each.scenario)}</small></th>" for each in config.families)
+    heads = "".join(
+        f"<th>{escape(each.name)}<br><small>{escape(each.scenario)}</small></th>" for each in config.families
+    )
     rows = "".join(
         f"<tr><td><b>{escape(policy)}</b></td>"
         + "".join(f"<td>{shown(means.get((each.name, policy)), 'share')}</td>" for each in config.families)

@@ -57,6 +57,12 @@ def test_a_wrong_key_is_named(change, said):
     assert str(error.value).startswith("study file 'x.yaml': ") and said in str(error.value)
 
 
+def test_a_folder_does_not_hide_a_bundled_study(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "smoke").mkdir()
+    assert load_study("smoke").name == "smoke"
+
+
 def test_files_that_are_no_study(tmp_path):
     with pytest.raises(RunError, match="no study named 'smok'; have \\['nightly', 'smoke'\\]"):
         load_study("smok")

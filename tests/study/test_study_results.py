@@ -117,6 +117,14 @@ def test_failed_rollouts_are_counted_and_escaped():
     assert "2 failed" in page and "lens &lt;cap&gt; on" in page and "lens <cap>" not in page
 
 
+def test_few_scenes_are_warned_of(good):
+    few = good.config.families[0].model_copy(update={"seeds": (0, 1)})
+    small = CONFIG.model_copy(update={"families": (few,)})
+    kept = good.values.filter(pl.col("clipgt_id").is_in(["bend-0", "bend-1"]))
+    assert "Only 2 scenes" in render_study(results_of(small, kept, SEEING))
+    assert "Only 10 scenes" not in render_study(good)
+
+
 def test_the_same_values_give_the_same_page(good):
     page = render_study(good)
     assert page == render_study(results_of(CONFIG, values(GOOD), SEEING))
