@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -126,6 +128,18 @@ def test_every_point_goes_to_one_body():
     box = clip.tracks[0].path.world_from_body[0]
     local = geometry.transform_points(geometry.inverse(box), gathered.static.xyz_m)
     assert not geometry.points_in_box(local, (4.0, 1.8, 1.5), 0.14).any()
+
+
+def test_returns_of_a_scanner_that_reaches_far_are_kept():
+    """A Pandar128 measures up to 200 m; beyond ``max_range_m`` returns are errors."""
+    street = Street(frames=1)
+    near = street.sweep("top", 0)
+    xyz = np.array([[180.0, 3.0, 2.0], [255.0, 3.0, 2.0]])
+    far = dataclasses.replace(near, xyz_m=xyz, intensity=None, point_t_us=np.full(2, near.t_us))
+    street.sweep = lambda lidar, index: far
+    gathered = gather(street, [], set(), PointSettings())
+    assert len(gathered.static) == 1
+    assert gathered.static.xyz_m[0] == pytest.approx(far.xyz_world_m[0], abs=1e-3)
 
 
 @pytest.mark.parametrize("lens", ["plain", "distorted", "fisheye"])

@@ -18,7 +18,8 @@ class PointSettings:
     max_voxel_m: float = 0.48
     voxel_per_distance: float = 0.01
     """Voxel edge per metre of distance to the driven path, rounded down to a power of two times ``min_voxel_m``."""
-    max_range_m: float = 120.0
+    max_range_m: float = 250.0
+    """Farther returns are dropped."""
     carve: bool = True
     """Drop points, pixels and Gaussians that recorded beams passed through: ghosts of movers, wrong depth."""
 
