@@ -39,6 +39,10 @@ def figure_rows(figures: Mapping[str, Any]) -> list[Row]:
         for left, share in free["false_obstacles"].items():
             percent = None if share is None else 100 * share
             rows.append(Row("False obstacles", f"{left} beside the path (% of returns)", percent, 2, -1))
+        own = free["recorded_in_free_space"]
+        rows.append(
+            Row("False obstacles", "recorded returns, for comparison (%)", None if own is None else 100 * own, 2)
+        )
     if road := figures["road"]:
         rows.append(Row("Road", "off-road agrees with the map", road.get("agreement"), 3, 1))
     rows += [

@@ -1,5 +1,7 @@
 """Scores of a scene beside its log: FLIP, sharpness, holes, regions, false obstacles, and what is held out."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from reconstruct_street import Street, camera
@@ -213,8 +215,6 @@ def test_seen_and_unseen_frames_are_told_apart(figures):
 
 
 def test_a_scene_has_few_holes_and_one_without_gaussians_only_holes(figures):
-    import dataclasses
-
     clip, scene, held, scores = figures
     assert max(share for share in scores["image"]["seen"]["holes"].values() if share is not None) < 0.1
     none = np.zeros(len(scene.static), bool)
@@ -224,8 +224,6 @@ def test_a_scene_has_few_holes_and_one_without_gaussians_only_holes(figures):
 
 
 def test_no_false_obstacles_on_the_path_but_before_a_board_in_the_way(figures):
-    import dataclasses
-
     clip, scene, _, scores = figures
     assert scores["free_space"]["false_obstacles"]["0 m"] < 0.02
     board = scene.static[:400]
@@ -257,6 +255,28 @@ def test_false_obstacles_are_looked_for_on_both_sides_of_the_path_and_added_up(m
     assert shares == {"0 m": 3 / 8, "1 m": 0.0, "2 m": 0.0, "3 m": 0.0}
     assert sorted(pose[1, 3].round(6) for pose in places) == sorted([-3, -2, -1, 0, 1, 2, 3] * 2)
     assert all(np.allclose(pose[[0, 2], 3], 0) and np.allclose(pose[:3, :3], np.eye(3)) for pose in places)
+
+
+def test_beams_that_did_not_start_where_the_log_says_contradict_its_own_returns(monkeypatch):
+    """The same returns, said to be seen from 4 m behind the left wall: beams to the right cross that wall's returns."""
+    clip, behind = street(), geometry.pose_from_xyyaw(0.0, 12.0, 0.0)
+    measured, reports = clip.sweep, []
+
+    def nothing(requests):
+        none = np.zeros(0, np.float32)
+        return [LidarFrame(r.sensor, r.start_us, r.end_us, np.zeros((0, 3), np.float32), none, none,
+                           none.astype(np.int32)) for r in requests]  # fmt: skip
+
+    def elsewhere(lidar, index):
+        sweep = measured(lidar, index)
+        xyz = geometry.transform_points(geometry.inverse(behind), sweep.xyz_m)
+        return dataclasses.replace(sweep, xyz_m=xyz, world_from_lidar=sweep.world_from_lidar @ behind)
+
+    for sweep in (measured, elsewhere):
+        clip.sweep = sweep
+        reports.append(lidar_scores.score_free_space(clip, nothing, lambda stage, fraction: None))
+    true, wrong = (report["recorded_in_free_space"] for report in reports)
+    assert true < 0.02 and wrong > 0.1
 
 
 @pytest.mark.parametrize("via_grpc", [False, True])
