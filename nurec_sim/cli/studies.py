@@ -28,8 +28,9 @@ def study(
     The report says how well each reconstruction ranks the policies (tau-b with interval and noise ceiling, flipped
     pairs), and whether the study could tell a bad one.
 
-    Bundled studies: `smoke` (two scenes, a few minutes) and `nightly` (24 scenes, a night on two cores). Copy one from
-    the package's folder `study/tiers` to make your own; docs/study.md explains every key.
+    Bundled studies: `smoke` (2 scenes, minutes), `evening` (18 scenes, half an hour on two cores), `nightly` (24
+    scenes, also `dense`). Copy one from the package's folder `study/tiers` to make your own; docs/study.md explains
+    every key.
 
     An interrupted study goes on where it stopped: give the same command again. The result is the same, byte for byte,
     for any --jobs. Exit status 1 if a rollout failed.

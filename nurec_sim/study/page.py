@@ -77,7 +77,7 @@ def _verdict(results: StudyResults) -> str:
     else:
         items.append(
             f"Noise ceiling: the truth agrees with itself, odd against even trials, with tau-b "
-            f"{_interval(ceiling.tau_b)}; no reconstruction can be expected to do better."
+            f"{_interval(ceiling.tau_b)}; a reconstruction above that owes it to sharing the random numbers."
         )
     scenes = len(results.config.scenes)
     if scenes < ENOUGH_SCENES:

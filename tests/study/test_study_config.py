@@ -11,7 +11,7 @@ LEAST = {"name": "mine", "families": [{"name": "bend", "seeds": [3, 8]}], "polic
 
 
 def test_bundled_studies_load_and_name_known_policies():
-    assert {"smoke", "nightly"} <= set(shipped_studies())
+    assert {"smoke", "evening", "nightly"} <= set(shipped_studies())
     for name in shipped_studies():
         study = load_study(name)
         assert study.name == name and set(study.policies) <= set(available_policies())
@@ -64,7 +64,7 @@ def test_a_folder_does_not_hide_a_bundled_study(tmp_path, monkeypatch):
 
 
 def test_files_that_are_no_study(tmp_path):
-    with pytest.raises(RunError, match="no study named 'smok'; have \\['nightly', 'smoke'\\]"):
+    with pytest.raises(RunError, match="no study named 'smok'; have \\['evening', 'nightly', 'smoke'\\]"):
         load_study("smok")
     with pytest.raises(RunError, match="cannot be read"):
         load_study(tmp_path / "none.yaml")
