@@ -9,17 +9,11 @@ from jaxtyping import Float64, Int64
 
 from nurec_sim import geometry
 from nurec_sim.evaluate.log_regions import RANGES_M, range_name
-from nurec_sim.evaluate.scores.free_space import (
-    BEAMS,
-    FARTHEST_M,
-    FiredSweep,
-    RecordedBeams,
-    false_obstacles,
-    in_boxes,
-)  # fmt: skip
+from nurec_sim.evaluate.scores.free_space import FARTHEST_M, FiredSweep, RecordedBeams, false_obstacles, in_boxes  # fmt: skip
 from nurec_sim.evaluate.scores.lidar import CloudScore, LidarScore, scanner_along, score_sweep
 from nurec_sim.evaluate.scores.surfaces import KINDS, surfaces_of
 from nurec_sim.logs.fired import as_fired, fired_fraction
+from nurec_sim.reconstruct.free_space import balls, chosen_sweeps, in_free_space, sweep_beams
 from nurec_sim.sensors import lidar_model, range_map
 from nurec_sim.types import Clip, LidarFrame, LidarModel, Sense, SensorRequest
 
@@ -30,8 +24,8 @@ SCANS = 5
 """Number of instants of a log at which they are counted."""
 MOST_BEAM_SWEEPS = 60
 """Maximum number of recorded sweeps that define free space; sampled evenly from longer logs."""
-EVERY_RETURN = 8
-"""Every n-th recorded return is tested with the log's own beams."""
+EVERY_RETURN, RETURN_M = 8, 0.03
+"""Every n-th recorded return is tested with the log's own beams, as a ball of this standard deviation."""
 
 Report = Callable[[str, float], None]
 
@@ -169,8 +163,9 @@ def score_free_space(clip: Clip, sense: Sense, report: Report) -> dict[str, obje
 
     Returns:
         ``false_obstacles`` by offset, and ``recorded_in_free_space``: the share of the log's own returns at these
-        instants that its beams seem to have passed through. Poles and leaves give some 1 %; more says that beams did
-        not start where the log has its LiDAR, as in sweeps merged from several, and that the first figure means little.
+        instants that its beams passed through, by the rule of ``reconstruct.free_space``. Leaves and movers give 1 to
+        2 %; several percent say that beams did not start where the log has its LiDAR, as in sweeps merged from several,
+        and that the first figure means little.
     """
     lidar = next((name for name in clip.rig.lidars if len(clip.sweep_times_us(name))), None)
     if lidar is None:
@@ -198,19 +193,20 @@ def score_free_space(clip: Clip, sense: Sense, report: Report) -> dict[str, obje
     report("false obstacles", 1.0)
     for left, (false, total) in counts.items():
         shares[f"{left:g} m"] = false / total if total else None
-    return {"false_obstacles": shares, "recorded_in_free_space": _contradicted(clip, lidar, instants, beams)}
+    return {"false_obstacles": shares, "recorded_in_free_space": _contradicted(clip, lidar, instants)}
 
 
-def _contradicted(clip: Clip, lidar: str, instants: Int64[np.ndarray, " n"], beams: RecordedBeams) -> float | None:
-    """Share of recorded returns within reach, outside boxes of movers, that beams of several sweeps passed through."""
-    passed = total = 0
+def _contradicted(clip: Clip, lidar: str, instants: Int64[np.ndarray, " n"]) -> float | None:
+    """Share of recorded returns within reach, outside boxes of movers, that the log's own beams passed through."""
+    beams = [sweep_beams(clip, name, clip.sweep(name, index)) for name, index in chosen_sweeps(clip, ())]
     middle = clip.sweep_times_us(lidar).sum(axis=1) // 2
+    passed = total = 0
     for t_us in instants:
         sweep = clip.sweep(lidar, int(np.abs(middle - t_us).argmin()))
         near = np.linalg.norm(sweep.xyz_m, axis=1) < FARTHEST_M
         xyz = sweep.xyz_world_m[near][::EVERY_RETURN]
         xyz = xyz[~in_boxes(xyz, clip.tracks, sweep.t_us)]
-        passed += int((beams.passed(xyz) >= BEAMS).sum())
+        passed += int(in_free_space(balls(xyz, np.full(len(xyz), RETURN_M, np.float32)), beams).sum())
         total += len(xyz)
     return passed / total if total else None
 
