@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 
 from nurec_sim import geometry
 from nurec_sim.evaluate.log_regions import RANGES_M, range_name
-from nurec_sim.evaluate.scores.free_space import FARTHEST_M, FiredSweep, RecordedBeams, false_obstacles, in_boxes  # fmt: skip
+from nurec_sim.evaluate.scores.free_space import FARTHEST_M, FiredSweep, RecordedBeams, false_obstacles, in_boxes
 from nurec_sim.evaluate.scores.lidar import CloudScore, LidarScore, scanner_along, score_sweep
 from nurec_sim.evaluate.scores.surfaces import KINDS, surfaces_of
 from nurec_sim.logs.fired import as_fired, fired_fraction
