@@ -213,15 +213,9 @@ def _contradicted(clip: Clip, lidar: str, instants: Int64[np.ndarray, " n"]) -> 
 
 def _recorded_beams(clip: Clip) -> RecordedBeams:
     fired, ends = [], []
-    for lidar, index in _chosen_sweeps(clip):
+    for lidar, index in chosen_sweeps(clip, (), MOST_BEAM_SWEEPS):
         sweep = clip.sweep(lidar, index)
         xyz, poses = as_fired(clip, lidar, sweep)
         fired.append(FiredSweep(xyz, fired_fraction(sweep), poses))
         ends.append(sweep.xyz_world_m)
     return RecordedBeams(fired, np.concatenate(ends))
-
-
-def _chosen_sweeps(clip: Clip) -> list[tuple[str, int]]:
-    every = [(name, index) for name in clip.rig.lidars for index in range(len(clip.sweep_times_us(name)))]
-    chosen = np.unique(np.linspace(0, len(every) - 1, min(MOST_BEAM_SWEEPS, len(every))).round().astype(int))
-    return [every[k] for k in chosen]
