@@ -7,20 +7,17 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import Protocol, TypeVar
 
+from nurec_sim.compute.worker import follow_parent
 from nurec_sim.errors import RunError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 TICK_S = 1.0
-PARENT_GONE = 3
-"""Exit status of a worker whose parent ended first."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")
 """Libraries that would otherwise take every core in every worker; LP is Mesa's software renderer."""
 
@@ -84,14 +81,6 @@ class LocalProcesses:
 
 def _begin() -> None:
     """First call in a worker: one thread per library, Ctrl-C left to the parent, and no life without it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    follow_parent()
     for name in ONE_THREAD:
         os.environ[name] = "1"
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-
-
-def _end_with(parent: multiprocessing.process.BaseProcess) -> None:
-    parent.join()
-    os._exit(PARENT_GONE)
