@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.request
 from types import SimpleNamespace
 
 import grpc
@@ -18,7 +19,7 @@ from serving_world import camera_request, scene
 from nurec_sim.scene import write_scene
 from nurec_sim.serving.server import SensorServer, ServerOptions
 from nurec_sim.serving.store import SceneStore
-from nurec_sim.serving.wire import ImageFormat, common, sensorsim
+from nurec_sim.serving.wire import ImageFormat, sensorsim
 
 
 @pytest.fixture(scope="module")
@@ -27,22 +28,29 @@ def archive(tmp_path_factory):
 
 
 BATCH = 12
+"""Images of a call of a second."""
+FLAGS = ("--port", "0", "--grace", "60", "--health-port", "0", "--metrics-port", "0", "--log-level", "info")
 
 
-def long_batch():
-    """A call of a second."""
+def long_batch(images):
+    """One call for so many images."""
     batch = sensorsim.BatchRGBRenderRequest()
-    for k in range(BATCH):
+    for k in range(images):
         message = camera_message(camera_request(t_us=5_100_000 + k), ImageFormat.PNG)
         message.resolution_w, message.resolution_h = 1280, 720
         batch.items.add(camera_name=str(k), request=message)
     return batch
 
 
-def begun_batch(stub):
-    """A long batch that the server has begun: it reads a connection's calls in the order in which they were sent."""
-    batch = stub.batch_render_rgb.future(long_batch(), timeout=60)
-    stub.get_version(common.Empty(), timeout=60)
+def said_address(process):
+    """The address at the end of the server's next log line."""
+    return process.stderr.readline().rsplit(" ", 1)[1].strip()
+
+
+def begun_batch(stub, metrics, images=BATCH):
+    """A batch that an idle server has begun: a call that it has only received may be refused after the signal."""
+    batch = stub.batch_render_rgb.future(long_batch(images), timeout=300)
+    wait_until(lambda: b"requests_in_progress 1.0\n" in urllib.request.urlopen(metrics).read(), 60)
     return batch
 
 
@@ -60,14 +68,15 @@ def test_a_signal_under_load_lets_calls_finish_and_takes_no_new_ones(archive):
                     return
                 begun.set()
 
-    with serving("serve", archive, "--port", "0", "--grace", "60") as (process, address), Stub(address) as stub:
+    with serving("serve", archive, *FLAGS) as (process, address), Stub(address) as stub:
+        _, metrics = said_address(process), said_address(process)
+        batch = begun_batch(stub, metrics)
         clients = [threading.Thread(target=keep_asking, args=(address,)) for _ in range(8)]
         for client in clients:
             client.start()
         assert begun.wait(300)  # the first frame of all may have to wait for kernels to be compiled
-        batch = begun_batch(stub)
         process.send_signal(signal.SIGTERM)
-        reply = batch.result(timeout=60)
+        reply = batch.result(timeout=300)
         assert len(reply.items) == BATCH and all(item.success for item in reply.items)
         for client in clients:
             client.join(60)
@@ -79,10 +88,9 @@ def test_a_signal_under_load_lets_calls_finish_and_takes_no_new_ones(archive):
 
 
 def test_a_second_signal_ends_the_process_at_once(archive):
-    words = ("serve", archive, "--port", "0", "--grace", "60", "--health-port", "0", "--log-level", "info")
-    with serving(*words) as (process, address), Stub(address) as stub:
-        health = process.stderr.readline().rsplit(" ", 1)[1].strip()
-        batch = begun_batch(stub)
+    with serving("serve", archive, *FLAGS) as (process, address), Stub(address) as stub:
+        health, metrics = said_address(process), said_address(process)
+        batch = begun_batch(stub, metrics, images=5 * BATCH)
         process.send_signal(signal.SIGTERM)
         with grpc.insecure_channel(health) as channel:
             check = health_pb2_grpc.HealthStub(channel).Check
