@@ -62,6 +62,7 @@ def test_one_scene_is_no_comparison():
         compare_scenes(Street(frames=2), {"a": lambda: None})
 
 
+@pytest.mark.slow
 def test_the_verb_writes_a_report_and_names_what_is_wrong(comparison, tmp_path, monkeypatch, capsys):
     clip, good, dark, _ = comparison
     monkeypatch.chdir(tmp_path)

@@ -63,6 +63,7 @@ def test_over_grpc_the_figures_are_the_same(figures):
     assert over["lidar"] == figures[0]["lidar"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half_width_m, agrees", slow_after(1, [(1.2, False), (4.0, True)]))
 def test_road_is_scored_against_the_map_of_the_log(half_width_m, agrees):
     ring = np.array([[-40, -half_width_m], [60, -half_width_m], [60, half_width_m], [-40, half_width_m]])
@@ -72,6 +73,7 @@ def test_road_is_scored_against_the_map_of_the_log(half_width_m, agrees):
     assert (road["agreement"] >= 0.95) == agrees
 
 
+@pytest.mark.slow
 def test_road_is_not_scored_without_a_map_or_a_drive(figures):
     assert figures[0]["road"] is None
     ring = np.array([[-40.0, -4], [60, -4], [60, 4], [-40, 4]])

@@ -62,6 +62,7 @@ def test_the_truth_of_a_target_is_what_the_world_shows_from_there(storm):
     assert np.median(np.abs(shown - z)[shown > 0] / z[shown > 0]) < 0.03
 
 
+@pytest.mark.slow
 def test_shift_moves_the_car_to_its_left_and_skips_what_is_inside_of_things():
     with Protocol("shift", (5,), **SMALL).window(0) as window:
         offsets = {target.left_m for target in window.targets}
@@ -102,6 +103,7 @@ def test_lidar_holds_out_sweeps_and_measures_them_beside_the_path_too(lidar):
             assert np.mean(np.linalg.norm(clip.sweep("lidar_top", index).xyz_m, axis=1) < 1) <= 0.2
 
 
+@pytest.mark.slow
 def test_clip_holds_out_every_kth_frame_of_all_cameras():
     protocol = Protocol("clip", (5,), seconds=2.0, rate_hz=3.0, hold_out_every=3, boxes=True, **SMALL)
     with protocol.window(0) as window:

@@ -11,6 +11,8 @@ from nurec_sim.evaluate import contenders, run_protocol
 from nurec_sim.evaluate.methods import CHOICES, describe, without_weights
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, PointSettings, ViewSettings
 
+pytestmark = pytest.mark.slow
+
 LIFT = LiftSettings(sky_px=32, views=ViewSettings(levels=16), points=PointSettings(min_voxel_m=0.24))
 NETWORK = FeedForwardSettings(random_weights=3, sky_px=16)
 

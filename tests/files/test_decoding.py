@@ -283,6 +283,7 @@ def test_xml_of_too_many_tags_is_not_parsed(memory):
     assert opendrive_root(b"<OpenDRIVE><road/></OpenDRIVE>", "map.xodr")[0].tag == "road"
 
 
+@pytest.mark.slow
 def test_a_volume_of_lists_within_lists_is_given_up_while_it_is_counted(memory):
     """3,000 bytes unpack to 2 million empty lists and mappings: 64 bytes each."""
     list_of_many = struct.pack(">BI", 0xDD, 100_000) + b"\x90\x80" * 50_000

@@ -17,6 +17,7 @@ import pytest
 import tiny_clip
 import torch
 import training_clips
+from repetition import slow_after
 from serving_world import scene
 
 import nurec_sim.evaluate
@@ -235,7 +236,7 @@ def test_a_place_that_cannot_be_written_is_one_line_before_the_work(
     assert files(place) == before
 
 
-@pytest.mark.parametrize("video", [False, True])
+@pytest.mark.parametrize("video", slow_after(1, [True, False]))
 def test_a_run_on_a_full_disk_ends_with_one_line_and_goes_on_later(
     video: bool, place: Path, monkeypatch, capsys
 ) -> None:

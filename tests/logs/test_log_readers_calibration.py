@@ -8,6 +8,8 @@ from waymo_files import write_waymo
 
 from nurec_sim import geometry, logs
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def town():

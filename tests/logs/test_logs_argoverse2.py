@@ -43,6 +43,7 @@ def change(path: Path, *expressions) -> None:
     polars.read_ipc(path.read_bytes()).with_columns(*expressions).write_ipc(path)
 
 
+@pytest.mark.slow
 def test_a_log_keeps_the_contract(folder):
     assert logs.check_reader(folder, Argoverse2Reader()) == []
 

@@ -299,6 +299,7 @@ def places(value: Any, path: tuple = ()) -> list[tuple]:
     return [found for key in keys for found in [(*path, key), *places(value[key], (*path, key))]]
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(
     name=st.sampled_from(["meta.json", "calib.json", "frames.json", "tracks.json", "map.json"]),

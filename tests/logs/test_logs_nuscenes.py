@@ -35,6 +35,7 @@ def clip(root) -> logs.Clip:
     return logs.open_clip(root / "scene-0007")
 
 
+@pytest.mark.slow
 def test_a_scene_keeps_the_contract(root):
     assert logs.check_reader(root / "scene-0007", NuScenesReader()) == []
 

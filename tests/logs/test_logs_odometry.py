@@ -34,6 +34,7 @@ def drifting(clip: logs.Clip, metres: float) -> logs.Clip:
     return clip.corrected(Trajectory(times, start @ np.array(local) @ geometry.inverse(start)))
 
 
+@pytest.mark.slow
 def test_drift_is_undone_and_reported(exact):
     clip = drifting(exact, 0.5)
     times = np.array([record.t_us for record in exact.sweep_records(LIDAR)])

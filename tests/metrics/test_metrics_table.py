@@ -143,6 +143,7 @@ def test_mean_is_the_scene_mean_of_trial_means_with_an_interval_over_scenes():
     assert one_scene["low"].is_null().all() and one_scene["high"].is_null().all()
 
 
+@pytest.mark.slow
 def test_interval_matches_theory_for_many_scenes():
     rng = np.random.default_rng(5)
     hits = rng.random(60) < 0.3

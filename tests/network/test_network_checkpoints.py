@@ -257,6 +257,7 @@ def test_half_precision_rounds_parameters_and_keeps_buffers(tmp_path: Path) -> N
     assert_same(load_state_dict(tmp_path / "w.safetensors"), state)
 
 
+@pytest.mark.slow
 def test_the_same_weights_are_the_same_bytes_in_every_process(tmp_path: Path) -> None:
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); from pathlib import Path\n"

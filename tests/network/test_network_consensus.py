@@ -136,6 +136,7 @@ def test_points_before_movable_things_are_looked_through_too():
     assert found.shown[1, 30:45, 60:90].mean() < 0.05
 
 
+@pytest.mark.slow
 def test_only_what_stands_may_own_a_surface():
     """Far images agree on a wall; a near one too, but two beside it look through: it is dropped and owns nothing."""
     chunk, true_m, semantic = street(frames=16)

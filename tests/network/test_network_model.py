@@ -122,6 +122,7 @@ def test_unknown_profile():
         network.build("huge")
 
 
+@pytest.mark.slow
 def test_small_profiles_fit_into_a_repository(tmp_path):
     dense, selective = network.build("tiny"), network.build("tiny-selective")
     assert sum(parameter.numel() for parameter in dense.parameters()) < 8.3e6

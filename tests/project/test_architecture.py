@@ -34,6 +34,7 @@ def test_policies_know_types_and_geometry_only(path: Path) -> None:
     assert not foreign
 
 
+@pytest.mark.slow
 def test_nothing_imports_policies() -> None:
     paths = sorted((REPO / "nurec_sim").rglob("*.py"))
     assert len(paths) > 100

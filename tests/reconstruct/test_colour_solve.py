@@ -71,6 +71,7 @@ def test_results_do_not_depend_on_the_number_of_threads(street, lifted, solved, 
     assert scene_hash(solved_from(lifted, street)) == scene_hash(solved)
 
 
+@pytest.mark.slow
 def test_the_method_solves(street, solved):
     scene = reconstruct(street, settings=SOLVED, cameras=["front"])
     # What ``solved`` started from had been rounded to half floats, as archives keep them.

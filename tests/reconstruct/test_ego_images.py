@@ -4,6 +4,7 @@ import dataclasses
 
 import cv2
 import numpy as np
+import pytest
 from feedforward_clip import MadeClip, clip_of, frame_times, pinhole
 
 from nurec_sim import geometry, sensors
@@ -11,6 +12,8 @@ from nurec_sim.reconstruct.ego_images import find_ego_images
 from nurec_sim.reconstruct.lift.settings import ViewSettings
 from nurec_sim.reconstruct.lift.views import read_views
 from nurec_sim.types import Trajectory
+
+pytestmark = pytest.mark.slow
 
 CAMERA = pinhole("front", width=400, height=240, field_deg=80.0)
 

@@ -16,6 +16,8 @@ from nurec_sim.render.cpu.renderer import CpuRenderer
 from nurec_sim.sim import Scenario, run_rollout
 from nurec_sim.types import Label, SensorRequest
 
+pytestmark = pytest.mark.slow
+
 CAMERAS = ["front", "left", "wide"]
 
 

@@ -173,6 +173,7 @@ def test_held_out_sweeps_do_not_carve_and_long_logs_are_thinned_evenly():
     assert chosen_sweeps(Street(frames=2), {0, 1}) == []
 
 
+@pytest.mark.slow
 def test_lift_keeps_nothing_where_beams_passed():
     """A box stands in the first frame only and is not labelled: a ghost in front of a wall across the street.
 

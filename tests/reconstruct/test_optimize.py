@@ -100,6 +100,7 @@ cli.main(["reconstruct", sys.argv[1], "--out", "scene.usdz", "--overwrite", "--r
 """
 
 
+@pytest.mark.slow
 def test_a_kill_leaves_the_old_archive(tmp_path):
     clip, archive = tiny_clip.write(tmp_path / "drive.zip"), tmp_path / "scene.usdz"
     archive.write_bytes(b"the old one")
@@ -182,6 +183,7 @@ def test_a_wrong_pose_is_corrected(street, lifted):
     assert told["largest_shift_m"] > 0.02 and abs(told["time_offset_ms"]) < 2
 
 
+@pytest.mark.slow
 def test_the_method_is_lift_and_a_fit_and_needs_images(street):
     scene = reconstruct(street, "optimized", cameras=["front"], settings=OptimizeSettings(seconds=None, steps=1))
     assert scene.provenance["method"] == "lift" and scene.provenance["refined"]["steps"] == 1

@@ -111,6 +111,7 @@ def test_provenance_is_plain_json(scene):
     assert any(text.startswith("no map") for text in facts["unknown"])
 
 
+@pytest.mark.slow
 def test_same_clip_same_scene_by_any_number_of_threads(street, scene, monkeypatch):
     monkeypatch.setattr(cores, "usable_cores", lambda: 3)
     again = reconstruct(street, settings=SMALL)
@@ -127,6 +128,7 @@ def test_works_without_boxes_and_intensity():
     assert geometry.points_in_box(box, (4, 1.8, 1.5), 0.2).sum() > 50
 
 
+@pytest.mark.slow
 def test_works_with_one_frame_and_standing():
     one = reconstruct(Street(frames=1, boxes=PARKED), settings=SMALL)
     assert len(one.static) > 1000 and len(one.dynamic) > 20
@@ -140,6 +142,7 @@ def test_works_without_cameras(street):
     assert any(text.startswith("no cameras") for text in scene.provenance["unknown"])
 
 
+@pytest.mark.slow
 def test_camera_gain_becomes_its_isp():
     pair = (camera("left", 0.3), camera("right", -0.3))
     clip = Street(frames=3, cameras=pair, gains={"right": 0.8})
@@ -185,6 +188,7 @@ def test_progress_names_stages_in_order(street):
     assert told == sorted(told) and (told[0], told[-1]) == (0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_the_provenance_says_by_how_much_times_were_moved():
     moved = reconstruct(Street(frames=1, time_offset_us=1_000_000), settings=SMALL)
     assert moved.provenance["time_offset_us"] == 1_000_000

@@ -126,6 +126,7 @@ def spoilt(rows):
     return result
 
 
+@pytest.mark.slow
 @settings(max_examples=50, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.sampled_from(ASKED), st.lists(ROW, max_size=8), st.lists(MOTION, max_size=4))
 def test_any_mixture_of_broken_gaussians(asked, rows, motions):

@@ -84,6 +84,7 @@ def test_a_server_renders_where_it_is_told(a_gpu):
     assert [type(renderer).__name__ for renderer in made] == ["GpuRenderer", "GpuRenderer", "CpuRenderer"]
 
 
+@pytest.mark.slow
 def test_render_says_which_device_once_and_refuses_others(tmp_path, no_driver, capsys):
     from nurec_sim.scene import write_scene
 

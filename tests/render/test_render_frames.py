@@ -76,6 +76,7 @@ def test_lidar_threshold_range_and_unknown_intensity():
     assert len(CpuRenderer(scene(wall())).render_lidar(request(short)).beam) == 0
 
 
+@pytest.mark.slow
 def test_lidar_reports_the_surface_and_no_mean_of_two():
     lidar = sensors.lidar_model("VLP-16", np.eye(4), columns=180)
     veil = dataclasses.replace(wall(6.0), opacity=np.full(len(wall()), 0.12, np.float32))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from gradient_worlds import SMALL, drawn, loss_of, motion, moved_world, poses_of, reference, weights, world
+from repetition import slow_after
 
 from nurec_sim import geometry
 from nurec_sim.render import spec
@@ -70,7 +71,7 @@ def test_every_parameter(name, parameter):
     assert_slopes_agree(loss, getattr(made, parameter), gradient, picked)
 
 
-@pytest.mark.parametrize("k", [3, 8, 15])
+@pytest.mark.parametrize("k", slow_after(1, [3, 8, 15]))
 def test_view_dependent_colours(k):
     sensor, made, pair = SMALL["pinhole"], world(20, sh=k), poses_of("pinhole")
     tensors = GaussianTensors.of(made)

@@ -19,6 +19,8 @@ from nurec_sim.render.cpu.grid import make_grid
 from nurec_sim.sensors import camera as camera_rays
 from nurec_sim.types import Fisheye, FTheta, FThetaReference, Pinhole, Shutter
 
+pytestmark = pytest.mark.slow
+
 LIDAR = sensors.lidar_model("VLP-16", np.eye(4), columns=240)
 LENSES = [
     None,
@@ -163,6 +165,7 @@ def test_hidden_tracks_are_not_drawn(world, boxed):
     assert np.abs(spec.render_camera(world, hidden).rgb.astype(int) - expected).max() <= 2
 
 
+@pytest.mark.slow
 def test_sixteen_threads_share_a_renderer(world, alone):
     """Also on its first frames, when tables and buffers are made."""
     renderer, asked = CpuRenderer(world, threads=2), list(mixture())

@@ -45,6 +45,7 @@ def test_a_rollout_comes_back_bit_for_bit(tmp_path, run):
     assert path.read_bytes() == save_rollout(load_rollout(path), tmp_path / "again.npz").read_bytes()
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.floats(-1e9, 1e9), min_size=1, max_size=4), st.text(max_size=8))
 def test_any_numbers_and_texts_survive(tmp_path_factory, numbers, text):

@@ -152,6 +152,7 @@ class Looks:
         return Plan(observation.t_us + 100_000 * steps, np.column_stack([0.8 * steps, 0 * steps, 0 * steps]))
 
 
+@pytest.mark.slow
 def test_a_server_killed_in_the_middle_fails_what_is_left_within_seconds(place, tmp_path):
     scene, _ = flat_street()
     scenario, heard = sim.load_scenario(place / "brief.yaml"), []
@@ -173,6 +174,7 @@ def test_a_server_killed_in_the_middle_fails_what_is_left_within_seconds(place, 
     assert len(rollouts[1].states) == 3 + 1 + 10
 
 
+@pytest.mark.slow
 def test_a_frozen_server_costs_one_time_limit_and_then_the_time_to_connect(place):
     with serving("serve", str(place / "street.usdz"), "--port", "0") as (process, address):
         with RemoteSensors(address, "street", timeout_s=2.0, connect_timeout_s=0.5) as sensors:
@@ -212,6 +214,7 @@ def test_a_finished_archive_is_not_refined(place, capsys):
     assert "--refine optimises reconstructions of clips; clipgt-street is a finished archive" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_real_interrupt_ends_a_run_with_130(place):
     """Ctrl-C while a policy hangs."""
     (place / "sleeps.py").write_text(

@@ -8,6 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 from metrics_worlds import flat_street, full_rollout
+from repetition import slow_after
 from striped_images import striped
 
 from nurec_sim import runs, sim
@@ -101,7 +102,7 @@ def test_resume_keeps_what_is_finished_and_drives_the_rest(finished):
     assert layout.rollout_folders(run)
 
 
-@pytest.mark.parametrize("spoil", ["cut", "bit", "empty", "other file"])
+@pytest.mark.parametrize("spoil", slow_after(1, ["bit", "cut", "empty", "other file"]))
 def test_a_damaged_rollout_is_driven_again_with_a_line_that_says_so(tmp_path, spoil):
     scene, _ = flat_street()
 

@@ -55,6 +55,7 @@ print(hashlib.sha256(target.getvalue()).hexdigest())
 """
 
 
+@pytest.mark.slow
 def test_the_bytes_of_a_video_do_not_depend_on_what_memory_held_before():
     """glibc fills allocated memory with MALLOC_PERTURB_: an encoder that reads what it never wrote gives two."""
     command = [sys.executable, "-c", ENCODES]

@@ -97,6 +97,7 @@ finite32 = st.floats(allow_nan=False, allow_infinity=False, width=32)
 finite64 = st.floats(allow_nan=False, allow_infinity=False)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(data=st.data(), count=st.integers(0, 6), scene_id=st.text("aé/@ \"\\'{}", min_size=1))
 def test_round_trip_of_any_numbers(tmp_path_factory, data, count, scene_id):
@@ -183,6 +184,7 @@ def test_archives_of_version_1_are_read_exactly(tmp_path):
     assert_same(archived(scene), read_scene(tmp_path / "a.usdz"))
 
 
+@pytest.mark.slow
 def test_same_scene_gives_the_same_bytes_in_every_process(tmp_path):
     first = write_scene(full_scene(), tmp_path / "a.usdz").read_bytes()
     assert write_scene(full_scene(), tmp_path / "b.usdz").read_bytes() == first

@@ -179,6 +179,7 @@ def test_surroundings_come_from_a_scene_and_skies_from_the_nearest_file(tmp_path
     assert import_scene(path, like=like, sky=tmp_path / "other.npz").sky.shape == (6, 2, 2, 3)
 
 
+@pytest.mark.slow
 def test_a_layer_takes_sky_and_colours_from_a_scene(tmp_path):
     """Of OpenUSD files too: what SCENE has and the file has not."""
     scene = dataclasses.replace(street(sh=0), dynamic=worlds.scene().dynamic)

@@ -286,6 +286,7 @@ def test_scaling_keeps_the_field_of_view(lens, width, height):
     assert np.allclose(after[both], before[both] * (width / WIDTH, height / HEIGHT), atol=1e-6 * max(width, height))
 
 
+@pytest.mark.slow
 @SMALL
 @given(lens=st.one_of(fthetas_by_angle, fthetas_by_distance))
 def test_fill_ftheta_adds_the_missing_polynomial(lens):

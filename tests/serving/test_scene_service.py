@@ -189,6 +189,7 @@ def test_clients_check_what_they_send_and_get(client):
         wire.read_range_map(v1.RangeMap(rows=2, columns=2, range_m=b"\0" * 16, intensity=b""), lidar_request())
 
 
+@pytest.mark.slow
 def test_clients_of_more_scenes_than_fit_get_the_right_frames():
     names = ("a", "b", "c")
     store = SceneStore([scene(name, seed=i) for i, name in enumerate(names)], capacity=1, threads=1)

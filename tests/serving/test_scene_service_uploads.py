@@ -256,6 +256,7 @@ run_until_signal(SensorServer(SceneStore([sys.argv[1]], threads=1), port=0, scen
 """
 
 
+@pytest.mark.slow
 def test_a_server_killed_during_an_upload_starts_again_without_a_half_file(archive, folder, tmp_path):
     street = write_scene(scene(), tmp_path / "street.usdz")
     command = [sys.executable, "-c", SERVER, str(street), str(folder)]

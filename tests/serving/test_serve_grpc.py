@@ -77,6 +77,7 @@ def test_the_launch_line_of_alpasim_serves_and_ends_cleanly(scenes, tmp_path):
     assert re.fullmatch(r"warning: any client that can reach 0.0.0.0:0 may call; .*", warnings[1])
 
 
+@pytest.mark.slow
 def test_a_protected_server_with_all_its_ports(scenes, tmp_path):
     from grpc_health.v1 import health_pb2, health_pb2_grpc
 

@@ -80,6 +80,7 @@ def test_eight_clients_at_once_get_what_one_gets(workers):
     assert slowest < 1.0
 
 
+@pytest.mark.slow
 def test_sixteen_clients_of_cameras_and_lidars_get_what_one_gets():
     """Each client has a channel of its own, asks in its own order, and for two scenes."""
     asked = []

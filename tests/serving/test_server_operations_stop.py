@@ -54,6 +54,7 @@ def begun_batch(stub, metrics, images=BATCH):
     return batch
 
 
+@pytest.mark.slow
 def test_a_signal_under_load_lets_calls_finish_and_takes_no_new_ones(archive):
     outcomes, begun = [], threading.Event()
 

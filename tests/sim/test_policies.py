@@ -77,6 +77,7 @@ def test_the_camera_brakes_for_a_parked_car(name):
     assert np.all(speed**2 / (2 * 8.0) < gap) and speed[-1] < 5.0
 
 
+@pytest.mark.slow
 def test_the_camera_follows_a_curve_it_only_sees():
     world = worlds.curve(radius_m=45.0)
     rollout = drive("camera_road_follower", world)

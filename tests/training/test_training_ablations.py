@@ -129,6 +129,7 @@ def test_variants_share_what_they_have_in_common(script, tmp_path):
     assert not {folder for folder, _ in again} & set(folders["full"])
 
 
+@pytest.mark.slow
 def test_finished_runs_are_not_trained_again(script, tmp_path):
     stages = [stage.model_dump() | {"steps": 1, "warm_up": 0} for stage in (CONFIG.stages[0], CONFIG.stages[2])]
     config, options = small_config(stages=stages), script.Options(out=tmp_path, threads=1)

@@ -107,6 +107,7 @@ def test_each_sample_has_its_clip_and_random_numbers_of_its_own(tmp_path, monkey
     assert draw_sample(tmp_path, WINDOWS, 2, 5) == samples[5] != draw_sample(tmp_path, WINDOWS, 3, 5)
 
 
+@pytest.mark.slow
 def test_a_failing_worker_is_reported_and_ends(tmp_path, monkeypatch):
     monkeypatch.setattr(cache_module, "TRIALS", 1)
     lines = []
@@ -117,6 +118,7 @@ def test_a_failing_worker_is_reported_and_ends(tmp_path, monkeypatch):
     assert len(lines) == 1 and "status 1" in lines[0]
 
 
+@pytest.mark.slow
 def test_a_process_fills_the_cache_and_a_second_run_goes_on(tmp_path):
     seen = []
     ClipCache(tmp_path, SETTINGS, 1, TOWN).fill(

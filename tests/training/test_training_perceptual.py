@@ -142,6 +142,7 @@ def test_small_images_use_fewer_scales_and_smaller_ones_are_refused():
         perceptual_distance(image, torch.rand(9, 60, 3))
 
 
+@pytest.mark.slow
 def test_beside_an_l1_loss_it_brings_an_uncertain_picture_nearer_to_the_truth():
     """One image has to explain pictures that lie now here and now there, as renderings from uncertain depth do."""
     image, rng = picture(64, 96), np.random.default_rng(1)

@@ -19,6 +19,8 @@ from nurec_sim.training.checkpoint import CHECKPOINT, read_position
 from nurec_sim.training.config import Stage, read_config
 from nurec_sim.training.trainer import CURVES, WEIGHTS, Trainer, learning_rate
 
+pytestmark = pytest.mark.slow
+
 
 def trainer(folder, config=None):
     return Trainer(config or small_config(), folder, GroundSamples(), mean_difference, threads=1)

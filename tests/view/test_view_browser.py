@@ -219,6 +219,7 @@ def test_ports_and_hosts(capsys):
     assert "refused to listen at '0.0.0.0', which other machines can reach; forward the port" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_command_stops_at_ctrl_c(tmp_path):
     scene.write_scene(view_worlds.scene(), tmp_path / "street.usdz")
     command = [

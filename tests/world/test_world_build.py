@@ -58,6 +58,7 @@ def world_triangles(town, data, geom):
     return points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
 
 
+@pytest.mark.slow
 def test_same_plan_same_bytes(town):
     again = build_town(town.plan)
     tables = """tex_data mesh_vert mesh_normal mesh_texcoord mesh_face geom_pos geom_quat geom_user geom_rgba geom_matid

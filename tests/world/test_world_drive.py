@@ -15,6 +15,8 @@ from nurec_sim.sim import Scenario, run_rollout
 from nurec_sim.types import Trajectory
 from nurec_sim.world import TrueWorld, street_rig, town_plan, write_town_clip
 
+pytestmark = pytest.mark.slow
+
 RIG = street_rig(84, 48, lidar_rows=16, lidar_columns=120)
 SCENARIO = Scenario(name="truth", duration_s=3.0, policies=("lidar_aeb", "camera_road_follower"),
                     sensors={"image_width_px": 84})  # fmt: skip

@@ -12,6 +12,8 @@ from nurec_sim.world import LABEL_OF_CLASS, SurfaceClass, street_rig
 from nurec_sim.world.sense.faces import FaceImage, Seen, plan_faces
 from nurec_sim.world.sense.shutter import bands_for, camera_patches, lidar_patches
 
+pytestmark = pytest.mark.slow
+
 FRONT = street_rig(112, 64).cameras["camera_front"]
 GLASS = Windshield(WindshieldReference.FORWARD, (0.002, 1.01, 0.003, 0.004, 0.002, -0.01),
                    (0.01, 0.004, 0.02, 0.99, 0.01, 0.03))  # fmt: skip

@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 import shapely
+from repetition import slow_after
 
 from nurec_sim import geometry
 from nurec_sim.errors import ClipError
@@ -19,7 +20,7 @@ def box(world_from_box, length_m, width_m):
     return shapely.Polygon(geometry.box_corners_xy(world_from_box, length_m, width_m))
 
 
-@pytest.fixture(scope="module", params=splits.TEMPLATES.all)
+@pytest.fixture(scope="module", params=slow_after(4, splits.TEMPLATES.all))
 def plan(request):
     split = "test" if request.param in splits.TEMPLATES.held_out else "train"
     return town_plan(3, split, request.param)
@@ -81,6 +82,7 @@ def test_ego_and_cars_stand_on_the_sloping_ground(plan):
             np.testing.assert_allclose(bottom[0, 2], plan.terrain.height_m(bottom[0, :2]), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_training_never_sees_what_is_held_out():
     kinds = (splits.TEMPLATES, splits.FACADES, splits.ASPHALTS, splits.PAVINGS, splits.FOLIAGES, splits.SKIES)
     held_out = {name for choices in kinds for name in choices.held_out}

@@ -11,6 +11,8 @@ from nurec_sim.world import SurfaceClass, TownNetwork
 from nurec_sim.world.model.assemble import build_town
 from nurec_sim.world.plan.layout import still_town
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module", params=["roundabout", "narrowing"])
 def town(request):

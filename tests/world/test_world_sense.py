@@ -21,6 +21,7 @@ HORIZON = -0.05
 """Towns are hilly: only rays steeper than this must meet the ground."""
 
 
+@pytest.mark.slow
 def test_two_worlds_of_one_plan_give_the_same_bytes(plan, rays):
     camera, lidar = request_at(plan, FRONT, 2.0), request_at(plan, LIDAR, 2.0, 100_000)
     with TrueWorld(small_plan.__wrapped__(), "rays") as again:
@@ -99,6 +100,7 @@ def test_opengl_follows_an_off_centre_lens(plan, painted, rays):
     assert np.median(np.abs(drawn.depth_m - cast.depth_m)[drawn.surface == cast.surface]) < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.needs_gl
 def test_opengl_serves_many_threads_with_the_same_frames(plan, painted):
     requests = [request_at(plan, FRONT, 0.5 * i) for i in range(8)]

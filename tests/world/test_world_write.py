@@ -133,6 +133,7 @@ def test_truth_lies_apart_from_the_log(plan, written):
     assert "exposure" not in json.dumps(dict(log.facts))
 
 
+@pytest.mark.slow
 def test_same_plan_same_log_to_the_byte(plan, written, tmp_path):
     again = write_town_clip(plan, tmp_path / "clip.zip", responses=random_responses(RIG, 4), **OPTIONS)
     assert again.read_bytes() == written[0].read_bytes()
@@ -177,6 +178,7 @@ def test_attachments_need_names_of_their_own(plan, tmp_path, name):
 # ----------------------------------------------------------------------------------------------------- command line
 
 
+@pytest.mark.slow
 def test_the_verb_draws_a_plan_with_the_car_that_was_asked_for(plan, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv(backend.ENVIRONMENT, "rays")
     (tmp_path / "plan.json").write_text(plan.to_json())
