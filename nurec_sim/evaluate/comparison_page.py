@@ -11,7 +11,7 @@ import numpy as np
 
 from nurec_sim.evaluate.comparison import Comparison, Picture
 from nurec_sim.evaluate.log_tables import Row, side_by_side
-from nurec_sim.report.template import STYLE
+from nurec_sim.report.template import html_page
 
 JPEG_QUALITY = 88
 MORE_STYLE = (
@@ -33,17 +33,17 @@ def render_comparison(comparison: Comparison) -> str:
             '<h2>Side by side</h2><div class="card"><video controls loop muted playsinline '
             f'src="data:video/mp4;base64,{data}"></video></div>'
         )
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(' / '.join(names))} · nurec_sim</title><style>{STYLE}{MORE_STYLE}</style></head>\n"
-        "<body><main>\n"
-        f"<h1>{escape(' / '.join(names))}</h1>\n"
+    title = " / ".join(names)
+    body = [
+        f"<h1>{escape(title)}</h1>",
         f'<p class="soft">Reconstructions of the log {escape(comparison.clip)}. Differences are to '
-        f"{escape(names[0])}; green is better, red is worse.</p>\n{_table(comparison)}\n"
+        f"{escape(names[0])}; green is better, red is worse.</p>",
+        _table(comparison),
         "<h2>Worst frames</h2><p>Above what was recorded and what each scene shows, below how different they look "
-        f"(FLIP: black equal, white most different).</p>{cards}\n{video}\n</main></body></html>\n"
-    )
+        f"(FLIP: black equal, white most different).</p>{cards}",
+        video,
+    ]
+    return html_page(f"{title} · nurec_sim", body, MORE_STYLE)
 
 
 def _table(comparison: Comparison) -> str:

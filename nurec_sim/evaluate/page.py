@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -17,7 +16,7 @@ from nurec_sim.evaluate.cells import Table
 from nurec_sim.evaluate.methods import CHOICES
 from nurec_sim.report.cells import count_of
 from nurec_sim.report.figure import base_layout, plain
-from nurec_sim.report.template import SCRIPT, STYLE
+from nurec_sim.report.template import html_page
 
 JPEG_QUALITY = 88
 TITLES = {
@@ -36,15 +35,6 @@ def render_page(results: Mapping[str, Any], tables: Sequence[Table], sheets: Seq
     """The report as HTML; the same results give the same text."""
     protocol = results["protocol"]
     figures = _curves(results["summary"]["methods"])
-    script = ""
-    if figures:
-        from plotly.offline import get_plotlyjs
-
-        stored = json.dumps({"figures": figures, "images": {}}, separators=(",", ":")).replace("<", "\\u003c")
-        script = (
-            f'<script type="application/json" id="figures">{stored}</script>\n'
-            f"<script>{get_plotlyjs()}</script>\n<script>{SCRIPT}</script>"
-        )
     body = [
         f"<h1>Evaluation: protocol {escape(protocol['name'])}</h1>",
         f'<p class="soft">{escape(TITLES[protocol["name"]])} · {count_of(len(results["windows"]), "window")} · '
@@ -59,12 +49,8 @@ def render_page(results: Mapping[str, Any], tables: Sequence[Table], sheets: Seq
         "<h2>Contact sheets</h2>",
         *(_sheet(path, results["windows"]) for path in sheets),
     ]
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(protocol['name'])} · nurec_sim</title><style>{STYLE}{MORE_STYLE}</style></head>\n"
-        "<body><main>\n" + "\n".join(part for part in body if part) + f"\n</main>{script}</body></html>\n"
-    )
+    stored = {"figures": figures, "images": {}} if figures else None
+    return html_page(f"{protocol['name']} · nurec_sim", body, MORE_STYLE, stored)
 
 
 def _table(table: Table) -> str:

@@ -8,7 +8,7 @@ from nurec_sim.logs import SENSOR_COLUMNS, Clip, Measure, describe_clip
 from nurec_sim.logs.overlay import CAPTION_PX, draw_camera
 from nurec_sim.report.cells import count_of, escape, fact_list, list_items
 from nurec_sim.report.log_map import drive_map, image_source, timeline
-from nurec_sim.report.template import STYLE
+from nurec_sim.report.template import html_page
 
 MOST_LISTED = 100
 SHOWN_AT = (0.1, 0.5, 0.9)
@@ -67,13 +67,7 @@ def log_page(clip: Clip, faults: Sequence[str], measures: Sequence[Measure]) -> 
         f'<div class="card">{drive_map(clip)}{_legend()}</div>',
         *_images(clip),
     ]
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(clip.id)} · nurec_sim</title><style>{STYLE}{MORE_STYLE}</style></head>\n<body><main>\n"
-        + "\n".join(part for part in body if part)
-        + "\n</main></body></html>\n"
-    )
+    return html_page(f"{clip.id} · nurec_sim", body, MORE_STYLE)
 
 
 def _checks(measures: Sequence[Measure]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 
 import polars as pl
@@ -17,7 +16,7 @@ from nurec_sim.report.data import ReportScene, RunReport
 from nurec_sim.report.events import grouped
 from nurec_sim.report.plan import PlanAxes, plan_view
 from nurec_sim.report.rollout_card import rollout_card
-from nurec_sim.report.template import SCRIPT, STYLE
+from nurec_sim.report.template import html_page
 
 MAX_EMBEDDED_BYTES = 40_000_000
 HEADLINE = {
@@ -35,8 +34,6 @@ HEADLINE = {
 
 def render_report(report: RunReport) -> str:
     """The whole report as one HTML text. The same report gives the same text."""
-    from plotly.offline import get_plotlyjs
-
     figures: dict[str, object] = {"collisions": collision_bars(report.summary)}
     images: dict[str, object] = {}
     comparison = report.comparison
@@ -73,8 +70,6 @@ def render_report(report: RunReport) -> str:
         trust(report.rollouts, worlds or sorted({entry.rollout.reconstruction for entry in report.rollouts})),
     ]
     tables = [_headline(report), _collisions(), _unknown(report), _failures(report)]
-    stored = json.dumps({"figures": figures, "images": images}, separators=(",", ":"), allow_nan=False)
-    stored = stored.replace("<", "\\u003c")  # so that no text can close the script element
     body = [
         _header(report),
         *(opening + rollouts + tables if comparison is not None else tables + rollouts),
@@ -83,14 +78,7 @@ def render_report(report: RunReport) -> str:
         _definitions(report),
         _versions(report),
     ]
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(report.title)} · nurec_sim</title><style>{STYLE}</style></head>\n<body><main>\n"
-        + "\n".join(part for part in body if part)
-        + f'\n</main><script type="application/json" id="figures">{stored}</script>\n'
-        f"<script>{get_plotlyjs()}</script>\n<script>{SCRIPT}</script></body></html>\n"
-    )
+    return html_page(f"{report.title} · nurec_sim", body, stored={"figures": figures, "images": images})
 
 
 def _video_bytes(report: RunReport) -> int:

@@ -1,4 +1,11 @@
-"""Style and script of the report: light, readable, no network."""
+"""Frame, style and script of the HTML reports: light, readable, no network."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from html import escape
+from typing import Any
 
 STYLE = """
 :root { --ink:#1e293b; --soft:#64748b; --line:#e2e8f0; --bg:#f8fafc; --card:#ffffff; --bad:#b91c1c; --good:#15803d; }
@@ -151,3 +158,38 @@ SCRIPT = """
   document.querySelectorAll('details[open]').forEach(openCard);
 })();
 """
+
+
+def html_page(
+    title: str,
+    body: Iterable[str],
+    style: str = "",
+    stored: Mapping[str, Any] | None = None,
+    script: str = SCRIPT,
+) -> str:
+    """A self-contained page; the same parts give the same text.
+
+    Args:
+        title: plain text.
+        body: pieces of HTML; empty ones are left out.
+        style: CSS after that of all reports.
+        stored: JSON values for ``script``, in the element ``figures``; None for a page without plotly and script.
+        script: JavaScript that runs at the end, with plotly loaded.
+    """
+    scripts = ""
+    if stored is not None:
+        from plotly.offline import get_plotlyjs
+
+        text = json.dumps(stored, separators=(",", ":"), allow_nan=False)
+        text = text.replace("<", "\\u003c")  # so that no text can close the script element
+        scripts = (
+            f'<script type="application/json" id="figures">{text}</script>\n'
+            f"<script>{get_plotlyjs()}</script>\n<script>{script}</script>"
+        )
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{STYLE}{style}</style></head>\n<body><main>\n"
+        + "\n".join(part for part in body if part)
+        + f"\n</main>{scripts}</body></html>\n"
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 
 import polars as pl
@@ -12,7 +11,7 @@ from nurec_sim.report.cells import count_of, escape, list_items, shown
 from nurec_sim.report.charts import BARS, comparison_bars
 from nurec_sim.report.comparison_sections import SHOWN, differences, points_cell, rank_agreement, rank_cell
 from nurec_sim.report.rollout_card import dot
-from nurec_sim.report.template import SCRIPT, STYLE
+from nurec_sim.report.template import html_page
 from nurec_sim.study.results import RANKED_BY, StudyResults
 
 MOST_SCENES = 10
@@ -22,24 +21,13 @@ ENOUGH_SCENES = 10
 
 def render_study(results: StudyResults) -> str:
     """The whole report as one HTML text. The same results give the same text."""
-    from plotly.offline import get_plotlyjs
-
     figures = {f"bars-{metric}": comparison_bars(results.comparison, metric) for metric in BARS}
-    stored = json.dumps({"figures": figures, "images": {}}, separators=(",", ":"), allow_nan=False)
-    stored = stored.replace("<", "\\u003c")  # so that no text can close the script element
     body = [
         _header(results), _verdict(results), _bars(results), rank_agreement(results.comparison), _seeing(results),
         _controls(results), differences(results.comparison), _families(results), _scenes(results), _pairs(results),
         _failures(results),
     ]  # fmt: skip
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(results.config.name)} · nurec_sim study</title><style>{STYLE}</style></head>\n<body><main>\n"
-        + "\n".join(part for part in body if part)
-        + f'\n</main><script type="application/json" id="figures">{stored}</script>\n'
-        f"<script>{get_plotlyjs()}</script>\n<script>{SCRIPT}</script></body></html>\n"
-    )
+    return html_page(f"{results.config.name} · nurec_sim study", body, stored={"figures": figures, "images": {}})
 
 
 def _header(results: StudyResults) -> str:

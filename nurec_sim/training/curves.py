@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from nurec_sim.errors import TrainingError
 from nurec_sim.files.new_files import write_file
 from nurec_sim.report.cells import escape
 from nurec_sim.report.figure import base_layout
-from nurec_sim.report.template import STYLE
+from nurec_sim.report.template import html_page
 
 FIXED = ("step", "stage", "seconds")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
@@ -30,6 +29,12 @@ SMOOTHING = 0.6
 COLUMNS = 4
 PANEL_PX = (340, 210)
 LEGEND_PX = 26
+MORE_STYLE = ".grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(360px,1fr));gap:10px}"
+SCRIPT = """
+JSON.parse(document.getElementById('figures').textContent).panels.forEach(function (panel) {
+  Plotly.newPlot(panel.id, panel.data, panel.layout, {responsive: true, displayModeBar: false});
+});
+"""
 INK, SOFT_INK = (30, 41, 59), (100, 116, 139)
 MARGIN = (52, 10, 24, 26)
 """Left, right, top and bottom of a panel's axes, pixels."""
@@ -123,28 +128,19 @@ def _fading_sums(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]
 
 def curves_page(curves: Curves, title: str) -> str:
     """One self-contained HTML text; the same curves give the same text."""
-    from plotly.offline import get_plotlyjs
-
     panels = [{"id": name, **_figure(curves, name)} for name in curves.values]
-    stored = json.dumps(panels, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     plots = "".join(
         f'<div class="card"><b>{escape(name)}</b><div id="{escape(name)}"></div></div>' for name in curves.values
     )
     stages = ", ".join(f'<b style="color:{colour}">{escape(stage)}</b>' for stage, colour in _coloured(curves))
     hours = curves.seconds[-1] / 3600
     last = ", ".join(f"{escape(name)} {_shown(values)}" for name, values in curves.values.items())
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f"<title>{escape(title)} · nurec_sim</title><style>{STYLE}"
-        ".grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(360px,1fr));gap:10px}</style></head>\n"
-        f'<body><main><h1>Training curves</h1><p class="soft">{escape(title)} · {int(curves.step[-1]):,} steps · '
-        f"{hours:.2f} h · stages {stages}</p><div class='grid'>{plots}</div>"
-        f'<p class="key">Thin: measured. Bold: smoothed. Newest: {last}.</p></main>'
-        f'<script type="application/json" id="panels">{stored}</script>\n<script>{get_plotlyjs()}</script>\n'
-        "<script>JSON.parse(document.getElementById('panels').textContent).forEach(function (panel) {"
-        "Plotly.newPlot(panel.id, panel.data, panel.layout, {responsive: true, displayModeBar: false});});</script>"
-        "</body></html>\n"
-    )
+    body = [
+        f'<h1>Training curves</h1><p class="soft">{escape(title)} · {int(curves.step[-1]):,} steps · '
+        f"{hours:.2f} h · stages {stages}</p><div class='grid'>{plots}</div>",
+        f'<p class="key">Thin: measured. Bold: smoothed. Newest: {last}.</p>',
+    ]
+    return html_page(f"{title} · nurec_sim", body, MORE_STYLE, stored={"panels": panels}, script=SCRIPT)
 
 
 def curves_image(curves: Curves) -> UInt8[np.ndarray, "h w 3"]:

@@ -81,7 +81,8 @@ def test_page_and_picture(tmp_path):
     page, picture = write_curves(folder)
     text = page.read_text()
     assert "&lt;run&gt;" in text and "<run>" not in text and "http-equiv" not in text
-    panels = json.loads(re.search(r'id="panels">(.*?)</script>', text, re.S).group(1))
+    stored = json.loads(re.search(r'id="figures">(.*?)</script>', text, re.S).group(1))
+    panels = stored["panels"]
     assert [panel["id"] for panel in panels] == ["rate", "loss", "abs_rel", "psnr", "skipped"]
     loss = panels[1]
     assert len(loss["data"]) == 4 and loss["layout"]["yaxis"]["type"] == "log"  # two stages, measured and smoothed
