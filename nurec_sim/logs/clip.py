@@ -194,17 +194,27 @@ class Clip:
         clip.time_offset_us += offset_us
         return clip
 
+    def remounted(self, origins_m: Mapping[str, Float64[np.ndarray, " 3"]]) -> Clip:
+        """The same log with LiDARs moved to where their beams start, given in their present frames."""
+        lidars, sweeps = dict(self.rig.lidars), dict(self._sweeps)
+        for name, origin in origins_m.items():
+            pose = lidars[name].rig_from_lidar @ geometry.pose(np.eye(3), origin)
+            lidars[name] = dataclasses.replace(lidars[name], rig_from_lidar=pose)
+            sweeps[name] = tuple(record.from_origin(origin) for record in sweeps.get(name, ()))
+        return self._with(self.ego, self._images, sweeps, self.tracks, dataclasses.replace(self.rig, lidars=lidars))
+
     def _with(
         self,
         ego: Trajectory,
         images: Mapping[str, Sequence[ImageRecord]],
         sweeps: Mapping[str, Sequence[SweepRecord]],
         tracks: Sequence[Track],
+        rig: Rig | None = None,
     ) -> Clip:
-        """The same log with other poses and times."""
+        """The same log with other poses and times, and another rig if given."""
         clip = Clip(
             id=self.id,
-            rig=self.rig,
+            rig=rig or self.rig,
             ego=ego,
             images=images,
             sweeps=sweeps,

@@ -82,5 +82,6 @@ def without_images(clip: Clip, held: HeldOut) -> Clip:
         for lidar in clip.rig.lidars
     }
     return ContextClip(
-        clip.id, clip.rig, clip.ego, clip.span_us, shots, turns, tuple(clip.tracks), clip.time_offset_us, clip.road_map
-    )
+        clip.id, clip.rig, clip.ego, clip.span_us, shots, turns, tuple(clip.tracks), clip.time_offset_us, clip.road_map,
+        clip.ego_mask,
+    )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,8 @@ class SweepRecord:
         world_from_lidar: pose of the LiDAR at ``t_us``.
         compensated: whether the points are already where they would be at ``t_us``; if not, they are moved by the ego's
             own motion between their time and ``t_us``.
+        origin_m: where its beams start in the axes of the stored points, if not at their origin (``logs.origins``);
+            ``world_from_lidar`` is the pose there.
     """
 
     file: str
@@ -35,6 +38,13 @@ class SweepRecord:
     end_us: int
     world_from_lidar: Matrix4
     compensated: bool = True
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def from_origin(self, origin_m: Float64[np.ndarray, " 3"]) -> SweepRecord:
+        """The sweep with its LiDAR moved to where its beams start, given in its present frame."""
+        x, y, z = np.add(self.origin_m, origin_m).tolist()
+        pose = self.world_from_lidar @ geometry.pose(np.eye(3), origin_m)
+        return dataclasses.replace(self, world_from_lidar=pose, origin_m=(x, y, z))
 
 
 def compensated_sweep(record: SweepRecord, stored: SweepPoints, lidar: LidarModel, ego: Trajectory) -> Sweep:
@@ -50,6 +60,7 @@ def compensated_sweep(record: SweepRecord, stored: SweepPoints, lidar: LidarMode
         ClipError: the arrays do not fit together, or hold too many points.
     """
     xyz_m, intensity, dt_us = _checked(stored)
+    xyz_m = xyz_m - record.origin_m if any(record.origin_m) else xyz_m
     point_t_us = _point_times(lidar, record, dt_us, xyz_m)
     if not record.compensated:
         xyz_m = _compensated(ego, record, xyz_m, point_t_us)

@@ -174,7 +174,10 @@ def test_every_third_image_is_held_out_with_the_sweeps_of_its_time():
     spins = clip.sweep_times_us("top")
     overlap = {k for k, (a, b) in enumerate(spins) if any(a <= end and b >= start for start, end in times)}
     assert held.sweeps == overlap and overlap
+    mask = np.zeros((96, 192), bool)
+    clip.ego_mask = lambda camera_id: mask
     seen = without_images(clip, held)
+    assert seen.ego_mask("left") is mask
     assert len(seen.camera_times_us("left")) == 4 and len(seen.camera_times_us("right")) == 6
     assert np.array_equal(seen.image("left", 2), clip.image("left", 3))
     assert without_images(clip, hold_out(clip, [])) is clip
