@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -28,6 +28,11 @@ from nurec_sim.cli.console import (
 from nurec_sim.cli.scenes import refinement
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable, write_file
+
+if TYPE_CHECKING:
+    from nurec_sim.render.support import Support
+    from nurec_sim.runs.sources import Offer
+    from nurec_sim.serving.store import SceneStore
 
 
 @app.command
@@ -271,6 +276,7 @@ def drive(
                 video=video,
                 progress=advance,
                 notice=_notice,
+                support_for=lambda scene: _support(store, served.get((scene.id, runs.reconstruction_of(scene)))),
             )
     heading, *rows = runs.headline(folder)
     print_table("means over rollouts", rows, heading)
@@ -279,6 +285,16 @@ def drive(
     if failed:
         _notice(f"{failed} of {rollouts} rollouts failed; the report gives the reasons")
         _leave(1)
+
+
+def _support(store: SceneStore, offer: Offer | None) -> Support | None:
+    """What the cameras of a scene recorded; None for the true world, and for scenes without times of frames."""
+    from nurec_sim.render.support import Support, recorded_frames
+
+    if offer is None:
+        return None
+    renderer = store.get(offer.served_as).renderer
+    return Support(renderer) if recorded_frames(renderer.scene) else None
 
 
 def _notice(text: str) -> None:

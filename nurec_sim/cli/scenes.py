@@ -110,7 +110,7 @@ def render(
     frame: int = 0,
     left_m: float = 0.0,
     yaw_deg: float = 0.0,
-    layer: Literal["rgb", "depth", "alpha", "label", "normal"] = "rgb",
+    layer: Literal["rgb", "depth", "alpha", "label", "normal", "support"] = "rgb",
     width: int | None = None,
     device: str = "auto",
 ) -> None:
@@ -123,7 +123,8 @@ def render(
         frame: index of the recorded frame that gives time and pose.
         left_m: lateral offset of the car in metres, left positive.
         yaw_deg: yaw offset of the car in degrees, left positive.
-        layer: output layer.
+        layer: output layer; `support` shows the image, the redder the less it rests on what was recorded
+            (docs/trust.md).
         width: image width in pixels; default: that of the camera.
         device: render device: auto (a GPU if available), cpu, cuda or cuda:N.
     """

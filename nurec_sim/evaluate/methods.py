@@ -15,6 +15,7 @@ from nurec_sim.errors import ReconstructError, WeightsError
 from nurec_sim.evaluate.windows import Window
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, OptimizeSettings, load_method
 from nurec_sim.render import make_renderer
+from nurec_sim.render.device import Renderer
 from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, Sense, SensorRequest
 
 Show = Callable[[SensorRequest], CameraFrame]
@@ -55,7 +56,12 @@ class Built:
     show: Show
     scene: GaussianScene | None
     seconds: float
-    sense: Sense | None = None
+    renderer: Renderer | None = None
+
+    @property
+    def sense(self) -> Sense | None:
+        """Renders any sensor, if there is a scene."""
+        return None if self.renderer is None else self.renderer.sense
 
     @property
     def gaussians(self) -> int | None:
@@ -172,7 +178,7 @@ def build(contender: Contender, window: Window, device: str = "auto") -> Built:
     started = time.perf_counter()
     scene = reconstruct(window.clip, contender.method, cameras=window.cameras, settings=contender.settings)
     renderer, spent = make_renderer(scene, device), time.perf_counter() - started
-    return Built(lambda request: renderer.render_camera(request, ("rgb", "depth")), scene, spent, renderer.sense)
+    return Built(lambda request: renderer.render_camera(request, ("rgb", "depth")), scene, spent, renderer)
 
 
 def _sees_lidar(contender: Contender) -> bool:

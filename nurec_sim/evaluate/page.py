@@ -15,7 +15,7 @@ from nurec_sim.errors import RunError
 from nurec_sim.evaluate.cells import Table
 from nurec_sim.evaluate.methods import CHOICES
 from nurec_sim.report.cells import count_of
-from nurec_sim.report.figure import base_layout, plain
+from nurec_sim.report.figure import base_layout, line_trace, plain
 from nurec_sim.report.template import html_page
 
 JPEG_QUALITY = 88
@@ -35,6 +35,9 @@ def render_page(results: Mapping[str, Any], tables: Sequence[Table], sheets: Seq
     """The report as HTML; the same results give the same text."""
     protocol = results["protocol"]
     figures = _curves(results["summary"]["methods"])
+    calibration = calibration_figure(results["summary"]["methods"])
+    if calibration is not None:
+        figures["calibration"] = calibration
     body = [
         f"<h1>Evaluation: protocol {escape(protocol['name'])}</h1>",
         f'<p class="soft">{escape(TITLES[protocol["name"]])} · {count_of(len(results["windows"]), "window")} · '
@@ -111,3 +114,18 @@ def _curves(methods: Mapping[str, Any]) -> dict[str, Any]:
         layout["xaxis"]["title"], layout["yaxis"]["title"] = {"text": "lateral offset (m)"}, {"text": title}
         figures[f"curve_{column}"] = {"data": traces, "layout": layout}
     return figures
+
+
+def calibration_figure(methods: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Share of right pixels over support of the methods that have it; None without."""
+    known = {name: row["support"]["calibration"] for name, row in methods.items() if row.get("support")}
+    if not known:
+        return None
+    data = [line_trace("calibrated", np.array([[0, 0], [1, 100]]), "#94a3b8", dash="dot")]
+    for name, bins in known.items():
+        colour = COLOURS[list(methods).index(name) % len(COLOURS)]
+        points = np.array([(each["support"], 100 * each["right"]) for each in bins])
+        data.append({**line_trace(name, points, colour), "mode": "lines+markers"})
+    layout = base_layout(300)
+    layout["xaxis"]["title"], layout["yaxis"]["title"] = {"text": "support"}, {"text": "right pixels (%)"}
+    return {"data": data, "layout": layout}

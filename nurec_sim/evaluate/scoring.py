@@ -14,8 +14,10 @@ from nurec_sim.evaluate.methods import Built, Contender, build
 from nurec_sim.evaluate.scans import score_beside
 from nurec_sim.evaluate.scores.depth import depth_score, least_squares_scale
 from nurec_sim.evaluate.scores.images import masked_psnr, masked_ssim, psnr, ssim
+from nurec_sim.evaluate.support import support_record
 from nurec_sim.evaluate.views import ScoredView, reduced
 from nurec_sim.evaluate.windows import EvaluationView, Window
+from nurec_sim.render.support import Support
 
 HIGHEST_PSNR_DB = 100.0
 """PSNR of identical images."""
@@ -45,8 +47,9 @@ def score_window(
 
     Returns:
         The record: ``gaussians``, ``seconds`` (``reconstruct``; ``render`` per view), ``unknown``, and per target
-        ``name``, ``left_m``, ``beyond``, ``full``, ``dynamic`` and ``static`` (see ``score_view``). Windows with target
-        sweeps also have ``sweeps`` (see ``scans.score_beside``).
+        ``name``, ``left_m``, ``beyond``, ``full``, ``dynamic`` and ``static`` (see ``score_view``), and in windows with
+        targets beside the path ``support`` (``support.support_record``). Windows with target sweeps also have
+        ``sweeps`` (see ``scans.score_beside``).
 
     Raises:
         ReconstructError, WeightsError: see ``methods.build``.
@@ -54,6 +57,7 @@ def score_window(
     report = progress or (lambda stage, fraction: None)
     report(f"{contender.name} reconstructs", 0.0)
     built: Built = build(contender, window, device)
+    support = _support(built, window)
     rows, views, rendering = [], {}, 0.0
     for index, target in enumerate(window.targets):
         report(f"{contender.name} shows", 0.3 + 0.7 * index / len(window.targets))
@@ -61,7 +65,10 @@ def score_window(
         frame = built.show(target.request)
         rendering += time.perf_counter() - started
         views[target.name] = view = reduced(frame.rgb, frame.depth_m)
-        rows.append({"name": target.name, "left_m": target.left_m, "beyond": target.beyond, **score_view(view, target)})
+        row = {"name": target.name, "left_m": target.left_m, "beyond": target.beyond, **score_view(view, target)}
+        if support is not None:
+            row["support"] = support_record(support.map(target.request, view.rgb.shape[1]), view, target.true)
+        rows.append(row)
     seconds = {"reconstruct": round(built.seconds, 3), "render": round(rendering / max(len(rows), 1), 4)}
     unknown = [] if built.scene is None else list(built.scene.provenance.get("unknown", ()))
     record = {"gaussians": built.gaussians, "seconds": seconds, "unknown": unknown, "targets": rows}
@@ -71,6 +78,13 @@ def score_window(
         built, window.beside, lambda fraction: report(f"{contender.name} scans", 0.3 + 0.7 * fraction)
     )
     return Scored(record, views, sweeps)
+
+
+def _support(built: Built, window: Window) -> Support | None:
+    """The support of a method's views, where some are beside the path and the truth is known."""
+    if built.renderer is None or not any(target.left_m for target in window.targets):
+        return None
+    return Support(built.renderer)
 
 
 def score_view(view: ScoredView, target: EvaluationView) -> dict[str, Figures | None]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from nurec_sim.evaluate.scans import mean_figures
+from nurec_sim.evaluate.support import summarize_support
 
 Record = Mapping[str, Any]
 FULL = ("psnr_db", "ssim", "abs_rel", "delta1", "abs_rel_metric", "delta1_metric", "depth_scale", "depth_coverage")
@@ -40,8 +41,9 @@ def summarize(windows: Sequence[Record], methods: Iterable[str]) -> dict[str, An
 
     Returns:
         ``methods``: by name ``full``, ``dynamic``, ``static``, ``between``, ``beyond`` (means), ``curve`` (means by the
-        offset from the path in metres), ``sweeps`` (``scans.mean_figures``), ``abs_rel_doubles_at_m``, ``gaussians``,
-        ``seconds``, ``views``, ``dynamic_views``, ``windows`` and ``failed``; ``differences``: a list of paired
+        offset from the path in metres), ``support`` (``support.summarize_support``), ``sweeps``
+        (``scans.mean_figures``), ``abs_rel_doubles_at_m``, ``gaussians``, ``seconds``, ``views``, ``dynamic_views``,
+        ``windows`` and ``failed``; ``differences``: a list of paired
         differences.
     """
     names = list(methods)
@@ -64,6 +66,7 @@ def _method(records: Sequence[Record]) -> dict[str, Any]:
         "between": _means([row["full"] for row in on_path if not row["beyond"]], FULL),
         "beyond": _means([row["full"] for row in on_path if row["beyond"]], FULL),
         "curve": curve,
+        "support": summarize_support(rows),
         "sweeps": mean_figures(good),
         "abs_rel_doubles_at_m": doubling_offset({float(offset): row["abs_rel"] for offset, row in curve.items()}),
         "gaussians": _mean([record["gaussians"] for record in good]),

@@ -7,6 +7,7 @@ from typing import Any
 
 from nurec_sim.evaluate.cells import NOT_KNOWN, Table, number, percent
 from nurec_sim.evaluate.scans import scan_tables
+from nurec_sim.evaluate.support import support_tables
 from nurec_sim.report.cells import count_of
 
 PAPER_HEADING = ("PSNR", "SSIM", "AbsRel", "δ1")
@@ -23,6 +24,7 @@ def tables(results: Mapping[str, Any]) -> list[Table]:
             _curve(methods, "psnr_db", "PSNR (dB)", 2),
             _curve(methods, "abs_rel", "AbsRel", 3),
             _doubling(methods),
+            *support_tables(methods),
         ]
     elif name == "lidar":
         return [*scan_tables(methods), _cost(methods), *_failures(results["windows"])]

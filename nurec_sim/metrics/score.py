@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from nurec_sim.metrics.offroad import offroad_series, true_offroad_series
 from nurec_sim.metrics.offroad_grid import OffroadGrid
 from nurec_sim.metrics.plans import plan_series
 from nurec_sim.metrics.progress import progress_series, proximity_series
-from nurec_sim.metrics.series import METRICS, make_series, times_of
+from nurec_sim.metrics.series import METRICS, make_series, times_of, unknown_series
 from nurec_sim.types import RoadMap, Rollout, Series
 
 
@@ -22,6 +23,7 @@ def score_rollout(
     road_map: RoadMap | None = None,
     profile: str = "strict",
     actors_known: bool | None = None,
+    support: Mapping[int, float] | None = None,
 ) -> list[Series]:
     """Computes the metrics of a rollout, including failed ones up to their last state.
 
@@ -34,6 +36,7 @@ def score_rollout(
         road_map: the log's map, for ``offroad_true``.
         profile: ``strict`` or ``alpasim``, see ``metrics.collision``.
         actors_known: whether the log has actor labels; None: if the rollout has any actor.
+        support: of the images that the policy got, 0..1 by time in microseconds; None if not known.
 
     Raises:
         ValueError: unknown profile, or actors that do not fit the states.
@@ -51,10 +54,18 @@ def score_rollout(
         *comfort_series(rollout),
         *feasibility_series(rollout),
         *plan_series(rollout),
+        *_support_series(rollout, support or {}),
     ]
     by_name = {series.name: series for series in found}
     assert by_name.keys() == METRICS.keys(), sorted(by_name.keys() ^ METRICS.keys())
     return [_only_relevant(by_name[name], rollout.first_closed_loop_us) for name in METRICS]
+
+
+def _support_series(rollout: Rollout, support: Mapping[int, float]) -> list[Series]:
+    names = ("support", "support_least")
+    if not support:
+        return [unknown_series(name, times_of(rollout)) for name in names]
+    return [make_series(name, np.array(list(support), np.int64), np.array(list(support.values()))) for name in names]
 
 
 def _only_relevant(series: Series, from_us: int) -> Series:

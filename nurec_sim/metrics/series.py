@@ -52,6 +52,8 @@ METRICS: dict[str, Metric] = {
     "plan_infeasible": Metric("bool", Reduce.MEAN, "a plan with a dynamically infeasible step"),
     "plan_deviation": Metric("m", Reduce.MEAN, "distance between successive plans at shared times"),
     "tracking_error_m": Metric("m", Reduce.MEAN, "distance between the planned and the executed position after 0.5 s"),
+    "support": Metric("share", Reduce.MEAN, "support of the images that the policy got, by recorded views"),
+    "support_least": Metric("share", Reduce.MIN, "least support of an instant's images that the policy got"),
 }
 """All metrics of ``score_rollout``, in this order; names and reductions as in AlpaSim where it has them."""
 

@@ -10,16 +10,18 @@ import numpy as np
 from nurec_sim.report.data import Comparison, ReportRollout
 from nurec_sim.report.events import first_offroad_us
 from nurec_sim.report.figure import ALARM, EGO, RECORDED, base_layout, plain, rounded, world_colour
+from nurec_sim.report.support import support_curve
 from nurec_sim.types import Rollout, Series
 
 if TYPE_CHECKING:
     import polars as pl
 
+SUPPORT_TITLE = "support of the images, share"
 CLASS_COLOURS = {"front": "#d55e00", "lateral": "#e69f00", "rear": "#0072b2"}  # Okabe-Ito palette, colour-blind safe
 
 
 def time_view(group: Sequence[ReportRollout]) -> dict[str, Any]:
-    """Speed, acceleration, reach beyond the road and gap to the nearest actor over time.
+    """Speed, acceleration, reach beyond the road, gap to the nearest actor, and support if known, over time.
 
     Args:
         group: one rollout, or the same one in several reconstructions.
@@ -28,10 +30,12 @@ def time_view(group: Sequence[ReportRollout]) -> dict[str, Any]:
     t_us = rollout.t_us
     zero_us = int(t_us[0])
     seconds = (t_us - zero_us) / 1e6
-    rows: list[tuple[str, list[tuple[str, np.ndarray, str, str | None]]]] = [
-        ("speed, m/s", [("recorded", _recorded_speed(rollout), RECORDED, "dash")]),
+    rows: list[tuple[str, list[tuple[str, np.ndarray, np.ndarray, str, str | None]]]] = [
+        ("speed, m/s", [("recorded", seconds, _recorded_speed(rollout), RECORDED, "dash")]),
         ("acceleration, m/s2", []), ("beyond the road, m", []), ("gap to actors, m", []),
     ]  # fmt: skip
+    if any(len(support_curve(entry)[0]) for entry in group):
+        rows.append((SUPPORT_TITLE, []))
     for place, entry in enumerate(group):
         name = entry.rollout.reconstruction if len(group) > 1 else "ego"
         colour = world_colour(place) if len(group) > 1 else EGO
@@ -41,30 +45,36 @@ def time_view(group: Sequence[ReportRollout]) -> dict[str, Any]:
             _values_of(entry.series.get("offroad_max_excursion_m")),
             _values_of(entry.series.get("min_distance_to_obstacle_m")),
         )  # fmt: skip
-        for (_, lines), values in zip(rows, curves, strict=True):
-            lines.append((name, values, colour, None))
-    layout, data = base_layout(560), []
+        for (_, lines), values in zip(rows, curves, strict=False):
+            lines.append((name, seconds, values, colour, None))
+        times, support = support_curve(entry)
+        if len(times):
+            rows[-1][1].append((name, (times - zero_us) / 1e6, support, colour, None))
+    gap_px, row_px = 30, 101
+    plot_px = len(rows) * row_px + (len(rows) - 1) * gap_px
+    layout, data = base_layout(plot_px + 66), []
     layout["xaxis"] |= {
         "title": {"text": "seconds since the start"},
-        "anchor": "y4",
+        "anchor": f"y{len(rows)}",
         "range": rounded([0, max(seconds[-1], 0.1)]),
     }
     layout["showlegend"] = False
-    height, gap = 0.205, 0.06
+    height, gap = row_px / plot_px, gap_px / plot_px
     for index, (title, lines) in enumerate(rows):
         axis = "y" if index == 0 else f"y{index + 1}"
         top = 1 - index * (height + gap)
         layout[f"yaxis{'' if index == 0 else index + 1}"] = {
             **layout["yaxis"], "domain": rounded([max(top - height, 0), top]), "rangemode": "tozero", "nticks": 4,
+            **({"range": [0, 1.02]} if title == SUPPORT_TITLE else {}),
         }  # fmt: skip
         layout.setdefault("annotations", []).append(
             {"text": title, "xref": "paper", "yref": "paper", "x": 0, "y": top, "xanchor": "left", "yanchor": "bottom",
              "showarrow": False, "font": {"size": 12, "color": "#475569"}}
         )  # fmt: skip
-        for name, values, colour, dash in lines:
+        for name, at, values, colour, dash in lines:
             style = {"color": colour, "width": 2} | ({"dash": dash} if dash else {})
             data.append(
-                {"type": "scatter", "mode": "lines", "name": name, "x": rounded(seconds[: len(values)]),
+                {"type": "scatter", "mode": "lines", "name": name, "x": rounded(at[: len(values)]),
                  "y": rounded(values), "xaxis": "x", "yaxis": axis, "line": style, "connectgaps": False}
             )  # fmt: skip
     layout["shapes"] = (_spans(group[0], zero_us) if len(group) == 1 else []) + [

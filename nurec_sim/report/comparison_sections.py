@@ -11,6 +11,7 @@ from nurec_sim.report.charts import BARS
 from nurec_sim.report.data import Comparison, ReportRollout, ReportScene, RunReport
 from nurec_sim.report.events import EXTRAPOLATED_M, farthest_apart, verdict
 from nurec_sim.report.rollout_card import SAME_M, dot
+from nurec_sim.report.support import support_by_distance
 
 SHOWN = {
     "collision_any": "Collision C",
@@ -293,5 +294,6 @@ def trust(rollouts: Sequence[ReportRollout], worlds: Sequence[str]) -> str:
         "others.</p>"
         f'<table><thead><tr><th>Policy</th><th class="n">farthest</th>{heads}</tr></thead>'
         f"<tbody>{''.join(rows)}</tbody></table>"
-        '<p class="key">Share of the time that the policy drove, by distance from the recorded path.</p></div>'
+        '<p class="key">Share of the time that the policy drove, by distance from the recorded path.</p>'
+        f"{support_by_distance(rollouts, worlds)}</div>"
     )

@@ -32,6 +32,12 @@ def first_offroad_us(entry: ReportRollout) -> int | None:
     return int(hits[0]) if len(hits) else None
 
 
+def first_event_us(entry: ReportRollout) -> int | None:
+    """Time of the first contact or off-road state, if there is one."""
+    times = [contact.t_us for contact in entry.contacts] + [first_offroad_us(entry)]
+    return min((t for t in times if t is not None), default=None)
+
+
 def happenings(entry: ReportRollout) -> list[Happening]:
     """All events of a rollout in time order."""
     rollout, found = entry.rollout, []

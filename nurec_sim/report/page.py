@@ -19,6 +19,8 @@ from nurec_sim.report.rollout_card import rollout_card
 from nurec_sim.report.template import html_page
 
 MAX_EMBEDDED_BYTES = 40_000_000
+OFTEN_WITHOUT_VALUE = ("time_to_first_event_s", "collision_delta_v_mps", "support", "support_least")
+"""Metrics without a value where there was no event or contact, or the policy has no camera."""
 HEADLINE = {
     "collision_any": "Collision C",
     "offroad": "Off-road O",
@@ -155,7 +157,7 @@ def _unknown(report: RunReport) -> str:
             continue
         dead = [
             name for name, row in cells.items()
-            if row["n_valid"] == 0 and name not in ("time_to_first_event_s", "collision_delta_v_mps")
+            if row["n_valid"] == 0 and name not in OFTEN_WITHOUT_VALUE
         ]  # fmt: skip
         if dead:
             items.append(f"{escape(policy)} ({escape(reconstruction)}): not computed: {escape(', '.join(dead))}")

@@ -11,6 +11,7 @@ from nurec_sim.report.cells import escape, list_items, meaning, shown
 from nurec_sim.report.data import ReportRollout, ReportScene, RunReport, Video
 from nurec_sim.report.events import farthest_apart, happenings, verdict
 from nurec_sim.report.figure import world_colour
+from nurec_sim.report.support import doubtful
 
 OPEN_ROLLOUTS = 1
 SAME_M = 1e-9
@@ -68,7 +69,9 @@ def rollout_card(index: int, group: Sequence[ReportRollout], scene: ReportScene,
 def _tags(entry: ReportRollout) -> str:
     words = verdict(entry)
     tags = [f'<span class="tag {"bad" if word in BAD else "warn"}">{escape(word)}</span>' for word in words]
-    return "".join(tags) or '<span class="tag good">no event</span>'
+    doubt = doubtful(entry)
+    shown_doubt = f'<span class="tag warn">{escape(doubt)}</span>' if doubt else ""
+    return ("".join(tags) or '<span class="tag good">no event</span>') + shown_doubt
 
 
 def _world(place: int, entry: ReportRollout) -> str:

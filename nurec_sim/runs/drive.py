@@ -15,18 +15,21 @@ import yaml
 
 import nurec_sim
 from nurec_sim.errors import RunError, ScenarioError
+from nurec_sim.render.support import Support
 from nurec_sim.runs import folder as layout
 from nurec_sim.runs.policies import LoadedPolicy, load_policies
 from nurec_sim.runs.recording import Recorder, record_recording
 from nurec_sim.runs.results import write_report
 from nurec_sim.runs.rollout_file import load_rollout, save_rollout
 from nurec_sim.runs.scene_file import SceneRecord, reconstruction_of, record_scene, save_scene_record
+from nurec_sim.runs.seen_support import save_support, seen_support
 from nurec_sim.sim import Scenario, run_rollout
 from nurec_sim.sim.policy_host import PLAN_TIMEOUT_S
 from nurec_sim.types import Clip, GaussianScene, Policy, Rollout, Sense
 
 Progress = Callable[[str, float], None]
 Notice = Callable[[str], None]
+SupportFor = Callable[[GaussianScene], Support | None]
 DRIVING_SHARE = 0.6
 """Fraction of a rollout's progress for driving; the rest is its video."""
 
@@ -100,6 +103,7 @@ def execute(
     notice: Notice | None = None,
     stamp: str | None = None,
     plan_timeout_s: float = PLAN_TIMEOUT_S,
+    support_for: SupportFor | None = None,
 ) -> Path:
     """Runs every policy in every scene with every seed, computes metrics, and writes the report.
 
@@ -123,6 +127,9 @@ def execute(
         notice: called with a line of text for failed rollouts and damaged files.
         stamp: name of the new run folder; the local date and time if None.
         plan_timeout_s: time limit for creating a policy, and for each plan.
+        support_for: scene -> what its cameras recorded, or None if that is not known; called once per scene, when a
+            policy with a camera has driven. It tells how much of what policies saw rests on recorded views; None does
+            not measure it.
 
     Returns:
         The run folder.
@@ -145,7 +152,7 @@ def execute(
         with layout.owned(run):
             layout.point_latest(run)
             jobs = _jobs(run, scenes, scenario, loaded, seeds, fidelity or {}, say)
-            _drive_all(jobs, sense_for, video, say, tell)
+            _drive_all(jobs, sense_for, support_for or (lambda scene: None), video, say, tell)
             if video:
                 for job in {job.scene.id: job for job in jobs if job.compared}.values():
                     if (clip := (logs or {}).get(job.scene.id)) is not None:
@@ -179,10 +186,12 @@ def _jobs(
 
 
 def _drive_all(
-    jobs: Sequence[RolloutJob], sense_for: Callable[[GaussianScene], Sense], video: bool, say: Progress, tell: Notice
-) -> None:
+    jobs: Sequence[RolloutJob], sense_for: Callable[[GaussianScene], Sense], support_for: SupportFor, video: bool,
+    say: Progress, tell: Notice,
+) -> None:  # fmt: skip
     """Runs all unfinished rollouts."""
     senses: dict[tuple[str, str], Sense] = {}
+    supports: dict[tuple[str, str], Support | None] = {}
     for index, job in enumerate(jobs):
 
         def advance(share: float, job: RolloutJob = job, index: int = index) -> None:
@@ -198,14 +207,17 @@ def _drive_all(
         key = job.scene.id, job.record.reconstruction
         if key not in senses:
             senses[key] = sense_for(job.scene)
-        rollout = drive_job(job, senses[key], wants_video, done, advance)
+        if key not in supports and job.policy.host.needs.cameras:
+            supports[key] = support_for(job.scene)
+        rollout = drive_job(job, senses[key], wants_video, done, advance, supports.get(key))
         if rollout.status != "ok":
             tell(f"{job.title} failed: {rollout.error}")
 
 
 def drive_job(
-    job: RolloutJob, sense: Sense, video: bool, driven: Rollout | None, advance: Callable[[float], None]
-) -> Rollout:
+    job: RolloutJob, sense: Sense, video: bool, driven: Rollout | None, advance: Callable[[float], None],
+    support: Support | None = None,
+) -> Rollout:  # fmt: skip
     """Runs one job (or only renders its missing video) and moves its folder into place."""
     rollout, recorder = driven, None
     if video:
@@ -222,7 +234,10 @@ def drive_job(
         (part / layout.VERSIONS).write_text(job.versions_text, encoding="utf-8")
         if rollout.status != "ok":
             (part / layout.ERROR).write_text(rollout.error + "\n", encoding="utf-8")
-        elif recorder is not None:
+        elif support is not None and job.policy.host.needs.cameras:
+            found = seen_support(rollout, job.scene, job.scenario, job.policy.host.needs, support)
+            save_support(found, part / layout.SUPPORT)
+        if rollout.status == "ok" and recorder is not None:
             recorder.write(rollout, sense, part, lambda share: advance(DRIVING_SHARE + share * (1 - DRIVING_SHARE)))
     return rollout
 

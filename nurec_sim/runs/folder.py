@@ -7,7 +7,7 @@
       <scene>/recorded.mp4  recorded_lidar.mp4
       <scene>/<reconstruction>/scene.json  road.npz
       <scene>/<reconstruction>/<policy>/<seed>/scenario.yaml  rollout.npz  versions.json  front.mp4
-      ... lidar.mp4  [error.txt]  [video_error.txt]
+      ... lidar.mp4  [support.json]  [error.txt]  [video_error.txt]
 
 A rollout's folder is written under a temporary name and renamed, so existing folders are complete. While writing, a run
 holds an advisory lock (``flock``) on its folder, which the system releases when the process ends. So hidden parts in an
@@ -29,7 +29,7 @@ from nurec_sim.files.new_files import swap, writing
 
 ROLLOUT, SCENARIO, VERSIONS, VIDEO, ERROR = "rollout.npz", "scenario.yaml", "versions.json", "front.mp4", "error.txt"
 LIDAR, RECORDED, RECORDED_LIDAR = "lidar.mp4", "recorded.mp4", "recorded_lidar.mp4"
-VIDEO_ERROR = "video_error.txt"
+VIDEO_ERROR, SUPPORT = "video_error.txt", "support.json"
 _LEFTOVER = re.compile(r"\..+\.(part|part\.\d+|old\.\d+)")
 """Temporary names of ``files.new_files.new_file`` and ``written_at_once``."""
 SCENE, ROAD, REPORT = "scene.json", "road.npz", "report.html"

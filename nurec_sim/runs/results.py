@@ -17,6 +17,7 @@ from nurec_sim.runs import folder as layout
 from nurec_sim.runs.compared import compare_reconstructions
 from nurec_sim.runs.rollout_file import load_rollout
 from nurec_sim.runs.scene_file import SceneRecord, load_scene_record
+from nurec_sim.runs.seen_support import load_support
 from nurec_sim.types import Rollout, Series
 
 PROFILE = "strict"
@@ -44,7 +45,14 @@ def write_report(run: Path | str, progress: Callable[[str, float], None] | None 
         if record is None:
             raise RunError(f"{place.parent.parent} lacks {layout.SCENE}; run again with --resume")
         rollout = load_rollout(place / layout.ROLLOUT)
-        series = score_rollout(rollout, record.grid, record.road_map, profile=PROFILE, actors_known=record.actors_known)
+        series = score_rollout(
+            rollout,
+            record.grid,
+            record.road_map,
+            profile=PROFILE,
+            actors_known=record.actors_known,
+            support=load_support(place / layout.SUPPORT),
+        )
         scored.append((rollout, series))
     table = metric_table(scored, run.name)
     write_table(table, run)

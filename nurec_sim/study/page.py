@@ -11,6 +11,7 @@ from nurec_sim.report.cells import count_of, escape, list_items, shown
 from nurec_sim.report.charts import BARS, comparison_bars
 from nurec_sim.report.comparison_sections import SHOWN, differences, points_cell, rank_agreement, rank_cell
 from nurec_sim.report.rollout_card import dot
+from nurec_sim.report.support import LOW
 from nurec_sim.report.template import html_page
 from nurec_sim.study.results import RANKED_BY, StudyResults
 
@@ -24,8 +25,8 @@ def render_study(results: StudyResults) -> str:
     figures = {f"bars-{metric}": comparison_bars(results.comparison, metric) for metric in BARS}
     body = [
         _header(results), _verdict(results), _bars(results), rank_agreement(results.comparison), _seeing(results),
-        _controls(results), differences(results.comparison), _families(results), _scenes(results), _pairs(results),
-        _failures(results),
+        _controls(results), _support(results), differences(results.comparison), _families(results), _scenes(results),
+        _pairs(results), _failures(results),
     ]  # fmt: skip
     return html_page(f"{results.config.name} · nurec_sim study", body, stored={"figures": figures, "images": {}})
 
@@ -92,6 +93,27 @@ def _discrimination(results: StudyResults) -> str:
     return (
         '<span class="bad">This study cannot discriminate</span>: corrupted reconstructions rank the policies as well '
         "as the intact one, or the scenes are too few to tell. Agreement above shows nothing about the reconstructions."
+    )
+
+
+def _support(results: StudyResults) -> str:
+    if not results.doubts:
+        return ""
+    rows = []
+    for world, found in results.doubts.items():
+        ratio = "unknown" if found.ratio is None else f"{found.ratio:.1f} times"
+        shares = [
+            f"{wrong} of {count}" + (f"<small>{100 * wrong / count:.0f} %</small>" if count else "")
+            for wrong, count in ((found.doubtful_wrong, found.doubtful), (found.others_wrong, found.others))
+        ]
+        cells = "".join(f'<td class="n">{cell}</td>' for cell in (*shares, ratio))
+        rows.append(f"<tr><td><b>{escape(world)}</b></td>{cells}</tr>")
+    return (
+        '<h2>Does low support warn?</h2><div class="card scroll"><table><thead><tr><th>World</th>'
+        '<th class="n">Wrong with low support</th><th class="n">Wrong of all others</th><th class="n">How often</th>'
+        f'</tr></thead><tbody>{"".join(rows)}</tbody></table><p class="key">Policies with cameras. Wrong: the '
+        "same rollout ends otherwise (collision, off-road) in the true world. Low: before its end the policy got an "
+        f"image of which less than {100 * LOW:.0f} % rests on recorded views.</p></div>"
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from nurec_sim.report import Comparison
 from nurec_sim.runs import folder as layout
 from nurec_sim.runs.compared import COMPARED, comparison_of
 from nurec_sim.study.config import StudyConfig, control_name
+from nurec_sim.study.doubt import Doubt, doubts
 from nurec_sim.study.tasks import ROLLOUTS, VALUES
 
 RANKED_BY = ("collision_offroad_mean", "scene_score")
@@ -43,7 +44,8 @@ class StudyResults:
     policies, ``seeing`` the agreements of those that look at a sensor only, by metric and world: blind ones agree by
     construction. ``drops`` is by control and metric how much less than the intact reconstruction it agrees with the
     truth. ``pairs`` is by world the difference of every two policies in (C+O)/2, adjusted by Holm. ``differing`` names
-    blind policies that did not drive the same in all worlds, which is a fault of the simulator.
+    blind policies that did not drive the same in all worlds, which is a fault of the simulator. ``doubts`` is by world
+    how often verdicts with and without low support are wrong.
     """
 
     config: StudyConfig
@@ -54,6 +56,7 @@ class StudyResults:
     drops: dict[tuple[str, str], Estimate]
     pairs: dict[str, list[tuple[str, str, Difference]]]
     differing: tuple[str, ...]
+    doubts: dict[str, Doubt] = field(default_factory=dict)
 
     @property
     def discriminates(self) -> bool | None:
@@ -137,7 +140,15 @@ def results_of(config: StudyConfig, values: pl.DataFrame, seeing: Sequence[str])
             pairs[world] = [(names[i], names[j], d) for i, j, d in policy_differences(paired.by_world[world])]
     comparison = comparison_of(values, worlds, "the map of the towns")
     return StudyResults(
-        config, values, comparison, tuple(sorted(seeing)), seen, drops, pairs, _differing(values, seeing)
+        config,
+        values,
+        comparison,
+        tuple(sorted(seeing)),
+        seen,
+        drops,
+        pairs,
+        _differing(values, seeing),
+        doubts(values, worlds),
     )
 
 
@@ -172,6 +183,7 @@ def as_json(results: StudyResults) -> dict[str, Any]:
         "controls": {f"{how}/{metric}": asdict(drop) for (how, metric), drop in results.drops.items()},
         "discriminates": results.discriminates,
         "blind_policies_that_differ": list(results.differing),
+        "verdicts_by_support": {world: asdict(each) for world, each in results.doubts.items()},
     })  # fmt: skip
 
 

@@ -26,12 +26,14 @@ from nurec_sim.files.new_files import write_file
 from nurec_sim.metrics.aggregate import rollout_values
 from nurec_sim.metrics.score import score_rollout
 from nurec_sim.metrics.table import metric_table
+from nurec_sim.render.support import Support, recorded_frames
 from nurec_sim.runs import folder as layout
 from nurec_sim.runs.common_truth import with_common_truth
 from nurec_sim.runs.drive import RolloutJob, drive_job
 from nurec_sim.runs.policies import load_policies
 from nurec_sim.runs.results import PROFILE
 from nurec_sim.runs.scene_file import SceneRecord, record_scene, save_scene_record
+from nurec_sim.runs.seen_support import load_support
 from nurec_sim.runs.truth import TRUTH
 from nurec_sim.scene import read_scene, write_scene
 from nurec_sim.sim import load_scenario
@@ -126,7 +128,7 @@ def drive(task: Task) -> list[str]:
     messages: list[str] = []
     config, base = task.config, load_scenario(task.family.scenario)
     facts = facts_of(task)
-    with _world(task, facts) as (scene, sense):
+    with _world(task, facts) as (scene, sense, support):
         record = dataclasses.replace(record_scene(scene), place=config.all_worlds.index(task.world))
         save_scene_record(record, task.world_folder)
         policies = load_policies(config.policies)
@@ -138,10 +140,10 @@ def drive(task: Task) -> list[str]:
                     job = RolloutJob(scene, record, policy, seed, base, target, compared=True)
                     rollout = job.finished(messages.append)
                     if rollout is None:
-                        rollout = drive_job(job, sense, False, None, lambda share: None)
+                        rollout = drive_job(job, sense, False, None, lambda share: None, support)
                     if rollout.status != "ok":
                         messages.append(f"{job.title} failed: {rollout.error}")
-                    scored.append(rollout)
+                    scored.append((rollout, load_support(target / layout.SUPPORT)))
         finally:
             for policy in policies:
                 policy.host.close()
@@ -162,14 +164,14 @@ def facts_of(task: Task) -> GaussianScene:
 
 
 @contextmanager
-def _world(task: Task, facts: GaussianScene) -> Iterator[tuple[GaussianScene, Sense]]:
-    """The scene of a world with the facts of the log, and its renderer."""
+def _world(task: Task, facts: GaussianScene) -> Iterator[tuple[GaussianScene, Sense, Support | None]]:
+    """The scene of a world with the facts of the log, what renders it, and the support of a reconstruction."""
     if task.world == TRUTH:
         from nurec_sim.world import TownPlan, TrueWorld
 
         plan = TownPlan.from_json((task.scene_folder / PLAN).read_text(encoding="utf-8"))
         with TrueWorld(plan) as town:
-            yield facts, town.sense
+            yield facts, town.sense, None
         return
     from nurec_sim.render import make_renderer
 
@@ -179,14 +181,15 @@ def _world(task: Task, facts: GaussianScene) -> Iterator[tuple[GaussianScene, Se
     named = {**facts.provenance, "method": source.world, "reconstruction": task.world}
     if not source.archive.exists():
         text = source.error_file.read_text(encoding="utf-8").strip()
-        yield dataclasses.replace(facts, provenance=named), _failing(text)
+        yield dataclasses.replace(facts, provenance=named), _failing(text), None
         return
     scene = read_scene(source.archive)
     scene = with_common_truth([facts, scene])[1]
     if task.world in made_of:
         scene = CONTROLS[made_of[task.world]](scene)
     scene = dataclasses.replace(scene, provenance={**scene.provenance, **named})
-    yield scene, make_renderer(scene, "cpu", threads=1).sense
+    renderer = make_renderer(scene, "cpu", threads=1)
+    yield scene, renderer.sense, Support(renderer) if recorded_frames(scene) else None
 
 
 def _failing(text: str) -> Sense:
@@ -198,11 +201,13 @@ def _failing(text: str) -> Sense:
     return sense
 
 
-def _save_values(task: Task, rollouts: Sequence[Rollout], record: SceneRecord, facts: GaussianScene) -> None:
+def _save_values(
+    task: Task, rollouts: Sequence[tuple[Rollout, dict[int, float]]], record: SceneRecord, facts: GaussianScene
+) -> None:
     """One row per rollout and metric."""
     scored = [
-        (rollout, score_rollout(rollout, record.grid, facts.road_map, PROFILE, actors_known=True))
-        for rollout in rollouts
+        (rollout, score_rollout(rollout, record.grid, facts.road_map, PROFILE, actors_known=True, support=support))
+        for rollout, support in rollouts
     ]
     values = rollout_values(metric_table(scored, task.config.name), PROFILE, ROAD)
     content = io.BytesIO()  # so that a disk error is reported as one

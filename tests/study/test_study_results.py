@@ -10,6 +10,7 @@ from nurec_sim.metrics.aggregate import DERIVED
 from nurec_sim.metrics.agreement import tau_b_drop
 from nurec_sim.metrics.series import METRICS
 from nurec_sim.study import make_study
+from nurec_sim.study.doubt import Doubt
 from nurec_sim.study.page import render_study
 from nurec_sim.study.results import agreement_rows, as_json, results_of
 
@@ -73,6 +74,25 @@ def test_a_perfect_reconstruction_and_a_control_that_swaps_two_policies(good):
     assert found["noise_ceiling"]["scene_score"]["tau_b"]["value"] == pytest.approx(1.0)
     assert found["failed"] == 0 and found["rollouts"] == SCENES * 3 * 4 * 2
     assert ("lift-faint", "scene_score", "0.00") in [row[:3] for row in agreement_rows(json.loads(json.dumps(found)))]
+
+
+def test_verdicts_with_low_support_are_counted_apart():
+    """In lift sees_b has an event in the first three scenes instead of one; in these its images had little support."""
+    table = values({"truth": TRUE_FRACTIONS, "lift": (0.9, 0.6, 0.8, 0.3), "lift-faint": TRUE_FRACTIONS})
+    town = pl.col("clipgt_id").str.split("-").list.last().cast(pl.Int64)
+    mine = (pl.col("name") == "support_least") & (pl.col("reconstruction") == "lift")
+    least = pl.when(town < 3).then(0.3).otherwise(0.9)
+    sees = pl.col("policy").is_in(list(SEEING))
+    table = table.with_columns(
+        pl.when(pl.col("name") != "support_least").then("value").when(mine & sees).then(least).alias("value")
+    )
+    results = results_of(CONFIG, table, SEEING)
+    # Two policies, ten scenes, two trials: 12 of 40 have low support, and of these sees_b is wrong in scenes 1 and 2.
+    assert results.doubts == {"lift": Doubt(12, 4, 28, 0)} and results.doubts["lift"].ratio is None
+    assert Doubt(12, 4, 28, 2).ratio == pytest.approx((4 / 12) / (2 / 28))
+    assert as_json(results)["verdicts_by_support"]["lift"]["doubtful_wrong"] == 4
+    page = render_study(results)
+    assert "Does low support warn?" in page and "4 of 12<small>33 %</small>" in page
 
 
 def test_the_drop_of_tau_by_hand():

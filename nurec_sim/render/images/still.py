@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -14,10 +15,14 @@ from nurec_sim.errors import RequestError
 from nurec_sim.files.new_files import write_file
 from nurec_sim.render.device import Renderer, make_renderer
 from nurec_sim.render.images.encode import encode_image
-from nurec_sim.types import CameraFrame, GaussianScene, Label, SensorRequest
+from nurec_sim.render.support import Support, small_camera
+from nurec_sim.types import CameraFrame, CameraModel, GaussianScene, Label, SensorRequest
 
-Layer = Literal["rgb", "depth", "alpha", "label", "normal"]
+Layer = Literal["rgb", "depth", "alpha", "label", "normal", "support"]
 FAR_M = 80.0
+SUPPORT_PX = 480
+"""Largest width at which support is shown: it is computed for every pixel and every recorded view."""
+INVENTED_RGB = (255, 0, 60)
 LABEL_RGB = {
     Label.OTHER: (120, 120, 120),
     Label.ROAD: (128, 64, 128),
@@ -106,17 +111,36 @@ def render_still(
         frame: index of the camera's recorded time.
         left_m: the car moved to its left.
         yaw_deg: the car turned to its left.
-        layer: what to show; depth is grey from near to ``FAR_M``, normals are coloured by x, y and z in the world.
+        layer: what to show; depth is grey from near to ``FAR_M``, normals are coloured by x, y and z in the world;
+            ``support`` is the image, the redder the less it rests on recorded views (``render.support``).
         width_px: image width, height follows; the camera's own size if None.
 
     Raises:
         RequestError: see ``render_view``.
         WriteError: the file cannot be written; one that was there is as it was.
     """
+    if layer == "support":
+        request = view_request(renderer.scene, camera_id, frame, left_m=left_m, yaw_deg=yaw_deg, width_px=width_px)
+        write_file(path, encode_image(support_picture(renderer, request)))
+        return
     shown = render_view(
         renderer, camera_id, frame, left_m=left_m, yaw_deg=yaw_deg, width_px=width_px, outputs=("rgb", layer)
     )
     write_file(path, encode_image(picture(shown, layer)))
+
+
+def support_picture(renderer: Renderer, request: SensorRequest) -> UInt8[np.ndarray, "h w 3"]:
+    """An image of a camera, ``SUPPORT_PX`` wide at most, the redder the less it rests on recorded views.
+
+    Raises:
+        RequestError: see ``render.support.Support``.
+    """
+    assert isinstance(request.sensor, CameraModel)
+    width_px = min(request.sensor.width_px, SUPPORT_PX)
+    small = small_camera(request.sensor, width_px)
+    rgb = renderer.render_camera(dataclasses.replace(request, sensor=small)).rgb
+    support = Support(renderer).map(request, width_px)[..., None]
+    return np.rint(rgb * support + np.array(INVENTED_RGB) * (1 - support)).astype(np.uint8)
 
 
 def picture(frame: CameraFrame, layer: Layer) -> UInt8[np.ndarray, "h w 3"]:
