@@ -109,12 +109,17 @@ def comparison_bars(comparison: Comparison, metric: str) -> dict[str, Any]:
         means, low, high = (np.array(values, np.float64) for values in percent)
         data.append(
             {"type": "bar", "orientation": "h", "name": plain(world), "y": [plain(policy) for policy in policies],
-             "x": rounded(means), "marker": {"color": world_colour(place)},
-             "text": ["unknown" if np.isnan(mean) else f"{mean:.0f} %" for mean in means],
-             "textposition": "outside", "cliponaxis": False, "textfont": {"size": 10},
+             "x": rounded(means), "marker": {"color": world_colour(place)}, "offsetgroup": str(place),
              "error_x": {"type": "data", "array": rounded(high - means), "arrayminus": rounded(means - low),
                          "visible": bool(np.isfinite(low).any()), "color": "#1e293b", "thickness": 1.2},
-             "hovertemplate": "%{y}: %{text}<extra>" + plain(world) + "</extra>"}
+             "hovertemplate": "%{y}: %{x:.0f} %<extra>" + plain(world) + "</extra>"}
+        )  # fmt: skip
+        # Outside of a bar that nobody sees, as long as the interval: beside the whisker instead of on it.
+        data.append(
+            {"type": "bar", "orientation": "h", "y": data[-1]["y"], "x": rounded(np.fmax(np.nan_to_num(high), means)),
+             "marker": {"color": "rgba(0,0,0,0)"}, "offsetgroup": str(place), "hoverinfo": "skip",
+             "text": ["unknown" if np.isnan(mean) else f"{mean:.0f} %" for mean in means],
+             "textposition": "outside", "cliponaxis": False, "textfont": {"size": 10}}
         )  # fmt: skip
     layout["height"] = 80 + (14 + 16 * len(comparison.worlds)) * len(policies)
     layout |= {"barmode": "group", "bargap": 0.3, "showlegend": False}

@@ -107,7 +107,11 @@ def test_the_report_opens_with_what_differs(finished):
     assert page.index("follows · street") < page.index("constant_velocity · street")
     assert "Not measured: give the log as well" in page
     stored = json.loads(re.search(r'id="figures">(.*?)</script>', text, re.S).group(1))["figures"]
-    assert [trace["name"] for trace in stored["bars-offroad"]["data"]] == ["lift", "dense"]
+    bars, labels = stored["bars-offroad"]["data"][::2], stored["bars-offroad"]["data"][1::2]
+    assert [trace["name"] for trace in bars] == ["lift", "dense"]
+    for bar, label in zip(bars, labels, strict=True):  # a value is written at the end of its interval
+        ends = [at + (half or 0) for at, half in zip(bar["x"], bar["error_x"]["array"], strict=True)]
+        assert label["x"] == pytest.approx(ends, abs=0.002) and label["offsetgroup"] == bar["offsetgroup"]
     lines = {trace["name"] for trace in stored["plan0"]["data"]}
     assert {"driven in lift", "driven in dense", "recorded path"} <= lines and len(stored["plan0"]["now"]) == 2
     assert {trace["name"] for trace in stored["time0"]["data"]} == {"recorded", "lift", "dense"}
