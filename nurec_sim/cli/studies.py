@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import resource
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from nurec_sim.cli.console import app, err, out, print_table, progress
+from nurec_sim.errors import RunError
 from nurec_sim.files.new_files import check_writable
 
 
@@ -19,6 +21,7 @@ def study(
     *,
     out_path: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     jobs: int | None = None,
+    ray: str | None = None,
     report: bool = False,
 ) -> None:
     """Does a reconstruction rank policies as the true world does? Towns, reconstructions, rollouts and one report.
@@ -33,15 +36,18 @@ def study(
     every key.
 
     An interrupted study goes on where it stopped: give the same command again. The result is the same, byte for byte,
-    for any --jobs. Exit status 1 if a rollout failed.
+    for any --jobs and on any cluster. Exit status 1 if a rollout failed.
 
     Examples: `nurec-sim study smoke`; `nurec-sim study mine.yaml --out studies/mine --jobs 8`;
-    `nurec-sim study smoke --report` rewrites the report only.
+    `nurec-sim study nightly --ray auto` on a Ray cluster (docs/fleet.md); `nurec-sim study smoke --report` rewrites
+    the report only.
 
     Args:
         config: name of a bundled study, or a YAML file.
         out_path: folder of the study; default: studies/NAME.
         jobs: worker processes; default: one per core.
+        ray: run on a Ray cluster instead: host:port of its head, `auto` for the one that this machine belongs to, or
+            `local`; needs `pip install 'nurec-sim[fleet]'`.
         report: only rewrite tables and report, of a finished study.
     """
     from nurec_sim import study as studies
@@ -49,18 +55,26 @@ def study(
 
     chosen = studies.load_study(config)
     folder = out_path or Path("studies") / chosen.name
-    executor = studies.LocalProcesses(usable_cores() if jobs is None else jobs)
     if report:
         path = studies.report_again(chosen, folder)
         out.print(f"wrote {path}", soft_wrap=True)
         return
+    if ray is not None and jobs is not None:
+        raise RunError("give --jobs or --ray, not both: a cluster runs one task per CPU")
     check_writable(folder, folder=True)
     started, before = time.monotonic(), _cpu_s()
-    out.print(
-        f"study {chosen.name}: {len(chosen.scenes)} scenes x {len(chosen.all_worlds)} worlds x "
-        f"{len(chosen.policies)} policies x {chosen.trials} trials = {chosen.rollouts} rollouts, {executor.jobs} jobs"
-    )
-    with progress("study") as advance:
+    with ExitStack() as stack:
+        executor: studies.Executor
+        if ray is None:
+            executor = studies.LocalProcesses(usable_cores() if jobs is None else jobs)
+        else:
+            executor = stack.enter_context(studies.RayCluster(ray))
+        out.print(
+            f"study {chosen.name}: {len(chosen.scenes)} scenes x {len(chosen.all_worlds)} worlds x "
+            f"{len(chosen.policies)} policies x {chosen.trials} trials = {chosen.rollouts} rollouts, "
+            f"{executor.jobs} jobs"
+        )
+        advance = stack.enter_context(progress("study"))
         path = studies.run_study(chosen, folder, executor, progress=advance, notice=_notice)
     results = studies.read_agreement(folder)
     heading = ("world", "metric", "tau-b", "95 % interval", "pairs: same", "flipped", "resolved in one", "unresolved")

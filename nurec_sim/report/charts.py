@@ -97,7 +97,8 @@ def comparison_bars(comparison: Comparison, metric: str) -> dict[str, Any]:
     """
     import polars as pl
 
-    layout, data = base_layout(0), []
+    layout = base_layout(0)
+    data: list[dict[str, Any]] = []
     table = comparison.summary.filter(pl.col("name") == metric)
     policies = sorted(table["policy"].unique().to_list())
     for place, world in enumerate(comparison.worlds):

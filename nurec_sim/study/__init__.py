@@ -12,6 +12,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "config": ["StudyConfig", "load_study", "make_study", "shipped_studies"],
         "controls": ["CONTROLS"],
         "executor": ["Executor", "LocalProcesses"],
+        "ray_cluster": ["RayCluster"],
         "results": ["StudyResults", "agreement_rows", "read_agreement", "write_study_report"],
         "run": ["report_again", "run_study"],
     },

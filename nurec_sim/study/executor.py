@@ -25,6 +25,11 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_
 class Executor(Protocol):
     """Runs independent tasks."""
 
+    @property
+    def jobs(self) -> int:
+        """How many run at a time."""
+        ...
+
     def run(
         self, work: Callable[[Task], Result], tasks: Sequence[Task], tick: Callable[[], None]
     ) -> Iterator[tuple[Task, Result]]:

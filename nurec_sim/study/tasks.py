@@ -82,6 +82,25 @@ class Task:
         """Where the rollouts of this world are."""
         return layout.scene_folder(self.folder / ROLLOUTS, self.scene_id, self.world)
 
+    @property
+    def corruption(self) -> str | None:
+        """Name of the corruption, if the world is a corrupted copy of a reconstruction."""
+        controls = self.config.controls
+        return {control_name(controls.of, how): how for how in controls.how}.get(self.world)
+
+    @property
+    def source(self) -> Task:
+        """The task of the reconstruction that this world shows."""
+        return dataclasses.replace(self, world=self.config.controls.of) if self.corruption else self
+
+    def inputs(self) -> list[Path]:
+        """Files of the study that exist and that the task reads."""
+        if not self.world:
+            return []
+        needed = [self.scene_folder / name for name in (LOG, PLAN)] + [self.source.archive, self.source.error_file]
+        finished = sorted(path for path in self.world_folder.rglob("*") if path.is_file())
+        return [path for path in needed if path.exists()] + finished
+
 
 def record(task: Task) -> list[str]:
     """Generates the town and records its log; returns messages."""
@@ -175,9 +194,7 @@ def _world(task: Task, facts: GaussianScene) -> Iterator[tuple[GaussianScene, Se
         return
     from nurec_sim.render import make_renderer
 
-    controls = task.config.controls
-    made_of = {control_name(controls.of, how): how for how in controls.how}
-    source = dataclasses.replace(task, world=controls.of) if task.world in made_of else task
+    source, corruption = task.source, task.corruption
     named = {**facts.provenance, "method": source.world, "reconstruction": task.world}
     if not source.archive.exists():
         text = source.error_file.read_text(encoding="utf-8").strip()
@@ -185,8 +202,8 @@ def _world(task: Task, facts: GaussianScene) -> Iterator[tuple[GaussianScene, Se
         return
     scene = read_scene(source.archive)
     scene = with_common_truth([facts, scene])[1]
-    if task.world in made_of:
-        scene = CONTROLS[made_of[task.world]](scene)
+    if corruption is not None:
+        scene = CONTROLS[corruption](scene)
     scene = dataclasses.replace(scene, provenance={**scene.provenance, **named})
     renderer = make_renderer(scene, "cpu", threads=1)
     yield scene, renderer.sense, Support(renderer) if recorded_frames(scene) else None

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nurec_sim.study import LocalProcesses, make_study, read_agreement, run_study
+from nurec_sim.study import LocalProcesses, RayCluster, make_study, read_agreement, run_study
 from nurec_sim.study.tasks import drive
 
 CONFIG = make_study(
@@ -32,20 +32,55 @@ def files(folder):
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.slow
-@pytest.mark.needs_gl
-def test_a_study_gives_the_same_bytes_with_two_jobs_and_after_an_interruption(tmp_path):
-    at_once = run_study(CONFIG, tmp_path / "a", LocalProcesses(2))
-    with pytest.raises(KeyboardInterrupt):
-        run_study(CONFIG, tmp_path / "b", Interrupted())
-    assert not (tmp_path / "b" / "report.html").exists()
-    (driven,) = (tmp_path / "b").glob("rollouts/*/*/values.parquet")
-    before = driven.stat().st_mtime_ns
-    run_study(CONFIG, tmp_path / "b", LocalProcesses(1))
-    assert driven.stat().st_mtime_ns == before, "a finished world is not driven in again"
-    first, second = files(tmp_path / "a"), files(tmp_path / "b")
+@pytest.fixture(scope="module")
+def at_once(tmp_path_factory):
+    """Folder of the study, made by two processes without an interruption."""
+    return run_study(CONFIG, tmp_path_factory.mktemp("study") / "a", LocalProcesses(2)).parent
+
+
+def assert_same_files(one, other):
+    first, second = files(one), files(other)
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []
-    found = read_agreement(tmp_path / "a")
+
+
+@pytest.mark.slow
+@pytest.mark.needs_gl
+def test_a_study_gives_the_same_bytes_with_two_jobs_and_after_an_interruption(at_once, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        run_study(CONFIG, tmp_path, Interrupted())
+    assert not (tmp_path / "report.html").exists()
+    (driven,) = tmp_path.glob("rollouts/*/*/values.parquet")
+    before = driven.stat().st_mtime_ns
+    run_study(CONFIG, tmp_path, LocalProcesses(1))
+    assert driven.stat().st_mtime_ns == before, "a finished world is not driven in again"
+    assert_same_files(at_once, tmp_path)
+    found = read_agreement(at_once)
     assert found["rollouts"] == 9 and found["failed"] == 0 and found["blind_policies_that_differ"] == []
-    assert "Does a reconstruction rank policies" in at_once.read_text()
+    assert "Does a reconstruction rank policies" in (at_once / "report.html").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.needs_gl
+def test_two_nodes_of_which_one_is_killed_give_the_same_bytes(at_once, tmp_path):
+    pytest.importorskip("ray", reason="Ray is not installed")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    killed = []
+
+    def kill(stage, share):
+        finished = sorted(path.parent.name for path in tmp_path.glob("rollouts/*/*/*/*/rollout.npz"))
+        if finished and not killed:
+            killed.append(finished)
+            cluster.remove_node(node, allow_graceful=False)
+
+    try:
+        node = cluster.add_node(num_cpus=1)
+        with RayCluster(cluster.address) as executor:
+            assert executor.jobs == 2
+            run_study(CONFIG, tmp_path, executor, progress=kill)
+            assert killed and executor.jobs == 1
+    finally:
+        cluster.shutdown()
+    assert_same_files(at_once, tmp_path)
