@@ -11,6 +11,7 @@ from skimage.metrics import structural_similarity
 from nurec_sim.evaluate.scores.images import psnr
 from nurec_sim.reconstruct import OptimizeSettings
 from nurec_sim.reconstruct.optimize import method
+from nurec_sim.reconstruct.optimize.adam import BRIGHTEST, SkyAdam
 from nurec_sim.reconstruct.optimize.depth_loss import depth_loss
 from nurec_sim.reconstruct.optimize.image_loss import colour_loss
 from nurec_sim.reconstruct.optimize.views import Returns, returns_in, training_views
@@ -88,6 +89,25 @@ def test_returns_of_labelled_boxes_are_left_out(street, lifted):
     unlabelled = training_views(street, dataclasses.replace(lifted, tracks=()), ["front"], set())
     assert all(len(a.returns) < len(b.returns) for a, b in zip(views, unlabelled, strict=True))
     assert all(len(view.returns) == 0 for view in training_views(street, lifted, ["front"], {0, 1, 2, 3}))
+
+
+def test_a_saturated_pixel_says_only_that_it_was_no_darker(street, lifted):
+    view = training_views(street, lifted, ["front"], set())[0]
+    image = np.full((1, 4, 3), 255, np.uint8)
+    image[0, 2:] = 249
+    shown = np.array([0.9, 1.3, 0.9, 1.3], np.float32)[None, :, None].repeat(3, axis=2)
+    wanted = dataclasses.replace(view, image=image, ego=None).colours_beside(shown)
+    assert wanted[0, :, 0] == pytest.approx([1, 1.3, 249 / 255, 249 / 255])
+
+
+def test_the_sky_may_be_brighter_than_the_white_of_an_image():
+    sky = np.full((6, 2, 2, 3), 0.99, np.float32)
+    adam, gradient = SkyAdam(sky), np.zeros((6, 2, 2, 3))
+    gradient[0, 0, 0] = -1
+    for rate in (0.1, 10.0):
+        adam.step(sky, gradient, rate)
+        assert sky[0, 0, 0] == pytest.approx(min(0.99 + rate, BRIGHTEST), rel=1e-5)
+    assert (sky.reshape(-1, 3)[1:] == np.float32(0.99)).all()
 
 
 def test_the_ego_vehicle_in_an_image_teaches_nothing(street, lifted):

@@ -22,6 +22,8 @@ BETA1, BETA2 = 0.9, 0.99
 EPSILON = 1e-15
 KEEP1, KEEP2, TINY = np.float32(1 - BETA1), np.float32(1 - BETA2), np.float32(EPSILON)
 SMALLEST_M = 1e-3
+BRIGHTEST = 4.0
+"""Of the sky, where white is 1: two stops above what the longest exposure can show."""
 
 
 @inner
@@ -179,7 +181,7 @@ def bias_corrections() -> Float32[np.ndarray, "v 2"]:
 
 @kernel
 def adam_cells(values, first, second, visits, gradient, rate):
-    """One step of Adam on the cells of a table that have a gradient, and those only; values stay within 0..1.
+    """One step of Adam on the cells of a table that have a gradient, and only those; values stay in 0..``BRIGHTEST``.
 
     Args:
         values: [n,c] what is optimised; changed.
@@ -201,7 +203,7 @@ def adam_cells(values, first, second, visits, gradient, rate):
             first[i, k] += (1 - BETA1) * (gradient[i, k] - first[i, k])
             second[i, k] += (1 - BETA2) * (gradient[i, k] * gradient[i, k] - second[i, k])
             step = first[i, k] / correction1 / (np.sqrt(second[i, k] / correction2) + EPSILON)
-            values[i, k] = min(max(values[i, k] - rate * step, 0.0), 1.0)
+            values[i, k] = min(max(values[i, k] - rate * step, 0.0), BRIGHTEST)
 
 
 class SkyAdam:

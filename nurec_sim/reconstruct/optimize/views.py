@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from nurec_sim import geometry, sensors
+from nurec_sim.reconstruct.lift.colour import SATURATED
 from nurec_sim.types import CameraModel, Clip, GaussianScene
 
 CELL_PX = 6
@@ -54,8 +55,13 @@ class TrainingView:
     ego: Bool[np.ndarray, "h w"] | None = None
 
     def colours_beside(self, shown: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-        """The image, 0..1, with the colours ``shown`` of the scene where it shows the ego vehicle: no error there."""
+        """The image, 0..1, with the colours ``shown`` of the scene where these are no error.
+
+        That is where the image shows the ego vehicle, and where it is saturated and the scene is brighter.
+        """
         colours = self.image.astype(np.float32) / np.float32(255)
+        # Clipped as it was, a bright sky would have another brightness in every exposure.
+        np.copyto(colours, shown, where=(colours > SATURATED) & (shown > colours))
         if self.ego is not None:
             colours[self.ego] = shown[self.ego]
         return colours
