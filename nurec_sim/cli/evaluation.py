@@ -17,6 +17,7 @@ from nurec_sim.cli.scenes import NO_FLAGS, MethodName, NetworkFlags, method_sett
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable, write_file
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
+from nurec_sim.types import ActorsName
 
 if TYPE_CHECKING:
     from nurec_sim.cli.progress import Report
@@ -42,6 +43,9 @@ class LogFlags:
     """CLIP: time budget in seconds for optimising the scene on its input images and sweeps."""
     poses: PosesName = "recorded"
     """CLIP: poses of the log, or refined by its LiDAR (docs/log_formats.md)."""
+    actors: ActorsName = "auto"
+    """CLIP: actors of the reconstruction: the log's boxes (recorded), what moves in its sweeps (found), or none; auto:
+    recorded, or found if there are no boxes. Scores are by the log's boxes in any case."""
     input_cameras: tuple[str, ...] = ()
     """CLIP: input cameras of the reconstruction; default: all."""
     target_cameras: tuple[str, ...] = ()
@@ -182,6 +186,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
                 progress=advance,
                 settings=settings,
                 refine=refinement(flags.refine),
+                actors=flags.actors,
             )
     if flags.json is not None:
         write_file(flags.json, json.dumps(figures, indent=1, sort_keys=True) + "\n")

@@ -10,6 +10,7 @@ from nurec_sim.cli.console import OnePath, app, out, print_faults, print_table, 
 from nurec_sim.cli.validation import inspect_scene
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable, new_file, write_file
+from nurec_sim.geometry import arc_length
 
 if TYPE_CHECKING:
     from nurec_sim.logs import Clip
@@ -21,8 +22,8 @@ def inspect(
 ) -> None:
     """Show the contents of a driving log or a scene archive, and check it.
 
-    Prints a table of sensors, rates, spans and boxes; the consistency of ground, cameras, LiDARs and boxes; then every
-    fault as one line. Exit status 1 if there are faults.
+    Prints a table of sensors, rates, spans and boxes; the consistency of ground, cameras, LiDARs and boxes; for a log
+    without boxes what moves in its sweeps; then every fault as one line. Exit status 1 if there are faults.
 
     Args:
         source: a driving log of any format (docs/log_formats.md), or a scene archive (.usdz).
@@ -58,14 +59,35 @@ def inspect(
         measures = logs.measure_clip(log)
     if measures:
         print_table("consistency", [(each.what, each.found) for each in measures])
+    shown = log if log.tracks else _with_found_actors(log)
     if html is not None:
         from nurec_sim.report.log_page import log_page
 
         with progress(f"writing {html.name}"):
-            write_file(html, log_page(log, faults, measures))
+            write_file(html, log_page(shown, faults, measures))
         out.print(f"wrote {html}", soft_wrap=True)
     print_faults([*faults, *(fault for each in measures for fault in each.faults)])
     out.print("no faults")
+
+
+def _with_found_actors(log: Clip) -> Clip:
+    """A log without boxes with what moves in its sweeps, which is printed."""
+    from nurec_sim.logs.selection import with_tracks
+    from nurec_sim.reconstruct.movers import find_actors
+
+    with progress("looking for what moves in the sweeps") as advance:
+        tracks = find_actors(log, progress=lambda done: advance("what moves", done))
+    if not tracks:
+        return log
+    rows = []
+    for track in tracks:
+        seconds = (track.path.end_us - track.path.start_us) / 1e6
+        moved_m = arc_length(track.path.position_m)[-1]
+        size = " x ".join(f"{edge:.1f}" for edge in track.size_m)
+        seen = f"{(track.path.start_us - log.span_us[0]) / 1e6:.1f} to {(track.path.end_us - log.span_us[0]) / 1e6:.1f}"
+        rows.append((track.id, track.label, size, seen, f"{moved_m / seconds:.1f}"))
+    print_table("no boxes; found by motion", rows, ("actor", "looks like", "size m", "seen s", "m/s"))
+    return with_tracks(log, tracks)
 
 
 def _write_overlay(log: Clip, path: Path, time_s: float | None) -> None:

@@ -15,6 +15,7 @@ from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
+from nurec_sim.types import ActorsName
 
 if TYPE_CHECKING:
     from nurec_sim.serving.store import LoadedScene
@@ -32,6 +33,7 @@ def reconstruct(
     method: MethodName = "lift",
     cameras: tuple[str, ...] = (),
     poses: PosesName = "recorded",
+    actors: ActorsName = "auto",
     map_from_gaussians: bool = False,
     refine: float | None = None,
     resume: bool = False,
@@ -56,6 +58,9 @@ def reconstruct(
         changes: a setting of the method, repeatable: --set sky_px=256 --set views.levels=48.
         cameras: use only these cameras; default: all, or as many as the network's profile supports.
         poses: those of the log, or refined by its LiDAR (docs/log_formats.md).
+        actors: whose objects move, instead of being part of the static world: recorded (boxes of the log), found (what
+            moves in its LiDAR sweeps, named found-1, found-2, ...), none; auto: recorded, or found if the log has no
+            boxes at all.
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
         refine: time budget in seconds for optimising the scene on the log's images and sweeps.
@@ -83,6 +88,7 @@ def reconstruct(
             progress=advance,
             settings=settings,
             refine=fit,
+            actors=actors,
         )
     derived = None
     if map_from_gaussians and world_scene.road_map is None:

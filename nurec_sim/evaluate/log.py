@@ -16,11 +16,14 @@ from typing import Any
 import numpy as np
 
 from nurec_sim.errors import ReconstructError
+from nurec_sim.evaluate.actor_scores import score_actors
 from nurec_sim.evaluate.image_scores import score_images
 from nurec_sim.evaluate.lidar_scores import score_free_space, score_sweeps
 from nurec_sim.logs.held_out import HeldOut, hold_out, without_images
+from nurec_sim.logs.selection import with_tracks
 from nurec_sim.metrics.offroad import offroad_agreement
 from nurec_sim.metrics.offroad_grid import scene_offroad_grid
+from nurec_sim.reconstruct.movers import NAME as FOUND
 from nurec_sim.render import make_renderer
 from nurec_sim.types import CameraFrame, Clip, GaussianScene, Sense, SensorRequest
 
@@ -102,6 +105,8 @@ def score_scene(
 ) -> dict[str, Any]:
     """Score what a scene of a log renders.
 
+    In a log without boxes, the actors that were found in its sweeps (``reconstruct.movers``) count as its boxes.
+
     Args:
         clip: the log.
         scene: its reconstruction.
@@ -122,6 +127,7 @@ def score_scene(
           per-frame lists and ``floor``: copying the seen image nearest in time.
         - ``lidar``: of the sweeps held out (``lidar_scores.score_sweeps``), None if there are none.
         - ``free_space``: false obstacles beside the path (``lidar_scores.score_free_space``), None without LiDAR.
+        - ``actors``: found actors against the log's boxes (``actor_scores.score_actors``), None without either.
         - ``road``: how off-road from Gaussians agrees with the log's map, None without a map.
         - ``seconds``, ``counts``, ``unknown``.
 
@@ -129,6 +135,10 @@ def score_scene(
         ReconstructError: an unknown camera, or a scene of another log.
     """
     held, report = held or HeldOut(), progress or (lambda stage, fraction: None)
+    found = score_actors(clip, scene)
+    if not clip.tracks:
+        # What moves in the log is in free space at other times, with a label or without.
+        clip = with_tracks(clip, [track for track in scene.tracks if track.id.startswith(FOUND)])
     inputs = [camera for camera in scene.provenance.get("cameras", scene.rig.cameras) if camera in clip.rig.cameras]
     targets = inputs if target_cameras is None else list(target_cameras)
     _check_cameras(clip, targets)
@@ -159,6 +169,7 @@ def score_scene(
         "lidar": lidar,
         "free_space": free,
         "road": score_road(scene),
+        "actors": found,
         "seconds": seconds,
         "counts": {"static": len(scene.static), "dynamic": len(scene.dynamic)}
         | dict(scene.provenance.get("counts", {})),

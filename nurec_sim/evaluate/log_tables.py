@@ -45,6 +45,8 @@ def figure_rows(figures: Mapping[str, Any]) -> list[Row]:
         )
     if road := figures["road"]:
         rows.append(Row("Road", "off-road agrees with the map", road.get("agreement"), 3, 1))
+    if actors := figures.get("actors"):
+        rows += _actor_rows(actors)
     rows += [
         Row("Scene", "static Gaussians", figures["counts"]["static"], 0),
         Row("Scene", "moving Gaussians", figures["counts"]["dynamic"], 0),
@@ -85,6 +87,18 @@ def _lidar_rows(lidar: Mapping[str, Any]) -> list[Row]:
                 ]
         rows.append(Row(f"LiDAR: {kind}", f"beams, {kind}", parts["beams"], 0))
     return rows
+
+
+def _actor_rows(actors: Mapping[str, Any]) -> list[Row]:
+    group, instants = "Found actors against the log's boxes, up to 40 m", actors["instants"]
+    return [
+        Row(group, "recall of moving vehicles", actors["recall"], 3, 1),
+        Row(group, "recall of moving people", actors["recall_people"], 3, 1),
+        Row(group, "precision", actors["precision"], 3, 1),
+        Row(group, "centres of vehicles, median error (m)", actors["centre_m"], 2, -1),
+        Row(group, "velocities of vehicles, median error (m/s)", actors["speed_mps"], 2, -1),
+        *(Row(group, f"instants of {name}", count, 0) for name, count in instants.items()),
+    ]
 
 
 def _image_rows(group: str, frames: Mapping[str, Any]) -> list[Row]:

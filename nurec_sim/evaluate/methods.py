@@ -176,7 +176,9 @@ def build(contender: Contender, window: Window, device: str = "auto") -> Built:
 
     _look(window, sweeps=_sees_lidar(contender))
     started = time.perf_counter()
-    scene = reconstruct(window.clip, contender.method, cameras=window.cameras, settings=contender.settings)
+    scene = reconstruct(
+        window.clip, contender.method, cameras=window.cameras, settings=contender.settings, actors="recorded"
+    )
     renderer, spent = make_renderer(scene, device), time.perf_counter() - started
     return Built(lambda request: renderer.render_camera(request, ("rgb", "depth")), scene, spent, renderer)
 

@@ -30,8 +30,10 @@ def describe_clip(clip: Clip) -> ClipSummary:
     """Sensors, counts, rates, times, tracks and map of a clip; reads no image and no sweep."""
     start_us, end_us = clip.span_us
     rows = [_camera_row(clip, name) for name in clip.rig.cameras] + [_lidar_row(clip, name) for name in clip.rig.lidars]
-    moving = sum(len(track.path.t_us) > 1 for track in clip.tracks)
-    labels = Counter(track.label for track in clip.tracks)
+    labelled = [track for track in clip.tracks if track.labelled]
+    found = Counter(track.label for track in clip.tracks if not track.labelled)
+    moving = sum(len(track.path.t_us) > 1 for track in labelled)
+    labels = Counter(track.label for track in labelled)
     path_m = float(np.linalg.norm(np.diff(clip.ego.position_m, axis=0), axis=1).sum())
     road_map = clip.road_map
     facts = [
@@ -41,8 +43,9 @@ def describe_clip(clip: Clip) -> ClipSummary:
         ("span", f"{start_us} to {end_us} us ({(end_us - start_us) / 1e6:.3f} s)"),
         *([("times", f"those of the log and {clip.time_offset_us} us")] if clip.time_offset_us else []),
         ("ego", f"{len(clip.ego.t_us)} poses{_rate_text(clip.ego.t_us)}, {path_m:.1f} m driven"),
-        ("boxes", f"{sum(len(track.path.t_us) for track in clip.tracks)} in {len(clip.tracks)} tracks"),
-        ("tracks", f"{moving} with more than one pose; {_counts(labels)}" if clip.tracks else "none"),
+        ("boxes", f"{sum(len(track.path.t_us) for track in labelled)} in {len(labelled)} tracks"),
+        ("tracks", f"{moving} with more than one pose; {_counts(labels)}" if labelled else "none"),
+        *([("found by motion, unlabelled", _counts(found))] if found else []),
         ("map", f"{len(road_map.drivable)} drivable areas, {len(road_map.lanes)} lanes" if road_map else "none"),
     ]
     facts += [

@@ -1,16 +1,18 @@
-"""A log with selected frames and sweeps of another one, loaded on demand."""
+"""A log with selected frames and sweeps of another one, loaded on demand, or with other tracks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from nurec_sim.types import Rig, RoadMap, Sweep, Track, Trajectory
+from nurec_sim.types import Clip, Rig, RoadMap, Sweep, Track, Trajectory
 
 Image = UInt8[np.ndarray, "h w 3"]
+AnyClip = TypeVar("AnyClip", bound=Clip)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +81,21 @@ class ContextClip:
     def sweep(self, lidar_id: str, index: int) -> Sweep:
         """One motion-compensated sweep."""
         return self.revolutions[lidar_id][index].sweep()
+
+
+class _OtherTracks:
+    """A log with other tracks."""
+
+    def __init__(self, clip: Clip, tracks: Sequence[Track]) -> None:
+        self._clip, self.tracks = clip, tuple(tracks)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._clip, name)
+
+
+def with_tracks(clip: AnyClip, tracks: Sequence[Track]) -> AnyClip:
+    """The same log with these tracks instead of its own."""
+    return cast(AnyClip, _OtherTracks(clip, tracks))
 
 
 def _times(records: Sequence[Shot] | Sequence[Revolution]) -> Int64[np.ndarray, "n 2"]:

@@ -21,10 +21,12 @@ from nurec_sim.reconstruct.lift.settings import (
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 
 if TYPE_CHECKING:
-    from nurec_sim.types import Clip, GaussianScene, Method
+    from nurec_sim.types import ActorsName, Clip, GaussianScene, Method
 
 START_SHARE = 0.15
 """Share of all work, about, that is done before the optimisation starts."""
+MOVERS_SHARE = 0.15
+"""Share of the work of a method, about, that it takes to find what moves."""
 
 __all__ = [
     "ColourSettings",
@@ -63,6 +65,7 @@ def reconstruct(
     progress: Callable[[str, float], None] | None = None,
     settings: Any = None,
     refine: OptimizeSettings | None = None,
+    actors: ActorsName = "auto",
 ) -> GaussianScene:
     """Build a Gaussian scene from a clip, at the precision of archives: reading it from one gives the same values.
 
@@ -75,10 +78,12 @@ def reconstruct(
         settings: an instance of the method's settings class: ``LiftSettings`` for ``lift``, ``FeedForwardSettings`` for
             ``dense`` and ``selective``, ``OptimizeSettings`` for ``optimized``; the defaults if None.
         refine: fit the scene to the images and sweeps afterwards; ``optimized`` is ``lift`` with this step.
+        actors: whose objects move: the boxes of the log (``recorded``), what moves in its sweeps (``found``), nobody
+            (``none``); ``auto`` takes the boxes, and what moves if there are none.
 
     Raises:
-        ReconstructError: no such method, camera or sweep, settings of another method, or the clip lacks what the
-            method needs.
+        ReconstructError: no such method, camera, sweep or choice of actors, settings of another method, or the clip
+            lacks what the method needs.
         WeightsError: the network's weights are not there or cannot be used.
     """
     made = load_method(method) if isinstance(method, str) else method
@@ -100,15 +105,20 @@ def reconstruct(
     if wrong:
         raise ReconstructError(f"clip {clip.id!r} has no sweeps {wrong} to hold out; have 0..{most - 1}")
 
+    from nurec_sim.reconstruct.movers import with_actors
     from nurec_sim.scene.precision import archived
 
     held = {int(index) for index in hold_out_sweeps}
     report = progress or (lambda stage, fraction: None)
     share = 1.0 if refine is None else START_SHARE
-    scene = made.reconstruct(
-        clip, settings, cameras=cameras, hold_out_sweeps=held, progress=lambda stage, done: report(stage, share * done)
-    )
-    scene = _with_provenance(scene, clip, made.name, chosen)
+    clip, note = with_actors(clip, actors, held, lambda done: report("moving objects", share * MOVERS_SHARE * done))
+    begun = 0.0 if note is None else MOVERS_SHARE
+
+    def step(stage: str, done: float) -> None:
+        report(stage, share * (begun + (1 - begun) * done))
+
+    scene = made.reconstruct(clip, settings, cameras=cameras, hold_out_sweeps=held, progress=step)
+    scene = _with_provenance(scene, clip, made.name, chosen, note)
     if refine is not None:
         from nurec_sim.reconstruct.optimize.method import refine as fit_to_log
 
@@ -124,10 +134,18 @@ def reconstruct(
     return archived(scene)
 
 
-def _with_provenance(scene: GaussianScene, clip: Clip, method: str, cameras: list[str]) -> GaussianScene:
-    """The scene with the entries that every provenance has, where the method left them out."""
+def _with_provenance(
+    scene: GaussianScene, clip: Clip, method: str, cameras: list[str], note: str | None
+) -> GaussianScene:
+    """The scene with the entries that every provenance has, where the method left them out, and a note on its actors.
+
+    The note says more than what methods say about logs without boxes, and replaces it.
+    """
     known: dict[str, Any] = {"method": method, "cameras": cameras}
     if clip.time_offset_us:
         known["time_offset_us"] = clip.time_offset_us
-    missing = {key: value for key, value in known.items() if key not in scene.provenance}
-    return dataclasses.replace(scene, provenance={**scene.provenance, **missing}) if missing else scene
+    provenance = known | dict(scene.provenance)
+    if note is not None:
+        others = [text for text in provenance.get("unknown", ()) if not text.startswith("no boxes:")]
+        provenance["unknown"] = [note, *others]
+    return dataclasses.replace(scene, provenance=provenance) if provenance != scene.provenance else scene

@@ -133,7 +133,7 @@ def rebuild(task: Task) -> list[str]:
         # Steps, not seconds: the same result on every machine, whatever else it does.
         settings = OptimizeSettings(seconds=None, steps=task.config.optimize_steps)
     try:
-        scene = reconstruct(logs.open_clip(task.scene_folder / LOG), method, settings=settings)
+        scene = reconstruct(logs.open_clip(task.scene_folder / LOG), method, settings=settings, actors="recorded")
     except ReconstructError as error:
         write_file(task.error_file, f"{error}\n")
         return [f"{task.title} cannot be reconstructed: {error}"]

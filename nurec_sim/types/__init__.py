@@ -31,7 +31,7 @@ from nurec_sim.types.loop import (
     Rollout,
     Series,
 )
-from nurec_sim.types.methods import Method, Progress
+from nurec_sim.types.methods import ActorsName, Method, Progress
 from nurec_sim.types.scenes import (
     GAUSSIAN_FIELDS,
     OPTIONAL_GAUSSIAN_FIELDS,
@@ -57,6 +57,7 @@ from nurec_sim.types.trajectories import (
 )
 
 __all__ = [
+    "ActorsName",
     "ActorState",
     "Box",
     "CameraFrame",

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from nurec_sim.types.logs import Clip
 from nurec_sim.types.scenes import GaussianScene
 
 Progress = Callable[[str, float], None]
 """Called with the current stage and the approximate fraction of all work done; may raise to abort the work."""
+
+ActorsName = Literal["auto", "recorded", "found", "none"]
+"""Which objects of a log are its actors: those with boxes, those found by their motion, none; ``auto`` takes the boxes
+if there are any."""
 
 
 class Method(Protocol):

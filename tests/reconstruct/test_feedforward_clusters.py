@@ -8,8 +8,8 @@ import pytest
 import render_scenes
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.feedforward.tracks.boxes import LEAST_M, Sighting, lengthened, track_of
 from nurec_sim.reconstruct.feedforward.tracks.clusters import group_into_tracks
+from nurec_sim.reconstruct.movers.boxes import LEAST_M, Sighting, lengthened, track_of
 from nurec_sim.render.cpu.renderer import CpuRenderer
 from nurec_sim.types import MOVABLE_LABELS, DynamicGaussians
 

@@ -1,5 +1,6 @@
 """The page about a log."""
 
+import contextlib
 import dataclasses
 import re
 
@@ -7,9 +8,11 @@ import numpy as np
 import pytest
 import tiny_clip
 
-from nurec_sim import cli, logs
+from nurec_sim import cli, geometry, logs
+from nurec_sim.reconstruct import movers
 from nurec_sim.report.log_map import drive_map, timeline
 from nurec_sim.report.log_page import log_page
+from nurec_sim.types import Track, Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -89,3 +92,20 @@ def test_the_command_writes_it(path, tmp_path, capsys):
     with pytest.raises(SystemExit):
         cli.main(["inspect", "street.usdz", "--html", str(out)])
     assert "--html shows a clip; street.usdz is a scene archive" in capsys.readouterr().err
+
+
+def test_a_log_without_boxes_is_shown_with_what_moves_in_it(tmp_path, capsys, monkeypatch):
+    bare = tiny_clip.write(tmp_path / "bare")
+    (bare / "tracks.json").unlink()
+    poses = np.stack([geometry.pose_from_xyyaw(x, 4.0, 0.0) for x in (5.0, 6.0)])
+    path = Trajectory(tiny_clip.START_US + np.array([0, 200_000]), poses)
+    found = Track("found-1", "automobile", (4.2, 1.7, 1.5), path, labelled=False)
+    monkeypatch.setattr(movers, "find_actors", lambda log, progress: (found,))
+    out = tmp_path / "page.html"
+    with contextlib.suppress(SystemExit):
+        cli.main(["inspect", str(bare), "--html", str(out)])
+    table = capsys.readouterr().out.partition("no boxes; found by motion")[2]
+    words = next(line for line in table.splitlines() if "found-1" in line).replace("│", " ").split()
+    assert words == "found-1 automobile 4.2 x 1.7 x 1.5 0.0 to 0.2 5.0".split()
+    page = out.read_text()
+    assert "found by motion, unlabelled" in page and "0 in 0 tracks" in page

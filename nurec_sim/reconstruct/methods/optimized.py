@@ -21,5 +21,11 @@ class Optimized(ShippedMethod):
     ) -> GaussianScene:
         """The scene of a log, by default from all its cameras."""
         return reconstruct(
-            clip, "lift", cameras=cameras, hold_out_sweeps=sorted(held), progress=progress, refine=settings
+            clip,
+            "lift",
+            cameras=cameras,
+            hold_out_sweeps=sorted(held),
+            progress=progress,
+            refine=settings,
+            actors="recorded",
         )

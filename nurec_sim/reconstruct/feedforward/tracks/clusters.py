@@ -19,9 +19,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from nurec_sim.reconstruct.feedforward.tracks.boxes import Sighting, lengthened, track_of
 from nurec_sim.reconstruct.feedforward.tracks.labelled import owners_of_points, poses_at
 from nurec_sim.reconstruct.lift.points import Actor
+from nurec_sim.reconstruct.movers.boxes import Sighting, lengthened, track_of
 from nurec_sim.types import DynamicGaussians, Track, Trajectory
 
 REACH_M = 120.0

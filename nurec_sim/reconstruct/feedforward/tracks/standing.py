@@ -10,8 +10,8 @@ from nurec_sim import geometry
 from nurec_sim.network.tensors import SemanticClass
 from nurec_sim.reconstruct.feedforward.chunks import ChunkInputs
 from nurec_sim.reconstruct.feedforward.layers import pixel_times_us
-from nurec_sim.reconstruct.feedforward.tracks.boxes import STANDING_MPS
 from nurec_sim.reconstruct.feedforward.tracks.labelled import owners_of_points, owners_of_rays, scene_actors
+from nurec_sim.reconstruct.movers.boxes import STANDING_MPS
 from nurec_sim.types import Clip
 
 
