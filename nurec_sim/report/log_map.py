@@ -38,7 +38,9 @@ def timeline(clip: Clip) -> tuple[str, list[str]]:
     rows = [("car's pose", np.stack([clip.ego.t_us, clip.ego.t_us], axis=1))]
     rows += [(name, clip.camera_times_us(name)) for name in clip.rig.cameras]
     rows += [(name, clip.sweep_times_us(name)) for name in clip.rig.lidars]
-    boxes = np.unique(np.concatenate([np.zeros(0, np.int64), *(track.path.t_us for track in clip.tracks)]))
+    boxes = np.unique(
+        np.concatenate([np.zeros(0, np.int64), *(track.path.t_us for track in clip.tracks if track.labelled)])
+    )
     if len(boxes):
         rows.append(("boxes", np.stack([boxes, boxes], axis=1)))
     start_us, end_us = clip.span_us

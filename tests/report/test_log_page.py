@@ -9,6 +9,7 @@ import pytest
 import tiny_clip
 
 from nurec_sim import cli, geometry, logs
+from nurec_sim.logs.selection import with_tracks
 from nurec_sim.reconstruct import movers
 from nurec_sim.report.log_map import drive_map, timeline
 from nurec_sim.report.log_page import log_page
@@ -109,3 +110,7 @@ def test_a_log_without_boxes_is_shown_with_what_moves_in_it(tmp_path, capsys, mo
     assert words == "found-1 automobile 4.2 x 1.7 x 1.5 0.0 to 0.2 5.0".split()
     page = out.read_text()
     assert "found by motion, unlabelled" in page and "0 in 0 tracks" in page
+    log = logs.open_clip(bare)
+    shown = with_tracks(log, (found,))
+    assert drive_map(shown).count("<polygon") == drive_map(log).count("<polygon") + 1
+    assert timeline(shown) == timeline(log)  # the log recorded no boxes
