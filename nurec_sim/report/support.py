@@ -13,7 +13,8 @@ from nurec_sim.report.events import first_event_us
 from nurec_sim.report.reasons import beside_path_m
 
 LOW = 0.6
-"""Verdicts after an image with less support are marked: in studies they are wrong several times as often."""
+"""Verdicts after an image with less support are marked. Of pixels with less about half or fewer are right
+(docs/trust.md); that verdicts after such images are wrong more often has not been shown."""
 LIMITS_M = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
 LEAST_IMAGES = 3
 """So few images at a distance say nothing about it."""
@@ -64,8 +65,9 @@ def support_by_distance(rollouts: Sequence[ReportRollout], worlds: Sequence[str]
         rows.append(f'<tr><td><b>{escape(world)}</b></td><td class="n">{len(found)}</td>{cells}</tr>')
         low = [limit for limit, mean in zip(LIMITS_M, means, strict=True) if mean is not None and mean < LOW]
         said.append(
-            f"In {escape(world)} verdicts rest on invention from <b>{low[0]:g} m</b> beside the recorded path on: "
-            f"there less than {100 * LOW:.0f} % of the images is supported."
+            f"In {escape(world)} what policies saw rests on invention from <b>{low[0]:g} m</b> beside the recorded "
+            f"path on: less than {100 * LOW:.0f} % of those images is supported. Look at the video before you believe "
+            "a verdict there."
             if low
             else f"In {escape(world)} images kept {100 * LOW:.0f} % support as far as policies drove "
             f"({found[:, 0].max():.1f} m beside the recorded path)."

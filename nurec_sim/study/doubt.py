@@ -10,6 +10,8 @@ import polars as pl
 from nurec_sim.report.support import LOW
 
 VERDICT = ("collision_any", "offroad")
+ENOUGH = 10
+"""With fewer verdicts on either side nothing can be said."""
 KEYS = ("clipgt_id", "policy", "seed")
 
 
@@ -27,8 +29,8 @@ class Doubt:
 
     @property
     def ratio(self) -> float | None:
-        """How many times as often doubtful verdicts are wrong; None if that cannot be said."""
-        if not (self.doubtful and self.others and self.others_wrong):
+        """How many times as often doubtful verdicts are wrong; None with few verdicts, or if no other is wrong."""
+        if min(self.doubtful, self.others) < ENOUGH or not self.others_wrong:
             return None
         return (self.doubtful_wrong / self.doubtful) / (self.others_wrong / self.others)
 

@@ -101,7 +101,7 @@ def _support(results: StudyResults) -> str:
         return ""
     rows = []
     for world, found in results.doubts.items():
-        ratio = "unknown" if found.ratio is None else f"{found.ratio:.1f} times"
+        ratio = "too few to say" if found.ratio is None else f"{found.ratio:.1f} times"
         shares = [
             f"{wrong} of {count}" + (f"<small>{100 * wrong / count:.0f} %</small>" if count else "")
             for wrong, count in ((found.doubtful_wrong, found.doubtful), (found.others_wrong, found.others))

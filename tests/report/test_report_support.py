@@ -62,7 +62,7 @@ def test_the_distance_from_which_verdicts_rest_on_invention_is_said():
     near = entry(dict.fromkeys(times, 0.9), y=0.2)
     far = entry(dict.fromkeys(times, 0.3), y=-1.7)
     said = words(support_by_distance([near, far], ["lift"]))
-    assert "In lift verdicts rest on invention from 1.5 m beside the recorded path on" in said
+    assert "In lift what policies saw rests on invention from 1.5 m beside the recorded path on" in said
     # Columns: instants, then 0 to 0.5 m, 0.5 to 1 m, 1 to 1.5 m, 1.5 to 2 m, 2 to 3 m, beyond.
     assert "lift 8 90 % none none 30 % none none" in said
     good = words(support_by_distance([near], ["lift"]))

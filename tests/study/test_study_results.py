@@ -90,9 +90,10 @@ def test_verdicts_with_low_support_are_counted_apart():
     # Two policies, ten scenes, two trials: 12 of 40 have low support, and of these sees_b is wrong in scenes 1 and 2.
     assert results.doubts == {"lift": Doubt(12, 4, 28, 0)} and results.doubts["lift"].ratio is None
     assert Doubt(12, 4, 28, 2).ratio == pytest.approx((4 / 12) / (2 / 28))
+    assert Doubt(9, 9, 28, 2).ratio is None and Doubt(12, 4, 9, 2).ratio is None
     assert as_json(results)["verdicts_by_support"]["lift"]["doubtful_wrong"] == 4
     page = render_study(results)
-    assert "Does low support warn?" in page and "4 of 12<small>33 %</small>" in page
+    assert "Does low support warn?" in page and "too few to say" in page and "4 of 12<small>33 %</small>" in page
 
 
 def test_the_drop_of_tau_by_hand():
