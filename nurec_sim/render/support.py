@@ -10,7 +10,7 @@ where ``angle`` is the one between the pixel's ray and the recorded ray at the p
 nearer than the recording, which has no more detail. Points that no view saw have support 0: what is shown there is
 invented, and right by chance at best. Points in the box of a track are followed with it.
 
-The constants were fitted on six generated towns with two methods, so that support is about the share of pixels that
+The constants were fitted on three generated towns with two methods, so that support is about the share of pixels that
 are right; ``nurec-sim evaluate --protocol shift`` measures that on others (``evaluate.support``).
 """
 
