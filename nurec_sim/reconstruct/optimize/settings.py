@@ -14,7 +14,7 @@ class LearningRates:
     """Of means along the axes of their Gaussian, in its standard deviations along them."""
     turn_rad: float = 0.15
     """Of turns about the axes of a Gaussian; of a tilt of a disc, as much less as it is thin (``adam``)."""
-    log_scale: float = 0.04
+    log_scale: float = 0.15
     logit_opacity: float = 0.05
     rgb: float = 0.02
     sky: float = 0.01
