@@ -28,7 +28,7 @@ USUAL_METHODS: dict[str, tuple[str, ...]] = {
     "storm": ("dense", "dense-lidar", "selective", "lift", "copy"),
     "clip": ("dense", "dense-lidar", "dense-concatenated", "lift", "copy"),
     "shift": ("dense", "dense-lidar", "selective", "lift", "copy"),
-    "lidar": ("lift", "optimized"),
+    "lidar": ("lidar", "lift", "optimized"),
 }
 USUAL_WORLDS = {"storm": 12, "clip": 3, "shift": 6, "lidar": 4}
 
@@ -68,8 +68,8 @@ class ProtocolFlags:
     """Compare methods on held-out procedural worlds or on logs (with --protocol)."""
 
     methods: tuple[str, ...] = ()
-    """Protocol: methods to compare: dense, dense-lidar, dense-concatenated, selective, lift, optimized, copy, or any
-    other method that `nurec-sim reconstruct` accepts; default: those of the protocol."""
+    """Protocol: methods to compare: dense, dense-lidar, dense-concatenated, selective, lidar, lidar-no-floor, lift,
+    optimized, copy, or any other method that `nurec-sim reconstruct` accepts; default: those of the protocol."""
     worlds: int | None = None
     """Protocol: number of procedural worlds; default: 12 for storm, 3 for clip, 6 for shift, 4 for lidar."""
     seed: int = 0

@@ -17,7 +17,17 @@ app.command(
 )
 
 Fetchable = Literal["pa-front", "pa-multiview", "pq-front", "da3-base"]
-Checkable = Literal["pa-front", "pa-multiview", "pq-front", "pa-full", "tiny", "tiny-selective", "tiny-sky-mlp"]
+Checkable = Literal[
+    "pa-front",
+    "pa-multiview",
+    "pq-front",
+    "pa-full",
+    "tiny",
+    "tiny-selective",
+    "tiny-sky-mlp",
+    "lidar",
+    "lidar-no-floor",
+]
 
 
 @weights.command(name="list")
@@ -30,13 +40,15 @@ def list_weights() -> None:
     from nurec_sim.network import PROFILES
     from nurec_sim.network.checkpoints import download
     from nurec_sim.network.checkpoints.released import RELEASED
+    from nurec_sim.network.lidar.profiles import LIDAR_PROFILES
 
+    profiles = [*PROFILES, *LIDAR_PROFILES]
     with progress("counting parameters"):
         from nurec_sim.network.checkpoints.fit import count_parameters
 
-        parameters = {name: f"{count_parameters(name) / 1e6:.1f} M" for name in PROFILES}
+        parameters = {name: f"{count_parameters(name) / 1e6:.1f} M" for name in profiles}
     rows = []
-    for name in (*PROFILES, *(name for name in RELEASED if name not in PROFILES)):
+    for name in (*profiles, *(name for name in RELEASED if name not in PROFILES)):
         released, shipped = RELEASED.get(name), download.shipped_weights(name)
         if shipped is not None:
             facts = (shipped.name, f"{shipped.stat().st_size:,}", "", "bundled")

@@ -13,7 +13,8 @@ import numpy as np
 
 from nurec_sim.errors import ReconstructError, WeightsError
 from nurec_sim.evaluate.windows import Window
-from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, OptimizeSettings, load_method
+from nurec_sim.network.lidar.profiles import LIDAR_PROFILES
+from nurec_sim.reconstruct import FeedForwardSettings, LidarSettings, LiftSettings, OptimizeSettings, load_method
 from nurec_sim.render import make_renderer
 from nurec_sim.render.device import Renderer
 from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, Sense, SensorRequest
@@ -26,6 +27,8 @@ CHOICES: Mapping[str, str] = {
     "selective": "the network, clusters around chosen points",
     "dense-lidar": "dense, with depth fitted locally to the LiDAR",
     "dense-concatenated": "dense, with chunks concatenated instead of merged by ownership",
+    "lidar": "the network's LiDAR branch",
+    "lidar-no-floor": "the same, trained without the scale floor",
     "lift": "coloured LiDAR and stereo, no learning",
     "optimized": "lift, then optimised on the input images and sweeps (400 steps)",
     "copy": "the input image nearest in time, unchanged; no depth",
@@ -80,8 +83,8 @@ def contenders(
     Args:
         names: of ``CHOICES``, or references for ``reconstruct.load_method`` with default settings; in the order of the
             tables, without duplicates.
-        network: network settings; profile and checkpoint apply to ``dense``, or to ``selective`` if the profile is
-            selective, all other settings to both.
+        network: network settings; profile and checkpoint apply to ``dense``, or to ``selective`` or the LiDAR branch if
+            the profile is theirs, all other settings to the first two.
         selective_checkpoint: weights of ``selective``.
         lift: settings of ``lift``; ``LIFT`` if None.
 
@@ -102,6 +105,9 @@ def _contender(name: str, network: FeedForwardSettings, selective: Path | None, 
         return Contender(name, "lift", lift)
     if name == "optimized":
         return Contender(name, "optimized", OPTIMIZED)
+    if name in LIDAR_PROFILES:
+        checkpoint = network.checkpoint if network.profile == name else None
+        return Contender(name, "lidar", LidarSettings(LIDAR_PROFILES[name].name, checkpoint))
     if name not in CHOICES:
         try:
             made = load_method(name)
@@ -123,15 +129,17 @@ def _contender(name: str, network: FeedForwardSettings, selective: Path | None, 
 def _decoder(profile: str) -> str:
     from nurec_sim.network import PROFILES
 
+    if profile in LIDAR_PROFILES:
+        return "lidar"
     if profile not in PROFILES:
-        raise ReconstructError(f"no network profile {profile!r}; have {list(PROFILES)}")
+        raise ReconstructError(f"no network profile {profile!r}; have {[*PROFILES, *LIDAR_PROFILES]}")
     return PROFILES[profile].decoder
 
 
 def without_weights(contender: Contender) -> str | None:
     """The reason if a method has no weights, else None."""
     settings = contender.settings
-    if not isinstance(settings, FeedForwardSettings) or settings.checkpoint is not None:
+    if not isinstance(settings, (FeedForwardSettings, LidarSettings)) or settings.checkpoint is not None:
         return None
     try:
         describe(contender)
@@ -151,15 +159,17 @@ def describe(contender: Contender) -> dict[str, Any]:
     if settings is None:
         return described
     values = dataclasses.asdict(settings)
-    if isinstance(settings, FeedForwardSettings):
+    if isinstance(settings, (FeedForwardSettings, LidarSettings)):
         from nurec_sim.network.checkpoints.download import find_weights, sha256
-        from nurec_sim.reconstruct.feedforward.method import profile_name
 
-        profile = values["profile"] = profile_name(contender.method, settings.profile)
-        values["ego_masks"] = None if settings.ego_masks is None else str(settings.ego_masks)
+        if isinstance(settings, FeedForwardSettings):
+            from nurec_sim.reconstruct.feedforward.method import profile_name
+
+            values["profile"] = profile_name(contender.method, settings.profile)
+            values["ego_masks"] = None if settings.ego_masks is None else str(settings.ego_masks)
         values["checkpoint"] = None
         if settings.random_weights is None:
-            values["checkpoint"] = sha256(find_weights(profile, settings.checkpoint))
+            values["checkpoint"] = sha256(find_weights(values["profile"], settings.checkpoint))
     return described | {"settings": values}
 
 

@@ -19,6 +19,7 @@ from nurec_sim.reconstruct.lift.settings import (
     ViewSettings,
 )
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
+from nurec_sim.reconstruct.range_maps.settings import LidarSettings
 
 if TYPE_CHECKING:
     from nurec_sim.types import ActorsName, Clip, GaussianScene, Method
@@ -32,6 +33,7 @@ __all__ = [
     "ColourSettings",
     "FeedForwardSettings",
     "GroundSettings",
+    "LidarSettings",
     "LiftSettings",
     "OptimizeSettings",
     "PointSettings",
@@ -76,7 +78,8 @@ def reconstruct(
         hold_out_sweeps: indices of sweeps that must not be read, of every LiDAR.
         progress: called with the stage's name and the fraction of all work that is done, about.
         settings: an instance of the method's settings class: ``LiftSettings`` for ``lift``, ``FeedForwardSettings`` for
-            ``dense`` and ``selective``, ``OptimizeSettings`` for ``optimized``; the defaults if None.
+            ``dense`` and ``selective``, ``LidarSettings`` for ``lidar``, ``OptimizeSettings`` for ``optimized``; the
+            defaults if None.
         refine: fit the scene to the images and sweeps afterwards; ``optimized`` is ``lift`` with this step.
         actors: whose objects move: the boxes of the log (``recorded``), what moves in its sweeps (``found``), nobody
             (``none``); ``auto`` takes the boxes, and what moves if there are none.

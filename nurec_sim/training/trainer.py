@@ -8,9 +8,7 @@ process takes its own samples, and DDP averages the gradients; only the first pr
 from __future__ import annotations
 
 import copy
-import csv
 import dataclasses
-import io
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -23,16 +21,18 @@ from torch import Tensor, nn
 
 from nurec_sim import network
 from nurec_sim.errors import TrainingError
-from nurec_sim.files.new_files import write_file, writing
+from nurec_sim.files.new_files import write_file
 from nurec_sim.network.checkpoints.state_dicts import save_weights
 from nurec_sim.training import checkpoint
 from nurec_sim.training.checkpoint import Position
 from nurec_sim.training.config import Stage, TrainingConfig
+from nurec_sim.training.curve_file import Curve
 from nurec_sim.training.curves import write_curves
 from nurec_sim.training.data.sample import TrainingSample
 from nurec_sim.training.data.samples import Samples
 from nurec_sim.training.losses.objective import Objective, StepOutputs
 from nurec_sim.training.processes import Processes
+from nurec_sim.training.rates import learning_rate
 from nurec_sim.training.rendering import PerceptualLoss
 from nurec_sim.training.start import load_shared, prepare
 
@@ -108,7 +108,7 @@ class Trainer:
         checkpoint.restore_optimiser(optimiser, trained, self._moments)
         self._moments = {}
         wrapped = self.processes.wrap(objective)
-        curve = _Curve(self.folder / CURVES, self.position.step) if self.processes.first else None
+        curve = Curve(self.folder / CURVES, self.position.step, COLUMNS) if self.processes.first else None
         with self.samples.stream(stage, self.position.step, self.processes) as stream:
             for step in range(self.position.step, last):
                 sample = next(stream)
@@ -181,14 +181,6 @@ class Trainer:
         write_file(self.folder / SAMPLES / f"{step:06d}.png", picture.tobytes())
 
 
-def learning_rate(stage: Stage, step: int) -> float:
-    """Linear warm-up, then half a cosine down to ``final_rate`` of the peak."""
-    if step < stage.warm_up:
-        return stage.learning_rate * (step + 1) / stage.warm_up
-    along = (step - stage.warm_up) / max(1, stage.steps - stage.warm_up)
-    return stage.learning_rate * (stage.final_rate + (1 - stage.final_rate) * (1 + math.cos(math.pi * along)) / 2)
-
-
 def _stages_with_starts(config: TrainingConfig) -> Iterator[tuple[Stage, int]]:
     first = 0
     for stage in config.stages:
@@ -202,34 +194,3 @@ def _groups(trained: Mapping[str, nn.Parameter], decay: float) -> list[dict[str,
     known = {id(each) for each in decays}
     others = [each for each in trained.values() if id(each) not in known]
     return [{"params": decays, "weight_decay": decay}, {"params": others, "weight_decay": 0.0}]
-
-
-class _Curve:
-    """Rows of means since the previous row; rows after the step at which a run resumes are dropped."""
-
-    def __init__(self, path: Path, step: int) -> None:
-        self.path, self.stage = path, ""
-        self.sums: dict[str, tuple[float, int]] = {}
-        kept = []
-        if path.is_file():
-            with path.open(newline="") as file:
-                kept = [row for row in csv.DictReader(file) if row["step"].isdigit() and int(row["step"]) <= step]
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, COLUMNS)
-        writer.writeheader()
-        writer.writerows({name: row.get(name, "") for name in COLUMNS} for row in kept)
-        write_file(path, text.getvalue())
-
-    def add(self, stage: str, values: Mapping[str, float]) -> None:
-        self.stage = stage
-        for name, value in values.items():
-            total, count = self.sums.get(name, (0.0, 0))
-            self.sums[name] = (total + value, count + 1)
-
-    def write(self, step: int, seconds: float) -> None:
-        means = {name: f"{total / count:.6g}" for name, (total, count) in self.sums.items()}
-        with writing(self.path), self.path.open("a", newline="") as file:
-            csv.DictWriter(file, COLUMNS).writerow(
-                {"step": step, "stage": self.stage, "seconds": f"{seconds:.1f}"} | means
-            )
-        self.sums = {}

@@ -11,6 +11,7 @@ from types import ModuleType
 from nurec_sim.errors import WeightsError, WriteError
 from nurec_sim.files.new_files import writing
 from nurec_sim.network.checkpoints.released import RELEASED, ReleasedFile
+from nurec_sim.network.lidar.profiles import LIDAR_PROFILES
 from nurec_sim.network.profiles import PROFILES
 
 CHECKPOINT_VARIABLE = "INSTANT_NUREC_FULL_PT"
@@ -29,8 +30,8 @@ def find_weights(profile: str, checkpoint: Path | None = None) -> Path:
         WeightsError: no such profile, a named file is not there, or the profile has no weights on this machine; the
             text says how to get them.
     """
-    if profile not in PROFILES:
-        raise WeightsError(f"no network profile {profile!r}; have {list(PROFILES)}")
+    if profile not in {**PROFILES, **LIDAR_PROFILES}:
+        raise WeightsError(f"no network profile {profile!r}; have {[*PROFILES, *LIDAR_PROFILES]}")
     if checkpoint is not None:
         if not Path(checkpoint).is_file():
             raise WeightsError(f"no weights at {str(checkpoint)!r}")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nurec_sim.errors import WeightsError
 from nurec_sim.network.checkpoints.depth_anything import depth_anything_3_state
@@ -22,6 +22,8 @@ from nurec_sim.network.checkpoints.state_dicts import (
     non_finite,
     read_metadata,
 )
+from nurec_sim.network.lidar.branch import LidarBranch
+from nurec_sim.network.lidar.profiles import LIDAR_PROFILES
 from nurec_sim.network.model import InstantNuRec
 from nurec_sim.network.profiles import PROFILES
 
@@ -39,14 +41,20 @@ class WeightsReport:
 @functools.cache
 def needed_state(profile: str) -> dict[str, Tensor]:
     """Names, shapes and types that a profile needs; the tensors hold no values and take no memory."""
-    with torch.device("meta"):
-        return InstantNuRec(PROFILES[profile]).state_dict()
+    return _empty(profile).state_dict()
 
 
 def count_parameters(profile: str) -> int:
     """How many numbers training chooses."""
+    return sum(parameter.numel() for parameter in _empty(profile).parameters())
+
+
+def _empty(profile: str) -> nn.Module:
+    """The network of a profile without storage."""
     with torch.device("meta"):
-        return sum(parameter.numel() for parameter in InstantNuRec(PROFILES[profile]).parameters())
+        if profile in LIDAR_PROFILES:
+            return LidarBranch(LIDAR_PROFILES[profile])
+        return InstantNuRec(PROFILES[profile])
 
 
 def check_weights(path: Path, profile: str | None = None) -> WeightsReport:
@@ -59,8 +67,9 @@ def check_weights(path: Path, profile: str | None = None) -> WeightsReport:
     Raises:
         WeightsError: the file cannot be read, or there is no such profile.
     """
-    if profile is not None and profile not in PROFILES:
-        raise WeightsError(f"no network profile {profile!r}; have {list(PROFILES)}")
+    known = [*PROFILES, *LIDAR_PROFILES]
+    if profile is not None and profile not in known:
+        raise WeightsError(f"no network profile {profile!r}; have {known}")
     path = Path(path)
     state = load_state_dict(path)
     faults = [f"{ascii(name)[1:-1]} holds values that are not finite" for name in non_finite(state)]
@@ -96,7 +105,7 @@ def _printable(text: str) -> str:
 
 def _differences(state: Mapping[str, Tensor]) -> dict[str, KeyDifferences]:
     """How a state dict differs from what each profile needs, and DA3-Base from what training starts with."""
-    found = {name: compare_keys(needed_state(name), state) for name in PROFILES}
+    found = {name: compare_keys(needed_state(name), state) for name in (*PROFILES, *LIDAR_PROFILES)}
     try:
         base = depth_anything_3_state(state)
     except WeightsError:

@@ -320,7 +320,7 @@ def _split(
     eye = np.broadcast_to(sweep.world_from_lidar[:3, 3], xyz.shape)
     free, parts = np.ones(len(xyz), bool), {}
     for actor in actors:
-        inside, box_xyz, box_eye, foot = _inside(actor, xyz, eye, t_us, free, settings.box_margin_m)
+        inside, box_xyz, box_eye, foot = returns_in_box(actor, xyz, eye, t_us, free, settings.box_margin_m)
         if not len(inside):
             continue
         # Every point belongs to one actor at most: to the first whose box holds it.
@@ -342,7 +342,7 @@ def _split(
     )
 
 
-def _inside(
+def returns_in_box(
     actor: Actor, xyz: np.ndarray, eye: np.ndarray, t_us: np.ndarray, free: np.ndarray, margin_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Indices of the points in an actor's box at their own times; the points and eyes in the box; which are feet."""

@@ -95,13 +95,14 @@ class DifferentiableRenderer:
         ]
 
     def _features(self, gaussians: GaussianTensors, reference: Float64[Tensor, "4 4"]) -> Float[Tensor, "n 3"]:
-        """Colours, or intensity, whether it is known, and no drop."""
+        """Colours, or intensity, whether it is known, and the probability of a drop."""
         if self._lidar:
             value = gaussians.intensity
             if value is None:
                 value = torch.full_like(gaussians.opacity, torch.nan)
             known = torch.isfinite(value)
-            return torch.stack([torch.where(known, value, 0), known.to(value.dtype), torch.zeros_like(value)], dim=-1)
+            drop = torch.zeros_like(value) if gaussians.ray_drop is None else gaussians.ray_drop
+            return torch.stack([torch.where(known, value, 0), known.to(value.dtype), drop], dim=-1)
         if gaussians.sh_rest is None:
             return gaussians.rgb
         offset = gaussians.mean_m.double() - reference[:3, 3].to(self.device)
@@ -132,7 +133,8 @@ def _sweep(planes: Tensor, tensors: GridTensors) -> LidarImages:
     planes = planes[:, cell_of_beam].reshape(DIFFERENTIABLE, *tensors.grid.valid.shape)
     half, alpha = planes[HALF], planes[ALPHA]
     mean = planes[DISTANCE] / alpha.clamp(min=MIN_ALPHA)
-    return LidarImages(torch.where(half > 0, half, mean), mean, planes[0] / planes[1].clamp(min=1e-12), alpha)
+    intensity, lost = planes[0] / planes[1].clamp(min=1e-12), planes[2] / alpha.clamp(min=MIN_ALPHA)
+    return LidarImages(torch.where(half > 0, half, mean), mean, intensity, alpha, lost)
 
 
 def _turned(vectors: Float64[Tensor, "h w 3"], rotation: Float64[Tensor, "h w 3"]) -> Float64[Tensor, "h w 3"]:

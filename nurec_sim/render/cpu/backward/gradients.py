@@ -37,6 +37,7 @@ class GaussianTensors:
     rgb: Float[Tensor, "n 3"]
     sh_rest: Float[Tensor, "n k 3"] | None = None
     intensity: Float[Tensor, " n"] | None = None
+    ray_drop: Float[Tensor, " n"] | None = None
 
     def __len__(self) -> int:
         """Number of Gaussians."""
@@ -105,13 +106,14 @@ class LidarImages:
     """Rows x columns of beams: ``range`` of the return and weighted mean ``distance`` in metres, 0 where there is none.
 
     The range is where half of the beam has been stopped, else the mean distance. ``intensity`` is the weighted mean
-    over the Gaussians whose intensity is known.
+    over the Gaussians whose intensity is known; ``ray_drop`` over all, 0 for Gaussians without one.
     """
 
     range: Float[Tensor, "h w"]
     distance: Float[Tensor, "h w"]
     intensity: Float[Tensor, "h w"]
     alpha: Float[Tensor, "h w"]
+    ray_drop: Float[Tensor, "h w"]
 
 
 def render_camera(
@@ -184,13 +186,15 @@ def render_lidar(
     if value is None:
         value = torch.full_like(gaussians.opacity, torch.nan)
     known = torch.isfinite(value)
-    features = torch.stack([torch.where(known, value, 0), known.to(value.dtype), torch.zeros_like(value)], dim=-1)
+    drop = torch.zeros_like(value) if gaussians.ray_drop is None else gaussians.ray_drop
+    features = torch.stack([torch.where(known, value, 0), known.to(value.dtype), drop], dim=-1)
     planes = _draw(gaussians, features, reference, Frame(sensor, pair, True, threads))
     # From grid cells, whose rows may be rolled, to beams.
     cells = torch.from_numpy(sensor.cell_of_beam)
     sums, alpha, distance, half = (plane.flatten(-2)[..., cells].reshape(plane.shape) for plane in planes)
     mean = distance / alpha.clamp(min=MIN_ALPHA)
-    return LidarImages(torch.where(half > 0, half, mean), mean, sums[0] / sums[1].clamp(min=1e-12), alpha)
+    intensity, lost = sums[0] / sums[1].clamp(min=1e-12), sums[2] / alpha.clamp(min=MIN_ALPHA)
+    return LidarImages(torch.where(half > 0, half, mean), mean, intensity, alpha, lost)
 
 
 class _Draw(torch.autograd.Function):
@@ -315,6 +319,7 @@ def _check(gaussians: GaussianTensors, sky: Tensor | None = None) -> None:
         "rgb": [[n, 3]],
         "sh_rest": [[n, 3, 3], [n, 8, 3], [n, 15, 3]],
         "intensity": [[n]],
+        "ray_drop": [[n]],
         "sky": [[3], [6, "s", "s", 3]],
     }
     values = {**{field.name: getattr(gaussians, field.name) for field in fields(gaussians)}, "sky": sky}

@@ -1,0 +1,1 @@
+"""The method `lidar`: range maps through the network's LiDAR branch."""
