@@ -62,7 +62,7 @@ def test_what_moves_without_a_box_lives_briefly():
     bare = Street(boxes=CAR, labelled=False)
     scene = reconstruct(bare, "lidar", settings=UNTRAINED)
     life = scene.dynamic.knot_t_us[:, 2] - scene.dynamic.knot_t_us[:, 0]
-    assert len(scene.dynamic) > 20 and (life <= 400_000).all() and (scene.dynamic.track == -1).all()
+    assert len(scene.dynamic) and (life <= 400_000).all() and (scene.dynamic.track == -1).all()
     assert "no boxes: what moves lives for the time between two windows" in scene.provenance["unknown"]
     kept = reconstruct(bare, "lidar", settings=dataclasses.replace(UNTRAINED, carve=False))
     assert len(kept.dynamic) == 0 and len(kept.static) > len(scene.static)
@@ -83,8 +83,11 @@ def test_a_surface_belongs_to_the_window_that_saw_it_from_nearest(street):
     xyz, reach = windows[0].xyz_world_m, windows[0].range_m
     kept = owned(xyz, reach, [beams[1]], 0.8)
     ratio = np.linalg.norm(xyz - beams[1].world_from_lidar[:3, 3], axis=1) / reach
-    # Four metres farther on: what lies far ahead is nearer there, what lies behind is not.
-    assert kept[ratio > 0.81].all() and kept[ratio < 0.7].mean() < 0.1 and (ratio < 0.7).sum() > 500
+    # Four metres farther on walls ahead are nearer, but for their tops out of sight; the car is no longer where it was.
+    wall = (ratio < 0.79) & (np.abs(xyz[:, 1]) > 7.9)
+    car = (np.abs(xyz[:, 1] - 1) < 1) & (xyz[:, 2] > 0.3)
+    assert kept[ratio > 0.81].all() and wall.sum() > 20 and kept[wall].mean() < 0.1
+    assert (ratio[car] < 0.7).sum() > 20 and kept[car].all()
     assert owned(xyz, reach, [beams[1]], 0.0).all()
 
 

@@ -71,7 +71,7 @@ def test_places_are_read_as_written(places):
 def test_a_sample_sees_what_the_input_saw():
     scans = in_a_cylinder(0.5)
     sample = scan_sample(scans, CONFIG.data, np.random.default_rng(0))
-    assert sample.range_m.shape == (16, 101) and sample.inputs.features.shape == (17, 16, 201)
+    assert sample.range_m.shape == (16, 100) and sample.inputs.features.shape == (17, 16, 200)
     assert sample.seen.float().mean() > 0.85 and bool((sample.label == 1).all())
     nearer = dataclasses.replace(scans, range_m=scans.range_m * np.array([0.5, 1.0], np.float32)[:, None, None])
     assert not scan_sample(nearer, CONFIG.data, np.random.default_rng(0)).seen.any()

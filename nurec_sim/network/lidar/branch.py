@@ -96,7 +96,7 @@ class LidarBranch(nn.Module):
         for block in self.coarse:
             coarse = block(coarse, around)
         tokens = torch.cat([tokens, functional.interpolate(coarse, scale_factor=COARSE, mode="nearest")], dim=1)
-        context = functional.interpolate(self.join(tokens), scale_factor=TOKEN, mode="bilinear")
+        context = _enlarged(self.join(tokens), around)
         every = torch.cat([beams, context], dim=1)[0, :, :rows, cut : cut + columns]
         every = every[:, inputs.chosen].T
         hidden = functional.gelu(functional.linear(every, self.hidden.weight[:, :, 0, 0], self.hidden.bias))
@@ -163,6 +163,12 @@ def _padded(x: Tensor, reach: int, around: bool) -> Tensor:
     sides = (reach, reach, 0, 0)
     x = functional.pad(x, sides, mode="circular") if around else functional.pad(x, sides)
     return functional.pad(x, (0, 0, reach, reach))
+
+
+def _enlarged(tokens: Tensor, around: bool) -> Tensor:
+    """Tokens interpolated to beams, over the seam as well."""
+    edged = functional.pad(tokens, (1, 1, 0, 0), mode="circular" if around else "replicate")
+    return functional.interpolate(edged, scale_factor=TOKEN, mode="bilinear")[..., TOKEN:-TOKEN]
 
 
 def _to_multiple(x: Tensor, unit: int, around: bool) -> tuple[Tensor, int]:

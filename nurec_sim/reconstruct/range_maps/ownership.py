@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float32, Float64
 
 from nurec_sim import geometry
 from nurec_sim.compute.kernels import kernel
-from nurec_sim.reconstruct.free_space import COLUMNS, MARGIN_M, MARGIN_SHARE, STEP_RAD, SweepBeams
+from nurec_sim.reconstruct.free_space import BEAM_SHARE, COLUMNS, MARGIN_M, MARGIN_SHARE, STEP_RAD, SweepBeams
 
 FINEST_M = 0.04
 """Edge of the finest voxels; coarser ones are doubled. Footprints near the sensor are widened to it."""
-NEXT_ROWS = 2
-"""Rows of the image of a sweep that are searched above and below: rows of many scanners lie apart."""
+MOST_CELLS = 5
+"""The image of a sweep is searched around a direction as far as its beams lie apart, up to so many cells."""
 
 
 def owned(
@@ -39,13 +39,14 @@ def owned(
     kept = np.ones(len(xyz_m), bool)
     for each in others:
         pose = geometry.inverse(each.world_from_lidar)
+        cells = min(int(np.ceil(each.width_rad / BEAM_SHARE / STEP_RAD)), MOST_CELLS)
         _drop_seen_nearer(xyz_m, range_m.astype(np.float64), nearer, pose, each.drift_m, each.reach_m, each.low,
-                          each.fraction, kept)  # fmt: skip
+                          each.fraction, cells, kept)  # fmt: skip
     return kept
 
 
 @kernel
-def _drop_seen_nearer(xyz, reach, nearer, pose, drift, image, low, fraction, kept):
+def _drop_seen_nearer(xyz, reach, nearer, pose, drift, image, low, fraction, cells, kept):
     rows = image.shape[0]
     for i in range(len(xyz)):
         if not kept[i]:
@@ -63,9 +64,13 @@ def _drop_seen_nearer(xyz, reach, nearer, pose, drift, image, low, fraction, kep
         column = int((np.arctan2(y, x) + np.pi) / STEP_RAD) % COLUMNS
         row = int(np.floor(np.arcsin(min(max(z / max(distance, 1e-6), -1.0), 1.0)) / STEP_RAD)) - low
         margin = MARGIN_M + MARGIN_SHARE * distance
-        for k in range(max(row - NEXT_ROWS, 0), min(row + NEXT_ROWS, rows - 1) + 1):
-            if image[k, column] > 0 and abs(image[k, column] - distance) < margin:
-                kept[i] = False
+        for k in range(max(row - cells, 0), min(row + cells, rows - 1) + 1):
+            for n in range(column - cells, column + cells + 1):
+                found = image[k, n % COLUMNS]
+                if found > 0 and abs(found - distance) < margin:
+                    kept[i] = False
+                    break
+            if not kept[i]:
                 break
 
 
