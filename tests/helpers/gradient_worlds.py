@@ -30,6 +30,8 @@ def world(n=40, sh=0, seed=1, around=False):
     made = dataclasses.replace(
         made, intensity=rng.random(n), scale_m=made.scale_m * 1.5 + 0.03, quat_wxyz=made.quat_wxyz * 2
     )
+    if around:
+        made = dataclasses.replace(made, ray_drop=rng.random(n))
     values = {f.name: getattr(made, f.name) for f in dataclasses.fields(made)}
     # What float32 holds exactly, so that both renderers see the same.
     return Gaussians(
@@ -52,14 +54,16 @@ def reference(made, sensor, pair, sky=None):
     lidar = sensor is SMALL["lidar"]
     colour = made.rgb if made.sh_rest is None else view_colour(made.rgb, made.sh_rest, made.mean_m - pose[:3, 3])
     known = np.isfinite(made.intensity)
-    values = np.stack([np.where(known, made.intensity, 0), known], axis=1) if lidar else colour
+    drop = np.zeros(len(made)) if made.ray_drop is None else made.ray_drop
+    values = np.stack([np.where(known, made.intensity, 0), known, drop], axis=1) if lidar else colour
     origin, direction = world_rays(request, grid)
     sums = spec.blend_rays(made, values, order, origin, direction, grid.near_m, grid.valid)
     mean = sums.distance / np.maximum(sums.alpha, spec.MIN_ALPHA)
     if lidar:
         intensity = sums.features[..., 0] / np.maximum(sums.features[..., 1], 1e-12)
         return {"range": np.where(sums.half > 0, sums.half, mean), "distance": mean, "intensity": intensity,
-                "alpha": sums.alpha}  # fmt: skip
+                "alpha": sums.alpha,
+                "ray_drop": sums.features[..., 2] / np.maximum(sums.alpha, spec.MIN_ALPHA)}  # fmt: skip
     behind = np.zeros((*sums.alpha.shape, 3)) if sky is None else spec.sky_colour(sky, direction)
     rgb = np.where(grid.valid[..., None], spec.finish_colour(sums.features, sums.alpha, behind, None), 0)
     surface = sums.alpha >= spec.SURFACE_ALPHA

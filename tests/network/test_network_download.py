@@ -19,6 +19,7 @@ from nurec_sim.network.checkpoints import fit as weights_check
 from nurec_sim.network.checkpoints import state_dicts as checkpoints
 from nurec_sim.network.checkpoints.download import CHECKPOINT_VARIABLE, fetch, find_weights, verify_file
 from nurec_sim.network.checkpoints.released import RELEASED, ReleasedFile
+from nurec_sim.network.lidar.profiles import LIDAR_PROFILES
 from nurec_sim.network.model import InstantNuRec
 
 CONTENT = b"not really weights"
@@ -98,7 +99,7 @@ def test_sizes_are_those_of_the_values_and_a_list_of_names(profile: str, keys: s
 
 def test_the_verbs_know_every_profile_and_every_file() -> None:
     assert set(get_args(verbs.Fetchable)) == set(RELEASED)
-    assert set(get_args(verbs.Checkable)) == set(network.PROFILES)
+    assert set(get_args(verbs.Checkable)) == {*network.PROFILES, *LIDAR_PROFILES}
 
 
 # --- finding
@@ -116,7 +117,7 @@ def test_what_is_given_comes_first_then_the_environment_then_ours_then_the_cache
     named = tmp_path / "any name"
     named.write_bytes(b"")
     monkeypatch.setenv(CHECKPOINT_VARIABLE, str(named))
-    for profile in network.PROFILES:
+    for profile in (*network.PROFILES, *LIDAR_PROFILES):
         assert find_weights(profile) == named
     given = tmp_path / "given.pth"
     given.write_bytes(b"")
@@ -248,7 +249,7 @@ def test_list_shows_what_is_here(hub: FakeHub, capsys: pytest.CaptureFixture[str
     fetch(file_of("pa-front"))
     assert run("list") == 0
     lines = {line.split()[1]: line for line in capsys.readouterr().out.splitlines() if line.startswith("│")}
-    assert set(lines) == {*network.PROFILES, "da3-base"}
+    assert set(lines) == {*network.PROFILES, *LIDAR_PROFILES, "da3-base"}
     assert "fetched" in lines["pa-front"] and "182.5 M" in lines["pa-front"]
     assert "missing" in lines["pq-front"] and "1,141,125,047" in lines["pq-front"]
     assert "946e2f66aca9" in lines["pa-multiview"]

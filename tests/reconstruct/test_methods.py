@@ -60,7 +60,7 @@ def test_installed_methods_are_listed_and_compared(dots, file, monkeypatch):
             return dots
 
     monkeypatch.setattr(plugins, "entry_points", lambda group: [Point()] if group == "nurec_sim.methods" else [])
-    assert available_methods() == ["dense", "dots", "lift", "optimized", "selective"]
+    assert available_methods() == ["dense", "dots", "lidar", "lift", "optimized", "selective"]
     one, two = contenders(("dots", "copy"))
     assert (one.name, one.settings) == ("dots", dots.settings()) and two.name == "copy"
     assert describe(one) == {"method": "dots", "settings": {"every": 10, "radius_m": 0.1}}

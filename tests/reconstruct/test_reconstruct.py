@@ -165,7 +165,7 @@ def test_held_out_sweeps_are_not_read(street):
 def test_errors_say_what_there_is(street):
     with pytest.raises(
         ReconstructError,
-        match=r"unknown reconstruction method 'magic'; have \['dense', 'lift', 'optimized', 'selective'\]",
+        match=r"unknown reconstruction method 'magic'; have \['dense', 'lidar', 'lift', 'optimized', 'selective'\]",
     ):
         reconstruct(street, "magic")
     with pytest.raises(ReconstructError, match=r"has no camera \['back'\]; have \['front'\]"):

@@ -15,7 +15,8 @@ from nurec_sim.render.cpu.backward.gradients import GaussianTensors
 from nurec_sim.render.cpu.blend.background import draw_sky
 from nurec_sim.types import Gaussians
 
-PARAMETERS = ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "intensity")
+PARAMETERS = ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "intensity", "ray_drop")
+LIDAR_ONLY = ("intensity", "ray_drop")
 STEP = 1e-6
 
 
@@ -44,7 +45,7 @@ def assert_slopes_agree(function, values, gradient, picked, least=0.9):
     assert (error <= 0.01 * np.abs(slopes) + 1e-3 * np.sqrt(np.mean(slopes**2))).all(), np.c_[got, slopes]
 
 
-CASES = [(name, p) for name in SMALL for p in PARAMETERS if p != ("rgb" if name == "lidar" else "intensity")]
+CASES = [(name, p) for name in SMALL for p in PARAMETERS if p not in (("rgb",) if name == "lidar" else LIDAR_ONLY)]
 
 
 @pytest.mark.parametrize(("name", "parameter"), CASES)

@@ -61,10 +61,12 @@ def range_maps_to_scene(clip: Clip, hold_out: set[int], progress: Progress, sett
     actors = actors_of(clip, PointSettings())
     windows: list[SweepWindow] = []
     beams: list[SweepBeams] = []
+    used: list[tuple[str, int]] = []
     for done, (window, fired) in enumerate(in_order(lambda job: _read(clip, *job), chosen)):
         progress("sweeps", SWEEPS_END * done / len(chosen))
         if window is not None:
             windows.append(window)
+            used.append(chosen[done])
             beams.append(fired)
     if not windows:
         raise ReconstructError(
@@ -93,7 +95,7 @@ def range_maps_to_scene(clip: Clip, hold_out: set[int], progress: Progress, sett
     if settings.ray_drop == "log":
         still = dataclasses.replace(still, ray_drop=None)
         dynamic = dataclasses.replace(dynamic, gaussians=dataclasses.replace(dynamic.gaussians, ray_drop=None))
-    unknown = sorted({lidar for (lidar, _), window in zip(chosen, windows, strict=False) if not window.beams_known})
+    unknown = sorted({lidar for (lidar, _), window in zip(used, windows, strict=True) if not window.beams_known})
     counts = {"windows": len(windows), "returns": sum(len(each) for each in kept), "decoded": len(merged),
               "static": len(still), "dynamic": len(dynamic)}  # fmt: skip
     provenance = {
@@ -102,7 +104,7 @@ def range_maps_to_scene(clip: Clip, hold_out: set[int], progress: Progress, sett
         "weights": weights,
         "cameras": [],
         "held_out_sweeps": sorted(hold_out),
-        "windows": [list(each) for each in chosen],
+        "windows": [list(each) for each in used],
         "counts": counts,
         "unknown": _unknown(clip, actors, still, unknown),
     }
