@@ -66,7 +66,9 @@ def test_installed_methods_are_listed_and_compared(dots, file, monkeypatch):
     assert describe(one) == {"method": "dots", "settings": {"every": 10, "radius_m": 0.1}}
     (by_file,) = contenders((str(file),))
     assert by_file.name == "dots"
-    with pytest.raises(ReconstructError, match=r"have \['dense', 'dots', 'lidar', 'lift'.*or one of \['dense'.*'copy'\]"):
+    with pytest.raises(
+        ReconstructError, match=r"have \['dense', 'dots', 'lidar', 'lift'.*or one of \['dense'.*'copy'\]"
+    ):
         contenders(("dosts",))
     with pytest.raises(ReconstructError, match="each once"):
         contenders(("dots", str(file)))
