@@ -43,7 +43,8 @@ def simulated(scene, street, index):
 
 
 def test_the_method_keeps_the_contract():
-    assert check_method(load_method("lidar"), Street(frames=3, cameras=()), UNTRAINED) == []
+    car = {"car": ((4.0, 1.8, 1.5), np.array([12.0, 1.0]))}
+    assert check_method(load_method("lidar"), Street(frames=3, cameras=(), boxes=car), UNTRAINED) == []
 
 
 def test_a_sweep_that_was_held_out_is_simulated(scene, street):
@@ -60,11 +61,11 @@ def test_actors_are_rigid_parts_of_their_boxes(scene):
 
 def test_what_moves_without_a_box_lives_briefly():
     bare = Street(boxes=CAR, labelled=False)
-    scene = reconstruct(bare, "lidar", settings=UNTRAINED)
+    scene = reconstruct(bare, "lidar", settings=UNTRAINED, actors="recorded")
     life = scene.dynamic.knot_t_us[:, 2] - scene.dynamic.knot_t_us[:, 0]
     assert len(scene.dynamic) and (life <= 400_000).all() and (scene.dynamic.track == -1).all()
     assert "no boxes: what moves lives for the time between two windows" in scene.provenance["unknown"]
-    kept = reconstruct(bare, "lidar", settings=dataclasses.replace(UNTRAINED, carve=False))
+    kept = reconstruct(bare, "lidar", settings=dataclasses.replace(UNTRAINED, carve=False), actors="recorded")
     assert len(kept.dynamic) == 0 and len(kept.static) > len(scene.static)
 
 
