@@ -114,8 +114,14 @@ def reconstruct(
     held = {int(index) for index in hold_out_sweeps}
     report = progress or (lambda stage, fraction: None)
     share = 1.0 if refine is None else START_SHARE
-    clip, note = with_actors(clip, actors, held, lambda done: report("moving objects", share * MOVERS_SHARE * done))
-    begun = 0.0 if note is None else MOVERS_SHARE
+    begun = 0.0
+
+    def search(done: float) -> None:
+        nonlocal begun
+        begun = MOVERS_SHARE * done
+        report("moving objects", share * begun)
+
+    clip, note = with_actors(clip, actors, held, search)
 
     def step(stage: str, done: float) -> None:
         report(stage, share * (begun + (1 - begun) * done))

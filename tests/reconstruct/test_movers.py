@@ -179,6 +179,7 @@ class _Nothing:
         return ()
 
     def reconstruct(self, clip, settings, *, cameras, hold_out_sweeps, progress):
+        progress("all", 0.0)
         progress("all", 1.0)
         return GaussianScene(
             id=clip.id, static=Gaussians.empty(0), dynamic=DynamicGaussians.empty(), sky=np.zeros((6, 2, 2, 3), "f4"),
@@ -195,6 +196,10 @@ def test_methods_get_the_found_actors_and_scenes_tell_of_them(log):
     assert "3 actors were found" in scene.provenance["unknown"][0]
     assert steps == sorted(steps) and steps[-1] == 1.0
     assert reconstruct(log, method, actors="none").tracks == ()
+    steps.clear()
+    still = Log(frames=6, boxes=PARKED, labelled=False)
+    assert reconstruct(still, method, progress=lambda stage, done: steps.append(done)).tracks == ()
+    assert steps == sorted(steps) and steps[-1] == 1.0 and len(steps) > 2
 
 
 # ------------------------------------------------------------------------------------------------------ following
