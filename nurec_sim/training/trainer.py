@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -35,6 +34,7 @@ from nurec_sim.training.processes import Processes
 from nurec_sim.training.rates import learning_rate
 from nurec_sim.training.rendering import PerceptualLoss
 from nurec_sim.training.start import load_shared, prepare
+from nurec_sim.training.updates import update
 
 WEIGHTS, RECIPE, CURVES, SAMPLES = "weights.safetensors", "recipe.json", "curves.csv", "samples"
 COLUMNS = (
@@ -116,7 +116,10 @@ class Trainer:
                 for group in optimiser.param_groups:
                     group["lr"] = rate
                 loss, figures, outputs = wrapped(sample)
-                figures |= self._update(optimiser, trained, loss, step) | {"rate": rate, "loss": float(loss.detach())}
+                figures |= update(
+                    optimiser, loss, self.model, self.average, trained,
+                    step=step, clip_norm=self.config.clip_norm, decay=self.config.average,
+                ) | {"rate": rate, "loss": float(loss.detach())}  # fmt: skip
                 done = step + 1
                 self.position = dataclasses.replace(self.position, step=done, seconds=self._seconds())
                 if curve is not None:
@@ -135,24 +138,6 @@ class Trainer:
         self.position = dataclasses.replace(self.position, data_hash=self.samples.data_hash())
         checkpoint.save_checkpoint(self.folder, self.model, self.average, optimiser, self.position)
         self._write_weights()
-
-    def _update(
-        self, optimiser: torch.optim.AdamW, trained: Mapping[str, nn.Parameter], loss: Tensor, step: int
-    ) -> dict[str, float]:
-        """One optimiser step and the moving average; a step with a non-finite gradient is skipped and counted."""
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = float(nn.utils.clip_grad_norm_(list(trained.values()), self.config.clip_norm))
-        if not math.isfinite(norm):
-            return {"skipped": 1.0}
-        optimiser.step()
-        # A short average at first, otherwise it would keep the random initialisation for 1 / (1 - decay) steps.
-        decay = min(self.config.average, (1 + step) / (10 + step))
-        with torch.no_grad():
-            for mean, (name, now) in zip(self.average.parameters(), self.model.named_parameters(), strict=True):
-                if name in trained:
-                    mean.lerp_(now, 1 - decay)
-        return {"gradient": norm, "skipped": 0.0}
 
     def _seconds(self) -> float:
         now = time.perf_counter()

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import nn
 
 from nurec_sim.compute.cores import in_order
 from nurec_sim.errors import TrainingError
@@ -29,6 +28,7 @@ from nurec_sim.training.lidar.places import generate_places, place_names, read_p
 from nurec_sim.training.lidar.samples import ScanSample, scan_sample
 from nurec_sim.training.rates import learning_rate
 from nurec_sim.training.trainer import CURVES, RECIPE, WEIGHTS
+from nurec_sim.training.updates import update
 
 COLUMNS = ("step", "stage", "seconds", "rate", "loss", "range", "intensity", "alpha", "drop", "label", "median_range",
            "holes", "gradient", "skipped")  # fmt: skip
@@ -82,7 +82,10 @@ class LidarTrainer:
             for group in optimiser.param_groups:
                 group["lr"] = rate
             loss, figures = scan_loss(self.model, sample, config.losses, self.threads)
-            figures |= self._update(optimiser, loss, step) | {"rate": rate, "loss": float(loss.detach())}
+            figures |= update(
+                optimiser, loss, self.model, self.average, dict(self.model.named_parameters()),
+                step=step, clip_norm=self.config.clip_norm, decay=self.config.average,
+            ) | {"rate": rate, "loss": float(loss.detach())}  # fmt: skip
             done = step + 1
             self.position = dataclasses.replace(self.position, step=done, seconds=self._seconds())
             curve.add("lidar", {name: value for name, value in figures.items() if math.isfinite(value)})
@@ -96,21 +99,6 @@ class LidarTrainer:
         rng = np.random.default_rng([self.config.seed, step, 0x5CA9])
         scans = read_place(self.places / names[int(rng.integers(len(names)))])
         return scan_sample(scans, self.config.data, rng)
-
-    def _update(self, optimiser: torch.optim.AdamW, loss: torch.Tensor, step: int) -> dict[str, float]:
-        """One optimiser step and the moving average; a step with a non-finite gradient is skipped and counted."""
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = float(nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip_norm))
-        if not math.isfinite(norm):
-            return {"skipped": 1.0}
-        optimiser.step()
-        # A short average at first, otherwise it would keep the initial state for 1 / (1 - decay) steps.
-        decay = min(self.config.average, (1 + step) / (10 + step))
-        with torch.no_grad():
-            for mean, now in zip(self.average.parameters(), self.model.parameters(), strict=True):
-                mean.lerp_(now, 1 - decay)
-        return {"gradient": norm, "skipped": 0.0}
 
     def _seconds(self) -> float:
         now = time.perf_counter()
