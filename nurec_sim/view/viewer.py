@@ -7,6 +7,7 @@ import io
 import socket
 import threading
 import time
+import warnings
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,8 @@ class Viewer:
 
     def __init__(self, opened: Opened, host: str = "127.0.0.1", port: int = 0) -> None:
         viser = import_viser()
+        # A tab may be closed while its picture is drawn.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         _check_port(host, port)
         self.painter = Painter(opened)
         self.tabs: dict[int, Tab] = {}
