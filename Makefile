@@ -18,7 +18,7 @@ $(VENV)/.installed: pyproject.toml setup.py constraints.txt
 demo: $(VENV)/.installed ## log -> Gaussian scene -> gRPC server -> closed loop -> report
 	$(BIN)/nurec-sim demo --out $(OUT)
 
-test: $(VENV)/.installed ## every rule once, some seven minutes on two cores
+test: $(VENV)/.installed ## every rule once, some five minutes on two cores
 	$(TESTS) -m "not slow"
 
 test-slow: $(VENV)/.installed ## tests that take many seconds, and repetitions of quick ones
