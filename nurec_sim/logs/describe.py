@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Int64
 
 from nurec_sim import sensors
-from nurec_sim.types import CameraModel, Spin
-
-if TYPE_CHECKING:
-    from nurec_sim.logs.clip import Clip
+from nurec_sim.types import CameraModel, Clip, Spin
 
 SENSOR_COLUMNS = ("sensor", "model", "size", "frames", "rate Hz", "span s", "shutter")
 
@@ -26,7 +25,26 @@ class ClipSummary:
     sensors: tuple[tuple[str, ...], ...]
 
 
-def describe_clip(clip: Clip) -> ClipSummary:
+class OpenedLog(Clip, Protocol):
+    """A log and where it comes from: what a summary tells."""
+
+    @property
+    def path(self) -> Path | None:
+        """Path it was opened from; None if created in memory."""
+        ...
+
+    @property
+    def format(self) -> str:
+        """Name of the reader that opened it."""
+        ...
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """Other metadata of the log."""
+        ...
+
+
+def describe_clip(clip: OpenedLog) -> ClipSummary:
     """Sensors, counts, rates, times, tracks and map of a clip; reads no image and no sweep."""
     start_us, end_us = clip.span_us
     rows = [_camera_row(clip, name) for name in clip.rig.cameras] + [_lidar_row(clip, name) for name in clip.rig.lidars]

@@ -13,7 +13,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "controls": ["CONTROLS"],
         "executor": ["Executor", "LocalProcesses"],
         "ray_cluster": ["RayCluster"],
-        "results": ["StudyResults", "agreement_rows", "read_agreement", "write_study_report"],
+        "results": ["StudyResults", "agreement_rows", "read_agreement"],
         "run": ["report_again", "run_study"],
     },
 )

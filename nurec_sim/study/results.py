@@ -1,8 +1,7 @@
-"""Gathers the rollouts of a study, and writes its tables and its report."""
+"""Gathers the rollouts of a study and compares its worlds."""
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -12,7 +11,6 @@ from typing import Any
 import polars as pl
 
 from nurec_sim.errors import RunError
-from nurec_sim.files.new_files import write_file
 from nurec_sim.metrics.agreement import (
     Agreement,
     Difference,
@@ -69,30 +67,6 @@ class StudyResults:
     def failed(self) -> int:
         """Number of failed rollouts."""
         return self.values.filter(pl.col("status") != "ok")["rollout_id"].n_unique()
-
-
-def write_study_report(folder: Path, config: StudyConfig, seeing: Sequence[str]) -> Path:
-    """Writes ``rollouts.parquet``, ``rollouts.csv``, ``agreement.json`` and ``report.html``; returns the last.
-
-    Args:
-        folder: of the study.
-        config: the study.
-        seeing: policies that look at a rendered sensor.
-
-    Raises:
-        RunError: the rollouts of a world are missing.
-    """
-    from nurec_sim.study.page import render_study
-
-    results = gather(folder, config, seeing)
-    for name, write in (("rollouts.parquet", results.values.write_parquet), ("rollouts.csv", results.values.write_csv)):
-        content = io.BytesIO()
-        write(content)
-        write_file(folder / name, content.getvalue())
-    write_file(folder / AGREEMENT, json.dumps(as_json(results), indent=1) + "\n")
-    path = folder / layout.REPORT
-    write_file(path, render_study(results))
-    return path
 
 
 def gather(folder: Path, config: StudyConfig, seeing: Sequence[str]) -> StudyResults:

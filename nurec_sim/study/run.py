@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,7 +20,8 @@ from nurec_sim.runs.truth import TRUTH
 from nurec_sim.sim import load_scenario
 from nurec_sim.study.config import StudyConfig
 from nurec_sim.study.executor import Executor
-from nurec_sim.study.results import write_study_report
+from nurec_sim.study.page import render_study
+from nurec_sim.study.results import AGREEMENT, as_json, gather
 from nurec_sim.study.tasks import LOG, PLAN, ROLLOUTS, VALUES, Task, drive, rebuild, record
 
 Progress = Callable[[str, float], None]
@@ -72,7 +75,7 @@ def run_study(
         rollouts = _Rollouts(folder, config.rollouts, say)
         _run(executor, drive, [task for task in worlds if not _finished(task)], "driving", rollouts.count, tell)
         say("writing the report", RECORD_SHARE + REBUILD_SHARE + DRIVE_SHARE)
-        report = write_study_report(folder, config, seeing)
+        report = _write_report(folder, config, seeing)
     say("", 1.0)
     return report
 
@@ -88,7 +91,7 @@ def report_again(config: StudyConfig, folder: Path) -> Path:
         raise RunError(f"{folder} holds no study; run it first")
     with layout.owned(folder):
         _claim(folder, config)
-        return write_study_report(folder, config, _seeing(config))
+        return _write_report(folder, config, _seeing(config))
 
 
 def resolved(config: StudyConfig) -> str:
@@ -96,6 +99,28 @@ def resolved(config: StudyConfig) -> str:
     names = sorted({family.scenario for family in config.families})
     scenarios = {name: load_scenario(name).model_dump(mode="json") for name in names}
     return yaml.safe_dump({"study": config.model_dump(mode="json"), "scenarios": scenarios}, sort_keys=False)
+
+
+def _write_report(folder: Path, config: StudyConfig, seeing: Sequence[str]) -> Path:
+    """Writes ``rollouts.parquet``, ``rollouts.csv``, ``agreement.json`` and ``report.html``; returns the last.
+
+    Args:
+        folder: of the study.
+        config: the study.
+        seeing: policies that look at a rendered sensor.
+
+    Raises:
+        RunError: the rollouts of a world are missing.
+    """
+    results = gather(folder, config, seeing)
+    for name, write in (("rollouts.parquet", results.values.write_parquet), ("rollouts.csv", results.values.write_csv)):
+        content = io.BytesIO()
+        write(content)
+        write_file(folder / name, content.getvalue())
+    write_file(folder / AGREEMENT, json.dumps(as_json(results), indent=1) + "\n")
+    path = folder / layout.REPORT
+    write_file(path, render_study(results))
+    return path
 
 
 def _claim(folder: Path, config: StudyConfig) -> None:
