@@ -11,7 +11,8 @@ from jaxtyping import Float64, UInt8
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import NurecSimError
 from nurec_sim.logs.overlay import draw_box, draw_lines, draw_points
-from nurec_sim.render.images.still import picture
+from nurec_sim.render.images.still import picture, tinted
+from nurec_sim.render.support import MAP_PX, VIEW_PX, Support
 from nurec_sim.types import CameraFrame, CameraModel, LidarFrame, LidarModel, SensorRequest
 from nurec_sim.view.camera import recorded_index, request_of
 from nurec_sim.view.rollouts import caption, events_of, lines_of
@@ -49,6 +50,8 @@ class Painter:
         self.opened, self.stage = opened, Stage(opened)
         self.events = {name: events_of(rollout) for name, rollout in opened.rollouts.items()}
         self._sweeps: dict[tuple, Float64[np.ndarray, "n 3"]] = {}
+        self._supports: dict[int, Support] = {}
+        self._supports_lock = threading.Lock()
         self._lock = threading.Lock()
 
     def paint(self, view: View, scale: float = 1.0, selected: str | None = None) -> Image:
@@ -81,9 +84,15 @@ class Painter:
         """One world's rendering with points, boxes and paths."""
         world, request = self.stage.world(view), request_of(self.stage, view, scale)
         layer = view.layer if view.layer in world.layers else "rgb"
-        (frame,) = world.sense([request], tuple(dict.fromkeys(("rgb", layer))))
+        outputs = ("rgb",) if layer in ("rgb", "support") else ("rgb", layer)
+        (frame,) = world.sense([request], outputs)
         assert isinstance(frame, CameraFrame)
-        image = np.array(picture(frame, layer))  # rendered arrays may be read-only
+        if layer == "support":
+            # Recorded views are compared with at VIEW_PX: a finer map would show no more.
+            width_px = min(MAP_PX if view.moving else VIEW_PX, frame.camera.width_px)
+            image = tinted(frame.rgb, self._support(view.world).map(request, width_px))
+        else:
+            image = np.array(picture(frame, layer))  # rendered arrays may be read-only
         camera, poses = frame.camera, request.world_from_sensor
         if view.lidar != NO_LIDAR:
             draw_points(image, camera, poses, self.points(view)[:: COARSE_STEP if view.moving else 1])
@@ -92,6 +101,15 @@ class Painter:
         if view.boxes or view.names or selected:
             self._draw_actors(image, camera, poses, view, selected)
         return image, request
+
+    def _support(self, world: int) -> Support:
+        """The recorded views of a world, rendered when its support is first asked for."""
+        with self._supports_lock:  # whoever else asks meanwhile waits, and finds them
+            if world not in self._supports:
+                renderer = self.opened.worlds[world].renderer
+                assert renderer is not None  # else support is none of the world's layers
+                self._supports[world] = Support(renderer)
+            return self._supports[world]
 
     def _draw_actors(
         self, image: Image, camera: CameraModel, poses: np.ndarray, view: View, selected: str | None

@@ -13,7 +13,9 @@ from jaxtyping import Int64
 
 from nurec_sim.errors import ArchiveError, NurecSimError, RequestError, RunError, UnknownFormatError
 from nurec_sim.logs import Clip, open_clip
+from nurec_sim.render.device import Renderer
 from nurec_sim.render.images.still import Layer
+from nurec_sim.render.support import recorded_frames
 from nurec_sim.runs.folder import ROLLOUT, rollout_folders
 from nurec_sim.runs.rollout_file import load_rollout
 from nurec_sim.runs.scene_file import load_scene_record, reconstruction_of
@@ -24,6 +26,7 @@ from nurec_sim.serving.store.sources import is_archive
 from nurec_sim.types import GaussianScene, Rig, Rollout, SensorFrame, SensorRequest, Track, Trajectory
 
 LAYERS: tuple[Layer, ...] = ("rgb", "depth", "alpha", "label", "normal")
+"""Of a scene in this process; ``support`` comes with them where it is known when the cameras recorded."""
 SAME_PLACE_M = 5.0
 """Paths of two reconstructions of one log differ by less: refined poses move by a metre or two."""
 MOST_NAMED = 5
@@ -37,7 +40,7 @@ class World:
     """One scene that can be looked at.
 
     ``sense`` renders requests with the outputs that are named, of those in ``layers``. ``times_us`` are the first and
-    the last time that can be rendered. ``scene`` is None if it is on a server.
+    the last time that can be rendered. ``scene`` and ``renderer`` are None if it is on a server.
     """
 
     name: str
@@ -50,6 +53,7 @@ class World:
     sense: Callable[[Sequence[SensorRequest], Sequence[str]], list[SensorFrame]]
     camera_times_us: Mapping[str, Int64[np.ndarray, "frames 2"]] = field(default_factory=dict)
     scene: GaussianScene | None = None
+    renderer: Renderer | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,10 +161,11 @@ def local_world(loaded: LoadedScene) -> World:
         ego=scene.ego,
         tracks=scene.tracks,
         times_us=scene.span_us,
-        layers=LAYERS,
+        layers=(*LAYERS, "support") if recorded_frames(scene) else LAYERS,
         sense=loaded.renderer.sense,
         camera_times_us=scene.camera_times_us,
         scene=scene,
+        renderer=loaded.renderer,
     )
 
 

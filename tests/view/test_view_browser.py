@@ -120,6 +120,7 @@ def test_toggles_and_comparison(page, tab):
     for act, undo in (
         (lambda: page.drag(*[control(page, "Boxes")] * 2, steps=1), lambda: setattr(tab.panel.boxes, "value", False)),
         (lambda: setattr(tab.panel.layer, "value", "label"), lambda: setattr(tab.panel.layer, "value", "rgb")),
+        (lambda: setattr(tab.panel.layer, "value", "support"), lambda: setattr(tab.panel.layer, "value", "rgb")),
         (lambda: setattr(tab.panel.other, "value", "dense"), lambda: setattr(tab.panel.other, "value", "off")),
         (lambda: setattr(tab.panel.camera, "value", "fish"), lambda: setattr(tab.panel.camera, "value", "free")),
     ):

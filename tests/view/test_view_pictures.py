@@ -11,11 +11,15 @@ import view_worlds
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import NurecSimError
 from nurec_sim.logs import overlay
+from nurec_sim.render import make_renderer
+from nurec_sim.render.images.still import INVENTED_RGB
+from nurec_sim.serving.store import LoadedScene
 from nurec_sim.types import CameraModel, Pinhole, SensorRequest
 from nurec_sim.view import Painter, View
 from nurec_sim.view.camera import eye_camera, parts_of, pose_of, ray_hits_box, request_of
 from nurec_sim.view.picture import BOX_RGB, PLAN_RGB, lidar_names
 from nurec_sim.view.rollouts import events_of, lines_of
+from nurec_sim.view.sources import Opened, local_world
 
 T_US = view_worlds.START_US + 630_000
 WIDE = (320, 180)
@@ -109,6 +113,28 @@ def test_layers_are_those_of_the_renderer(painter, worlds):
         worlds[0], worlds[0].rig.cameras["front"], T_US, T_US + 1 + view_worlds.EXPOSURE_US, apply_isp=False
     )
     assert np.array_equal(plain, want)
+
+
+def test_support_is_red_where_no_camera_looked(worlds):
+    scene, times = worlds[0].scene, worlds[0].camera_times_us["front"]
+    once = dataclasses.replace(scene, camera_times_us={"front": times[2:3]})
+    painter = Painter(Opened((worlds[0], local_world(LoadedScene(once, make_renderer(once, "cpu", threads=1))))))
+    at_frame = View(int(times[2, 0]), camera="front", layer="support", **PLAIN)
+    plain, shown = painter.paint(dataclasses.replace(at_frame, layer="rgb")), painter.paint(at_frame)
+    # All ten recorded views saw this point of the sky, which is in the same direction from everywhere: 10 of 10.2.
+    want = plain[2, 160] * (10 / 10.2) + np.array(INVENTED_RGB) * (0.2 / 10.2)
+    assert np.abs(shown[2, 160] - want).max() <= 0.6
+    # Right of a wipe is a reconstruction from a single view: 1 of 1.2.
+    shown = painter.paint(dataclasses.replace(at_frame, other=1, wipe=0.25))
+    assert np.abs(shown[2, 160] - (plain[2, 160] / 1.2 + np.array(INVENTED_RGB) * (0.2 / 1.2))).max() <= 0.6
+    # No camera looked back: all of it is invented, in a coarse picture too.
+    back = geometry.rotation_from_yaw(np.pi) @ np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    behind = View(T_US, WIDE, browser_from_eye=geometry.pose(back, np.array([0, 0, 1.5])), layer="support", route=False)
+    for view in (behind, dataclasses.replace(behind, moving=True)):
+        assert (painter.paint(view) == INVENTED_RGB).all()
+    # Where it is not known when the cameras recorded, there is no such layer.
+    unknown = local_world(LoadedScene(dataclasses.replace(scene, camera_times_us={}), worlds[0].renderer))
+    assert (*unknown.layers, "support") == worlds[0].layers
 
 
 def test_the_car_and_actors_can_be_moved_and_hidden(painter, worlds):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import RequestError
@@ -139,8 +139,22 @@ def support_picture(renderer: Renderer, request: SensorRequest) -> UInt8[np.ndar
     width_px = min(request.sensor.width_px, SUPPORT_PX)
     small = small_camera(request.sensor, width_px)
     rgb = renderer.render_camera(dataclasses.replace(request, sensor=small)).rgb
-    support = Support(renderer).map(request, width_px)[..., None]
-    return np.rint(rgb * support + np.array(INVENTED_RGB) * (1 - support)).astype(np.uint8)
+    return tinted(rgb, Support(renderer).map(request, width_px))
+
+
+def tinted(rgb: UInt8[np.ndarray, "h w 3"], support: Float32[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "h w 3"]:
+    """An image, the redder the less it rests on recorded views.
+
+    Args:
+        rgb: the image.
+        support: its support, 0..1, of any size.
+    """
+    import cv2
+
+    if support.shape != rgb.shape[:2]:
+        support = np.asarray(cv2.resize(support, rgb.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+    weight = support[..., None]
+    return np.rint(rgb * weight + np.array(INVENTED_RGB) * (1 - weight)).astype(np.uint8)
 
 
 def picture(frame: CameraFrame, layer: Layer) -> UInt8[np.ndarray, "h w 3"]:
