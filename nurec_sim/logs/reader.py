@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from nurec_sim import plugins
 from nurec_sim.errors import ClipError, NurecSimError, UnknownFormatError
@@ -108,6 +110,25 @@ def find_reader(path: Path) -> LogReader:
         + "".join(f"  {line}\n" for line in [*known, *broken])
         + "docs/log_formats.md describes them, docs/write_a_log_reader.md says how to read others"
     )
+
+
+@runtime_checkable
+class _KnowsFiles(Protocol):
+    """A reader of a format whose logs also depend on files beside their path, such as a calibration for all logs."""
+
+    def files(self, path: Path) -> Sequence[Path]: ...
+
+
+def log_files(path: Path) -> Sequence[Path]:
+    """Files and folders that a log depends on: its path, and what its reader names in ``files(path)``, if it has that.
+
+    A path that no reader can open stands for itself.
+    """
+    try:
+        reader = find_reader(path)
+        return reader.files(path) if isinstance(reader, _KnowsFiles) else [path]
+    except ClipError:
+        return [path]
 
 
 def _nothing_at(path: Path) -> ClipError:

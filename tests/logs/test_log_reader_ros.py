@@ -1,6 +1,7 @@
 """ROS 2 bags written by ``mcap-ros2-support``: layouts, times of points, transforms, settings and damage."""
 
 import dataclasses
+import shutil
 import sys
 
 import numpy as np
@@ -12,6 +13,7 @@ from nurec_sim import logs
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.readers import _ros_messages, _ros_sensors
 from nurec_sim.logs.readers.ros_bag import RosBagReader
+from nurec_sim.serving.store import content_key
 from nurec_sim.types import Pinhole, Rig
 
 
@@ -118,6 +120,18 @@ lidars:
     assert np.isclose(opened.ego.world_from_body[0, 2, 3], 0.01 - 0.5 - 0.3)
     assert (np.diff(opened.camera_times_us("nose"), axis=1) == 20_000).all()
     assert np.isclose(opened.sweep("roof", 0).intensity.max(), 0.5)
+
+
+def test_a_cached_scene_depends_on_the_bag_and_on_its_settings(bag, tmp_path):
+    copy = tmp_path / f"own{bag.suffix}"
+    shutil.copy(bag, copy)
+    beside, file = content_key(copy, "lift"), settings_of(copy, tmp_path, "")
+    named = content_key(file, "lift")
+    copy.with_suffix(".yaml").write_text("world: odom\n")
+    assert content_key(copy, "lift") != beside
+    with copy.open("ab") as end:
+        end.write(b"more")
+    assert content_key(file, "lift") != named
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from waymo_files import write_waymo
 from nurec_sim import geometry, logs
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.readers.waymo_v2 import WaymoReader
+from nurec_sim.serving.store import content_key
 from nurec_sim.types import Rig
 
 # Their first column looks half a column right of straight back; 90 columns are 4 degrees apart.
@@ -97,7 +98,13 @@ def test_the_reader_keeps_the_contract_for_folders_and_files(segment, tmp_path):
         shutil.copy(file, file.with_stem("other"))
     with pytest.raises(ClipError, match=r"both: holds 2 segments.*'vehicle_pose/other.parquet'"):
         logs.open_clip(both)
-    assert logs.open_clip(both / "lidar" / "other.parquet").id == "other"
+    other = both / "lidar" / "other.parquet"
+    assert logs.open_clip(other).id == "other"
+    before = content_key(other, "lift")
+    (both / "lidar" / "tiny.parquet").unlink()
+    assert content_key(other, "lift") == before
+    (both / "lidar_box" / "other.parquet").unlink()
+    assert content_key(other, "lift") != before
 
 
 def test_frames_alone_give_the_path_and_rows_of_equal_height(clip, images, tmp_path):

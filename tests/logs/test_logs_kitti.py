@@ -15,6 +15,7 @@ from nurec_sim.logs.checks.sampling import sample_sweeps
 from nurec_sim.logs.readers import kitti_raw
 from nurec_sim.logs.readers.kitti_odometry import KittiOdometryReader
 from nurec_sim.logs.readers.kitti_raw import KittiRawReader
+from nurec_sim.serving.store import content_key
 
 FRONT, LIDAR = "camera_front", published.LIDAR
 
@@ -115,6 +116,21 @@ def test_a_folder_above_one_drive_is_enough_and_several_are_named(drive):
         ClipError, match=r"holds 2 drives of KITTI raw; give the folder of one: .*0042_sync', .*0043_sync"
     ):
         logs.open_clip(day)
+
+
+def test_a_cached_scene_depends_on_the_files_beside_a_log(drive, root, tmp_path):
+    keys = {content_key(drive, "lift")}
+    for name in (kitti_raw.CAM_TO_CAM, kitti_raw.VELO_TO_CAM, kitti_raw.IMU_TO_VELO):
+        (drive.parent / name).write_text((drive.parent / name).read_text() + "\n")
+        keys.add(content_key(drive, "lift"))
+    (drive.parent / "notes.txt").write_text("not of the drive")
+    keys.add(content_key(drive, "lift"))
+    assert len(keys) == 4
+    shutil.copytree(root / "odometry", tmp_path / "odometry")
+    sequence = tmp_path / "odometry" / "sequences" / "07"
+    before = content_key(sequence, "lift")
+    (tmp_path / "odometry" / "poses" / "07.txt").write_text("1 0 0\n")
+    assert content_key(sequence, "lift") != before
 
 
 def test_grey_cameras_stand_in_where_there_is_no_colour(drive):

@@ -43,6 +43,14 @@ class FolderReader(abc.ABC):
             raise ClipError(f"holds {len(found)} {self.noun}; give the folder of one: {names}{more}")
         return self.read(found[0].resolve())
 
+    def files(self, path: Path) -> list[Path]:
+        """What a log depends on: its folder, and the files for it outside of it."""
+        return [path, *(file for log in self.logs(path) for file in self.beside(log.resolve()) if file.exists())]
+
+    def beside(self, log: Path) -> list[Path]:
+        """Files outside of one of ``logs`` that it depends on, whether they exist or not; none by default."""
+        return []
+
     @abc.abstractmethod
     def logs(self, path: Path) -> list[Path]:
         """Folders (or main files) of logs: the path itself, or those below it, sorted."""

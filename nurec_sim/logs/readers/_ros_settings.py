@@ -60,6 +60,13 @@ class Settings:
     lidars: dict[str, LidarSettings] | None = None
 
 
+def settings_file(path: Path) -> Path:
+    """The YAML file of a bag, whether it exists or not; the path itself if it is one."""
+    if path.suffix in (".yaml", ".yml"):
+        return path
+    return path / SETTINGS_FILE if path.is_dir() else path.with_suffix(".yaml")
+
+
 def read_settings(path: Path) -> tuple[Path, Settings]:
     """The bag and its settings: from the YAML file that is given, or from the one beside the bag if there is one.
 
@@ -68,12 +75,11 @@ def read_settings(path: Path) -> tuple[Path, Settings]:
     Raises:
         ClipError: a key is unknown or its value wrong; the text names the file, the key, and what is allowed.
     """
-    given = path.suffix in (".yaml", ".yml")
-    file = path if given else path / SETTINGS_FILE if path.is_dir() else path.with_suffix(".yaml")
+    file = settings_file(path)
     if not file.is_file():
         return path, Settings()
     content = read_yaml(file)
-    if given:
+    if file == path:
         path = file.parent / fields.of_kind(file.name, content, "bag", str)
         if not path.exists():
             raise ClipError(f"{file.name}: there is no bag at {str(path)!r}")

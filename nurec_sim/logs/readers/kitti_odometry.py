@@ -26,7 +26,7 @@ COLOUR, GREY = ("image_2", "image_3"), ("image_0", "image_1")
 # 1.73 m high; it is taken to be level.
 RIG_FROM_VELO = geometry.pose(np.eye(3), np.array([0.76, 0.0, 1.73]))
 SEQUENCE = re.compile(r"\d\d")
-FILES = ("calib.txt", "times.txt")
+FILES, POSES = ("calib.txt", "times.txt"), "poses"
 LATEST_S = 1e9
 
 
@@ -48,6 +48,10 @@ class KittiOdometryReader(FolderReader):
             if SEQUENCE.fullmatch(each.resolve().name) and all((each / name).is_file() for name in FILES)
         )
 
+    def beside(self, log: Path) -> list[Path]:
+        """The poses."""
+        return [log.parents[1] / POSES / f"{log.name}.txt"]
+
     def read(self, log: Path) -> Clip:
         """The sequence as a clip."""
         return _read(Storage(log.parents[1]), log.name)
@@ -59,7 +63,7 @@ def _read(storage: Storage, sequence: str) -> Clip:
     rectified_from_velo = np.vstack([kitti.entry(f"{folder}/calib.txt", rows, "Tr", (3, 4)), [0, 0, 0, 1]])
     rig_from_rectified = RIG_FROM_VELO @ geometry.inverse(rectified_from_velo)
     times = [round(1e6 * seconds[0]) for seconds in _numbers(storage, f"{folder}/times.txt", 1)]
-    poses_file = f"poses/{sequence}.txt"
+    poses_file = f"{POSES}/{sequence}.txt"
     if not storage.exists(poses_file):
         raise ClipError(f"{poses_file} is missing: the benchmark publishes poses for the sequences 00 to 10")
     poses = np.tile(np.eye(4), (len(times), 1, 1))

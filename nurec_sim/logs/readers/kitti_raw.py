@@ -52,6 +52,10 @@ class KittiRawReader(FolderReader):
         found = sorted([*path.glob("*_drive_*_sync"), *path.glob("*/*_drive_*_sync")])
         return [each for each in found if DRIVE.fullmatch(each.name) and each.is_dir()]
 
+    def beside(self, log: Path) -> list[Path]:
+        """The calibration of the day."""
+        return [log.parent / name for name in (CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO)]
+
     def read(self, log: Path) -> Clip:
         """The drive as a clip."""
         return _read(Storage(log.parent), log.name)

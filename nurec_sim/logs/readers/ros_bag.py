@@ -23,7 +23,7 @@ from nurec_sim.logs.readers import _ros_messages as messages
 from nurec_sim.logs.readers import _ros_sensors as decoding
 from nurec_sim.logs.readers import _ros_storage as storage
 from nurec_sim.logs.readers._ros_frames import WORLDS, Frames
-from nurec_sim.logs.readers._ros_settings import CameraSettings, LidarSettings, Settings, read_settings
+from nurec_sim.logs.readers._ros_settings import CameraSettings, LidarSettings, Settings, read_settings, settings_file
 from nurec_sim.logs.readers._ros_source import BagSource, SensorMessages, StoredMessage
 from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.types import CameraModel, LidarModel, Matrix4, Rig, Trajectory
@@ -45,6 +45,12 @@ class RosBagReader:
             with path.open("rb") as file:
                 return any(line.startswith(b"bag:") for line in file.read(1 << 16).splitlines())
         return storage.is_bag(path)
+
+    def files(self, path: Path) -> list[Path]:
+        """The bag, and the YAML file that names it or lies beside it."""
+        bag, _ = read_settings(path)
+        file = settings_file(path)
+        return [bag, file] if file.is_file() else [bag]
 
     def open(self, path: Path) -> Clip:
         """The bag as a clip.

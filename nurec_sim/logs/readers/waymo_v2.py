@@ -62,6 +62,10 @@ class WaymoReader(FolderReader):
             return [beside] if beside.is_file() else []
         return sorted((path / POSE).glob("*.parquet")) if path.is_dir() else []
 
+    def beside(self, log: Path) -> list[Path]:
+        """The segment's files of the other components."""
+        return sorted(log.parent.parent.glob(f"*/{log.name}"))
+
     def read(self, log: Path) -> Clip:
         """The segment as a clip."""
         return _read(Tables(log.parent.parent, log.stem))

@@ -87,11 +87,13 @@ def _foreign_code(method: Method) -> str | None:
 
 def content_key(clip_path: Path, recipe: Recipe | str) -> str:
     """A name for what a reconstruction depends on: the clip's files, the recipe, our version and code."""
+    from nurec_sim.logs.reader import log_files
+
     if isinstance(recipe, str):
         recipe = Recipe(recipe)
     package = Path(nurec_sim.__file__).parent
     code = "".join(files_hash(package / folder, "*.py") for folder in _CODE)
-    facts = "\0".join([nurec_sim.__version__, code, recipe.text(), files_hash(clip_path)])
+    facts = "\0".join([nurec_sim.__version__, code, recipe.text(), *map(files_hash, log_files(clip_path))])
     name = load_method(recipe.method).name
     return f"{clip_path.stem}-{name}-{hashlib.sha256(facts.encode()).hexdigest()[:24]}"
 
