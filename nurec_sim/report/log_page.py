@@ -30,7 +30,7 @@ h1 { overflow-wrap:anywhere; } figure { margin:0; }
 svg { width:100%; height:auto; max-height:900px; display:block; } svg text { font-size:13px; fill:#334155; }
 .shots { display:grid; grid-template-columns:repeat(auto-fill,minmax(300px,1fr)); gap:10px; }
 .shots img { width:100%; border-radius:6px; display:block; }
-td.find { min-width:14em; } td.todo { min-width:16em; }
+td.find { min-width:14em; } td.todo { min-width:16em; } table.plain td { white-space:nowrap; }
 .swatch { display:inline-block; width:12px; height:12px; border-radius:3px; vertical-align:-1px; margin-right:4px; }
 @media (max-width:600px) { svg.wide { min-width:640px; } }
 """
@@ -73,6 +73,8 @@ def log_page(clip: Clip, faults: Sequence[str], measures: Sequence[Measure]) -> 
 def _checks(measures: Sequence[Measure]) -> str:
     if not measures:
         return '<p class="none">Nothing to check: the log has no LiDAR.</p>'
+    # Where there is nothing to do, a column for it would only be too wide for a phone.
+    idle = not any(each.faults or each.found.startswith(UNDECIDED) for each in measures)
     rows = []
     for each in measures:
         undecided = each.found.startswith(UNDECIDED)
@@ -83,9 +85,11 @@ def _checks(measures: Sequence[Measure]) -> str:
         faults = "".join(f'<small class="bad">{escape(fault)}</small>' for fault in each.faults)
         rows.append(
             f'<tr><td>{escape(each.what)}</td><td><span class="tag {tag[0]}">{tag[1]}</span></td>'
-            f'<td class="find">{escape(each.found)}{faults}</td><td class="todo">{escape(todo)}</td></tr>'
+            f'<td class="find">{escape(each.found)}{faults}</td>'
+            + ("" if idle else f'<td class="todo">{escape(todo)}</td>')
+            + "</tr>"
         )
-    heads = "".join(f"<th>{text}</th>" for text in ("Check", "", "Found", "What to do"))
+    heads = "".join(f"<th>{text}</th>" for text in ("Check", "", "Found", *(() if idle else ("What to do",))))
     return (
         f'<div class="card scroll"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
         '<p class="key">LiDAR in camera: how much better depth edges of the LiDAR meet edges of the image than by '
@@ -107,7 +111,7 @@ def _faults(faults: Sequence[str]) -> str:
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<table class="plain"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
 
 
 def _legend() -> str:

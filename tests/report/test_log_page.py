@@ -45,6 +45,10 @@ def test_the_page_stands_alone_and_tells_everything(clip):
     # 3 cameras with 3 frames each: one time is enough.
     assert page.count("<figure>") == 3 and page.count("data:image/jpeg") == 3
     assert "no faults" in log_page(clip, [], [])
+    # Where nothing is to be done, there is no column for it.
+    fits = log_page(clip, [], measures[2:])
+    assert "What to do" in page and "What to do" not in fits
+    assert re.findall(r"<tr><td>(.*?)</tr>", fits)[0].endswith('<td class="find">90% of 20 in sight</td>')
 
 
 def test_the_timeline_has_every_frame_and_names_gaps(clip):
