@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,7 +13,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from nurec_sim import display, geometry
+from nurec_sim import display
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.describe import SENSOR_COLUMNS, describe_clip
 from nurec_sim.logs.sweeps import SweepRecord, compensated_sweep
@@ -24,8 +23,6 @@ IMAGES_KEPT = 6
 SWEEPS_KEPT = 2
 
 T = TypeVar("T")
-R = TypeVar("R", "ImageRecord", SweepRecord)
-_TIMES = ("start_us", "t_us", "end_us")
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,84 +144,31 @@ class Clip:
                     parts.append(display.table("", [(str(error),)]))
         return "".join(parts)
 
-    def corrected(self, correction: Trajectory) -> Clip:
-        """The same log with all poses moved by a correction that varies over time.
-
-        Args:
-            correction: ``refined_from_recorded`` in the world at some times; interpolated in between.
-        """
-
-        def moved(path: Trajectory) -> Trajectory:
-            return Trajectory(path.t_us, _corrected(correction, path.t_us, path.world_from_body))
-
-        def image(record: ImageRecord) -> ImageRecord:
-            times = np.array([record.start_us, record.end_us])
-            return dataclasses.replace(
-                record, world_from_camera=_corrected(correction, times, record.world_from_camera)
-            )
-
-        def sweep(record: SweepRecord) -> SweepRecord:
-            pose = _corrected(correction, np.array([record.t_us]), record.world_from_lidar[None])[0]
-            return dataclasses.replace(record, world_from_lidar=pose)
-
-        return self._with(
-            # Poses of the ego where the correction changes too: in between, both are interpolated.
-            moved(_resampled(self.ego, correction.t_us)),
-            {name: [image(record) for record in rows] for name, rows in self._images.items()},
-            {name: [sweep(record) for record in rows] for name, rows in self._sweeps.items()},
-            [dataclasses.replace(track, path=moved(track.path)) for track in self.tracks],
-        )
-
-    def later(self, offset_us: int) -> Clip:
-        """The same log with ``offset_us`` added to all times."""
-
-        def moved(path: Trajectory) -> Trajectory:
-            return Trajectory(path.t_us + offset_us, path.world_from_body)
-
-        def put_off(record: R) -> R:
-            changed = {name: getattr(record, name) + offset_us for name in _TIMES if hasattr(record, name)}
-            return dataclasses.replace(record, **changed)
-
-        clip = self._with(
-            moved(self.ego),
-            {name: [put_off(record) for record in rows] for name, rows in self._images.items()},
-            {name: [put_off(record) for record in rows] for name, rows in self._sweeps.items()},
-            [dataclasses.replace(track, path=moved(track.path)) for track in self.tracks],
-        )
-        clip.time_offset_us += offset_us
-        return clip
-
-    def remounted(self, origins_m: Mapping[str, Float64[np.ndarray, " 3"]]) -> Clip:
-        """The same log with LiDARs moved to where their beams start, given in their present frames."""
-        lidars, sweeps = dict(self.rig.lidars), dict(self._sweeps)
-        for name, origin in origins_m.items():
-            pose = lidars[name].rig_from_lidar @ geometry.pose(np.eye(3), origin)
-            lidars[name] = dataclasses.replace(lidars[name], rig_from_lidar=pose)
-            sweeps[name] = tuple(record.from_origin(origin) for record in sweeps.get(name, ()))
-        return self._with(self.ego, self._images, sweeps, self.tracks, dataclasses.replace(self.rig, lidars=lidars))
-
-    def _with(
+    def replaced(
         self,
-        ego: Trajectory,
-        images: Mapping[str, Sequence[ImageRecord]],
-        sweeps: Mapping[str, Sequence[SweepRecord]],
-        tracks: Sequence[Track],
+        *,
+        ego: Trajectory | None = None,
+        images: Mapping[str, Sequence[ImageRecord]] | None = None,
+        sweeps: Mapping[str, Sequence[SweepRecord]] | None = None,
+        tracks: Sequence[Track] | None = None,
         rig: Rig | None = None,
+        time_offset_us: int | None = None,
     ) -> Clip:
-        """The same log with other poses and times, and another rig if given."""
+        """The same log with some parts replaced; arguments as for the class and its attributes."""
         clip = Clip(
             id=self.id,
             rig=rig or self.rig,
-            ego=ego,
-            images=images,
-            sweeps=sweeps,
+            ego=ego or self.ego,
+            images=self._images if images is None else images,
+            sweeps=self._sweeps if sweeps is None else sweeps,
             source=self.source,
-            tracks=tracks,
+            tracks=self.tracks if tracks is None else tracks,
             road_map=self.road_map,
             facts=self.facts,
             rig_from_log=self.rig_from_log,
         )
-        clip.path, clip.format, clip.time_offset_us = self.path, self.format, self.time_offset_us
+        clip.path, clip.format = self.path, self.format
+        clip.time_offset_us = self.time_offset_us if time_offset_us is None else time_offset_us
         return clip
 
     @property
@@ -360,28 +304,6 @@ class Clip:
             raise error if str(error).startswith(f"{name}: ") else ClipError(f"{name}: {what}: {error}") from None
         except Exception as error:
             raise ClipError(f"{name}: {what} cannot be read: {type(error).__name__}: {error}") from error
-
-
-def _resampled(path: Trajectory, t_us: Int64[np.ndarray, " n"]) -> Trajectory:
-    """A trajectory with poses at further times within its span."""
-    times = np.union1d(path.t_us, t_us[(t_us > path.start_us) & (t_us < path.end_us)])
-    return Trajectory(times, path.at(times))
-
-
-def _corrected(
-    correction: Trajectory, t_us: Int64[np.ndarray, " n"], poses: Float64[np.ndarray, "n 4 4"]
-) -> Float64[np.ndarray, "n 4 4"]:
-    """Poses moved by the correction at their times.
-
-    The correction turns about the origin of the world, which may be far away. Poses moved by the corrections before and
-    after are interpolated instead, in which rotation and translation do not mix.
-    """
-    low = np.clip(np.searchsorted(correction.t_us, t_us, side="right") - 1, 0, max(len(correction.t_us) - 2, 0))
-    ends = np.stack([low, np.minimum(low + 1, len(correction.t_us) - 1)], axis=1)
-    span = np.maximum(np.diff(correction.t_us[ends], axis=1)[:, 0], 1)
-    share = np.clip((t_us - correction.t_us[low]) / span, 0.0, 1.0)
-    pairs = correction.world_from_body[ends] @ poses[:, None]
-    return geometry.interpolate_pose_pairs(pairs, share)
 
 
 def _named(clip_id: str, kind: str, name: str, known: Mapping[str, T]) -> T:

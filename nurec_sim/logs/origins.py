@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.clip import Clip
+from nurec_sim.logs.moved import remounted
 
 LOWEST_M = 0.3
 """LiDARs lower than this over the road are not where the log has them, if the points agree."""
@@ -51,7 +52,7 @@ def with_origins(clip: Clip) -> Clip:
             found[name] = geometry.transform_points(geometry.inverse(lidar.rig_from_lidar), origin)
     if not found:
         return clip
-    moved = clip.remounted(found)
+    moved = remounted(clip, found)
     for name in found:
         height = moved.rig.lidars[name].rig_from_lidar[2, 3]
         moved.facts[f"beams_of_{name}"] = (

@@ -11,6 +11,7 @@ from nurec_sim import plugins
 from nurec_sim.errors import ClipError, NurecSimError, UnknownFormatError
 from nurec_sim.logs.clip import Clip
 from nurec_sim.logs.consistency import EARLIEST_US, table_faults
+from nurec_sim.logs.moved import later
 from nurec_sim.logs.origins import with_origins
 from nurec_sim.types import LogReader
 
@@ -150,4 +151,4 @@ def _late_enough(clip: Clip) -> Clip:
     Clients encode times as unsigned integers, and request frames from half a second before the first.
     """
     seconds = -((clip.span_us[0] - EARLIEST_US) // SECOND_US)
-    return clip.later(seconds * SECOND_US) if seconds > 0 else clip
+    return later(clip, seconds * SECOND_US) if seconds > 0 else clip

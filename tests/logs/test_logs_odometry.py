@@ -9,6 +9,7 @@ import tiny_clip
 
 from nurec_sim import cli, geometry, logs
 from nurec_sim.errors import ClipError
+from nurec_sim.logs.moved import corrected
 from nurec_sim.logs.odometry import agreement_m, refine_poses
 from nurec_sim.logs.odometry.refine import _smoothed, _tridiagonal
 from nurec_sim.logs.odometry.static_points import moving_tracks, static_points
@@ -31,7 +32,7 @@ def drifting(clip: logs.Clip, metres: float) -> logs.Clip:
     times = np.linspace(clip.span_us[0], clip.sweep_records(LIDAR)[-1].t_us, 20).astype(np.int64)
     start = clip.ego.at(times[0])
     local = [geometry.pose_from_xyyaw(0, metres * share, np.radians(1) * share) for share in np.linspace(0, 1, 20)]
-    return clip.corrected(Trajectory(times, start @ np.array(local) @ geometry.inverse(start)))
+    return corrected(clip, Trajectory(times, start @ np.array(local) @ geometry.inverse(start)))
 
 
 @pytest.mark.slow
@@ -71,7 +72,7 @@ def test_points_of_what_moves_and_of_the_car_are_left_out(exact):
 def test_a_correction_moves_everything_that_was_seen(tmp_path):
     clip = logs.open_clip(tiny_clip.write(tmp_path / "tiny.zip"))
     turn = geometry.pose_from_xyyaw(3.0, -1.0, 0.2, z=0.5)
-    moved = clip.corrected(Trajectory(np.array([clip.span_us[0]]), turn[None]))
+    moved = corrected(clip, Trajectory(np.array([clip.span_us[0]]), turn[None]))
     assert np.allclose(moved.ego.world_from_body, turn @ clip.ego.world_from_body)
     for name in clip.rig.cameras:
         assert np.allclose(moved.world_from_camera(name, 1), turn @ clip.world_from_camera(name, 1))
@@ -81,7 +82,7 @@ def test_a_correction_moves_everything_that_was_seen(tmp_path):
         assert np.allclose(track.path.world_from_body, turn @ given.path.world_from_body)
     # One that begins in the middle: nothing before it changes from pose to pose, half of it half way.
     start, end = clip.ego.start_us, clip.ego.end_us
-    ramp = clip.corrected(Trajectory(np.array([start, end]), np.stack([np.eye(4), geometry.pose_from_xyyaw(0, 2, 0)])))
+    ramp = corrected(clip, Trajectory(np.array([start, end]), np.stack([np.eye(4), geometry.pose_from_xyyaw(0, 2, 0)])))
     middle = (start + end) // 2
     assert np.allclose(ramp.ego.at(middle)[:3, 3] - clip.ego.at(middle)[:3, 3], [0, 1, 0], atol=1e-3)
     assert ramp.span_us == clip.span_us and ramp.path == clip.path
@@ -150,7 +151,7 @@ def test_surfaces_of_a_real_drive_agree_as_well_as_with_published_odometry(reald
     pack = logs.open_clip(path)
     frames = json.loads((path / "frames.json").read_text())["frames"]
     recorded, odometry = (np.array([f[key] for f in frames]) for key in ("T_world_ego_oxts", "T_world_ego"))
-    clip = pack.corrected(Trajectory(pack.ego.t_us, recorded @ geometry.inverse(odometry)))
+    clip = corrected(pack, Trajectory(pack.ego.t_us, recorded @ geometry.inverse(odometry)))
     refined, report = refine_poses(clip)
     assert report.lost == 0 and report.agreement_m[0] > 0.4
     assert report.agreement_m[1] < agreement_m(pack, "lidar") + 0.005

@@ -9,6 +9,7 @@ import pytest
 import tiny_clip
 
 from nurec_sim import cli, geometry, logs
+from nurec_sim.logs.moved import later
 from nurec_sim.logs.selection import with_tracks
 from nurec_sim.reconstruct import movers
 from nurec_sim.report.log_map import drive_map, timeline
@@ -55,7 +56,7 @@ def test_the_timeline_has_every_frame_and_names_gaps(clip):
     drawn, gaps = timeline(clip)
     boxes = 3  # distinct times of poses of tracks
     assert drawn.count("<rect") == len(clip.ego.t_us) + 3 * 3 + 3 + boxes and not gaps
-    late = clip.later(0)
+    late = later(clip, 0)
     records = [dataclasses.replace(late.image_records("front")[0], start_us=t, end_us=t)
                for t in tiny_clip.START_US + np.array([0, 50_000, 100_000, 150_000, 290_000])]  # fmt: skip
     late._images["front"] = tuple(records)

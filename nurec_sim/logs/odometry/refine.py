@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.clip import Clip
+from nurec_sim.logs.moved import corrected
 from nurec_sim.logs.odometry.agreement import agreement_m
 from nurec_sim.logs.odometry.register import Registration, Surface, register, surface_of
 from nurec_sim.logs.odometry.static_points import moving_tracks, static_points, thinned
@@ -101,7 +102,7 @@ def refine_poses(clip: Clip, progress: Report = lambda stage, done: None) -> tup
 
         found = _odometry(refined, lidar_id, clip.ego.at(times), step)
         poses = _smoothed(times, clip.ego.at(times), np.array([each.pose for each in found]))
-        refined = clip.corrected(Trajectory(times, poses @ geometry.inverse(clip.ego.at(times))))
+        refined = corrected(clip, Trajectory(times, poses @ geometry.inverse(clip.ego.at(times))))
     fitted = [each.residual_m for each in found[1:] if each.share >= FEWEST_PARTNERS]
     moved = np.linalg.norm(refined.ego.at(times)[:, :3, 3] - clip.ego.at(times)[:, :3, 3], axis=1)
     report = PoseReport(
