@@ -220,6 +220,8 @@ def drive(
     fit = refinement(refine)
     if fit is not None and address is not None:
         raise NurecSimError("--refine cannot be used with --address: the scenes are those of the running server")
+    if scenario.added_actors and address is not None:
+        raise NurecSimError(f"scenario {scenario.name!r} adds actors, which needs a server of its own: no --address")
     loaded = runs.load_policies(policy_names or scenario.policies, plan_timeout_s)
     if address is not None:
         with RemoteSensors(address) as sensors:
@@ -254,10 +256,13 @@ def drive(
                         part = part_of(advance, len(fidelity), len(scenes), key[1])
                         every = served[key].hold_out_every
                         fidelity[key] = measure_fidelity(logs_by_id[scene.id], scene, senses[key], every, part)
+        # After the comparison with the log, which does not have them.
+        loaded_scenes, added = runs.add_to_served(store, loaded_scenes, scenario, scenario_path.parent)
+        scenes = [scene for _, scene in loaded_scenes]
         if true_world is not None:
             if len({scene.id for scene in scenes}) != 1:
                 raise NurecSimError(f"--true-world needs exactly one clip or scene, got {len(scenes)}")
-            scene, sense = stack.enter_context(runs.true_world(true_world, scenes[0]))
+            scene, sense = stack.enter_context(runs.true_world(true_world, scenes[0], added=added.get(scenes[0].id)))
             # First, because the others are compared with it.
             scenes.insert(0, scene)
             senses[scene.id, runs.reconstruction_of(scene)] = sense

@@ -8,6 +8,7 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "added_actors": ["AddedActors", "add_to_served", "added_actors", "with_added_actors"],
         "drive": ["execute"],
         "policies": ["load_policies"],
         "results": ["headline", "write_report"],

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from nurec_sim.errors import ClipError, RunError
+from nurec_sim.runs.added_actors import AddedActors
 from nurec_sim.types import GaussianScene, Sense
 from nurec_sim.world import TownPlan, TrueWorld
 
@@ -23,7 +24,7 @@ SAME_PLACE_M = 0.01
 
 @contextmanager
 def true_world(
-    plan_file: str | Path, scene: GaussianScene, backend: str | None = None
+    plan_file: str | Path, scene: GaussianScene, backend: str | None = None, added: AddedActors | None = None
 ) -> Iterator[tuple[GaussianScene, Sense]]:
     """The town of a plan as a scene.
 
@@ -32,6 +33,7 @@ def true_world(
         scene: any reconstruction of that town's log; metrics use its sensors, tracks, map and road, so that only the
             rendering differs.
         backend: see ``world.TrueWorld``.
+        added: actors of the scenario, which the scene has.
 
     Yields:
         The scene with reconstruction name ``truth``, and the town's ``sense``.
@@ -45,6 +47,8 @@ def true_world(
         raise RunError(f"{plan_file}: {error}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise RunError(f"{plan_file}: the town plan cannot be read: {error}") from None
+    if added is not None:
+        plan = added.in_town(plan)
     _check_same_town(plan, scene)
     with TrueWorld(plan, backend) as world:
         provenance = {**scene.provenance, "method": TRUTH}

@@ -36,8 +36,12 @@ def edited_actors(
         seed: of the rollout.
 
     Raises:
-        ScenarioError: an edit names an actor that the scene does not have, or there is no lead actor.
+        ScenarioError: an edit names an actor that the scene does not have, there is no lead actor, or the scene was not
+            given the actors that the scenario adds.
     """
+    missing = sorted(set(scenario.added_actors) - {track.id for track in tracks})
+    if missing:
+        raise ScenarioError(f"scene {scene_id!r} lacks the added actors {missing}; see runs.with_added_actors")
     edits = dict(scenario.actors)
     if LEAD in edits and not any(track.id == LEAD for track in tracks):
         edit = edits.pop(LEAD)

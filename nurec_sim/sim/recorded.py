@@ -31,7 +31,7 @@ class RecordedDrive:
         self.t_us = ego.t_us[keep]
         self.line_m = ego.position_m[keep, :2]
         self.station_m = geometry.arc_length(self.line_m)
-        self.speed_mps = self._speeds(self.t_us)
+        self.speed_mps = self.speeds(self.t_us)
 
     @property
     def length_m(self) -> float:
@@ -88,7 +88,7 @@ class RecordedDrive:
         if elapsed_s <= 0:
             return 0.0, 0.0, 0.0
         times = np.array([low[0], t_us, high[0]])
-        before, now, after = self._speeds(times)
+        before, now, after = self.speeds(times)
         yaw = geometry.yaw_of(self.ego.at(times))
         yaw_rate = float(geometry.wrap_angle(yaw[2] - yaw[0])) / elapsed_s
         return float(now), float(after - before) / elapsed_s, yaw_rate
@@ -99,7 +99,8 @@ class RecordedDrive:
             np.minimum(t_us + SPEED_WINDOW_US, self.ego.end_us),
         )
 
-    def _speeds(self, t_us: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    def speeds(self, t_us: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+        """Recorded speeds along x (m/s, never negative) over 0.5 s; 0 outside of the recording."""
         low, high = self._window(t_us)
         # Differences over 0.5 s average localisation noise; projected on the heading, sideways noise at a standstill
         # is no speed.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from nurec_sim.errors import ScenarioError
 
@@ -23,7 +24,14 @@ def _whole_states(value: float) -> float:
     return value
 
 
+def _one_speed(speed_mps: float | None, speed_fraction: float | None) -> None:
+    if speed_mps is not None and speed_fraction is not None:
+        raise ValueError("give speed_mps or speed_fraction, not both")
+
+
 Seconds = Annotated[float, AfterValidator(_whole_states)]
+Side = Annotated[float, Field(ge=0.1, le=30)]
+Shade = Annotated[float, Field(ge=0, le=1)]
 
 
 class _Strict(BaseModel):
@@ -75,12 +83,79 @@ class ActorEdit(_Strict):
     brake: Brake | None = None
 
 
+class Move(_Strict):
+    """An added actor changes its speed or its place beside the recorded path, within ``over_s`` from ``at_s`` on.
+
+    The speed changes linearly. Sideways it starts and ends at rest: the lateral speed rises and falls for a quarter of
+    the time each.
+    """
+
+    at_s: float = Field(ge=0, le=MAX_DURATION_S)
+    over_s: float = Field(gt=0, le=MAX_DURATION_S)
+    lateral_m: float | None = Field(None, ge=-50, le=50)
+    speed_mps: float | None = Field(None, ge=-40, le=40)
+    speed_fraction: float | None = Field(None, ge=0, le=3)
+
+    @model_validator(mode="after")
+    def _moves(self) -> Move:
+        _one_speed(self.speed_mps, self.speed_fraction)
+        if self.lateral_m is None and self.speed_mps is None and self.speed_fraction is None:
+            raise ValueError("a move needs lateral_m, speed_mps or speed_fraction")
+        return self
+
+    @property
+    def changes_speed(self) -> bool:
+        """Whether it changes the speed."""
+        return self.speed_mps is not None or self.speed_fraction is not None
+
+
+class AddedActor(_Strict):
+    """An actor that the log does not have, on a path beside the recorded one (``sim.added_actors``).
+
+    At the start of the rollout it is ``along_m`` ahead of where the recorded car is ``ego_at_s`` after the start, and
+    ``lateral_m`` to the left of its path; both are of its centre, from the rear axle. It drives along the path, with a
+    negative speed against it; ``speed_fraction`` is of the recorded car's speed at the same time. Without a speed it
+    stands. ``asset`` is the name of an actor of the procedural towns, or an archive, ``car.usdz`` or
+    ``street.usdz#track``, with the Gaussians of one. ``size_m`` and ``colour`` (0..1) replace those of the asset.
+    """
+
+    asset: str = Field(min_length=1)
+    along_m: float = Field(ge=-200, le=300)
+    lateral_m: float = Field(0.0, ge=-50, le=50)
+    ego_at_s: float = Field(0.0, ge=0, le=MAX_DURATION_S)
+    speed_mps: float | None = Field(None, ge=-40, le=40)
+    speed_fraction: float | None = Field(None, ge=0, le=3)
+    moves: tuple[Move, ...] = ()
+    size_m: tuple[Side, Side, Side] | None = None
+    colour: tuple[Shade, Shade, Shade] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> AddedActor:
+        _one_speed(self.speed_mps, self.speed_fraction)
+        for what, moves in (
+            ("speed", [move for move in self.moves if move.changes_speed]),
+            ("place", [move for move in self.moves if move.lateral_m is not None]),
+        ):
+            for before, after in itertools.pairwise(moves):
+                if after.at_s < before.at_s + before.over_s - 1e-9:
+                    raise ValueError(
+                        f"the move at {after.at_s:g} s changes the {what} before that at {before.at_s:g} s has ended"
+                    )
+        given = [self.speed_mps, *(move.speed_mps for move in self.moves)]
+        fractions = [self.speed_fraction, *(move.speed_fraction for move in self.moves)]
+        signs = {speed > 0 for speed in (*given, *fractions) if speed}
+        if len(signs) > 1:
+            raise ValueError("an added actor cannot turn round: its speeds must have one sign")
+        return self
+
+
 class Scenario(_Strict):
     """One scenario. Every key except ``name`` has a default; durations are multiples of 0.1 s.
 
     ``clip`` is a clip or scene (path or name), optional if given on the command line. ``warm_up_s`` of
     ``duration_s`` follow the log before the policy drives. ``actors`` are edits by track id; ``lead`` is the nearest
-    actor ahead in the lane of the recorded drive when it brakes, or at the start if it does not.
+    actor ahead in the lane of the recorded drive when it brakes, or at the start if it does not. ``added_actors`` are
+    actors that the log does not have, by their track id.
     """
 
     name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")
@@ -95,6 +170,7 @@ class Scenario(_Strict):
     sensors: SensorSettings = SensorSettings()
     perturbation: Perturbation = Perturbation()
     actors: dict[str, ActorEdit] = {}
+    added_actors: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.\-]+$")], AddedActor] = {}
 
     @field_validator("seeds")
     @classmethod
@@ -168,12 +244,15 @@ def _fault(item: Mapping[str, Any]) -> str:
     if item["type"] == "missing":
         return f"key '{key}' is missing"
     text = item["msg"].removeprefix("Value error, ").removeprefix("Input ")
-    return f"key '{key}': {text}, got {item['input']!r}"
+    return f"key '{key}': {text}" + ("" if isinstance(item["input"], dict) else f", got {item['input']!r}")
 
 
 def _fields_at(location: list[str]) -> list[str]:
     """Allowed keys at a location in the file."""
-    parts: dict[str, type[BaseModel]] = {"sensors": SensorSettings, "perturbation": Perturbation, "actors": ActorEdit}
+    parts: dict[str, type[BaseModel]] = {
+        "sensors": SensorSettings, "perturbation": Perturbation, "actors": ActorEdit, "added_actors": AddedActor,
+    }  # fmt: skip
     model = parts.get(location[0], Scenario) if location else Scenario
     model = Brake if location[-1:] == ["brake"] else model
+    model = Move if "moves" in location else model
     return sorted(model.model_fields)

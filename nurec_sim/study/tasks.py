@@ -21,13 +21,14 @@ from typing import Any
 import numpy as np
 
 from nurec_sim import logs
-from nurec_sim.errors import NurecSimError, ReconstructError
+from nurec_sim.errors import NurecSimError, ReconstructError, ScenarioError
 from nurec_sim.files.new_files import write_file
 from nurec_sim.metrics.aggregate import rollout_values
 from nurec_sim.metrics.score import score_rollout
 from nurec_sim.metrics.table import metric_table
 from nurec_sim.render.support import Support, recorded_frames
 from nurec_sim.runs import folder as layout
+from nurec_sim.runs.added_actors import AddedActors, added_actors
 from nurec_sim.runs.common_truth import with_common_truth
 from nurec_sim.runs.drive import RolloutJob, drive_job
 from nurec_sim.runs.policies import load_policies
@@ -36,7 +37,7 @@ from nurec_sim.runs.scene_file import SceneRecord, record_scene, save_scene_reco
 from nurec_sim.runs.seen_support import load_support
 from nurec_sim.runs.truth import TRUTH
 from nurec_sim.scene import read_scene, write_scene
-from nurec_sim.sim import load_scenario
+from nurec_sim.sim import load_scenario, scenario_file
 from nurec_sim.study.config import Family, StudyConfig, control_name
 from nurec_sim.study.controls import CONTROLS
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene, Rollout, Sense, SensorFrame, SensorRequest
@@ -146,8 +147,15 @@ def drive(task: Task) -> list[str]:
     """Drives all policies and trials in one world, and scores them; returns a message for each failure."""
     messages: list[str] = []
     config, base = task.config, load_scenario(task.family.scenario)
-    facts = facts_of(task)
-    with _world(task, facts) as (scene, sense, support):
+    log_facts = facts_of(task)
+    try:
+        added = added_actors(base, log_facts, scenario_file(task.family.scenario).parent)
+    except ScenarioError as error:
+        # Its rollouts fail, as rows of the study: they lack the actors.
+        added = AddedActors()
+        messages.append(f"{task.title}: {error}")
+    facts = added.in_facts(log_facts)
+    with _world(task, log_facts, added) as (scene, sense, support):
         record = dataclasses.replace(record_scene(scene), place=config.all_worlds.index(task.world))
         save_scene_record(record, task.world_folder)
         policies = load_policies(config.policies)
@@ -183,14 +191,22 @@ def facts_of(task: Task) -> GaussianScene:
 
 
 @contextmanager
-def _world(task: Task, facts: GaussianScene) -> Iterator[tuple[GaussianScene, Sense, Support | None]]:
-    """The scene of a world with the facts of the log, what renders it, and the support of a reconstruction."""
+def _world(
+    task: Task, facts: GaussianScene, added: AddedActors
+) -> Iterator[tuple[GaussianScene, Sense, Support | None]]:
+    """The scene of a world with the facts of the log, what renders it, and the support of a reconstruction.
+
+    Args:
+        task: which world.
+        facts: of the log.
+        added: actors of the scenario, which all worlds get.
+    """
     if task.world == TRUTH:
         from nurec_sim.world import TownPlan, TrueWorld
 
         plan = TownPlan.from_json((task.scene_folder / PLAN).read_text(encoding="utf-8"))
-        with TrueWorld(plan) as town:
-            yield facts, town.sense, None
+        with TrueWorld(added.in_town(plan)) as town:
+            yield added.in_facts(facts), town.sense, None
         return
     from nurec_sim.render import make_renderer
 
@@ -198,10 +214,10 @@ def _world(task: Task, facts: GaussianScene) -> Iterator[tuple[GaussianScene, Se
     named = {**facts.provenance, "method": source.world, "reconstruction": task.world}
     if not source.archive.exists():
         text = source.error_file.read_text(encoding="utf-8").strip()
-        yield dataclasses.replace(facts, provenance=named), _failing(text), None
+        yield dataclasses.replace(added.in_facts(facts), provenance=named), _failing(text), None
         return
     scene = read_scene(source.archive)
-    scene = with_common_truth([facts, scene])[1]
+    scene = added.in_scene(with_common_truth([facts, scene])[1])
     if corruption is not None:
         scene = CONTROLS[corruption](scene)
     scene = dataclasses.replace(scene, provenance={**scene.provenance, **named})

@@ -9,6 +9,7 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__,
     submod_attrs={
+        "assets.actor_gaussians": ["ACTOR_SIZES_M", "actor_gaussians"],
         "model.assemble": ["Town", "build_town"],
         "plan.layout": ["town_plan"],
         "plan.network": ["TownNetwork"],
@@ -16,7 +17,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "plan.rig": ["LIDAR_ID", "street_rig"],
         "plan.road": ["RoadLine"],
         "plan.surface": ["LABEL_OF_CLASS", "SurfaceClass"],
-        "plan.town": ["Actor", "Building", "Prop", "Road", "RoadPiece", "TownPlan"],
+        "plan.town": ["LABEL_OF_KIND", "Actor", "Building", "Prop", "Road", "RoadPiece", "TownPlan"],
         "sense.backend": ["BACKENDS", "pick_backend"],
         "sense.isp": ["CameraResponse", "apply_response", "random_response"],
         "sense.scan": ["LidarResponse", "TrueScan"],

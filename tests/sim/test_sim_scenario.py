@@ -42,7 +42,7 @@ def test_a_scenario_survives_writing_and_reading():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("name: a\nduraton_s: 3\n", "unknown key 'duraton_s'; allowed: actors, clip, controller, duration_s"),
+        ("name: a\nduraton_s: 3\n", "unknown key 'duraton_s'; allowed: actors, added_actors, clip, controller"),
         ("name: a\nsensors: {fps: 3}\n", "unknown key 'sensors.fps'; allowed: image_width_px, interval_s"),
         ("name: a\nactors: {'7': {jump: 1}}\n", "unknown key 'actors.7.jump'; allowed: brake, delay_s, hide, shift_m"),
         (

@@ -15,6 +15,8 @@ from nurec_sim.world.assets.textures_people import band_uv
 HEIGHT_M = 1.76
 HIP_M, KNEE_M, SHOULDER_M, ELBOW_M = 0.92, 0.46, 1.44, 0.29
 """Heights of hip and shoulder; lengths of thigh and upper arm."""
+LEAN_RAD = 0.55
+"""Forward lean of cyclists."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,15 @@ LIMBS = tuple(
         Limb(f"{side}_forearm", f"{side}_arm", (0.0, y * 0.015, -ELBOW_M)),
     )
 )
+
+
+def leaning_joint(limb: Limb, lean_rad: float) -> tuple[float, float, float]:
+    """A limb's joint in its parent's frame; shoulders move with the trunk, which leans forward about the hip."""
+    x, y, z = limb.joint
+    if limb.parent or not limb.name.endswith("_arm"):
+        return x, y, z
+    up = z - HIP_M
+    return up * float(np.sin(lean_rad)), y, HIP_M + up * float(np.cos(lean_rad))
 
 
 def walking_angles(phase_rad: float, stride: float) -> dict[str, float]:

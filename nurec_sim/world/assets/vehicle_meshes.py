@@ -12,6 +12,8 @@ from nurec_sim.world.assets.vehicle_families import FAMILIES, Family
 
 PARTS = ("paint", "glass", "wheel", "headlight", "taillight", "plate", "cargo")
 """``wheel`` also contains trim and bumpers, which share the dark material."""
+LASER_OF_PART = {"taillight": 0.9, "headlight": 0.8, "plate": 0.95, "glass": 0.1, "wheel": 0.2}
+"""Fraction of a laser's light that a part reflects; the others reflect as ``SurfaceClass.VEHICLE`` does."""
 RUBBER = 0.02
 """The first corner of the wheel texture is uniform."""
 MIRROR_M = 0.075

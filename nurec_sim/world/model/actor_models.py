@@ -12,17 +12,14 @@ from jaxtyping import Float64
 from nurec_sim.world.assets import people, textures_ground, textures_people, textures_vehicles
 from nurec_sim.world.assets.meshes import Corners, MeshBuilder
 from nurec_sim.world.assets.vehicle_families import FAMILIES
-from nurec_sim.world.assets.vehicle_meshes import vehicle_parts
+from nurec_sim.world.assets.vehicle_meshes import LASER_OF_PART, vehicle_parts
 from nurec_sim.world.model.builder import SpecBuilder
 from nurec_sim.world.plan.surface import SurfaceClass
 from nurec_sim.world.plan.town import Actor, TownPlan
 
-LASER_OF_PART = {"taillight": 0.9, "headlight": 0.8, "plate": 0.95, "glass": 0.1, "wheel": 0.2}
 STRIDE_M, BRISK_MPS = 1.45, 1.4
 PEDAL_TURN_M = 5.0
 SMOOTH_DEG = 70.0
-LEAN_RAD = 0.55
-"""Forward lean of cyclists."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +108,7 @@ class ActorBuilder:
         cloth = f"person{instance}"
         self.builder.material(cloth, textures_people.person(rng, actor.colour))
         scale = actor.size_m[2] / people.HEIGHT_M
-        foot, bare, lean = -actor.size_m[2] / 2, rng.random() < 0.3, LEAN_RAD if rides else 0.0
+        foot, bare, lean = -actor.size_m[2] / 2, rng.random() < 0.3, people.LEAN_RAD if rides else 0.0
 
         def place(where: Any, corners: Corners, material: str, tint: tuple[float, ...] = (1.0, 1.0, 1.0)) -> None:
             """Adds a part of the person, scaled to their height.
@@ -130,11 +127,7 @@ class ActorBuilder:
         place(trunk, upper.corners(SMOOTH_DEG), cloth)
         bodies, joints = {"": trunk}, {}
         for limb in people.LIMBS:
-            x, y, z = limb.joint
-            if rides and limb.name.endswith("_arm"):
-                # Shoulders move with the trunk, which leans forward about the hip.
-                up = z - people.HIP_M
-                x, z = up * np.sin(lean), people.HIP_M + up * np.cos(lean)
+            x, y, z = people.leaning_joint(limb, lean)
             part = _rigid(bodies[limb.parent], [x * scale, y * scale, z * scale])
             hinge = part.add_joint(name=f"{actor.id}_{limb.name}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
             # All people share the meshes of limbs, with long or short clothes.
