@@ -147,7 +147,7 @@ def test_a_demo_log_is_not_written_elsewhere(tmp_path: Path, name: str, text: st
     ("arguments", "text"),
     [
         (["serve", "nowhere.usdz"], "nothing to serve: nowhere.usdz does not exist"),
-        (["run", "--scenario", "nope"], "no scenario named 'nope'; have ['demo', 'hard_brake', 'short'"),
+        (["run", "--scenario", "nope"], "no scenario named 'nope'; have ['cut_in', 'demo', 'hard_brake', 'pedestrian'"),
         (["run", "--scenario", "short"], "has no clip"),
         (["demo", "--refine", "0"], "--refine: seconds must be positive and finite, got 0.0"),
         (["run", "--scenario", "demo", "--refine", "5", "--address", "127.0.0.1:9"], "--refine cannot be used with"),

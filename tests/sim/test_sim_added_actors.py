@@ -60,6 +60,8 @@ def test_a_car_leans_with_the_hill_and_follows_a_better_ground():
 
 def test_the_path_goes_on_straight_where_the_recording_ends_and_when_it_stands():
     assert path({"along_m": 75, "lateral_m": 2}, body=PERSON)(0.0)[0][:2, 3] == pytest.approx([75, 2], abs=1e-6)
+    uphill = path({"along_m": 80}, worlds.hill(slope=0.1))(0.0)[0]  # 20 m beyond the end
+    assert uphill[:3, 3] == pytest.approx([80 - 0.0746, 0, 8 + 0.746], abs=1e-3)
     ahead = path({"along_m": 200}, worlds.straight_road(duration_s=6))(0.0)[0]
     assert ahead[:2, 3] == pytest.approx([200, 0], abs=1e-6)
     still = path({"along_m": 20, "lateral_m": 3}, worlds.standing(6.0))(0.0)[0]

@@ -71,5 +71,7 @@ def test_faults_are_named_with_file_and_key(tmp_path, text, said):
 def test_missing_files_and_names():
     with pytest.raises(ScenarioError, match=r"scenario file 'nowhere.yaml' does not exist"):
         load_scenario("nowhere.yaml")
-    with pytest.raises(ScenarioError, match=r"no scenario named 'nowhere'; have \['demo', 'hard_brake', 'short'"):
+    with pytest.raises(
+        ScenarioError, match=r"no scenario named 'nowhere'; have \['cut_in', 'demo', 'hard_brake', 'pedestrian'"
+    ):
         load_scenario("nowhere")

@@ -60,6 +60,23 @@ def test_finished_rollouts_are_not_driven_again(street, monkeypatch):
     assert (task.world_folder / "values.parquet").read_bytes() == before
 
 
+def test_worlds_get_the_actors_that_a_scenario_adds(street, tmp_path):
+    """A standing van is hit by who does not look; where there is no room for it, rollouts fail and say so."""
+    task, scene = street
+    write_scene(scene, task.archive)
+    for along_m, said in ((14.0, []), (4.0, ["'van' is in the place of the recorded car"])):
+        file = tmp_path / f"van{along_m:g}.yaml"
+        file.write_text("{name: van, duration_s: 3, added_actors: {van: {asset: van, along_m: %g}}}" % along_m)
+        family = task.family.model_copy(update={"scenario": str(file)})
+        messages = drive(dataclasses.replace(task, family=family))
+        values = values_of(task).filter(pl.col("policy") == "constant_velocity")
+        if said:
+            assert said[0] in messages[0] and set(values["status"]) == {"failed"}
+        else:
+            hit = values.filter(pl.col("name") == "collision_any")
+            assert not messages and set(values["status"]) == {"ok"} and hit["value"].to_list() == [1.0]
+
+
 def test_controls_only_spoil_what_is_rendered():
     scene, _ = flat_street()
     for name, control in CONTROLS.items():
