@@ -66,7 +66,7 @@ def test_worlds_get_the_actors_that_a_scenario_adds(street, tmp_path):
     write_scene(scene, task.archive)
     for along_m, said in ((14.0, []), (4.0, ["'van' is in the place of the recorded car"])):
         file = tmp_path / f"van{along_m:g}.yaml"
-        file.write_text("{name: van, duration_s: 3, added_actors: {van: {asset: van, along_m: %g}}}" % along_m)
+        file.write_text(f"name: van\nduration_s: 3\nadded_actors: {{van: {{asset: van, along_m: {along_m}}}}}\n")
         family = task.family.model_copy(update={"scenario": str(file)})
         messages = drive(dataclasses.replace(task, family=family))
         values = values_of(task).filter(pl.col("policy") == "constant_velocity")
