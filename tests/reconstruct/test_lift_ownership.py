@@ -1,9 +1,19 @@
 """Which lifted points stay: views along a straight drive, with the sky or a surface behind the points."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from nurec_sim.reconstruct.lift.lifting import FARTHER, OWNER_BORDER, OWNER_RING, owned
+from nurec_sim import geometry
+from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels
+from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.ground import Ground
+from nurec_sim.reconstruct.lift.lifting import FARTHER, OWNER_BORDER, OWNER_RING, Lifted, owned, owning
+from nurec_sim.reconstruct.lift.pictures import DepthPicture
+from nurec_sim.reconstruct.lift.points import Cloud
+from nurec_sim.reconstruct.lift.settings import LiftSettings
+from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 
 SIZE, FOCAL = (96, 64), 80.0
 TOLERANCE = 0.001
@@ -24,8 +34,8 @@ def kept(depth_m, seen_m, back_m, matched):
     packed = np.stack([view_at(back) for back in (0.0, *back_m)])
     one = np.array([[0.2, -0.1, depth_m]]), np.array([depth_m]), np.zeros(1, np.int32), np.array([matched])
     rgb, pictures = np.full((1, 3), 90, np.float32), np.full((count, SIZE[1], SIZE[0], 3), 90, np.uint8)
-    present = np.ones(count, bool)
-    return bool(owned(*one, rgb, packed, inverse, pictures, present, TOLERANCE, OWNER_RING, OWNER_BORDER)[0])
+    present, owns = np.ones(count, bool), np.ones(inverse.shape, bool)
+    return bool(owned(*one, rgb, packed, inverse, owns, pictures, present, TOLERANCE, OWNER_RING, OWNER_BORDER)[0])
 
 
 SKY_M = np.inf
@@ -50,3 +60,51 @@ def test_a_matched_point_that_another_view_agrees_with_is_not_judged_from_afar(a
 
 def test_a_matched_point_behind_what_other_views_see_stays():
     assert kept(5.0, [4.0], [10.0], matched=True)
+
+
+def test_two_views_that_leave_a_surface_to_each_other_both_keep_it():
+    """Rings of distance end at exp(2.3) = 9.97 m. The second view is 0.3 m ahead of the first.
+
+    What the first sees at 10.0 m is at 9.7 m for the second, one ring nearer, which hence owns it. What the second sees
+    at 9.4 m is at 9.7 m for the first, in the same ring, and the first of two views owns.
+    """
+    shape, turn = (8, 8), np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    tile = Tile(8, 8, 16.0, (4.0, 4.0), np.eye(3), 1, None, np.ones(shape, bool), np.zeros(3))
+    rgb = np.full((*shape, 3), 99, np.uint8)
+    views = [
+        WorkingView("front", k, 1_000_000, True, tile, geometry.pose(turn, np.array([ahead_m, 0, 0])), np.zeros(3), rgb)
+        for k, ahead_m in enumerate((0.0, 0.3))
+    ]
+    nothing = np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)
+    body = Surfels(None, Cloud.empty(), *nothing)
+    none = np.zeros((4, 4), bool)
+    ground = Ground(np.zeros(2), 0.1, np.zeros((4, 4), np.float32), none, none, none, np.ones((4, 4), np.uint8))
+    settings = LiftSettings(opacity=0.5)
+
+    def centres(first_m, second_m):
+        pictures = [
+            DepthPicture(
+                np.full(shape, 1 / m, np.float32),
+                np.zeros(shape, np.int32),
+                np.full(shape, -1, np.int32),
+                *np.zeros((2, *shape), bool),
+            )  # fmt: skip
+            for m in (first_m, second_m)
+        ]
+        pixels = body_pixels([body], views, pictures, [rgb] * 2, settings)[0]
+        gaussians, _ = body_gaussians(body, pixels, ground, views, pictures, [rgb] * 2, settings)
+        middle = (np.abs(gaussians.mean_m[:, 1:]) < 0.5).all(axis=1)
+        return sorted({round(float(x), 1) for x in gaussians.mean_m[middle, 0]})
+
+    assert centres(10.0, 9.4) == [9.7, 10.0]
+    assert centres(10.3, 10.0) == [10.3], "both in the same ring: the first owns, once"
+
+
+def test_pixels_near_a_kept_one_own_and_those_of_other_bodies_do():
+    """Of a row of nine pixels body 0 shows six; the first and the fifth were lifted, the fifth was kept."""
+    body = np.array([[0, 0, 0, 0, 0, 0, 3, 3, 3]], np.int32)
+    two = Lifted.concatenate([Lifted.empty()])
+    two = dataclasses.replace(two, xyz_m=np.zeros((2, 3)), view=np.zeros(2, np.int32), pixel=np.array([0, 4], np.int32))
+    masks = owning([body, body], two, np.array([False, True]), 1)
+    assert masks[0].astype(int).tolist() == [[0, 0, 0, 1, 1, 1, 1, 1, 1]]
+    assert masks[1].astype(int).tolist() == [[0, 0, 0, 0, 0, 0, 1, 1, 1]]

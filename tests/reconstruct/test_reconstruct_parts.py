@@ -1,5 +1,6 @@
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -226,6 +227,15 @@ def test_measured_depth_stays():
 @pytest.mark.parametrize("thinning", [1, 2, 4, 8, 16])
 def test_lattice_keeps_its_share(thinning):
     assert lifting.lattice((64, 64), thinning).mean() == pytest.approx(1 / thinning)
+
+
+@pytest.mark.parametrize(("thinning", "reach"), [(1, 0), (2, 1), (4, 1), (8, 2), (16, 2), (32, 4)])
+def test_reach_of_a_lattice_covers_every_pixel_and_is_no_longer(thinning, reach):
+    assert lifting.lattice_reach(thinning) == reach
+    for tried, covers in ((reach, True), (reach - 1, False)):
+        around = np.ones((2 * tried + 1, 2 * tried + 1) if tried >= 0 else (1, 1), np.uint8)
+        near = cv2.dilate(lifting.lattice((64, 64), thinning).astype(np.uint8), around)[16:48, 16:48]
+        assert tried < 0 or near.all() == covers
 
 
 def test_isp_of_cameras_that_share_points():

@@ -69,17 +69,17 @@ def test_a_rim_that_looks_like_what_lies_behind_it_is_trimmed(grey, kept):
 # ------------------------------------------------------------------------------------------------------------- owning
 
 
-def owned(views, own_view=0, own_rgb=100.0, depth_m=10.0):
+def owned(views, own_view=0, own_rgb=100.0, depth_m=10.0, owning=True):
     """Whether a point 10 m ahead, which its own view saw at ``depth_m``, stays, and its colour.
 
-    Views are (metres behind the origin, inverse depth seen, grey shown).
+    Views are (metres behind the origin, inverse depth seen, grey shown); they may own or not.
     """
     packed = np.stack([looking_ahead(behind_m) for behind_m, _, _ in views])
     inverse_depth = np.stack([np.full((9, 9), w, np.float32) for _, w, _ in views])
     pictures = np.stack([np.full((9, 9, 3), grey, np.uint8) for _, _, grey in views])
-    rgb = np.full((1, 3), own_rgb, np.float32)
+    rgb, owns = np.full((1, 3), own_rgb, np.float32), np.full(inverse_depth.shape, owning)
     one = np.array([[0.0, 0.0, 10.0]]), np.array([depth_m]), np.array([own_view], np.int32), np.zeros(1, bool)
-    keep = lifting.owned(*one, rgb, packed, inverse_depth, pictures, np.ones(len(views), bool), 0.002,
+    keep = lifting.owned(*one, rgb, packed, inverse_depth, owns, pictures, np.ones(len(views), bool), 0.002,
                          lifting.OWNER_RING, lifting.OWNER_BORDER)  # fmt: skip
     return bool(keep[0]), rgb[0, 0]
 
@@ -101,6 +101,12 @@ def test_the_nearest_view_owns_a_surface_and_of_equally_near_ones_the_first():
     assert not owned([AGREES, (-2.0, 1 / 8, 100)], own_view=0)[0]
     assert owned([(2.0, 1 / 12, 100), AGREES], own_view=1)[0]
     assert not owned([(0.4, 1 / 10.4, 100), AGREES], own_view=1)[0]
+
+
+def test_a_view_whose_pixel_is_gone_agrees_and_owns_nothing():
+    nearer = (-2.0, 1 / 8, 100)
+    assert not owned([AGREES, nearer])[0] and owned([AGREES, nearer], owning=False)[0]
+    assert owned([AGREES, nearer, THROUGH, nearer], owning=False)[0]
 
 
 def test_other_views_mix_into_a_colour_with_three_tenths_of_its_weight():

@@ -90,8 +90,7 @@ def body_pixels(
         Lifted points per body, in the order of ``bodies``.
     """
     parts = [[Lifted.empty()] for _ in bodies]
-    pixels = sum(view.rgb.shape[0] * view.rgb.shape[1] for view in views)
-    thinning = 2 ** max(0, int(np.ceil(np.log2(max(KEPT_SHARE * pixels / settings.views.budget, 1)))))
+    thinning = _thinning(views, settings)
 
     def lift(k: int) -> list[tuple[int, Lifted]]:
         view, picture = views[k], pictures[k]
@@ -127,6 +126,12 @@ def body_pixels(
     return [Lifted.concatenate(each) for each in parts]
 
 
+def _thinning(views: Sequence[WorkingView], settings: LiftSettings) -> int:
+    """One pixel in how many is lifted."""
+    pixels = sum(view.rgb.shape[0] * view.rgb.shape[1] for view in views)
+    return 2 ** max(0, int(np.ceil(np.log2(max(KEPT_SHARE * pixels / settings.views.budget, 1)))))
+
+
 def body_gaussians(
     body: Surfels,
     pixels: Lifted,
@@ -152,11 +157,15 @@ def body_gaussians(
     stays = _owned(pixels, body, views, pictures, rgb, settings)
     shown, dropped = outside_free_space(pixels[stays], body, ground, settings, beams)
     parts = [shown]
-    if len(dropped):
-        # Where a pixel's depth is wrong, those of other views take over, and the surfels behind it.
-        pictures = marked_free(pictures, pixels, dropped)
+    # Where a pixel's depth is wrong, those of other views take over, and the surfels behind it.
+    pictures = marked_free(pictures, pixels, dropped)
+    if not stays.all():
+        # Along grazing ground rings of distance are a few pixels wide, so that each of two views may leave a surface to
+        # the other. In the end only pixels that are still there own.
+        reach = lifting.lattice_reach(_thinning(views, settings))
+        owns = lifting.owning([picture.body for picture in pictures], pixels, stays, reach)
         rest = pixels[~stays]
-        rest = rest[_owned(rest, body, views, pictures, rgb, settings)]
+        rest = rest[_owned(rest, body, views, pictures, rgb, settings, owns)]
         parts.append(outside_free_space(rest, body, ground, settings, beams)[0])
     cloud = body.cloud
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
@@ -176,14 +185,19 @@ def _owned(
     pictures: Sequence[DepthPicture],
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,
+    owns: Sequence[np.ndarray] | None = None,
 ) -> np.ndarray:
-    """Which pixels of a body no other view owns; those of wrong depth (``DepthPicture.free``) own nothing."""
+    """Which pixels of a body no other view owns; those of wrong depth (``DepthPicture.free``) own nothing.
+
+    ``owns`` says which pixels of each view may own; None: all.
+    """
     if not len(everything):
         return np.zeros(0, bool)
     packed, present = _packed(views, body)
     step = 1 / settings.views.min_depth_m / (settings.views.levels - 1)
     depths = [np.where(picture.free, np.float32(np.nan), picture.inverse_depth) for picture in pictures]
     depth_stack, rgb_stack = lifting.stacked(depths), lifting.stacked(rgb)
+    owner_stack = np.ones(depth_stack.shape, bool) if owns is None else lifting.stacked(owns)
     # Boxes are not exact enough to tell from afar whether a view looks through an actor.
     matched = (everything.surfel < 0) & (body.actor is None)
     kept = in_order(
@@ -195,6 +209,7 @@ def _owned(
             everything.rgb[part],
             packed,
             depth_stack,
+            owner_stack,
             rgb_stack,
             present,
             0.3 * step,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
@@ -110,7 +111,7 @@ def normals_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> 
 
 
 @kernel
-def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, pictures, present, tolerance, ring, border):
+def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictures, present, tolerance, ring, border):
     """Which points no other view owns, and that few views look through.
 
     The owner of a surface is the view in the nearest ring of distance, rings growing by the factor ``exp(ring)``, and
@@ -129,6 +130,7 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, pictures, p
             weighted by nearness, which evens out exposure drift and reflections.
         packed: [k,23] projections from the points' frame into the views.
         inverse_depth: [k,h,w] of the views, 1/m; NaN where a pixel is masked.
+        owns: [k,h,w] pixels of the views that may own; the others only agree or look through.
         pictures: [k,h,w,3] colours of the views, 0..255.
         present: [k] whether the body is there at each view's time.
         tolerance: 1/m, see above.
@@ -165,7 +167,8 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, pictures, p
                 agree += 1
                 margin = border * view[3]
                 inside = margin < u < view[3] - margin and 0.5 * margin < v < view[4] - 0.5 * margin
-                if inside and (np.floor(np.log(z) / ring), k) < (own_ring, own_view[i]):
+                owner = inside and owns[k, int(v), int(u)]
+                if owner and (np.floor(np.log(z) / ring), k) < (own_ring, own_view[i]):
                     keep[i] = False
                     break
                 # Views from farther resolve the surface less: by the area of their pixels on it.
@@ -189,6 +192,35 @@ def lattice(shape: tuple[int, int], thinning: int) -> Bool[np.ndarray, "h w"]:
         row, column, thinning = np.where(row % 2, -1, row // 2), np.where(column % 2, -1, column // 2), thinning // 4
     mask = (row >= 0) & (column >= 0)
     return mask & ((row + column) % 2 == 0) if thinning == 2 else mask
+
+
+def lattice_reach(thinning: int) -> int:
+    """Distance from any pixel to the nearest one of the ``lattice``, in rows or columns, whichever is larger."""
+    doublings = int(thinning).bit_length() - 1
+    spacing = 2 ** (doublings // 2)
+    return spacing if doublings % 2 else spacing // 2
+
+
+def owning(
+    bodies: Sequence[Int32[np.ndarray, "h w"]], pixels: Lifted, kept: Bool[np.ndarray, " n"], reach: int
+) -> list[Bool[np.ndarray, "h w"]]:
+    """Pixels of each view that own: of this body those near a lifted pixel that was kept, of other bodies all.
+
+    Args:
+        bodies: of each view: the body that each pixel shows.
+        pixels: all lifted pixels of one body.
+        kept: which of them are still there.
+        reach: how far a kept pixel stands for those around it, in pixels (``lattice_reach``).
+    """
+    masks, number = [], None
+    if len(pixels):
+        number = bodies[pixels.view[0]].flat[pixels.pixel[0]]
+    for k, body in enumerate(bodies):
+        here = np.zeros(body.shape, np.uint8)
+        here.flat[pixels.pixel[kept & (pixels.view == k)]] = 1
+        here = cv2.dilate(here, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+        masks.append((body != number) | (here > 0))
+    return masks
 
 
 def stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
