@@ -62,17 +62,19 @@ def test_a_matched_point_behind_what_other_views_see_stays():
     assert kept(5.0, [4.0], [10.0], matched=True)
 
 
-def test_two_views_that_leave_a_surface_to_each_other_both_keep_it():
-    """Rings of distance end at exp(2.3) = 9.97 m. The second view is 0.3 m ahead of the first.
+def test_two_views_that_leave_level_ground_to_each_other_both_keep_it():
+    """Rings of distance end at exp(2.3) = 9.97 m. Both views look down, the second from 0.3 m lower.
 
     What the first sees at 10.0 m is at 9.7 m for the second, one ring nearer, which hence owns it. What the second sees
     at 9.4 m is at 9.7 m for the first, in the same ring, and the first of two views owns.
     """
-    shape, turn = (8, 8), np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    shape, turn = (8, 8), np.diag([1.0, -1.0, -1.0])
     tile = Tile(8, 8, 16.0, (4.0, 4.0), np.eye(3), 1, None, np.ones(shape, bool), np.zeros(3))
     rgb = np.full((*shape, 3), 99, np.uint8)
     views = [
-        WorkingView("front", k, 1_000_000, True, tile, geometry.pose(turn, np.array([ahead_m, 0, 0])), np.zeros(3), rgb)
+        WorkingView(
+            "front", k, 1_000_000, True, tile, geometry.pose(turn, np.array([0, 0, -ahead_m])), np.zeros(3), rgb
+        )
         for k, ahead_m in enumerate((0.0, 0.3))
     ]
     nothing = np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)
@@ -93,8 +95,8 @@ def test_two_views_that_leave_a_surface_to_each_other_both_keep_it():
         ]
         pixels = body_pixels([body], views, pictures, [rgb] * 2, settings)[0]
         gaussians, _ = body_gaussians(body, pixels, ground, views, pictures, [rgb] * 2, settings)
-        middle = (np.abs(gaussians.mean_m[:, 1:]) < 0.5).all(axis=1)
-        return sorted({round(float(x), 1) for x in gaussians.mean_m[middle, 0]})
+        middle = (np.abs(gaussians.mean_m[:, :2]) < 0.5).all(axis=1)
+        return sorted({round(-float(z), 1) for z in gaussians.mean_m[middle, 2]})
 
     assert centres(10.0, 9.4) == [9.7, 10.0]
     assert centres(10.3, 10.0) == [10.3], "both in the same ring: the first owns, once"

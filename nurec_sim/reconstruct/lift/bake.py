@@ -11,7 +11,7 @@ from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.free_space import SweepBeams
 from nurec_sim.reconstruct.lift import colour, lifting, surfaces
 from nurec_sim.reconstruct.lift.bodies import Surfels
-from nurec_sim.reconstruct.lift.footprints import marked_free, outside_free_space, parts_of
+from nurec_sim.reconstruct.lift.footprints import marked_free, on_level, outside_free_space, parts_of
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
@@ -159,14 +159,19 @@ def body_gaussians(
     parts = [shown]
     # Where a pixel's depth is wrong, those of other views take over, and the surfels behind it.
     pictures = marked_free(pictures, pixels, dropped)
-    if not stays.all():
+    rest = pixels[~stays]
+    taken = _owned(rest, body, views, pictures, rgb, settings) if len(dropped) else np.zeros(len(rest), bool)
+    more = [rest[taken]]
+    if body.actor is None:
         # Along grazing ground rings of distance are a few pixels wide, so that each of two views may leave a surface to
-        # the other. In the end only pixels that are still there own.
+        # the other. There in the end only pixels that are still there own.
+        stays[~stays] = taken
         reach = lifting.lattice_reach(_thinning(views, settings))
         owns = lifting.owning([picture.body for picture in pictures], pixels, stays, reach)
-        rest = pixels[~stays]
-        rest = rest[_owned(rest, body, views, pictures, rgb, settings, owns)]
-        parts.append(outside_free_space(rest, body, ground, settings, beams)[0])
+        left = rest[~taken]
+        left = left[on_level(left, ground)]
+        more.append(left[_owned(left, body, views, pictures, rgb, settings, owns)])
+    parts.append(outside_free_space(Lifted.concatenate(more), body, ground, settings, beams)[0])
     cloud = body.cloud
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
     # A view replaces surfels by its pixels unless it sees them so obliquely that surfels are the finer of the two.

@@ -108,6 +108,11 @@ def on_ground(lifted: Lifted, ground: Ground) -> Lifted:
     )[(np.abs(ground.above(xyz)) < GROUND_M) & (depth > 0)]
 
 
+def on_level(lifted: Lifted, ground: Ground) -> Bool[np.ndarray, " n"]:
+    """Lifted points on the ground, or on a surface within 14 degrees of level."""
+    return (np.abs(ground.above(lifted.xyz_m)) < GROUND_M) | (lifted.normal[:, 2] > LEVEL)
+
+
 def parts_of(count: int) -> list[slice]:
     """Rows 0..count in parts for threads."""
     return [slice(start, min(start + PART, count)) for start in range(0, count, PART)]
@@ -142,9 +147,7 @@ def _footprints(
         intensity = np.where(from_surfel, body.cloud.intensity[lifted.surfel], intensity)
     stretch = np.full(n, surfaces.MOST_STRETCH)
     if body.actor is None:
-        flat = np.abs(ground.above(lifted.xyz_m)) < GROUND_M
-        flat |= lifted.normal[:, 2] > LEVEL
-        stretch = np.where(flat, surfaces.MOST_STRETCH_OF_GROUND, stretch)
+        stretch = np.where(on_level(lifted, ground), surfaces.MOST_STRETCH_OF_GROUND, stretch)
         label = np.where(~from_surfel & ground.is_road(lifted.xyz_m), Label.ROAD, label)
     return surfaces.footprints(lifted.xyz_m, lifted.normal, lifted.ray, lifted.pixel_m, lifted.rgb / 255, intensity,
                                label, settings.opacity, np.minimum(stretch, most_stretch))  # fmt: skip
