@@ -218,8 +218,8 @@ def owning(
     for k, body in enumerate(bodies):
         here = np.zeros(body.shape, np.uint8)
         here.flat[pixels.pixel[kept & (pixels.view == k)]] = 1
-        here = cv2.dilate(here, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
-        masks.append((body != number) | (here > 0))
+        around = cv2.dilate(here, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+        masks.append((body != number) | (around > 0))
     return masks
 
 
