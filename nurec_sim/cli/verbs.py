@@ -32,8 +32,8 @@ from nurec_sim.cli.console import app, err
 from nurec_sim.errors import NurecSimError
 
 KEPT = {
-    "run": "finished rollouts are kept: resume with --resume runs/latest (or your run folder)",
-    "demo": "finished rollouts are kept: resume with --resume runs/latest (or your run folder)",
+    "run": "finished rollouts are kept: if there are any, resume with --resume runs/latest (or your run folder)",
+    "demo": "finished rollouts are kept: if there are any, resume with --resume runs/latest (or your run folder)",
     "study": "finished rollouts are kept: give the same command again",
     "evaluate": "finished windows of a protocol are kept: resume with --resume evaluations/latest (or your run folder)",
 }
