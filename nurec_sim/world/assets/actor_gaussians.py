@@ -50,19 +50,19 @@ class _Surface:
     laser: float
 
 
-def actor_gaussians(kind: str, size_m: Size, colour: Colour, seed: int = 0) -> Gaussians:
+def actor_gaussians(kind: str, size_m: Size, colour: Colour) -> Gaussians:
     """The Gaussians of an actor in its box frame: x forward, y left, z up, origin at the centre of the box.
 
     Args:
         kind: one of ``ACTOR_SIZES_M``.
         size_m: length, width and height of its box; vehicles fill it.
         colour: of paint or shirt, 0..1.
-        seed: of textures, hair and clothes.
 
     Raises:
         ValueError: no such kind.
     """
-    rng = np.random.default_rng([seed, *kind.encode()])
+    # Of textures, hair and clothes.
+    rng = np.random.default_rng([0, *kind.encode()])
     person = kind in ("pedestrian", "cyclist")
     surfaces = _person(rng, kind, size_m, colour) if person else _vehicle(rng, kind, size_m, colour)
     spacing = float(np.clip(SPACING_SHARE * max(size_m), *SPACING_M))
