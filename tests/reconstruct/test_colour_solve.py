@@ -11,7 +11,8 @@ from nurec_sim.reconstruct import ColourSettings, LiftSettings, ViewSettings, re
 from nurec_sim.reconstruct.lift import colour_solve
 from nurec_sim.render import CpuRenderer
 from nurec_sim.scene import scene_hash
-from nurec_sim.types import Gaussians, SensorRequest
+from nurec_sim.scene.usd.dome_texture import sample_cubemap
+from nurec_sim.types import DynamicGaussians, Gaussians, Pinhole, SensorRequest
 
 SETTINGS = LiftSettings(sky_px=32, views=ViewSettings(levels=32), colours=ColourSettings(rounds=0))
 SOLVED = dataclasses.replace(SETTINGS, colours=ColourSettings())
@@ -93,3 +94,28 @@ def test_few_images_are_taken_of_a_long_log_and_the_others_lie_between(street, l
     exposures = colour_solve.solve_colours(lifted, street, ["front"], settings, lambda fraction: None).exposures
     first, second, third, last = exposures["front"]
     assert second == pytest.approx((first + third) / 2) and last == pytest.approx(third)
+
+
+class UnlikeLenses(Street):
+    """A grey sky that a longer lens shows brighter to the left and darker to the right, as no response does."""
+
+    def image(self, camera_id, index):
+        grey = np.full(256, 128.0) if camera_id == "front" else np.linspace(158, 98, 256)
+        return np.broadcast_to(grey[:, None], (128, 256, 3)).astype(np.uint8)
+
+
+def test_the_image_of_a_longer_lens_leaves_no_edge_in_the_sky(lifted):
+    wide = camera(width=256, height=128)
+    long = dataclasses.replace(wide, id="long", lens=Pinhole(720.0, 720.0, 128.0, 64.0))
+    street = UnlikeLenses(frames=4, cameras=(wide, long))
+    sky = np.full((6, 128, 128, 3), 0.5, np.float32)
+    empty = dataclasses.replace(lifted, static=Gaussians.empty(), dynamic=DynamicGaussians.empty(), tracks=(), sky=sky)
+    empty = dataclasses.replace(empty, rig=street.rig, isp={})
+    solved = colour_solve.solve_colours(empty, street, ["front", "long"], SOLVED, lambda fraction: None)
+    bearing = np.linspace(-20, 20, 400)  # the long lens ends at 10 degrees, where it is 12 % too bright or dark
+    ahead = np.stack([np.cos(np.radians(bearing)), np.sin(np.radians(bearing)), 0 * bearing], axis=1)
+    grey = sample_cubemap(solved.sky, ahead).mean(axis=1)
+    steps = np.abs(grey[10:] - grey[:-10])  # over 1 degree; the weights fall over 4
+    assert np.ptp(grey) > 0.03, "the long lens takes part"
+    # 0.12 over the 4 degrees of the fall, and 0.24 over the 20 of the longer lens itself.
+    assert steps.max() < 0.12 / 4 + 0.24 / 20

@@ -22,7 +22,7 @@ from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.ego_images import shows_ego
 from nurec_sim.reconstruct.lift.colour import SATURATED
 from nurec_sim.reconstruct.lift.settings import LiftSettings
-from nurec_sim.reconstruct.lift.views import border_weight
+from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, border_weight
 from nurec_sim.reconstruct.optimize.responses import borrowed_responses
 from nurec_sim.render.cpu.backward.colours import spread_errors, spread_sky_errors
 from nurec_sim.render.cpu.backward.frame import SENSORS, ExactView
@@ -46,14 +46,15 @@ FIT_PX = 3
 
 @dataclass(frozen=True, eq=False)
 class SolvedImage:
-    """A frame at working size: its camera with fewer pixels, its poses, its colours, and what each pixel counts."""
+    """A frame at working size: its camera with fewer pixels, its poses, its colours, and what its pixels count."""
 
     camera: CameraModel
     frame: int
     t_us: int
     world_from_camera: Float64[np.ndarray, "2 4 4"]
     rgb: UInt8[np.ndarray, "h w 3"]
-    weight: Float32[np.ndarray, "h w"]
+    weights: Float32[np.ndarray, "2 h w"]
+    """Of each pixel, in the colours of Gaussians and in those of the sky."""
 
 
 def solve_colours(
@@ -75,9 +76,7 @@ def solve_colours(
     step = -(-len(frames) // settings.colours.images)
     chosen = [(camera, k) for camera in cameras for k in range(0, len(times[camera]), step)]
     solve = ColourSolve(scene, settings.colours.trust, settings.colours.gain_pull)
-    weights = {camera: _sees_street(scene, camera, settings.views.width_px) for camera in cameras}
-    if len(cameras) > 1:
-        weights = {camera: weight * border_weight(*weight.shape) for camera, weight in weights.items()}
+    weights = {camera: _pixel_weights(scene, camera, settings.views.width_px, len(cameras) > 1) for camera in cameras}
     # In random order: of neighbours in time, which show the same, the later would correct the earlier.
     random, rounds = np.random.default_rng(0), settings.colours.images // len(chosen)
     order = [random.permutation(len(chosen)) for _ in range(min(max(rounds, 1), settings.colours.rounds))]
@@ -97,27 +96,45 @@ def solve_colours(
     return replace(solve.scene(), exposures=responses)
 
 
-def _sees_street(scene: GaussianScene, camera: str, width_px: int) -> Float32[np.ndarray, "h w"]:
-    """1 where a camera sees neither the ego vehicle nor past its lens, at its width divided by a whole number."""
+def _pixel_weights(scene: GaussianScene, camera: str, width_px: int, several: bool) -> Float32[np.ndarray, "2 h w"]:
+    """Weights of the pixels of a camera, at its width divided by a whole number; see ``SolvedImage``.
+
+    Pixels of the ego vehicle and past the lens count nothing. Among several cameras those near the border count less,
+    and in the sky pixels count by their solid angle in texels: a longer lens would else outvote the others there.
+    """
     model = scene.rig.cameras[camera]
     reduction = max(1, -(-model.width_px // width_px))
     width, height = model.width_px // reduction, model.height_px // reduction
     rays, seen = sensors.pixel_rays(sensors.scaled_camera(model, width, height))
     if (image := scene.ego_images.get(camera)) is None:
-        return (seen & ~shows_ego(rays, model, scene.rig.body)).astype(np.float32)
-    cover = cv2.resize(image[..., 3].astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    return (seen & (cover == 0)).astype(np.float32)
+        street = (seen & ~shows_ego(rays, model, scene.rig.body)).astype(np.float32)
+    else:
+        cover = cv2.resize(image[..., 3].astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        street = (seen & (cover == 0)).astype(np.float32)
+    if not several:
+        return np.stack([street, street])
+    texels = _middle_solid_angle(rays) / (4 * np.pi / scene.sky[..., 0].size)
+    return np.stack(
+        [street * border_weight(height, width), street * border_weight(height, width, LEAST_SKY_WEIGHT) * texels]
+    ).astype(np.float32)
 
 
-def _read(clip: Clip, camera: str, frame: int, weight: Float32[np.ndarray, "h w"]) -> SolvedImage:
+def _middle_solid_angle(rays: Float64[np.ndarray, "h w 3"]) -> float:
+    """Solid angle of the pixel in the middle, in steradian."""
+    v, u = (n // 2 for n in rays.shape[:2])
+    across, down = rays[v, u] - rays[v, u - 1], rays[v, u] - rays[v - 1, u]
+    return float(np.linalg.norm(np.cross(across, down)))
+
+
+def _read(clip: Clip, camera: str, frame: int, weights: Float32[np.ndarray, "2 h w"]) -> SolvedImage:
     """A frame, reduced to the size of its weights by a whole number, as working views are."""
     model, image = clip.rig.cameras[camera], clip.image(camera, frame)
-    height, width = weight.shape
+    height, width = weights.shape[1:]
     reduction = model.width_px // width
     small = cv2.resize(image[: height * reduction, : width * reduction], (width, height), interpolation=cv2.INTER_AREA)
     t_us = int(np.asarray(clip.camera_times_us(camera)[frame]).sum()) // 2
     poses = np.asarray(clip.world_from_camera(camera, frame), np.float64)
-    return SolvedImage(sensors.scaled_camera(model, width, height), frame, t_us, poses, small, weight)
+    return SolvedImage(sensors.scaled_camera(model, width, height), frame, t_us, poses, small, weights)
 
 
 class ColourSolve:
@@ -150,22 +167,22 @@ class ColourSolve:
             rays = NO_TABLE if view.projection_mode == AFFINE else sensor.rays
             picture = Picture(view, rays, CAMERA, layers, scratch)
             planes = draw([picture], self._workers)[0]
-            height, width = image.weight.shape
+            height, width = image.rgb.shape[:2]
             clear = 1 - planes[0, :height, :width]
             shown = planes[1:4, :height, :width]
             shown = shown + clear * draw_sky(view.directions, turn, self._sky, self._workers, clear)
             recorded = image.rgb.transpose(2, 0, 1).astype(np.float32) / np.float32(255)
-            weight = image.weight * (sensor.grid.valid > 0)
-            response = self._fit_response(image, shown, recorded, weight)
+            weights = image.weights * (sensor.grid.valid > 0)
+            response = self._fit_response(image, shown, recorded, weights[0])
             back = np.linalg.inv(response[:, :3])
             wanted = np.einsum("ij,jhw->ihw", back, recorded - response[:, 3, None, None]).astype(np.float32)
             error = wanted - shown
             right = (recorded > SATURATED) & (error < 0)
             error[right] = 0
-            weight = (weight * ~right.all(axis=0)).astype(np.float32)
+            weight, sky_weight = (weights * ~right.all(axis=0)).astype(np.float32)
             shares = spread_errors(picture, planes, weight, error, self._workers)
             texels = np.zeros((*self._sky.shape[:3], 4), np.float32)
-            spread_sky_errors(view.directions, turn, weight * clear, error, texels)
+            spread_sky_errors(view.directions, turn, sky_weight * clear, error, texels)
             # Placed blocks of the moving layer follow each other as those they were made from.
             placed = np.flatnonzero(np.isin(self._moving.index[:, 0], moving.index.reshape(-1, BLOCK)[:, 0]))
             _change_blocks(layers[0][1], layers[0][1], shares[0], self._seen[0], self._static.fields)

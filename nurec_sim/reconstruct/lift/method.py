@@ -26,7 +26,7 @@ from nurec_sim.reconstruct.lift.pictures import DepthPicture, depth_pictures
 from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
-from nurec_sim.reconstruct.lift.views import WorkingView, border_weight, read_views
+from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, WorkingView, border_weight, read_views
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene
 
 Progress = Callable[[str, float], None]
@@ -129,7 +129,8 @@ def lift(
 def _sky_weight(picture: DepthPicture, view: WorkingView, settings: LiftSettings) -> np.ndarray:
     """Weight of each pixel in the sky: 1 if it is far and looks like sky, little if it is merely far."""
     far = (picture.inverse_depth < 1 / settings.views.max_depth_m) & view.tile.valid
-    return np.where(far, np.where(picture.sky, 1.0, 0.02), 0.0) * border_weight(*far.shape)
+    border = border_weight(view.tile.height, view.tile.width, LEAST_SKY_WEIGHT)
+    return np.where(far, np.where(picture.sky, 1.0, 0.02), 0.0) * border
 
 
 _ENDS = {

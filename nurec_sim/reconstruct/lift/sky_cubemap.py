@@ -37,7 +37,8 @@ def make_sky(
         face, s, t = geometry.cubemap_coordinates(direction)
         column, row = (np.clip((x * size).astype(np.int64), 0, size - 1) for x in (s, t))
         shown, place = np.unique((face * size + row) * size + column, return_inverse=True)
-        weight, rgb = weights[k][mask], colours[k][mask] / 255
+        # By solid angle: a longer lens, with more pixels in a texel, counts like the others.
+        weight, rgb = weights[k][mask] / view.tile.focal_px**2, colours[k][mask] / 255
         sums = [np.bincount(place, values, len(shown)) for values in (weight, *(weight[:, None] * rgb).T)]
         return shown, np.stack(sums, axis=1)
 
@@ -45,6 +46,6 @@ def make_sky(
         count[shown] += sums[:, 0]
         total[shown] += sums[:, 1:]
     known = count > 0
-    colour = np.where(known[:, None], total / np.maximum(count, 1e-9)[:, None], 0.0)
+    colour = np.where(known[:, None], total / np.where(known, count, 1.0)[:, None], 0.0)
     seen = known.reshape(6, size, size).astype(np.float32)
     return fill_unseen(colour.reshape(6, size, size, 3).astype(np.float32), seen)

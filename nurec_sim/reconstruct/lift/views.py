@@ -21,6 +21,8 @@ from nurec_sim.types import Box, CameraModel, Clip, Shutter
 
 BORDER, LEAST_WEIGHT = 0.2, 0.4
 """Part of an image's shorter side over which ``border_weight`` falls, and the weight at its border."""
+LEAST_SKY_WEIGHT = 0.02
+"""The same in the sky, where an edge shows most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,14 +114,19 @@ def without_ego(tile: Tile, camera: CameraModel, body: Box) -> Tile:
     return dataclasses.replace(tile, valid=tile.valid & ~shows_ego(rays @ tile.camera_from_tile.T, camera, body))
 
 
-def border_weight(height: int, width: int) -> Float32[np.ndarray, "h w"]:
+def border_weight(height: int, width: int, least: float = LEAST_WEIGHT) -> Float32[np.ndarray, "h w"]:
     """1 in the middle of an image, less at its border.
 
     Where images of several cameras end on each other, their different vignettes would leave an edge.
+
+    Args:
+        height: of the image, in pixels.
+        width: the same.
+        least: the weight at the border.
     """
     rows, columns = (np.minimum(np.arange(n) + 0.5, n - np.arange(n) - 0.5) for n in (height, width))
     inside = np.minimum(rows[:, None], columns) / (BORDER * min(height, width))
-    return np.clip(inside, LEAST_WEIGHT, 1).astype(np.float32)
+    return np.clip(inside, least, 1).astype(np.float32)
 
 
 def without_pixels(tile: Tile, mask: Bool[np.ndarray, "h w"]) -> Tile:
