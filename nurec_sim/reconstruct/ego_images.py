@@ -4,17 +4,21 @@ The bonnet or the boot stays at its place in the image while the car drives; the
 Textured pixels that match better at their own place than along their epipolar line are evidence for the vehicle, those
 that match along the line are evidence for the street. The vehicle fills the image from its lower edge up to a boundary
 of one row per column: the one that contradicts the least evidence, found by dynamic programming.
+
+A car ahead that keeps its distance stays at its place too. What stands beyond the ego vehicle by LiDAR returns or boxes
+of the log is evidence for the street, unless the lower body of the car may hide it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from nurec_sim import geometry, sensors
+from nurec_sim.reconstruct.around_ego import shows_others
 from nurec_sim.types import Box, CameraModel, Clip
 
 EGO_HEIGHT_M = 0.75
@@ -50,19 +54,22 @@ FEATHER_PX = 1.5
 
 
 def find_ego_images(
-    clip: Clip, cameras: Sequence[str], progress: Callable[[float], None] = lambda fraction: None
+    clip: Clip,
+    cameras: Sequence[str],
+    progress: Callable[[float], None] = lambda fraction: None,
+    hold_out: Collection[int] = (),
 ) -> dict[str, UInt8[np.ndarray, "h w 4"]]:
     """Images of the ego vehicle as each camera sees it, RGBA of the camera's size; none of cameras that do not see it.
 
-    The log's own masks (``Clip.ego_mask``) come first. Without two frames at least ``BASELINE_M`` apart the vehicle is
-    taken to be where its outline is, below ``EGO_HEIGHT_M``.
+    Sweeps of ``hold_out`` are not read. The log's own masks (``Clip.ego_mask``) come first. Without two frames at least
+    ``BASELINE_M`` apart the vehicle is taken to be where its outline is, below ``EGO_HEIGHT_M``.
     """
     images = {}
     for number, camera in enumerate(cameras):
         progress(number / len(cameras))
         mask = clip.ego_mask(camera)
         if mask is None:
-            mask = _find_mask(clip, camera)
+            mask = _find_mask(clip, camera, hold_out)
         if mask is not None and mask.any():
             images[camera] = _picture(clip, camera, mask)
     return images
@@ -84,7 +91,7 @@ def shows_ego(rays: Float64[np.ndarray, "h w 3"], camera: CameraModel, body: Box
     return (enter < leave) & (leave > 0)
 
 
-def _find_mask(clip: Clip, camera: str) -> Bool[np.ndarray, "h w"] | None:
+def _find_mask(clip: Clip, camera: str, hold_out: Collection[int]) -> Bool[np.ndarray, "h w"] | None:
     """Where the camera sees the vehicle, at the size of the camera; None if nowhere."""
     model = clip.rig.cameras[camera]
     reduction = max(1, round(model.width_px / WIDTH_PX))
@@ -103,12 +110,14 @@ def _find_mask(clip: Clip, camera: str) -> Bool[np.ndarray, "h w"] | None:
     ego, street = np.zeros(near.shape), np.zeros(near.shape)
     size = small.width_px, small.height_px
     grey = {i: _grey(clip.image(camera, i), size) for i in sorted({i for pair in pairs for i in pair})}
+    hidden = shows_ego(rays, small, clip.rig.body)
+    others = {i: shows_others(clip, small, i, hold_out) & ~hidden for i in sorted({first for first, _ in pairs})}
     for first, second in pairs:
         points = np.where(near, depth_m, 1.0)[..., None] * rays
         second_from_first = geometry.inverse(poses[second]) @ poses[first]
         here, there = _evidence(small, grey[first], grey[second], points, second_from_first)
-        ego += here & near
-        street += there & near
+        ego += here & near & ~others[first]
+        street += (there | others[first]) & near
     mask = _believed(_below_boundary(ego / len(pairs), street / len(pairs), near), ego / len(pairs))
     if not mask.any():
         return None

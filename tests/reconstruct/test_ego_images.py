@@ -1,6 +1,7 @@
 """The ego vehicle in the frames of a log: found where it stays while the street moves, and not lifted."""
 
 import dataclasses
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -11,7 +12,8 @@ from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.ego_images import find_ego_images
 from nurec_sim.reconstruct.lift.settings import ViewSettings
 from nurec_sim.reconstruct.lift.views import read_views
-from nurec_sim.types import Trajectory
+from nurec_sim.types import LidarModel, Rig, Sweep, Track, Trajectory
+from nurec_sim.world import LIDAR_ID, street_rig
 
 pytestmark = pytest.mark.slow
 
@@ -102,3 +104,77 @@ def test_its_pixels_are_not_lifted():
     images = find_ego_images(clip, ["front"])
     view = read_views(clip, ["front"], images, ViewSettings())[0]
     np.testing.assert_array_equal(view.tile.valid, images["front"][..., 3] == 0)
+
+
+AHEAD_M, REAR = 6.0, (slice(120, 175), slice(165, 235))
+"""Distance of the car ahead from the camera, and where its rear is in the image: 1.76 m wide, from the ground up."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FollowingClip(GroundClip):
+    """A plain road, and a car ahead that keeps its distance, known by returns from its rear or by its box."""
+
+    ahead: bool = True
+    returns: bool = False
+
+    @cached_property
+    def rig(self) -> Rig:
+        lidars: dict[str, LidarModel] = {LIDAR_ID: street_rig().lidars[LIDAR_ID]} if self.returns else {}
+        return Rig(self.cameras, lidars)
+
+    def sweep_times_us(self, lidar_id: str) -> np.ndarray:
+        return self.times["front"] + np.array([-50_000, 50_000])
+
+    def sweep(self, lidar_id: str, index: int) -> Sweep:
+        """Returns every 10 cm on the rear."""
+        y, z = np.meshgrid(np.arange(-0.85, 0.9, 0.1), np.arange(0.05, 1.4, 0.1))
+        ahead_m = CAMERA.rig_from_camera[0, 3] + AHEAD_M
+        xyz = np.stack([np.full(y.size, ahead_m), y.ravel(), z.ravel()], axis=1)
+        start_us, end_us = self.sweep_times_us(lidar_id)[index].tolist()
+        t_us = (start_us + end_us) // 2
+        return Sweep(t_us, start_us, end_us, self.ego.at(t_us), xyz, None, np.full(len(xyz), t_us))
+
+    def image(self, camera_id: str, index: int) -> np.ndarray:
+        grey = np.full((240, 400), 128, np.float32)
+        if self.ahead:
+            grey[REAR] = VEHICLE[REAR]
+        if self.bonnet:
+            grey = np.where(bonnet_mask(), VEHICLE, grey)
+        return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
+
+
+def following(known: str, **options) -> FollowingClip:
+    plain = clip_of(CAMERA, times=frame_times(6, 100_000))
+    clip = FollowingClip(plain.cameras, plain.times, returns=known == "returns", **options)
+    return with_box(clip, CAMERA.rig_from_camera[0, 3] + AHEAD_M) if known == "box" else clip
+
+
+def with_box(clip: GroundClip, rear_m: float):
+    """A car ahead is labelled, its rear at so much before the origin of the rig."""
+    middle = geometry.pose(np.eye(3), np.array([rear_m + 2.0, 0.0, 0.7]))
+    path = Trajectory(clip.ego.t_us, clip.ego.world_from_body @ middle)
+    return dataclasses.replace(clip, tracks=(Track("ahead", "automobile", (4.0, 1.76, 1.4), path),))
+
+
+@pytest.mark.parametrize("known", ["returns", "box"])
+def test_a_car_ahead_that_keeps_its_distance_is_not_the_ego_vehicle(known: str):
+    assert find_ego_images(following(known, bonnet=False), ["front"]) == {}
+    (image,) = find_ego_images(following(known), ["front"]).values()
+    (alone,) = find_ego_images(following("nothing", ahead=False), ["front"]).values()
+    found, true = image[..., 3] > 127, alone[..., 3] > 127
+    assert (found & true).sum() / (found | true).sum() > 0.95 and not found[REAR].any()
+
+
+def test_sweeps_that_are_held_out_say_nothing():
+    """Without them, nothing tells the car ahead from a bonnet: the picture alone would be taken for one."""
+    clip = following("returns", bonnet=False)
+    (image,) = find_ego_images(clip, ["front"], hold_out=range(6)).values()
+    assert (image[REAR][10:, :, 3] > 127).mean() > 0.5
+
+
+def test_what_the_bonnet_may_hide_from_the_camera_is_no_evidence():
+    """A box that stands in front of the bonnet reaches into its image: the bonnet is found as without it."""
+    clip = with_box(driving(), rear_m=4.5)
+    (image,) = find_ego_images(clip, ["front"]).values()
+    found, true = image[..., 3] > 127, bonnet_mask()
+    assert (found & true).sum() / (found | true).sum() > 0.9

@@ -67,7 +67,7 @@ def feedforward(
     windows = chunk_windows(clip, chosen, profile, settings)
     progress("weights", 0.0)
     model, weights = _model(settings, device)
-    ego_images = find_ego_images(clip, chosen)
+    ego_images = find_ego_images(clip, chosen, hold_out=hold_out)
     layers, fits = [], []
     for window in windows:
         chunk_progress = _within(progress, window.index, len(windows))

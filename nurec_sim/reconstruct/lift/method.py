@@ -64,7 +64,7 @@ def lift(
     stages.start("ground and surfaces")
     bodies, ground = surfels_of(clip, actors, gathered, settings)
     stages.start("images")
-    ego_images = find_ego_images(clip, cameras, stages.fraction)
+    ego_images = find_ego_images(clip, cameras, stages.fraction, hold_out)
     views = read_views(clip, cameras, ego_images, settings.views, stages.fraction)
     stages.start("depth")
     pictures = depth_pictures(views, bodies, settings, stages.fraction)
