@@ -64,7 +64,7 @@ def describe_clip(clip: OpenedLog) -> ClipSummary:
         ("boxes", f"{sum(len(track.path.t_us) for track in labelled)} in {len(labelled)} tracks"),
         ("tracks", f"{moving} with more than one pose; {_counts(labels)}" if labelled else "none"),
         *([("found by motion, unlabelled", _counts(found))] if found else []),
-        ("map", f"{len(road_map.drivable)} drivable areas, {len(road_map.lanes)} lanes" if road_map else "none"),
+        ("map", str(road_map) if road_map else "none"),
     ]
     facts += [
         (f"log: {key.replace('_', ' ')}", value)

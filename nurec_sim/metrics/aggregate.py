@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import polars as pl
 
 CENSOR_M = 4.0
+BRAKES_MPS2 = 2.0
+"""A car brakes from here on. Coasting is weaker; the shipped policies brake by 3 m/s2 and more for obstacles."""
 MAX_UNKNOWN_FRAC = 0.2
 """Scenes with a larger fraction of unknown states are excluded from ``offroad`` for every policy."""
 ROLLOUT_KEYS = (
@@ -32,6 +34,10 @@ DERIVED: dict[str, tuple[str, str]] = {
     "time_to_first_event_s": (
         "s",
         "from the first policy-driven state to the first collision or off-road state; none if neither",
+    ),
+    "time_to_first_brake_s": (
+        "s",
+        "from the first policy-driven state to the first that brakes by more than 2 m/s2; none if none does",
     ),
     "censored_4m": ("bool", "the ego was 4 m off the recorded path at some time"),
 }
@@ -143,11 +149,18 @@ def _rollout_numbers(series: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]
         numbers["offroad_or_collision"] = 0.0
     numbers["scene_score"] = _scene_score(numbers)
     numbers["censored_4m"] = float(np.isfinite(censor_us)) if np.isfinite(numbers["dist_to_gt_trajectory"]) else np.nan
-    numbers["time_to_first_event_s"] = np.nan
-    if np.isfinite(event_us):
-        t_us, relevant, _ = series["eval_relevant"]
-        numbers["time_to_first_event_s"] = (event_us - t_us[np.argmax(relevant > 0)]) / 1e6
+    numbers["time_to_first_event_s"] = _time_to_s(series, event_us)
+    brake_us = _first_us(series.get("braking_mps2"), BRAKES_MPS2)
+    numbers["time_to_first_brake_s"] = _time_to_s(series, brake_us if brake_us <= end_us else np.inf)
     return numbers
+
+
+def _time_to_s(series: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]], t_us: float) -> float:
+    """Seconds from the first policy-driven state; NaN for an infinite time."""
+    if not np.isfinite(t_us):
+        return float("nan")
+    times, relevant, _ = series["eval_relevant"]
+    return float(t_us - times[np.argmax(relevant > 0)]) / 1e6
 
 
 def _scene_score(numbers: dict[str, float]) -> float:

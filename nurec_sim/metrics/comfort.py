@@ -43,6 +43,17 @@ def comfort_series(rollout: Rollout) -> list[Series]:
     ]
 
 
+def braking_series(rollout: Rollout) -> Series:
+    """``braking_mps2``: how hard the car brakes in every state; 0 while it does not."""
+    accel = np.array([state.accel_mps2 for state in rollout.states])
+    t_us = times_of(rollout)
+    return (
+        make_series("braking_mps2", t_us, np.maximum(-accel, 0.0))
+        if len(accel)
+        else unknown_series("braking_mps2", t_us)
+    )
+
+
 def motion_signals(rollout: Rollout) -> dict[str, Float64[np.ndarray, " t"]] | None:
     """The six smoothed signals while the policy drives, NaN before; None if they cannot be computed."""
     from scipy.signal import savgol_filter

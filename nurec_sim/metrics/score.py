@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from nurec_sim.metrics.collision import check_profile, collision_series
-from nurec_sim.metrics.comfort import comfort_series, feasibility_series
+from nurec_sim.metrics.comfort import braking_series, comfort_series, feasibility_series
 from nurec_sim.metrics.offroad import offroad_series, true_offroad_series
 from nurec_sim.metrics.offroad_grid import OffroadGrid
 from nurec_sim.metrics.plans import plan_series
@@ -51,6 +51,7 @@ def score_rollout(
         true_offroad_series(rollout, road_map),
         *progress_series(rollout),
         *proximity_series(rollout),
+        braking_series(rollout),
         *comfort_series(rollout),
         *feasibility_series(rollout),
         *plan_series(rollout),

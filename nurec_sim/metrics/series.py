@@ -41,6 +41,7 @@ METRICS: dict[str, Metric] = {
     "gt_dist_traveled_m": Metric("m", Reduce.LAST, "length of the whole recorded path"),
     "min_distance_to_obstacle_m": Metric("m", Reduce.MIN, "gap to the nearest actor's box"),
     "ttc_s": Metric("s", Reduce.MIN, "time to contact at constant velocity with actors ahead; 3 = none within 3 s"),
+    "braking_mps2": Metric("m/s2", Reduce.MAX, "deceleration along the car's own axis, not smoothed"),
     "comfort": Metric("bool", Reduce.MIN, "all six motion signals are within the nuPlan bounds"),
     "lon_accel_mps2": Metric("m/s2", Reduce.MAX, "magnitude of the longitudinal acceleration"),
     "lat_accel_mps2": Metric("m/s2", Reduce.MAX, "magnitude of the lateral acceleration"),

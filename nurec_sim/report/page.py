@@ -19,7 +19,13 @@ from nurec_sim.report.rollout_card import rollout_card
 from nurec_sim.report.template import html_page
 
 MAX_EMBEDDED_BYTES = 40_000_000
-OFTEN_WITHOUT_VALUE = ("time_to_first_event_s", "collision_delta_v_mps", "support", "support_least")
+OFTEN_WITHOUT_VALUE = (
+    "time_to_first_event_s",
+    "time_to_first_brake_s",
+    "collision_delta_v_mps",
+    "support",
+    "support_least",
+)
 """Metrics without a value where there was no event or contact, or the policy has no camera."""
 HEADLINE = {
     "collision_any": "Collision C",

@@ -54,8 +54,6 @@ def summary(scene: GaussianScene) -> list[tuple[str, str]]:
     degree = 0 if scene.static.sh_rest is None else int(np.sqrt(scene.static.sh_rest.shape[1] + 1)) - 1
     owners = np.unique(scene.dynamic.track[scene.dynamic.track >= 0])
     path_m = np.linalg.norm(np.diff(scene.ego.position_m, axis=0), axis=1).sum()
-    road = scene.road_map
-    map_text = "none" if road is None else f"{len(road.drivable)} drivable areas, {len(road.lanes)} lanes"
     cameras = [f"{c.id} {c.width_px}x{c.height_px} {type(c.lens).__name__}" for c in scene.rig.cameras.values()]
     lidars = [f"{x.id} {len(x.elevation_rad)}x{len(x.azimuth_rad)}" for x in scene.rig.lidars.values()]
     return [
@@ -69,7 +67,7 @@ def summary(scene: GaussianScene) -> list[tuple[str, str]]:
         ("colour correction", ", ".join(scene.isp) or "none"),
         ("cameras", ", ".join(cameras) or "none"),
         ("LiDARs", ", ".join(lidars) or "none"),
-        ("road map", map_text),
+        ("road map", "none" if scene.road_map is None else str(scene.road_map)),
         ("method", str(scene.provenance.get("method", "unknown"))),
         ("in memory", f"{sum(array.nbytes for array in arrays.values()) / 2**20:.1f} MiB"),
     ]

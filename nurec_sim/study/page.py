@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import polars as pl
-
 from nurec_sim.metrics.agreement import CONFIDENCE, Estimate
-from nurec_sim.report.cells import count_of, escape, list_items, shown
+from nurec_sim.report.cells import count_of, escape, list_items
 from nurec_sim.report.charts import BARS, comparison_bars
 from nurec_sim.report.comparison_sections import SHOWN, differences, points_cell, rank_agreement, rank_cell
 from nurec_sim.report.rollout_card import dot
-from nurec_sim.report.support import LOW
 from nurec_sim.report.template import html_page
 from nurec_sim.study.results import RANKED_BY, StudyResults
+from nurec_sim.study.rollout_sections import (
+    braking_section,
+    failures_section,
+    families_section,
+    scenes_section,
+    support_section,
+)
 
-MOST_SCENES = 10
 ENOUGH_SCENES = 10
 """Below this the report warns: the percentile bootstrap undercovers with few clusters."""
 
@@ -25,8 +26,8 @@ def render_study(results: StudyResults) -> str:
     figures = {f"bars-{metric}": comparison_bars(results.comparison, metric) for metric in BARS}
     body = [
         _header(results), _verdict(results), _bars(results), rank_agreement(results.comparison), _seeing(results),
-        _controls(results), _support(results), differences(results.comparison), _families(results), _scenes(results),
-        _pairs(results), _failures(results),
+        _controls(results), support_section(results), braking_section(results), differences(results.comparison),
+        families_section(results), scenes_section(results), _pairs(results), failures_section(results),
     ]  # fmt: skip
     return html_page(f"{results.config.name} · nurec_sim study", body, stored={"figures": figures, "images": {}})
 
@@ -96,27 +97,6 @@ def _discrimination(results: StudyResults) -> str:
     )
 
 
-def _support(results: StudyResults) -> str:
-    if not results.doubts:
-        return ""
-    rows = []
-    for world, found in results.doubts.items():
-        ratio = "too few to say" if found.ratio is None else f"{found.ratio:.1f} times"
-        shares = [
-            f"{wrong} of {count}" + (f"<small>{100 * wrong / count:.0f} %</small>" if count else "")
-            for wrong, count in ((found.doubtful_wrong, found.doubtful), (found.others_wrong, found.others))
-        ]
-        cells = "".join(f'<td class="n">{cell}</td>' for cell in (*shares, ratio))
-        rows.append(f"<tr><td><b>{escape(world)}</b></td>{cells}</tr>")
-    return (
-        '<h2>Does low support warn?</h2><div class="card scroll"><table><thead><tr><th>World</th>'
-        '<th class="n">Wrong with low support</th><th class="n">Wrong of all others</th><th class="n">How often</th>'
-        f'</tr></thead><tbody>{"".join(rows)}</tbody></table><p class="key">Policies with cameras. Wrong: the '
-        "same rollout ends otherwise (collision, off-road) in the true world. Low: before its end the policy got an "
-        f"image of which less than {100 * LOW:.0f} % rests on recorded views.</p></div>"
-    )
-
-
 def _interval(estimate: Estimate) -> str:
     if estimate.value != estimate.value:
         return "unknown (all policies tied)"
@@ -182,67 +162,6 @@ def _drop_cell(drop: Estimate | None) -> str:
     return f"{rank_cell(drop)}<small>{judged}</small>"
 
 
-def _families(results: StudyResults) -> str:
-    """What each family of scenes exposes, in the true world."""
-    config = results.config
-    family = {scene_id: each.name for scene_id, each, _ in config.scenes}
-    truth = results.values.filter(
-        (pl.col("reconstruction") == config.worlds[0]) & (pl.col("name") == "offroad_or_collision")
-    ).with_columns(pl.col("clipgt_id").replace_strict(family).alias("family"))
-    means = {
-        (row["family"], row["policy"]): row["value"]
-        for row in truth.group_by("family", "policy").agg(pl.col("value").mean()).iter_rows(named=True)
-    }
-    policies = sorted(truth["policy"].unique().to_list())
-    heads = "".join(
-        f"<th>{escape(each.name)}<br><small>{escape(each.scenario)}</small></th>" for each in config.families
-    )
-    rows = "".join(
-        f"<tr><td><b>{escape(policy)}</b></td>"
-        + "".join(f"<td>{shown(means.get((each.name, policy)), 'share')}</td>" for each in config.families)
-        + "</tr>"
-        for policy in policies
-    )
-    return (
-        f'<h2>What the scenes expose</h2><div class="card scroll"><table><thead><tr><th>Policy</th>{heads}</tr></thead>'
-        f'<tbody>{rows}</tbody></table><p class="key">Share of rollouts in the true world that collide or leave the '
-        "road. A family in which all policies do alike ranks none.</p></div>"
-    )
-
-
-def _scenes(results: StudyResults) -> str:
-    """Scenes by how many verdicts differ from the truth."""
-    items = [
-        f"<b>{escape(scene)}</b>: {count_of(len(changes), 'rollout')} "
-        f"{'ends' if len(changes) == 1 else 'end'} differently: {escape('; '.join(changes[:6]))}"
-        + (f" and {len(changes) - 6} more" if len(changes) > 6 else "")
-        for scene, changes in _changes(results)
-    ]
-    if not items:
-        return '<h2>Scenes</h2><div class="card">No rollout ends differently in a reconstruction.</div>'
-    return f'<h2>Scenes with most disagreement</h2><div class="card"><ul>{list_items(items[:MOST_SCENES])}</ul></div>'
-
-
-def _changes(results: StudyResults) -> Iterator[tuple[str, list[str]]]:
-    worlds = results.config.worlds
-    verdicts: dict[tuple[str, str, int], dict[str, str]] = {}
-    wanted = results.values.filter(pl.col("name").is_in(["collision_any", "offroad"]) & (pl.col("value") == 1))
-    for row in results.values.filter(pl.col("name") == "offroad").iter_rows(named=True):
-        verdicts.setdefault((row["clipgt_id"], row["policy"], row["seed"]), {})[row["reconstruction"]] = (
-            "no event" if row["status"] == "ok" else "failed"
-        )
-    for row in wanted.iter_rows(named=True):
-        said = "collision" if row["name"] == "collision_any" else "off-road"
-        verdicts[row["clipgt_id"], row["policy"], row["seed"]][row["reconstruction"]] = said
-    by_scene: dict[str, list[str]] = {}
-    for (scene, policy, seed), found in sorted(verdicts.items()):
-        for world in worlds[1:]:
-            if found[world] != found[worlds[0]]:
-                text = f"{policy}, seed {seed}: {found[worlds[0]]} in truth, {found[world]} in {world}"
-                by_scene.setdefault(scene, []).append(text)
-    return iter(sorted(by_scene.items(), key=lambda item: (-len(item[1]), item[0])))
-
-
 def _pairs(results: StudyResults) -> str:
     """Every two policies in every world, with adjusted p-values."""
     worlds = [world for world in results.config.worlds if world in results.pairs]
@@ -266,20 +185,4 @@ def _pairs(results: StudyResults) -> str:
         f'{SHOWN[RANKED_BY[0]]}</summary><div class="scroll"><table><thead><tr><th>Pair</th>{heads}</tr></thead>'
         f'<tbody>{"".join(rows)}</tbody></table></div><p class="key">Percentage points, intervals over scenes; p '
         "adjusted for the number of pairs (Holm).</p></details>"
-    )
-
-
-def _failures(results: StudyResults) -> str:
-    rows = results.values.filter(pl.col("status") != "ok").unique("rollout_id", keep="first", maintain_order=True)
-    if not len(rows):
-        return ""
-    items = [
-        f"{escape(row['policy'])} in {escape(row['clipgt_id'])} ({escape(row['reconstruction'])}), seed {row['seed']}: "
-        f"{escape(row['error'])}"
-        for row in rows.head(50).iter_rows(named=True)
-    ]
-    more = [f"and {len(rows) - 50} more"] if len(rows) > 50 else []
-    return (
-        f'<h2>Failures</h2><div class="card"><p>A failed rollout has no value; its trial is left out for all policies '
-        f"and worlds, so that all are compared on the same ones.</p><ul>{list_items([*items, *more])}</ul></div>"
     )

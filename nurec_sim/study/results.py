@@ -23,6 +23,7 @@ from nurec_sim.metrics.agreement import (
 from nurec_sim.report import Comparison
 from nurec_sim.runs import folder as layout
 from nurec_sim.runs.compared import COMPARED, comparison_of
+from nurec_sim.study.braking import Braking, first_braking
 from nurec_sim.study.config import StudyConfig, control_name
 from nurec_sim.study.doubt import Doubt, doubts
 from nurec_sim.study.tasks import ROLLOUTS, VALUES
@@ -43,7 +44,8 @@ class StudyResults:
     construction. ``drops`` is by control and metric how much less than the intact reconstruction it agrees with the
     truth. ``pairs`` is by world the difference of every two policies in (C+O)/2, adjusted by Holm. ``differing`` names
     blind policies that did not drive the same in all worlds, which is a fault of the simulator. ``doubts`` is by world
-    how often verdicts with and without low support are wrong.
+    how often verdicts with and without low support are wrong. ``braking`` is by world and policy that looks at a sensor
+    when it first brakes, against the truth.
     """
 
     config: StudyConfig
@@ -55,6 +57,7 @@ class StudyResults:
     pairs: dict[str, list[tuple[str, str, Difference]]]
     differing: tuple[str, ...]
     doubts: dict[str, Doubt] = field(default_factory=dict)
+    braking: dict[tuple[str, str], Braking] = field(default_factory=dict)
 
     @property
     def discriminates(self) -> bool | None:
@@ -123,6 +126,7 @@ def results_of(config: StudyConfig, values: pl.DataFrame, seeing: Sequence[str])
         pairs,
         _differing(values, seeing),
         doubts(values, worlds),
+        first_braking(values, worlds, sorted(seeing)),
     )
 
 
@@ -157,6 +161,7 @@ def as_json(results: StudyResults) -> dict[str, Any]:
         "controls": {f"{how}/{metric}": asdict(drop) for (how, metric), drop in results.drops.items()},
         "discriminates": results.discriminates,
         "blind_policies_that_differ": list(results.differing),
+        "first_braking": {f"{world}/{policy}": asdict(each) for (world, policy), each in results.braking.items()},
         "verdicts_by_support": {world: asdict(each) for world, each in results.doubts.items()},
     })  # fmt: skip
 

@@ -42,6 +42,10 @@ class RoadMap:
     drivable: tuple[tuple[Float64[np.ndarray, "k 2"], ...], ...] = ()
     lanes: tuple[Float64[np.ndarray, "k 3"], ...] = ()
 
+    def __str__(self) -> str:
+        counts = ((len(self.drivable), "drivable area"), (len(self.lanes), "lane"))
+        return ", ".join(f"{count} {noun}{'' if count == 1 else 's'}" for count, noun in counts)
+
 
 @dataclass(frozen=True)
 class Sweep:

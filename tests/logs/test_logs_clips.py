@@ -232,7 +232,7 @@ def test_the_summary_names_sensors_rates_and_contents(tmp_path):
     assert facts["ego"] == "7 poses at 20.00 Hz, 3.0 m driven"
     assert facts["boxes"] == "4 in 2 tracks"
     assert facts["tracks"] == "1 with more than one pose; 1 automobile, 1 traffic_cone"
-    assert facts["map"] == "1 drivable areas, 1 lanes"
+    assert facts["map"] == "1 drivable area, 1 lane"
     assert facts["log: licence"] == "none"
     assert summary.sensors == (
         ("front", "pinhole, distorted", "64 x 48", "3", "10.00", "0.220", "top_to_bottom"),

@@ -57,6 +57,15 @@ def test_past_the_end_of_the_log_there_is_no_recorded_place():
     assert found["dist_to_gt_location"].valid.tolist() == [True] * 20 + [False] * 10
 
 
+def test_braking_is_the_deceleration_of_states_and_never_negative():
+    states = tuple(
+        dataclasses.replace(state, accel_mps2=accel)
+        for state, accel in zip(rollout(straight_poses(4)).states, (1.0, 0.0, -3.5, -0.5), strict=True)
+    )
+    found = scores(rollout(straight_poses(4), states=states))["braking_mps2"]
+    assert found.values.tolist() == [0.0, 0.0, 3.5, 0.5] and found.value() == 3.5
+
+
 def test_a_standing_recording_has_no_progress():
     found = scores(rollout(standing(20, 1, 1, z=0.0)))
     assert not found["progress"].valid.any() and found["dist_to_gt_trajectory"].value() == 0

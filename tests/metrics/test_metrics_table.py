@@ -86,6 +86,16 @@ def test_only_the_first_event_counts():
     assert value(values, "progress") == pytest.approx(10 / 39)
 
 
+def test_the_moment_of_first_braking():
+    """From the take-over at state 5 to state 20; what comes before, or after a collision, does not count."""
+    brakes = np.where(np.arange(40) == 20, 2.5, 1.5)
+    run = rollout(straight_poses(40), warm_up=5)
+    found = rollout_values(metric_table([with_series(run, braking_mps2=brakes)], "r"))
+    assert value(found, "time_to_first_brake_s") == pytest.approx(1.5) and value(found, "braking_mps2") == 2.5
+    crashed = with_series(run, braking_mps2=brakes, collision_any=step(40, 15))
+    assert value(rollout_values(metric_table([crashed], "r")), "time_to_first_brake_s") is None
+
+
 def test_two_events_at_once_both_count():
     values = rollout_values(metric_table([drive(collision_any=step(40, 10), offroad=step(40, 10))], "r"))
     assert value(values, "collision_any") == value(values, "offroad") == value(values, "collision_offroad_mean") == 1

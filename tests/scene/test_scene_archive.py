@@ -322,7 +322,7 @@ def test_summary_counts_what_is_there():
     assert rows["static Gaussians"].startswith("400 (other 126, road 131, movable 143), harmonics degree 2")
     assert rows["moving Gaussians"] == "53 of 2 tracks"
     assert rows["time"] == "4.00 s from 1700000000123457 us"
-    assert rows["road map"] == "2 drivable areas, 1 lanes"
+    assert rows["road map"] == "2 drivable areas, 1 lane"
     assert dict(summary(empty_scene()))["cameras"] == "none"
 
 

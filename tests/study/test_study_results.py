@@ -96,6 +96,31 @@ def test_verdicts_with_low_support_are_counted_apart():
     assert "Does low support warn?" in page and "too few to say" in page and "4 of 12<small>33 %</small>" in page
 
 
+def test_moments_of_first_braking_are_compared_with_the_truth():
+    """sees_a brakes at 3.0 s in truth; in lift 0.1 s later in scenes 0 to 5, 0.7 s earlier in 6, not at all in 7.
+
+    In scene 8 it brakes in lift only, in scene 9 in neither; two trials each.
+    """
+    later = {6: -0.7, 7: None, 8: 0.0, 9: None}
+    table = values({"truth": TRUE_FRACTIONS, "lift": TRUE_FRACTIONS, "lift-faint": TRUE_FRACTIONS})
+    town = pl.col("clipgt_id").str.split("-").list.last().cast(pl.Int64)
+    moment = pl.when(pl.col("reconstruction") == "truth").then(pl.when(town < 8).then(3.0)).when(
+        pl.col("reconstruction") == "lift"
+    ).then(3.0 + town.replace_strict(later, default=0.1, return_dtype=pl.Float64))  # fmt: skip
+    mine = (pl.col("name") == "time_to_first_brake_s") & (pl.col("policy") == "sees_a")
+    table = table.with_columns(pl.when(mine).then(moment).otherwise("value").alias("value"))
+    results = results_of(CONFIG, table, SEEING)
+    found = results.braking["lift", "sees_a"]
+    assert (found.both, found.early, found.late, found.missed, found.false, found.neither) == (14, 2, 0, 2, 2, 2)
+    assert found.median_s == pytest.approx(0.1) and found.worst_s == pytest.approx(0.7)
+    control = results.braking["lift-faint", "sees_a"]
+    assert (control.both, control.missed, control.neither, control.median_s) == (0, 16, 4, None)
+    assert ("lift", "blind_a") not in results.braking
+    assert as_json(results)["first_braking"]["lift/sees_a"]["false"] == 2
+    page = render_study(results)
+    assert "When policies first brake" in page and "0.1<small>at most 0.7</small>" in page
+
+
 def test_the_drop_of_tau_by_hand():
     """Three policies that both worlds and every resample order alike, against one that reverses them."""
     truth = np.repeat([[0.1], [0.5], [0.9]], 5, axis=1)
