@@ -72,7 +72,7 @@ def study(
         out.print(
             f"study {chosen.name}: {len(chosen.scenes)} scenes x {len(chosen.all_worlds)} worlds x "
             f"{len(chosen.policies)} policies x {chosen.trials} trials = {chosen.rollouts} rollouts, "
-            f"{executor.jobs} jobs"
+            f"{executor.jobs} job{'' if executor.jobs == 1 else 's'}"
         )
         advance = stack.enter_context(progress("study"))
         path = studies.run_study(chosen, folder, executor, progress=advance, notice=_notice)

@@ -124,6 +124,8 @@ def control_name(of: str, how: str) -> str:
 def load_study(name: str | Path) -> StudyConfig:
     """Reads a study file; a bare name such as ``smoke`` is a bundled one.
 
+    Scenario files that it names are relative to the current folder, or else to the study file's own.
+
     Raises:
         RunError: no such study, not a YAML mapping, or a key is unknown or wrong.
         ScenarioError: a scenario that it names cannot be loaded.
@@ -140,7 +142,20 @@ def load_study(name: str | Path) -> StudyConfig:
         raise RunError(f"study file '{path}' cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise RunError(f"study file '{path}' must hold keys and values, got {type(content).__name__}")
-    return make_study(content, f"study file '{path}'")
+    return make_study(_with_scenarios_beside(content, path.parent), f"study file '{path}'")
+
+
+def _with_scenarios_beside(content: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The same with paths of scenario files that lie in the study file's folder and not in the current one."""
+
+    def resolved(family: Any) -> Any:
+        name = family.get("scenario") if isinstance(family, dict) else None
+        if not isinstance(name, str) or not Path(name).suffix or Path(name).exists() or not (folder / name).is_file():
+            return family
+        return family | {"scenario": str(folder / name)}
+
+    families = content.get("families")
+    return content | {"families": [resolved(family) for family in families]} if isinstance(families, list) else content
 
 
 def shipped_studies() -> list[str]:

@@ -31,6 +31,21 @@ def test_a_study_counts_its_rollouts_and_names_its_scenes(tmp_path):
     assert study.rollouts == 2 * 3 * 2 * 3
 
 
+def test_scenario_files_are_found_beside_the_study_file(tmp_path, monkeypatch):
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies" / "slow.yaml").write_text("name: slow\nduration_s: 4.0\n")
+    file = tmp_path / "studies" / "mine.yaml"
+    family = {"name": "bend", "seeds": [3], "scenario": "slow.yaml"}
+    file.write_text(yaml.safe_dump(LEAST | {"families": [family]}))
+    monkeypatch.chdir(tmp_path)
+    assert load_study(file).families[0].scenario == str(tmp_path / "studies" / "slow.yaml")
+    monkeypatch.chdir(tmp_path / "studies")
+    assert load_study("mine.yaml").families[0].scenario == "slow.yaml"
+    file.write_text(yaml.safe_dump(LEAST | {"families": [family | {"scenario": "fast.yaml"}]}))
+    with pytest.raises(ScenarioError, match="family 'bend': scenario file 'fast.yaml' does not exist"):
+        load_study(file)
+
+
 def test_no_two_towns_share_seeds_and_more_trials_keep_the_first():
     one, three = (make_study(LEAST | {"trials": trials}) for trials in (1, 3))
     assert three.seeds(3) == (3000, 3001, 3002) and one.seeds(3) == (3000,)
