@@ -29,6 +29,7 @@ from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
 from nurec_sim.reconstruct.optimize.poses import PoseCorrections
 from nurec_sim.reconstruct.optimize.responses import FrameResponses, borrowed_responses
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
+from nurec_sim.reconstruct.optimize.unseen import colour_unseen, shown_by
 from nurec_sim.reconstruct.optimize.views import TrainingView, training_views
 from nurec_sim.render.cpu.backward.frame import SENSORS, Frame
 from nurec_sim.scene import scene_hash
@@ -78,6 +79,7 @@ def refine(
         if settings.resume:
             run.restore(read_checkpoint(settings.checkpoint, run.key))
     run.run(progress)
+    run.colour_unseen()
     return run.scene(clip)
 
 
@@ -147,6 +149,13 @@ class Optimization:
         self._check()
         self._restore(self.best)
         self._clear_free_space()
+
+    def colour_unseen(self) -> None:
+        """Give what no image shows the colours of what is like it."""
+        parameters = self.parameters
+        # What was fitted has been seen; the other images are looked at now, so that a short run knows as much.
+        others = [view for number, view in enumerate(self.views) if number not in self._clear]
+        colour_unseen(parameters, (parameters.visits[: parameters.static_count] > 0) | shown_by(parameters, others))
 
     def _clear_free_space(self) -> None:
         """Take out what recorded beams have passed through."""

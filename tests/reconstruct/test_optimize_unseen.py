@@ -1,0 +1,78 @@
+"""Colours of Gaussians that no image shows."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from nurec_sim.reconstruct import OptimizeSettings
+from nurec_sim.reconstruct.optimize import method
+from nurec_sim.reconstruct.optimize.adam import RGB
+from nurec_sim.reconstruct.optimize.parameters import Parameters
+from nurec_sim.reconstruct.optimize.unseen import colour_unseen, shown_by
+from nurec_sim.reconstruct.optimize.views import training_views
+from nurec_sim.types import DynamicGaussians, Label
+
+
+def test_an_image_shows_what_is_before_it_and_not_what_is_behind(street, lifted):
+    """The camera looks along x; one Gaussian is 20 m before it, one behind it, one behind a wall."""
+    (view, *_) = training_views(street, lifted, ["front"], set())
+    eye = view.world_from_camera[0, :3, 3]
+    static = lifted.static[:4]
+    places = eye + np.array([[20.0, 0, 0], [-20.0, 0, 0], [10.0, 2.0, 0.0], [20.0, 4.0, 0.0]])
+    small = dataclasses.replace(
+        static,
+        mean_m=places.astype(np.float32),
+        scale_m=np.where([[False], [False], [True], [False]], 0.5, 0.1).repeat(3, axis=1).astype(np.float32),
+        opacity=np.full(4, 0.9999, np.float32),
+    )
+    # The wall is three Gaussians deep: one lets a hundredth through.
+    deep = small[np.array([0, 1, 2, 2, 2, 3])]
+    parameters = Parameters(dataclasses.replace(lifted, static=deep, dynamic=DynamicGaussians.empty(), tracks=()))
+    x = parameters.static_gaussians(np.arange(6)).mean_m - eye.astype(np.float32)
+    seen = shown_by(parameters, [view])
+    assert seen[x[:, 0] < 0].tolist() == [False]
+    assert seen[(x[:, 0] == 20) & (x[:, 1] == 0)].tolist() == [True]
+    assert seen[(x[:, 1] > 3)].tolist() == [False]
+    assert not parameters.gradients.features.any()
+
+
+def test_the_colour_is_that_of_what_is_alike(lifted):
+    """Bright upright, dark upright and road: green, red, grey. What is not seen takes the colour of its kind."""
+    static = lifted.static[:7]
+    kinds = np.array([0, 1, 2, 0, 1, 2, 0])
+    colours = np.array([[0, 1, 0], [1, 0, 0], [0.5, 0.5, 0.5]], np.float32)
+    unseen = np.array([False, False, False, True, True, True, True])
+    made = dataclasses.replace(
+        static,
+        mean_m=np.array([[0, k, 0.0 if kind == 2 else 2.0] for k, kind in enumerate(kinds)], np.float32),
+        normal=np.where((kinds == 2)[:, None], [0.0, 0, 1], [1.0, 0, 0]).astype(np.float32),
+        intensity=np.array([0.9, 0.1, 0.3], np.float32)[kinds],
+        label=np.where(kinds == 2, Label.ROAD, Label.OTHER).astype(static.label.dtype),
+        rgb=np.where(unseen[:, None], np.float32(1), colours[kinds]),
+    )
+    parameters = Parameters(dataclasses.replace(lifted, static=made, dynamic=DynamicGaussians.empty(), tracks=()))
+    order = parameters.static_gaussians(np.arange(7)).mean_m[:, 1].astype(int)
+    colour_unseen(parameters, ~unseen[order])
+    got = parameters.values[:, RGB : RGB + 3][np.argsort(order)]
+    np.testing.assert_array_equal(got[:3], colours)
+    assert got[3:] == pytest.approx(colours[kinds[3:]], abs=0.2)
+
+
+def test_a_fit_colours_what_no_image_shows(street, lifted):
+    """Behind the car the street is grey by its intensity; it takes on the colours that the images show ahead."""
+    views = training_views(street, lifted, ["front"], set())
+    run = method.Optimization(lifted, views, OptimizeSettings(seconds=None, steps=3))
+    run.run(lambda *_: None)
+    fitted = run.parameters.visits[: run.parameters.static_count] > 0
+    seen = fitted | shown_by(run.parameters, views)
+    assert 0 < seen.sum() < len(seen) and (seen & ~fitted).any(), "three of the four images have been fitted"
+    before = run.parameters.values.copy()
+    run.colour_unseen()
+    after = run.parameters.values
+    static = run.parameters.static_count
+    assert np.array_equal(after[:static][seen], before[:static][seen]) and np.array_equal(
+        after[static:], before[static:]
+    )
+    assert np.array_equal(after[:, :RGB], before[:, :RGB]), "colours alone change"
+    assert (after[:static][~seen, RGB:] != before[:static][~seen, RGB:]).any()
