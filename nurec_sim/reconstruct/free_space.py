@@ -11,6 +11,7 @@ import dataclasses
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
@@ -56,6 +57,8 @@ class SweepBeams:
         beams: unit direction, range (m) and firing time (fraction of the sweep) of each return.
         image: [rows, COLUMNS] a beam in each angular cell, -1 without.
         reach_m: [rows, COLUMNS] its range, metres; -1 without.
+        farthest_m: [rows, COLUMNS] the largest of these ranges among the cells in which a beam that meets a Gaussian
+            with its centre in this cell may be looked for.
         low: elevation of the image's first row, in cells.
         width_rad: half of the width of a beam.
         fraction: mean firing time of each column, as a fraction of the sweep.
@@ -67,6 +70,7 @@ class SweepBeams:
     beams: Float32[np.ndarray, "n 5"]
     image: Int32[np.ndarray, "rows columns"]
     reach_m: Float32[np.ndarray, "rows columns"]
+    farthest_m: Float32[np.ndarray, "rows columns"]
     low: int
     width_rad: float
     fraction: Float64[np.ndarray, " columns"]
@@ -107,7 +111,16 @@ def _beams(t_us, world_from_lidar, drift_m, along, fired) -> SweepBeams:
     width = BEAM_SHARE * STEP_RAD * np.sqrt(len(image) * np.count_nonzero(count) / max(len(distance), 1))
     beams = np.column_stack([along, distance, fired]).astype(np.float32)
     reach = np.where(image >= 0, beams[image, 3], np.float32(-1)) if len(beams) else np.full_like(image, -1, np.float32)
-    return SweepBeams(t_us, world_from_lidar, drift_m, beams, image, reach, low, width, mean[last])
+    farthest = _farthest(reach)
+    return SweepBeams(t_us, world_from_lidar, drift_m, beams, image, reach, farthest, low, width, mean[last])
+
+
+def _farthest(reach_m: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
+    """The largest range up to ``MOST_CELLS`` rows and columns away, across the seam; one more for rounding."""
+    cells = int(np.ceil(MOST_CELLS)) + 1
+    around = np.concatenate([reach_m[:, -cells:], reach_m, reach_m[:, :cells]], axis=1)
+    window = np.ones((2 * cells + 1, 2 * cells + 1), np.uint8)
+    return np.ascontiguousarray(cv2.dilate(around, window)[:, cells:-cells])
 
 
 @kernel
@@ -176,7 +189,7 @@ def count_beams(
         world = world_from_body(sum(sweep.t_us) // 2)
         if world is not None:
             pose = geometry.inverse(sweep.world_from_lidar) @ world
-            found = sweep.beams, sweep.image, sweep.reach_m
+            found = sweep.beams, sweep.image, sweep.reach_m, sweep.farthest_m
             jobs.append((pose, sweep.drift_m, *found, sweep.low, sweep.width_rad, sweep.fraction))
 
     def count(start: int) -> None:
@@ -244,7 +257,9 @@ def _meeting(canonical, o, d):
 
 
 @kernel
-def _count(xyz, canonical, extent, pose, drift, beams, image, reach_m, low, width, fraction, passed, stopped):
+def _count(
+    xyz, canonical, extent, pose, drift, beams, image, reach_m, farthest_m, low, width, fraction, passed, stopped
+):
     rows = image.shape[0]
     turn = np.ascontiguousarray(pose[:3, :3].T)
     for i in range(len(xyz)):
@@ -263,13 +278,17 @@ def _count(xyz, canonical, extent, pose, drift, beams, image, reach_m, low, widt
         if distance < NEAREST_M or level < 0.1 * distance:
             continue
         azimuth, elevation = (_angle(y, x) + np.pi) / STEP_RAD, _angle(z, level) / STEP_RAD - low
+        margin = MARGIN_M + MARGIN_SHARE * distance
+        # Most Gaussians are hidden from most sweeps: all beams around end before them.
+        middle = min(max(int(np.floor(elevation)), 0), rows - 1)
+        if farthest_m[middle, int(np.floor(azimuth)) % COLUMNS] < distance - margin:
+            continue
         # Seen along the beams a grazing footprint is as small as others, however long.
         up, back = level / distance, -z / (level * distance)
         across = _half_width(extent[i], *_turned(turn, -y / level, x / level, 0.0)) / level
         upward = _half_width(extent[i], *_turned(turn, back * x, back * y, up)) / distance
         across = min(max(across, width) / STEP_RAD, MOST_CELLS)
         upward = min(max(upward, width) / STEP_RAD, MOST_CELLS)
-        margin = MARGIN_M + MARGIN_SHARE * distance
         for row in range(
             max(int(np.floor(elevation - upward)), 0), min(int(np.floor(elevation + upward)), rows - 1) + 1
         ):

@@ -207,8 +207,11 @@ def _cones(row: Int64[np.ndarray, " n"], height: Values, across: Values) -> tupl
     """
     count = row.max() + 1
     apex = np.full(count, np.nan)
+    usable = np.flatnonzero(across > NEAREST_M)
+    usable = usable[np.argsort(row[usable], kind="stable")]
+    ends = np.searchsorted(row[usable], np.arange(count + 1))
     for k in range(count):
-        chosen = (row == k) & (across > NEAREST_M)
+        chosen = usable[ends[k] : ends[k + 1]]
         z, rho = height[chosen], across[chosen]
         if len(z) < FEWEST_POINTS or np.ptp(rho) < LEAST_SPREAD * np.median(rho):
             continue

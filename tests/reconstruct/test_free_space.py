@@ -114,6 +114,15 @@ def test_foliage_stays_as_long_as_half_of_the_beams_return(parked):
         assert in_free_space(at([10, 0, 0], sigma_m=0.2), [sweep]).tolist() == [free]
 
 
+def test_beams_that_pass_beside_a_hidden_centre_count(parked):
+    """A post in front hides the middle 0.8 degrees of a Gaussian that is 2.8 degrees wide, but not its sides."""
+    azimuth = np.degrees(np.arctan2(directions()[:, 1], directions()[:, 0]))
+    post = sweep_of(parked, np.where(np.abs(azimuth) < 0.4, 5.0, 30.0))
+    passed, stopped = count_beams(at([10, 0, 0], sigma_m=0.2), [post])
+    assert passed[0] > 3 and stopped[0] == 0
+    assert not count_beams(at([10, 0, 0], sigma_m=0.2), [sweep_of(parked, 5.0)])[0].any()
+
+
 def test_a_footprint_is_judged_by_the_space_that_it_fills(parked):
     """A disc in the plane of grazing beams touches none of them; tipped by 30 degrees it stands in their way."""
     flat = dataclasses.replace(at([10, 0, -0.1]), scale_m=np.array([[0.5, 0.05, 0.002]], np.float32))

@@ -99,6 +99,13 @@ def test_normals_of_a_plane_face_the_sensor(seed):
     assert (spacing >= 0.1 - 1e-6).all() and (spacing <= 0.3 + 1e-6).all()
 
 
+def test_census_tells_the_clearly_darker_neighbours_row_by_row():
+    """Of the middle of 7 x 7 equal pixels the first neighbour is 2 darker, the last 3, the second 1: too little."""
+    gray = np.full((7, 7), 100, np.uint8)
+    gray[0, 0], gray[0, 1], gray[6, 6] = 98, 99, 97
+    assert int(depth.census(gray)[3, 3]) == (1 << 47) | 1
+
+
 def test_one_scan_line_faces_the_sensor():
     xyz = np.column_stack([np.linspace(-1, 1, 50), np.full(50, 5.0), np.zeros(50)])
     _, normal, _ = surface_of(cloud_of(xyz, eye=(0, 0, 0)))

@@ -21,13 +21,23 @@ SMOOTH_ONE, SMOOTH_MANY = 6.0, 48.0
 
 def census(gray: UInt8[np.ndarray, "h w"]) -> UInt64[np.ndarray, "h w"]:
     """48 bits per pixel: which of the 7x7 neighbours are darker."""
-    padded = np.pad(gray.astype(np.int16), 3, mode="edge")
-    bits = np.zeros(gray.shape, np.uint64)
-    for dy in range(7):
-        for dx in range(7):
-            if (dy, dx) != (3, 3):
-                darker = padded[dy : dy + gray.shape[0], dx : dx + gray.shape[1]] < gray.astype(np.int16) - 1
-                bits = (bits << np.uint64(1)) | darker.astype(np.uint64)
+    return _census(np.pad(gray, 3, mode="edge"))
+
+
+@kernel
+def _census(padded):
+    """The same from a picture with three more pixels at every side."""
+    height, width = padded.shape[0] - 6, padded.shape[1] - 6
+    bits = np.zeros((height, width), np.uint64)
+    for row in range(height):
+        for dy in range(7):
+            for dx in range(7):
+                if dy == 3 and dx == 3:
+                    continue
+                for column in range(width):
+                    # Two more than another byte fits no byte: int64.
+                    darker = np.int64(padded[row + dy, column + dx]) + 1 < np.int64(padded[row + 3, column + 3])
+                    bits[row, column] = (bits[row, column] << np.uint64(1)) | np.uint64(darker)
     return bits
 
 

@@ -106,7 +106,7 @@ class _Voxels:
 
     def _merge(self) -> None:
         if len(self.keys) > 1:
-            key, sums = _sum_by_key(np.concatenate(self.keys), np.concatenate(self.sums))
+            key, sums = _sum_by_key(np.concatenate(self.keys), self.sums)
             self.keys, self.sums = [key], [sums]
         self.pending = 0
 
@@ -153,27 +153,32 @@ def _voxel_sums(
     key = ((level << 57) | (cell[:, 0] << 38) | (cell[:, 1] << 19) | cell[:, 2]).astype(np.int64)
     known = np.isfinite(intensity)
     rows = np.column_stack([xyz, eye, edge, np.where(known, intensity, 0.0), known, np.ones(len(xyz))])
-    return _sum_by_key(key, rows)
+    return _sum_by_key(key, [rows])
 
 
-def _sum_by_key(key: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sum_by_key(key: np.ndarray, parts: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct keys, ascending, and the sums of the rows of each; the rows of all parts follow each other."""
     order = np.argsort(key, kind="stable")
     in_order_of_key = key[order]
-    place = np.cumsum(in_order_of_key[1:] != in_order_of_key[:-1])
-    place = np.concatenate([np.zeros(min(len(key), 1), np.int64), place])
-    keys = np.zeros(int(place[-1]) + 1 if len(key) else 0, np.int64)
-    keys[place] = in_order_of_key
-    sums = np.zeros((len(keys), rows.shape[1]))
-    _add_rows(order, place, rows, sums)
+    first = np.ones(len(key), bool)
+    first[1:] = in_order_of_key[1:] != in_order_of_key[:-1]
+    place = np.empty(len(key), np.int64)
+    place[order] = np.cumsum(first) - 1
+    keys = in_order_of_key[first]
+    sums = np.zeros((len(keys), parts[0].shape[1]))
+    start = 0
+    for rows in parts:
+        _add_rows(place[start : start + len(rows)], rows, sums)
+        start += len(rows)
     return keys, sums
 
 
 @kernel
-def _add_rows(order, place, rows, sums):
-    """Add row ``order[i]`` to ``sums[place[i]]``, one after the other."""
-    for i in range(len(order)):
+def _add_rows(place, rows, sums):
+    """Add each row to ``sums[place]``, one after the other."""
+    for i in range(len(place)):
         for c in range(rows.shape[1]):
-            sums[place[i], c] += rows[order[i], c]
+            sums[place[i], c] += rows[i, c]
 
 
 PATH_PART = 16
@@ -354,7 +359,11 @@ def returns_in_box(
     near = near[free[near] & actor.present(t_us[near])]
     if not len(near):
         return near, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)
-    box_from_world = geometry.inverse(actor.path.at(t_us[near]))
+    if len(actor.path.t_us) == 1:
+        # One pose for all points, as each would get.
+        box_from_world = np.broadcast_to(geometry.inverse(actor.path.at(int(t_us[near[0]]))), (len(near), 4, 4))
+    else:
+        box_from_world = geometry.inverse(actor.path.at(t_us[near]))
     box = np.einsum("nij,nj->ni", box_from_world[:, :3, :3], xyz[near]) + box_from_world[:, :3, 3]
     hit = geometry.points_in_box(box, actor.track.size_m, margin_m)
     near, box, box_from_world = near[hit], box[hit], box_from_world[hit]

@@ -9,6 +9,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
+from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.points import Cloud
 from nurec_sim.types import Gaussians, Label
 
@@ -53,10 +54,7 @@ def surface_of(cloud: Cloud, chunk: int = 16_384) -> tuple[Cloud, np.ndarray, np
         offset = cloud.xyz_m[index] - cloud.xyz_m[part][:, None]
         # Neighbours across a gap belong to another surface.
         close = distance < np.maximum(4 * distance[:, 3:4], 4 * cloud.spacing_m[part, None])
-        weight = close / close.sum(axis=1, keepdims=True)
-        mean = np.einsum("nk,nkd->nd", weight, offset)
-        centred = offset - mean[:, None]
-        covariance = np.einsum("nk,nki,nkj->nij", weight, centred, centred)
+        mean, covariance = _moments(offset, close)
         # Principal axes of the neighbourhood, variances ascending: the first axis is the normal of a plane.
         variance, axes = np.linalg.eigh(covariance)
         normal = axes[:, :, 0]
@@ -78,6 +76,32 @@ def surface_of(cloud: Cloud, chunk: int = 16_384) -> tuple[Cloud, np.ndarray, np
     for _ in in_order(fit, range(0, n, chunk)):
         pass
     return dataclasses.replace(cloud, xyz_m=xyz), normals, spacing
+
+
+@kernel
+def _moments(offset, close):
+    """Mean [n,3] and covariance [n,3,3] of the ``close`` [n,k] ones of points [n,k,3]."""
+    n, k, _ = offset.shape
+    mean, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    for i in range(n):
+        count = 0
+        for j in range(k):
+            if close[i, j]:
+                count += 1
+                for a in range(3):
+                    mean[i, a] += offset[i, j, a]
+        for a in range(3):
+            mean[i, a] /= count
+        for j in range(k):
+            if close[i, j]:
+                for a in range(3):
+                    for b in range(a + 1):
+                        covariance[i, a, b] += (offset[i, j, a] - mean[i, a]) * (offset[i, j, b] - mean[i, b])
+        for a in range(3):
+            for b in range(a + 1):
+                covariance[i, a, b] /= count
+                covariance[i, b, a] = covariance[i, a, b]
+    return mean, covariance
 
 
 def rotation_onto(normal: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
