@@ -8,11 +8,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from nurec_sim import geometry
 from nurec_sim.errors import NurecSimError
 from nurec_sim.sim.flat_world import FlatWorld, flat_world, poses_along
 from nurec_sim.sim.plans import check_plan
+from nurec_sim.sim.policy_sensors import SIDES_RAD
 from nurec_sim.sim.rollout import run_rollout
 from nurec_sim.sim.scenario import Scenario
 from nurec_sim.types import Needs, Observation, Plan, Policy, Rig, Track, Trajectory
@@ -87,6 +91,16 @@ def _straight(speed_mps: float, with_lead: bool = False) -> FlatWorld:
         t_us = 1_000_000 + 100_000 * np.arange(41, dtype=np.int64)
         poses = poses_along(line, 25.0 + 8.0 * np.arange(41) / 10, z_m=0.75)
         tracks.append(Track("lead", "automobile", (4.5, 1.8, 1.5), Trajectory(t_us, poses)))
-    return flat_world(
+    world = flat_world(
         f"straight at {speed_mps:g} m/s{' behind a car' if with_lead else ''}", line, speed_mps, 4.0, tracks
     )
+    return replace(world, rig=_with_sides(world.rig))
+
+
+def _with_sides(rig: Rig) -> Rig:
+    """A rig whose front camera has twins that look 60 degrees to the left and to the right."""
+    front = next(iter(rig.cameras.values()))
+    turns = {name: geometry.pose_from_xyyaw(0.0, 0.0, yaw) for name, yaw in SIDES_RAD.items()}
+    sides = [replace(front, id=f"front_{name}", rig_from_camera=turn @ front.rig_from_camera)
+             for name, turn in turns.items()]  # fmt: skip
+    return replace(rig, cameras={**rig.cameras, **{camera.id: camera for camera in sides}})

@@ -36,6 +36,9 @@ from nurec_sim.types import (
 
 MAX_VIRTUAL_FOV_RAD = math.radians(100.0)
 FRONT_TOLERANCE_RAD = math.radians(10.0)
+TELE_FOV_RAD, TELE_AT_MOST_RAD = math.radians(30.0), math.radians(45.0)
+SIDES_RAD = {"left": math.radians(60.0), "right": math.radians(-60.0)}
+SIDE_TOLERANCE_RAD = math.radians(40.0)
 PoseAt = Callable[[int], Matrix4]
 Exposures = Int64[np.ndarray, "frames 2"]
 
@@ -142,23 +145,48 @@ class SensorSuite:
 
 
 def find_camera(rig: Rig, name: str) -> CameraModel:
-    """A camera by id, or the most forward-facing one for ``front``.
+    """A camera by id, or by where it looks: ``front``, ``tele``, ``left`` or ``right``.
 
     Of the cameras within 10 degrees of the most forward-facing one, ``front`` is the one with the widest view, and of
-    these the first in the rig, which excludes tele cameras and the right camera of a stereo pair.
+    these the first in the rig, which excludes tele cameras and the right camera of a stereo pair. ``tele`` is the one
+    with the narrowest view, if that is at most 45 degrees; otherwise a virtual camera with the middle 30 degrees of
+    ``front``. ``left`` and ``right`` are the cameras that look closest to 60 degrees aside, by 40 at most.
 
     Raises:
         ScenarioError: no such camera; the text lists the rig's.
     """
     if name in rig.cameras:
         return rig.cameras[name]
-    if name == "front" and rig.cameras:
+    if name in ("front", "tele") and rig.cameras:
         off_axis = {c.id: math.acos(min(1.0, float(c.rig_from_camera[0, 2]))) for c in rig.cameras.values()}
         best = min(off_axis.values())
         forward = [c for c in rig.cameras.values() if off_axis[c.id] <= best + FRONT_TOLERANCE_RAD]
         # Rounded to 1 mrad: the two cameras of a stereo pair count as equal, and ``max`` returns the first of equals.
-        return max(forward, key=lambda c: round(horizontal_fov_rad(c), 3))
+        front = max(forward, key=lambda c: round(horizontal_fov_rad(c), 3))
+        return front if name == "front" else _tele(front, forward)
+    if name in SIDES_RAD:
+        off = {c.id: _off_yaw(c, SIDES_RAD[name]) for c in rig.cameras.values()}
+        if off and min(off.values()) <= SIDE_TOLERANCE_RAD:
+            return rig.cameras[min(off, key=lambda camera_id: round(off[camera_id], 3))]
     raise ScenarioError(f"camera '{name}' is needed but the rig has no such camera; have {list(rig.cameras)}")
+
+
+def _off_yaw(camera: CameraModel, yaw_rad: float) -> float:
+    """Angle between the horizontal direction of a camera and a yaw in the rig; pi for one that looks up or down."""
+    x, y = (float(value) for value in camera.rig_from_camera[:2, 2])
+    if math.hypot(x, y) < 0.5:
+        return math.pi
+    return abs(math.remainder(math.atan2(y, x) - yaw_rad, 2 * math.pi))
+
+
+def _tele(front: CameraModel, forward: Sequence[CameraModel]) -> CameraModel:
+    """The forward camera with the narrowest view, or the middle of ``front``, with as many pixels as the whole."""
+    narrow = min(forward, key=lambda c: round(horizontal_fov_rad(c), 3))
+    if horizontal_fov_rad(narrow) <= TELE_AT_MOST_RAD:
+        return narrow
+    focal = front.width_px / 2 / math.tan(TELE_FOV_RAD / 2)
+    lens = Pinhole(focal, focal, front.width_px / 2, front.height_px / 2)
+    return replace(front, lens=lens, windshield=None)
 
 
 def find_lidar(rig: Rig, name: str) -> LidarModel:

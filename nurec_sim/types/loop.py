@@ -77,7 +77,8 @@ class Needs:
     """The sensors that a policy reads; the loop renders no others.
 
     ``cameras`` and ``lidars`` are sensor ids of the rig, or the aliases ``front`` (the camera facing closest to
-    forward) and ``any`` (the first LiDAR). Images are rendered at ``image_width_px`` with the same field of view.
+    forward), ``tele`` (its middle 30 degrees, or the rig's tele camera), ``left`` and ``right`` (60 degrees aside), and
+    ``any`` (the first LiDAR). Images are rendered at ``image_width_px`` with the same field of view.
     """
 
     cameras: tuple[str, ...] = ()

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 REPO = Path(__file__).parents[2]
-POLICY_MAY_IMPORT = {"nurec_sim.types", "nurec_sim.geometry", "nurec_sim.policies", "numpy", "jaxtyping"}
+POLICY_MAY_IMPORT = {
+    "nurec_sim.types", "nurec_sim.geometry", "nurec_sim.policies", "numpy", "jaxtyping", "safetensors"
+}  # fmt: skip
 
 
 def imported_modules(path: Path) -> set[str]:

@@ -7,9 +7,10 @@ import pytest
 import worlds
 
 from nurec_sim import geometry
+from nurec_sim.errors import ScenarioError
 from nurec_sim.plugins import load_policy
 from nurec_sim.sim import Scenario, run_rollout
-from nurec_sim.sim.policy_sensors import exposure_us
+from nurec_sim.sim.policy_sensors import exposure_us, find_camera, horizontal_fov_rad
 from nurec_sim.sim.rollout import start_offset, timeline
 from nurec_sim.sim.scenario import ActorEdit, Perturbation, SensorSettings
 from nurec_sim.types import CameraFrame, Fisheye, LidarFrame, Needs, Pinhole, Plan, Rig, Shutter
@@ -275,6 +276,27 @@ def test_policies_only_meet_ideal_pinholes():
     fov = 2 * np.arctan(seen.width_px / 2 / seen.lens.fx_px)
     assert np.degrees(fov) == pytest.approx(min(100.0, np.degrees(2 * 320 / 200)), abs=0.5)
     assert seen.id == camera.id and np.array_equal(seen.rig_from_camera, camera.rig_from_camera)
+
+
+def turned(camera, name, yaw_deg):
+    turn = geometry.pose_from_xyyaw(0.0, 0.0, np.deg2rad(yaw_deg))
+    return replace(camera, id=name, rig_from_camera=turn @ camera.rig_from_camera)
+
+
+def test_cameras_are_found_by_where_they_look():
+    front = worlds.straight_road().rig.cameras["front_wide"]
+    rear_left, left, right = (turned(front, *each) for each in (("b", 140), ("c", 45), ("d", -95)))
+    rig = Rig({camera.id: camera for camera in (front, rear_left, left, right)}, {})
+    assert find_camera(rig, "left").id == "c" and find_camera(rig, "right").id == "d"
+    with pytest.raises(ScenarioError, match="camera 'left' is needed but the rig has no such camera"):
+        find_camera(Rig({"a": front, "b": rear_left}, {}), "left")
+    # No tele camera: 30 of the front camera's 90 degrees, with as many pixels; 320 / tan(15 degrees) = 1194.3.
+    tele = find_camera(rig, "tele")
+    assert tele.id == "front_wide" and (tele.width_px, tele.height_px) == (640, 384)
+    assert tele.lens.fx_px == pytest.approx(1194.26, abs=0.01) and np.isclose(horizontal_fov_rad(tele), np.deg2rad(30))
+    narrow = replace(front, id="narrow", lens=replace(front.lens, fx_px=900.0, fy_px=900.0))  # 39 degrees
+    assert find_camera(replace(rig, cameras={**rig.cameras, "narrow": narrow}), "tele").id == "narrow"
+    assert find_camera(replace(rig, cameras={**rig.cameras, "narrow": narrow}), "front").id == "front_wide"
 
 
 def test_front_is_the_wide_camera_that_looks_forward():
