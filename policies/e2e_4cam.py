@@ -1,4 +1,4 @@
-"""End-to-end driving by the front camera, a tele view and the cameras at both sides: a small network, trained by imitation (``_end_to_end``)."""
+"""End-to-end driving by front, tele and side cameras: a small network, trained by imitation (``_end_to_end``)."""
 
 from __future__ import annotations
 

@@ -172,3 +172,42 @@ def test_a_bad_detector_overlooks_and_misplaces():
 
 def test_the_documents_policy_keeps_the_contract():
     assert check_policy(names_of("policies.md")["Creep"]()) == []
+
+
+@pytest.mark.parametrize("name", ["e2e_1cam", "e2e_2cam"])
+def test_networks_keep_to_the_route_in_a_world_that_they_have_never_seen(name):
+    world = worlds.curve()
+    rollout = drive(name, world, duration_s=6.0)
+    assert rollout.status == "ok" and np.abs(lateral(rollout, world)).max() < 2.0
+    assert geometry.arc_length(rollout.world_from_rig[:, :2, 3])[-1] > 15
+
+
+def test_networks_look_at_their_images():
+    """Another image, another plan; and the shipped files are small."""
+    policy, world = load_policy("e2e_1cam"), worlds.straight_road()
+    seen = []
+
+    def dark(requests):
+        seen.extend(request.sensor.id for request in requests)
+        return [replace(frame, rgb=frame.rgb // 4) for frame in world.sense(requests)]
+
+    scenario = Scenario(name="test", duration_s=1.0)
+    plain, other = (run_rollout(scenario, policy, sense, world) for sense in (world.sense, dark))
+    assert not np.array_equal(plain.plans[0][1].pose, other.plans[0][1].pose)
+    assert set(seen) == {"front_wide"} and policy.weights_file.stat().st_size < 1_500_000
+
+
+def test_a_network_without_its_weights_says_what_makes_them(tmp_path):
+    policy, world = load_policy("e2e_1cam"), worlds.straight_road()
+
+    class Lost(type(policy)):
+        weights_file = tmp_path / "none.safetensors"
+
+    rollout = run_rollout(Scenario(name="test", duration_s=1.0), Lost(), world.sense, world)
+    assert rollout.status == "failed" and "nurec-sim train makes it" in rollout.error
+    Lost.weights_file.write_bytes(load_policy("e2e_2cam").weights_file.read_bytes())
+    rollout = run_rollout(Scenario(name="test", duration_s=1.0), Lost(), world.sense, world)
+    assert "is not of an end-to-end policy with 1 cameras" in rollout.error
+    Lost.weights_file.write_bytes(b"no")
+    rollout = run_rollout(Scenario(name="test", duration_s=1.0), Lost(), world.sense, world)
+    assert "is damaged or no .safetensors file" in rollout.error

@@ -47,7 +47,7 @@ def folder(tmp_path_factory):
 
 def test_the_network_is_the_same_in_numpy_and_in_torch():
     policy = load_policy("e2e_2cam")
-    network = DrivingNetwork(policy.shapes(), seed=1)
+    network = DrivingNetwork(policy.shapes(), seed=1).eval()
     assert {name: tuple(value.shape) for name, value in network.state_dict().items()} == policy.shapes()
     rng = np.random.default_rng(2)
     images, numbers = rng.integers(0, 256, (2, 64, 128, 3), np.uint8), rng.standard_normal(12).astype(np.float32)

@@ -31,7 +31,7 @@ class DriveSettings(Strict):
     """
 
     first_town: int = Field(0, ge=0)
-    towns: int = Field(20, ge=1)
+    towns: int = Field(24, ge=1)
     town_s: float = Field(12.0, ge=4, le=30)
     places: int = Field(40, ge=1)
     answers: int = Field(6, ge=1)
@@ -66,15 +66,15 @@ class ImitationConfig(Strict):
     profile: Literal["imitation"] = "imitation"
     policies: tuple[str, ...] = ("e2e_1cam", "e2e_2cam", "e2e_4cam")
     seed: int = Field(0, ge=0)
-    steps: int = Field(1200, ge=1)
+    steps: int = Field(500, ge=1)
     batch: int = Field(32, ge=1)
     learning_rate: float = Field(1e-3, gt=0, le=1)
-    warm_up: int = Field(100, ge=0)
+    warm_up: int = Field(50, ge=0)
     final_rate: float = Field(0.02, ge=0, le=1)
-    weight_decay: float = Field(0.01, ge=0)
+    weight_decay: float = Field(0.05, ge=0)
     clip_norm: float = Field(1.0, gt=0)
     average: float = Field(0.99, ge=0, lt=1)
-    route_noise_m: float = Field(0.7, ge=0)
+    route_noise_m: float = Field(0.35, ge=0)
     held_out: int = Field(8, ge=2)
     log_every: int = Field(20, ge=1)
     checkpoint_every: int = Field(100, ge=1)

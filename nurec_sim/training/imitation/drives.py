@@ -1,4 +1,4 @@
-"""Examples for imitation: images at poses beside a recorded drive, and what an expert who sees the truth would do there.
+"""Examples for imitation: images at poses beside a recorded drive, and what an expert who sees the truth does there.
 
 An expert that only ever drives well never shows how to recover (Ross et al., DAgger, 2011). Here its answer is known
 from any pose, so the ego is put beside its path, turned, ahead of its time, at other speeds, and behind other vehicles.

@@ -8,6 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+DROPOUT = 0.3
+"""Of the features of every camera, in training only: towns are few."""
+
 
 class DrivingNetwork(nn.Module):
     """Strided convolutions and a layer per camera, shared; then layers for all cameras together.
@@ -32,8 +35,10 @@ class DrivingNetwork(nn.Module):
                 # He et al. 2015: keeps the variance through layers with ReLU.
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(module.bias)
+            last = self.head[-1]
+            assert isinstance(last, nn.Linear)
             with torch.no_grad():
-                self.head[-1].weight.mul_(0.1)
+                last.weight.mul_(0.1)  # the first answer is about straight on
 
     def forward(self, images: Tensor, numbers: Tensor) -> Tensor:
         """Outputs [batch, outputs] of images uint8 [batch, cameras, h, w, 3] and numbers [batch, n]."""
@@ -41,7 +46,9 @@ class DrivingNetwork(nn.Module):
         x = images.flatten(0, 1).permute(0, 3, 1, 2).float() / 127.5 - 1
         for convolution in self.convolutions:
             x = functional.relu(convolution(x))
-        x = functional.relu(self.camera(x.flatten(1))).reshape(batch, cameras * self.camera.out_features)
+        x = functional.dropout(x.flatten(1), DROPOUT, self.training)
+        x = functional.relu(self.camera(x)).reshape(batch, cameras * self.camera.out_features)
+        x = functional.dropout(x, DROPOUT, self.training)
         x = torch.cat([x, numbers], dim=1)
         for layer in self.head[:-1]:
             x = functional.relu(layer(x))

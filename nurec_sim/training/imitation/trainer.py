@@ -102,7 +102,7 @@ class ImitationTrainer:
         position = self.positions[name]
         if position.step == 0 and (before := config.policies.index(name)):
             self._start_from(model, config.policies[before - 1])
-        average = copy.deepcopy(model).requires_grad_(False)
+        average = copy.deepcopy(model).requires_grad_(False).eval()
         moments = checkpoint.load_networks(folder, model, average) if position.step else {}
         parameters = dict(model.named_parameters())
         optimiser = torch.optim.AdamW(parameters.values(), lr=config.learning_rate, weight_decay=config.weight_decay)
@@ -114,7 +114,9 @@ class ImitationTrainer:
             rate = learning_rate(config, step)
             for group in optimiser.param_groups:
                 group["lr"] = rate
-            loss, figures = imitation_loss(model, seen.training(config, step))
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(config.seed * 1_000_003 + step)  # of the dropout
+                loss, figures = imitation_loss(model, seen.training(config, step))
             figures |= {"rate": rate, "loss": float(loss.detach())}
             figures |= update(optimiser, loss, model, average, parameters, step=step, clip_norm=config.clip_norm,
                               decay=config.average)  # fmt: skip
