@@ -178,3 +178,23 @@ def test_a_disc_is_tilted_less_the_thinner_it_is(lifted):
     turned = before.T @ after
     tilt = 0.02 * 0.002 / 0.08
     assert [turned[2, 1], turned[0, 2], turned[1, 0]] == pytest.approx([tilt, tilt, 0.02], rel=2e-2)
+
+
+def test_a_disc_grows_wider_and_not_thicker_and_a_ball_grows_in_all_directions(lifted):
+    """The gradient asks for larger standard deviations along all axes: of a disc of 8 x 6 x 0.2 cm, and of a ball."""
+    thin = np.array([[0.08, 0.002, 0.06], [0.05, 0.04, 0.045]], np.float32)
+    static = dataclasses.replace(lifted.static[:2], scale_m=thin)
+    parameters = Parameters(dataclasses.replace(lifted, static=static, dynamic=DynamicGaussians.empty(), tracks=()))
+    # Static Gaussians are kept in another order.
+    disc, ball = np.exp(parameters.values[:, SCALE + 1]).argsort()
+    before = parameters.values[:, SCALE : SCALE + 3].copy()
+    parameters.gradients.scale[:2] = -1
+    parameters.step(parameters.at(lifted.span_us[0]), np.array([0, 1], np.int32), rate_columns(0, 0, 0.1, 0, 0), 1.0)
+    change = parameters.values[:, SCALE : SCALE + 3] - before
+    assert change[disc] == pytest.approx([0.1, 0.0, 0.1], abs=1e-4)
+    assert change[ball] == pytest.approx([0.1, 0.1, 0.1], abs=1e-4)
+    # Thinner it may become.
+    for _ in range(40):
+        parameters.gradients.scale[:2] = 1
+        parameters.step(parameters.at(lifted.span_us[0]), np.array([0, 1], np.int32), rate_columns(0, 0, 0.1, 0, 0), 1)
+    assert parameters.values[disc, SCALE + 1] == pytest.approx(np.log(1e-3), abs=1e-3)

@@ -87,7 +87,21 @@ def _freedom(a, b):
 
 @kernel
 def adam_step(
-    rows, values, first, second, visits, corrections, turns, row_turn, by, scale, opacity, rates, pulls, largest_m
+    rows,
+    values,
+    first,
+    second,
+    visits,
+    corrections,
+    turns,
+    row_turn,
+    by,
+    scale,
+    opacity,
+    rates,
+    pulls,
+    largest_m,
+    thickest,
 ):
     """One step on some Gaussians; those without any gradient, which others hide, are left as they are.
 
@@ -108,6 +122,7 @@ def adam_step(
             not used, the others are of turns (rad) about the Gaussian's axes before they are limited (``_freedom``).
         pulls: [2] float32 weights of a Gaussian's opacity, and of the sum of its standard deviations, in the loss.
         largest_m: standard deviations end here.
+        thickest: [n,3] the largest log standard deviation along each axis, besides ``largest_m``.
     """
     gradient, change, axes = np.zeros(VALUES, np.float32), np.zeros(VALUES, np.float32), np.zeros((3, 3), np.float32)
     low, high = np.float32(np.log(SMALLEST_M)), np.float32(np.log(largest_m))
@@ -161,8 +176,8 @@ def adam_step(
         for k in range(SCALE, VALUES):
             values[i, k] -= change[k]
         # Bounds: a scale near 0 makes the covariance singular, a huge one covers the view from inside.
-        for k in range(SCALE, SCALE + 3):
-            values[i, k] = min(max(values[i, k], low), high)
+        for k in range(3):
+            values[i, SCALE + k] = min(max(values[i, SCALE + k], low), high, thickest[i, k])
         # The renderer takes unit quaternions, and a step leaves the unit sphere.
         norm = np.float32(0)
         for k in range(QUAT, QUAT + 4):

@@ -20,6 +20,8 @@ from nurec_sim.types import Gaussians, GaussianScene
 
 OPACITIES = (0.005, 0.985)
 """A logit begins within these: outside of them its gradient is too small, or none (the renderer stops at 0.99)."""
+FLAT = 0.5
+"""A Gaussian that is thinner than this share of its middle standard deviation is a disc, which lies on a surface."""
 NOWHERE = -1
 
 
@@ -54,6 +56,7 @@ class Parameters:
         everything = Gaussians.concatenate([self._scene.static, scene.dynamic.gaussians])
         self.values = _values(everything)
         count = len(everything)
+        self._thickest = _thickest(self.values)
         self.first, self.second = np.zeros((count, VALUES), np.float32), np.zeros((count, VALUES), np.float32)
         self.visits = np.zeros(count, np.int32)
         self._corrections = bias_corrections()
@@ -121,7 +124,8 @@ class Parameters:
         self._parts(
             adam_step, rows,
             (self.values, self.first, self.second, self.visits, self._corrections, drawn.turns, self._row_turn,
-             self.gradients, drawn.world.scale, drawn.world.opacity, rates.astype(np.float32), pulls, largest_m),
+             self.gradients, drawn.world.scale, drawn.world.opacity, rates.astype(np.float32), pulls, largest_m,
+             self._thickest),
         )  # fmt: skip
         self._place(rows[rows < self.static_count])
 
@@ -178,6 +182,20 @@ def _values(gaussians: Gaussians) -> Float32[np.ndarray, "n 14"]:
     values[:, OPACITY] = np.log(opacity / (1 - opacity))
     values[:, RGB : RGB + 3] = gaussians.rgb
     return values
+
+
+def _thickest(values: Float32[np.ndarray, "n 14"]) -> Float32[np.ndarray, "n 3"]:
+    """Logs of the largest standard deviations: discs must not grow thicker, all other axes are free (infinity).
+
+    A thick disc stops beams before its surface. The images do not need it: they see discs from the front.
+    """
+    log_scale = values[:, SCALE : SCALE + 3]
+    thinnest, middle = np.sort(log_scale, axis=1)[:, :2].T
+    rows = np.flatnonzero(thinnest < middle + np.log(FLAT))
+    axis = log_scale[rows].argmin(axis=1)
+    thickest = np.full(log_scale.shape, np.inf, np.float32)
+    thickest[rows, axis] = log_scale[rows, axis]
+    return thickest
 
 
 def _with_values(gaussians: Gaussians, values: Float32[np.ndarray, "n 14"]) -> Gaussians:
