@@ -29,6 +29,8 @@ AFTER_S = np.array([0.5, 1.0, 2.0, 3.0, 4.0])
 SPEED_SCALE_MPS, LENGTH_SCALE_M = 10.0, 10.0
 NUMBERS = 2 + 2 * len(ROUTE_M)
 KERNELS = (5, 3, 3, 3, 3)
+DIGITS = 6
+"""Of the network's outputs."""
 HARDEST_BRAKE_MPS2, ACCEL_MPS2 = 6.0, 2.0
 STANDS_MPS = 0.3
 """A lower wanted speed means to stop."""
@@ -84,7 +86,7 @@ def numbers_of(
 
 
 def answer(
-    outputs: Float32[np.ndarray, " 17"],
+    outputs: Float64[np.ndarray, " 17"],
 ) -> tuple[Float64[np.ndarray, "p 2"], Float64[np.ndarray, " s"]]:
     """Path (metres, in the rig frame) and speeds (m/s) from the network's outputs."""
     count = 2 * len(PATH_M)
@@ -101,12 +103,12 @@ def targets_of(path_m: np.ndarray, speeds_mps: np.ndarray) -> np.ndarray:
 
 def forward(
     weights: Mapping[str, np.ndarray], images: UInt8[np.ndarray, "cameras h w 3"], numbers: Float32[np.ndarray, " 12"]
-) -> Float32[np.ndarray, " 17"]:
+) -> Float64[np.ndarray, " 17"]:
     """The network: five strided convolutions and a layer per camera, shared; then three layers for all.
 
     ``training.imitation.network`` is the same in PyTorch.
     """
-    x = images.astype(np.float32) / np.float32(127.5) - np.float32(1)
+    x = images / 127.5 - 1
     for layer, kernel in enumerate(KERNELS):
         x = np.maximum(_convolved(x, weights[f"convolutions.{layer}.weight"], kernel)
                        + weights[f"convolutions.{layer}.bias"], 0)  # fmt: skip
@@ -117,12 +119,13 @@ def forward(
     for layer in range(3):
         x = weights[f"head.{layer}.weight"] @ x + weights[f"head.{layer}.bias"]
         x = np.maximum(x, 0) if layer < 2 else x
-    return x
+    # Libraries sum in an order that depends on the number of threads; that is far below the last digit kept.
+    return np.round(x, DIGITS)
 
 
 def _convolved(
-    x: Float32[np.ndarray, "n h w c"], weight: Float32[np.ndarray, "out c k k"], kernel: int
-) -> Float32[np.ndarray, "n h2 w2 out"]:
+    x: Float64[np.ndarray, "n h w c"], weight: Float64[np.ndarray, "out c k k"], kernel: int
+) -> Float64[np.ndarray, "n h2 w2 out"]:
     """A convolution of stride 2 that halves the image, as one matrix product."""
     pad = kernel // 2
     padded = np.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
@@ -133,7 +136,7 @@ def _convolved(
 
 
 def read_weights(path: Path, cameras: int) -> dict[str, np.ndarray]:
-    """Weights from their file, in single precision.
+    """Weights from their file, in double precision.
 
     Raises:
         FileNotFoundError: there is none.
@@ -148,7 +151,7 @@ def read_weights(path: Path, cameras: int) -> dict[str, np.ndarray]:
     shapes = weight_shapes(cameras)
     if {name: value.shape for name, value in found.items()} != shapes:
         raise ValueError(f"{path} is not of an end-to-end policy with {cameras} cameras")
-    return {name: np.ascontiguousarray(value, np.float32) for name, value in found.items()}
+    return {name: np.ascontiguousarray(value, np.float64) for name, value in found.items()}
 
 
 def weight_shapes(cameras: int) -> dict[str, tuple[int, ...]]:
@@ -205,7 +208,7 @@ class EndToEnd:
 
     def outputs(
         self, images: UInt8[np.ndarray, "cameras h w 3"], numbers: Float32[np.ndarray, " 12"]
-    ) -> Float32[np.ndarray, " 17"]:
+    ) -> Float64[np.ndarray, " 17"]:
         """What the network answers; ``reset`` comes first."""
         assert self.weights is not None, "reset() comes first"
         return forward(self.weights, images, numbers)

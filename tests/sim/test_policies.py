@@ -1,5 +1,8 @@
 """The shipped policies: the conformance kit on each, and what each is for."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -211,3 +214,21 @@ def test_a_network_without_its_weights_says_what_makes_them(tmp_path):
     Lost.weights_file.write_bytes(b"no")
     rollout = run_rollout(Scenario(name="test", duration_s=1.0), Lost(), world.sense, world)
     assert "is damaged or no .safetensors file" in rollout.error
+
+
+def test_networks_answer_with_the_same_bytes_on_any_number_of_threads():
+    """Single precision without rounding fails this with OpenBLAS."""
+    code = (
+        "import numpy as np; from nurec_sim.plugins import load_policy; p = load_policy('e2e_4cam'); p.reset(None, 0); "
+        "r = np.random.default_rng(0); "
+        "print([p.outputs(r.integers(0, 256, (4, 64, 128, 3), np.uint8), r.standard_normal(12).astype(np.float32))"
+        ".tobytes().hex() for _ in range(4)])"
+    )
+    answers = [
+        subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, "OPENBLAS_NUM_THREADS": count, "OMP_NUM_THREADS": count},
+            check=True, capture_output=True, text=True,
+        ).stdout
+        for count in ("1", "2")
+    ]  # fmt: skip
+    assert answers[0] == answers[1] and len(answers[0]) > 100
