@@ -176,22 +176,11 @@ def test_what_lies_well_behind_a_depth_that_beams_passed_is_not_seen_there():
         assert seen_colours((depth_m, 20), (True, False))[0][0] == pytest.approx([grey] * 3)
 
 
-def test_unseen_points_take_the_colours_of_seen_ones_within_two_metres():
-    """0.45 and 0.95 m away weigh 1 / 0.5 and 1 / 1; the other unseen point has nobody nearer than 2.05 m."""
-    x = np.array([0.0, 0.45, -0.95, -3.0])
-    rgb = np.array([[0] * 3, [0.3] * 3, [0.9] * 3, [0] * 3], np.float32)
-    seen, none = np.array([False, True, True, False]), np.full(4, np.nan, np.float32)
-    filled = colour.fill_unseen(np.column_stack([x, np.zeros((4, 2))]), rgb, seen, ~seen, none)
-    assert filled[:, 0] == pytest.approx([(2 * 0.3 + 0.9) / 3, 0.3, 0.9, 0.4])
-
-
-def test_unseen_points_far_from_seen_ones_are_grey_by_their_intensity():
+def test_points_that_no_image_shows_are_grey_by_their_intensity():
     """From 0.2 to 0.6, reached at the ninth decile of the known intensities; unknown ones count as half of that."""
-    intensity = np.array([*range(11), np.nan], np.float32)
-    filled = colour.fill_unseen(
-        np.zeros((12, 3)), np.zeros((12, 3), np.float32), np.zeros(12, bool), np.ones(12, bool), intensity
-    )
-    assert filled[[0, 3, 9, 10, 11], 1] == pytest.approx([0.2, 0.2 + 0.4 / 3, 0.6, 0.6, 0.4])
+    grey = colour.grey_of(np.array([*range(11), np.nan], np.float32))
+    assert grey[[0, 3, 9, 10, 11], 1] == pytest.approx([0.2, 0.2 + 0.4 / 3, 0.6, 0.6, 0.4])
+    assert colour.grey_of(np.full(2, np.nan, np.float32)) == pytest.approx(0.4)
 
 
 def test_the_response_of_a_camera_is_not_that_of_the_glare_in_it():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.views import WorkingView
+from nurec_sim.reconstruct.unseen_colours import colours_by_likeness
 from nurec_sim.types import Gaussians
 
 KEPT_SHARE = 0.4
@@ -155,8 +157,8 @@ def body_gaussians(
         beams: recorded beams; Gaussians in the space that they passed are dropped.
     """
     stays = _owned(pixels, body, views, pictures, rgb, settings)
-    shown, dropped = outside_free_space(pixels[stays], body, ground, settings, beams)
-    parts = [shown]
+    pixel_gaussians, dropped = outside_free_space(pixels[stays], body, ground, settings, beams)
+    parts = [pixel_gaussians]
     # Where a pixel's depth is wrong, those of other views take over, and the surfels behind it.
     pictures = marked_free(pictures, pixels, dropped)
     rest = pixels[~stays]
@@ -176,11 +178,14 @@ def body_gaussians(
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
     # A view replaces surfels by its pixels unless it sees them so obliquely that surfels are the finer of the two.
     keep = (pixel > 3 * body.spacing_m) & (np.isfinite(pixel) | (through == 0))
-    colours = colour.fill_unseen(cloud.xyz_m, seen_rgb / 255, np.isfinite(pixel), keep, cloud.intensity)
+    seen = np.isfinite(pixel)
+    colours = np.where(seen[:, None], seen_rgb / np.float32(255), colour.grey_of(cloud.intensity))
     discs = surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.spacing_m[keep], colours[keep],
                            cloud.intensity[keep], body.label[keep], settings.opacity)  # fmt: skip
-    parts.append(discs[~body.in_free_space(discs, beams)])
-    return Gaussians.concatenate(parts), sum(map(len, parts[:-1]))
+    stays = ~body.in_free_space(discs, beams)
+    made, lifted = Gaussians.concatenate([*parts, discs[stays]]), sum(map(len, parts))
+    shown = np.concatenate([np.ones(lifted, bool), seen[keep][stays]])
+    return replace(made, rgb=colours_by_likeness(made, shown)), lifted
 
 
 def _owned(

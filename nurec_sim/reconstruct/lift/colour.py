@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from nurec_sim import geometry
-from nurec_sim.compute.cores import usable_cores
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.free_space import MARGIN_M, MARGIN_SHARE
 from nurec_sim.reconstruct.lift.splat import project_point
@@ -86,47 +85,13 @@ def seen_colours(xyz, normal, packed, inverse_depth, free, pictures, present, to
     return rgb, pixel, through
 
 
-def fill_unseen(
-    xyz_m: Float64[np.ndarray, "n 3"],
-    rgb: Float32[np.ndarray, "n 3"],
-    seen: Bool[np.ndarray, " n"],
-    wanted: Bool[np.ndarray, " n"],
-    intensity: Float32[np.ndarray, " n"],
-    reach_m: float = 2.0,
-) -> Float32[np.ndarray, "n 3"]:
-    """Give unseen points the mean colour of the nearest seen ones, else grey by their LiDAR intensity.
-
-    Args:
-        xyz_m: points, metres.
-        rgb: colours 0..1; those of wanted unseen points are replaced.
-        seen: whether a view saw the point.
-        wanted: whether the point's colour matters.
-        intensity: LiDAR intensity in any unit; NaN where unknown.
-        reach_m: how near a seen point must be for its colour to be used.
-    """
-    from scipy.spatial import cKDTree
-
-    result = rgb.copy()
-    unseen = np.flatnonzero(wanted & ~seen)
-    if not len(unseen):
-        return result
+def grey_of(intensity: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3"]:
+    """Colours, 0..1, of points that no image shows, by their LiDAR intensity in any unit; NaN where it is unknown."""
     known = np.isfinite(intensity)
     level = np.nanpercentile(intensity[known], 90) if known.any() else 1.0
     # LiDAR intensity tells bright paint from dark asphalt, but has no absolute scale: relative to its 90th percentile.
     grey = 0.2 + 0.4 * np.clip(np.where(known, intensity, 0.5 * level) / max(level, 1e-6), 0, 1)
-    result[unseen] = grey[unseen, None]
-    if seen.any():
-        source = np.flatnonzero(seen)
-        # Bounded, or points far from all that is seen would search the whole tree. Farther neighbours come as infinity.
-        distance, index = cKDTree(xyz_m[source]).query(
-            xyz_m[unseen], k=[1, 2, 3, 4], distance_upper_bound=reach_m, workers=usable_cores()
-        )
-        near = np.isfinite(distance[:, 0])
-        weight = 1 / (distance[near] + 0.05)
-        nearest = rgb[source[np.minimum(index[near], len(source) - 1)]]
-        mixed = np.einsum("nk,nkc->nc", weight, nearest) / weight.sum(axis=1, keepdims=True)
-        result[unseen[near]] = mixed
-    return result
+    return np.repeat(grey.astype(np.float32)[:, None], 3, axis=1)
 
 
 def solve_isp(

@@ -1,37 +1,23 @@
-"""Colours of what no image shows: those of the Gaussians that are most like it and that an image does show.
-
-LiDAR measures surfaces outside of all images and behind what the images show. Seen from beside the driven path they
-come into view, and ``lift`` knows no more of their colour than their intensity.
-"""
+"""Which static Gaussians the images of a log show; the others get the colours of what is like them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
-from scipy.spatial import cKDTree
+from jaxtyping import Bool
 
 from nurec_sim import sensors
 from nurec_sim.reconstruct.optimize.adam import RGB
 from nurec_sim.reconstruct.optimize.parameters import Parameters
 from nurec_sim.reconstruct.optimize.views import TrainingView
+from nurec_sim.reconstruct.unseen_colours import colours_by_likeness
 from nurec_sim.render.cpu.backward.frame import SENSORS, Frame
-from nurec_sim.types import Gaussians, Label
 
 WIDTH_PX = 480
 """Images are drawn at about this width to see what they show."""
 LEAST_PX = 1e-3
 """A Gaussian is shown by an image if its shares of all pixels add up to this much."""
-NEIGHBOURS = 8
-MOST_SEEN = 20_000
-"""The scene is thinned to so many Gaussians to learn from, evenly: with ten times as many the colours are no better."""
-INEXACT = 0.5
-"""A neighbour may be so much farther than the nearest one, as a share; looking for the very nearest takes ten times as
-long."""
-ACROSS_M, UP_M = 10.0, 1.0
-"""Distances along and across the ground that count like one standard deviation of the intensity, and like a surface
-that is level instead of upright: what is as high above the ground is alike over a long way along a street."""
 
 
 def shown_by(parameters: Parameters, views: Sequence[TrainingView]) -> Bool[np.ndarray, " n"]:
@@ -56,35 +42,13 @@ def shown_by(parameters: Parameters, views: Sequence[TrainingView]) -> Bool[np.n
 
 
 def colour_unseen(parameters: Parameters, seen: Bool[np.ndarray, " n"]) -> None:
-    """Change the colours of the static Gaussians that are not seen to the mean of those of similar ones, by likeness.
+    """Change the colours of the static Gaussians that are not seen to those of what is like them.
 
     Args:
         parameters: changed.
         seen: which static ones keep their colours; if none or all are, nothing changes.
     """
-    static, values = parameters.static_count, parameters.values
-    known, unknown = np.flatnonzero(seen), np.flatnonzero(~seen)
-    if not len(known) or not len(unknown):
-        return
-    features = _features(parameters.static_gaussians(np.arange(static)))
-    known = known[:: -(-len(known) // MOST_SEEN)]
-    count = min(NEIGHBOURS, len(known))
-    tree, ranks = cKDTree(features[known]), np.arange(1, count + 1)
-    distance, nearest = tree.query(features[unknown], k=ranks, eps=INEXACT, workers=-1)
-    weight = 1 / (distance + 1e-3) ** 2
-    weight /= weight.sum(axis=1, keepdims=True)
-    rgb: Float32[np.ndarray, "k c 3"] = values[known[nearest], RGB : RGB + 3]
-    values[unknown, RGB : RGB + 3] = np.einsum("kc,kci->ki", weight, rgb)
+    static = parameters.static_count
+    gaussians = parameters.static_gaussians(np.arange(static))
+    parameters.values[:static, RGB : RGB + 3][~seen] = colours_by_likeness(gaussians, seen)[~seen]
     parameters.values_changed()
-
-
-def _features(gaussians: Gaussians) -> Float64[np.ndarray, "n 6"]:
-    """What tells whether Gaussians are alike: place, whether they are level, intensity, and whether they are road."""
-    intensity = gaussians.intensity.astype(np.float64)
-    known = np.isfinite(intensity)
-    level, spread = (intensity[known].mean(), intensity[known].std()) if known.any() else (0.0, 0.0)
-    place = gaussians.mean_m.astype(np.float64) / (ACROSS_M, ACROSS_M, UP_M)
-    bright = np.where(known, (intensity - level) / max(spread, 1e-6), 0.0)
-    # Like an outlier of the intensity: road is coloured by road.
-    road = 3.0 * (gaussians.label == Label.ROAD)
-    return np.column_stack([place, np.abs(gaussians.normal[:, 2]), bright, road])

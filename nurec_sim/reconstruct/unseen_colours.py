@@ -1,0 +1,57 @@
+"""Colours of what no image shows: those of the Gaussians that are most like it and that an image does show.
+
+LiDAR measures surfaces outside of all images and behind what the images show. Seen from beside the driven path they
+come into view, and a log says no more of their colour than their intensity.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+from scipy.spatial import cKDTree
+
+from nurec_sim.compute.cores import usable_cores
+from nurec_sim.types import Gaussians, Label
+
+NEIGHBOURS = 8
+MOST_SEEN = 20_000
+"""The scene is thinned to so many Gaussians to learn from, evenly: with ten times as many the colours are no better."""
+INEXACT = 0.5
+"""A neighbour may be so much farther than the nearest one, as a share; looking for the very nearest takes ten times as
+long."""
+ACROSS_M, UP_M = 10.0, 1.0
+"""Distances along and across the ground that count like one standard deviation of the intensity, and like a surface
+that is level instead of upright: what is as high above the ground is alike over a long way along a street."""
+
+
+def colours_by_likeness(gaussians: Gaussians, seen: Bool[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3"]:
+    """The colours of Gaussians; those that are not seen get the mean of those of similar ones, weighted by likeness.
+
+    Args:
+        gaussians: in the world.
+        seen: which of them keep their colours; if none or all are, all do.
+    """
+    rgb: Float32[np.ndarray, "n 3"] = gaussians.rgb.copy()
+    known, unknown = np.flatnonzero(seen), np.flatnonzero(~seen)
+    if not len(known) or not len(unknown):
+        return rgb
+    features = _features(gaussians)
+    known = known[:: -(-len(known) // MOST_SEEN)]
+    ranks = np.arange(1, min(NEIGHBOURS, len(known)) + 1)
+    distance, nearest = cKDTree(features[known]).query(features[unknown], k=ranks, eps=INEXACT, workers=usable_cores())
+    weight = 1 / (distance + 1e-3) ** 2
+    weight /= weight.sum(axis=1, keepdims=True)
+    rgb[unknown] = np.einsum("kc,kci->ki", weight, gaussians.rgb[known[nearest]])
+    return rgb
+
+
+def _features(gaussians: Gaussians) -> Float64[np.ndarray, "n 6"]:
+    """What tells whether Gaussians are alike: place, whether they are level, intensity, and whether they are road."""
+    intensity = gaussians.intensity.astype(np.float64)
+    known = np.isfinite(intensity)
+    level, spread = (intensity[known].mean(), intensity[known].std()) if known.any() else (0.0, 0.0)
+    place = gaussians.mean_m.astype(np.float64) / (ACROSS_M, ACROSS_M, UP_M)
+    bright = np.where(known, (intensity - level) / max(spread, 1e-6), 0.0)
+    # Like an outlier of the intensity: road is coloured by road.
+    road = 3.0 * (gaussians.label == Label.ROAD)
+    return np.column_stack([place, np.abs(gaussians.normal[:, 2]), bright, road])

@@ -1,0 +1,72 @@
+"""Gaussians that no image shows take the colours of what is like them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from nurec_sim.reconstruct import unseen_colours
+from nurec_sim.reconstruct.unseen_colours import colours_by_likeness
+from nurec_sim.types import Gaussians, Label
+
+GREEN, RED, GREY = np.array([[0, 1, 0], [1, 0, 0], [0.5, 0.5, 0.5]], np.float32)
+
+
+def street(place_m, colours, intensity=np.nan, normal=(1.0, 0, 0), label=Label.OTHER) -> Gaussians:
+    """Gaussians with one of each property, or the same for all."""
+    count = len(place_m)
+    empty = Gaussians.empty()
+    zeros = {
+        field.name: np.zeros((count, *getattr(empty, field.name).shape[1:]), getattr(empty, field.name).dtype)
+        for field in dataclasses.fields(Gaussians)
+        if getattr(empty, field.name) is not None
+    }
+    return dataclasses.replace(
+        empty,
+        **zeros
+        | {
+            "mean_m": np.asarray(place_m, np.float32),
+            "rgb": np.broadcast_to(np.asarray(colours, np.float32), (count, 3)).copy(),
+            "intensity": np.broadcast_to(np.float32(intensity), count).copy(),
+            "normal": np.broadcast_to(np.asarray(normal, np.float32), (count, 3)).copy(),
+            "label": np.broadcast_to(np.asarray(label, zeros["label"].dtype), count).copy(),
+        },
+    )
+
+
+def test_the_mean_is_weighted_by_the_squares_of_likeness():
+    """1 and 2 units of height away (1 m each) weigh 1 and 1/4, to the 1e-3 that keeps a distance of 0 finite."""
+    made = street([[0, 0, 0], [0, 0, 1], [0, 0, -2]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    got = colours_by_likeness(made, np.array([False, True, True]))
+    assert got[0] == pytest.approx([0.8, 0.2, 0.0], abs=1e-3)
+    np.testing.assert_array_equal(got[1:], made.rgb[1:])
+
+
+def test_ten_metres_along_the_street_count_like_one_metre_of_height():
+    made = street([[0, 0, 0], [10, 0, 0], [0, 0, 1]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    assert colours_by_likeness(made, np.array([False, True, True]))[0] == pytest.approx([0.5, 0.5, 0.0], abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("unlike", "alike"),
+    [
+        ({"intensity": [0.1, 0.9, 0.1]}, "intensity"),
+        ({"normal": [[1.0, 0, 0], [0, 0, 1], [1, 0, 0]]}, "normal"),
+        ({"label": [Label.ROAD, Label.OTHER, Label.ROAD]}, "label"),
+    ],
+)
+def test_what_differs_in_kind_counts_less_than_what_is_farther_away(unlike, alike):
+    """The second is nearer (1 m against 5 m) but of another kind than the first; the third is of its kind."""
+    made = street([[0, 0, 0], [1, 0, 0], [5, 0, 0]], [GREY, RED, GREEN], **unlike)
+    red, green, _ = colours_by_likeness(made, np.array([False, True, True]))[0]
+    assert green > red, alike
+
+
+def test_eight_are_mixed_and_nothing_changes_if_all_or_none_are_seen(monkeypatch):
+    made = street([[0, 0, 0], *[[0, 0, 1.0]] * 8, [0, 0, 1.1]], [GREY, *[RED] * 8, GREEN])
+    some = np.arange(10) > 0
+    assert colours_by_likeness(made, some)[0] == pytest.approx(RED), "the ninth does not count"
+    for seen in (np.ones(10, bool), np.zeros(10, bool)):
+        np.testing.assert_array_equal(colours_by_likeness(made, seen), made.rgb)
+    monkeypatch.setattr(unseen_colours, "MOST_SEEN", 1)
+    assert colours_by_likeness(made, np.arange(10) > 8)[0] == pytest.approx(GREEN)
