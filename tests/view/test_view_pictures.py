@@ -60,7 +60,8 @@ def test_the_free_camera_is_the_browsers(painter, worlds):
     camera = CameraModel("front", 320, 180, Pinhole(focal, focal, 160, 90), np.eye(4))
     pose = geometry.pose(turn, np.array([-3.0, 1.0, 2.5]) + np.round(worlds[0].ego.position_m[0]))
     want = rendered(worlds[0], camera, T_US, T_US + 1, np.stack([pose, pose]))
-    assert np.array_equal(painter.paint(view), want)
+    # The pose has been a quaternion in between: its last digits may round a colour the other way.
+    assert np.abs(painter.paint(view).astype(int) - want).max() <= 1
     # Following, it moves and turns with the car, level.
     followed = request_of(painter.stage, dataclasses.replace(view, follow=True), 1.0)
     car = worlds[0].ego.at(T_US)
