@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from nurec_sim import geometry, sensors
+from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.around_ego import shows_others
 from nurec_sim.types import Box, CameraModel, Clip
 
@@ -109,15 +110,20 @@ def _find_mask(clip: Clip, camera: str, hold_out: Collection[int]) -> Bool[np.nd
         return None
     ego, street = np.zeros(near.shape), np.zeros(near.shape)
     size = small.width_px, small.height_px
-    grey = {i: _grey(clip.image(camera, i), size) for i in sorted({i for pair in pairs for i in pair})}
-    hidden = shows_ego(rays, small, clip.rig.body)
-    others = {i: shows_others(clip, small, i, hold_out) & ~hidden for i in sorted({first for first, _ in pairs})}
-    for first, second in pairs:
-        points = np.where(near, depth_m, 1.0)[..., None] * rays
+    frames = sorted({i for pair in pairs for i in pair})
+    grey = dict(zip(frames, in_order(lambda i: _grey(clip.image(camera, i), size), frames), strict=True))
+    hidden, points = shows_ego(rays, small, clip.rig.body), np.where(near, depth_m, 1.0)[..., None] * rays
+
+    def compared(pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        first, second = pair
+        others = shows_others(clip, small, first, hold_out) & ~hidden
         second_from_first = geometry.inverse(poses[second]) @ poses[first]
         here, there = _evidence(small, grey[first], grey[second], points, second_from_first)
-        ego += here & near & ~others[first]
-        street += (there | others[first]) & near
+        return here & near & ~others, (there | others) & near
+
+    for here, there in in_order(compared, pairs):
+        ego += here
+        street += there
     mask = _believed(_below_boundary(ego / len(pairs), street / len(pairs), near), ego / len(pairs))
     if not mask.any():
         return None

@@ -115,7 +115,8 @@ def with_ray_drop(
     models = {lidar: found_scanner(clip.rig.lidars[lidar], each) for lidar, each in maps.items() if each}
     rig = dataclasses.replace(scene.rig, lidars={**scene.rig.lidars, **models})
     scene = dataclasses.replace(scene, rig=rig, provenance=provenance)
-    parts = [_votes(scene, each, models[lidar]) for lidar, found in maps.items() for each in found]
+    found = [(each, models[lidar]) for lidar, every in maps.items() for each in every]
+    parts = list(in_order(lambda each: _votes(scene, *each), found))
     if not parts:
         return scene
     votes = Votes(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Votes)))

@@ -97,13 +97,13 @@ def range_map(lidar: LidarModel, xyz_fired_m: Points) -> RangeMap:
     xyz = np.asarray(xyz_fired_m, np.float64).reshape(-1, 3)
     across = np.maximum(np.hypot(xyz[:, 0], xyz[:, 1]), 1e-6)
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
-    row = _rows_in_order(azimuth, xyz[:, 2], across, len(lidar.elevation_rad))
-    ordered = row is not None
-    if row is None:
+    found = _rows_in_order(azimuth, xyz[:, 2], across, len(lidar.elevation_rad))
+    ordered = found is not None
+    if found is None:
         row, elevation, apex = _rows_by_elevation(lidar.elevation_rad, xyz[:, 2], across)
         offset = lidar.row_azimuth_offset_rad
     else:
-        elevation, apex = _cones(row, xyz[:, 2], across)
+        row, elevation, apex = found
         # Nominal offsets belong to nominal rows.
         nearest = np.abs(elevation[:, None] - lidar.elevation_rad).argmin(axis=1)
         offset = lidar.row_azimuth_offset_rad[nearest]
@@ -145,8 +145,12 @@ def range_map(lidar: LidarModel, xyz_fired_m: Points) -> RangeMap:
     return RangeMap(refined, apex, point, distance, len(xyz), residual, scatter, ordered)
 
 
-def _rows_in_order(azimuth: Values, height: Values, across: Values, most: int) -> Int64[np.ndarray, " n"] | None:
-    """Rows, if points are stored row by row from one end of the elevations to the other; None otherwise.
+def _rows_in_order(
+    azimuth: Values, height: Values, across: Values, most: int
+) -> tuple[Int64[np.ndarray, " n"], Values, Values] | None:
+    """Rows, their elevations and apexes, if points are stored row by row from one end of the elevations to the other.
+
+    None if they are not.
 
     Within a row the azimuth advances from where the file starts a turn: straight ahead, behind, or at its first point.
     A new row starts where it falls back by most of a turn.
@@ -160,10 +164,13 @@ def _rows_in_order(azimuth: Values, height: Values, across: Values, most: int) -
         row = np.concatenate([[0], np.cumsum(np.diff(turned) < -np.pi)])
         if not 2 <= row[-1] + 1 <= most or np.bincount(row).min() < FEWEST_POINTS:
             continue
-        elevation, _ = _cones(row, height, across)
+        elevation, apex = _cones(row, height, across)
         steps = np.diff(elevation)
-        if np.all(steps < 0) or np.all(steps > 0):
-            return row if steps[0] < 0 else row[-1] - row
+        if np.all(steps < 0):
+            return row, elevation, apex
+        if np.all(steps > 0):
+            row = row[-1] - row
+            return row, *_cones(row, height, across)
     return None
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from nurec_sim.network.stereo.paths import add_path
+from nurec_sim.network.stereo.paths import FORWARDS, add_paths
 from nurec_sim.network.stereo.semi_global import _summed_by_torch, semi_global
 
 
@@ -17,12 +17,21 @@ def test_the_compiled_sums_are_those_of_torch_to_the_bit(shape):
     assert torch.equal(semi_global(cost, guide, 0.05, 2.0), (across + down) / 4)
 
 
-@pytest.mark.parametrize(("dy", "dx"), [(0, 1), (-1, 0), (1, -1), (-1, 1), (1, 1)])
-def test_a_path_costs_what_the_published_recursion_says(dy, dx):
+@pytest.mark.parametrize("directions", [*([each] for each in FORWARDS), FORWARDS])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_paths_cost_what_the_published_recursion_says(directions, sign):
     """Equation 13 of Hirschmueller (2008), pixel by pixel; paths begin where they enter the image."""
     rng = np.random.default_rng(3)
-    cost, jump, small = rng.random((5, 6, 4), np.float32), 0.3 + rng.random((5, 6)), 0.2
-    expected = np.zeros((5, 6, 4))
+    directions = sign * np.array(directions)
+    cost, jumps, small = rng.random((5, 6, 4), np.float32), 0.3 + rng.random((len(directions), 5, 6)), 0.2
+    total = np.ones_like(cost)
+    add_paths(cost, jumps, small, directions, total)
+    expected = sum(cost_of_path(cost, jump, small, dy, dx) for (dy, dx), jump in zip(directions, jumps, strict=True))
+    np.testing.assert_allclose(total - 1, expected, atol=1e-6)
+
+
+def cost_of_path(cost, jump, small, dy, dx):
+    expected = np.zeros(cost.shape)
     for row in range(5)[:: dy or 1]:
         for column in range(6)[:: dx or 1]:
             expected[row, column] = cost[row, column]
@@ -31,9 +40,7 @@ def test_a_path_costs_what_the_published_recursion_says(dy, dx):
                 for d in range(4):
                     near = [before[k] + small for k in (d - 1, d + 1) if 0 <= k < 4]
                     expected[row, column, d] += min(before[d], before.min() + jump[row, column], *near) - before.min()
-    total = np.ones_like(cost)
-    add_path(cost, jump, small, dy, dx, total)
-    np.testing.assert_allclose(total - 1, expected, atol=1e-6)
+    return expected
 
 
 def test_a_pixel_that_fits_any_depth_takes_that_of_its_neighbours_up_to_an_edge():

@@ -58,8 +58,22 @@ def test_a_matched_point_that_another_view_agrees_with_is_not_judged_from_afar(a
     assert kept(5.0, [5.0 + agrees_from_m, SKY_M, SKY_M], [agrees_from_m, 12.0, 14.0], matched=True)
 
 
-def test_a_matched_point_behind_what_other_views_see_stays():
-    assert kept(5.0, [4.0], [10.0], matched=True)
+def test_a_matched_point_behind_what_a_view_from_afar_sees_stays():
+    assert kept(5.0, [4.0, 4.0], [10.0, 10.0], matched=True)
+
+
+@pytest.mark.parametrize("matched", [True, False])
+def test_a_matched_point_that_none_confirms_and_two_views_see_something_in_front_of_goes(matched):
+    assert kept(5.0, [3.0], [1.0], matched)
+    assert kept(5.0, [3.0, 3.0], [1.0, 1.5], matched) is not matched
+
+
+def test_masked_pixels_of_other_views_do_not_hide_a_point():
+    assert kept(5.0, [np.nan, np.nan], [1.0, 1.5], matched=True)
+
+
+def test_a_hidden_matched_point_that_another_view_confirms_stays():
+    assert kept(5.0, [3.0, 3.0, 7.0], [1.0, 1.5, 2.0], matched=True)
 
 
 def test_two_views_that_leave_level_ground_to_each_other_both_keep_it():

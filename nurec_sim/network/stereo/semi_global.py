@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nurec_sim.network.stereo.paths import add_path, brightness_steps
+from nurec_sim.network.stereo.paths import add_paths, brightness_steps
 
 SMALL_STEP, LARGE_STEP = 0.05, 2.0
 """Default penalties for moving to the adjacent depth, and to any other, from a pixel to its neighbour."""
@@ -45,14 +45,14 @@ def _on_cpu(
     across, down = np.zeros_like(volume), np.zeros_like(volume)
     for total, dy, dx in ((across, 0, 1), (across, 0, -1), (down, 1, 0), (down, -1, 0)):
         jump = small + large / (1 + EDGE * brightness_steps(brightness, dy, dx))
-        add_path(volume, jump, np.float32(small), dy, dx, total)
+        add_paths(volume, jump[None], np.float32(small), np.array([[dy, dx]]), total)
     return torch.from_numpy((across + down) / 4).permute(2, 0, 1)
 
 
 def _summed_by_torch(
     cost: Float[Tensor, "length d m"], guide: Float[Tensor, "length m"], small: float, large: float
 ) -> Float[Tensor, "length d m"]:
-    """The sums of ``paths.add_path`` in both directions along the first axis, on any device."""
+    """The sums of ``paths.add_paths`` in both directions along the first axis, on any device."""
     jump = small + large / (1 + EDGE * (guide[1:] - guide[:-1]).abs())
     total = torch.zeros_like(cost)
     for order, jumps in ((range(len(cost)), jump), (range(len(cost) - 1, -1, -1), jump.flip(0))):

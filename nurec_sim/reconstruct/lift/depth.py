@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt64
 
 from nurec_sim.compute.kernels import inner, kernel
-from nurec_sim.network.stereo.paths import add_path, brightness_steps
+from nurec_sim.network.stereo.paths import FORWARDS, add_paths, brightness_steps
 
 PRIOR_COST, PRIOR_CAP = 40.0, 220.0
 SKY_COST, NOT_SKY_COST = 60.0, 40.0
@@ -177,10 +177,11 @@ def smooth_depth(
 ) -> Float32[np.ndarray, "h w"]:
     """Inverse depth of least cost after semi-global matching along eight paths (``stereo.paths``)."""
     total, brightness = np.zeros_like(cost), gray.astype(np.float32)
-    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+    for directions in (np.array(FORWARDS), -np.array(FORWARDS)):
         # Depth is likely to jump where the brightness does, so a jump costs less there.
-        jump = np.maximum(SMOOTH_MANY / (1 + brightness_steps(brightness, dy, dx) / 8), SMOOTH_ONE + 1)
-        add_path(cost, jump.astype(np.float32), np.float32(SMOOTH_ONE), dy, dx, total)
+        steps = np.stack([brightness_steps(brightness, dy, dx) for dy, dx in directions])
+        jump = np.maximum(SMOOTH_MANY / (1 + steps / 8), SMOOTH_ONE + 1)
+        add_paths(cost, jump.astype(np.float32), np.float32(SMOOTH_ONE), directions, total)
     return _least(total, step)
 
 

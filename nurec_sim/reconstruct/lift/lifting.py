@@ -21,6 +21,8 @@ MIXING = 0.3
 """Weight of another view's colour for a surface, next to 1 for the owner's."""
 FARTHER = 1.5
 """Views this many times as far away as the own view resolve a surface too badly to be asked about it as others are."""
+HIDING = 2
+"""So many views that see something in front of a matched point drop it, if none agrees with it."""
 OWNER_BORDER = 0.04
 """Views own nothing in this part of their width at the border, where nothing checks their depth."""
 
@@ -119,7 +121,9 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
     inside it if its inverse depth there is the same within ``tolerance`` plus 10 %; it looks through the point if it is
     clearly smaller. Points are dropped if more than half as many views look through them as agree. Matched points that
     no other view agrees with are dropped if any view looks through them, from however far: wrong depth at the edges of
-    trees puts points in front of the sky, which often only views from farther back see past.
+    trees puts points in front of the sky, which often only views from farther back see past. They are dropped as well
+    if ``HIDING`` views see something in front of them: depth that is matched too far hides behind the true surface from
+    all views along the path, and would hang beside it as a dot for a camera that is turned or moved aside.
 
     Args:
         xyz: [n,3] points in the body's frame, metres.
@@ -142,7 +146,7 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
     """
     keep = np.ones(len(xyz), np.bool_)
     for i in range(len(xyz)):
-        agree, through, total = 0, 0, 1.0
+        agree, through, hidden, total = 0, 0, 0, 1.0
         far_agree, far_through = 0, 0
         # Rings instead of plain distance: neighbouring pixels then share one owner, and the surface does not become a
         # patchwork of views with slightly different depth.
@@ -178,7 +182,11 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
                     mixed[c] += share * pictures[k, int(v), int(u), c]
             elif w < here:
                 through += 1
-        if 2 * through > agree or (far_through > 0 and agree + far_agree == 0):
+            elif w > here:  # not where it is NaN
+                hidden += 1
+        if 2 * through > agree:
+            keep[i] = False
+        elif matched[i] and agree + far_agree == 0 and (far_through > 0 or hidden >= HIDING):
             keep[i] = False
         if keep[i]:
             rgb[i] = mixed / total

@@ -44,7 +44,20 @@ def project_point(view, x, y, z):
 
 
 @kernel
-def splat(view, xyz, normal, spacing, offset, front, total, weight, nearest, index, second):
+def project_surfels(view, xyz):
+    """Rows [m] of the points [n,3] that may reach into the image, and their pixels and depths [m,3] (u, v, metres)."""
+    width, height = int(view[3]), int(view[4])
+    rows, places, count = np.empty(len(xyz), np.int64), np.empty((len(xyz), 3)), 0
+    for i in range(len(xyz)):
+        u, v, depth = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+        if depth >= 0.3 and u >= -8 and v >= -8 and u <= width + 8 and v <= height + 8:
+            rows[count], places[count, 0], places[count, 1], places[count, 2] = i, u, v, depth
+            count += 1
+    return rows[:count].copy(), places[:count].copy()
+
+
+@kernel
+def splat(view, rows, places, normal, spacing, offset, front, total, weight, nearest, index, second):
     """Splat surfels: the first pass keeps the smallest depth in ``front``, the second averages near it.
 
     Each surfel covers a disc of its spacing and takes at every pixel the depth of its tangent plane, bounded so that a
@@ -53,7 +66,8 @@ def splat(view, xyz, normal, spacing, offset, front, total, weight, nearest, ind
 
     Args:
         view: [23] packed projection from the surfels' frame.
-        xyz: [n,3] centres, metres.
+        rows: see ``project_surfels``.
+        places: likewise.
         normal: [n,3] unit normals.
         spacing: [n] distance between surfels, metres.
         offset: added to row numbers in ``index``.
@@ -65,10 +79,8 @@ def splat(view, xyz, normal, spacing, offset, front, total, weight, nearest, ind
         second: whether this is the second pass.
     """
     width, height, focal = int(view[3]), int(view[4]), view[0]
-    for i in range(len(xyz)):
-        u, v, depth = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
-        if depth < 0.3 or u < -8 or v < -8 or u > width + 8 or v > height + 8:
-            continue
+    for k in range(len(rows)):
+        i, u, v, depth = rows[k], places[k, 0], places[k, 1], places[k, 2]
         # Distant surfels should still hit a pixel; the upper bound limits the cost of surfels close to the camera.
         radius = min(max(SPLAT_RADIUS * spacing[i] * focal / depth, 0.6), 8.0)
         n0 = view[5] * normal[i, 0] + view[6] * normal[i, 1] + view[7] * normal[i, 2]
@@ -160,9 +172,10 @@ def draw_surfels(
     """Inverse depth (0: nothing) and surfel per pixel (-1: none) of (packed view, xyz, normal, spacing, offset)."""
     front, total, weight = (np.zeros(shape, np.float32) for _ in range(3))
     nearest, index = np.full(shape, 2.0, np.float32), np.full(shape, -1, np.int32)
+    jobs = [(packed, *project_surfels(packed, xyz), *rest) for packed, xyz, *rest in bodies]
     for second in (False, True):
-        for packed, xyz, normal, spacing, offset in bodies:
-            splat(packed, xyz, normal, spacing, offset, front, total, weight, nearest, index, second)
+        for job in jobs:
+            splat(*job, front, total, weight, nearest, index, second)
     inverse_depth = np.where(weight > 0, total / np.maximum(weight, 1e-9), 0).astype(np.float32)
     drop_shine_through(inverse_depth, index)
     return inverse_depth, index
