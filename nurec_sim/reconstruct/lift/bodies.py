@@ -68,12 +68,11 @@ def surfels_of(
     feet = [world for _, world in gathered.feet.values()]
     everything = np.concatenate([gathered.static.xyz_m, *feet])
     ground = find_ground(everything, clip.ego.world_from_body, settings.ground)
-    static, ghosts = gathered.static, np.zeros(len(gathered.static), bool)
-    above = ground.above(static.xyz_m)
+    static = gathered.static
+    sheet, standing = ground.sheet(static), static[~(np.abs(ground.above(static.xyz_m)) < 0.08)]
     if settings.points.carve:
-        ghosts = in_free_space(balls(static.xyz_m, surfaces.DISC_SIGMA * static.spacing_m), gathered.beams)
-    sheet = ground.sheet(static)
-    standing = static[~ghosts & ~(np.abs(above) < 0.08)]
+        ghosts = in_free_space(balls(standing.xyz_m, surfaces.DISC_SIGMA * standing.spacing_m), gathered.beams)
+        standing = standing[~ghosts]
     standing, normal, spacing = surfaces.surface_of(standing)
     row, column, _ = ground.cells(sheet.xyz_m)
     road = ground.road[row, column]
