@@ -21,11 +21,9 @@ from nurec_sim.cli.console import print_table
 from nurec_sim.evaluate.scores.images import psnr, ssim
 from nurec_sim.types import SensorRequest
 
-HEADING = ("method", "log s", "CPU s", "peak GB", "static k", "moving k", "USDZ MB", "PSNR dB", "SSIM",
-           "first part dB", "first part SSIM")  # fmt: skip
+HEADING = ("method", "log s", "CPU s", "peak GB", "static k", "moving k", "USDZ MB", "PSNR dB", "SSIM")
 FRAMES = 12
-"""Frames per camera that are scored, evenly spread over the log; and as many of its first part, which is as long as
-the shortest log. Later streets may be harder or easier; the first part shows what the length of a log alone costs."""
+"""Frames per camera that are scored, evenly spread over the log."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +55,13 @@ def main(options: Options) -> None:
         for method in options.methods:
             name = f"{method} {length:g}"
             if name not in rows:
-                rows[name] = {"method": method, "seconds": length} | _row(clip, method, min(options.seconds))
+                rows[name] = {"method": method, "seconds": length} | _row(clip, method)
                 kept.write_text(json.dumps(rows, indent=2) + "\n")
     order = sorted(rows.values(), key=lambda row: (row["method"], row["seconds"]))
     print_table("growth with the length of a log", [_cells(row) for row in order], HEADING)
 
 
-def _row(clip: Path, method: str, first_s: float) -> dict[str, Any]:
+def _row(clip: Path, method: str) -> dict[str, Any]:
     archive = clip.with_name(f"{method}_{clip.stem}.usdz")
     cpu_s, peak_bytes = _command("reconstruct", str(clip), "--method", method, "--overwrite", "--out", str(archive))
     made = scene.read_scene(archive)
@@ -73,7 +71,7 @@ def _row(clip: Path, method: str, first_s: float) -> dict[str, Any]:
         "static": len(made.static),
         "dynamic": len(made.dynamic),
         "archive_bytes": archive.stat().st_size,
-    } | _scores(made, logs.open_clip(clip), first_s)
+    } | _scores(made, logs.open_clip(clip))
 
 
 def _command(*words: str) -> tuple[float, int]:
@@ -88,23 +86,19 @@ def _command(*words: str) -> tuple[float, int]:
     return usage.ru_utime + usage.ru_stime, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def _scores(made: scene.GaussianScene, clip: logs.Clip, first_s: float) -> dict[str, float]:
+def _scores(made: scene.GaussianScene, clip: logs.Clip) -> dict[str, float]:
     """Means over recorded frames of all cameras, which the reconstruction has seen, or lie between seen ones."""
-    renderer, values = render.make_renderer(made, "cpu"), {}
-    for part, until_us in (("", clip.span_us[1]), ("first_", clip.span_us[0] + round(first_s * 1e6))):
-        psnr_db, similarity = [], []
-        for camera in clip.rig.cameras.values():
-            times = clip.camera_times_us(camera.id)
-            count = int(np.count_nonzero(times[:, 1] <= until_us))
-            for k in np.linspace(0, count - 1, FRAMES).round().astype(int):
-                start_us, end_us = (int(t) for t in times[k])
-                poses = clip.world_from_camera(camera.id, k)
-                request = SensorRequest(made.id, camera, start_us, max(end_us, start_us + 1), poses)
-                drawn, recorded = renderer.render_camera(request, ("rgb",)).rgb, clip.image(camera.id, k)
-                psnr_db.append(psnr(drawn, recorded))
-                similarity.append(ssim(drawn, recorded))
-        values |= {f"{part}psnr_db": float(np.mean(psnr_db)), f"{part}ssim": float(np.mean(similarity))}
-    return values
+    renderer, psnr_db, similarity = render.make_renderer(made, "cpu"), [], []
+    for camera in clip.rig.cameras.values():
+        times = clip.camera_times_us(camera.id)
+        for k in np.linspace(0, len(times) - 1, FRAMES).round().astype(int):
+            start_us, end_us = (int(t) for t in times[k])
+            poses = clip.world_from_camera(camera.id, k)
+            request = SensorRequest(made.id, camera, start_us, max(end_us, start_us + 1), poses)
+            drawn, recorded = renderer.render_camera(request, ("rgb",)).rgb, clip.image(camera.id, k)
+            psnr_db.append(psnr(drawn, recorded))
+            similarity.append(ssim(drawn, recorded))
+    return {"psnr_db": float(np.mean(psnr_db)), "ssim": float(np.mean(similarity))}
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
@@ -118,8 +112,6 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
         f"{row['archive_bytes'] / 1e6:.0f}",
         f"{row['psnr_db']:.2f}",
         f"{row['ssim']:.3f}",
-        f"{row['first_psnr_db']:.2f}",
-        f"{row['first_ssim']:.3f}",
     )
 
 
