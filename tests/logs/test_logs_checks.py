@@ -1,3 +1,4 @@
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from nurec_sim import cli, geometry, logs
 from nurec_sim.logs.checks import borders, ground, turned
 from nurec_sim.logs.checks.boxes import check_boxes
 from nurec_sim.logs.checks.calibration import check_calibration
+from nurec_sim.logs.checks.camera_pairs import check_camera_pairs
 from nurec_sim.logs.checks.ground import check_ground
 from nurec_sim.logs.checks.sampling import sample_sweeps
 from nurec_sim.types import Box, Rig, Track, Trajectory
@@ -53,6 +55,8 @@ def test_a_sound_log_fits_together(demo):
         "ground below the rear axle, LiDAR 'lidar_top'",
         "beams of LiDAR 'lidar_top'",
         *(f"LiDAR in camera {name!r}" for name in demo.rig.cameras),
+        "cameras 'camera_front' and 'camera_front_left'",
+        "cameras 'camera_front' and 'camera_front_right'",
         "boxes that hold LiDAR points",
     ]
     height = float(found["ground below the rear axle, LiDAR 'lidar_top'"].split("z = ")[1].split()[0])
@@ -115,6 +119,30 @@ def test_a_log_without_lidar_has_nothing_to_compare(demo, spoil):
     blind = spoil.remade(demo, rig=Rig(demo.rig.cameras, {}), sweeps={})
     measures = logs.measure_clip(blind)
     assert [each.found for each in measures] == ["cannot tell: no sweep about the time of an image"] * 3
+
+
+def apart_px(found: str) -> tuple[float, float]:
+    """``the same points lie +0.41 px across and +0.08 px down apart ...``"""
+    words = found.split()
+    return float(words[4]), float(words[8])
+
+
+def test_cameras_with_exact_calibrations_agree_to_a_tenth_of_a_pixel(demo, sweeps):
+    rows = check_camera_pairs(demo, sweeps)
+    assert len(rows) == 2
+    np.testing.assert_allclose([apart_px(row.found) for row in rows], 0.0, atol=0.1)
+
+
+def test_cameras_that_show_the_same_two_pixels_apart_are_found(demo, two, spoil, monkeypatch):
+    """One camera twice; the second image is the first one moved by 2 pixels to the right and 1 down."""
+    front, records = demo.rig.cameras["camera_front"], demo.image_records("camera_front")
+    cameras = {"front": dataclasses.replace(front, id="front"), "again": dataclasses.replace(front, id="again")}
+    same = spoil.remade(demo, rig=Rig(cameras, demo.rig.lidars), images=dict.fromkeys(cameras, records))
+    moved = {"front": (0, 0), "again": (1, 2)}
+    monkeypatch.setattr(same, "image", lambda name, k: np.roll(demo.image("camera_front", k), moved[name], (0, 1)))
+    (row,) = check_camera_pairs(same, two)
+    assert row.what == "cameras 'front' and 'again'" and row.faults == ()
+    np.testing.assert_allclose(apart_px(row.found), (2.0, 1.0), atol=0.05)
 
 
 def test_a_forgotten_ground_height_is_found(demo, spoil):

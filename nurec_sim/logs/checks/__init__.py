@@ -5,6 +5,7 @@ from __future__ import annotations
 from nurec_sim.logs.checks.beams import check_beams
 from nurec_sim.logs.checks.boxes import check_boxes
 from nurec_sim.logs.checks.calibration import check_calibration
+from nurec_sim.logs.checks.camera_pairs import check_camera_pairs
 from nurec_sim.logs.checks.ground import check_ground
 from nurec_sim.logs.checks.measure import Measure
 from nurec_sim.logs.checks.sampling import sample_sweeps
@@ -26,5 +27,6 @@ def measure_clip(clip: Clip) -> list[Measure]:
         *check_ground(clip, sweeps),
         *check_beams(clip, sweeps),
         *check_calibration(clip, sweeps),
+        *check_camera_pairs(clip, sweeps),
         *check_boxes(clip, sweeps),
     ]
