@@ -131,7 +131,9 @@ def _sampled(
     """What an image shows of world points; corner-origin pixels have their centres at +0.5, OpenCV's at 0."""
     import cv2
 
-    uv = sensors.project_rolling(camera, pair, xyz.reshape(-1, 3))[0].astype(np.float32).reshape(*xyz.shape[:2], 2) - 0.5
+    uv = (
+        sensors.project_rolling(camera, pair, xyz.reshape(-1, 3))[0].astype(np.float32).reshape(*xyz.shape[:2], 2) - 0.5
+    )
     # One row per point: OpenCV's maps have at most 32,767 columns and rows.
     grey = cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     width = round(np.sqrt(xyz.shape[1]))
