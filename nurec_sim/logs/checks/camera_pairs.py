@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from nurec_sim import geometry, sensors
+from nurec_sim import sensors
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.checks.measure import Measure
 from nurec_sim.logs.checks.sampling import SampledSweep
@@ -35,7 +35,7 @@ FURTHEST_US = 100_000
 CORRELATION = 0.9
 """Normalised cross-correlation from which a patch counts as found."""
 TEXTURE = 20.0
-"""Smaller eigenvalue of a patch's mean squared gradients, in grey levels squared: it then has corners, not only edges."""
+"""Smaller eigenvalue of a patch's mean squared gradients, in grey levels squared: it has corners, not only edges."""
 NEAREST_M = 3.0
 
 
@@ -64,10 +64,10 @@ def check_camera_pairs(clip: Clip, sweeps: Sequence[SampledSweep]) -> list[Measu
 
 def _apart(clip: Clip, first: str, second: str, each: SampledSweep) -> Float64[np.ndarray, "m 2"]:
     """Where patches of the first camera are found in the second one, off their place, in pixels of the first."""
-    views = [_view(clip, name, each.sweep.t_us) for name in (first, second)]
-    if views[0] is None or views[1] is None:
+    view, other_view = (_view(clip, name, each.sweep.t_us) for name in (first, second))
+    if view is None or other_view is None:
         return np.zeros((0, 2))
-    (camera, pair, image), (other, other_pair, other_image) = views
+    (camera, pair, image), (other, other_pair, other_image) = view, other_view
     xyz = each.sweep.xyz_world_m
     xyz = xyz[np.isfinite(xyz).all(axis=1)]
     shown = np.ones(len(xyz), bool)
