@@ -27,18 +27,18 @@ def train(
     until: int | None = None,
     ablation: AblationName = "full",
 ) -> None:
-    """Train the network, its LiDAR branch, or the end-to-end policies, in procedural towns (docs/training.md).
+    """Train the network, its LiDAR branch, end-to-end policies or the detector, in procedural towns (docs/training.md).
 
     Writes curves, sample renders, checkpoints and weights to the run folder. The same command resumes an interrupted
     run. For several processes or GPUs: `torchrun --nproc-per-node N -m nurec_sim.cli train RECIPE`.
 
     Args:
         recipe: a YAML file such as nurec_sim/training/recipes/tiny.yaml; lidar.yaml for the LiDAR branch,
-            end-to-end.yaml for the policies.
+            end-to-end.yaml for the policies, detector.yaml for the camera detector.
         out_path: the run folder; default: runs/train/RECIPE-NAME.
         clips: cache folder for generated clips, which may be shared between runs.
-        generators: processes that generate clips; 0 uses existing clips only. The LiDAR branch and the
-            policies ignore it and loaders.
+        generators: processes that generate clips; 0 uses existing clips only. The LiDAR branch, the
+            policies and the detector ignore it and loaders.
         loaders: processes that prepare samples; 0 is a thread of the training process.
         threads: of torch and of the renderer; default: all cores.
         until: stop after this step, counted from the start of the recipe.
@@ -50,6 +50,7 @@ def train(
     from nurec_sim.training.ablations import ablated
     from nurec_sim.training.config import read_config
     from nurec_sim.training.data.samples import TownSamples
+    from nurec_sim.training.detection.config import is_detector_recipe
     from nurec_sim.training.imitation.config import is_imitation_recipe
     from nurec_sim.training.lidar.config import is_lidar_recipe
     from nurec_sim.training.losses.lpips import load_lpips
@@ -69,6 +70,9 @@ def train(
         return
     if is_imitation_recipe(recipe):
         _train_policies(recipe, folder, clips, until, ablation)
+        return
+    if is_detector_recipe(recipe):
+        _train_detector(recipe, folder, clips, until, ablation)
         return
     config = ablated(read_config(recipe), ablation)
     for place in (folder, clips):
@@ -117,6 +121,20 @@ def _train_policies(recipe: Path, folder: Path, drives: Path, until: int | None,
         files = ImitationTrainer(config, folder, drives).run(advance, until)
     for path in files:
         out.print(f"wrote {path}", soft_wrap=True)
+
+
+def _train_detector(recipe: Path, folder: Path, images: Path, until: int | None, ablation: AblationName) -> None:
+    from nurec_sim.training.detection.config import read_detector_config
+    from nurec_sim.training.detection.trainer import DetectorTrainer
+
+    config = read_detector_config(recipe)
+    if ablation != "full":
+        raise TrainingError(f"the detector has no ablations, got {ablation}")
+    for place in (folder, images):
+        check_writable(place, folder=True)
+    with progress("training") as advance:
+        path = DetectorTrainer(config, folder, images).run(advance, until)
+    out.print(f"wrote {path}", soft_wrap=True)
 
 
 def _tell(line: str) -> None:

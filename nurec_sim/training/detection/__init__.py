@@ -1,0 +1,1 @@
+"""Training of the camera detector in procedural towns."""
