@@ -23,14 +23,15 @@ if TYPE_CHECKING:
     from nurec_sim.cli.progress import Report
     from nurec_sim.types import Clip
 
-ProtocolName = Literal["storm", "clip", "shift", "lidar"]
+ProtocolName = Literal["storm", "clip", "shift", "lidar", "detection"]
 USUAL_METHODS: dict[str, tuple[str, ...]] = {
     "storm": ("dense", "dense-lidar", "selective", "lift", "copy"),
     "clip": ("dense", "dense-lidar", "dense-concatenated", "lift", "copy"),
     "shift": ("dense", "dense-lidar", "selective", "lift", "copy"),
     "lidar": ("lidar", "lift", "optimized"),
+    "detection": ("dense", "selective", "lift", "optimized", "copy"),
 }
-USUAL_WORLDS = {"storm": 12, "clip": 3, "shift": 6, "lidar": 4}
+USUAL_WORLDS = {"storm": 12, "clip": 3, "shift": 6, "lidar": 4, "detection": 6}
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,9 @@ class LogFlags:
     it was made from."""
     local: bool = False
     """CLIP: render in this process instead of through gRPC."""
+    detector: bool = False
+    """CLIP: also compare what a camera detector finds in recorded and in rendered images; it learnt in generated towns
+    (docs/evaluation.md)."""
     images: Path | None = None
     """CLIP: also write rendered and recorded images side by side into this folder."""
     json: Path | None = None
@@ -71,7 +75,8 @@ class ProtocolFlags:
     """Protocol: methods to compare: dense, dense-lidar, dense-concatenated, selective, lidar, lidar-no-floor, lift,
     optimized, copy, or any other method that `nurec-sim reconstruct` accepts; default: those of the protocol."""
     worlds: int | None = None
-    """Protocol: number of procedural worlds; default: 12 for storm, 3 for clip, 6 for shift, 4 for lidar."""
+    """Protocol: number of procedural worlds; default: 12 for storm, 3 for clip, 6 for shift and detection, 4 for
+    lidar."""
     seed: int = 0
     """Protocol: seed of the first procedural world; the others follow consecutively."""
     clips: tuple[Path, ...] = ()
@@ -110,7 +115,8 @@ def evaluate(
     `evaluate CLIP` compares with the recording: images of target cameras, held-out LiDAR sweeps.
     `evaluate --protocol NAME` prints the paper's tables: `storm` is 2 s with four input frames (Table 1), `clip` a
     whole log through the chunked pipeline (Table 2), `shift` views at lateral offsets, `lidar` held-out sweeps of a
-    Pandar128 on the path and beside it (Table 3). evaluations/latest has tables, contact sheets and report.html.
+    Pandar128 on the path and beside it (Table 3), `detection` a camera detector on true and on rendered images, on
+    the path and beside it. evaluations/latest has tables, contact sheets and report.html.
 
     Args:
         clip: a driving log (docs/log_formats.md).
@@ -124,7 +130,9 @@ def evaluate(
     if protocol is None:
         _refuse(given(side_by_side, NO_PROTOCOL_FLAGS), "without --protocol")
         if clip is None:
-            raise NurecSimError("nothing to evaluate: give a clip, or --protocol storm, clip, shift or lidar")
+            raise NurecSimError(
+                "nothing to evaluate: give a clip, or --protocol storm, clip, shift, lidar or detection"
+            )
         evaluate_log(clip, log, hold_out_every or 0, network)
         return
     _refuse(given(log, NO_LOG_FLAGS), "with --protocol")
@@ -183,6 +191,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
                 via_grpc=not flags.local,
                 device=device,
                 images_dir=flags.images,
+                detector=flags.detector,
                 progress=advance,
                 settings=settings,
                 refine=refinement(flags.refine),
@@ -198,6 +207,8 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
             print_table(
                 f"{title} on {log.id}. {group}", [(r.name, r.text) for r in figure_rows(figures) if r.group == group]
             )
+    if detection := figures.get("detection"):
+        out.print(str(detection.get("caveat") or f"The detector: {detection['not_known']}."), style="dim", markup=False)
 
 
 def _score_archive(log: Clip, flags: LogFlags, hold_out_every: int, device: str, advance: Report) -> dict[str, Any]:
@@ -216,6 +227,7 @@ def _score_archive(log: Clip, flags: LogFlags, hold_out_every: int, device: str,
         via_grpc=not flags.local,
         device=device,
         images_dir=flags.images,
+        detector=flags.detector,
         progress=advance,
     )
 

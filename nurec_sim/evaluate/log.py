@@ -17,6 +17,7 @@ import numpy as np
 
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.actor_scores import score_actors
+from nurec_sim.evaluate.detection.log import score_log_detections
 from nurec_sim.evaluate.image_scores import score_images
 from nurec_sim.evaluate.lidar_scores import score_free_space, score_sweeps
 from nurec_sim.logs.held_out import HeldOut, hold_out, without_images
@@ -44,6 +45,7 @@ def evaluate(
     via_grpc: bool = True,
     device: str = "auto",
     images_dir: Path | None = None,
+    detector: bool = False,
     progress: Progress | None = None,
     **options: Any,
 ) -> dict[str, object]:
@@ -60,6 +62,7 @@ def evaluate(
         via_grpc: render through a sensor server in this process over gRPC, or directly.
         device: that renders; see ``render.choose_device``.
         images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
+        detector: whether to compare what the camera detector finds in recorded and in rendered images.
         progress: called with the stage and the approximate fraction done.
         options: passed to ``reconstruct``.
 
@@ -87,7 +90,7 @@ def evaluate(
     seconds["reconstruct"] = round(sum(stages.seconds.values()), 3)
     figures = score_scene(
         clip, scene, held, target_cameras=target_cameras, via_grpc=via_grpc, device=device,
-        images_dir=images_dir, progress=_part(report, 0.6, 1.0),
+        images_dir=images_dir, detector=detector, progress=_part(report, 0.6, 1.0),
     )  # fmt: skip
     return {**figures, "method": method, "seconds": {**seconds, **figures["seconds"]}}
 
@@ -101,6 +104,7 @@ def score_scene(
     via_grpc: bool = True,
     device: str = "auto",
     images_dir: Path | None = None,
+    detector: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Score what a scene of a log renders.
@@ -115,6 +119,7 @@ def score_scene(
         via_grpc: whether frames come over gRPC or from a renderer directly.
         device: that renders; see ``render.choose_device``.
         images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
+        detector: whether to compare what the camera detector finds in recorded and in rendered images.
         progress: called with the stage and the approximate fraction done.
 
     Returns:
@@ -128,6 +133,7 @@ def score_scene(
         - ``lidar``: of the sweeps held out (``lidar_scores.score_sweeps``), None if there are none.
         - ``free_space``: false obstacles beside the path (``lidar_scores.score_free_space``), None without LiDAR.
         - ``actors``: found actors against the log's boxes (``actor_scores.score_actors``), None without either.
+        - ``detection``: ``detection.log.score_log_detections``, only with ``detector``.
         - ``road``: how off-road from Gaussians agrees with the log's map, None without a map.
         - ``seconds``, ``counts``, ``unknown``.
 
@@ -135,7 +141,7 @@ def score_scene(
         ReconstructError: an unknown camera, or a scene of another log.
     """
     held, report = held or HeldOut(), progress or (lambda stage, fraction: None)
-    found = score_actors(clip, scene)
+    found, recorded = score_actors(clip, scene), clip
     if not clip.tracks:
         # What moves in the log is in free space at other times, with a label or without.
         clip = with_tracks(clip, [track for track in scene.tracks if track.id.startswith(FOUND)])
@@ -157,6 +163,7 @@ def score_scene(
         )
         free = score_free_space(clip, sense, _part(report, 0.9, 1.0))
         seconds["lidar"] = round(time.perf_counter() - started, 3)
+        detection = score_log_detections(recorded, targets, held, sense, images_dir) if detector else None
     return {
         "clip": clip.id,
         "scene": scene.id,
@@ -170,6 +177,7 @@ def score_scene(
         "free_space": free,
         "road": score_road(scene),
         "actors": found,
+        **({} if detection is None else {"detection": detection}),
         "seconds": seconds,
         "counts": {"static": len(scene.static), "dynamic": len(scene.dynamic)}
         | dict(scene.provenance.get("counts", {})),

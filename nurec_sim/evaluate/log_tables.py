@@ -47,6 +47,8 @@ def figure_rows(figures: Mapping[str, Any]) -> list[Row]:
         rows.append(Row("Road", "off-road agrees with the map", road.get("agreement"), 3, 1))
     if actors := figures.get("actors"):
         rows += _actor_rows(actors)
+    if detection := figures.get("detection"):
+        rows += _detection_rows(detection)
     rows += [
         Row("Scene", "static Gaussians", figures["counts"]["static"], 0),
         Row("Scene", "moving Gaussians", figures["counts"]["dynamic"], 0),
@@ -99,6 +101,25 @@ def _actor_rows(actors: Mapping[str, Any]) -> list[Row]:
         Row(group, "velocities of vehicles, median error (m/s)", actors["speed_mps"], 2, -1),
         *(Row(group, f"instants of {name}", count, 0) for name, count in instants.items()),
     ]
+
+
+def _detection_rows(detection: Mapping[str, Any]) -> list[Row]:
+    """Recorded images first, the same figures of rendered ones below."""
+    group = "Camera detector, recorded and rendered images"
+    rows = [Row(group, "images", detection["images"], 0)] if "images" in detection else []
+    for name, figures in detection.get("figures", {}).items():
+        rows += [
+            Row(group, f"{name}: visible objects", figures["there"], 0),
+            Row(group, f"{name}: detections, recorded", figures["true_found"], 0),
+            Row(group, f"{name}: detections, rendered", figures["found"], 0),
+            Row(group, f"{name}: precision, recorded", figures["true_precision"], 3),
+            Row(group, f"{name}: precision, rendered", figures["precision"], 3),
+            Row(group, f"{name}: recall, recorded", figures["true_recall"], 3),
+            Row(group, f"{name}: recall, rendered", figures["recall"], 3),
+            Row(group, f"{name}: kept in rendered", figures["kept"], 3, 1),
+            Row(group, f"{name}: backed by recorded", figures["backed"], 3, 1),
+        ]
+    return rows
 
 
 def _image_rows(group: str, frames: Mapping[str, Any]) -> list[Row]:

@@ -24,6 +24,7 @@ TITLES = {
     "clip": "Whole clips through the chunked pipeline",
     "shift": "Views at lateral offsets",
     "lidar": "Held-out LiDAR sweeps on the driven path and beside it",
+    "detection": "A camera detector on true and on rendered images",
 }
 CURVES = {"psnr_db": "PSNR (dB)", "abs_rel": "AbsRel (aligned)", "abs_rel_metric": "AbsRel (metres)"}
 SWEEP_CURVES = {"cd_l1_sum": "Chamfer distance (m)", "median_abs_range_error_m": "median range error (m)"}

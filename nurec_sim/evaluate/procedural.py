@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import cache
 
@@ -9,9 +10,11 @@ import numpy as np
 from jaxtyping import Int64
 
 from nurec_sim import geometry
+from nurec_sim.evaluate.detection.sights import Sight
 from nurec_sim.evaluate.views import reduced, reduced_mask
 from nurec_sim.evaluate.windows import EvaluationView
 from nurec_sim.logs.selection import ContextClip, Revolution, Shot
+from nurec_sim.network.detector.objects import labelled_objects
 from nurec_sim.sensors import lidar_model
 from nurec_sim.types import CameraModel, Label, Pinhole, Rig, SensorRequest, Trajectory
 from nurec_sim.world import LIDAR_ID, TrueWorld, street_rig, town_plan, true_sweep
@@ -76,7 +79,9 @@ class EvaluationWorld:
         # Rendered at most once: methods under comparison read the same frames.
         return Shot(t_us, t_us, request.world_from_sensor, cache(lambda: self.world.view(request).rgb))
 
-    def target(self, name: str, camera_id: str, t_us: int, left_m: float = 0.0, beyond: bool = False) -> EvaluationView:
+    def target(
+        self, name: str, camera_id: str, t_us: int, left_m: float = 0.0, beyond: bool = False, sight: bool = False
+    ) -> EvaluationView:
         """A target view with its ground truth.
 
         Args:
@@ -85,12 +90,18 @@ class EvaluationWorld:
             t_us: instant of the exposure, microseconds.
             left_m: lateral offset of the car from the recorded drive, left positive.
             beyond: whether the instant is before the first or after the last input frame.
+            sight: whether it gets what a detector needs.
         """
         request = self.request(camera_id, t_us, left_m)
         seen = self.world.view(request)
         movable = reduced_mask(LABEL_OF_CLASS[seen.surface] == Label.MOVABLE)
         depth_m = np.where(seen.surface == SurfaceClass.SKY, np.float32(0), seen.depth_m)
-        return EvaluationView(name, request, reduced(seen.rgb, depth_m), movable, left_m, beyond)
+        view = EvaluationView(name, request, reduced(seen.rgb, depth_m), movable, left_m, beyond)
+        if not sight:
+            return view
+        camera, pose = self.rig.cameras[camera_id], request.world_from_sensor[0]
+        objects = labelled_objects(self.world.plan.tracks(), t_us, camera, pose, seen.instance)
+        return dataclasses.replace(view, sight=Sight(seen.rgb, camera, objects))
 
     def revolutions(self, span_us: tuple[int, int]) -> dict[str, tuple[Revolution, ...]]:
         """Consecutive LiDAR sweeps within a time span."""

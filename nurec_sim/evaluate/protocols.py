@@ -4,13 +4,14 @@
 ``clip``   a whole log through the chunked pipeline; every k-th frame is a target, the rest are inputs (Table 2).
 ``shift``  as ``storm``, but with targets at lateral offsets, in procedural worlds only.
 ``lidar``  as ``shift``, but the targets are sweeps of a ``SCANNER`` that are held out (Table 3).
+``detection``  as ``shift``, 1 and 2 m beside the path, with a camera detector on true and on rendered images.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,14 +26,15 @@ from nurec_sim.evaluate.windows import EvaluationView, Window
 from nurec_sim.logs.selection import ContextClip
 from nurec_sim.world import Quality, TrueWorld
 
-PROTOCOLS = ("storm", "clip", "shift", "lidar")
-ProtocolName = Literal["storm", "clip", "shift", "lidar"]
+PROTOCOLS = ("storm", "clip", "shift", "lidar", "detection")
+ProtocolName = Literal["storm", "clip", "shift", "lidar", "detection"]
 
 STEP_US = 100_000
 STORM_FRAMES, STORM_CONTEXT = 20, (0, 5, 10, 15)
 START_S = 1.0
 """Start of windows after the start of their world."""
 SHIFTS_M = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
+DETECTION_SHIFTS_M = (1.0, 2.0)
 SHIFT_FRAMES = (3, 8, 13)
 """Target frames for lateral offsets: each about halfway between two input frames."""
 SCANNER, SWEEP_SHIFTS_M = "PANDAR128", (1.0, 2.0, 3.0)
@@ -92,7 +94,7 @@ class Protocol:
             raise ReconstructError("a protocol runs on procedural worlds or on recorded logs: give seeds or clips")
         if min(self.seeds, default=0) < 0 or len(set(self.seeds)) < len(self.seeds):
             raise ReconstructError(f"seeds must not be negative, and each may be given once, got {self.seeds}")
-        if self.clips and self.name in ("shift", "lidar"):
+        if self.clips and self.name in ("shift", "lidar", "detection"):
             raise ReconstructError(
                 f"protocol {self.name!r} needs procedural worlds: logs have no sensors at lateral offsets"
             )
@@ -162,15 +164,27 @@ def _storm(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, 
 
 
 def _shift(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, report: Progress) -> Made:
+    return _beside(protocol, source, id, start_us, report, SHIFTS_M)
+
+
+def _detection(protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, report: Progress) -> Made:
+    return _beside(protocol, source, id, start_us, report, DETECTION_SHIFTS_M, sight=True)
+
+
+def _beside(
+    protocol: Protocol, source: EvaluationWorld, id: str, start_us: int, report: Progress, shifts_m: Sequence[float],
+    sight: bool = False,
+) -> Made:  # fmt: skip
+    """Targets on the path and on both sides of it."""
     times, span_us = _storm_times(start_us)
     clip = source.clip(id, times[list(STORM_CONTEXT)], span_us, protocol.boxes)
     camera = next(iter(source.rig.cameras))
-    places = [0.0, *(side * shift for shift in SHIFTS_M for side in (1, -1))]
+    places = [0.0, *(side * shift for shift in shifts_m for side in (1, -1))]
     targets = []
     for count, left_m in enumerate(places):
         report("rendering", 0.1 + 0.9 * count / len(places))
         for frame in SHIFT_FRAMES:
-            target = source.target(f"{frame:02d}{left_m:+.1f}", camera, int(times[frame]), left_m)
+            target = source.target(f"{frame:02d}{left_m:+.1f}", camera, int(times[frame]), left_m, sight=sight)
             if not _inside_something(target):
                 targets.append(target)
     return Made(clip, targets)
@@ -221,6 +235,7 @@ _MAKERS: dict[ProtocolName, Callable[[Protocol, EvaluationWorld, str, int, Progr
     "shift": _shift,
     "clip": _clip,
     "lidar": _lidar,
+    "detection": _detection,
 }
 
 

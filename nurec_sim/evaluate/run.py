@@ -17,6 +17,7 @@ from typing import Any
 
 import nurec_sim
 from nurec_sim.errors import ReconstructError, RunError
+from nurec_sim.evaluate.detection.sheet import draw_detections
 from nurec_sim.evaluate.methods import Contender, describe
 from nurec_sim.evaluate.page import render_page
 from nurec_sim.evaluate.protocols import Protocol
@@ -108,6 +109,8 @@ def _window(
             sheet = folder / "sheets" / f"{name}.png"
             if window.beside:
                 draw_scans(sheet, window.beside, {method: scored.sweeps for method, scored in shown.items()})
+            elif any(target.sight is not None for target in window.targets):
+                draw_detections(sheet, window, {method: scored.detections for method, scored in shown.items()})
             else:
                 draw_sheet(sheet, window, shown)
             write_file(folder / "windows" / f"{name}.json", _json(record))

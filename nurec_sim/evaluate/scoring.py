@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, UInt8
 
 from nurec_sim.evaluate.methods import Built, Contender, build
 from nurec_sim.evaluate.scans import score_beside
@@ -17,6 +17,7 @@ from nurec_sim.evaluate.scores.images import masked_psnr, masked_ssim, psnr, ssi
 from nurec_sim.evaluate.support import support_record
 from nurec_sim.evaluate.views import ScoredView, reduced
 from nurec_sim.evaluate.windows import EvaluationView, Window
+from nurec_sim.network.detector.codec import Detections
 from nurec_sim.render.support import Support
 
 HIGHEST_PSNR_DB = 100.0
@@ -27,11 +28,19 @@ Figures = dict[str, float | None]
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A method's record of a window (plain JSON), its views by target name, and a sweep by lateral offset."""
+    """Results of a method on a window.
+
+    Attributes:
+        record: plain JSON.
+        views: by target name.
+        sweeps: one by lateral offset.
+        detections: images at their full size with detections, by target name.
+    """
 
     record: dict[str, Any]
     views: dict[str, ScoredView]
     sweeps: dict[float, Float64[np.ndarray, "n 3"]] = field(default_factory=dict)
+    detections: dict[str, tuple[UInt8[np.ndarray, "h w 3"], Detections]] = field(default_factory=dict)
 
 
 def score_window(
@@ -48,7 +57,8 @@ def score_window(
     Returns:
         The record: ``gaussians``, ``seconds`` (``reconstruct``; ``render`` per view), ``unknown``, and per target
         ``name``, ``left_m``, ``beyond``, ``full``, ``dynamic`` and ``static`` (see ``score_view``), and in windows with
-        targets beside the path ``support`` (``support.support_record``). Windows with target sweeps also have
+        targets beside the path ``support`` (``support.support_record``), or where a detector is asked ``detection``
+        (``detection.sights.Sight.record``). Windows with target sweeps also have
         ``sweeps`` (see ``scans.score_beside``).
 
     Raises:
@@ -58,7 +68,7 @@ def score_window(
     report(f"{contender.name} reconstructs", 0.0)
     built: Built = build(contender, window, device)
     support = _support(built, window)
-    rows, views, rendering = [], {}, 0.0
+    rows, views, detections, rendering = [], {}, {}, 0.0
     for index, target in enumerate(window.targets):
         report(f"{contender.name} shows", 0.3 + 0.7 * index / len(window.targets))
         started = time.perf_counter()
@@ -68,12 +78,15 @@ def score_window(
         row = {"name": target.name, "left_m": target.left_m, "beyond": target.beyond, **score_view(view, target)}
         if support is not None:
             row["support"] = support_record(support.map(target.request, view.rgb.shape[1]), view, target.true)
+        if target.sight is not None:
+            found = target.sight.detector(frame.rgb, target.sight.camera)
+            row["detection"], detections[target.name] = target.sight.record(found), (frame.rgb, found)
         rows.append(row)
     seconds = {"reconstruct": round(built.seconds, 3), "render": round(rendering / max(len(rows), 1), 4)}
     unknown = [] if built.scene is None else list(built.scene.provenance.get("unknown", ()))
     record = {"gaussians": built.gaussians, "seconds": seconds, "unknown": unknown, "targets": rows}
     if not window.beside:
-        return Scored(record, views)
+        return Scored(record, views, detections=detections)
     record["sweeps"], sweeps = score_beside(
         built, window.beside, lambda fraction: report(f"{contender.name} scans", 0.3 + 0.7 * fraction)
     )
@@ -81,8 +94,8 @@ def score_window(
 
 
 def _support(built: Built, window: Window) -> Support | None:
-    """The support of a method's views, where some are beside the path and the truth is known."""
-    if built.renderer is None or not any(target.left_m for target in window.targets):
+    """The support of a method's views, where some are beside the path and no detector is asked."""
+    if built.renderer is None or not any(target.left_m and target.sight is None for target in window.targets):
         return None
     return Support(built.renderer)
 

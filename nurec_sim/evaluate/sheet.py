@@ -28,19 +28,19 @@ def draw_sheet(path: Path, window: Window, shown: Mapping[str, Scored]) -> None:
     rows = []
     chosen = chosen_targets(window.targets)
     for target in chosen:
-        cells = [_cell(_rgb(target.true), f"{target.name}  truth")]
+        cells = [lettered(_rgb(target.true), f"{target.name}  truth")]
         for name, scored in shown.items():
             full = _figures(scored, target)["full"]
-            cells.append(_cell(_rgb(scored.views[target.name]), f"{name}  {full['psnr_db']:.1f} dB"))
-        rows.append(_beside(cells))
+            cells.append(lettered(_rgb(scored.views[target.name]), f"{name}  {full['psnr_db']:.1f} dB"))
+        rows.append(side_by_side(cells))
     target = chosen[0]
-    cells = [_cell(_depth(target.true), f"{target.name}  depth, {NEAR_M:g} to {FAR_M:g} m")]
+    cells = [lettered(_depth(target.true), f"{target.name}  depth, {NEAR_M:g} to {FAR_M:g} m")]
     for name in columns[1:]:
         error = _figures(shown[name], target)["full"]["abs_rel"]
         caption = f"{name}  depth unknown" if error is None else f"{name}  AbsRel {error:.3f}"
-        cells.append(_cell(_depth(shown[name].views[target.name]), caption))
-    rows.append(_beside(cells))
-    sheet = _below(rows)
+        cells.append(lettered(_depth(shown[name].views[target.name]), caption))
+    rows.append(side_by_side(cells))
+    sheet = stacked(rows)
     with new_file(path) as file:
         file.write(cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))[1].tobytes())
 
@@ -88,18 +88,20 @@ def _shade(depth_m: Float32[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     return np.rint(255 * (1 - share)).astype(np.uint8)
 
 
-def _cell(picture: Picture, caption: str) -> Picture:
+def lettered(picture: Picture, caption: str) -> Picture:
+    """A picture under its caption."""
     bar = np.full((BAR_PX, picture.shape[1], 3), PAPER, np.uint8)
     cv2.putText(bar, caption, (3, BAR_PX - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, INK, 1, cv2.LINE_AA)
     return np.vstack([bar, picture])
 
 
-def _beside(cells: Sequence[Picture]) -> Picture:
+def side_by_side(cells: Sequence[Picture]) -> Picture:
+    """Pictures of one height in a row."""
     gap = np.full((cells[0].shape[0], GAP_PX, 3), PAPER, np.uint8)
     return np.hstack([part for cell in cells for part in (cell, gap)][:-1])
 
 
-def _below(rows: Sequence[Picture]) -> Picture:
+def stacked(rows: Sequence[Picture]) -> Picture:
     """Stacks rows of any width, padded on the right."""
     width = max(row.shape[1] for row in rows)
     return np.vstack(

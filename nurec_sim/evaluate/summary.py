@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from nurec_sim.evaluate.detection.summary import summarize_detection
 from nurec_sim.evaluate.scans import mean_figures
 from nurec_sim.evaluate.support import summarize_support
 
@@ -42,9 +43,9 @@ def summarize(windows: Sequence[Record], methods: Iterable[str]) -> dict[str, An
     Returns:
         ``methods``: by name ``full``, ``dynamic``, ``static``, ``between``, ``beyond`` (means), ``curve`` (means by the
         offset from the path in metres), ``support`` (``support.summarize_support``), ``sweeps``
-        (``scans.mean_figures``), ``abs_rel_doubles_at_m``, ``gaussians``, ``seconds``, ``views``, ``dynamic_views``,
-        ``windows`` and ``failed``; ``differences``: a list of paired
-        differences.
+        (``scans.mean_figures``), ``detection`` (``detection.summary.summarize_detection``), ``abs_rel_doubles_at_m``,
+        ``gaussians``, ``seconds``, ``views``, ``dynamic_views``, ``windows`` and ``failed``; ``differences``: a list of
+        paired differences.
     """
     names = list(methods)
     figures = {name: _method([window["methods"][name] for window in windows]) for name in names}
@@ -68,6 +69,7 @@ def _method(records: Sequence[Record]) -> dict[str, Any]:
         "curve": curve,
         "support": summarize_support(rows),
         "sweeps": mean_figures(good),
+        "detection": summarize_detection(good),
         "abs_rel_doubles_at_m": doubling_offset({float(offset): row["abs_rel"] for offset, row in curve.items()}),
         "gaussians": _mean([record["gaussians"] for record in good]),
         "seconds": {stage: _mean([record["seconds"][stage] for record in good]) for stage in ("reconstruct", "render")},

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from nurec_sim.evaluate.cells import NOT_KNOWN, Table, number, percent
+from nurec_sim.evaluate.detection.summary import detection_tables
 from nurec_sim.evaluate.scans import scan_tables
 from nurec_sim.evaluate.support import support_tables
 from nurec_sim.report.cells import count_of
@@ -28,6 +29,8 @@ def tables(results: Mapping[str, Any]) -> list[Table]:
         ]
     elif name == "lidar":
         return [*scan_tables(methods), _cost(methods), *_failures(results["windows"])]
+    elif name == "detection":
+        return [*detection_tables(methods), _cost(methods), *_failures(results["windows"])]
     else:
         made.append(_paper_table(results))
         if name == "storm":

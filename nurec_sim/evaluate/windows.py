@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool
 
+from nurec_sim.evaluate.detection.sights import Sight
 from nurec_sim.evaluate.views import ScoredView
 from nurec_sim.types import Clip, SensorRequest
 
@@ -24,6 +25,7 @@ class EvaluationView:
         movable: mask of vehicles and other movable objects, moving or not; None if unknown.
         left_m: lateral offset from the driven path, left positive.
         beyond: whether it is before the first or after the last input frame.
+        sight: the image at its full size with the objects before the camera, where a detector is asked.
     """
 
     name: str
@@ -32,6 +34,7 @@ class EvaluationView:
     movable: Bool[np.ndarray, "h w"] | None
     left_m: float = 0.0
     beyond: bool = False
+    sight: Sight | None = None
 
 
 @dataclass(frozen=True, eq=False)

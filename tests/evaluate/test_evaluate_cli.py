@@ -62,7 +62,7 @@ def test_usual_methods_without_weights_are_left_out_and_named(streets, monkeypat
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        ((), "nothing to evaluate: give a clip, or --protocol storm, clip, shift or lidar"),
+        ((), "nothing to evaluate: give a clip, or --protocol storm, clip, shift, lidar or detection"),
         (("log", "--worlds", "3"), "--worlds cannot be used without --protocol"),
         (("--protocol", "storm", "--method", "lift", "--local"), "--local cannot be used with --protocol"),
         (("log", "--protocol", "storm"), "with --protocol, logs are given by --clips log"),
