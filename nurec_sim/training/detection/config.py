@@ -57,7 +57,7 @@ class DetectorConfig(Strict):
 
     profile: Literal["detector"] = "detector"
     seed: int = Field(0, ge=0)
-    steps: int = Field(1000, ge=1)
+    steps: int = Field(1200, ge=1)
     batch: int = Field(16, ge=1)
     learning_rate: float = Field(2e-3, gt=0, le=1)
     warm_up: int = Field(100, ge=0)
