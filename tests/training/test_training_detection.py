@@ -95,15 +95,22 @@ def test_a_mirrored_view_is_that_of_a_mirrored_world():
     assert objects.heading_rad[0] == -0.4
 
 
-def test_crops_move_the_middle_of_the_image(folder):
-    examples = Examples([drawn(0)])
-    batch = examples.training(CONFIG, 1)
-    for tangents, heat in zip(batch.tangents, batch.heat, strict=True):
-        row, column = np.argwhere(heat[0] >= 1)[0]
-        # The cell of the car is where the rays of its pixels point at it, mirrored or not.
-        ray = tangents[:, 4 * row : 4 * row + 4, 4 * column : 4 * column + 4].mean(axis=(1, 2))
-        assert np.abs(np.abs(ray) - [2 / 12, 1 / 12]).max() < 2.1 / FOCAL_PX
-        assert tangents.shape == (2, CROP_PX[1], CROP_PX[0])
+def test_crops_keep_image_rays_and_maps_together():
+    """A dot at the middle of the car: u = 176 + 343 * 2 / 12, v = 112 + 343 / 12."""
+    town = drawn(0)
+    town.images[:] = 40
+    town.images[:, 138:143, 231:236] = 250
+    examples = Examples([town])
+    for step in range(3):
+        batch = examples.training(CONFIG, step)
+        for image, tangents, heat in zip(batch.images, batch.tangents, batch.heat, strict=True):
+            assert image.shape == (3, CROP_PX[1], CROP_PX[0])
+            row, column = np.argwhere(heat[0] >= 1)[0]
+            cell = slice(4 * row, 4 * row + 4), slice(4 * column, 4 * column + 4)
+            # The ray of the cell points at the car, mirrored or not, and the cell shows the dot.
+            ray = tangents[:, *cell].mean(axis=(1, 2))
+            assert np.abs(np.abs(ray) - [2 / 12, 1 / 12]).max() < 2.1 / FOCAL_PX
+            assert image[0][cell].mean() > image[0].mean() + 40
 
 
 def test_the_threshold_is_where_f1_is_best():
