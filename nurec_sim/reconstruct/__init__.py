@@ -135,6 +135,10 @@ def reconstruct(
         scene = fit_to_log(
             scene, clip, used, held, lambda stage, done: report(stage, share + (1 - share) * done), refine
         )
+    if scene.static.falloff is None and np.isfinite(scene.static.intensity).any():
+        from nurec_sim.reconstruct.incidence import with_incidence
+
+        scene = with_incidence(scene, clip, held)
     # Surfaces that LiDAR gave their intensity are also told how often beams return from them.
     if scene.static.ray_drop is None and np.isfinite(scene.static.intensity).any():
         from nurec_sim.reconstruct.ray_drop import with_ray_drop

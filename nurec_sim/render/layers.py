@@ -123,7 +123,19 @@ def moving_gaussians(
         label=gaussians.label,
         intensity=gaussians.intensity,
         ray_drop=gaussians.ray_drop,
+        falloff=gaussians.falloff,
     )
+
+
+def seen_intensity(gaussians: Gaussians, eye_m: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " n"]:
+    """Intensity of returns to an eye by incidence (``Gaussians.falloff``); as it is where the normal is unknown."""
+    intensity = gaussians.intensity.astype(np.float64)
+    if gaussians.falloff is None:
+        return intensity
+    away = gaussians.mean_m.astype(np.float64) - eye_m
+    normal = np.nan_to_num(gaussians.normal.astype(np.float64))
+    met = np.abs((away * normal).sum(axis=1)) / np.maximum(np.linalg.norm(away, axis=1), 1e-12)
+    return intensity * np.where(normal.any(axis=1), 1 - gaussians.falloff * (1 - np.minimum(met, 1)), 1)
 
 
 def view_colour(

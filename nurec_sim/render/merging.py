@@ -217,6 +217,7 @@ def _merge_chunk(surfels: Surfels, groups: Int64[np.ndarray, "g 4"]) -> Surfels:
         intensity=_mean_intensity(g.intensity, weight),
         sh_rest=None if g.sh_rest is None else np.einsum("gk,gkjc->gjc", weight, g.sh_rest).astype(np.float32),
         ray_drop=None if g.ray_drop is None else np.einsum("gk,gk->g", weight, g.ray_drop).astype(np.float32),
+        falloff=None if g.falloff is None else np.einsum("gk,gk->g", weight, g.falloff).astype(np.float32),
     )
     area = sigma[:, 1] * sigma[:, 2]
     return Surfels(merged, spread @ spread.transpose(0, 2, 1), axes[:, :, 0], area, contrast2, error_m2)

@@ -35,7 +35,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from nurec_sim import geometry
-from nurec_sim.render.layers import MIN_ALPHA, facing_normals, visible_gaussians
+from nurec_sim.render.layers import MIN_ALPHA, facing_normals, seen_intensity, visible_gaussians
 from nurec_sim.render.rays import ray_grid, reference_pose, world_rays
 from nurec_sim.types import (
     CameraFrame,
@@ -130,7 +130,8 @@ def render_lidar(
     gaussians, order = visible_gaussians(scene, request, grid)
     known = np.isfinite(gaussians.intensity)
     drop = np.zeros(len(gaussians)) if gaussians.ray_drop is None else np.clip(np.nan_to_num(gaussians.ray_drop), 0, 1)
-    features = np.stack([np.where(known, gaussians.intensity, 0), known, drop], axis=-1).astype(np.float64)
+    intensity = seen_intensity(gaussians, reference_pose(request, grid.reference)[0][:3, 3])
+    features = np.stack([np.where(known, intensity, 0), known, drop], axis=-1).astype(np.float64)
     origin, direction = world_rays(request, grid)
     fired = grid.valid.copy()
     if beams is not None:

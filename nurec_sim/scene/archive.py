@@ -124,7 +124,8 @@ def read_archive(path: Path | str) -> GaussianScene:
         if not len(moving):  # no field is there to tell which optional ones they have
             harmonics = np.zeros((0, counts["dynamic_sh_rest"], 3), np.float32) if counts["dynamic_sh_rest"] else None
             drop = np.zeros(0, np.float32) if counts.get("dynamic_ray_drop") else None
-            moving = dataclasses.replace(moving, sh_rest=harmonics, ray_drop=drop)
+            falloff = np.zeros(0, np.float32) if counts.get("dynamic_falloff") else None
+            moving = dataclasses.replace(moving, sh_rest=harmonics, ray_drop=drop, falloff=falloff)
         in_box = None
         if counts.get("dynamic_in_box"):
             _check_hashes(package, manifest, (IN_BOX,))
@@ -185,6 +186,7 @@ def _manifest(scene: GaussianScene, digest: str, members: dict[str, bytes]) -> d
             "dynamic": len(scene.dynamic),
             "dynamic_sh_rest": 0 if harmonics is None else harmonics.shape[1],
             "dynamic_ray_drop": int(scene.dynamic.gaussians.ray_drop is not None),
+            **({} if scene.dynamic.gaussians.falloff is None else {"dynamic_falloff": 1}),
             **({} if scene.dynamic.in_box is None else {"dynamic_in_box": 1}),
         },
         "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},

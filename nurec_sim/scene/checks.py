@@ -102,17 +102,21 @@ def check_gaussians(gaussians: Gaussians, what: str) -> None:
         _check_array(gaussians.sh_rest, f"{what}.sh_rest", np.float32, (n, *shape[1:2], 3))
         if shape[1] not in (3, 8, 15):
             raise ArchiveError(f"{what}.sh_rest has {shape[1]} coefficients; degrees 1, 2, 3 have 3, 8, 15")
-    if gaussians.ray_drop is not None:
-        _check_array(gaussians.ray_drop, f"{what}.ray_drop", np.float32, (n,))
-    for name in ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal", "sh_rest", "ray_drop"):
+    for name in ("ray_drop", "falloff"):
+        values = getattr(gaussians, name)
+        if values is not None:
+            _check_array(values, f"{what}.{name}", np.float32, (n,))
+    for name in ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal", "sh_rest", "ray_drop", "falloff"):
         values = getattr(gaussians, name)
         if values is not None and not np.isfinite(values).all():
             _refuse(~np.isfinite(values.reshape(n, -1)).all(axis=1), what, name, "not finite")
     _refuse(np.any(gaussians.scale_m < 0, axis=1), what, "scale_m", "negative")
     _refuse((gaussians.opacity < 0) | (gaussians.opacity > 1), what, "opacity", "outside 0..1")
     _refuse((gaussians.intensity < 0) | (gaussians.intensity > 1), what, "intensity", "outside 0..1 (NaN is unknown)")
-    if gaussians.ray_drop is not None:
-        _refuse((gaussians.ray_drop < 0) | (gaussians.ray_drop > 1), what, "ray_drop", "outside 0..1")
+    for name in ("ray_drop", "falloff"):
+        values = getattr(gaussians, name)
+        if values is not None:
+            _refuse((values < 0) | (values > 1), what, name, "outside 0..1")
     _refuse(~np.isin(gaussians.label, [int(label) for label in Label]), what, "label", "not a Label")
     norm = np.sqrt(np.einsum("ij,ij->i", gaussians.quat_wxyz, gaussians.quat_wxyz))
     _refuse(np.abs(norm - 1) > 1e-3, what, "quat_wxyz", "not of unit length")

@@ -20,7 +20,7 @@ LARGEST = float(np.finfo(np.float16).max)
 TERM_STEP = 2.0**-14
 """Constant terms are multiples of this. Half floats near 0 are closer together than the float32 colours made of them:
 rounding twice would differ from rounding once."""
-_HALF_FIELDS = ("quat_wxyz", "scale_m", "opacity", "normal", "intensity", "sh_rest", "ray_drop")
+_HALF_FIELDS = ("quat_wxyz", "scale_m", "opacity", "normal", "intensity", "sh_rest", "ray_drop", "falloff")
 
 
 def archived(scene: GaussianScene) -> GaussianScene:

@@ -34,7 +34,8 @@ class Gaussians:
     coefficients of degree 1 and up (k = 3, 8 or 15, basis and order as in 3DGS files) or None. ``intensity`` is the
     LiDAR return in 0..1, NaN where unknown. ``normal`` is a unit vector, zero where unknown. ``ray_drop`` is the
     probability in 0..1 that a LiDAR beam which meets the Gaussian does not return (glass, black paint, water), or None:
-    every beam returns.
+    every beam returns. ``falloff`` is the share in 0..1 of the intensity that is lost at grazing incidence, or None: none
+    is. A beam that meets the surface at an angle a from its normal returns ``intensity * (1 - falloff * (1 - |cos a|))``.
     """
 
     mean_m: Float32[np.ndarray, "n 3"]
@@ -47,6 +48,7 @@ class Gaussians:
     intensity: Float32[np.ndarray, " n"]
     sh_rest: Float32[np.ndarray, "n k 3"] | None = None
     ray_drop: Float32[np.ndarray, " n"] | None = None
+    falloff: Float32[np.ndarray, " n"] | None = None
 
     def __len__(self) -> int:
         return len(self.mean_m)
@@ -75,7 +77,7 @@ class Gaussians:
     def concatenate(cls, parts: Sequence[Gaussians]) -> Gaussians:
         """Concatenates Gaussians; either all parts have ``sh_rest`` of the same degree, or none has.
 
-        If some parts have ``ray_drop``, the others get 0.
+        If some parts have ``ray_drop`` or ``falloff``, the others get 0.
         """
         if not parts:
             return cls.empty()
@@ -86,17 +88,17 @@ class Gaussians:
         fields: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in parts]) for name in GAUSSIAN_FIELDS
         }
-        drops = [part.ray_drop for part in parts]
-        ray_drop = None
-        if any(drop is not None for drop in drops):
-            ray_drop = np.concatenate(
-                [np.zeros(len(p), np.float32) if d is None else d for p, d in zip(parts, drops, strict=True)]
-            )
-        return cls(**fields, sh_rest=merged, ray_drop=ray_drop)
+        for name in ("ray_drop", "falloff"):
+            given = [getattr(part, name) for part in parts]
+            if any(values is not None for values in given):
+                fields[name] = np.concatenate(
+                    [np.zeros(len(p), np.float32) if v is None else v for p, v in zip(parts, given, strict=True)]
+                )
+        return cls(**fields, sh_rest=merged)
 
 
 GAUSSIAN_FIELDS = ("mean_m", "quat_wxyz", "scale_m", "opacity", "rgb", "normal", "label", "intensity")
-OPTIONAL_GAUSSIAN_FIELDS = ("sh_rest", "ray_drop")
+OPTIONAL_GAUSSIAN_FIELDS = ("sh_rest", "ray_drop", "falloff")
 SHOWN_BESIDE_M, SHOWN_ABOVE_M = 20.0, 3.0
 """What a scene shows of itself in notebooks: so far beside the recorded path, up to this height above it."""
 RIGID_LIFE_US = 10**12

@@ -9,6 +9,7 @@ from nurec_sim.render.cpu.moving import PackedMoving
 from nurec_sim.render.cpu.pack import (
     COLOUR,
     DROP,
+    FALLOFF,
     INTENSITY,
     KNOWN,
     LABEL,
@@ -39,7 +40,10 @@ def layer(n=400, sh=0, seed=3):
     normal[rng.random(3 * n) < 0.1] = 0
     rest = rng.normal(0, 0.3, (3 * n, sh, 3)).astype(np.float32) if sh else None
     drop = rng.random(3 * n).astype(np.float32)
-    gaussians = dataclasses.replace(gaussians, normal=normal.astype(np.float32), sh_rest=rest, ray_drop=drop)
+    falloff = rng.random(3 * n).astype(np.float32)
+    gaussians = dataclasses.replace(
+        gaussians, normal=normal.astype(np.float32), sh_rest=rest, ray_drop=drop, falloff=falloff
+    )
     knot_t_us, knot_m, owner = (
         np.concatenate([getattr(part, name) for part in parts])[order] for name in ("knot_t_us", "knot_m", "track")
     )
@@ -80,6 +84,7 @@ def assert_packed_is_readable(dynamic, t_us, actors=None):
     assert np.array_equal(rows, wanted_rows)
     quat = wanted.quat_wxyz / np.linalg.norm(wanted.quat_wxyz, axis=1, keepdims=True)
     drop = np.zeros(len(rows)) if wanted.ray_drop is None else wanted.ray_drop
+    falloff = np.zeros(len(rows)) if wanted.falloff is None else wanted.falloff * wanted.normal.any(axis=1)
     for first, values in (
         (MEAN, wanted.mean_m),
         (SCALE, wanted.scale_m),
@@ -88,6 +93,7 @@ def assert_packed_is_readable(dynamic, t_us, actors=None):
         (NORMAL, wanted.normal),
         (LABEL, wanted.label[:, None]),
         (DROP, drop[:, None]),
+        (FALLOFF, falloff[:, None]),
         (INTENSITY, np.nan_to_num(wanted.intensity)[:, None]),
         (KNOWN, np.isfinite(wanted.intensity)[:, None]),
     ):

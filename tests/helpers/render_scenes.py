@@ -100,6 +100,7 @@ def cloud(n=250, seed=0, low=(-8, -8, -3), high=(14, 8, 4), sh=0, drop=False):
         intensity=np.where(rng.random(n) < 0.2, np.nan, rng.random(n)).astype(np.float32),
         sh_rest=rng.normal(0, 0.15, (n, sh, 3)).astype(np.float32) if sh else None,
         ray_drop=np.random.default_rng(seed + 2).random(n).astype(np.float32) if drop else None,
+        falloff=np.random.default_rng(seed + 3).random(n).astype(np.float32) if drop else None,
     )
 
 

@@ -101,6 +101,21 @@ def test_ray_drop_is_the_weighted_mean_of_what_a_beam_meets():
     assert len(spec.render_lidar(scene(none), request(lidar()), LidarFilter(0.0), np.array([12])).beam) == 1
 
 
+def test_intensity_falls_off_with_incidence():
+    # Beam 12 looks along x. The normal is 60 degrees off it: half of what the surface can lose is lost.
+    wall = dataclasses.replace(row_of_walls([8], opacity=0.9), intensity=np.float32([0.8]))
+    normal = np.float32([[-0.5, np.sqrt(0.75), 0]])
+
+    def shown(**fields):
+        world = dataclasses.replace(wall, **{"normal": normal, "falloff": np.float32([0.6]), **fields})
+        return float(spec.render_lidar(scene(world), request(lidar()), None, np.array([12])).intensity[0])
+
+    assert shown() == pytest.approx(0.8 * (1 - 0.6 * 0.5), abs=1e-6)
+    assert shown(normal=-normal) == pytest.approx(0.8 * (1 - 0.6 * 0.5), abs=1e-6)
+    assert shown(normal=np.float32([[-1, 0, 0]])) == shown(falloff=None) == pytest.approx(0.8, abs=1e-6)
+    assert shown(normal=np.zeros((1, 3), np.float32)) == pytest.approx(0.8, abs=1e-6)
+
+
 def test_the_distance_filter_takes_beams_that_meet_two_things():
     world = scene(row_of_walls([4, 9], opacity=[0.6, 0.9]))  # range 4, mean 5.875
     for limit, returns in ((None, 1), (1.8, 0), (1.9, 1)):
@@ -129,3 +144,10 @@ def test_ray_drop_goes_where_its_gaussians_go():
     assert Gaussians.concatenate([plain, dropping]).ray_drop.tolist() == [0, 0, 0, 0, *dropping.ray_drop.tolist()]
     assert Gaussians.concatenate([plain, plain]).ray_drop is None
     assert Gaussians.empty(2).ray_drop is None
+
+
+def test_falloff_goes_where_its_gaussians_go():
+    plain, falling = cloud(2), dataclasses.replace(cloud(2), falloff=np.float32([0.1, 0.2]))
+    assert falling[1:].falloff.tolist() == falling.falloff[1:].tolist() and plain[1:].falloff is None
+    assert Gaussians.concatenate([plain, falling]).falloff.tolist() == [0, 0, *falling.falloff.tolist()]
+    assert Gaussians.concatenate([plain, plain]).falloff is None

@@ -73,11 +73,11 @@ def test_no_moving_gaussians_keep_their_degree(tmp_path):
 
 
 def with_ray_drop(scene):
-    """The scene with a drop probability for every Gaussian."""
+    """The scene with a drop probability and a falloff for every Gaussian."""
 
     def dropping(part):
         probability = np.random.default_rng(len(part)).integers(0, 9, len(part)).astype(np.float32) / 8
-        return dataclasses.replace(part, ray_drop=probability)
+        return dataclasses.replace(part, ray_drop=probability, falloff=1 - probability)
 
     moving = dataclasses.replace(scene.dynamic, gaussians=dropping(scene.dynamic.gaussians))
     return dataclasses.replace(scene, static=dropping(scene.static), dynamic=moving)
@@ -255,6 +255,7 @@ FAULTS = {
     "opacity": (lambda: broken(opacity=np.full(5, 1.5, np.float32)), r"opacity: 5 of 5 are outside 0\.\.1"),
     "intensity": (lambda: broken(intensity=np.full(5, -1, np.float32)), r"intensity: 5 of 5 are outside 0\.\.1"),
     "ray drop": (lambda: broken(ray_drop=np.full(5, 1.5, np.float32)), r"ray_drop: 5 of 5 are outside 0\.\.1"),
+    "falloff": (lambda: broken(falloff=np.full(5, -0.5, np.float32)), r"falloff: 5 of 5 are outside 0\.\.1"),
     "no ray drop": (lambda: broken(ray_drop=NAN[:, 0]), r"ray_drop: 5 of 5 are not finite"),
     "scale": (lambda: broken(scale_m=np.full((5, 3), -1, np.float32)), r"scale_m: 5 of 5 are negative"),
     "quaternion": (lambda: broken(quat_wxyz=np.ones((5, 4), np.float32)), r"quat_wxyz: 5 of 5 are not of unit length"),

@@ -55,7 +55,7 @@ LOG_MAX_OPACITY = float(np.log(MAX_OPACITY))
 class MovingBlocks(NamedTuple):
     """Blocks of a ``PackedMoving`` as its kernel reads them."""
 
-    fields: Float32[np.ndarray, "blocks 21 256"]
+    fields: Float32[np.ndarray, "blocks 22 256"]
     sh_rest: Float32[np.ndarray, "blocks k3 256"]
     knot_us: Float64[np.ndarray, "blocks 3 256"]
     knot_m: Float32[np.ndarray, "blocks 9 256"]
@@ -66,7 +66,7 @@ class MovingBlocks(NamedTuple):
 class PlacedBlocks(NamedTuple):
     """Blocks at an instant, and spheres around their live Gaussians."""
 
-    fields: Float32[np.ndarray, "b 21 256"]
+    fields: Float32[np.ndarray, "b 22 256"]
     centre_m: Float64[np.ndarray, "b 3"]
     radius_m: Float64[np.ndarray, " b"]
     """0 where nothing is alive."""
@@ -82,7 +82,7 @@ class PackedMoving:
     of track k have ``track`` k plus the number of tracks; ``boxed`` lists those k.
     """
 
-    fields: Float32[np.ndarray, "blocks 21 256"]
+    fields: Float32[np.ndarray, "blocks 22 256"]
     sh_rest: Float32[np.ndarray, "blocks k3 256"]
     index: Int32[np.ndarray, "blocks 256"]
     knot_us: Float64[np.ndarray, "blocks 3 256"]

@@ -13,7 +13,8 @@ from nurec_sim.types import Gaussians
 
 # Fields of a block.
 MEAN, QUAT, SCALE, LOG_OPACITY, COLOUR, LABEL, INTENSITY, KNOWN, DROP, NORMAL = 0, 3, 7, 10, 11, 14, 15, 16, 17, 18
-FIELDS = 21
+FALLOFF = 21
+FIELDS = 22
 
 BLOCK = 256
 MIN_SCALE_M = 1e-5
@@ -27,7 +28,7 @@ NEVER_SEEN = -1e9
 class LayerBlocks(NamedTuple):
     """Blocks of a layer as the projecting kernels read them."""
 
-    fields: Float32[np.ndarray, "blocks 21 256"]
+    fields: Float32[np.ndarray, "blocks 22 256"]
     sh_rest: Float32[np.ndarray, "blocks k3 256"]
     """[0,0,0] without view-dependent colours."""
     chosen: Int64[np.ndarray, " b"]
@@ -43,7 +44,7 @@ class PackedGaussians:
     coefficient-major, row 3 j + c for coefficient j of colour c, and [0,0,0] without view-dependent colours.
     """
 
-    fields: Float32[np.ndarray, "blocks 21 256"]
+    fields: Float32[np.ndarray, "blocks 22 256"]
     sh_rest: Float32[np.ndarray, "blocks k3 256"]
     index: Int32[np.ndarray, " rows"]
     block_centre: Float64[np.ndarray, "blocks 3"]
@@ -74,7 +75,7 @@ def pack(gaussians: Gaussians, sort: bool = True) -> PackedGaussians:
     return PackedGaussians(fields, sh_rest, index, centre, radius)
 
 
-def gaussian_columns(gaussians: Gaussians, chosen: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n 21"]:
+def gaussian_columns(gaussians: Gaussians, chosen: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n 22"]:
     """The fields of the chosen Gaussians, one row each."""
     columns = np.zeros((len(chosen), FIELDS), np.float32)
     quat = gaussians.quat_wxyz[chosen].astype(np.float64)
@@ -94,6 +95,10 @@ def gaussian_columns(gaussians: Gaussians, chosen: Int64[np.ndarray, " n"]) -> F
         columns[:, DROP] = np.clip(np.nan_to_num(drop[chosen]), 0, 1)
     normal = gaussians.normal[chosen]
     columns[:, NORMAL : NORMAL + 3] = np.where(np.isfinite(normal), np.clip(normal, -1, 1), 0)
+    falloff = getattr(gaussians, "falloff", None)
+    if falloff is not None:
+        # Without a normal there is no incidence.
+        columns[:, FALLOFF] = columns[:, NORMAL : NORMAL + 3].any(axis=1) * np.clip(np.nan_to_num(falloff[chosen]), 0, 1)
     return columns
 
 
@@ -127,7 +132,7 @@ def morton_order(points: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
 
 
 def block_spheres(
-    fields: Float32[np.ndarray, "blocks 21 256"],
+    fields: Float32[np.ndarray, "blocks 22 256"],
 ) -> tuple[Float64[np.ndarray, "blocks 3"], Float64[np.ndarray, " blocks"]]:
     """A sphere around everything of each block that is at least 1/255 opaque."""
     if len(fields) == 0:

@@ -23,7 +23,20 @@ from jaxtyping import Float32, Int16, Int32
 from llvmlite import ir
 
 from nurec_sim.render.cpu.kernel import inner
-from nurec_sim.render.cpu.pack import BLOCK, COLOUR, DROP, INTENSITY, KNOWN, LABEL, LOG_OPACITY, MEAN, QUAT, SCALE
+from nurec_sim.render.cpu.pack import (
+    BLOCK,
+    COLOUR,
+    DROP,
+    FALLOFF,
+    INTENSITY,
+    KNOWN,
+    LABEL,
+    LOG_OPACITY,
+    MEAN,
+    NORMAL,
+    QUAT,
+    SCALE,
+)
 from nurec_sim.render.cpu.simd import I32, LANES, Lanes, Vector, declare, spread, vector_kernel
 from nurec_sim.types import Matrix4
 
@@ -162,11 +175,21 @@ def colour_features(v: Lanes, block: ir.Value, scratch: ir.Value) -> None:
         v.store(v.load(block, 4 * BLOCK * (COLOUR + k)), scratch, STEP * (FEATURES + k))
 
 
-@vector_kernel("ii")
-def lidar_features(v: Lanes, block: ir.Value, scratch: ir.Value) -> None:
-    """Take intensity, whether it is known, and the drop probability as features."""
-    for k, field in enumerate((INTENSITY, KNOWN, DROP)):
-        v.store(v.load(block, 4 * BLOCK * field), scratch, STEP * (FEATURES + k))
+@vector_kernel("iii")
+def lidar_features(v: Lanes, block: ir.Value, view: ir.Value, scratch: ir.Value) -> None:
+    """Take intensity, as it returns to the eye, whether it is known, and the drop probability as features."""
+    offset = [
+        (v.load(block, 4 * BLOCK * (MEAN + k)) - v.broadcast(view, 4 * (EYE_HIGH + k)))
+        - v.broadcast(view, 4 * (EYE_LOW + k))
+        for k in range(3)
+    ]
+    normal = [v.load(block, 4 * BLOCK * (NORMAL + k)) for k in range(3)]
+    met = dot(normal, offset).abs() / dot(offset, offset).max(1e-24).sqrt()
+    # See ``Gaussians.falloff``.
+    kept = 1 - v.load(block, 4 * BLOCK * FALLOFF) * (1 - met).max(0)
+    v.store(v.load(block, 4 * BLOCK * INTENSITY) * kept, scratch, STEP * FEATURES)
+    for k, field in enumerate((KNOWN, DROP)):
+        v.store(v.load(block, 4 * BLOCK * field), scratch, STEP * (FEATURES + 1 + k))
 
 
 @vector_kernel("iii")

@@ -216,8 +216,9 @@ def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray
         ("semanticClass", types.UCharArray, Vt.UCharArray.FromNumpy(np.ascontiguousarray(gaussians.label))),
         ("intensity", types.HalfArray, Vt.HalfArray.FromNumpy(half(gaussians.intensity))),
     ]
-    if gaussians.ray_drop is not None:
-        columns.append(("rayDrop", types.HalfArray, Vt.HalfArray.FromNumpy(half(gaussians.ray_drop))))
+    for name, values in (("rayDrop", gaussians.ray_drop), ("falloff", gaussians.falloff)):
+        if values is not None:
+            columns.append((name, types.HalfArray, Vt.HalfArray.FromNumpy(half(values))))
     for name, kind, array in columns:
         primvars.CreatePrimvar(f"{NAMESPACE}:{name}", kind, UsdGeom.Tokens.vertex).Set(array)
     if not len(gaussians):
@@ -260,7 +261,7 @@ def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Ga
         "intensity": values(f"{prefix}intensity", np.float32),
         "index": values(f"{prefix}index", np.int32),
     }
-    for name, attribute, *shape in (("rgb", "rgb", 3), ("ray_drop", "rayDrop")):
+    for name, attribute, *shape in (("rgb", "rgb", 3), ("ray_drop", "rayDrop"), ("falloff", "falloff")):
         if layer.GetAttributeAtPath(f"{path}.{prefix}{attribute}") is not None:
             columns[name] = values(f"{prefix}{attribute}", np.float32, *shape)
     lengths = {name: len(column) for name, column in columns.items()} | {"coefficients": len(coefficients) / terms}
@@ -274,6 +275,7 @@ def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Ga
     return columns["index"], Gaussians(
         positions, quat_wxyz, columns["scales"], columns["opacities"], rgb, columns["normal"],
         columns["label"], columns["intensity"], rest, columns.get("ray_drop"),
+        columns.get("falloff"),
     )  # fmt: skip
 
 

@@ -183,7 +183,7 @@ def _merged(part: Gaussians, inside: Int64[np.ndarray, " m"], begins: Int64[np.n
         "normal": np.where(length > 1e-6, direction / np.maximum(length, 1e-6), 0.0),
         "intensity": _mean_of_known(part.intensity, weight, begins),
     }
-    for name in ("sh_rest", "ray_drop"):
+    for name in ("sh_rest", "ray_drop", "falloff"):
         values = getattr(part, name)
         if values is not None:
             fields[name] = mean(values)

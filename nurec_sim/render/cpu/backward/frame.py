@@ -115,7 +115,7 @@ class Frame:
         )
         return self.draw_packed(packed)
 
-    def draw_packed(self, packed: Float32[np.ndarray, "blocks 21 256"]) -> Float32[np.ndarray, "6 h w"]:
+    def draw_packed(self, packed: Float32[np.ndarray, "blocks 22 256"]) -> Float32[np.ndarray, "6 h w"]:
         """Render Gaussians that are packed already (``pack``), like ``draw``; row i of them is packed row i."""
         blocks = len(packed)
         nothing = np.zeros((0, 0, 0), np.float32)

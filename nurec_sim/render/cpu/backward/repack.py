@@ -12,6 +12,7 @@ from nurec_sim.render.cpu.kernel import f4, inner, kernel
 from nurec_sim.render.cpu.pack import (
     BLOCK,
     COLOUR,
+    FALLOFF,
     INTENSITY,
     LABEL,
     LOG_OPACITY,
@@ -19,6 +20,7 @@ from nurec_sim.render.cpu.pack import (
     MEAN,
     MIN_SCALE_M,
     NEVER_SEEN,
+    NORMAL,
     QUAT,
     SCALE,
 )
@@ -61,7 +63,7 @@ def repack(first, last, gaussians, lidar, fields):
         last: one behind the last.
         gaussians: see ``RawGaussians``.
         lidar: whether the features are those of a LiDAR.
-        fields: [blocks,21,256] output, see ``pack``; only what a frame without normals reads.
+        fields: [blocks,22,256] output, see ``pack``; only what a frame without normals reads.
     """
     feature = INTENSITY if lidar else COLOUR
     mean, quat, scale, opacity, features = gaussians
@@ -69,6 +71,11 @@ def repack(first, last, gaussians, lidar, fields):
         out = fields[block]
         # Frames with gradients have no labels.
         out[LABEL] = f4(0)
+        if lidar:
+            # Nor does what they return depend on the incidence.
+            for c in range(3):
+                out[NORMAL + c] = f4(0)
+            out[FALLOFF] = f4(0)
         for k in range(BLOCK):
             i = block * BLOCK + k
             if i >= len(mean) or not _drawable(gaussians, i):

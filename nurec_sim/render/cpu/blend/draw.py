@@ -248,7 +248,7 @@ def record_normals(fields, sources, first, count, eye, normals):
     """Write the normals of a run of records, turned to face the eye.
 
     Args:
-        fields: [blocks,21,256] the layer's Gaussians, see ``pack``.
+        fields: [blocks,22,256] the layer's Gaussians, see ``pack``.
         sources: [n] packed row of each record.
         first: first record of the run.
         count: how many.

@@ -229,7 +229,7 @@ def take_features(block, sh_rest, number, lane, view, scratch, lidar):
         lidar: whether the features are those of a LiDAR.
     """
     if lidar:
-        lidar_features(block, scratch)
+        lidar_features(block, view, scratch)
     elif sh_rest.shape[1] == 0:
         colour_features(block, scratch)
     else:

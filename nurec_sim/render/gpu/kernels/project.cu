@@ -137,9 +137,14 @@ project(const View* views, int static_blocks, const float* static_fields, const 
     Record r = record_of(g);
     bool close = g.nearest < view.near_m;
     r.w.w = __int_as_float(((int)f[LABEL * BLOCK] & LABEL_BITS) | (close ? CLOSE_BIT : 0));
+    float3 normal = make_float3(f[NORMAL * BLOCK], f[(NORMAL + 1) * BLOCK], f[(NORMAL + 2) * BLOCK]);
+    float slanted = dot(apply(view.turn, normal), g.centre);
     float3 features = make_float3(f[COLOUR * BLOCK], f[(COLOUR + 1) * BLOCK], f[(COLOUR + 2) * BLOCK]);
     if (view.intensity) {
-        features = make_float3(f[INTENSITY * BLOCK], f[(INTENSITY + 1) * BLOCK], f[(INTENSITY + 2) * BLOCK]);
+        // By incidence; see Gaussians.falloff.
+        float met = fabsf(slanted) / fmaxf(g.distance, 1e-12f);
+        float kept = 1 - f[FALLOFF * BLOCK] * fmaxf(1 - met, 0.0f);
+        features = make_float3(kept * f[INTENSITY * BLOCK], f[(INTENSITY + 1) * BLOCK], f[(INTENSITY + 2) * BLOCK]);
     } else if (sh_count > 0 && (int)blockIdx.x < static_blocks) {
         float3 away = (1 / fmaxf(g.distance, 1e-12f)) * apply_transposed(view.turn, g.centre);
         const float* rest = static_sh + (size_t)blockIdx.x * 3 * sh_count * BLOCK + threadIdx.x;
@@ -148,8 +153,7 @@ project(const View* views, int static_blocks, const float* static_fields, const 
                                fmaxf(features.z + sh_channel(rest + 2 * BLOCK, sh_count, away), 0.0f));
     }
     r.features = with(features, r.features.w);
-    float3 normal = make_float3(f[NORMAL * BLOCK], f[(NORMAL + 1) * BLOCK], f[(NORMAL + 2) * BLOCK]);
-    float sign = dot(apply(view.turn, normal), g.centre) > 0 ? -1.0f : 1.0f;
+    float sign = slanted > 0 ? -1.0f : 1.0f;
     int row = blockIdx.x * BLOCK + threadIdx.x;
     r.facing = with(sign * normal, __int_as_float(row));
     span.view = blockIdx.y;

@@ -23,7 +23,8 @@
 
 // Fields of a block of packed Gaussians, [FIELDS][BLOCK] (render/cpu/pack.py).
 enum Field {
-    MEAN = 0, QUAT = 3, SCALE = 7, LOG_OPACITY = 10, COLOUR = 11, LABEL = 14, INTENSITY = 15, NORMAL = 18, FIELDS = 21
+    MEAN = 0, QUAT = 3, SCALE = 7, LOG_OPACITY = 10, COLOUR = 11, LABEL = 14, INTENSITY = 15, NORMAL = 18, FALLOFF = 21,
+    FIELDS = 22
 };
 
 // Places of the planes that blending leaves, each one value per ray.
