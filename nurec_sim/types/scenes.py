@@ -34,8 +34,9 @@ class Gaussians:
     coefficients of degree 1 and up (k = 3, 8 or 15, basis and order as in 3DGS files) or None. ``intensity`` is the
     LiDAR return in 0..1, NaN where unknown. ``normal`` is a unit vector, zero where unknown. ``ray_drop`` is the
     probability in 0..1 that a LiDAR beam which meets the Gaussian does not return (glass, black paint, water), or None:
-    every beam returns. ``falloff`` is the share in 0..1 of the intensity that is lost at grazing incidence, or None: none
-    is. A beam that meets the surface at an angle a from its normal returns ``intensity * (1 - falloff * (1 - |cos a|))``.
+    every beam returns. ``falloff`` is the share in 0..1 of the intensity that is lost at grazing incidence, or None:
+    none is. A beam that meets the surface at an angle a from its normal returns
+    ``intensity * (1 - falloff * (1 - |cos a|))``.
     """
 
     mean_m: Float32[np.ndarray, "n 3"]

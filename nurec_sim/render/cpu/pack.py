@@ -98,7 +98,9 @@ def gaussian_columns(gaussians: Gaussians, chosen: Int64[np.ndarray, " n"]) -> F
     falloff = getattr(gaussians, "falloff", None)
     if falloff is not None:
         # Without a normal there is no incidence.
-        columns[:, FALLOFF] = columns[:, NORMAL : NORMAL + 3].any(axis=1) * np.clip(np.nan_to_num(falloff[chosen]), 0, 1)
+        columns[:, FALLOFF] = columns[:, NORMAL : NORMAL + 3].any(axis=1) * np.clip(
+            np.nan_to_num(falloff[chosen]), 0, 1
+        )
     return columns
 
 
