@@ -187,8 +187,25 @@ def test_the_verb_draws_a_plan_with_the_car_that_was_asked_for(plan, tmp_path, m
     clip = logs.open_clip(tmp_path / "made")
     assert logs.check_clip(clip) == [] and list(clip.rig.lidars) == []
     assert list(clip.rig.cameras) == ["camera_front", "camera_front_left", "camera_front_right"]
-    assert clip.facts["command"] == "nurec-sim world --plan plan.json"  # not where to: the same log, the same bytes
+    # Not where to: the same log has the same bytes.
+    order = "nurec-sim world --plan plan.json --hz 1 --cameras 3 --lens ftheta --pixels 12544 --lidar none"
+    assert clip.facts["command"] == order
     assert (tmp_path / "made" / "map.xodr").is_file() and "x_junction" in capsys.readouterr().out
+
+
+def test_the_verb_draws_the_usual_cameras_in_the_size_and_quality_that_were_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setenv(backend.ENVIRONMENT, "rays")
+    order = ["--seed", "3", "--split", "train", "--template", "straight", "--seconds", "1", "--traffic", "dense"]
+    order += ["--hz", "1"]
+    sizes = {}
+    for quality in ("30", "95"):
+        words = [*order, "--jpeg-quality", quality, "--width", "96", "--height", "64"]
+        cli.main(["world", *words, "--out", str(tmp_path / quality)])
+        clip = logs.open_clip(tmp_path / quality)
+        assert clip.facts["command"] == " ".join(["nurec-sim world", *words])
+        assert clip.image("camera_front", 0).shape == (64, 96, 3)
+        sizes[quality] = sum(path.stat().st_size for path in (tmp_path / quality).rglob("*.jpg"))
+    assert sizes["30"] < 0.6 * sizes["95"]
 
 
 @pytest.mark.parametrize(
@@ -199,6 +216,11 @@ def test_the_verb_draws_a_plan_with_the_car_that_was_asked_for(plan, tmp_path, m
         (["--template", "roundabout"], "no template 'roundabout' in split 'train'; have straight"),
         (["--seconds", "1", "--hz", "30"], "--hz must be within 0.1..25, got 30"),
         (["--seconds", "1", "--lidar", "HDL"], "no LiDAR 'HDL'; have"),
+        (["--seconds", "1", "--jpeg-quality", "0"], "--jpeg-quality must be within 1..100, got 0"),
+        (["--seconds", "1", "--width", "8"], "at least 16 x 16 pixels"),
+        (["--seconds", "1", "--width", "640", "--cameras", "1"], "give --pixels for a random one"),
+        (["--seconds", "1", "--template", "straight", "--turn", "left"], "goes left at its first junction"),
+        (["--plan", "there.json", "--turn", "left"], "--plan defines the town; remove --turn"),
         (["--plan", "there.json", "--seed", "3"], "--plan defines the town; remove --seed"),
         (["--plan", "nowhere.json"], "cannot read the plan nowhere.json"),
         (["--plan", "there.json"], "there.json: not a town plan: the text itself"),

@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 
 from nurec_sim.world.plan import fleet
+from nurec_sim.world.plan.density import Density, Turn
 from nurec_sim.world.plan.drivers import Driver
 from nurec_sim.world.plan.routes import END_M, SPACING_M, Route, lay_route, random_lanes
 from nurec_sim.world.plan.rules import Rules
@@ -19,14 +20,13 @@ EGO_SIZE_M = (4.9, 1.9, 1.5)
 EGO_EAGERNESS = (0.5, 1.3)
 """The ego's desired speed relative to the limit."""
 FASTEST_EGO_MPS = 16.0
-EGO_TRIES = 8
-VEHICLES = (8, 18)
+EGO_TRIES, TURNING_TRIES = 8, 40
+"""Random routes that the ego chooses from; more when it has to turn."""
 SEEN_M = 90.0
 """Vehicles further from the ego's route are not simulated."""
 LEAVING_M = 60.0
 """Nor are vehicles about to leave the town."""
 CYCLISTS = 0.13
-LEAD = 0.8
 FREE_M = 2.5
 FLOWING_RANK = 3
 """Rank that rarely has to wait at a junction; the ego prefers such routes slightly."""
@@ -42,12 +42,19 @@ class Vehicle:
     driver: Driver
 
 
-def ego_driver(rng: np.random.Generator, rules: Rules, seconds: float) -> Driver:
-    """The ego: through a junction if there is one, usually not into a red light."""
+def ego_driver(rng: np.random.Generator, rules: Rules, seconds: float, turn: Turn | None = None) -> Driver:
+    """The ego: through a junction if there is one, usually not into a red light.
+
+    Args:
+        rng: random generator.
+        rules: lanes and right of way of the town.
+        seconds: length of its drive.
+        turn: its way through the first junction, if one of the random routes has it.
+    """
     eagerness = float(rng.uniform(*EGO_EAGERNESS))
     firsts = [lane for lane in rules.lanes.values() if not lane.in_junction]
     best: tuple[float, Route, float] | None = None
-    for _ in range(EGO_TRIES):
+    for _ in range(EGO_TRIES if turn is None else TURNING_TRIES):
         first = firsts[int(rng.integers(len(firsts)))]
         # Expected distance: the desired speed, less some for bends and waiting.
         distance = 0.85 * min(FASTEST_EGO_MPS, first.speed_limit_mps * eagerness) * seconds
@@ -64,6 +71,8 @@ def ego_driver(rng: np.random.Generator, rules: Rules, seconds: float) -> Driver
             score -= 1.5
         if first_rank >= FLOWING_RANK:
             score += float(rng.uniform(0.0, 1.0))
+        if turn is not None and (not inside or rules.lanes[inside[0].lane].turn != turn):
+            score -= 10.0
         start = float(rng.uniform(8.0, max(free, 10.0)))
         if inside:
             # Reaches the junction after 10 to 60 % of the expected distance.
@@ -76,7 +85,7 @@ def ego_driver(rng: np.random.Generator, rules: Rules, seconds: float) -> Driver
 
 
 def other_vehicles(
-    rng: np.random.Generator, rules: Rules, split: Split, ego: Driver, way: shapely.LineString
+    rng: np.random.Generator, rules: Rules, split: Split, ego: Driver, way: shapely.LineString, density: Density
 ) -> list[Vehicle]:
     """Usually a lead car, and vehicles on the lanes around ``way``, nearest first.
 
@@ -86,9 +95,10 @@ def other_vehicles(
         split: ``train`` or ``test``: selects the vehicle families.
         ego: the ego at its start; nothing is placed on it.
         way: the ego's route ahead (m); vehicles start within ``SEEN_M`` of it.
+        density: how many.
     """
-    places = _lead(rng, rules, ego) + _places(rng, rules, way)
-    wanted = int(rng.integers(VEHICLES[0], VEHICLES[1] + 1))
+    places = _lead(rng, rules, ego, density.lead) + _places(rng, rules, way, density.spacing_m)
+    wanted = int(rng.integers(density.vehicles[0], density.vehicles[1] + 1))
     taken = [(ego.route.at(np.array(ego.station_m)), EGO_SIZE_M[0])]
     found: list[Vehicle] = []
     for away, route, station in places:
@@ -121,23 +131,25 @@ Place = tuple[float, Route, float]
 """How late it is considered, its route, and its station on it."""
 
 
-def _lead(rng: np.random.Generator, rules: Rules, ego: Driver) -> list[Place]:
+def _lead(rng: np.random.Generator, rules: Rules, ego: Driver, chance: float) -> list[Place]:
     """Start of a slower lead car ahead of the ego, most of the time."""
     # The gap grows with speed by half a second of driving.
     station = ego.station_m + EGO_SIZE_M[0] + float(rng.uniform(7.0, 28.0)) + 0.5 * ego.speed_mps
     slower = float(rng.uniform(0.7, 1.1))
-    if rng.random() > LEAD or station > ego.route.length_m - LEAVING_M:
+    if rng.random() > chance or station > ego.route.length_m - LEAVING_M:
         return []
     return [(-1.0, lay_route(rules.lanes, [leg.lane for leg in ego.route.legs], speed_factor=slower), station)]
 
 
-def _places(rng: np.random.Generator, rules: Rules, way: shapely.LineString) -> list[Place]:
+def _places(
+    rng: np.random.Generator, rules: Rules, way: shapely.LineString, spacing_m: tuple[float, float]
+) -> list[Place]:
     """Start positions on all lanes of roads, roughly nearest first."""
     places: list[Place] = []
     for lane in rules.lanes.values():
         if lane.in_junction:
             continue
-        spacing = float(rng.uniform(12.0, 40.0))
+        spacing = float(rng.uniform(*spacing_m))
         station = float(rng.uniform(4.0, spacing))
         while station < lane.length_m - 4.0:
             # Vehicles stop at the end of their route, so it reaches 200 m beyond the start.

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
+from nurec_sim.world.plan.density import Density
 from nurec_sim.world.plan.network import TownNetwork
 from nurec_sim.world.plan.splits import VEHICLES, Split
 from nurec_sim.world.plan.town import Actor, ActorKind
@@ -58,8 +59,9 @@ def pick_colour(rng: np.random.Generator) -> tuple[float, float, float]:
 
 
 def parked_cars(
-    rng: np.random.Generator, network: TownNetwork, split: Split, span_us: tuple[int, int], way: shapely.LineString
-) -> list[Actor]:
+    rng: np.random.Generator, network: TownNetwork, split: Split, span_us: tuple[int, int], way: shapely.LineString,
+    density: Density,
+) -> list[Actor]:  # fmt: skip
     """Cars in the parking strips around the ego's route, nearest first, with small pose noise.
 
     Args:
@@ -68,12 +70,13 @@ def parked_cars(
         split: ``train`` or ``test``: selects the vehicle families.
         span_us: first and last time of their (constant) poses.
         way: the ego's route ahead (m); cars are kept within ``PARKED_NEAR_M`` of it.
+        density: how many.
     """
     found: list[tuple[float, Actor]] = []
     for name, road in network.roads.items():
         kept_free = _kept_free(network, name)
         for side in (-1, 1):
-            full, station = float(rng.uniform(0.2, 0.95)), float(rng.uniform(2.0, 8.0))
+            full, station = float(rng.uniform(*density.parked)), float(rng.uniform(2.0, 8.0))
             while station < road.length_m - 7.0:
                 kind = pick_kind(rng, split, parked=True)
                 size = pick_size(rng, kind)

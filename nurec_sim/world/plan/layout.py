@@ -8,6 +8,7 @@ import numpy as np
 
 from nurec_sim.world.plan import traffic
 from nurec_sim.world.plan.appearance import town_style, town_terrain, town_weather
+from nurec_sim.world.plan.density import DENSITIES, TURNS, Traffic, Turn
 from nurec_sim.world.plan.furniture import town_props
 from nurec_sim.world.plan.junctions import Mouth
 from nurec_sim.world.plan.lots import town_houses
@@ -23,8 +24,11 @@ STEP_US = 50_000
 MOST_SECONDS = 30.0
 
 
-def town_plan(seed: int, split: Split = "train", template: str | None = None, seconds: float = 12.0) -> TownPlan:
-    """The town of a seed with ``seconds`` of traffic; takes less than a second.
+def town_plan(
+    seed: int, split: Split = "train", template: str | None = None, seconds: float = 12.0,
+    traffic_density: Traffic = "usual", turn: Turn | None = None,
+) -> TownPlan:  # fmt: skip
+    """The town of a seed with ``seconds`` of traffic; takes about a second, a few with ``turn``.
 
     Args:
         seed: same seed, same split, same plan to the byte.
@@ -32,13 +36,20 @@ def town_plan(seed: int, split: Split = "train", template: str | None = None, se
             every other one a held-out template, and never repeat a training town.
         template: one of ``splits.TEMPLATES``; by seed if not given.
         seconds: length of the drive, 1..30.
+        traffic_density: ``usual``, or ``dense``: the same town with more vehicles, parked cars and pedestrians.
+        turn: the way that the ego goes through its first junction: ``left``, ``right`` or ``straight``; by seed if not
+            given.
 
     Raises:
-        ValueError: a negative seed, an unknown split or template, a template that the split holds out, or seconds out
-            of range.
+        ValueError: a negative seed, an unknown split, template, density or turn, a template that the split holds out,
+            seconds out of range, or no drive in the town turns so.
     """
+    for what, given, known in (("traffic density", traffic_density, DENSITIES), ("turn", turn, (None, *TURNS))):
+        if given not in known:
+            raise ValueError(f"no {what} {given!r}; have {', '.join(each for each in known if each)}")
     plan = still_town(seed, split, template, seconds)
-    ego, actors = traffic.drive(TownNetwork(plan), seed, split, plan.span_us)
+    density = DENSITIES[traffic_density]
+    ego, actors = traffic.drive(TownNetwork(plan), seed, split, plan.span_us, density, turn)
     return replace(plan, ego=ego, actors=actors)
 
 

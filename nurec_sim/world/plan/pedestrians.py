@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from scipy.spatial.distance import cdist
 
 from nurec_sim import geometry
+from nurec_sim.world.plan.density import Density
 from nurec_sim.world.plan.fleet import pick_colour
 from nurec_sim.world.plan.network import TownNetwork
 from nurec_sim.world.plan.swept_boxes import Boxes, standing
@@ -25,9 +26,6 @@ BEHIND_TREES_M, BEFORE_BENCHES_M = 1.3, 1.1
 ROOM_M = {"bus_stop": 1.3, "bench": 0.9, "billboard": 1.5}
 USUAL_ROOM_M = 0.45
 """Clearance of pedestrians from the centre of props, by kind."""
-WALKERS = (3, 8)
-CROSSERS = (0.5, 0.35, 0.15)
-"""Probability of zero, one or two pedestrians at a nearby crossing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +45,9 @@ class Walker:
 
 
 def people(
-    rng: np.random.Generator, network: TownNetwork, ego_xy: Float64[np.ndarray, "k 2"], t_s: Float64[np.ndarray, " t"]
-) -> list[Walker]:
+    rng: np.random.Generator, network: TownNetwork, ego_xy: Float64[np.ndarray, "k 2"], t_s: Float64[np.ndarray, " t"],
+    density: Density,
+) -> list[Walker]:  # fmt: skip
     """Pedestrians around the ego's path.
 
     Args:
@@ -56,10 +55,12 @@ def people(
         network: sidewalks, roads and crossings.
         ego_xy: the ego's path.
         t_s: sample times of the paths.
+        density: how many.
     """
     way = shapely.LineString(ego_xy)
-    found = _on_crossings(rng, network, way, t_s)
-    return found + _on_sidewalks(rng, network, way, t_s, int(rng.integers(WALKERS[0], WALKERS[1] + 1)))
+    found = _on_crossings(rng, network, way, t_s, density.crossers)
+    count = int(rng.integers(density.walkers[0], density.walkers[1] + 1))
+    return found + _on_sidewalks(rng, network, way, t_s, count)
 
 
 def boxes_of(walkers: Sequence[Walker], t_s: Float64[np.ndarray, " t"]) -> Boxes:
@@ -138,8 +139,9 @@ def _runs_into_something(xy: Float64[np.ndarray, "t 2"], network: TownNetwork) -
 
 
 def _on_crossings(
-    rng: np.random.Generator, network: TownNetwork, way: shapely.LineString, t_s: np.ndarray
-) -> list[Walker]:
+    rng: np.random.Generator, network: TownNetwork, way: shapely.LineString, t_s: np.ndarray,
+    chances: tuple[float, float, float],
+) -> list[Walker]:  # fmt: skip
     found = []
     for crossing in network.plan.crossings:
         road = network.roads[crossing.road]
@@ -147,7 +149,7 @@ def _on_crossings(
         if shapely.distance(way, shapely.Point(middle)) > NEAR_M:
             continue
         # Two people cross side by side, not through each other.
-        for share in (0.3, 0.7)[: int(rng.choice(3, p=CROSSERS))]:
+        for share in (0.3, 0.7)[: int(rng.choice(3, p=chances))]:
             station = crossing.station_m + share * crossing.depth_m
             walker = _crosser(rng, network, crossing, station, t_s)
             if not _runs_into_something(walker.xy_m, network):

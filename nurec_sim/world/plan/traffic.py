@@ -15,10 +15,12 @@ from jaxtyping import Bool, Float64, Int64
 
 from nurec_sim.world.plan import departures, drivers, fleet, pedestrians
 from nurec_sim.world.plan import swept_boxes as boxes
+from nurec_sim.world.plan.density import DENSITIES, Density, Turn
 from nurec_sim.world.plan.departures import Vehicle
 from nurec_sim.world.plan.drivers import STEP_S
 from nurec_sim.world.plan.network import TownNetwork
 from nurec_sim.world.plan.pedestrians import Walker
+from nurec_sim.world.plan.routes import SPACING_M, Route
 from nurec_sim.world.plan.rules import Rules
 from nurec_sim.world.plan.splits import STREAM_OF_SPLIT, Split
 from nurec_sim.world.plan.swept_boxes import Boxes
@@ -29,39 +31,56 @@ AHEAD_M = 130.0
 """Length of the ego's route around which other actors are generated."""
 KEPT_EVERY = 2
 """Subsampling of actor paths; the ego keeps every step."""
-ATTEMPTS, AGAIN = 3, 5
+ATTEMPTS, TURNING_ATTEMPTS, AGAIN = 3, 12, 5
 APART_M = 0.08
-LIVELY_SHARE, LIVELY_COUNT, LIVELY_M = 0.6, 2, 40.0
-"""A drive is lively if for this fraction of time this many actors move within this distance ahead of the ego."""
+LIVELY_SHARE, LIVELY_M = 0.6, 40.0
+"""A drive is lively if for this fraction of time ``Density.lively`` actors move within this distance ahead of the ego.
+"""
 
 EgoPath = tuple[tuple[int, float, float, float], ...]
 
 
-def drive(network: TownNetwork, seed: int, split: Split, span_us: tuple[int, int]) -> tuple[EgoPath, tuple[Actor, ...]]:
-    """All trajectories in a town, deterministic for seed and split.
+def drive(
+    network: TownNetwork, seed: int, split: Split, span_us: tuple[int, int], density: Density | None = None,
+    turn: Turn | None = None,
+) -> tuple[EgoPath, tuple[Actor, ...]]:  # fmt: skip
+    """All trajectories in a town, deterministic for its arguments.
 
-    Of up to ``ATTEMPTS`` random scenes the first lively one is taken, else the liveliest.
+    Of up to ``ATTEMPTS`` random scenes the first lively one is taken, else the liveliest; with ``turn``, of up to
+    ``TURNING_ATTEMPTS`` and only of those in which the ego turns.
 
     Args:
         network: the town's lanes and areas.
         seed: seed of the town.
         split: ``train`` or ``test``: selects vehicle families and the random stream.
         span_us: first and last time of the trajectories.
+        density: how much traffic; usual if not given.
+        turn: the way that the ego goes through the first junction within the span; any if not given.
 
     Returns:
         The ego as (t_us, x, y, yaw) every 50 ms over the whole span, and all other actors; no two boxes ever touch.
+
+    Raises:
+        ValueError: in no scene the ego turned.
     """
-    rules = Rules(network)
+    rules, density = Rules(network), density or DENSITIES["usual"]
     best: tuple[float, _Scene] | None = None
-    for attempt in range(ATTEMPTS):
+    for attempt in range(ATTEMPTS if turn is None else TURNING_ATTEMPTS):
         rng = np.random.default_rng([STREAM_OF_SPLIT[split], seed, 0x7A, attempt])
-        scene = _scene(rng, rules, split, span_us)
-        lively = liveliness(scene.boxes, scene.movers)
+        scene = _scene(rng, rules, split, span_us, density, turn)
+        if scene is None:
+            continue
+        lively = liveliness(scene.boxes, scene.movers, density.lively)
         if best is None or lively > best[0]:
             best = lively, scene
         if lively >= LIVELY_SHARE:
             break
-    assert best is not None
+    if best is None:
+        seconds = (span_us[1] - span_us[0]) / 1e6
+        raise ValueError(
+            f"no drive of {seconds:g} s in town {seed} of split {split!r} ({network.plan.template}) goes {turn} at its "
+            "first junction; another seed, a longer drive or a template with junctions may"
+        )
     return best[1].ego_path(), best[1].actors()
 
 
@@ -124,18 +143,20 @@ class _Scene:
         return Actor(name, kind, size_m, colour, moves, path)
 
 
-def _scene(rng: np.random.Generator, rules: Rules, split: Split, span_us: tuple[int, int]) -> _Scene:
-    """One attempt: simulates and removes colliding actors until none is left."""
+def _scene(
+    rng: np.random.Generator, rules: Rules, split: Split, span_us: tuple[int, int], density: Density, turn: Turn | None
+) -> _Scene | None:
+    """One attempt: simulates and removes colliding actors until none is left; None if the ego does not ``turn``."""
     seconds = (span_us[1] - span_us[0]) * 1e-6
     steps, warm = round(seconds / STEP_S), round(WARM_UP_S / STEP_S)
     # Time 0 is the start of the log; the warm-up is negative.
     t_s = (np.arange(warm + steps + 1) - warm) * STEP_S
-    ego = departures.ego_driver(rng, rules, seconds + WARM_UP_S)
+    ego = departures.ego_driver(rng, rules, seconds + WARM_UP_S, turn)
     ahead = ego.route.at(np.linspace(ego.station_m, min(ego.station_m + AHEAD_M, ego.route.length_m), 27))
     way = shapely.LineString(ahead)
-    parked = fleet.parked_cars(rng, rules.network, split, span_us, way)
-    walkers = pedestrians.people(rng, rules.network, ahead, t_s)
-    vehicles = departures.other_vehicles(rng, rules, split, ego, way)
+    parked = fleet.parked_cars(rng, rules.network, split, span_us, way, density)
+    walkers = pedestrians.people(rng, rules.network, ahead, t_s, density)
+    vehicles = departures.other_vehicles(rng, rules, split, ego, way, density)
     # Without the removed actors the others drive differently, so the simulation starts again. After the last round, the
     # remaining colliding actors are only left out.
     for again in range(AGAIN):
@@ -148,6 +169,8 @@ def _scene(rng: np.random.Generator, rules: Rules, split: Split, span_us: tuple[
         half = np.array([actor.size_m[:2] for actor in parked]).reshape(-1, 2) / 2
         groups = [motion, pedestrians.boxes_of(walkers, t_s), boxes.standing(places, half, len(t_s))]
         everything = boxes.together(groups).since(warm)
+        if turn is not None and _first_turn(ego.route, everything.middle_m[:, 0], rules) != turn:
+            return None
         driving, walking = len(everyone), len(everyone) + len(walkers)
         stays = ~_superfluous(everything, driving, walking)
         if stays.all() or again == AGAIN - 1:
@@ -157,6 +180,15 @@ def _scene(rng: np.random.Generator, rules: Rules, split: Split, span_us: tuple[
         parked = [each for each, stay in zip(parked, stays[walking:], strict=True) if stay]
     t_us = span_us[0] + np.rint(np.arange(steps + 1) * STEP_S * 1e6).astype(np.int64)
     return _Scene(t_us, everything, vehicles, walkers, parked, stays)
+
+
+def _first_turn(route: Route, driven_m: Float64[np.ndarray, "t 2"], rules: Rules) -> str:
+    """The way through the first junction between the ends of a drive along a route; empty if there is none."""
+    first, last = (SPACING_M * np.linalg.norm(route.xy_m - place, axis=1).argmin() for place in driven_m[[0, -1]])
+    for leg in route.legs:
+        if leg.in_junction and first <= leg.start_m and leg.end_m <= last:
+            return rules.lanes[leg.lane].turn
+    return ""
 
 
 def _superfluous(everything: Boxes, driving: int, walking: int) -> Bool[np.ndarray, " n"]:
@@ -177,8 +209,8 @@ def _superfluous(everything: Boxes, driving: int, walking: int) -> Bool[np.ndarr
     return out
 
 
-def liveliness(everything: Boxes, who: Bool[np.ndarray, " n"]) -> float:
-    """Fraction of time in which ``LIVELY_COUNT`` of ``who`` move close ahead of box 0, the ego."""
+def liveliness(everything: Boxes, who: Bool[np.ndarray, " n"], count: int = 2) -> float:
+    """Fraction of time in which ``count`` of ``who`` move close ahead of box 0, the ego."""
     # Every half second is enough, and a displacement of 15 cm over it is a moving actor.
     each = round(0.5 / STEP_S)
     middle, yaw = everything.middle_m[::each], everything.yaw_rad[::each, :1]
@@ -188,4 +220,4 @@ def liveliness(everything: Boxes, who: Bool[np.ndarray, " n"]) -> float:
     moves = np.linalg.norm(np.diff(middle[:, who], axis=0), axis=2) > 0.15
     # A sector of about 50 degrees to either side of straight ahead.
     seen = (ahead > 0) & (ahead < LIVELY_M) & (aside < 1.2 * ahead) & moves
-    return float((seen.sum(axis=1) >= LIVELY_COUNT).mean())
+    return float((seen.sum(axis=1) >= count).mean())
