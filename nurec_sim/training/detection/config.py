@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from nurec_sim.errors import TrainingError
+from nurec_sim.training.recipe_file import read_recipe, recipe_profile
 from nurec_sim.training.settings import Strict
 
 PROFILE = "detector"
@@ -77,11 +76,7 @@ class DetectorConfig(Strict):
 
 def is_detector_recipe(path: Path) -> bool:
     """Whether a recipe trains the detector; False also where it cannot be read."""
-    try:
-        raw = yaml.safe_load(Path(path).read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
-        return False
-    return isinstance(raw, dict) and raw.get("profile") == PROFILE
+    return recipe_profile(path) == PROFILE
 
 
 def read_detector_config(path: Path) -> DetectorConfig:
@@ -90,13 +85,4 @@ def read_detector_config(path: Path) -> DetectorConfig:
     Raises:
         TrainingError: the file cannot be read, or a key is missing, misspelt or out of range.
     """
-    try:
-        raw: Any = yaml.safe_load(Path(path).read_text())
-        return DetectorConfig.model_validate(raw)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise TrainingError(f"{path} cannot be read as YAML: {error}") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the recipe"
-        known = ", ".join(DetectorConfig.model_fields)
-        raise TrainingError(f"{path}: {where}: {first['msg']}; a recipe has the keys {known}") from None
+    return read_recipe(path, DetectorConfig)

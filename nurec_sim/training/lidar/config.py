@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any
 
-import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from nurec_sim.errors import TrainingError
 from nurec_sim.network.lidar.profiles import LIDAR_PROFILES
+from nurec_sim.training.recipe_file import read_recipe, recipe_profile
 from nurec_sim.training.settings import Strict
 
 WITHOUT_FLOOR = {"lidar": "lidar-no-floor"}
@@ -92,11 +91,7 @@ class LidarTrainingConfig(Strict):
 
 def is_lidar_recipe(path: Path) -> bool:
     """Whether a recipe's profile is one of the LiDAR branch; False also where it cannot be read."""
-    try:
-        raw = yaml.safe_load(Path(path).read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
-        return False
-    return isinstance(raw, dict) and raw.get("profile") in LIDAR_PROFILES
+    return recipe_profile(path) in LIDAR_PROFILES
 
 
 def read_lidar_config(path: Path) -> LidarTrainingConfig:
@@ -105,13 +100,4 @@ def read_lidar_config(path: Path) -> LidarTrainingConfig:
     Raises:
         TrainingError: the file cannot be read, or a key is missing, misspelt or out of range.
     """
-    try:
-        raw: Any = yaml.safe_load(Path(path).read_text())
-        return LidarTrainingConfig.model_validate(raw)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise TrainingError(f"{path} cannot be read as YAML: {error}") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the recipe"
-        known = ", ".join(LidarTrainingConfig.model_fields)
-        raise TrainingError(f"{path}: {where}: {first['msg']}; a recipe has the keys {known}") from None
+    return read_recipe(path, LidarTrainingConfig)
