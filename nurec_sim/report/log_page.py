@@ -22,6 +22,8 @@ REMEDIES = {
     "LiDAR in camera": "Check the direction of the camera's mounting pose (rig from camera, OpenCV axes), its lens, "
     "and the times of images and sweeps. Where nothing stands out against sky or street this cannot tell: look at the "
     "images below.",
+    "cameras": "Check the mounting poses of both cameras and the times of their images: surfaces that both see will be "
+    "blurred or doubled.",
     "boxes": "Check the frame of the boxes (centre, x forward), their times, and the LiDAR's mounting pose.",
 }
 """What to do about a check, by the beginning of its name."""
