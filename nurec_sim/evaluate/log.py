@@ -161,9 +161,16 @@ def score_scene(
             if held.sweeps
             else None
         )
-        free = score_free_space(clip, sense, _part(report, 0.9, 1.0))
+        end = 0.95 if detector else 1.0
+        free = score_free_space(clip, sense, _part(report, 0.9, end))
         seconds["lidar"] = round(time.perf_counter() - started, 3)
-        detection = score_log_detections(recorded, targets, held, sense, images_dir) if detector else None
+        detection = (
+            score_log_detections(
+                recorded, targets, held, sense, images_dir, lambda done: report("detector", end + (1 - end) * done)
+            )
+            if detector
+            else None
+        )
     return {
         "clip": clip.id,
         "scene": scene.id,
