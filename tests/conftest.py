@@ -86,5 +86,5 @@ def rawlogs() -> Path:
 
 @pytest.fixture(scope="session")
 def alpasim_messages() -> Path:
-    """Folder of all recorded AlpaSim messages; those of the demo log alone are part of the repository."""
+    """Folder of all recorded AlpaSim messages; those of a generated street alone are part of the repository."""
     return _folder("NUREC_SIM_ALPASIM_MESSAGES", "alpasim_messages", "AlpaSim messages")

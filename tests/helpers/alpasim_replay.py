@@ -1,7 +1,8 @@
 """Messages that AlpaSim's runtime (commit 3032e0c) really sent, and a client that sends them once more.
 
-``tests/data/alpasim_messages`` holds those of the demo log; those of a KITTI log are not ours to ship. A line is one
-message: ``kind`` (the entry in AlpaSim's log), ``type`` and ``message`` (protobuf JSON). Images are left out.
+``tests/data/alpasim_messages`` holds those of a generated street and what they need of its log (``STREET_LOG``); those
+of a KITTI log are not ours to ship. A line is one message: ``kind`` (the entry in AlpaSim's log), ``type`` and
+``message`` (protobuf JSON). Images are left out.
 """
 
 import gzip
@@ -16,6 +17,8 @@ from nurec_sim.serving.wire.messages import pool
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene, Label
 
 OURS = Path(__file__).parents[1] / "data" / "alpasim_messages"
+STREET_LOG = OURS / "street_log.zip"
+"""The log that shipped with version 0.1.0: its rig, path, tracks and map, and the first frame of each sensor."""
 SUBMITTED = {
     "driver_session_request": "start_session",
     "driver_camera_image": "submit_image_observation",

@@ -155,7 +155,7 @@ def test_grey_cameras_stand_in_where_there_is_no_colour(drive):
         ("image_02/timestamps.txt", lambda t: t[:90], "image_02/data/0000000003.png: has no time: .* have 3 lines"),
         ("velodyne_points/timestamps_end.txt", lambda t: t.replace("2011", "2010"), "needs start <= time <= end, got"),
         ("tracklet_labels.xml", lambda t: t[:400], "tracklet_labels.xml: is not a readable XML file"),
-        ("tracklet_labels.xml", lambda t: t.replace("<h>1.44", "<h>-1.44"), "tracklet 0: h, w, l must be positive"),
+        ("tracklet_labels.xml", lambda t: t.replace("<h>", "<h>-", 1), "tracklet 0: h, w, l must be positive"),
         ("tracklet_labels.xml", lambda t: t.replace("<tx>", "<tx>x"), "<tx> must be a finite number, got 'x"),
     ],
 )  # fmt: skip

@@ -305,10 +305,11 @@ def test_the_demo_log_becomes_two_chunks():
     assert len(set(first.frames["camera_front"]) & set(last.frames["camera_front"])) == 4
     few = dataclasses.replace(last, frames={camera: frames[-2:] for camera, frames in last.frames.items()})
     chunk = chunk_inputs(clip, TINY, few, FeedForwardSettings(), {})
-    assert chunk.tensors.rgb.shape == (1, 6, 224, 406, 3) and chunk.index == 1
-    # The car drives ahead: the second frame lies along z of the first.
+    # 28 x 17 patches of 14 pixels in the aspect of the cameras, 640 x 400: sqrt(476 * 1.6) = 27.6 across, 17.2 down.
+    assert chunk.tensors.rgb.shape == (1, 6, 17 * 14, 28 * 14, 3) and chunk.index == 1
+    # The car drives ahead, a quarter of a second at 5.8 m/s: the second frame lies along z of the first, 0.15 a metre.
     ahead = chunk.tensors.c2w[0, 1, :3, 3]
-    assert ahead[2] > 0.3 and ahead[:2].abs().max() < 0.2 * ahead[2]
+    assert float(ahead[2]) == pytest.approx(0.15 * 5.8 / 4, abs=0.005) and ahead[:2].abs().max() < 0.2 * ahead[2]
 
 
 # --------------------------------------------------------------------------------------------------------- ego masks

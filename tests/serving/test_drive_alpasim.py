@@ -1,11 +1,9 @@
 """What AlpaSim's runtime sent in four rollouts, sent once more to our driver and to our sensor server over sockets."""
 
-from pathlib import Path
-
 import grpc
 import numpy as np
 import pytest
-from alpasim_replay import OURS, RENDERED, SUBMITTED, decoded, read_messages, scene_of
+from alpasim_replay import OURS, RENDERED, STREET_LOG, SUBMITTED, decoded, read_messages, scene_of
 from driving_calls import Stub as DriverStub
 from driving_calls import image_message, times_of, xy_of
 from serving_calls import Stub as SensorStub
@@ -17,9 +15,8 @@ from nurec_sim.serving.server import SensorServer
 from nurec_sim.serving.store import SceneStore
 from nurec_sim.serving.wire import egodriver
 
-DEMO_LOG = Path(__file__).parents[2] / "scenarios" / "demo_clip.zip"
 FILES = ("map_route", "recorded_route", "short_log_recorded_route", "short_log_no_route")
-"""The first two are of the demo log and part of the repository, the others of KITTI raw 0002."""
+"""The first two are of a generated street and part of the repository, the others of KITTI raw 0002."""
 
 
 @pytest.fixture(params=FILES)
@@ -35,7 +32,7 @@ def recording(request):
 def clip(recording, request):
     """The log that the rollout was driven in."""
     name = recording[0]
-    log = request.getfixturevalue("realdata") / "kitti_raw_0002" if name.startswith("short_log") else DEMO_LOG
+    log = request.getfixturevalue("realdata") / "kitti_raw_0002" if name.startswith("short_log") else STREET_LOG
     return open_clip(log)
 
 

@@ -9,7 +9,7 @@ from nurec_sim import geometry
 from nurec_sim.serving.driver.motion import ego_states
 from nurec_sim.serving.wire.driving_states import ReportedMotion, ReportedState
 
-HEADING = 0.98  # rad, as on the demo log
+HEADING = 0.98  # rad, as on a recorded street
 
 
 def told(t_s, along_m, motion=None, yaw=HEADING):
