@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 from nurec_sim import metrics, plugins, runs, sim
 from nurec_sim.metrics.offroad import offroad_agreement
@@ -58,16 +59,48 @@ def test_offroad_from_gaussians_agrees_with_the_true_polygon(loaded: LoadedScene
     assert grid.overruled_frac < 0.05
 
 
-def test_log_replay_has_no_event_and_constant_velocity_has_one(
+def test_who_drives_without_an_event_who_collides_and_who_leaves_the_road(
     loaded: LoadedScene, remote: RemoteSensors, scenario: Scenario
 ) -> None:
-    events = {}
-    for name in ("log_replay", "constant_velocity"):
-        rollout = sim.run_rollout(scenario, plugins.load_policy(name), remote.sense, loaded.scene)
+    """The log has no event. Driving straight on misses the turn, on a road without anybody. Who brakes for the pedestrian
+    by the crossing stops in her way, and she does not react. The network with one image cuts the corner."""
+    names = ("collision_any", "offroad", "offroad_true")
+    events, rollouts = {}, {}
+    for policy in ("log_replay", "constant_velocity", "route_follower", "e2e_1cam"):
+        rollout = sim.run_rollout(scenario, plugins.load_policy(policy), remote.sense, loaded.scene)
         assert rollout.status == "ok", rollout.error
-        events[name] = [value(rollout, loaded.scene, metric) for metric in ("collision_any", "offroad", "offroad_true")]
-    assert events["log_replay"] == [0.0, 0.0, 0.0]
-    assert max(events["constant_velocity"]) == 1.0
+        events[policy] = [value(rollout, loaded.scene, metric) for metric in names]
+        rollouts[policy] = rollout
+    assert events == {
+        "log_replay": [0.0, 0.0, 0.0],
+        "constant_velocity": [0.0, 0.0, 0.0],
+        "route_follower": [1.0, 0.0, 0.0],
+        "e2e_1cam": [0.0, 1.0, 1.0],
+    }
+    ends = {policy: rollout.world_from_rig[-1, :2, 3] for policy, rollout in rollouts.items()}
+    recorded = loaded.scene.ego.world_from_body[-1, :2, 3]
+    assert np.linalg.norm(ends["log_replay"] - recorded) < 0.5
+    assert np.linalg.norm(ends["constant_velocity"] - recorded) > 20
+    found = {policy: contact_with(rollout, "pedestrian_0") for policy, rollout in rollouts.items()}
+    assert found == {policy: policy == "route_follower" for policy in rollouts}
+
+
+def contact_with(rollout: Rollout, actor: str) -> bool:
+    """Whether the outlines of the car and of an actor ever overlap, by shapely."""
+    length, width, _ = rollout.actor_sizes_m[actor]
+    body = rollout.rig.body
+    return any(
+        outline(ego, body.center_m[0], body.size_m[0], body.size_m[1]).intersects(outline(box, 0.0, length, width))
+        for ego, box in zip(rollout.world_from_rig, rollout.actors[actor], strict=True)
+        if np.isfinite(box).all()
+    )
+
+
+def outline(pose: np.ndarray, ahead_m: float, length_m: float, width_m: float) -> shapely.Polygon:
+    """A box from above, its centre ahead of the origin of its pose."""
+    x = ahead_m + length_m / 2 * np.array([1, 1, -1, -1])
+    y = width_m / 2 * np.array([1, -1, -1, 1])
+    return shapely.Polygon((pose[:2, :2] @ [x, y]).T + pose[:2, 3])
 
 
 def assert_same_frame(a: SensorFrame, b: SensorFrame) -> None:

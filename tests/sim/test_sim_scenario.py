@@ -19,7 +19,7 @@ def test_shipped_scenarios_load_and_name_known_policies():
         scenario = load_scenario(name)
         assert scenario.name == name and set(scenario.policies) <= set(available_policies())
     assert load_scenario("demo").policies == tuple(
-        ["log_replay", "constant_velocity", "route_follower", "camera_road_follower", "lidar_aeb"]
+        ["log_replay", "constant_velocity", "route_follower", "camera_road_follower", "lidar_aeb", "e2e_1cam"]
     )
 
 

@@ -3,6 +3,7 @@ import json
 import subprocess
 import sys
 import zipfile
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -289,20 +290,47 @@ def test_importing_the_package_loads_no_mujoco():
 
 
 def test_demo_clip_is_what_its_description_says():
-    """It shows the street that seed 7 gave before there were towns; the file is kept as it is (docs/world.md)."""
+    """A busy junction, a right turn, and people: docs/world.md."""
     clip = logs.open_clip(DEMO)
-    assert DEMO.stat().st_size <= 8_000_000 and logs.check_clip(clip) == []
-    assert clip.facts["dataset"] == "nurec_sim procedural street"
-    assert clip.facts["command"] == "nurec-sim world --seed 7 --seconds 12 --out demo_clip.zip"
-    assert clip.span_us[0] == 1_000_000 and clip.ego.t_us[-1] == 13_000_000
-    speed = np.linalg.norm(np.diff(clip.ego.position_m, axis=0), axis=1) / np.diff(clip.ego.t_us * 1e-6)
-    assert 9.2 <= speed[0] <= 9.8 and 6.5 < speed[-1] < 7.5
-    road = shapely.Polygon(clip.road_map.drivable[0][0])
+    assert DEMO.stat().st_size <= 7_100_000 and logs.check_clip(clip) == []
+    assert clip.facts["command"] == (
+        "nurec-sim world --seed 22 --split test --template t_junction --seconds 10 --traffic dense --turn right"
+        " --hz 4 --jpeg-quality 75 --width 640 --height 400"
+    )
+    assert clip.span_us[0] == 1_000_000 and clip.ego.t_us[-1] == 11_000_000
+    assert {(camera.width_px, camera.height_px) for camera in clip.rig.cameras.values()} == {(640, 400)}
+    assert {clip.frame_count(name) for name in clip.rig.cameras} == {clip.sweep_count(LIDAR_ID)} == {40}
+    steps = np.diff(clip.ego.position_m[:, :2], axis=0)
+    speed = np.linalg.norm(steps, axis=1) / np.diff(clip.ego.t_us * 1e-6)
+    assert 3.0 <= speed.min() and speed.max() <= 6.0 and 44 <= np.linalg.norm(steps, axis=1).sum() <= 46
+    heading = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    assert np.degrees(heading[-1] - heading[0]) == pytest.approx(-76, abs=1)  # to the right
+    turning_s = clip.ego.t_us[1:][np.abs(heading - heading[0]) > np.radians(5)][0] / 1e6
+    assert turning_s == pytest.approx(5.3, abs=0.2)
+    road = shapely.Polygon(clip.road_map.drivable[0][0], clip.road_map.drivable[0][1:])
     assert shapely.contains_xy(road, *clip.ego.position_m[:, :2].T).all()
-    kinds = {track.id.split("_")[0] for track in clip.tracks}
-    assert kinds == {"lead", "oncoming", "parked", "pedestrian"}
-    assert all(track.controllable != track.id.startswith("parked") for track in clip.tracks)
-    assert clip.frame_count("camera_front") == clip.sweep_count(LIDAR_ID) == 60
-    image = clip.image("camera_front", 30).astype(float)
-    sky, ground = image[2:20].mean(axis=(0, 1)), image[-20:].mean(axis=(0, 1))
-    assert sky[2] > sky[0] + 15 and np.ptp(ground) < 15
+    ahead = clip.ego.position_m[0, :2] + 45 * steps[0] / np.linalg.norm(steps[0])
+    assert shapely.contains(road, shapely.LineString([clip.ego.position_m[0, :2], ahead]))  # straight on is road, too
+    assert Counter((track.label, track.controllable) for track in clip.tracks) == {
+        ("automobile", True): 24, ("automobile", False): 25, ("person", True): 11, ("person", False): 3,
+    }  # fmt: skip
+
+
+def test_people_of_the_demo_clip_are_seen_and_one_crosses_behind_the_car():
+    clip = logs.open_clip(DEMO)
+    road = shapely.Polygon(clip.road_map.drivable[0][0], clip.road_map.drivable[0][1:])
+    people = [track for track in clip.tracks if track.label == "person"]
+    near = {
+        track.id
+        for track in people
+        for t_us in track.path.t_us[::5]
+        if np.linalg.norm(track.path.at(t_us)[:2, 3] - clip.ego.at(t_us)[:2, 3]) < 15
+    }
+    assert len(near) >= 6
+    walker = next(track for track in people if track.id == "pedestrian_0").path
+    crossing = walker.t_us[shapely.contains_xy(road, *walker.position_m[:, :2].T)]
+    line = shapely.LineString(clip.ego.position_m[:, :2])
+    met = np.array([line.project(shapely.Point(walker.at(t)[:2, 3])) for t in crossing])
+    driven = np.array([line.project(shapely.Point(clip.ego.at(t)[:2, 3])) for t in crossing])
+    assert shapely.LineString(walker.position_m[:, :2]).crosses(line)
+    assert len(crossing) > 10 and (driven - met).min() > 10  # the rear axle is well past where they walk
