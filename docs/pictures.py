@@ -14,7 +14,7 @@ from nurec_sim import display, logs, render, scene
 
 IMAGES = Path(__file__).parent / "images"
 BAR_PX, GAP_PX = 24, 4
-FRAMES = {"straight": ("camera_front", 8), "curve": ("camera_front", 34), "side": ("camera_front_left", 20)}
+FRAMES = {"straight": ("camera_front", 8), "turn": ("camera_front", 28), "side": ("camera_front_left", 31)}
 """Name of a picture -> camera and frame."""
 OFFSETS = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (0.0, 20.0)]
 """Of the car: metres to its left, degrees to its left."""
@@ -47,8 +47,8 @@ def main(log: Path, archive: Path) -> None:
                 text = "rendered, same pose"
             view = render.render_view(renderer, camera, frame, left_m=left_m, yaw_deg=yaw_deg)
             pictures.append(captioned(view.rgb, text))
-        (IMAGES / f"gallery_{name}.jpg").write_bytes(display.jpeg(sheet(pictures, 2), 85))
-        if name == "curve":
+        (IMAGES / f"gallery_{name}.jpg").write_bytes(display.jpeg(sheet(pictures, 2), 80))
+        if name == "turn":
             chain = [pictures[0], pictures[1], captioned(render.render_view(renderer, camera, frame, left_m=1.5).rgb,
                                                          "rendered, 1.5 m to the left")]  # fmt: skip
             (IMAGES / "chain.jpg").write_bytes(display.jpeg(sheet(chain, 3), 85))
