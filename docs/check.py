@@ -23,7 +23,7 @@ PAGES = {"tutorial": REPO / "docs" / "tutorial.md"}
 NOTEBOOKS = {path.stem: path for path in sorted((REPO / "docs" / "notebooks").glob("*.ipynb"))}
 MARKED = re.compile(r"<!-- (run|output) -->\n+```(?:bash|text)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 LIMIT_S = 3600
-MAX_BYTES = 300_000
+MAX_BYTES = 350_000
 """Of a notebook with its outputs."""
 
 

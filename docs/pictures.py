@@ -1,4 +1,4 @@
-"""Makes the pictures of the tutorial and the gallery from the log that ships with the package.
+"""Makes the pictures of README, the gallery and docs/trust.md from the log that ships with the package.
 
 nurec-sim demo --save-log demo.zip && nurec-sim reconstruct demo.zip --out demo.usdz
 python docs/pictures.py demo.zip demo.usdz
@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from nurec_sim import display, logs, render, scene
+from nurec_sim.render.images.still import support_picture, view_request
 
 IMAGES = Path(__file__).parent / "images"
 BAR_PX, GAP_PX = 24, 4
@@ -18,6 +19,8 @@ FRAMES = {"straight": ("camera_front", 8), "turn": ("camera_front", 28), "side":
 """Name of a picture -> camera and frame."""
 OFFSETS = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (0.0, 20.0)]
 """Of the car: metres to its left, degrees to its left."""
+SUPPORT_AT_M = (0.0, 1.5, 3.0)
+"""To its left, in the picture of support."""
 
 
 def captioned(rgb: np.ndarray, text: str) -> np.ndarray:
@@ -52,6 +55,9 @@ def main(log: Path, archive: Path) -> None:
             chain = [pictures[0], pictures[1], captioned(render.render_view(renderer, camera, frame, left_m=1.5).rgb,
                                                          "rendered, 1.5 m to the left")]  # fmt: skip
             (IMAGES / "chain.jpg").write_bytes(display.jpeg(sheet(chain, 3), 85))
+            requests = [view_request(renderer.scene, camera, frame, left_m=left_m) for left_m in SUPPORT_AT_M]
+            shown = [support_picture(renderer, request) for request in requests]
+            (IMAGES / "support.jpg").write_bytes(display.jpeg(sheet(shown, len(shown)), 85))
 
 
 if __name__ == "__main__":

@@ -98,7 +98,7 @@ def demo(
     device: str = "auto",
     refine: float | None = None,
 ) -> None:
-    """Run the whole chain on the bundled demo log: about five minutes on two cores.
+    """Run the whole chain on the bundled demo log: about two minutes on two cores.
 
     Args:
         save_log: only write the demo log to this .zip file, to try other commands on it.

@@ -80,7 +80,7 @@ def test_who_drives_without_an_event_who_collides_and_who_leaves_the_road(
     ends = {policy: rollout.world_from_rig[-1, :2, 3] for policy, rollout in rollouts.items()}
     recorded = loaded.scene.ego.world_from_body[-1, :2, 3]
     assert np.linalg.norm(ends["log_replay"] - recorded) < 0.5
-    assert np.linalg.norm(ends["constant_velocity"] - recorded) > 20
+    assert np.linalg.norm(ends["constant_velocity"] - recorded) > 15  # on, where the log turned
     found = {policy: contact_with(rollout, "pedestrian_0") for policy, rollout in rollouts.items()}
     assert found == {policy: policy == "route_follower" for policy in rollouts}
 

@@ -31,7 +31,7 @@ MIN_SCALE_M = 1e-3
 MAX_OPACITY = 0.999
 MAX_GROWTH = 1.5
 """How much wider than its members' spread a merged Gaussian becomes at most (the best from a half to an eighth of the
-Gaussians of ``scenarios/demo_clip.zip``, where it is worth 4 dB)."""
+Gaussians of the log that shipped with version 0.1.0, where it is worth 4 dB)."""
 AXIS_BITS = 19
 """Voxels per axis, as a power of two; what is further out shares the outermost ones (at 0.1 m: 26 km away)."""
 GROUPS_AT_ONCE = 1 << 12
