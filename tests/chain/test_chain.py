@@ -62,8 +62,11 @@ def test_offroad_from_gaussians_agrees_with_the_true_polygon(loaded: LoadedScene
 def test_who_drives_without_an_event_who_collides_and_who_leaves_the_road(
     loaded: LoadedScene, remote: RemoteSensors, scenario: Scenario
 ) -> None:
-    """The log has no event. Driving straight on misses the turn, on a road without anybody. Who brakes for the pedestrian
-    by the crossing stops in her way, and she does not react. The network with one image cuts the corner."""
+    """The log has no event. Driving straight on misses the turn, on a road without anybody.
+
+    Who brakes for the pedestrian by the crossing stops in her way, and she does not react. The network with one image
+    cuts the corner.
+    """
     names = ("collision_any", "offroad", "offroad_true")
     events, rollouts = {}, {}
     for policy in ("log_replay", "constant_velocity", "route_follower", "e2e_1cam"):
