@@ -212,18 +212,20 @@ def smoothed_middle(jump_to):
     cost[4, 4, 10], cost[4, 4, 16] = 30, 0
     image = np.full((9, 9), 0, np.uint8)
     image[4, 4] = jump_to
-    return depth.smooth_depth(cost, image, 0.01)[4, 4] / 0.01
+    return depth.smooth_depth(cost, image, 0.01 * np.arange(24))[4, 4] / 0.01
 
 
 def test_lone_matches_are_smoothed_away_unless_an_edge_surrounds_them():
-    """Staying alone costs 48 on each of 8 paths, 7 beside a change of 240 grey levels; the match counts 30 on each."""
+    """Staying alone costs 80 on each of 8 paths, 11 beside a change of 240 grey levels; the match counts 30 on each."""
     assert smoothed_middle(jump_to=0) == pytest.approx(10, abs=0.5)
     assert smoothed_middle(jump_to=240) == pytest.approx(16, abs=0.5)
 
 
 def test_inverse_depth_lies_at_the_vertex_between_levels():
     cost = ((np.arange(24) - 10.3) ** 2).astype(np.float32)[None, None]
-    assert depth.smooth_depth(cost, np.zeros((1, 1), np.uint8), 0.01)[0, 0] == pytest.approx(0.103, rel=1e-4)
+    assert depth.smooth_depth(cost, np.zeros((1, 1), np.uint8), 0.01 * np.arange(24))[0, 0] == pytest.approx(
+        0.103, rel=1e-4
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------- points

@@ -204,7 +204,6 @@ def _owned(
     if not len(everything):
         return np.zeros(0, bool)
     packed, present = _packed(views, body)
-    step = 1 / settings.views.min_depth_m / (settings.views.levels - 1)
     depths = [np.where(picture.free, np.float32(np.nan), picture.inverse_depth) for picture in pictures]
     depth_stack, rgb_stack = lifting.stacked(depths), lifting.stacked(rgb)
     owner_stack = np.ones(depth_stack.shape, bool) if owns is None else lifting.stacked(owns)
@@ -222,7 +221,7 @@ def _owned(
             owner_stack,
             rgb_stack,
             present,
-            0.3 * step,
+            settings.views.agreement,
             lifting.OWNER_RING,
             lifting.OWNER_BORDER,
         ),

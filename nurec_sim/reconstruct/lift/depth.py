@@ -16,7 +16,9 @@ from nurec_sim.network.stereo.paths import FORWARDS, add_paths, brightness_steps
 PRIOR_COST, PRIOR_CAP = 40.0, 220.0
 SKY_COST, NOT_SKY_COST = 60.0, 40.0
 NEUTRAL_COST = 24.0
-SMOOTH_ONE, SMOOTH_MANY = 6.0, 48.0
+SMOOTH_ONE, SMOOTH_MANY = 10.0, 80.0
+NO_SURFACE = 0.0035
+"""Levels up to this inverse depth (1/m; from 285 m on) are sky rather than a surface."""
 
 
 def census(gray: UInt8[np.ndarray, "h w"]) -> UInt64[np.ndarray, "h w"]:
@@ -50,7 +52,7 @@ def _popcount(x):
 
 
 @kernel
-def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, other_codes, step, levels, cost):
+def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, other_codes, inverse_depths, cost):
     """Fill ``cost`` (0..100): mean of the two best neighbours of census and colour differences.
 
     Pixels with a prior are left alone.
@@ -64,11 +66,10 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
         codes: [h,w] its ``census``.
         other_rgb: [n,h',w',3] the neighbours' colours, padded to one size.
         other_codes: [n,h',w'] their ``census``, padded likewise.
-        step: 1/m from one level of inverse depth to the next; level 0 is infinitely far.
-        levels: how many.
+        inverse_depths: [levels] inverse depth of each level, 1/m, increasing from 0.
         cost: [h,w,levels] output.
     """
-    height, width, _ = rgb.shape
+    height, width, levels = cost.shape
     focal = view[0]
     first, second, seen = np.empty(levels), np.empty(levels), np.empty(levels, np.int64)
     for row in range(height):
@@ -103,7 +104,7 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
                 rolling = o[17] != 0.0 or o[18] != 0.0 or o[19] != 0.0
                 scale, middle_u, middle_v, right, bottom = o[0], o[1], o[2], o[3], o[4]
                 for level in range(levels):
-                    w = level * step
+                    w = inverse_depths[level]
                     a, b, c = a0 + w * a1, b0 + w * b1, c0 + w * c1
                     if c <= 1e-6:
                         continue
@@ -146,34 +147,43 @@ def matching_cost(view, world_from_view, prior, others, rgb, codes, other_rgb, o
 
 
 @kernel
-def add_prior(cost, prior, sky, step):
+def add_prior(cost, prior, sky, inverse_depths):
     """Bend the costs towards the measured inverse depth where there is one, and towards infinity in the sky.
 
     Args:
         cost: [h,w,levels] changed; replaced where there is a prior.
         prior: [h,w] measured inverse depth, 1/m; 0 where there is none.
         sky: [h,w] pixels that look like sky.
-        step: 1/m from one level of inverse depth to the next.
+        inverse_depths: [levels] see ``matching_cost``.
     """
     height, width, levels = cost.shape
+    surfaces = 1
+    while surfaces < levels and inverse_depths[surfaces] <= NO_SURFACE:
+        surfaces += 1
     for row in range(height):
         for column in range(width):
             w = prior[row, column]
             if w > 0:
+                above = min(max(np.searchsorted(inverse_depths, w), 1), levels - 1)
+                below = inverse_depths[above - 1]
+                at = above - 1 + (w - below) / (inverse_depths[above] - below)
                 for level in range(levels):
                     # Truncated linear: a wrong measurement (a splat over a silhouette) can be outvoted by its
                     # surroundings.
-                    cost[row, column, level] = min(PRIOR_COST * abs(level - w / step), PRIOR_CAP)
+                    cost[row, column, level] = min(PRIOR_COST * abs(level - at), PRIOR_CAP)
             elif sky[row, column]:
-                for level in range(1, levels):
+                for level in range(surfaces, levels):
                     cost[row, column, level] += SKY_COST
             else:
                 # Infinity fits any pixel without texture; without this charge plain walls would become sky.
-                cost[row, column, 0] += NOT_SKY_COST
+                for level in range(surfaces):
+                    cost[row, column, level] += NOT_SKY_COST
 
 
 def smooth_depth(
-    cost: Float32[np.ndarray, "h w levels"], gray: UInt8[np.ndarray, "h w"], step: float
+    cost: Float32[np.ndarray, "h w levels"],
+    gray: UInt8[np.ndarray, "h w"],
+    inverse_depths: Float64[np.ndarray, " levels"],
 ) -> Float32[np.ndarray, "h w"]:
     """Inverse depth of least cost after semi-global matching along eight paths (``stereo.paths``)."""
     total, brightness = np.zeros_like(cost), gray.astype(np.float32)
@@ -182,11 +192,11 @@ def smooth_depth(
         steps = np.stack([brightness_steps(brightness, dy, dx) for dy, dx in directions])
         jump = np.maximum(SMOOTH_MANY / (1 + steps / 8), SMOOTH_ONE + 1)
         add_paths(cost, jump.astype(np.float32), np.float32(SMOOTH_ONE), directions, total)
-    return _least(total, step)
+    return _least(total, inverse_depths)
 
 
 @kernel
-def _least(total, step):
+def _least(total, inverse_depths):
     """The level of least cost [h,w,levels], with a parabola between levels, as inverse depth [h,w]."""
     height, width, levels = total.shape
     result = np.zeros((height, width), np.float32)
@@ -201,7 +211,10 @@ def _least(total, step):
                 curve = a - 2 * b + c
                 if curve > 1e-6:
                     shift = min(max(0.5 * (a - c) / curve, -0.5), 0.5)
-            result[row, column] = (best + shift) * step if best > 0 else 0.0
+            if best > 0:
+                beside = best + 1 if shift > 0 else best - 1
+                here, there = inverse_depths[best], inverse_depths[beside]
+                result[row, column] = here + abs(shift) * (there - here)
     return result
 
 
@@ -212,8 +225,7 @@ def dense_inverse_depth(
     prior: Float32[np.ndarray, "h w"],
     sky: Bool[np.ndarray, "h w"],
     neighbours: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
-    levels: int,
-    step: float,
+    inverse_depths: Float64[np.ndarray, " levels"],
 ) -> Float32[np.ndarray, "h w"]:
     """Inverse depth of every pixel: the prior where it holds, matching and smoothness elsewhere, 0 in the sky.
 
@@ -224,10 +236,10 @@ def dense_inverse_depth(
         prior: measured inverse depth, 1/m; 0 where there is none.
         sky: pixels that look like sky.
         neighbours: (packed view, rgb, census) of the views to match against; empty leaves only priors and smoothness.
-        levels: number of inverse-depth hypotheses, the first one infinitely far.
-        step: 1/m from one to the next.
+        inverse_depths: the hypotheses, 1/m, increasing from 0.
     """
     height, width = prior.shape
+    levels = len(inverse_depths)
     cost = np.full((height, width, levels), NEUTRAL_COST, np.float32)
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     if neighbours:
@@ -238,9 +250,10 @@ def dense_inverse_depth(
         for n, (_, picture, code) in enumerate(neighbours):
             pictures[n, : picture.shape[0], : picture.shape[1]] = picture
             codes[n, : code.shape[0], : code.shape[1]] = code
-        matching_cost(packed, world_from_view, prior, others, rgb, census(gray), pictures, codes, step, levels, cost)
-    add_prior(cost, prior, sky, step)
-    result = smooth_depth(cost, gray, step)
+        matching_cost(packed, world_from_view, prior, others, rgb, census(gray), pictures, codes, inverse_depths, cost)
+    add_prior(cost, prior, sky, inverse_depths)
+    result = smooth_depth(cost, gray, inverse_depths)
     # The prior is exact where smoothing agrees with it; nearer than the nearest level, smoothing cannot express it.
-    trusted = (prior > 0) & ((np.abs(result - prior) < 1.5 * step + 0.1 * prior) | (prior > (levels - 2) * step))
+    step = inverse_depths[-1] / (levels - 1)
+    trusted = (prior > 0) & ((np.abs(result - prior) < 1.5 * step + 0.1 * prior) | (prior > inverse_depths[-2]))
     return np.where(trusted, prior, result).astype(np.float32)

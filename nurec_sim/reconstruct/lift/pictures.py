@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
@@ -12,6 +12,7 @@ from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.lift import depth, lifting
 from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.fusion import fused_depths
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.splat import draw_surfels, trim_silhouettes
@@ -38,7 +39,7 @@ class DepthPicture:
 def depth_pictures(
     views: Sequence[WorkingView], bodies: Sequence[Surfels], settings: LiftSettings, progress: Callable[[float], None]
 ) -> list[DepthPicture]:
-    """Dense depth of the key views, matched against all views.
+    """Dense depth of the key views, matched against all views and fused among key views.
 
     Args:
         views: working views; those with ``key`` get a picture.
@@ -48,7 +49,6 @@ def depth_pictures(
     """
     keys = [k for k, view in enumerate(views) if view.key]
     options = settings.views
-    step = 1 / options.min_depth_m / (options.levels - 1)
     # The sky is judged against the brightest parts of this log: exposure differs between logs.
     bright = (
         float(np.percentile(np.concatenate([v.rgb[::8, ::8].mean(axis=-1).ravel() for v in views]), 98)) if views else 0
@@ -63,22 +63,35 @@ def depth_pictures(
         sky = lifting.sky_coloured(view, prior, bright)
         around = [(views[n].packed, views[n].rgb, codes[n]) for n in neighbours_of(views, k, options.neighbours)]
         dense = depth.dense_inverse_depth(
-            view.packed, view.world_from_view, view.rgb, prior, sky, around, options.levels, step
+            view.packed, view.world_from_view, view.rgb, prior, sky, around, options.inverse_depths
         )
         # Pixels that show nothing of the world neither agree with a point nor look through it.
         dense[~view.tile.valid] = np.nan
         # Where smoothing overruled the splatted surfel, the pixel does not show that surfel.
         index[dense != prior] = -1
         drawn = np.where(index >= 0, body, STATIC)
-        body = _bodies_of_pixels(view, bodies, dense, drawn)
-        index[body != drawn] = -1
-        return DepthPicture(dense, body, index, sky, np.zeros(dense.shape, bool))
+        return DepthPicture(dense, drawn, index, sky, np.zeros(dense.shape, bool))
 
-    pictures = []
+    def with_bodies(k: int, picture: DepthPicture) -> DepthPicture:
+        body = _bodies_of_pixels(views[k], bodies, picture.inverse_depth, picture.body)
+        return replace(picture, body=body, surfel=np.where(body == picture.body, picture.surfel, -1))
+
+    drawn = []
     for done, picture in enumerate(in_order(one, keys)):
         progress(done / len(keys))
-        pictures.append(picture)
-    return pictures
+        drawn.append(picture)
+    bodies_of = [p.body for p in in_order(lambda each: with_bodies(*each), zip(keys, drawn, strict=True))]
+    # What moves is not where its neighbours in time show it.
+    static = [
+        np.where(body == 0, p.inverse_depth, np.float32(np.nan)) for p, body in zip(drawn, bodies_of, strict=True)
+    ]
+    fixed = [p.surfel >= 0 for p in drawn]
+    fused = fused_depths([views[k] for k in keys], static, fixed, options.agreement, options.fusion_rounds)
+    drawn = [
+        replace(picture, inverse_depth=np.where(body == 0, depth, picture.inverse_depth))
+        for picture, body, depth in zip(drawn, bodies_of, fused, strict=True)
+    ]
+    return list(in_order(lambda each: with_bodies(*each), zip(keys, drawn, strict=True)))
 
 
 def _draw(view: WorkingView, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -5,6 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+from jaxtyping import Float64
+
+BEND = 0.75
+"""Inverse-depth levels at infinity are closer by this share than on average, those nearby farther apart."""
+
 
 @dataclass(frozen=True)
 class PointSettings:
@@ -64,6 +70,28 @@ class ViewSettings:
     """Surfaces farther than this belong to the sky cubemap."""
     neighbours: int = 4
     """Views that each view is matched against; 0 turns matching off."""
+    fusion_rounds: int = 3
+    """How often the depths of neighbouring views are fused; 0 leaves each view with its own."""
+
+    @property
+    def level_step(self) -> float:
+        """Mean difference of two neighbouring inverse-depth levels, 1/m."""
+        return 1 / self.min_depth_m / (self.levels - 1)
+
+    @property
+    def agreement(self) -> float:
+        """Inverse depths of one surface differ by less than this (1/m), plus a share of themselves."""
+        return 0.3 * self.level_step
+
+    @property
+    def inverse_depths(self) -> Float64[np.ndarray, " levels"]:
+        """The inverse-depth hypotheses of the matching, 1/m, from 0; a parabola, so finer the farther away.
+
+        A pixel resolves far surfaces by long baselines and near ones by short ones, so equal steps would be too coarse
+        there and too fine here: at 60 m a step of 1/250 m is 14 m.
+        """
+        level = np.arange(self.levels)
+        return self.level_step * level * (1 - BEND + BEND * level / (self.levels - 1))
 
     def for_images(self, sizes: Sequence[tuple[int, int, int]]) -> ViewSettings:
         """The settings with the largest ``width_px`` that ``pixels`` allows, but no smaller one.

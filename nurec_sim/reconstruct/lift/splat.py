@@ -43,6 +43,30 @@ def project_point(view, x, y, z):
     return u, v, c
 
 
+@inner
+def world_point(view, world_from_view, u, v, inverse_depth):
+    """The point that a pixel shows, the reverse of ``project_point``: (x, y, z) in metres.
+
+    Args:
+        view: [23] packed projection.
+        world_from_view: [4,4] pose of the view.
+        u: of the pixel.
+        v: likewise.
+        inverse_depth: along the optical axis, 1/m, not 0.
+    """
+    # Where the camera was when the pixel was exposed, off its middle (rolling shutter).
+    f = min(max(view[20] * u + view[21] * v + view[22], -0.5), 0.5)
+    x = (u - view[1]) / view[0] / inverse_depth + view[17] * f
+    y = (v - view[2]) / view[0] / inverse_depth + view[18] * f
+    z = 1.0 / inverse_depth + view[19] * f
+    m = world_from_view
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
+    )
+
+
 @kernel
 def project_surfels(view, xyz):
     """Rows [m] of the points [n,3] that may reach into the image, and their pixels and depths [m,3] (u, v, metres)."""

@@ -1,0 +1,159 @@
+"""Depth of neighbouring views fused: each view's own is noisy, and what several of them agree on is not.
+
+Visibility-based fusion (Merrell et al. 2007): at each pixel the own depth competes with what the neighbours show there.
+The depth that most of them support wins, and becomes the mean of its supporters. A nearer surface hides what lies
+behind it, so a farther depth also needs neighbours that look through the near one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from nurec_sim.compute.cores import in_order
+from nurec_sim.compute.kernels import kernel
+from nurec_sim.reconstruct.lift.lifting import stacked
+from nurec_sim.reconstruct.lift.splat import project_point, world_point
+from nurec_sim.reconstruct.lift.views import WorkingView
+
+NEIGHBOURS = 8
+"""Views whose depth is compared with a view's own."""
+NEAREST_M, FARTHEST_M = 0.25, 10.0
+"""Distances of the neighbours."""
+FACING = 0.7
+"""Least cosine between the directions of neighbours."""
+AGREE = 0.05
+"""Two depths support each other within this share of the inverse depth, plus ``tolerance``."""
+FARTHEST = 1e-3
+"""1/m; pixels at infinity are taken to the neighbours at this inverse depth."""
+
+
+def fused_depths(
+    views: Sequence[WorkingView],
+    depths: Sequence[Float32[np.ndarray, "h w"]],
+    fixed: Sequence[Bool[np.ndarray, "h w"]],
+    tolerance: float,
+    rounds: int,
+) -> list[Float32[np.ndarray, "h w"]]:
+    """Inverse depths of all views after fusing them ``rounds`` times.
+
+    Args:
+        views: working views.
+        depths: their inverse depths, 1/m; 0 is infinitely far, NaN takes no part.
+        fixed: pixels that keep their depth: it is measured. They support others.
+        tolerance: 1/m, see ``AGREE``.
+        rounds: each spreads agreement to the neighbours of neighbours.
+    """
+    around = neighbours_of(views)
+    packed = np.stack([view.packed for view in views]) if views else np.zeros((0, 23))
+    poses = [view.world_from_view for view in views]
+
+    def one(k: int) -> Float32[np.ndarray, "h w"]:
+        near = around[k]
+        if not near:
+            return before[k]
+        candidates = np.full((len(near), *before[k].shape), np.nan, np.float32)
+        for shown, n in zip(candidates, near, strict=True):
+            warp(packed[n], poses[n], before[n], packed[k], shown)
+        return fuse(
+            before[k], fixed[k], candidates, packed[k], poses[k], packed[near], stacked([before[n] for n in near]),
+            tolerance,
+        )  # fmt: skip
+
+    before = list(depths)
+    for _ in range(rounds):
+        before = list(in_order(one, range(len(views))))
+    return before
+
+
+def neighbours_of(views: Sequence[WorkingView]) -> list[list[int]]:
+    """For each view the nearest others that look the same way, ``NEIGHBOURS`` at most."""
+    place = np.array([view.world_from_view[:3, 3] for view in views]).reshape(-1, 3)
+    ahead = np.array([view.world_from_view[:3, 2] for view in views]).reshape(-1, 3)
+    found = []
+    for k in range(len(views)):
+        far = np.linalg.norm(place - place[k], axis=1)
+        good = (far > NEAREST_M) & (far < FARTHEST_M) & (ahead @ ahead[k] > FACING)
+        order = np.argsort(far, kind="stable")
+        found.append(order[good[order]][:NEIGHBOURS].tolist())
+    return found
+
+
+@kernel
+def warp(view, world_from_view, depth, other, shown):
+    """What another view shows if the world is as this view sees it: its nearest points, in the pixels they fall in.
+
+    Args:
+        view: [23] packed projection (``WorkingView.packed``).
+        world_from_view: [4,4] its pose.
+        depth: [h,w] its inverse depth, 1/m.
+        other: [23] packed projection of the other view.
+        shown: [h',w'] inverse depth in the other view; NaN where nothing falls. Changed.
+    """
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            w = depth[row, column]
+            if not w >= 0.0:  # NaN
+                continue
+            x, y, z = world_point(view, world_from_view, column + 0.5, row + 0.5, max(w, FARTHEST))
+            u, v, far = project_point(other, x, y, z)
+            if far <= 0.3 or u < 0 or v < 0 or u >= shown.shape[1] or v >= shown.shape[0]:
+                continue
+            if not shown[int(v), int(u)] >= 1.0 / far:
+                shown[int(v), int(u)] = 1.0 / far
+
+
+@kernel
+def fuse(own, fixed, candidates, view, world_from_view, others, other_depths, tolerance):
+    """The fused inverse depth [h,w] of a view.
+
+    Args:
+        own: [h,w] its inverse depth, 1/m; 0 is infinitely far, NaN stays.
+        fixed: [h,w] pixels that stay.
+        candidates: [n,h,w] what its neighbours show there (``warp``).
+        view: [23] packed projection of the view.
+        world_from_view: [4,4] its pose.
+        others: [n,23] packed projections of the neighbours.
+        other_depths: [n,h',w'] their inverse depths.
+        tolerance: 1/m, see ``AGREE``.
+    """
+    result, some = own.copy(), np.empty(len(candidates) + 1, np.float32)
+    for row in range(own.shape[0]):
+        for column in range(own.shape[1]):
+            if fixed[row, column] or not own[row, column] >= 0.0:
+                continue
+            some[0], count = own[row, column], 1
+            for n in range(len(candidates)):
+                if candidates[n, row, column] >= 0.0:
+                    some[count] = candidates[n, row, column]
+                    count += 1
+            best, support, own_support = 0, 0, 0
+            for i in range(count):
+                near, reach = 0, tolerance + AGREE * some[i]
+                for j in range(count):
+                    near += abs(some[j] - some[i]) < reach
+                if i == 0:
+                    own_support = near
+                if near > support:
+                    best, support = i, near
+            if some[best] < some[0] - tolerance - AGREE * some[0]:
+                x, y, z = world_point(view, world_from_view, column + 0.5, row + 0.5, some[0])
+                agree, through = 0, 0
+                for n in range(len(others)):
+                    u, v, far = project_point(others[n], x, y, z)
+                    if far <= 0.3 or u < 0 or v < 0 or u >= others[n, 3] or v >= others[n, 4]:
+                        continue
+                    there, here = other_depths[n, int(v), int(u)], 1.0 / far
+                    agree += abs(there - here) < tolerance + AGREE * here
+                    through += there <= here - tolerance - AGREE * here
+                if through <= agree:
+                    best, support = 0, own_support
+            if support > 1:
+                total, reach = 0.0, tolerance + AGREE * some[best]
+                for j in range(count):
+                    if abs(some[j] - some[best]) < reach:
+                        total += some[j]
+                result[row, column] = total / support
+    return result

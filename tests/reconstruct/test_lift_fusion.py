@@ -1,0 +1,143 @@
+"""Depth of neighbouring views fused: cameras side by side, 0.5 m apart, look at walls across their axes.
+
+With a focal length of 20 pixels a wall at 10 m lies 20 * 0.5 / 10 = 1 pixel further left in the next view.
+"""
+
+import numpy as np
+import pytest
+
+from nurec_sim import geometry
+from nurec_sim.reconstruct.lift import depth, fusion
+from nurec_sim.reconstruct.lift.settings import ViewSettings
+from nurec_sim.reconstruct.lift.splat import project_point, world_point
+from nurec_sim.reconstruct.lift.views import Tile, WorkingView
+
+SHAPE, FOCAL, TOLERANCE = (6, 12), 20.0, 0.001
+WALL = np.float32(0.1)
+
+
+def view_at(right_m, drift_m=(0.0, 0.0, 0.0), fraction=(0.0, 0.0, 0.0), turn=None):
+    tile = Tile(SHAPE[1], SHAPE[0], FOCAL, (SHAPE[1] / 2, SHAPE[0] / 2), np.eye(3), 1, None, np.ones(SHAPE, bool),
+                np.array(fraction))  # fmt: skip
+    pose = geometry.pose(np.eye(3) if turn is None else turn, np.array([right_m, 0.0, 0.0]))
+    return WorkingView("front", 0, 0, True, tile, pose, np.array(drift_m), np.zeros((*SHAPE, 3), np.uint8))
+
+
+def fused(depths, fixed=None, rounds=1):
+    views = [view_at(0.5 * k) for k in range(len(depths))]
+    fixed = [np.zeros(SHAPE, bool)] * len(depths) if fixed is None else fixed
+    return fusion.fused_depths(views, depths, fixed, TOLERANCE, rounds)
+
+
+def walls(count):
+    return [np.full(SHAPE, WALL) for _ in range(count)]
+
+
+@pytest.mark.parametrize("wrong", [0.2, 0.05, 0.0])
+def test_a_depth_that_the_neighbours_deny_becomes_theirs(wrong):
+    """Nearer, farther, and infinitely far."""
+    depths = walls(3)
+    depths[1][3, 6] = wrong
+    assert fused(depths)[1][3, 6] == pytest.approx(0.1, rel=1e-6)
+
+
+def test_depths_that_agree_become_their_mean():
+    depths = walls(3)
+    depths[0][:], depths[2][:] = 0.102, 0.103
+    assert fused(depths)[1][3, 6] == pytest.approx((0.1 + 0.102 + 0.103) / 3, rel=1e-6)
+
+
+def test_measured_depths_stay_and_support_others():
+    depths, fixed = walls(3), [np.ones(SHAPE, bool), np.zeros(SHAPE, bool), np.ones(SHAPE, bool)]
+    depths[0][3, 6], depths[1][3, 6] = 0.104, 0.2
+    result = fused(depths, fixed)
+    assert result[0][3, 6] == np.float32(0.104)
+    assert result[1][3, 6] == pytest.approx(0.1, rel=1e-6)
+
+
+def test_masked_pixels_take_no_part():
+    depths = walls(3)
+    depths[1][3, 6] = np.nan
+    depths[0][:] = np.nan
+    result = fused(depths)
+    assert np.isnan(result[1][3, 6]) and np.isnan(result[0]).all()
+    assert result[1][2, 2] == pytest.approx(0.1, rel=1e-6)
+
+
+def test_without_rounds_or_neighbours_depths_stay():
+    depths = [np.random.default_rng(0).uniform(0, 0.3, SHAPE).astype(np.float32) for _ in range(2)]
+    assert np.array_equal(fused(depths, rounds=0), depths)
+    assert np.array_equal(fused(depths[:1])[0], depths[0])
+
+
+@pytest.mark.parametrize(("seen", "result"), [([0.2, 0.1], 0.2), ([0.1, 0.1], 0.1), ([0.2, 0.2], 0.2)])
+def test_a_farther_depth_wins_only_if_more_neighbours_look_through_the_near_one(seen, result):
+    """Three candidates say 10 m, the own depth 5 m; two neighbours show ``seen`` where the near point would be."""
+    own = np.full(SHAPE, np.float32(0.2))
+    candidates = np.full((3, *SHAPE), WALL)
+    others = np.stack([view_at(0.5).packed, view_at(-0.5).packed])
+    shown = np.stack([np.full(SHAPE, np.float32(w)) for w in seen])
+    view = view_at(0.0)
+    found = fusion.fuse(
+        own, np.zeros(SHAPE, bool), candidates, view.packed, view.world_from_view, others, shown, TOLERANCE
+    )
+    assert found[3, 6] == pytest.approx(result, rel=1e-6)
+
+
+def test_the_own_depth_stays_where_another_has_no_more_support():
+    own, view = np.full(SHAPE, np.float32(0.2)), view_at(0.0)
+    candidates = np.stack([np.full(SHAPE, np.float32(w)) for w in (0.3, 0.2, 0.3)])
+    none = np.zeros((0, 23)), np.zeros((0, *SHAPE), np.float32)
+    found = fusion.fuse(own, np.zeros(SHAPE, bool), candidates, view.packed, view.world_from_view, *none, TOLERANCE)
+    assert found[3, 6] == pytest.approx(0.2, rel=1e-6)
+
+
+def test_the_nearest_of_what_falls_into_a_pixel_is_shown():
+    """A pole at 5 m moves right by 2 pixels, the wall by 1: the pole hides the wall's next column and bares its own."""
+    depths = walls(1)[0]
+    depths[:, 6] = 0.2
+    shown = np.full(SHAPE, np.nan, np.float32)
+    fusion.warp(view_at(0.0).packed, view_at(0.0).world_from_view, depths, view_at(-0.5).packed, shown)
+    assert shown[3].tolist() == pytest.approx([np.nan] + [0.1] * 6 + [np.nan, 0.2] + [0.1] * 3, nan_ok=True)
+
+
+def test_neighbours_are_the_nearest_that_look_the_same_way():
+    back = np.diag([-1.0, 1.0, -1.0])
+    views = [view_at(x) for x in (0.0, 0.2, 0.5, 9.9, 10.1)] + [view_at(1.0, turn=back)]
+    assert fusion.neighbours_of(views)[0] == [2, 3]
+    assert len(fusion.neighbours_of([view_at(0.3 * k) for k in range(20)])[0]) == fusion.NEIGHBOURS
+
+
+def test_world_point_is_the_reverse_of_projecting_with_a_rolling_shutter():
+    turn = geometry.matrix_from_quat(np.array([0.9, 0.1, -0.3, 0.2]) / np.linalg.norm([0.9, 0.1, -0.3, 0.2]))
+    view = view_at(0.7, drift_m=(0.1, -0.05, 0.4), fraction=(0.0, 1 / SHAPE[0], -0.5), turn=turn)
+    x, y, z = world_point.py_func(view.packed, view.world_from_view, 2.5, 4.5, 0.25)
+    u, v, far = project_point.py_func(view.packed, x, y, z)
+    # The camera is 0.1 m to the right at the row's time, a quarter of the exposure after its middle, of 0.4 m ahead.
+    assert (u, v, far) == pytest.approx((2.5, 4.5, 4.0), abs=1e-3)
+
+
+# -------------------------------------------------------------------------------------------------------------- levels
+
+
+def test_levels_are_four_times_finer_at_infinity_than_on_average():
+    levels = ViewSettings(levels=72, min_depth_m=3.5).inverse_depths
+    assert levels[0] == 0 and levels[-1] == pytest.approx(1 / 3.5)
+    # 1 / 3.5 / 71 = 4.024e-3; times 0.25 + 0.75 / 71 at the first level, 0.25 + 0.75 * 141 / 71 at the last.
+    assert np.diff(levels)[[0, -1]] == pytest.approx([4.024e-3 * 0.26056, 4.024e-3 * 1.73944], rel=1e-3)
+
+
+def test_the_sky_is_charged_for_surfaces_and_surfaces_for_all_levels_of_the_sky():
+    """Levels at infinity, 500, 286, 100 and 50 m."""
+    cost = np.zeros((1, 2, 5), np.float32)
+    sky = np.array([[True, False]])
+    depth.add_prior(cost, np.zeros((1, 2), np.float32), sky, np.array([0, 0.002, 0.0035, 0.01, 0.02]))
+    assert cost[0].tolist() == [[0, 0, 0, 60, 60], [40, 40, 40, 0, 0]]
+
+
+def test_a_measured_depth_between_two_levels_costs_by_its_distance_in_levels():
+    """0.0125 lies a quarter of the way from the level 0.01 to the next."""
+    cost = np.zeros((1, 1, 4), np.float32)
+    prior = np.full((1, 1), 0.0125, np.float32)
+    depth.add_prior(cost, prior, np.zeros((1, 1), bool), np.array([0, 0.01, 0.02, 0.04]))
+    assert cost[0, 0].tolist() == pytest.approx([40 * 1.25, 40 * 0.25, 40 * 0.75, 40 * 1.75], rel=1e-4)
