@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.lift import depth, fusion
+from nurec_sim.reconstruct.lift import depth, fusion, lifting
 from nurec_sim.reconstruct.lift.settings import ViewSettings
 from nurec_sim.reconstruct.lift.splat import project_point, world_point
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView
@@ -129,15 +129,32 @@ def test_levels_are_four_times_finer_at_infinity_than_on_average():
 
 def test_the_sky_is_charged_for_surfaces_and_surfaces_for_all_levels_of_the_sky():
     """Levels at infinity, 500, 286, 100 and 50 m."""
-    cost = np.zeros((1, 2, 5), np.float32)
-    sky = np.array([[True, False]])
-    depth.add_prior(cost, np.zeros((1, 2), np.float32), sky, np.array([0, 0.002, 0.0035, 0.01, 0.02]))
-    assert cost[0].tolist() == [[0, 0, 0, 60, 60], [40, 40, 40, 0, 0]]
+    cost = np.zeros((1, 3, 5), np.float32)
+    sky = np.array([[depth.SKY, depth.NOT_SKY, depth.MAYBE_SKY]], np.uint8)
+    depth.add_prior(cost, np.zeros((1, 3), np.float32), sky, np.array([0, 0.002, 0.0035, 0.01, 0.02]))
+    assert cost[0].tolist() == [[0, 0, 0, 60, 60], [40, 40, 40, 0, 0], [0, 0, 0, 0, 0]]
 
 
 def test_a_measured_depth_between_two_levels_costs_by_its_distance_in_levels():
     """0.0125 lies a quarter of the way from the level 0.01 to the next."""
     cost = np.zeros((1, 1, 4), np.float32)
     prior = np.full((1, 1), 0.0125, np.float32)
-    depth.add_prior(cost, prior, np.zeros((1, 1), bool), np.array([0, 0.01, 0.02, 0.04]))
+    depth.add_prior(cost, prior, np.zeros((1, 1), np.uint8), np.array([0, 0.01, 0.02, 0.04]))
     assert cost[0, 0].tolist() == pytest.approx([40 * 1.25, 40 * 0.25, 40 * 0.75, 40 * 1.75], rel=1e-4)
+
+
+def test_sky_reaches_the_upper_end_and_is_wider_than_a_pole():
+    """A white wall below the roof, a white pole into the sky, and a lens whose last columns start at row 2."""
+    picture = [
+        "ssssss..sssss.###",
+        "ssssss..sssss.###",
+        "ssssss..sssss.sss",
+        "..........pp..sss",
+        ".wwww.....pp..sss",
+        ".wwww.....pp.....",
+        ".wwww.....pp.....",
+    ]
+    signs = np.array([list(row) for row in picture])
+    found = lifting.sky_likeness(np.isin(signs, ["s", "w", "p"]), signs != "#")
+    expected = np.select([signs == "s", signs == "w"], [depth.SKY, depth.MAYBE_SKY], depth.NOT_SKY)
+    assert np.array_equal(found, expected)

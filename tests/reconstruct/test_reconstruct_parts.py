@@ -213,7 +213,8 @@ def test_depth_is_found_by_matching_where_nothing_was_measured():
     step, levels = 1 / 3.5 / 47, 48
     empty = np.zeros((96, 192), np.float32)
     around = [(v.packed, v.rgb, depth.census(v.rgb.mean(axis=-1).astype(np.uint8))) for v in views[1:]]
-    found = depth.dense_inverse_depth(views[0].packed, views[0].world_from_view, views[0].rgb, empty, empty > 1, around,
+    no_sky = np.full((96, 192), depth.NOT_SKY, np.uint8)
+    found = depth.dense_inverse_depth(views[0].packed, views[0].world_from_view, views[0].rgb, empty, no_sky, around,
                                       step * np.arange(levels))  # fmt: skip
     pose = views[0].world_from_view
     rays = lifting.rays_of(views[0]).reshape(-1, 3)
@@ -227,8 +228,9 @@ def test_depth_is_found_by_matching_where_nothing_was_measured():
 def test_measured_depth_stays():
     prior = np.full((20, 30), 0.123, np.float32)
     view = read_views(Street(frames=1, cameras=(camera(width=30, height=20),)), ["front"], {}, ViewSettings())[0]
+    no_sky = np.full(prior.shape, depth.NOT_SKY, np.uint8)
     found = depth.dense_inverse_depth(
-        view.packed, view.world_from_view, view.rgb, prior, prior > 1, [], 0.01 * np.arange(32)
+        view.packed, view.world_from_view, view.rgb, prior, no_sky, [], 0.01 * np.arange(32)
     )
     assert np.array_equal(found, prior)
 

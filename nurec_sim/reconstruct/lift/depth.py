@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8, UInt64
+from jaxtyping import Float32, Float64, UInt8, UInt64
 
 from nurec_sim.compute.kernels import inner, kernel
 from nurec_sim.network.stereo.paths import FORWARDS, add_paths, brightness_steps
 
 PRIOR_COST, PRIOR_CAP = 40.0, 220.0
+NOT_SKY, MAYBE_SKY, SKY = 0, 1, 2
+"""What a pixel looks like (``lifting.sky_likeness``)."""
 SKY_COST, NOT_SKY_COST = 60.0, 40.0
 NEUTRAL_COST = 24.0
 SMOOTH_ONE, SMOOTH_MANY = 10.0, 80.0
@@ -153,7 +155,7 @@ def add_prior(cost, prior, sky, inverse_depths):
     Args:
         cost: [h,w,levels] changed; replaced where there is a prior.
         prior: [h,w] measured inverse depth, 1/m; 0 where there is none.
-        sky: [h,w] pixels that look like sky.
+        sky: [h,w] ``NOT_SKY``, ``MAYBE_SKY`` or ``SKY``.
         inverse_depths: [levels] see ``matching_cost``.
     """
     height, width, levels = cost.shape
@@ -171,10 +173,10 @@ def add_prior(cost, prior, sky, inverse_depths):
                     # Truncated linear: a wrong measurement (a splat over a silhouette) can be outvoted by its
                     # surroundings.
                     cost[row, column, level] = min(PRIOR_COST * abs(level - at), PRIOR_CAP)
-            elif sky[row, column]:
+            elif sky[row, column] == SKY:
                 for level in range(surfaces, levels):
                     cost[row, column, level] += SKY_COST
-            else:
+            elif sky[row, column] == NOT_SKY:
                 # Infinity fits any pixel without texture; without this charge plain walls would become sky.
                 for level in range(surfaces):
                     cost[row, column, level] += NOT_SKY_COST
@@ -223,7 +225,7 @@ def dense_inverse_depth(
     world_from_view: Float64[np.ndarray, "4 4"],
     rgb: UInt8[np.ndarray, "h w 3"],
     prior: Float32[np.ndarray, "h w"],
-    sky: Bool[np.ndarray, "h w"],
+    sky: UInt8[np.ndarray, "h w"],
     neighbours: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
     inverse_depths: Float64[np.ndarray, " levels"],
 ) -> Float32[np.ndarray, "h w"]:
@@ -234,7 +236,7 @@ def dense_inverse_depth(
         world_from_view: its pose.
         rgb: its colours, 0..255.
         prior: measured inverse depth, 1/m; 0 where there is none.
-        sky: pixels that look like sky.
+        sky: ``NOT_SKY``, ``MAYBE_SKY`` or ``SKY``.
         neighbours: (packed view, rgb, census) of the views to match against; empty leaves only priors and smoothness.
         inverse_depths: the hypotheses, 1/m, increasing from 0.
     """

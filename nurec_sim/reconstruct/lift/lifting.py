@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.compute.kernels import kernel
+from nurec_sim.reconstruct.lift.depth import MAYBE_SKY, NOT_SKY, SKY
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import WorkingView
 
@@ -23,6 +24,8 @@ FARTHER = 1.5
 """Views this many times as far away as the own view resolve a surface too badly to be asked about it as others are."""
 HIDING = 2
 """So many views that see something in front of a matched point drop it, if none agrees with it."""
+SKY_PX = 3
+"""Least width of a patch of sky, pixels."""
 OWNER_BORDER = 0.04
 """Views own nothing in this part of their width at the border, where nothing checks their depth."""
 
@@ -247,3 +250,23 @@ def sky_coloured(view: WorkingView, prior: Float32[np.ndarray, "h w"], bright: f
     light = rgb.mean(axis=-1)
     blue = (rgb[..., 2] > 1.15 * rgb[..., 0] + 5) & (light > 0.45 * bright)
     return (up > 0.0) & (prior <= 0) & ((light > 0.8 * bright) | blue) & view.tile.valid
+
+
+def sky_likeness(coloured: Bool[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """How much pixels look like sky: ``NOT_SKY``, ``MAYBE_SKY`` or ``SKY``.
+
+    White walls and bright poles have the colour of the sky too. But the sky goes on beyond the upper end of the image,
+    and is wider than a pole. Sky-coloured pixels that surfaces enclose may be either.
+
+    Args:
+        coloured: pixels with the colour of the sky (``sky_coloured``).
+        valid: pixels that show the world.
+    """
+    wide = cv2.morphologyEx(coloured.astype(np.uint8), cv2.MORPH_OPEN, np.ones((SKY_PX, SKY_PX), np.uint8))
+    count, region = cv2.connectedComponents(wide, connectivity=8)
+    upper_end = valid & ~np.pad(valid, ((1, 0), (0, 0)))[:-1]
+    ends_above = np.zeros(count, bool)
+    ends_above[region[upper_end]] = True
+    return np.where(ends_above[region] & (wide > 0), SKY, np.where(coloured & (wide > 0), MAYBE_SKY, NOT_SKY)).astype(
+        np.uint8
+    )

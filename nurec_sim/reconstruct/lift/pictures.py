@@ -61,9 +61,10 @@ def depth_pictures(
         prior, index, body = _draw(view, bodies)
         trim_silhouettes(prior, index, grays[k])
         sky = lifting.sky_coloured(view, prior, bright)
+        likeness = lifting.sky_likeness(sky, view.tile.valid)
         around = [(views[n].packed, views[n].rgb, codes[n]) for n in neighbours_of(views, k, options.neighbours)]
         dense = depth.dense_inverse_depth(
-            view.packed, view.world_from_view, view.rgb, prior, sky, around, options.inverse_depths
+            view.packed, view.world_from_view, view.rgb, prior, likeness, around, options.inverse_depths
         )
         # Pixels that show nothing of the world neither agree with a point nor look through it.
         dense[~view.tile.valid] = np.nan
