@@ -13,10 +13,12 @@ from nurec_sim.logs.clip import Clip
 from nurec_sim.logs.consistency import EARLIEST_US, table_faults
 from nurec_sim.logs.moved import later
 from nurec_sim.logs.origins import with_origins
+from nurec_sim.logs.storage import is_cut_zip
 from nurec_sim.types import LogReader
 
 SECOND_US = 1_000_000
 _NAMES_SHOWN = 8
+_CUT_SHORT = ", a .zip that is cut short or damaged"
 
 
 def open_clip(path: str | Path, reader: LogReader | str | None = None) -> Clip:
@@ -139,7 +141,7 @@ def _nothing_at(path: Path) -> ClipError:
 def _looks(path: Path) -> str:
     """A short description of what is at a path."""
     if not path.is_dir():
-        return f"a file of {path.stat().st_size:,} bytes"
+        return f"a file of {path.stat().st_size:,} bytes{_CUT_SHORT if is_cut_zip(path) else ''}"
     names = sorted(each.name for each in path.iterdir())
     more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
     return f"a folder with {', '.join(names[:_NAMES_SHOWN])}{more}" if names else "an empty folder"

@@ -60,6 +60,22 @@ def schema_of(path: Path) -> str | None:
     return schema if isinstance(schema, str) else None
 
 
+def is_cut_zip(path: Path) -> bool:
+    """Whether a file begins as a zip does, but its directory is missing: cut short, or damaged at its end.
+
+    What is left may hold a whole zip, such as an ``.npz`` file, whose directory is then found instead.
+    """
+    with path.open("rb") as file:
+        if file.read(4) != b"PK\x03\x04":
+            return False
+        try:
+            check_directory(file)
+            with zipfile.ZipFile(file) as archive:
+                return min((info.header_offset for info in archive.infolist()), default=1) > 0
+        except _DAMAGE:
+            return True
+
+
 def parsed_json(data: bytes, where: str, kind: type[T], noun: str) -> T:
     """The value of a JSON file.
 

@@ -34,7 +34,7 @@ svg { width:100%; height:auto; max-height:900px; display:block; } svg text { fon
 .shots img { width:100%; border-radius:6px; display:block; }
 td.find { min-width:14em; } td.todo { min-width:16em; } table.plain td { white-space:nowrap; }
 .swatch { display:inline-block; width:12px; height:12px; border-radius:3px; vertical-align:-1px; margin-right:4px; }
-@media (max-width:600px) { svg.wide { min-width:640px; } }
+@media (max-width:600px) { svg.wide { min-width:640px; } td.find { min-width:0; } }
 """
 
 

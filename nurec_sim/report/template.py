@@ -54,6 +54,7 @@ dd { margin:0; overflow-wrap:anywhere; }
 a { color:#1d4ed8; } .card h3:first-child { margin-top:0; }
 @media (max-width:900px) { .pair { grid-template-columns:minmax(0,1fr); } .columns { columns:1; }
   main { padding:14px 10px 40px; } }
+@media (max-width:600px) { dl { grid-template-columns:fit-content(38%) minmax(0,1fr); } }
 @media print { details.card { break-inside:avoid; } }
 """
 
@@ -75,6 +76,8 @@ SCRIPT = """
       figure.data.push({type: 'scatter', mode: 'markers', name: 'now', x: [], y: [], hoverinfo: 'skip',
         showlegend: false, marker: {size: 13, color: cars, line: {color: '#0f172a', width: 2}}});
     }
+    // Else Plotly, which measures its parent when the window changes, would find none and squash the figure.
+    element.style.height = figure.layout.height + 'px';
     Plotly.newPlot(element, figure.data, figure.layout, {responsive: true, displayModeBar: false});
   }
   function drawInside(root) { root.querySelectorAll('.plot').forEach(draw); }

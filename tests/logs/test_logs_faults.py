@@ -278,6 +278,14 @@ def test_damaged_zips_are_found(tmp_path):
     assert fault.startswith("camera 'front' frame 0: clip.zip: file images/front/0000.png in the zip is damaged")
 
 
+def test_zips_that_are_cut_short_are_named(tmp_path):
+    path = tiny_clip.write(tmp_path / "clip.zip")
+    size = path.stat().st_size // 2
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(ClipError, match=f"it is a file of {size:,} bytes, a .zip that is cut short or damaged. Known"):
+        logs.open_clip(path)
+
+
 def test_large_files_are_not_read(clip_folder, monkeypatch):
     monkeypatch.setattr(storage, "LIMITS", Limits(file_bytes=10))
     with pytest.raises(ClipError, match="file meta.json has .* bytes; at most 10 are allowed"):
