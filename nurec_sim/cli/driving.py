@@ -208,6 +208,7 @@ def drive(
     """
     from nurec_sim import logs, runs, sim
     from nurec_sim.evaluate import measure_fidelity
+    from nurec_sim.runs.folder import existing_run_folder
     from nurec_sim.serving.client import RemoteSensors
     from nurec_sim.serving.server import SensorServer
     from nurec_sim.serving.store import SceneStore
@@ -222,6 +223,8 @@ def drive(
         raise NurecSimError("--refine cannot be used with --address: the scenes are those of the running server")
     if scenario.added_actors and address is not None:
         raise NurecSimError(f"scenario {scenario.name!r} adds actors, which needs a server of its own: no --address")
+    if resume is not None:
+        existing_run_folder(resume)  # fails here, before scenes are reconstructed
     loaded = runs.load_policies(policy_names or scenario.policies, plan_timeout_s)
     if address is not None:
         with RemoteSensors(address) as sensors:

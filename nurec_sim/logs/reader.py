@@ -140,6 +140,8 @@ def _nothing_at(path: Path) -> ClipError:
 
 def _looks(path: Path) -> str:
     """A short description of what is at a path."""
+    if path.suffix.lower() == ".usdz":
+        return "a scene archive, which a reconstruction of a log is"
     if not path.is_dir():
         return f"a file of {path.stat().st_size:,} bytes{_CUT_SHORT if is_cut_zip(path) else ''}"
     names = sorted(each.name for each in path.iterdir())

@@ -260,6 +260,14 @@ def test_a_policy_that_cannot_be_had_ends_a_run_before_its_scenes_are_read(polic
     assert text in capsys.readouterr().err
 
 
+def test_a_run_that_does_not_exist_is_not_resumed_and_no_scene_is_read(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("nurec_sim.serving.store.SceneStore.get", lambda *_, **__: pytest.fail("work was begun"))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["demo", "--resume", str(tmp_path / "none")])
+    assert stop.value.code == 1
+    assert "none does not exist; give a folder written by `nurec-sim run`" in capsys.readouterr().err
+
+
 # ------------------------------------------------------------------------------------------------- at Python's prompt
 
 

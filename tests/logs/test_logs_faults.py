@@ -247,6 +247,9 @@ def test_paths_that_are_no_clips_are_named(tmp_path):
     (tmp_path / "file").write_text("hello")
     with pytest.raises(ClipError, match="file: no log reader knows this format; it is a file of 5 bytes"):
         logs.open_clip(tmp_path / "file")
+    (tmp_path / "street.usdz").write_text("hello")
+    with pytest.raises(ClipError, match="street.usdz: no log .*; it is a scene archive, which a reconstruction of a"):
+        logs.open_clip(tmp_path / "street.usdz")
 
 
 @pytest.mark.parametrize("name", ["../meta.json", "/meta.json", "a/../../meta.json", "C:/meta.json"])
