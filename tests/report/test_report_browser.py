@@ -36,7 +36,9 @@ def test_figures_keep_their_heights_when_the_window_changes(page: Browser, text:
     page.wait(lambda: page.run(HEIGHTS) == wanted, "all figures have their heights")
     for width in (1000, 390):
         page("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False)
-        page.wait(lambda width=width: page.run(f"{DRAWN}.every(each => each._fullLayout.width < {width})"), "it follows")
+        page.wait(
+            lambda width=width: page.run(f"{DRAWN}.every(each => each._fullLayout.width < {width})"), "it follows"
+        )
         assert page.run(HEIGHTS) == wanted, width
         assert page.run(SIDEWAYS) == 0, width
     assert page.errors == []
