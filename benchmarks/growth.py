@@ -32,14 +32,14 @@ FRAMES = 12
 
 @dataclass(frozen=True)
 class Options:
-    """Reconstruct the first parts of one drive through a town and write build/growth/rows.json.
+    """Reconstruct the first parts of one drive through a town and write rows.json, in a folder for each drive.
 
     Args:
         seconds: lengths of the log; the longest is recorded, the others are its first parts.
         methods: reconstruction methods.
         seed: of the town.
         hz: frame sets per second.
-        folder: for logs, archives and rows; what is there is not made again.
+        folder: for the folders of drives: logs, archives and rows. What is there is not made again.
     """
 
     seconds: tuple[float, ...] = (5, 10, 20, 30)
@@ -51,16 +51,18 @@ class Options:
 
 def main(options: Options) -> None:
     """Makes the missing rows and prints all."""
-    options.folder.mkdir(parents=True, exist_ok=True)
-    kept = options.folder / "rows.json"
-    rows: dict[str, dict[str, Any]] = json.loads(kept.read_text()) if kept.exists() else {}
     longest, shortest = max(options.seconds), min(options.seconds)
-    drive = options.folder / f"town{longest:g}.zip"
+    # A longer drive need not begin as a shorter one, and the shared part is that of the shortest.
+    folder = options.folder / f"seed{options.seed}_{options.hz:g}hz_{shortest:g}to{longest:g}s"
+    folder.mkdir(parents=True, exist_ok=True)
+    kept = folder / "rows.json"
+    rows: dict[str, dict[str, Any]] = json.loads(kept.read_text()) if kept.exists() else {}
+    drive = folder / f"town{longest:g}.zip"
     if not drive.exists():
         drawn = ("--seed", str(options.seed), "--seconds", f"{longest:g}", "--hz", f"{options.hz:g}")
         _command("world", *drawn, "--out", str(drive))
     for length in options.seconds:
-        clip = options.folder / f"town{length:g}.zip"
+        clip = folder / f"town{length:g}.zip"
         if not clip.exists():
             _command("trim", str(drive), "--seconds", f"{length:g}", "--out", str(clip))
         for method in options.methods:
