@@ -18,12 +18,12 @@ import tyro
 
 from nurec_sim.cli.console import print_table
 
-HEADING = ("budget s", "seen dB", "SSIM", "unseen dB", "SSIM", "range 10-20 m", "20-40 m", "Gaussians")
+HEADING = ("budget s", "seen dB, SSIM", "unseen dB, SSIM", "median range error at 10-20, 20-40 m", "Gaussians")
 
 
 @dataclass(frozen=True)
 class Options:
-    """Optimise a log for growing times and write build/curves/LOG.json.
+    """Optimise a log for growing times; the scores of each budget go to a file of their own in build/curves.
 
     Args:
         log: a driving log.
@@ -31,7 +31,7 @@ class Options:
         targets: cameras to score.
         hold_out_sweeps: every so many sweeps are held out and simulated.
         budgets: seconds of optimisation after `lift`; 0 is `lift` itself.
-        folder: for results; what is there is not made again.
+        folder: for results; what is there of the same log, cameras and sweeps is not made again.
     """
 
     log: tyro.conf.Positional[Path]
@@ -45,9 +45,9 @@ class Options:
 def main(options: Options) -> None:
     """Makes the missing rows and prints all."""
     options.folder.mkdir(parents=True, exist_ok=True)
-    rows = []
+    rows, cameras = [], f"{'-'.join(options.inputs)}_{'-'.join(options.targets)}"
     for budget in options.budgets:
-        scores = options.folder / f"{options.log.name}_{budget:g}.json"
+        scores = options.folder / f"{options.log.name}_{cameras}_{options.hold_out_sweeps}_{budget:g}.json"
         if not scores.exists():
             _evaluate(options, budget, scores)
         rows.append(_cells(budget, json.loads(scores.read_text())))
@@ -67,16 +67,11 @@ def _evaluate(options: Options, budget: float, scores: Path) -> None:
 
 
 def _cells(budget: float, scores: dict[str, Any]) -> tuple[str, ...]:
-    seen, unseen, ranges = scores["image"]["seen"], scores["image"]["unseen"], scores["lidar"]["by_range"]
-    return (
-        f"{budget:g}",
-        f"{seen['psnr_db']:.2f}",
-        f"{seen['ssim']:.3f}",
-        f"{unseen['psnr_db']:.2f}",
-        f"{unseen['ssim']:.3f}",
-        *(f"{ranges[f'{part} m']['median_abs_range_error_m']:.3f}" for part in ("10-20", "20-40")),
-        f"{scores['counts']['static'] + scores['counts']['dynamic']}",
-    )
+    seen, unseen = (scores["image"][kind] for kind in ("seen", "unseen"))
+    ranges = [scores["lidar"]["by_range"][part]["median_abs_range_error_m"] for part in ("10-20 m", "20-40 m")]
+    images = [f"{each['psnr_db']:.2f}, {each['ssim']:.3f}" for each in (seen, unseen)]
+    count = scores["counts"]["static"] + scores["counts"]["dynamic"]
+    return f"{budget:g}", *images, ", ".join(f"{each:.3f}" for each in ranges), str(count)
 
 
 if __name__ == "__main__":
