@@ -104,8 +104,8 @@ def test_the_nearest_of_what_falls_into_a_pixel_is_shown():
 def test_neighbours_are_the_nearest_that_look_the_same_way():
     back = np.diag([-1.0, 1.0, -1.0])
     views = [view_at(x) for x in (0.0, 0.2, 0.5, 9.9, 10.1)] + [view_at(1.0, turn=back)]
-    assert fusion.neighbours_of(views)[0] == [2, 3]
-    assert len(fusion.neighbours_of([view_at(0.3 * k) for k in range(20)])[0]) == fusion.NEIGHBOURS
+    assert fusion.nearest_views(views)[0] == [2, 3]
+    assert len(fusion.nearest_views([view_at(0.3 * k) for k in range(20)])[0]) == fusion.NEIGHBOURS
 
 
 def test_world_point_is_the_reverse_of_projecting_with_a_rolling_shutter():

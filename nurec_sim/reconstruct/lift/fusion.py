@@ -46,7 +46,7 @@ def fused_depths(
         tolerance: 1/m, see ``AGREE``.
         rounds: each spreads agreement to the neighbours of neighbours.
     """
-    around = neighbours_of(views)
+    around = nearest_views(views)
     packed = np.stack([view.packed for view in views]) if views else np.zeros((0, 23))
     poses = [view.world_from_view for view in views]
 
@@ -68,7 +68,7 @@ def fused_depths(
     return before
 
 
-def neighbours_of(views: Sequence[WorkingView]) -> list[list[int]]:
+def nearest_views(views: Sequence[WorkingView]) -> list[list[int]]:
     """For each view the nearest others that look the same way, ``NEIGHBOURS`` at most."""
     place = np.array([view.world_from_view[:3, 3] for view in views]).reshape(-1, 3)
     ahead = np.array([view.world_from_view[:3, 2] for view in views]).reshape(-1, 3)
