@@ -116,11 +116,12 @@ def test_two_views_that_leave_level_ground_to_each_other_both_keep_it():
     assert centres(10.3, 10.0) == [10.3], "both in the same ring: the first owns, once"
 
 
-def test_pixels_near_a_kept_one_own_and_those_of_other_bodies_do():
-    """Of a row of nine pixels body 0 shows six; the first and the fifth were lifted, the fifth was kept."""
-    body = np.array([[0, 0, 0, 0, 0, 0, 3, 3, 3]], np.int32)
+def test_pixels_of_a_kept_block_own_and_those_of_other_bodies_do():
+    """Of nine columns body 0 shows six, as a block of four by four, which was not kept, and one of two by two."""
+    body = np.array([[0, 0, 0, 0, 0, 0, 3, 3, 3]] * 4, np.int32)
     two = Lifted.concatenate([Lifted.empty()])
-    two = dataclasses.replace(two, xyz_m=np.zeros((2, 3)), view=np.zeros(2, np.int32), pixel=np.array([0, 4], np.int32))
-    masks = owning([body, body], two, np.array([False, True]), 1)
-    assert masks[0].astype(int).tolist() == [[0, 0, 0, 1, 1, 1, 1, 1, 1]]
-    assert masks[1].astype(int).tolist() == [[0, 0, 0, 0, 0, 0, 1, 1, 1]]
+    two = dataclasses.replace(two, xyz_m=np.zeros((2, 3)), view=np.zeros(2, np.int32), pixel=np.array([0, 4], np.int32),
+                              edge=np.array([4, 2], np.uint8))  # fmt: skip
+    masks = owning([body, body], two, np.array([False, True]))
+    assert masks[0].astype(int).tolist() == [[0, 0, 0, 0, 1, 1, 1, 1, 1]] * 2 + [[0, 0, 0, 0, 0, 0, 1, 1, 1]] * 2
+    assert masks[1].astype(int).tolist() == [[0, 0, 0, 0, 0, 0, 1, 1, 1]] * 4

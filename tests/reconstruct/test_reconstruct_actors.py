@@ -87,7 +87,7 @@ def test_a_moving_actor_keeps_its_recorded_path():
 
 
 def test_pixels_go_to_the_frame_of_their_body_and_normals_are_computed_once_per_view(monkeypatch):
-    """A wall 10 m ahead of a camera that looks along x; the left half of the picture shows an actor."""
+    """A chequered wall 10 m ahead of a camera that looks along x; the left half of the picture shows an actor."""
     shape, calls = (4, 8), []
     normals_of = lifting.normals_of
     monkeypatch.setattr(lifting, "normals_of", lambda *given: calls.append(1) or normals_of(*given))
@@ -96,7 +96,7 @@ def test_pixels_go_to_the_frame_of_their_body_and_normals_are_computed_once_per_
     bodies = [Surfels(each, Cloud.empty(), *nothing) for each in (None, mover)]
     turn = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     tile = Tile(8, 4, 8.0, (4.0, 2.0), np.eye(3), 1, None, np.ones(shape, bool), np.zeros(3))
-    rgb = np.zeros((*shape, 3), np.uint8)
+    rgb = np.tile((np.indices(shape).sum(axis=0) % 2 * 99).astype(np.uint8)[..., None], 3)
     t_us = (1_200_000, 2_200_000)
     views = [WorkingView("front", 0, t, True, tile, geometry.pose(turn, np.zeros(3)), np.zeros(3), rgb) for t in t_us]
     body = np.repeat(np.arange(8) < 4, 4).reshape(8, 4).T.astype(np.int32)

@@ -11,18 +11,19 @@ from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.free_space import SweepBeams
 from nurec_sim.reconstruct.lift import colour, lifting, surfaces
+from nurec_sim.reconstruct.lift.blocks import block_costs, block_maxima, block_means, chosen_blocks, tolerance_for
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.footprints import marked_free, on_level, outside_free_space, parts_of
 from nurec_sim.reconstruct.lift.ground import Ground
-from nurec_sim.reconstruct.lift.lifting import Lifted
+from nurec_sim.reconstruct.lift.lifting import NOBODY, Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.views import WorkingView
 from nurec_sim.reconstruct.unseen_colours import colours_by_likeness
 from nurec_sim.types import Gaussians
 
-KEPT_SHARE = 0.4
-"""Share of the pixels of all views that owns a surface, about; to meet the budget before ownership is known."""
+OWNING_SHARE = 0.4
+"""Share of the blocks of all views that owns a surface, about; to meet the budget before ownership is known."""
 
 
 def camera_isp(
@@ -79,7 +80,7 @@ def body_pixels(
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,
 ) -> list[Lifted]:
-    """The pixels of all views that show each body, in its frame, thinned to the budget.
+    """The pixels of all views that show each body, in its frame, as blocks (``blocks``) that meet the budget.
 
     Args:
         bodies: the static world, then the actors; the numbers in ``DepthPicture.body`` index it.
@@ -91,36 +92,23 @@ def body_pixels(
     Returns:
         Lifted points per body, in the order of ``bodies``.
     """
+    near = [
+        np.where((picture.inverse_depth > 1 / settings.views.max_depth_m) & view.tile.valid, picture.body, NOBODY)
+        for view, picture in zip(views, pictures, strict=True)
+    ]
+    costs = list(in_order(lambda k: block_costs(rgb[k], pictures[k].inverse_depth, near[k]), range(len(views))))
+    pixels = sum(int(np.count_nonzero(body >= 0)) for body in near)
+    tolerance = tolerance_for(costs, pixels, round(settings.views.budget / OWNING_SHARE))
     parts = [[Lifted.empty()] for _ in bodies]
-    thinning = _thinning(views, settings)
 
     def lift(k: int) -> list[tuple[int, Lifted]]:
-        view, picture = views[k], pictures[k]
-        near = (picture.inverse_depth > 1 / settings.views.max_depth_m) & view.tile.valid
-        near &= lifting.lattice(near.shape, thinning)
-        # These are of the whole view, so they are computed before the loop over bodies.
-        points, normals = (
-            lifting.points_of(view, picture.inverse_depth),
-            lifting.normals_of(view, picture.inverse_depth),
-        )
-        rays, found = lifting.rays_of(view), []
-        for number in np.unique(picture.body[near & (picture.body >= 0)]):
-            body, mask = bodies[number], near & (picture.body == number)
-            body_from_world = geometry.inverse(body.world_from_body(view.t_us))
-            xyz = geometry.transform_points(body_from_world, points[mask])
-            surfel = picture.surfel[mask]
-            normal = geometry.rotate_vectors(body_from_world[:3, :3], normals[mask])
-            normal = np.where((surfel >= 0)[:, None], body.normal[surfel] if len(body.cloud) else normal, normal)
-            ray = rays[mask]
-            ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-            ray = geometry.rotate_vectors((body_from_world @ view.world_from_view)[:3, :3], ray)
-            z = 1 / picture.inverse_depth[mask].astype(np.float64)
-            pixel_m = np.sqrt(thinning) * z / view.tile.focal_px
-            mine = np.full(len(z), k, np.int32)
-            place = np.flatnonzero(mask).astype(np.int32)
-            shown = rgb[k][mask].astype(np.float32)
-            found.append((number, Lifted(xyz, normal, ray, z, pixel_m, shown, surfel, mine, place)))
-        return found
+        first, edge = chosen_blocks(costs[k], near[k], tolerance)
+        shown = near[k].flat[first]
+        # Means of pictures of the whole view, so they are computed before the loop over bodies.
+        everything = _world_points(k, views[k], pictures[k], rgb[k], first, edge)
+        return [
+            (number, _in_body(everything[shown == number], views[k], bodies[number])) for number in np.unique(shown)
+        ]
 
     for found in in_order(lift, range(len(views))):
         for number, lifted in found:
@@ -128,10 +116,32 @@ def body_pixels(
     return [Lifted.concatenate(each) for each in parts]
 
 
-def _thinning(views: Sequence[WorkingView], settings: LiftSettings) -> int:
-    """One pixel in how many is lifted."""
-    pixels = sum(view.rgb.shape[0] * view.rgb.shape[1] for view in views)
-    return 2 ** max(0, int(np.ceil(np.log2(max(KEPT_SHARE * pixels / settings.views.budget, 1)))))
+def _world_points(
+    k: int, view: WorkingView, picture: DepthPicture, rgb: np.ndarray, first: np.ndarray, edge: np.ndarray
+) -> Lifted:
+    """Blocks of the k-th view as points in the world."""
+    depth = picture.inverse_depth
+    pictures = lifting.points_of(view, depth), lifting.normals_of(view, depth), lifting.rays_of(view), rgb
+    xyz, normal, ray, colours = (block_means(values, first, edge) for values in pictures)
+    ray = geometry.rotate_vectors(view.world_from_view[:3, :3], ray)
+    normal, ray = (each / np.maximum(np.linalg.norm(each, axis=1, keepdims=True), 1e-9) for each in (normal, ray))
+    z = 1 / block_means(depth[..., None].astype(np.float64), first, edge)[:, 0]
+    return Lifted(xyz, normal, ray, z, edge * z / view.tile.focal_px, colours.astype(np.float32),
+                  block_maxima(picture.surfel, first, edge), np.full(len(first), k, np.int32), first, edge)  # fmt: skip
+
+
+def _in_body(points: Lifted, view: WorkingView, body: Surfels) -> Lifted:
+    """Points of one body of a view, in its frame; normals of its surfels where these gave the depth."""
+    body_from_world = geometry.inverse(body.world_from_body(view.t_us))
+    turn, measured = body_from_world[:3, :3], points.surfel >= 0
+    normal = geometry.rotate_vectors(turn, points.normal)
+    normal[measured] = body.normal[points.surfel[measured]]
+    return replace(
+        points,
+        xyz_m=geometry.transform_points(body_from_world, points.xyz_m),
+        normal=normal,
+        ray=geometry.rotate_vectors(turn, points.ray),
+    )
 
 
 def body_gaussians(
@@ -160,7 +170,7 @@ def body_gaussians(
     pixel_gaussians, dropped = outside_free_space(pixels[stays], body, ground, settings, beams)
     parts = [pixel_gaussians]
     # Where a pixel's depth is wrong, those of other views take over, and the surfels behind it.
-    pictures = marked_free(pictures, pixels, dropped)
+    pictures = marked_free(pictures, dropped)
     rest = pixels[~stays]
     taken = _owned(rest, body, views, pictures, rgb, settings) if len(dropped) else np.zeros(len(rest), bool)
     more = [rest[taken]]
@@ -168,8 +178,7 @@ def body_gaussians(
         # Along grazing ground rings of distance are a few pixels wide, so that each of two views may leave a surface to
         # the other. There in the end only pixels that are still there own.
         stays[~stays] = taken
-        reach = lifting.lattice_reach(_thinning(views, settings))
-        owns = lifting.owning([picture.body for picture in pictures], pixels, stays, reach)
+        owns = lifting.owning([picture.body for picture in pictures], pixels, stays)
         left = rest[~taken]
         left = left[on_level(left, ground)]
         more.append(left[_owned(left, body, views, pictures, rgb, settings, owns)])

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from jaxtyping import Bool
 
 from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.free_space import SweepBeams
 from nurec_sim.reconstruct.lift import surfaces
+from nurec_sim.reconstruct.lift.blocks import painted
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
@@ -25,8 +25,6 @@ LEVEL = 0.97
 """Vertical part of a normal from which a surface counts as level, as ground is that lies beyond the height grid."""
 LOW_M, GRAZING = 0.5, 0.03
 """Pixels wrongly this low over the ground show the ground, unless their rays are flatter than this slope."""
-EDGE = 0.1
-"""Neighbouring pixels whose inverse depth differs by this share show different surfaces."""
 PART = 32_768
 """Points that a thread works on at a time."""
 
@@ -54,34 +52,20 @@ def outside_free_space(
     return Gaussians.concatenate(parts), rest[~stays]
 
 
-def marked_free(pictures: Sequence[DepthPicture], pixels: Lifted, wrong: Lifted) -> list[DepthPicture]:
-    """The pictures with pixels of wrong depth marked as ``free``.
+def marked_free(pictures: Sequence[DepthPicture], wrong: Lifted) -> list[DepthPicture]:
+    """The pictures with the pixels of blocks of wrong depth marked as ``free``.
 
     Args:
         pictures: of the views that ``Lifted.view`` indexes.
-        pixels: all that were lifted. The others, left out to save Gaussians, follow the nearest of these.
-        wrong: those of wrong depth.
+        wrong: the blocks of wrong depth.
     """
-    order = np.argsort(pixels.view, kind="stable")
-    ends = np.searchsorted(pixels.view[order], np.arange(len(pictures) + 1))
 
     def marked(k: int) -> DepthPicture:
-        depth, free = pictures[k].inverse_depth, pictures[k].free.copy()
-        mine = wrong.pixel[wrong.view == k]
-        if not len(mine):
-            return pictures[k]
-        free.flat[mine] = True
-        skipped = np.ones(depth.shape, np.uint8)
-        skipped.flat[pixels.pixel[order[ends[k] : ends[k + 1]]]] = 0
-        _, nearest = cv2.distanceTransformWithLabels(skipped, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-        source = np.zeros(int(nearest.max()) + 1, np.int64)
-        source[nearest[skipped == 0]] = np.flatnonzero(skipped == 0)
-        source = source[nearest]
-        # Not across an edge of depth.
-        alike = np.abs(depth - depth.flat[source]) < EDGE * depth
-        return dataclasses.replace(pictures[k], free=free | (free.flat[source] & alike))
+        mine = wrong.view == k
+        here = painted(*pictures[k].free.shape, wrong.pixel[mine], wrong.edge[mine])
+        return dataclasses.replace(pictures[k], free=pictures[k].free | here)
 
-    return list(in_order(marked, range(len(pictures))))
+    return [marked(k) for k in range(len(pictures))]
 
 
 def _low(lifted: Lifted, ground: Ground) -> Bool[np.ndarray, " n"]:

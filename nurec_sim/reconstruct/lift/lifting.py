@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.compute.kernels import kernel
+from nurec_sim.reconstruct.lift.blocks import painted
 from nurec_sim.reconstruct.lift.depth import MAYBE_SKY, NOT_SKY, SKY
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import WorkingView
@@ -32,11 +33,11 @@ OWNER_BORDER = 0.04
 
 @dataclass(frozen=True)
 class Lifted:
-    """Points lifted from views, in the frame of their body: world or box.
+    """Points lifted from views, in the frame of their body: world or box. Each stands for a block of pixels.
 
-    ``ray`` is the unit direction from the camera, ``depth_m`` the depth along its axis, ``pixel_m`` the width of one
-    pixel there, ``surfel`` the row of the surfel that gave the depth, or -1, ``pixel`` the index of the pixel in the
-    picture of ``view``, row by row.
+    ``ray`` is the unit direction from the camera, ``depth_m`` the depth along its axis, ``pixel_m`` the width of the
+    block there, ``surfel`` the row of a surfel that gave depth to it, or -1, ``pixel`` the index of its first pixel in
+    the picture of ``view``, row by row, ``edge`` its number of rows and of columns.
     """
 
     xyz_m: Float64[np.ndarray, "n 3"]
@@ -48,6 +49,7 @@ class Lifted:
     surfel: Int32[np.ndarray, " n"]
     view: Int32[np.ndarray, " n"]
     pixel: Int32[np.ndarray, " n"]
+    edge: UInt8[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.xyz_m)
@@ -58,8 +60,9 @@ class Lifted:
     @classmethod
     def empty(cls) -> Lifted:
         """No points."""
-        some = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0)
-        return cls(*some, np.zeros((0, 3), np.float32), *(np.zeros(0, np.int32) for _ in range(3)))
+        vector, number, index = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int32)
+        colour, edge = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
+        return cls(vector, vector, vector, number, number, colour, index, index, index, edge)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Lifted]) -> Lifted:
@@ -196,41 +199,22 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
     return keep
 
 
-def lattice(shape: tuple[int, int], thinning: int) -> Bool[np.ndarray, "h w"]:
-    """One pixel in ``thinning`` (a power of two), on a square lattice, turned by 45 degrees for 2, 8, 32, ..."""
-    row, column = np.indices(shape, sparse=True)
-    while thinning >= 4:
-        row, column, thinning = np.where(row % 2, -1, row // 2), np.where(column % 2, -1, column // 2), thinning // 4
-    mask = (row >= 0) & (column >= 0)
-    return mask & ((row + column) % 2 == 0) if thinning == 2 else mask
-
-
-def lattice_reach(thinning: int) -> int:
-    """Distance from any pixel to the nearest one of the ``lattice``, in rows or columns, whichever is larger."""
-    doublings = int(thinning).bit_length() - 1
-    spacing = 2 ** (doublings // 2)
-    return spacing if doublings % 2 else spacing // 2
-
-
 def owning(
-    bodies: Sequence[Int32[np.ndarray, "h w"]], pixels: Lifted, kept: Bool[np.ndarray, " n"], reach: int
+    bodies: Sequence[Int32[np.ndarray, "h w"]], pixels: Lifted, kept: Bool[np.ndarray, " n"]
 ) -> list[Bool[np.ndarray, "h w"]]:
-    """Pixels of each view that own: of this body those near a lifted pixel that was kept, of other bodies all.
+    """Pixels of each view that own: of this body those of blocks that were kept, of other bodies all.
 
     Args:
         bodies: of each view: the body that each pixel shows.
-        pixels: all lifted pixels of one body.
+        pixels: all lifted blocks of one body.
         kept: which of them are still there.
-        reach: how far a kept pixel stands for those around it, in pixels (``lattice_reach``).
     """
     masks, number = [], None
     if len(pixels):
         number = bodies[pixels.view[0]].flat[pixels.pixel[0]]
     for k, body in enumerate(bodies):
-        here = np.zeros(body.shape, np.uint8)
-        here.flat[pixels.pixel[kept & (pixels.view == k)]] = 1
-        around = cv2.dilate(here, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
-        masks.append((body != number) | (around > 0))
+        mine = kept & (pixels.view == k)
+        masks.append((body != number) | painted(*body.shape, pixels.pixel[mine], pixels.edge[mine]))
     return masks
 
 

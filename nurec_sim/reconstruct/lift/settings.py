@@ -61,8 +61,8 @@ class ViewSettings:
     """Pixels are lifted from every n-th frame, so that no more working views than this are left."""
     max_frames: int = 240
     """Frames between them only help to find depth; they too are thinned evenly to this number."""
-    budget: int = 900_000
-    """Gaussians to lift from pixels, about: pixels are skipped on a regular lattice to meet it."""
+    budget: int = 700_000
+    """Gaussians to lift from pixels at most, about: the plainest blocks of pixels become one each to meet it."""
     levels: int = 72
     """Inverse-depth hypotheses of the matching, from infinity to ``min_depth_m``."""
     min_depth_m: float = 3.5
@@ -127,8 +127,8 @@ class ColourSettings:
 class LiftSettings:
     """All settings of ``reconstruct(clip, "lift")``.
 
-    The limits ``max_views``, ``max_frames`` and ``budget`` of ``views``, and ``images`` of ``colours``, are for logs of
-    up to ``path_m`` and ``duration_s``; longer ones get more (``for_log``).
+    The limits ``max_views``, ``max_frames``, ``pixels`` and ``budget`` of ``views``, and ``images`` of ``colours``, are
+    for logs of up to ``path_m`` and ``duration_s``; longer ones get more (``for_log``).
     """
 
     points: PointSettings = field(default_factory=PointSettings)
@@ -139,7 +139,7 @@ class LiftSettings:
     """Edge of a cubemap face."""
     opacity: float = 0.95
     path_m: float = 50.0
-    duration_s: float = 10.0
+    duration_s: float = 5.0
     most_lengths: float = 8.0
     """Limits grow no further than this, which bounds time and memory."""
 
@@ -151,6 +151,8 @@ class LiftSettings:
             duration_s: of the recording; where the car stands others move.
         """
         lengths = min(max(path_m / self.path_m, duration_s / self.duration_s, 1.0), self.most_lengths)
-        views = {name: round(lengths * getattr(self.views, name)) for name in ("max_views", "max_frames", "budget")}
+        views = {
+            name: round(lengths * getattr(self.views, name)) for name in ("max_views", "max_frames", "pixels", "budget")
+        }
         colours = replace(self.colours, images=round(lengths * self.colours.images))
         return replace(self, views=replace(self.views, **views), colours=colours)
