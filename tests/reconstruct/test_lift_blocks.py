@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nurec_sim.reconstruct.lift.blocks import (
-    DEEPEST_M,
+    DEPTH_COST,
     FLAT,
     LEAST_TOLERANCE,
     NEVER,
@@ -66,11 +66,13 @@ def test_blocks_lie_on_planes_that_are_not_seen_along_the_ray(slope, bend, one):
     assert (block_costs(rgb, depth, body)[0][0, 0] != NEVER) == one
 
 
-@pytest.mark.parametrize(("far_m", "one"), [(20 + 0.99 * DEEPEST_M, True), (20 + 1.01 * DEEPEST_M, False)])
-def test_blocks_are_not_deep(far_m, one):
+def test_depth_costs_like_colour_and_the_larger_counts():
+    """0.4 m of depth over a plain block of two by two pixels, then with a difference of 30 in one of them."""
     rgb, _, body = plain(2, 2)
-    depth = (1 / np.array([[far_m, far_m], [20.0, 20.0]])).astype(np.float32)
-    assert (block_costs(rgb, depth, body)[0][0, 0] != NEVER) == one
+    depth = (1 / np.array([[20.4, 20.4], [20.0, 20.0]])).astype(np.float32)
+    assert block_costs(rgb, depth, body)[0][0, 0] == pytest.approx(0.4 * DEPTH_COST, abs=1)
+    rgb[0, 0] += 30
+    assert block_costs(rgb, depth, body)[0][0, 0] == 30
 
 
 def test_no_block_reaches_over_bodies_nor_over_pixels_without_depth():

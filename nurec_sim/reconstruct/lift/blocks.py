@@ -21,9 +21,9 @@ FLAT = 0.01
 """In a block, inverse depth deviates from that of a plane by this share at most."""
 SLOPE = 0.15
 """In a block, inverse depth varies by this share at most: more is an edge of depth, or a surface along the ray."""
-DEEPEST_M = 0.3
-"""A block is no deeper than this along the camera's axis. The road's edge is found by where Gaussians lie, so that few
-long ones on plain asphalt would give way to many on grass."""
+DEPTH_COST = 65.0
+"""What a metre of depth from one end of a block to the other costs, in differences of colour: at least, not on top. The
+road's edge is found by where Gaussians lie, so that few long ones on plain asphalt would give way to many on grass."""
 NEVER = 0xFFFF
 """Cost of blocks that are not taken as one, whatever the tolerance."""
 
@@ -33,8 +33,8 @@ def block_costs(
 ) -> list[UInt16[np.ndarray, "rows columns"]]:
     """What is lost by taking each block as one, for each of ``EDGES``.
 
-    The cost is the largest difference of a colour channel, times the number of blocks of two by two pixels in it; it is
-    never less than that of the blocks within it.
+    The cost is the largest difference of a colour channel, times the number of blocks of two by two pixels in it, or that
+    of its depth (``DEPTH_COST``) if that is more; it is never less than that of the blocks within it.
 
     Args:
         rgb: colours 0..255.
@@ -154,8 +154,7 @@ def _costs(rgb, inverse_depth, body, edge):
                     slope_v += w * (r - middle)
                     least, most = min(least, w), max(most, w)
             mean = total / count
-            # Nor where depth is NaN.
-            if not one or not most - least <= min(SLOPE * mean, DEEPEST_M * least * most):
+            if not one or not most - least <= SLOPE * mean:  # nor where depth is NaN
                 continue
             for r in range(edge):
                 for c in range(edge):
@@ -170,5 +169,6 @@ def _costs(rgb, inverse_depth, body, edge):
                         value = int(rgb[top + r, left + c, k])
                         dark, light = min(dark, value), max(light, value)
                 difference = max(difference, light - dark)
-            costs[row, column] = difference * (count // 4)
+            deep = DEPTH_COST * (1 / least - 1 / most)
+            costs[row, column] = min(max(difference * (count // 4), deep), NEVER - 1)
     return costs
