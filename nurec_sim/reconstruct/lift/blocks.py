@@ -33,8 +33,8 @@ def block_costs(
 ) -> list[UInt16[np.ndarray, "rows columns"]]:
     """What is lost by taking each block as one, for each of ``EDGES``.
 
-    The cost is the largest difference of a colour channel, times the number of blocks of two by two pixels in it, or that
-    of its depth (``DEPTH_COST``) if that is more; it is never less than that of the blocks within it.
+    The cost is the largest difference of a colour channel, times the number of blocks of two by two pixels in it, or
+    that of its depth (``DEPTH_COST``) if that is more; it is never less than that of the blocks within it.
 
     Args:
         rgb: colours 0..255.
