@@ -274,6 +274,22 @@ def test_limits_follow_the_length_of_the_log(path_m, duration_s, lengths):
     assert views.width_px == 640 and longer.points == given.points
 
 
+@pytest.mark.parametrize(
+    ("make", "changed", "message"),
+    [
+        (ViewSettings, {"budget": -5}, "budget must be 1 or more, got -5"),
+        (ViewSettings, {"levels": 1}, "levels must be 2 or more, got 1"),
+        (ViewSettings, {"neighbours": -1}, "neighbours must be 0 or more, got -1"),
+        (ViewSettings, {"min_depth_m": 200.0}, "below max_depth_m, got 200.0 and 150.0"),
+        (LiftSettings, {"duration_s": 0.0}, "duration_s must be positive and finite, got 0.0"),
+        (LiftSettings, {"most_lengths": 0.5}, "most_lengths must be 1 or more, got 0.5"),
+    ],
+)
+def test_impossible_settings_are_named(make, changed, message):
+    with pytest.raises(ValueError, match=message):
+        make(**changed)
+
+
 def test_short_logs_of_large_images_are_worked_on_in_more_detail():
     """8 million pixels: 12 images of 1936 x 1216 fit at half their size; 300 do not even at a quarter, nor does 640."""
     settings = ViewSettings()

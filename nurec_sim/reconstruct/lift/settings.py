@@ -73,6 +73,21 @@ class ViewSettings:
     fusion_rounds: int = 3
     """How often the depths of neighbouring views are fused; 0 leaves each view with its own."""
 
+    def __post_init__(self) -> None:
+        """Checks the limits.
+
+        Raises:
+            ValueError: one is too small, or the range of depths is empty.
+        """
+        limits = {"width_px": 1, "pixels": 1, "max_views": 1, "max_frames": 1, "budget": 1, "levels": 2}
+        for name, least in (limits | {"neighbours": 0, "fusion_rounds": 0}).items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be {least} or more, got {getattr(self, name)}")
+        if not 0 < self.min_depth_m < self.max_depth_m:
+            raise ValueError(
+                f"min_depth_m must be above 0 and below max_depth_m, got {self.min_depth_m} and {self.max_depth_m}"
+            )
+
     @property
     def level_step(self) -> float:
         """Mean difference of two neighbouring inverse-depth levels, 1/m."""
@@ -142,6 +157,18 @@ class LiftSettings:
     duration_s: float = 5.0
     most_lengths: float = 8.0
     """Limits grow no further than this, which bounds time and memory."""
+
+    def __post_init__(self) -> None:
+        """Checks the lengths.
+
+        Raises:
+            ValueError: one is not positive, or limits would shrink.
+        """
+        for name in ("sky_px", "path_m", "duration_s"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        if not self.most_lengths >= 1:
+            raise ValueError(f"most_lengths must be 1 or more, got {self.most_lengths}")
 
     def for_log(self, path_m: float, duration_s: float) -> LiftSettings:
         """The settings for a log of this length: limits in proportion to it, so that detail does not depend on it.
