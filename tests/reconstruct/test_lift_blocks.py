@@ -66,6 +66,15 @@ def test_blocks_lie_on_planes_that_are_not_seen_along_the_ray(slope, bend, one):
     assert (block_costs(rgb, depth, body)[0][0, 0] != NEVER) == one
 
 
+def test_a_block_is_never_cheaper_than_those_within_it():
+    """A twist of 1.04 % of the left columns' inverse depth is too much for them, and not for the mean of all four."""
+    rgb, _, body = plain(4, 4)
+    row, column = np.mgrid[:4, :4]
+    depth = 1 + 0.045 * column + 1.04 * FLAT * (-1.0) ** (row + column)
+    two, four, _ = block_costs(rgb, depth.astype(np.float32), body)
+    assert two[:, 0].tolist() == [NEVER] * 2 and four[0, 0] == NEVER and (two[:, 1] < NEVER).all()
+
+
 def test_depth_costs_like_colour_and_the_larger_counts():
     """0.4 m of depth over a plain block of two by two pixels, then with a difference of 30 in one of them."""
     rgb, _, body = plain(2, 2)
