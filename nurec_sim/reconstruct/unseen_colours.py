@@ -6,8 +6,10 @@ come into view, and a log says no more of their colour than their intensity.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
 from nurec_sim.compute.cores import usable_cores
@@ -22,6 +24,9 @@ long."""
 ACROSS_M, UP_M = 10.0, 1.0
 """Distances along and across the ground that count like one standard deviation of the intensity, and like a surface
 that is level instead of upright: what is as high above the ground is alike over a long way along a street."""
+SMOOTHED = 24
+"""Intensities of what is not seen are medians of so many nearest ones: single returns differ by the laser and the angle
+as much as by the surface, and would give a road the colours of all of them side by side."""
 
 
 def colours_by_likeness(gaussians: Gaussians, seen: Bool[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3"]:
@@ -35,7 +40,7 @@ def colours_by_likeness(gaussians: Gaussians, seen: Bool[np.ndarray, " n"]) -> F
     known, unknown = np.flatnonzero(seen), np.flatnonzero(~seen)
     if not len(known) or not len(unknown):
         return rgb
-    features = _features(gaussians)
+    features = _features(replace(gaussians, intensity=_smoothed(gaussians, unknown)))
     known = known[:: -(-len(known) // MOST_SEEN)]
     ranks = np.arange(1, min(NEIGHBOURS, len(known)) + 1)
     distance, nearest = cKDTree(features[known]).query(features[unknown], k=ranks, eps=INEXACT, workers=usable_cores())
@@ -43,6 +48,19 @@ def colours_by_likeness(gaussians: Gaussians, seen: Bool[np.ndarray, " n"]) -> F
     weight /= weight.sum(axis=1, keepdims=True)
     rgb[unknown] = np.einsum("kc,kci->ki", weight, gaussians.rgb[known[nearest]])
     return rgb
+
+
+def _smoothed(gaussians: Gaussians, some: Int64[np.ndarray, " m"]) -> Float32[np.ndarray, " n"]:
+    """The intensities, those of some Gaussians replaced by the median of their surroundings."""
+    smooth = gaussians.intensity.copy()
+    known = np.flatnonzero(np.isfinite(smooth))
+    some = some[np.isfinite(smooth[some])]
+    if len(some):
+        tree = cKDTree(gaussians.mean_m[known])
+        ranks = np.arange(1, min(SMOOTHED, len(known)) + 1)
+        _, nearest = tree.query(gaussians.mean_m[some], k=ranks, eps=INEXACT, workers=usable_cores())
+        smooth[some] = np.median(gaussians.intensity[known[nearest]], axis=1)
+    return smooth
 
 
 def _features(gaussians: Gaussians) -> Float64[np.ndarray, "n 6"]:

@@ -216,7 +216,7 @@ def level_ground():
 
 def body_of(xyz_m, normal):
     cloud = dataclasses.replace(Cloud.empty(), xyz_m=xyz_m, intensity=np.full(len(xyz_m), 0.5, np.float32))
-    return Surfels(None, cloud, normal, np.full(len(xyz_m), 0.5, np.float32), np.zeros(len(xyz_m), np.uint8))
+    return Surfels(None, cloud, normal, *np.full((2, len(xyz_m)), 0.5, np.float32), np.zeros(len(xyz_m), np.uint8))
 
 
 def test_pixels_low_over_the_road_are_moved_down_to_it_along_their_rays():

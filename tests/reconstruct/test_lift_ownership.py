@@ -91,7 +91,7 @@ def test_two_views_that_leave_level_ground_to_each_other_both_keep_it():
         )
         for k, ahead_m in enumerate((0.0, 0.3))
     ]
-    nothing = np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)
+    nothing = np.zeros((0, 3), np.float32), *np.zeros((2, 0), np.float32), np.zeros(0, np.uint8)
     body = Surfels(None, Cloud.empty(), *nothing)
     none = np.zeros((4, 4), bool)
     ground = Ground(np.zeros(2), 0.1, np.zeros((4, 4), np.float32), none, none, none, np.ones((4, 4), np.uint8))

@@ -92,7 +92,7 @@ def test_pixels_go_to_the_frame_of_their_body_and_normals_are_computed_once_per_
     normals_of = lifting.normals_of
     monkeypatch.setattr(lifting, "normals_of", lambda *given: calls.append(1) or normals_of(*given))
     mover = actor(drive(speed=8.0))
-    nothing = np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)
+    nothing = np.zeros((0, 3), np.float32), *np.zeros((2, 0), np.float32), np.zeros(0, np.uint8)
     bodies = [Surfels(each, Cloud.empty(), *nothing) for each in (None, mover)]
     turn = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     tile = Tile(8, 4, 8.0, (4.0, 2.0), np.eye(3), 1, None, np.ones(shape, bool), np.zeros(3))

@@ -6,8 +6,9 @@ from reconstruct_street import Street
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lift import colour, depth, lifting, splat, surfaces
+from nurec_sim.reconstruct.lift.bodies import surfels_of
 from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, voxel_edge_m
-from nurec_sim.reconstruct.lift.settings import PointSettings
+from nurec_sim.reconstruct.lift.settings import LiftSettings, PointSettings
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 
 TOWARDS = np.array([[0.0, 0.0, -1.0]])
@@ -244,13 +245,24 @@ def test_a_scan_line_with_noise_of_its_ranges_faces_the_sensor():
     assert (-normal[:, 1] > 0.95).all()
 
 
-def test_discs_reach_so_far_that_none_of_a_lattice_shows_gaps():
-    """Standard deviations: 0.45 of the spacing, and a twentieth of that in thickness but 3 mm at least."""
+def test_discs_are_a_twentieth_as_thick_as_wide_but_3_mm():
     n = 2
-    made = surfaces.discs(np.zeros((n, 3)), np.repeat(-TOWARDS, n, axis=0), np.array([0.1, 0.4]), np.zeros((n, 3)),
+    made = surfaces.discs(np.zeros((n, 3)), np.repeat(-TOWARDS, n, axis=0), np.array([0.045, 0.18]), np.zeros((n, 3)),
                           np.zeros(n), np.zeros(n, np.uint8), 0.9)  # fmt: skip
     assert made.scale_m[0] == pytest.approx([0.045, 0.045, 0.003])
     assert made.scale_m[1] == pytest.approx([0.18, 0.18, 0.009])
+
+
+def test_the_sheet_of_the_ground_has_no_gaps():
+    """Where four discs of its lattice meet, less than a tenth of what is below shows through, at 0.95 of opacity."""
+    found = gather(Street(frames=3), [], set(), PointSettings())
+    (world,), ground = surfels_of(Street(frames=3), [], found, LiftSettings())
+    sheet = np.arange(len(world.cloud)) >= len(world.cloud) - len(ground.sheet(found.static))
+    corner = world.spacing_m[sheet] / np.sqrt(2)
+    each = 0.95 * np.exp(-((corner / world.sigma_m[sheet]) ** 2) / 2)
+    assert sheet.sum() > 100 and ((1 - each) ** 4 < 0.1).all()
+    standing = ~sheet
+    assert world.sigma_m[standing] == pytest.approx(0.45 * world.spacing_m[standing])
 
 
 def test_footprints_have_six_tenths_of_their_pixels():

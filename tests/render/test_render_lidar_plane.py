@@ -34,7 +34,7 @@ def discs(spacing_m=0.15):
     x, y = np.meshgrid(np.arange(3, 75, spacing_m), np.arange(-6, 6, spacing_m))
     xyz = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     xyz[:, :2] += np.random.default_rng(0).uniform(-0.4, 0.4, (len(xyz), 2)) * spacing_m
-    return surfaces.discs(**ground(xyz), spacing_m=np.full(len(xyz), spacing_m))
+    return surfaces.discs(**ground(xyz), sigma_m=np.full(len(xyz), surfaces.DISC_SIGMA * spacing_m))
 
 
 def footprints(focal_px=200.0, camera_height_m=1.5):

@@ -189,7 +189,7 @@ def body_gaussians(
     keep = (pixel > 3 * body.spacing_m) & (np.isfinite(pixel) | (through == 0))
     seen = np.isfinite(pixel)
     colours = np.where(seen[:, None], seen_rgb / np.float32(255), colour.grey_of(cloud.intensity))
-    discs = surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.spacing_m[keep], colours[keep],
+    discs = surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.sigma_m[keep], colours[keep],
                            cloud.intensity[keep], body.label[keep], settings.opacity)  # fmt: skip
     stays = ~body.in_free_space(discs, beams)
     made, lifted = Gaussians.concatenate([*parts, discs[stays]]), sum(map(len, parts))

@@ -18,12 +18,16 @@ from nurec_sim.types import Clip, Gaussians, Label
 
 @dataclass(frozen=True)
 class Surfels:
-    """The measured surface of one rigid body (``actor`` None: the static world), in its frame."""
+    """The measured surface of one rigid body (``actor`` None: the static world), in its frame.
+
+    ``spacing_m`` is the distance between points, ``sigma_m`` the standard deviation of discs that close the surface.
+    """
 
     actor: Actor | None
     cloud: Cloud
     normal: Float32[np.ndarray, "n 3"]
     spacing_m: Float32[np.ndarray, " n"]
+    sigma_m: Float32[np.ndarray, " n"]
     label: UInt8[np.ndarray, " n"]
 
     def world_from_body(self, t_us: int) -> np.ndarray:
@@ -82,6 +86,7 @@ def surfels_of(
             Cloud.concatenate([standing, sheet]),
             np.concatenate([normal, ground.normals()[row, column].astype(np.float32)]),
             np.concatenate([spacing, sheet.spacing_m]),
+            np.concatenate([surfaces.DISC_SIGMA * spacing, surfaces.LATTICE_SIGMA * sheet.spacing_m]),
             np.concatenate([np.full(len(standing), Label.OTHER), np.where(road, Label.ROAD, Label.OTHER)]).astype(
                 np.uint8
             ),
@@ -93,5 +98,6 @@ def surfels_of(
             box_feet, world_feet = gathered.feet[actor.index]
             cloud = Cloud.concatenate([cloud, points.thinned(box_feet[~(np.abs(ground.above(world_feet)) < 0.08)])])
         cloud, normal, spacing = surfaces.surface_of(cloud)
-        bodies.append(Surfels(actor, cloud, normal, spacing, np.full(len(cloud), Label.MOVABLE, np.uint8)))
+        sigma, label = surfaces.DISC_SIGMA * spacing, np.full(len(cloud), Label.MOVABLE, np.uint8)
+        bodies.append(Surfels(actor, cloud, normal, spacing, sigma, label))
     return bodies, ground
