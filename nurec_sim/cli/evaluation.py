@@ -40,6 +40,8 @@ class LogFlags:
 
     method: MethodName = "lift"
     """CLIP: the method, as in `nurec-sim reconstruct`."""
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE"), tyro.conf.UseAppendAction] = ()
+    """CLIP: a setting of the method, as in `nurec-sim reconstruct`: --set views.width_px=1280."""
     refine: float | None = None
     """CLIP: time budget in seconds for optimising the scene on its input images and sweeps."""
     poses: PosesName = "recorded"
@@ -98,6 +100,8 @@ class ProtocolFlags:
 LogGroup = Annotated[LogFlags, tyro.conf.arg(name="")]
 ProtocolGroup = Annotated[ProtocolFlags, tyro.conf.arg(name="")]
 NO_LOG_FLAGS, NO_PROTOCOL_FLAGS = LogFlags(), ProtocolFlags()
+NOT_OF_A_SCENE = ("--set", "--refine")
+"""Flags that say how to reconstruct."""
 
 
 @app.command
@@ -165,18 +169,19 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
     from nurec_sim.evaluate import evaluate as run_evaluation
     from nurec_sim.evaluate import figure_rows
 
-    settings = method_settings(flags.method, network)
+    render_device = network.device
+    if flags.method not in ("dense", "selective"):
+        network = dataclasses.replace(network, device=NO_FLAGS.device)  # its renderer alone uses it
+    settings = method_settings(flags.method, network, flags.set)
     log = logs.open_clip(path)
     if flags.json is not None:
         check_writable(flags.json)
     if flags.images is not None:
         check_writable(flags.images, folder=True)
-    device = chosen_device(network.device)
-    if flags.scene is not None and flags.refine is not None:
-        raise NurecSimError("--refine fits a new reconstruction; --scene is finished")
+    device = chosen_device(render_device)
+    if flags.scene is not None and (changed := [name for name in given(flags, NO_LOG_FLAGS) if name in NOT_OF_A_SCENE]):
+        raise NurecSimError(f"{', '.join(changed)}: for a new reconstruction, and --scene is a finished one")
     log = with_poses(log, flags.poses)
-    if flags.method not in ("dense", "selective"):
-        network = dataclasses.replace(network, device=NO_FLAGS.device)  # its renderer alone uses it
     with progress("evaluating") as advance:
         if flags.scene is not None:
             figures = _score_archive(log, flags, hold_out_every, device, advance)

@@ -6,6 +6,7 @@ from evaluation_worlds import StreetProtocol
 
 from nurec_sim import cli, evaluate
 from nurec_sim.cli import evaluation
+from nurec_sim.errors import NurecSimError
 
 
 def run_cli(*words):
@@ -65,6 +66,8 @@ def test_usual_methods_without_weights_are_left_out_and_named(streets, monkeypat
         ((), "nothing to evaluate: give a clip, or --protocol storm, clip, shift, lidar or detection"),
         (("log", "--worlds", "3"), "--worlds cannot be used without --protocol"),
         (("--protocol", "storm", "--method", "lift", "--local"), "--local cannot be used with --protocol"),
+        (("--protocol", "storm", "--set", "sky_px=8"), "--set cannot be used with --protocol"),
+        (("log", "--set", "views.width=8"), "--set: there is no setting 'views.width'; have ['budget'"),
         (("log", "--protocol", "storm"), "with --protocol, logs are given by --clips log"),
         (("--protocol", "storm", "--clips", "log", "--seed", "2"), "--worlds and --seed select procedural worlds"),
         (("--protocol", "storm", "--clips", "log", "--methods", "copy"), "no clip at"),
@@ -80,3 +83,26 @@ def test_mistakes_are_one_clear_line(words, text, tmp_path, monkeypatch, capsys)
     assert stop.value.code == 1
     assert text in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_settings_are_those_of_the_method_and_the_device_that_of_the_renderer(tmp_path, monkeypatch, capsys):
+    """`lift` has no device of its own: --device is no mistake, and chooses what renders."""
+    wanted = []
+
+    def stop_here(log, method, **given):
+        wanted.append((method, given["settings"], given["device"]))
+        raise NurecSimError("enough")
+
+    monkeypatch.setattr(evaluate, "evaluate", stop_here)
+    world = tmp_path / "town.zip"
+    cli.main(
+        ["world", "--seed", "1", "--seconds", "1", "--hz", "2", "--width", "64", "--height", "64", "--out", str(world)]
+    )
+    with pytest.raises(SystemExit):
+        run_cli(world, "--device", "cpu", "--set", "views.width_px=99", "--set", "sky_px=8")
+    ((method, settings, device),) = wanted
+    assert (method, settings.views.width_px, settings.sky_px, device) == ("lift", 99, 8, "cpu")
+    assert "enough" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        run_cli(world, "--scene", "made.usdz", "--set", "sky_px=8")
+    assert "--set: for a new reconstruction, and --scene is a finished one" in capsys.readouterr().err

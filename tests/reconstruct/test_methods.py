@@ -96,7 +96,7 @@ def test_settings_from_the_command_line(file):
     assert (dense.frames, dense.max_gaussians, dense.merge) == (4, None, "concatenate")
     for given, text in [
         ("sky_px", r"--set takes NAME=VALUE, got 'sky_px'"),
-        ("sky=1", r"--set: there is no setting 'sky'; have \['colours', 'duration_s', 'ground'"),
+        ("sky=1", r"--set: there is no setting 'sky'; have \['colours', 'detail_px', 'duration_s', 'ground'"),
         ("views.sky=1", r"there is no setting 'views.sky'; have \['budget'"),
         ("sky_px.a=1", r"there is no setting 'sky_px.a'"),
         ("sky_px=x", r"--set sky_px=x: Input should be a valid integer"),

@@ -10,7 +10,13 @@ from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.lift import colour, depth, lifting, splat
 from nurec_sim.reconstruct.lift.ground import find_ground
 from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather
-from nurec_sim.reconstruct.lift.settings import GroundSettings, LiftSettings, PointSettings, ViewSettings
+from nurec_sim.reconstruct.lift.settings import (
+    ColourSettings,
+    GroundSettings,
+    LiftSettings,
+    PointSettings,
+    ViewSettings,
+)
 from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
 from nurec_sim.reconstruct.lift.surfaces import footprints, surface_of
 from nurec_sim.reconstruct.lift.views import choose_frames, read_views, tiles_of
@@ -266,7 +272,7 @@ def test_sky_without_any_view_is_grey():
 )
 def test_limits_follow_the_length_of_the_log(path_m, duration_s, lengths):
     given = LiftSettings(views=ViewSettings(max_views=40, max_frames=240, budget=900_000, pixels=10**6, width_px=640))
-    longer = given.for_log(path_m, duration_s)
+    longer = given.for_log(path_m, duration_s, [(640, 400, 10)])
     views = longer.views
     assert (views.max_views, views.max_frames) == (40 * lengths, 240 * lengths)
     assert (views.budget, views.pixels) == (900_000 * lengths, 10**6 * lengths)
@@ -283,6 +289,7 @@ def test_limits_follow_the_length_of_the_log(path_m, duration_s, lengths):
         (ViewSettings, {"min_depth_m": 200.0}, "below max_depth_m, got 200.0 and 150.0"),
         (LiftSettings, {"duration_s": 0.0}, "duration_s must be positive and finite, got 0.0"),
         (LiftSettings, {"most_lengths": 0.5}, "most_lengths must be 1 or more, got 0.5"),
+        (LiftSettings, {"most_detail": 0.0}, "most_detail must be 1 or more, got 0.0"),
     ],
 )
 def test_impossible_settings_are_named(make, changed, message):
@@ -290,11 +297,41 @@ def test_impossible_settings_are_named(make, changed, message):
         make(**changed)
 
 
+@pytest.mark.parametrize(
+    ("width_px", "reduction"),
+    [(640, 1), (960, 1), (961, 2), (1242, 2), (1600, 2), (1920, 3), (1936, 3), (3848, 6), (100, 1)],
+)
+def test_images_are_reduced_by_the_whole_number_that_comes_nearest(width_px, reduction):
+    """To 640 pixels; of two as near the smaller, which keeps more: 1600 becomes 800 and not 533."""
+    assert ViewSettings().reduction_of(width_px) == reduction
+
+
+@pytest.mark.parametrize(
+    ("path_m", "images", "limits"),
+    [
+        (20.0, [(1242, 375, 51)], 1.0),  # 621 x 187 a camera
+        (20.0, [(700, 500, 100)], 1.0),  # just what one length is for
+        (20.0, [(700, 500, 100)] * 3, 3**0.5),
+        (20.0, [(1400, 1000, 100)] * 3, 3**0.5),  # worked on at 700 x 500
+        (20.0, [(1600, 900, 100)] * 6, 2.0),  # 800 x 450 and six of them: 2.48, but no more than 2
+        (100.0, [(1600, 900, 100)] * 6, 4.0),  # twice as long
+        (300.0, [(1600, 900, 100)] * 6, 8.0),  # six times as long, but no more than 8
+        (20.0, [], 1.0),
+    ],
+)
+def test_limits_follow_what_the_cameras_see_at_once(path_m, images, limits):
+    """With the square root of the pixels beyond 350,000, all cameras together; the number of views does not."""
+    given = LiftSettings(views=ViewSettings(budget=100_000, max_views=40), colours=ColourSettings(images=50))
+    more = given.for_log(path_m, 1.0, images)
+    assert more.views.budget == round(100_000 * limits) and more.colours.images == round(50 * limits)
+    assert more.views.max_views == round(40 * max(path_m / 50, 1.0))
+
+
 def test_short_logs_of_large_images_are_worked_on_in_more_detail():
     """8 million pixels: 12 images of 1936 x 1216 fit at half their size; 300 do not even at a quarter, nor does 640."""
     settings = ViewSettings()
-    assert settings.for_images([(1936, 1216, 2)] * 6).width_px == 968
-    assert settings.for_images([(1936, 1216, 50)] * 6) == settings
-    assert settings.for_images([(1242, 375, 51)]) == settings  # 23.8 million at full size, 5.9 at half
-    assert settings.for_images([(1600, 900, 1)] * 5).width_px == 1600  # 7.2 million
-    assert settings.for_images([(320, 192, 10)]) == settings and settings.for_images([]) == settings
+    assert settings.widened([(1936, 1216, 2)] * 6).width_px == 968
+    assert settings.widened([(1936, 1216, 50)] * 6) == settings
+    assert settings.widened([(1242, 375, 51)]) == settings  # 23.8 million at full size, 5.9 at half
+    assert settings.widened([(1600, 900, 1)] * 5).width_px == 1600  # 7.2 million
+    assert settings.widened([(320, 192, 10)]) == settings and settings.widened([]) == settings

@@ -21,7 +21,7 @@ from nurec_sim.compute.cores import in_order, usable_cores
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.ego_images import shows_ego
 from nurec_sim.reconstruct.lift.colour import SATURATED
-from nurec_sim.reconstruct.lift.settings import LiftSettings
+from nurec_sim.reconstruct.lift.settings import LiftSettings, ViewSettings
 from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, border_weight
 from nurec_sim.reconstruct.optimize.responses import borrowed_responses
 from nurec_sim.render.cpu.backward.colours import spread_errors, spread_sky_errors
@@ -76,7 +76,7 @@ def solve_colours(
     step = -(-len(frames) // settings.colours.images)
     chosen = [(camera, k) for camera in cameras for k in range(0, len(times[camera]), step)]
     solve = ColourSolve(scene, settings.colours.trust, settings.colours.gain_pull)
-    weights = {camera: _pixel_weights(scene, camera, settings.views.width_px, len(cameras) > 1) for camera in cameras}
+    weights = {camera: _pixel_weights(scene, camera, settings.views, len(cameras) > 1) for camera in cameras}
     # In random order: of neighbours in time, which show the same, the later would correct the earlier.
     random, rounds = np.random.default_rng(0), settings.colours.images // len(chosen)
     order = [random.permutation(len(chosen)) for _ in range(min(max(rounds, 1), settings.colours.rounds))]
@@ -96,14 +96,16 @@ def solve_colours(
     return replace(solve.scene(), exposures=responses)
 
 
-def _pixel_weights(scene: GaussianScene, camera: str, width_px: int, several: bool) -> Float32[np.ndarray, "2 h w"]:
-    """Weights of the pixels of a camera, at its width divided by a whole number; see ``SolvedImage``.
+def _pixel_weights(
+    scene: GaussianScene, camera: str, views: ViewSettings, several: bool
+) -> Float32[np.ndarray, "2 h w"]:
+    """Weights of the pixels of a camera, at the size of its working views; see ``SolvedImage``.
 
     Pixels of the ego vehicle and past the lens count nothing. Among several cameras those near the border count less,
     and in the sky pixels count by their solid angle in texels: a longer lens would else outvote the others there.
     """
     model = scene.rig.cameras[camera]
-    reduction = max(1, -(-model.width_px // width_px))
+    reduction = views.reduction_of(model.width_px)
     width, height = model.width_px // reduction, model.height_px // reduction
     rays, seen = sensors.pixel_rays(sensors.scaled_camera(model, width, height))
     if (image := scene.ego_images.get(camera)) is None:

@@ -48,10 +48,9 @@ def lift(
         ReconstructError: the clip has no LiDAR sweep to build from.
     """
     path_m, span_us = float(arc_length(clip.ego.world_from_body[:, :3, 3])[-1]), clip.span_us[1] - clip.span_us[0]
-    given, settings = settings, settings.for_log(path_m, span_us / 1e6)
     images = [(model.width_px, model.height_px, len(clip.camera_times_us(camera)))
               for camera, model in clip.rig.cameras.items() if camera in cameras]  # fmt: skip
-    settings = dataclasses.replace(settings, views=settings.views.for_images(images))
+    given, settings = settings, settings.for_log(path_m, span_us / 1e6, images)
     stages = _Stages(progress)
     stages.start("sweeps")
     actors = points.actors_of(clip, settings.points)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -51,8 +52,8 @@ class ViewSettings:
     """The pinhole working views, their depth and the pixels lifted from them."""
 
     width_px: int = 640
-    """Working views have at most this width, by a whole-number reduction of the image; wider ones in short logs
-    (``for_images``)."""
+    """Working views have about this width, by a whole-number reduction of the image (``reduction_of``); wider ones in
+    short logs (``widened``)."""
     pixels: int = 8_000_000
     """Working views are wider as long as all images together have at most this many pixels."""
     max_field_deg: float = 110.0
@@ -108,17 +109,21 @@ class ViewSettings:
         level = np.arange(self.levels)
         return self.level_step * level * (1 - BEND + BEND * level / (self.levels - 1))
 
-    def for_images(self, sizes: Sequence[tuple[int, int, int]]) -> ViewSettings:
+    def reduction_of(self, width_px: int) -> int:
+        """By which whole number images of this width are reduced: the nearest to what ``width_px`` asks for."""
+        return max(1, math.ceil(width_px / self.width_px - 0.5))
+
+    def widened(self, images: Sequence[tuple[int, int, int]]) -> ViewSettings:
         """The settings with the largest ``width_px`` that ``pixels`` allows, but no smaller one.
 
         Args:
-            sizes: of each camera: width and height in pixels, and its number of images.
+            images: of each camera: width and height in pixels, and how many.
         """
-        share = min(1.0, self.max_frames / max(sum(count for _, _, count in sizes), 1))
-        for reduction in range(1, max((width for width, _, _ in sizes), default=1) // self.width_px + 1):
-            pixels = share * sum((width // reduction) * (height // reduction) * n for width, height, n in sizes)
+        share = min(1.0, self.max_frames / max(sum(count for _, _, count in images), 1))
+        for reduction in range(1, max((width for width, _, _ in images), default=1) // self.width_px + 1):
+            pixels = share * sum((width // reduction) * (height // reduction) * n for width, height, n in images)
             if pixels <= self.pixels:
-                widest = max(width for width, _, _ in sizes)
+                widest = max(width for width, _, _ in images)
                 return replace(self, width_px=max(self.width_px, -(-widest // reduction)))
         return self
 
@@ -143,7 +148,7 @@ class LiftSettings:
     """All settings of ``reconstruct(clip, "lift")``.
 
     The limits ``max_views``, ``max_frames``, ``pixels`` and ``budget`` of ``views``, and ``images`` of ``colours``, are
-    for logs of up to ``path_m`` and ``duration_s``; longer ones get more (``for_log``).
+    for logs of up to ``path_m`` and ``duration_s`` whose cameras have ``detail_px``; others get more (``for_log``).
     """
 
     points: PointSettings = field(default_factory=PointSettings)
@@ -157,6 +162,10 @@ class LiftSettings:
     duration_s: float = 5.0
     most_lengths: float = 8.0
     """Limits grow no further than this, which bounds time and memory."""
+    detail_px: int = 350_000
+    """Pixels of the working views of one instant, all cameras together."""
+    most_detail: float = 2.0
+    """``budget`` and ``images`` grow no further than this with the square root of the pixels."""
 
     def __post_init__(self) -> None:
         """Checks the lengths.
@@ -164,22 +173,31 @@ class LiftSettings:
         Raises:
             ValueError: one is not positive, or limits would shrink.
         """
-        for name in ("sky_px", "path_m", "duration_s"):
+        for name in ("sky_px", "path_m", "duration_s", "detail_px"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
-        if not self.most_lengths >= 1:
-            raise ValueError(f"most_lengths must be 1 or more, got {self.most_lengths}")
+        for name in ("most_lengths", "most_detail"):
+            if not getattr(self, name) >= 1:
+                raise ValueError(f"{name} must be 1 or more, got {getattr(self, name)}")
 
-    def for_log(self, path_m: float, duration_s: float) -> LiftSettings:
-        """The settings for a log of this length: limits in proportion to it, so that detail does not depend on it.
+    def for_log(self, path_m: float, duration_s: float, images: Sequence[tuple[int, int, int]]) -> LiftSettings:
+        """The settings for a log: limits that follow its length, and the size and number of its cameras.
+
+        Neighbouring pixels show much the same, and cameras overlap: the Gaussians that are worth their cost grow with
+        the square root of the pixels, as do the images that tell their colours.
 
         Args:
             path_m: length of the driven path, metres.
             duration_s: of the recording; where the car stands others move.
+            images: of each camera: width and height in pixels, and how many.
         """
         lengths = min(max(path_m / self.path_m, duration_s / self.duration_s, 1.0), self.most_lengths)
-        views = {
+        longer = {
             name: round(lengths * getattr(self.views, name)) for name in ("max_views", "max_frames", "pixels", "budget")
         }
-        colours = replace(self.colours, images=round(lengths * self.colours.images))
-        return replace(self, views=replace(self.views, **views), colours=colours)
+        views = replace(self.views, **longer).widened(images)
+        reduced = [(width // r, height // r) for width, height, _ in images for r in [views.reduction_of(width)]]
+        detail = math.sqrt(sum(width * height for width, height in reduced) / self.detail_px)
+        limits = min(lengths * min(max(detail, 1.0), self.most_detail), self.most_lengths)
+        views = replace(views, budget=round(limits * self.views.budget))
+        return replace(self, views=views, colours=replace(self.colours, images=round(limits * self.colours.images)))

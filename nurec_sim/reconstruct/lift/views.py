@@ -75,7 +75,7 @@ class WorkingView:
 
 def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
     """Cut a camera into pinhole tiles of at most ``max_field_deg``; one exact reduction if it is a plain pinhole."""
-    reduction = max(1, int(np.ceil(camera.width_px / settings.width_px)))
+    reduction = settings.reduction_of(camera.width_px)
     lens = camera.ideal_pinhole
     if lens is not None and abs(lens.fx_px - lens.fy_px) < 1e-3 * lens.fx_px:
         width, height = camera.width_px // reduction, camera.height_px // reduction
