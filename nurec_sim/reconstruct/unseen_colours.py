@@ -24,9 +24,9 @@ long."""
 ACROSS_M, UP_M = 10.0, 1.0
 """Distances along and across the ground that count like one standard deviation of the intensity, and like a surface
 that is level instead of upright: what is as high above the ground is alike over a long way along a street."""
-SMOOTHED = 24
-"""Intensities of what is not seen are medians of so many nearest ones: single returns differ by the laser and the angle
-as much as by the surface, and would give a road the colours of all of them side by side."""
+SMOOTHED, THINNED = 8, 3
+"""Intensities of what is not seen are medians of so many nearest ones, of every third Gaussian: single returns differ by
+the laser and the angle as much as by the surface, and would give a road the colours of all of them side by side."""
 
 
 def colours_by_likeness(gaussians: Gaussians, seen: Bool[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3"]:
@@ -53,7 +53,7 @@ def colours_by_likeness(gaussians: Gaussians, seen: Bool[np.ndarray, " n"]) -> F
 def _smoothed(gaussians: Gaussians, some: Int64[np.ndarray, " m"]) -> Float32[np.ndarray, " n"]:
     """The intensities, those of some Gaussians replaced by the median of their surroundings."""
     smooth = gaussians.intensity.copy()
-    known = np.flatnonzero(np.isfinite(smooth))
+    known = np.flatnonzero(np.isfinite(smooth))[::THINNED]
     some = some[np.isfinite(smooth[some])]
     if len(some):
         tree = cKDTree(gaussians.mean_m[known])

@@ -42,7 +42,7 @@ def test_the_colour_is_that_of_what_is_alike(lifted):
 
     Seven places stand a metre apart, each of so many Gaussians that their intensities are not mixed with the next.
     """
-    each = unseen_colours.SMOOTHED
+    each = 2 * unseen_colours.SMOOTHED * unseen_colours.THINNED
     kinds = np.array([0, 1, 2, 0, 1, 2, 0]).repeat(each)
     colours = np.array([[0, 1, 0], [1, 0, 0], [0.5, 0.5, 0.5]], np.float32)
     unseen = np.array([False, False, False, True, True, True, True]).repeat(each)
