@@ -25,8 +25,8 @@ ACROSS_M, UP_M = 10.0, 1.0
 """Distances along and across the ground that count like one standard deviation of the intensity, and like a surface
 that is level instead of upright: what is as high above the ground is alike over a long way along a street."""
 SMOOTHED, THINNED = 8, 3
-"""Intensities of what is not seen are medians of so many nearest ones, of every third Gaussian: single returns differ by
-the laser and the angle as much as by the surface, and would give a road the colours of all of them side by side."""
+"""Intensities of what is not seen are medians of so many nearest ones, of every third Gaussian: single returns differ
+by the laser and the angle as much as by the surface, and would give a road the colours of all of them side by side."""
 
 
 def colours_by_likeness(gaussians: Gaussians, seen: Bool[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3"]:

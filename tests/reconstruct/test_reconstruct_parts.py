@@ -59,6 +59,59 @@ def test_pavement_level_with_the_road_cannot_be_told_apart():
     assert ground.is_road(np.array([[10.0, 6.0, 0.0]]))[0]
 
 
+@pytest.mark.parametrize(("size_m", "road"), [((1.3, 1.3), True), ((4.0, 1.5), False)])
+def test_islands_of_two_square_metres_are_not_road(size_m, road):
+    """Raised by 12 cm in the middle of a lane: smaller than that it is no island, but uneven asphalt."""
+    points = ground_points(STEP_M)
+    raised = (np.abs(points[:, :2] - [10, 2]) < np.array(size_m) / 2).all(axis=1)
+    points[raised, 2] += 0.12
+    assert find_ground(points, drive(), GroundSettings()).is_road(np.array([[10.0, 2.0, 0.12]]))[0] == road
+
+
+def test_what_lies_under_a_standing_car_is_road():
+    """Nobody sees the asphalt below it, but for a few returns from its underbody."""
+    points = ground_points(STEP_M)
+    car = (np.abs(points[:, :2] - [10, 2]) < (2.2, 0.9)).all(axis=1)
+    returns = np.column_stack([np.random.default_rng(2).uniform([9.5, 1.9], [10.5, 2.1], (60, 2)), np.full(60, 0.15)])
+    ground = find_ground(np.concatenate([points[~car], returns]), drive(), GroundSettings())
+    x, y = np.meshgrid(np.arange(8, 12, 0.1), np.arange(1.1, 3.0, 0.1))
+    row, column, _ = ground.cells(np.column_stack([x.ravel(), y.ravel(), 0 * y.ravel()]))
+    assert ground.road[row, column].all()
+
+
+@pytest.mark.parametrize("bend_m", [np.inf, 60.0])
+def test_the_kerb_goes_on_behind_a_parked_car(bend_m):
+    """The car hides 4.4 m of the kerb, 1.6 m of the road before it and 0.4 m of the pavement; so too in a bend."""
+    points, poses = ground_points(STEP_M), drive()
+    hidden = (np.abs(points[:, :2] - [10, KERB_M - 0.6]) < (2.2, 1.0)).all(axis=1)
+    x, y = np.meshgrid(np.arange(8.0, 12.0, 0.1), np.arange(KERB_M - 1.5, KERB_M + 0.9, 0.1))
+    at = np.column_stack([x.ravel(), y.ravel(), 0 * y.ravel()])
+    for xyz in (points, at):
+        xyz[:, 1] += xyz[:, 0] ** 2 / 2 / bend_m
+    poses[:, 1, 3] = poses[:, 0, 3] ** 2 / 2 / bend_m
+    yaw = np.arctan(poses[:, 0, 3] / bend_m)
+    poses[:, :2, :2] = np.stack([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]).transpose(2, 0, 1)
+    ground = find_ground(points[~hidden], poses, GroundSettings())
+    row, column, _ = ground.cells(at)
+    road, beyond = ground.road[row, column], y.ravel() - KERB_M
+    assert road[beyond < -0.25].mean() > 0.99 and road[beyond > 0.25].mean() < 0.01
+
+
+def test_returns_from_under_a_parked_car_tell_heights_but_do_not_fence_off_the_road():
+    """A ring of returns from wheels and sills, 8 cm up; within it some from the road, 3 cm lower than around it."""
+    points = ground_points(STEP_M)
+    car = (np.abs(points[:, :2] - [10, 2.3]) < (2.2, 0.9)).all(axis=1)
+    inner = (np.abs(points[:, :2] - [10, 2.3]) < (1.8, 0.6)).all(axis=1)
+    under = points[car] - np.where(inner[car], 0.03, -0.08)[:, None] * (0, 0, 1)
+    ground = find_ground(points[~car], drive(), GroundSettings(), under)
+    x, y = np.meshgrid(np.arange(7.9, 12.1, 0.1), np.arange(1.5, 3.1, 0.1))
+    row, column, _ = ground.cells(np.column_stack([x.ravel(), y.ravel(), 0 * y.ravel()]))
+    assert ground.road[row, column].all()
+    middle = (np.abs(x - 10) < 1.3).ravel() & (np.abs(y - 2.3) < 0.3).ravel()
+    assert ground.height_m[row, column][middle].mean() == pytest.approx(-0.03, abs=0.005)
+    assert ground.height_m[row, column].max() < 0.02, "no wheels"
+
+
 def test_ground_holes_are_filled_flat():
     points = ground_points(STEP_M)
     hole = np.linalg.norm(points[:, :2] - [8, 0], axis=1) < 2.0

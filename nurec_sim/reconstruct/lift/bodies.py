@@ -70,8 +70,8 @@ def surfels_of(
         The static world's surfels first, then one entry per actor; and the ground.
     """
     feet = [world for _, world in gathered.feet.values()]
-    everything = np.concatenate([gathered.static.xyz_m, *feet])
-    ground = find_ground(everything, clip.ego.world_from_body, settings.ground)
+    under = np.concatenate(feet) if feet else None
+    ground = find_ground(gathered.static.xyz_m, clip.ego.world_from_body, settings.ground, under)
     static = gathered.static
     sheet, standing = ground.sheet(static), static[~(np.abs(ground.above(static.xyz_m)) < 0.08)]
     if settings.points.carve:

@@ -1,4 +1,4 @@
-"""The ground as a height grid, and the road grown in it from the driven path up to the kerbs."""
+"""The ground as a height grid, fitted to the lowest points near the driven path."""
 
 from __future__ import annotations
 
@@ -9,19 +9,17 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from nurec_sim.reconstruct.lift.points import Cloud
+from nurec_sim.reconstruct.lift.road import DRIVEN_M, FILL_M, grow_road
 from nurec_sim.reconstruct.lift.settings import GroundSettings
 
 MAX_CELLS = 16_000_000
 """Larger grids get larger cells."""
 BAND_M, BAND_SLOPE = 0.4, 0.08
 """Ground is looked for this far above and below the driven path, and this much more per metre away from it."""
-FILL_M = 3.0
-"""Holes are filled up to this far from measured ground."""
-
+UNDER_M = 0.05
+"""Returns from under a vehicle are of the ground if they lie this near to it, and else of wheels and sills."""
 ENOUGH_SHARE, ENOUGH_CELLS = 0.12, 3.0
 """A hole is filled with the mean under the narrowest Gaussian that holds this share of measured cells, or as many."""
-SEEN_M = 0.4
-"""Ground this close to a measured cell counts as seen."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +98,20 @@ class Ground:
 
 
 def find_ground(
-    xyz_m: Float64[np.ndarray, "n 3"], world_from_rig: Float64[np.ndarray, "k 4 4"], settings: GroundSettings
+    xyz_m: Float64[np.ndarray, "n 3"],
+    world_from_rig: Float64[np.ndarray, "k 4 4"],
+    settings: GroundSettings,
+    under_m: Float64[np.ndarray, "m 3"] | None = None,
 ) -> Ground:
-    """Fit the height grid to the lowest points near the driven path and grow the road from it."""
+    """Fit the height grid to the lowest points near the driven path and grow the road from it.
+
+    Args:
+        xyz_m: points of the static world.
+        world_from_rig: the driven path.
+        settings: cells, and what ends a road.
+        under_m: points in the lowest part of boxes. Where nothing else was measured they tell heights, but not where
+            the road ends: a ring of returns from wheels would fence off what is under a parked car.
+    """
     from scipy.spatial import cKDTree
 
     path = densify_path(world_from_rig)
@@ -116,9 +125,12 @@ def find_ground(
     distance = cv2.resize(distance.astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
     expected = cv2.resize(path[nearest, 2].astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
 
-    index = np.floor((xyz_m[:, :2] - low) / cell).astype(np.int64)
-    inside = np.all((index >= 0) & (index < (columns, rows)), axis=1)
-    points, flat = xyz_m[inside], index[inside, 1] * columns + index[inside, 0]
+    def in_grid(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        index = np.floor((xyz[:, :2] - low) / cell).astype(np.int64)
+        inside = np.all((index >= 0) & (index < (columns, rows)), axis=1)
+        return xyz[inside], index[inside, 1] * columns + index[inside, 0]
+
+    points, flat = in_grid(xyz_m)
     offset = points[:, 2] - expected.reshape(-1)[flat]
     # The band widens with the distance: the ground may slope away from the path.
     band = np.abs(offset) < BAND_M + BAND_SLOPE * distance.reshape(-1)[flat]
@@ -130,14 +142,17 @@ def find_ground(
     known &= distance <= settings.reach_m
     known = _drop_raised(height, known, cell)
     filled = _fill(height, known)
-    steps = _steps(filled, cell, settings)
-    tall = _tall(points, flat, filled, rows, columns)
+    above = points[:, 2] - filled.reshape(-1)[flat]
+    tall = np.bincount(flat[(above > 0.2) & (above < 1.5)], minlength=rows * columns).reshape(rows, columns) >= 2
+    road = grow_road(filled, known, tall, distance, low, cell, world_from_rig, settings)
+    if under_m is not None:
+        points, flat = in_grid(under_m)
+        below = np.abs(points[:, 2] - filled.reshape(-1)[flat]) < UNDER_M
+        more, measured = _low_heights(points[below, 2], flat[below], rows, columns)
+        filled, known = _fill(np.where(known, height, more), known | measured), known | measured
     near = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) * cell <= FILL_M
-    free = ~steps & ~tall & near & (distance <= settings.road_reach_m)
-    seen = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) * cell <= SEEN_M
-    road = _grow(free, seen | (distance < 1.2), filled, distance, cell, settings)
     stride = np.where(distance < 8, 1, np.where(distance < 16, 2, 4)).astype(np.uint8)
-    return Ground(low, cell, filled, known, near | (distance < 1.2), road, stride)
+    return Ground(low, cell, filled, known, near | (distance < DRIVEN_M), road, stride)
 
 
 def densify_path(world_from_rig: Float64[np.ndarray, "k 4 4"], step_m: float = 0.1) -> Float64[np.ndarray, "m 3"]:
@@ -199,71 +214,3 @@ def _fill(height: np.ndarray, known: np.ndarray) -> np.ndarray:
     if done.any() and not done.all():
         result[~done] = np.median(result[done])
     return result
-
-
-def _steps(height: np.ndarray, cell_m: float, settings: GroundSettings) -> np.ndarray:
-    """Cells with a height step across 0.4 m in any of four directions."""
-    reach = max(int(round(0.2 / cell_m)), 1)
-    limit = settings.step_m + settings.slope * 2 * reach * cell_m
-    steps = np.zeros(height.shape, bool)
-    for dy, dx, stretch in ((0, reach, 1.0), (reach, 0, 1.0), (reach, reach, 1.4), (reach, -reach, 1.4)):
-        rise = np.roll(height, (-dy, -dx), (0, 1)) - np.roll(height, (dy, dx), (0, 1))
-        steps |= np.abs(rise) > (limit if stretch == 1.0 else settings.step_m + settings.slope * 2.8 * reach * cell_m)
-    return steps
-
-
-def _tall(points: np.ndarray, flat: np.ndarray, filled: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Cells with an upright object: two or more points between 0.2 and 1.5 m above the ground."""
-    above = points[:, 2] - filled.reshape(-1)[flat]
-    count = np.bincount(flat[(above > 0.2) & (above < 1.5)], minlength=rows * columns)
-    return (count >= 2).reshape(rows, columns)
-
-
-def _grow(
-    free: np.ndarray,
-    seen: np.ndarray,
-    height: np.ndarray,
-    distance: np.ndarray,
-    cell_m: float,
-    settings: GroundSettings,
-) -> np.ndarray:
-    """The part of the free cells that the path reaches, out to the kerb.
-
-    Through seen cells only, because interpolation under a parked car turns a kerb into a ramp; through gaps wider than
-    twice the opening; and no cell may lie far above or below the road beside it, which stops what leaks all the same.
-    """
-    driven = distance < 0.9
-    room = cv2.distanceTransform((free & seen | driven).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
-    wide = (room > settings.opening_m) | driven
-    reached = driven.copy()
-    ring = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(round(0.4 / cell_m), 1) + 1,) * 2)
-    for _ in range(round(settings.road_reach_m / 0.4)):
-        # Compared with the road already reached beside it, not with the path: roads have crowns and ramps.
-        level = _beside(height, reached, 0.5 / cell_m)
-        grown = wide & (cv2.dilate(reached.astype(np.uint8), ring) > 0) & (np.abs(height - level) < settings.step_m)
-        if not (grown & ~reached).any():
-            break
-        reached |= grown
-    away = cv2.distanceTransform((~reached).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
-    road = reached | (free & seen & (away <= settings.opening_m + 1.5 * cell_m))
-    # The step test reaches 0.2 m across the kerb: give back what still lies as low as the road beside it.
-    away = cv2.distanceTransform((~road).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
-    road |= seen & (away <= 0.3) & (np.abs(height - _beside(height, road, 0.15 / cell_m)) < settings.step_m)
-    # What nobody saw belongs to whatever lies next to it.
-    unseen, nearest = cv2.distanceTransformWithLabels(
-        (~seen).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    is_road = np.zeros(nearest.max() + 1, bool)
-    is_road[nearest[seen & road]] = True
-    road |= ~seen & is_road[nearest] & (unseen * cell_m <= FILL_M)
-    count, part, stats, _ = cv2.connectedComponentsWithStats((~road).astype(np.uint8), connectivity=4)
-    small = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] * cell_m**2 < 1.0)
-    return road | np.isin(part, small)
-
-
-def _beside(height: np.ndarray, part: np.ndarray, sigma: float) -> np.ndarray:
-    """Height of the nearest cells of a part: their mean under a Gaussian, infinite where none is near."""
-    weight = part.astype(np.float32)
-    total = cv2.GaussianBlur(np.where(part, height, 0).astype(np.float32), (0, 0), sigma)
-    mass = cv2.GaussianBlur(weight, (0, 0), sigma)
-    return np.where(mass > 1e-3, total / np.maximum(mass, 1e-3), np.inf)
