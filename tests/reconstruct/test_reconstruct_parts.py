@@ -94,7 +94,7 @@ def test_the_kerb_goes_on_behind_a_parked_car(bend_m):
     ground = find_ground(points[~hidden], poses, GroundSettings())
     row, column, _ = ground.cells(at)
     road, beyond = ground.road[row, column], y.ravel() - KERB_M
-    assert road[beyond < -0.25].mean() > 0.99 and road[beyond > 0.25].mean() < 0.01
+    assert road[beyond < -0.15].mean() > 0.99 and road[beyond > 0.15].mean() < 0.01
 
 
 def test_returns_from_under_a_parked_car_tell_heights_but_do_not_fence_off_the_road():

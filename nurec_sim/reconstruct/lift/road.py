@@ -12,8 +12,8 @@ from nurec_sim.reconstruct.lift.settings import GroundSettings
 
 FILL_M = 3.0
 """Holes are filled up to this far from measured ground."""
-SEEN_M = 0.4
-"""Ground this close to a measured cell counts as seen."""
+SEEN_M, SURE_M = 0.4, 0.15
+"""Ground this close to a measured cell counts as seen: where the road may grow, and where its edge is certain."""
 DRIVEN_M = 1.2
 """Ground this close to the driven path counts as seen: the car drove there."""
 ISLAND_M2 = 2.0
@@ -50,7 +50,9 @@ def grow_road(
     free &= distance_m <= settings.road_reach_m
     seen = (from_known <= SEEN_M) | (distance_m < DRIVEN_M)
     road = _grow(free, seen, height_m, distance_m, cell_m, settings)
-    return _without_islands(_continued(road, seen, corner_m, cell_m, world_from_rig), seen, cell_m)
+    sure = (from_known <= SURE_M) | (distance_m < DRIVEN_M)
+    hidden = ~sure & (from_known <= FILL_M) & (distance_m <= settings.road_reach_m)
+    return _without_islands(_continued(road, sure, hidden, corner_m, cell_m, world_from_rig), seen, cell_m)
 
 
 def _steps(height: np.ndarray, cell_m: float, settings: GroundSettings) -> np.ndarray:
@@ -99,27 +101,27 @@ def _grow(
 
 def _continued(
     road: Bool[np.ndarray, "rows columns"],
-    seen: Bool[np.ndarray, "rows columns"],
+    sure: Bool[np.ndarray, "rows columns"],
+    hidden: Bool[np.ndarray, "rows columns"],
     corner_m: Float64[np.ndarray, " 2"],
     cell_m: float,
     world_from_rig: Float64[np.ndarray, "k 4 4"],
 ) -> Bool[np.ndarray, "rows columns"]:
-    """The road with what nobody saw: it belongs to what lies next to it along the drive, rather than across.
+    """The road with what is hidden: it belongs to what is sure next to it along the drive, rather than across.
 
     A parked car hides the kerb beside it, which goes on as it does before and behind the car.
     """
     from scipy.spatial import cKDTree
 
-    unseen = cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, 5) * cell_m
-    border = np.nonzero(seen & (cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0))
-    hidden = np.nonzero((unseen > 0) & (unseen <= FILL_M))
-    road = road & seen
+    border = np.nonzero(sure & (cv2.erode(sure.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0))
+    within = np.nonzero(hidden)
+    road = road & sure
     if len(border[0]):
         beside_border, beside_hidden = (
             _along_and_across(corner_m + (np.column_stack(cells[::-1]) + 0.5) * cell_m, world_from_rig) * (ALONG, 1.0)
-            for cells in (border, hidden)
+            for cells in (border, within)
         )
-        road[hidden] = road[border][cKDTree(beside_border).query(beside_hidden, workers=usable_cores())[1]]
+        road[within] = road[border][cKDTree(beside_border).query(beside_hidden, workers=usable_cores())[1]]
     return road
 
 
