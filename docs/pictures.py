@@ -50,7 +50,7 @@ def main(log: Path, archive: Path) -> None:
                 text = "rendered, same pose"
             view = render.render_view(renderer, camera, frame, left_m=left_m, yaw_deg=yaw_deg)
             pictures.append(captioned(view.rgb, text))
-        (IMAGES / f"gallery_{name}.jpg").write_bytes(display.jpeg(sheet(pictures, 2), 70))
+        (IMAGES / f"gallery_{name}.jpg").write_bytes(display.jpeg(sheet(pictures, 2), 64))
         if name == "turn":
             chain = [pictures[0], pictures[1], captioned(render.render_view(renderer, camera, frame, left_m=1.5).rgb,
                                                          "rendered, 1.5 m to the left")]  # fmt: skip
