@@ -112,6 +112,13 @@ def test_returns_from_under_a_parked_car_tell_heights_but_do_not_fence_off_the_r
     assert ground.height_m[row, column].max() < 0.02, "no wheels"
 
 
+def test_a_car_may_go_back_on_its_own_track():
+    there, points = drive()[:11], ground_points(STEP_M)
+    hidden = np.linalg.norm(points[:, :2] - [8, 3], axis=1) < 0.5
+    ground = find_ground(points[~hidden], np.concatenate([there, there[-2::-1]]), GroundSettings())
+    assert ground.is_road(np.array([[8.0, 3.0, 0.0]]))[0]
+
+
 def test_ground_holes_are_filled_flat():
     points = ground_points(STEP_M)
     hole = np.linalg.norm(points[:, :2] - [8, 0], axis=1) < 2.0

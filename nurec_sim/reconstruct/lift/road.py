@@ -144,7 +144,8 @@ def _along_and_across(
     at = np.arange(0.0, length[-1])
     line = np.column_stack([np.interp(at, length, corners[:, k]) for k in (0, 1)])
     ahead = np.gradient(line, axis=0)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    # It is zero where the car turned back on its own track.
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     nearest = cKDTree(line).query(xy_m, workers=usable_cores())[1]
     offset, ahead = xy_m - line[nearest], ahead[nearest]
     return np.column_stack(
