@@ -192,9 +192,7 @@ class LiftSettings:
             images: of each camera: width and height in pixels, and how many.
         """
         lengths = min(max(path_m / self.path_m, duration_s / self.duration_s, 1.0), self.most_lengths)
-        longer = {
-            name: round(lengths * getattr(self.views, name)) for name in ("max_views", "max_frames", "pixels", "budget")
-        }
+        longer = {name: round(lengths * getattr(self.views, name)) for name in ("max_views", "max_frames", "pixels")}
         views = replace(self.views, **longer).widened(images)
         reduced = [(width // r, height // r) for width, height, _ in images for r in [views.reduction_of(width)]]
         detail = math.sqrt(sum(width * height for width, height in reduced) / self.detail_px)
