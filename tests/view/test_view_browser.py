@@ -1,5 +1,6 @@
 """The viewer in a real browser, and its command."""
 
+import contextlib
 import os
 import signal
 import socket
@@ -59,11 +60,8 @@ def stop_playing(page, tab):
     """Clicks on Play, again if nothing happens: on a busy machine the panel may be drawn anew under the click."""
     for _ in range(4):
         page.drag(*[control(page, "Play")] * 2, steps=1)
-        end = time.monotonic() + 8.0
-        while time.monotonic() < end:
-            if not tab.session.playing:
-                return
-            time.sleep(0.1)
+        with contextlib.suppress(AssertionError):
+            return page.wait(lambda: not tab.session.playing, "play stops", 8.0)
     raise AssertionError("play does not stop")
 
 
