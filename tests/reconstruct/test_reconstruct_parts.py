@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from reconstruct_street import KERB_M, STEP_M, Street, camera
 
 from nurec_sim import geometry, sensors
-from nurec_sim.reconstruct.lift import colour, depth, lifting, splat
+from nurec_sim.reconstruct.lift import colour, depth, lifting, road, splat
 from nurec_sim.reconstruct.lift.ground import find_ground
 from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather
 from nurec_sim.reconstruct.lift.settings import (
@@ -110,6 +110,20 @@ def test_returns_from_under_a_parked_car_tell_heights_but_do_not_fence_off_the_r
     middle = (np.abs(x - 10) < 1.3).ravel() & (np.abs(y - 2.3) < 0.3).ravel()
     assert ground.height_m[row, column][middle].mean() == pytest.approx(-0.03, abs=0.005)
     assert ground.height_m[row, column].max() < 0.02, "no wheels"
+
+
+def test_places_beside_the_drive_are_those_of_the_projection_onto_its_line():
+    """On a circle of 60 m radius and before its start; half a metre from a sample, 14 m aside, 14/60 of that at most."""
+    angle = np.arange(0.0, 1.0, 1 / 60)
+    poses = np.stack([geometry.pose_from_xyyaw(60 * np.sin(a), 60 * (1 - np.cos(a)), a) for a in angle])
+    xy = np.random.default_rng(3).uniform([-20, -10], [40, 20], (500, 2))
+    line = np.concatenate([[[-road.BEYOND_M, 0.0]], poses[:, :2, 3]])
+    along, left = geometry.project_to_polyline(xy, line)
+    got = road._along_and_across(xy, poses)
+    near = np.abs(left) < 14
+    assert near.sum() > 300
+    assert got[near, 0] == pytest.approx(along[near], abs=0.5 * 14 / 60 + 0.02)
+    assert got[near, 1] == pytest.approx(left[near], abs=0.02)
 
 
 def test_a_car_may_go_back_on_its_own_track():

@@ -135,7 +135,11 @@ def _without_islands(road: np.ndarray, seen: np.ndarray, cell_m: float) -> np.nd
 def _along_and_across(
     xy_m: Float64[np.ndarray, "n 2"], world_from_rig: Float64[np.ndarray, "k 4 4"]
 ) -> Float64[np.ndarray, "n 2"]:
-    """Metres along the driven path, which goes on straight beyond its ends, and to its left."""
+    """Metres along the driven path, which goes on straight beyond its ends, and to its left.
+
+    ``geometry.project_to_polyline`` for hundreds of thousands of points: the nearest of samples a metre apart decides,
+    and not the nearest of all segments.
+    """
     from scipy.spatial import cKDTree
 
     driven, ends = world_from_rig[:, :2, 3], world_from_rig[[0, -1], :2, 0] * BEYOND_M
