@@ -113,7 +113,7 @@ def test_returns_from_under_a_parked_car_tell_heights_but_do_not_fence_off_the_r
 
 
 def test_places_beside_the_drive_are_those_of_the_projection_onto_its_line():
-    """On a circle of 60 m radius and before its start; half a metre from a sample, 14 m aside, 14/60 of that at most."""
+    """On a circle of 60 m radius and before its start; half a metre from a sample, 14 m aside, 14/60 of that off."""
     angle = np.arange(0.0, 1.0, 1 / 60)
     poses = np.stack([geometry.pose_from_xyyaw(60 * np.sin(a), 60 * (1 - np.cos(a)), a) for a in angle])
     xy = np.random.default_rng(3).uniform([-20, -10], [40, 20], (500, 2))
