@@ -19,6 +19,7 @@ from nurec_sim.types import (
     Sweep,
     Trajectory,
 )
+from nurec_sim.types.rows import rows_of
 
 
 def straight(*t_us: int) -> Trajectory:
@@ -114,3 +115,19 @@ def test_an_opened_clip_has_all_that_the_protocol_names():
     attributes = {"id", "rig", "ego", "tracks", "road_map", "time_offset_us"}
     assert attributes < names
     assert names - attributes <= set(dir(logs.Clip))
+
+
+@pytest.mark.parametrize(
+    "index", [np.array([3, 0, 3, -1]), np.arange(5) % 2 == 0, slice(1, 4), np.array([], np.int64), np.zeros(5, bool)]
+)
+def test_rows_of_arrays_are_those_that_numpy_indexes(index):
+    arrays = [np.arange(5.0), np.arange(15).reshape(5, 3), np.arange(40, dtype=np.uint8).reshape(5, 2, 4)]
+    for found, array in zip(rows_of(arrays, index), arrays, strict=True):
+        np.testing.assert_array_equal(found, array[index])
+        assert found.dtype == array.dtype
+
+
+@pytest.mark.parametrize("index", [np.ones(4, bool), np.ones(6, bool), np.array([5])])
+def test_rows_that_arrays_do_not_have_are_refused(index):
+    with pytest.raises(IndexError):
+        rows_of([np.arange(5.0), np.zeros((5, 3))], index)

@@ -18,15 +18,15 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def in_order(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+def in_order(function: Callable[[Item], Result], items: Iterable[Item], ahead: int | None = None) -> Iterator[Result]:
     """Results of a function for each item, in the order of the items, computed by as many threads as there are cores.
 
-    Only a few items are begun before their results are taken, which bounds memory. An exception of the function is
-    raised where its result is due; items that have not begun by then are left out.
+    Only a few items are begun before their results are taken, which bounds memory: ``ahead``, or two per core. An
+    exception of the function is raised where its result is due; items that have not begun by then are left out.
     """
     rest, cores = iter(items), usable_cores()
     with ThreadPoolExecutor(cores) as pool:
-        begun = deque(pool.submit(function, item) for item in islice(rest, 2 * cores))
+        begun = deque(pool.submit(function, item) for item in islice(rest, 2 * cores if ahead is None else ahead))
         try:
             while begun:
                 result = begun.popleft().result()

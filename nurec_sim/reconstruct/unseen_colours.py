@@ -40,10 +40,11 @@ def colours_by_likeness(gaussians: Gaussians, seen: Bool[np.ndarray, " n"]) -> F
     known, unknown = np.flatnonzero(seen), np.flatnonzero(~seen)
     if not len(known) or not len(unknown):
         return rgb
-    features = _features(replace(gaussians, intensity=_smoothed(gaussians, unknown)))
+    smooth = replace(gaussians, intensity=_smoothed(gaussians, unknown))
     known = known[:: -(-len(known) // MOST_SEEN)]
     ranks = np.arange(1, min(NEIGHBOURS, len(known)) + 1)
-    distance, nearest = cKDTree(features[known]).query(features[unknown], k=ranks, eps=INEXACT, workers=usable_cores())
+    tree = cKDTree(_features(smooth, known))
+    distance, nearest = tree.query(_features(smooth, unknown), k=ranks, eps=INEXACT, workers=usable_cores())
     weight = 1 / (distance + 1e-3) ** 2
     weight /= weight.sum(axis=1, keepdims=True)
     rgb[unknown] = np.einsum("kc,kci->ki", weight, gaussians.rgb[known[nearest]])
@@ -63,13 +64,13 @@ def _smoothed(gaussians: Gaussians, some: Int64[np.ndarray, " m"]) -> Float32[np
     return smooth
 
 
-def _features(gaussians: Gaussians) -> Float64[np.ndarray, "n 6"]:
+def _features(gaussians: Gaussians, some: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 6"]:
     """What tells whether Gaussians are alike: place, whether they are level, intensity, and whether they are road."""
-    intensity = gaussians.intensity.astype(np.float64)
-    known = np.isfinite(intensity)
-    level, spread = (intensity[known].mean(), intensity[known].std()) if known.any() else (0.0, 0.0)
-    place = gaussians.mean_m.astype(np.float64) / (ACROSS_M, ACROSS_M, UP_M)
-    bright = np.where(known, (intensity - level) / max(spread, 1e-6), 0.0)
+    everywhere = gaussians.intensity[np.isfinite(gaussians.intensity)].astype(np.float64)
+    level, spread = (everywhere.mean(), everywhere.std()) if len(everywhere) else (0.0, 0.0)
+    intensity = gaussians.intensity[some].astype(np.float64)
+    place = gaussians.mean_m[some].astype(np.float64) / (ACROSS_M, ACROSS_M, UP_M)
+    bright = np.where(np.isfinite(intensity), (intensity - level) / max(spread, 1e-6), 0.0)
     # Like an outlier of the intensity: road is coloured by road.
-    road = 3.0 * (gaussians.label == Label.ROAD)
-    return np.column_stack([place, np.abs(gaussians.normal[:, 2]), bright, road])
+    road = 3.0 * (gaussians.label[some] == Label.ROAD)
+    return np.column_stack([place, np.abs(gaussians.normal[some, 2]), bright, road])

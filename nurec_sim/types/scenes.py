@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
 from nurec_sim import display
 from nurec_sim.types.logs import RoadMap, Track
+from nurec_sim.types.rows import rows_of
 from nurec_sim.types.sensors import Rig
 from nurec_sim.types.trajectories import Trajectory
 
@@ -59,10 +60,8 @@ class Gaussians:
         return f"Gaussians({len(self):,}, {harmonics} harmonics beyond the colour)"
 
     def __getitem__(self, index: np.ndarray | slice) -> Gaussians:
-        fields: dict[str, Any] = {name: getattr(self, name)[index] for name in GAUSSIAN_FIELDS}
-        for name in OPTIONAL_GAUSSIAN_FIELDS:
-            values = getattr(self, name)
-            fields[name] = None if values is None else values[index]
+        given = [name for name in (*GAUSSIAN_FIELDS, *OPTIONAL_GAUSSIAN_FIELDS) if getattr(self, name) is not None]
+        fields: dict[str, Any] = dict(zip(given, rows_of((getattr(self, name) for name in given), index), strict=True))
         return Gaussians(**fields)
 
     @classmethod

@@ -30,6 +30,20 @@ def test_only_a_few_items_are_begun_before_their_results_are_taken(monkeypatch):
     assert len(taken) <= 3 + 2 * 2
 
 
+def test_items_that_are_begun_beside_a_long_one_do_not_wait_for_its_result(monkeypatch):
+    monkeypatch.setattr(cores, "usable_cores", lambda: 2)
+    last_done = threading.Event()
+
+    def work(item):
+        if item == 0:
+            assert last_done.wait(10)
+        if item == 19:
+            last_done.set()
+        return item
+
+    assert list(in_order(work, range(20), ahead=20)) == list(range(20))
+
+
 def test_an_error_comes_where_its_result_is_due():
     results = in_order(lambda item: 1 / item, [1, 0, 2])
     assert next(results) == 1

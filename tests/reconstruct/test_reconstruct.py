@@ -181,7 +181,7 @@ def test_progress_names_stages_in_order(street):
     reconstruct(Street(frames=1), settings=SMALL, progress=lambda stage, fraction: seen.append((stage, fraction)))
     stages = list(dict.fromkeys(stage for stage, _ in seen))
     assert stages == [
-        "sweeps", "ground and surfaces", "images", "depth", "colours", "lifting", "sky", "solving colours",
+        "sweeps", "ground and surfaces", "images", "depth", "colours", "lifting", "solving colours",
         "ray drop",
     ]  # fmt: skip
     told = [fraction for _, fraction in seen]

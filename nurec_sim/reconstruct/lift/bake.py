@@ -179,8 +179,7 @@ def body_gaussians(
         # the other. There in the end only pixels that are still there own.
         stays[~stays] = taken
         owns = lifting.owning([picture.body for picture in pictures], pixels, stays)
-        left = rest[~taken]
-        left = left[on_level(left, ground)]
+        left = rest[~taken & on_level(rest, ground)]
         more.append(left[_owned(left, body, views, pictures, rgb, settings, owns)])
     parts.append(outside_free_space(Lifted.concatenate(more), body, ground, settings, beams)[0])
     cloud = body.cloud
@@ -189,12 +188,23 @@ def body_gaussians(
     keep = (pixel > 3 * body.spacing_m) & (np.isfinite(pixel) | (through == 0))
     seen = np.isfinite(pixel)
     colours = np.where(seen[:, None], seen_rgb / np.float32(255), colour.grey_of(cloud.intensity))
-    discs = surfaces.discs(cloud.xyz_m[keep], body.normal[keep], body.sigma_m[keep], colours[keep],
-                           cloud.intensity[keep], body.label[keep], settings.opacity)  # fmt: skip
+    discs = _discs(body, colours, np.flatnonzero(keep), settings.opacity)
     stays = ~body.in_free_space(discs, beams)
     made, lifted = Gaussians.concatenate([*parts, discs[stays]]), sum(map(len, parts))
     shown = np.concatenate([np.ones(lifted, bool), seen[keep][stays]])
     return replace(made, rgb=colours_by_likeness(made, shown)), lifted
+
+
+def _discs(body: Surfels, colours: np.ndarray, rows: np.ndarray, opacity: float) -> Gaussians:
+    """Some surfels of a body, with these colours of all of them, as Gaussians."""
+    cloud = body.cloud
+
+    def made(part: slice) -> Gaussians:
+        mine = rows[part]
+        return surfaces.discs(cloud.xyz_m[mine], body.normal[mine], body.sigma_m[mine], colours[mine],
+                              cloud.intensity[mine], body.label[mine], opacity)  # fmt: skip
+
+    return Gaussians.concatenate([Gaussians.empty(), *in_order(made, parts_of(len(rows)))])
 
 
 def _owned(

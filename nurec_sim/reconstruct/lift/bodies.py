@@ -8,12 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.free_space import SweepBeams, balls, count_beams, in_free_space, is_free
 from nurec_sim.reconstruct.lift import points, surfaces
 from nurec_sim.reconstruct.lift.ground import Ground, find_ground
 from nurec_sim.reconstruct.lift.points import Actor, Cloud, Gathered
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.types import Clip, Gaussians, Label
+
+SHEET_M = 0.08
+"""Points so near to the ground are part of its sheet."""
 
 
 @dataclass(frozen=True)
@@ -72,32 +76,40 @@ def surfels_of(
     feet = [world for _, world in gathered.feet.values()]
     under = np.concatenate(feet) if feet else None
     ground = find_ground(gathered.static.xyz_m, clip.ego.world_from_body, settings.ground, under)
+
+    def made(number: int) -> Surfels:
+        if number == 0:
+            return _world_surfels(gathered, ground, settings.points.carve)
+        return _actor_surfels(actors[number - 1], gathered, ground)
+
+    return list(in_order(made, range(1 + len(actors)), 1 + len(actors))), ground
+
+
+def _world_surfels(gathered: Gathered, ground: Ground, carve: bool) -> Surfels:
     static = gathered.static
-    sheet, standing = ground.sheet(static), static[~(np.abs(ground.above(static.xyz_m)) < 0.08)]
-    if settings.points.carve:
+    sheet, standing = ground.sheet(static), static[~(np.abs(ground.above(static.xyz_m)) < SHEET_M)]
+    if carve:
         ghosts = in_free_space(balls(standing.xyz_m, surfaces.DISC_SIGMA * standing.spacing_m), gathered.beams)
         standing = standing[~ghosts]
     standing, normal, spacing = surfaces.surface_of(standing)
     row, column, _ = ground.cells(sheet.xyz_m)
     road = ground.road[row, column]
-    bodies = [
-        Surfels(
-            None,
-            Cloud.concatenate([standing, sheet]),
-            np.concatenate([normal, ground.normals()[row, column].astype(np.float32)]),
-            np.concatenate([spacing, sheet.spacing_m]),
-            np.concatenate([surfaces.DISC_SIGMA * spacing, surfaces.LATTICE_SIGMA * sheet.spacing_m]),
-            np.concatenate([np.full(len(standing), Label.OTHER), np.where(road, Label.ROAD, Label.OTHER)]).astype(
-                np.uint8
-            ),
-        )
-    ]
-    for actor in actors:
-        cloud = gathered.actors[actor.index]
-        if actor.index in gathered.feet:
-            box_feet, world_feet = gathered.feet[actor.index]
-            cloud = Cloud.concatenate([cloud, points.thinned(box_feet[~(np.abs(ground.above(world_feet)) < 0.08)])])
-        cloud, normal, spacing = surfaces.surface_of(cloud)
-        sigma, label = surfaces.DISC_SIGMA * spacing, np.full(len(cloud), Label.MOVABLE, np.uint8)
-        bodies.append(Surfels(actor, cloud, normal, spacing, sigma, label))
-    return bodies, ground
+    return Surfels(
+        None,
+        Cloud.concatenate([standing, sheet]),
+        np.concatenate([normal, ground.normals[row, column].astype(np.float32)]),
+        np.concatenate([spacing, sheet.spacing_m]),
+        np.concatenate([surfaces.DISC_SIGMA * spacing, surfaces.LATTICE_SIGMA * sheet.spacing_m]),
+        np.concatenate([np.full(len(standing), Label.OTHER), np.where(road, Label.ROAD, Label.OTHER)]).astype(np.uint8),
+    )
+
+
+def _actor_surfels(actor: Actor, gathered: Gathered, ground: Ground) -> Surfels:
+    cloud = gathered.actors[actor.index]
+    if actor.index in gathered.feet:
+        box_feet, world_feet = gathered.feet[actor.index]
+        off_ground = ~(np.abs(ground.above(world_feet)) < SHEET_M)
+        cloud = Cloud.concatenate([cloud, points.thinned(box_feet[off_ground])])
+    cloud, normal, spacing = surfaces.surface_of(cloud)
+    sigma, label = surfaces.DISC_SIGMA * spacing, np.full(len(cloud), Label.MOVABLE, np.uint8)
+    return Surfels(actor, cloud, normal, spacing, sigma, label)

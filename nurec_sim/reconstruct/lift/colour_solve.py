@@ -181,15 +181,19 @@ class ColourSolve:
             error = wanted - shown
             right = (recorded > SATURATED) & (error < 0)
             error[right] = 0
-            weight, sky_weight = (weights * ~right.all(axis=0)).astype(np.float32)
+            weight, sky_weight = (weights * ~(right[0] & right[1] & right[2])).astype(np.float32)
             shares = spread_errors(picture, planes, weight, error, self._workers)
             texels = np.zeros((*self._sky.shape[:3], 4), np.float32)
             spread_sky_errors(view.directions, turn, sky_weight * clear, error, texels)
             # Placed blocks of the moving layer follow each other as those they were made from.
             placed = np.flatnonzero(np.isin(self._moving.index[:, 0], moving.index.reshape(-1, BLOCK)[:, 0]))
-            _change_blocks(layers[0][1], layers[0][1], shares[0], self._seen[0], self._static.fields)
-            _change_blocks(layers[1][1], placed[layers[1][1]], shares[1], self._seen[1], self._moving.fields)
-            _change_sky(texels, self._seen[2], self._sky)
+            changes = [(layers[0][1], layers[0][1], shares[0], self._seen[0], self._static.fields),
+                       (layers[1][1], placed[layers[1][1]], shares[1], self._seen[1], self._moving.fields)]  # fmt: skip
+            self._workers.run_calls([
+                *((_change_blocks, drawn[low:high], blocks[low:high], *values) for drawn, blocks, *values in changes
+                  for low, high in self._workers.ranges(len(blocks), 16)),
+                *((_change_sky, *face) for face in zip(texels, self._seen[2], self._sky, strict=True)),
+            ])  # fmt: skip
         return float((weight * error**2).mean())
 
     def _fit_response(
@@ -253,16 +257,15 @@ def _change_blocks(drawn, blocks, shares, seen, fields):
 
 @kernel
 def _change_sky(shares, seen, sky):
-    """The same for the texels of a sky: [6,s,s,4], [6,s,s] and [6,s,s,3]."""
-    for face in range(len(sky)):
-        for j in range(sky.shape[1]):
-            for i in range(sky.shape[1]):
-                share = shares[face, j, i]
-                if share[0] > 0:
-                    seen[face, j, i] += share[0]
-                    for c in range(3):
-                        colour = sky[face, j, i, c] + share[1 + c] / seen[face, j, i]
-                        sky[face, j, i, c] = min(max(colour, np.float32(0)), np.float32(BRIGHTEST))
+    """The same for the texels of a face of the sky: [s,s,4], [s,s] and [s,s,3]."""
+    for j in range(sky.shape[0]):
+        for i in range(sky.shape[1]):
+            share = shares[j, i]
+            if share[0] > 0:
+                seen[j, i] += share[0]
+                for c in range(3):
+                    colour = sky[j, i, c] + share[1 + c] / seen[j, i]
+                    sky[j, i, c] = min(max(colour, np.float32(0)), np.float32(BRIGHTEST))
 
 
 def _with_colours(gaussians: Gaussians, fields: np.ndarray, index: np.ndarray) -> Gaussians:

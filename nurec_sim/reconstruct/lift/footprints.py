@@ -85,7 +85,7 @@ def on_ground(lifted: Lifted, ground: Ground) -> Lifted:
     return dataclasses.replace(
         moved,
         xyz_m=xyz,
-        normal=ground.normals()[row, column],
+        normal=ground.normals[row, column],
         depth_m=depth,
         pixel_m=moved.pixel_m * depth / moved.depth_m,
         surfel=np.full(len(moved), -1, np.int32),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -89,6 +90,7 @@ class Ground:
         eye = xyz + (0, 0, 2.0)
         return Cloud(xyz, eye, spacing, intensity.astype(np.float32))
 
+    @cached_property
     def normals(self) -> Float64[np.ndarray, "rows columns 3"]:
         """Upward unit normals of the smoothed surface."""
         smooth = cv2.GaussianBlur(self.height_m, (0, 0), 3.0)

@@ -15,6 +15,7 @@ from nurec_sim.reconstruct.lift.blocks import painted
 from nurec_sim.reconstruct.lift.depth import MAYBE_SKY, NOT_SKY, SKY
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import WorkingView
+from nurec_sim.types.rows import rows_of
 
 STATIC, NOBODY = -1, -2
 OWNER_RING = 0.1
@@ -55,7 +56,7 @@ class Lifted:
         return len(self.xyz_m)
 
     def __getitem__(self, index: np.ndarray | slice) -> Lifted:
-        return Lifted(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return Lifted(*rows_of((getattr(self, name) for name in self.__dataclass_fields__), index))
 
     @classmethod
     def empty(cls) -> Lifted:

@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from nurec_sim.compute.cores import in_order
 from nurec_sim.errors import ReconstructError
 from nurec_sim.geometry import arc_length
 from nurec_sim.reconstruct.ego_images import find_ego_images
@@ -76,17 +78,22 @@ def lift(
     static, moving, lifted = Gaussians.empty(), [], 0
     beams = gathered.beams if settings.points.carve else []
     pixels = body_pixels(bodies, views, pictures, canonical, settings)
-    for number, body in enumerate(bodies):
-        stages.fraction(number / len(bodies))
-        gaussians, count = body_gaussians(body, pixels[number], ground, views, pictures, canonical, settings, beams)
-        lifted += count
-        if body.actor is None:
-            static = gaussians
-        elif len(gaussians):
-            moving.append(actor_layer.in_box(body.actor, gaussians))
-    stages.start("sky")
-    sky = make_sky(views, canonical, [_sky_weight(p, v, settings) for p, v in zip(pictures, views, strict=True)],
-                   settings.sky_px)  # fmt: skip
+
+    def made(number: int) -> tuple[Gaussians, int]:
+        return body_gaussians(bodies[number], pixels[number], ground, views, pictures, canonical, settings, beams)
+
+    with ThreadPoolExecutor(1) as beside:
+        weights = [_sky_weight(picture, view, settings) for picture, view in zip(pictures, views, strict=True)]
+        far = beside.submit(make_sky, views, canonical, weights, settings.sky_px)
+        # The world takes as long as all actors, so they are all begun beside it.
+        for number, (gaussians, count) in enumerate(in_order(made, range(len(bodies)), len(bodies))):
+            stages.fraction((number + 1) / len(bodies))
+            lifted += count
+            if (actor := bodies[number].actor) is None:
+                static = gaussians
+            elif len(gaussians):
+                moving.append(actor_layer.in_box(actor, gaussians))
+        sky = far.result()
     dynamic = DynamicGaussians.concatenate(moving)
     counts = {
         "sweeps": gathered.sweep_count,
@@ -134,12 +141,11 @@ def _sky_weight(picture: DepthPicture, view: WorkingView, settings: LiftSettings
 
 _ENDS = {
     "sweeps": 0.1,
-    "ground and surfaces": 0.2,
-    "images": 0.21,
-    "depth": 0.7,
-    "colours": 0.71,
-    "lifting": 0.85,
-    "sky": 0.87,
+    "ground and surfaces": 0.21,
+    "images": 0.24,
+    "depth": 0.5,
+    "colours": 0.51,
+    "lifting": 0.78,
     "solving colours": 1.0,
 }
 """The part of all work that is done at the end of each stage, about (on the demonstration's log)."""

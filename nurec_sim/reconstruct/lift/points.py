@@ -14,6 +14,7 @@ from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.free_space import SweepBeams, chosen_sweeps, sweep_beams
 from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.types import MOVABLE_LABELS, Clip, Track, Trajectory
+from nurec_sim.types.rows import rows_of
 
 FOOT_M = 0.3
 """Points this close to the bottom of a box may be road; the ground decides."""
@@ -36,7 +37,7 @@ class Cloud:
         return len(self.xyz_m)
 
     def __getitem__(self, index: np.ndarray | slice) -> Cloud:
-        return Cloud(*(getattr(self, name)[index] for name in CLOUD_FIELDS))
+        return Cloud(*rows_of((getattr(self, name) for name in CLOUD_FIELDS), index))
 
     @classmethod
     def concatenate(cls, parts: Sequence[Cloud]) -> Cloud:

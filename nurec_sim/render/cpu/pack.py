@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
+from nurec_sim.compute.cores import in_order
 from nurec_sim.render.layers import drawable
 from nurec_sim.types import Gaussians
 
@@ -21,6 +22,8 @@ MIN_SCALE_M = 1e-5
 MAX_OPACITY = 0.99
 REACH = float(np.sqrt(2 * np.log(255)))
 """Standard deviations at which an opaque Gaussian has faded to 1/255."""
+PART = 64
+"""Blocks that a thread packs at a time."""
 NEVER_SEEN = -1e9
 """LOG_OPACITY of rows that only fill a block up."""
 
@@ -60,18 +63,29 @@ def pack(gaussians: Gaussians, sort: bool = True) -> PackedGaussians:
 
     ``sort`` groups neighbours in space into blocks, which changes the order of Gaussians of exactly equal depth only.
     """
-    chosen = np.flatnonzero(drawable(gaussians))
+    parts = [slice(first, first + PART * BLOCK) for first in range(0, len(gaussians), PART * BLOCK)]
+    seen = in_order(lambda part: drawable(gaussians[part]), parts)
+    chosen = np.flatnonzero(np.concatenate([np.zeros(0, bool), *seen]))
     if sort and len(chosen):
         chosen = chosen[morton_order(gaussians.mean_m[chosen])]
     blocks = -(-len(chosen) // BLOCK)
     index = np.full(blocks * BLOCK, -1, np.int32)
     index[: len(chosen)] = chosen
+    fields = np.empty((blocks, FIELDS, BLOCK), np.float32)
+    centre, radius = np.empty((blocks, 3)), np.empty(blocks)
+
+    def fill(first: int) -> None:
+        some = slice(first, min(first + PART, blocks))
+        columns = gaussian_columns(gaussians, chosen[some.start * BLOCK : some.stop * BLOCK])
+        fields[some] = to_blocks(columns, some.stop - some.start, fill=LOG_OPACITY)
+        centre[some], radius[some] = block_spheres(fields[some])
+
+    for _ in in_order(fill, range(0, blocks, PART)):
+        pass
     rest = gaussians.sh_rest
-    fields = to_blocks(gaussian_columns(gaussians, chosen), blocks, fill=LOG_OPACITY)
     sh_rest = np.zeros((0, 0, 0), np.float32)
     if rest is not None and len(chosen):
         sh_rest = to_blocks(rest[chosen].reshape(len(chosen), -1).astype(np.float32), blocks)
-    centre, radius = block_spheres(fields)
     return PackedGaussians(fields, sh_rest, index, centre, radius)
 
 
@@ -108,28 +122,39 @@ def to_blocks(
     columns: Float32[np.ndarray, "n fields"], blocks: int, fill: int | None = None
 ) -> Float32[np.ndarray, "blocks fields 256"]:
     """Rows to blocks of arrays; rows that fill up are zero but for the column ``fill``, which is NEVER_SEEN."""
-    rows = np.zeros((blocks * BLOCK, columns.shape[1]), np.float32)
+    count, fields = columns.shape
+    made = np.empty((blocks, fields, BLOCK), np.float32)
+    full, left = divmod(count, BLOCK)
+    made[:full] = columns[: full * BLOCK].reshape(full, BLOCK, fields).transpose(0, 2, 1)
+    made[full:] = 0
     if fill is not None:
-        rows[:, fill] = NEVER_SEEN
+        made[full:, fill] = NEVER_SEEN
         # Unit rotation and extent, so that no kernel divides by zero.
-        rows[:, [QUAT, SCALE, SCALE + 1, SCALE + 2]] = 1
-    rows[: len(columns)] = columns
-    return np.ascontiguousarray(rows.reshape(blocks, BLOCK, columns.shape[1]).transpose(0, 2, 1))
+        made[full:, [QUAT, SCALE, SCALE + 1, SCALE + 2]] = 1
+    if left:
+        made[full, :, :left] = columns[full * BLOCK :].T
+    return made
 
 
 def morton_order(points: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
     """Order of points along a Z-order curve of 2^21 cells a side over all but the most distant of them."""
     # Quantiles: a few Gaussians far away (sky, outliers) would otherwise take all of the curve's resolution.
     low, high = np.quantile(points, 0.001, axis=0), np.quantile(points, 0.999, axis=0)
-    cells = np.clip((points - low) / max(float((high - low).max()), 1e-9), 0, 1) * (2**21 - 1)
-    code = np.zeros(len(points), np.uint64)
-    for axis in range(3):
-        v = cells[:, axis].astype(np.uint64)
-        # Spread 21 bits to every third place (Morton 1966), by halves.
-        for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
-                            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):  # fmt: skip
-            v = (v | (v << np.uint64(shift))) & np.uint64(mask)
-        code |= v << np.uint64(axis)
+    extent = max(float((high - low).max()), 1e-9)
+
+    def codes(first: int) -> np.ndarray:
+        cells = np.clip((points[first : first + PART * BLOCK] - low) / extent, 0, 1) * (2**21 - 1)
+        code = np.zeros(len(cells), np.uint64)
+        for axis in range(3):
+            v = cells[:, axis].astype(np.uint64)
+            # Spread 21 bits to every third place (Morton 1966), by halves.
+            for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+                                (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):  # fmt: skip
+                v = (v | (v << np.uint64(shift))) & np.uint64(mask)
+            code |= v << np.uint64(axis)
+        return code
+
+    code = np.concatenate(list(in_order(codes, range(0, len(points), PART * BLOCK))))
     return np.argsort(code, kind="stable")
 
 
