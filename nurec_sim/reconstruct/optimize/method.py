@@ -29,6 +29,7 @@ from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
 from nurec_sim.reconstruct.optimize.poses import PoseCorrections
 from nurec_sim.reconstruct.optimize.responses import FrameResponses, borrowed_responses
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
+from nurec_sim.reconstruct.optimize.tracks import TrackCorrections
 from nurec_sim.reconstruct.optimize.unseen import colour_unseen, shown_by
 from nurec_sim.reconstruct.optimize.views import TrainingView, training_views
 from nurec_sim.render.cpu.backward.frame import SENSORS, Frame
@@ -110,6 +111,7 @@ class Optimization:
         for view in views:
             frames[view.camera.id] += 1
         self.poses = PoseCorrections(views, settings.poses)
+        self.tracks = TrackCorrections(scene, settings.tracks)
         self.responses = FrameResponses(scene, frames)
         every = settings.check_every
         self.checked = [
@@ -179,7 +181,7 @@ class Optimization:
         """How well an image is shown."""
         view = self.views[number]
         frame = Frame(SENSORS.tables(view.camera), self.poses.pair(number), False)
-        frame.draw_packed(self.parameters.at(view.t_us).packed)
+        frame.draw_packed(self.parameters.at(view.t_us, self.tracks.pose).packed)
         shown = Composite(frame, self.sky).shown(self.responses.of(view.camera.id, view.frame))
         shown = np.clip(shown, 0, 1)
         error = np.square(shown - view.colours_beside(shown)).mean(dtype=np.float64)
@@ -188,13 +190,13 @@ class Optimization:
     def _result(self) -> dict[str, np.ndarray]:
         """The arrays that make the scene, as they are kept."""
         found = {"values": self.parameters.values, "sky": self.sky, "poses": self.poses.values,
-                 "offsets": self.poses.offsets}  # fmt: skip
+                 "offsets": self.poses.offsets, "tracks": self.tracks.values}  # fmt: skip
         return found | {f"response {name}": values for name, values in self.responses.values.items()}
 
     def _moments(self) -> dict[str, np.ndarray]:
         """The arrays of all Adams, as they are kept."""
         adams = {"gaussians": self.parameters, "sky": self._sky_adam, "poses": self.poses.adam,
-                 "offsets": self.poses.offset_adam}  # fmt: skip
+                 "offsets": self.poses.offset_adam, "tracks": self.tracks.adam}  # fmt: skip
         adams |= {f"response {name}": adam for name, adam in self.responses.adam.items()}
         return {f"{part} of {name}": getattr(adam, part) for name, adam in adams.items()
                 for part in ("first", "second", "visits")}  # fmt: skip
@@ -226,7 +228,7 @@ class Optimization:
         view, weights, rates = self.views[number], self.settings.weights, self.settings.rates
         height, width = view.image.shape[:2]
         frame = Frame(SENSORS.tables(view.camera), self.poses.pair(number), False)
-        drawn = self.parameters.at(view.t_us)
+        drawn = self.parameters.at(view.t_us, self.tracks.pose)
         alpha, distance = frame.draw_packed(drawn.packed)[[0, 4], :height, :width]
         composite = Composite(frame, self.sky)
         if self.responses.is_new(view.camera.id, view.frame):
@@ -254,6 +256,8 @@ class Optimization:
         )
         if self.settings.correct_poses:
             self.poses.step(number, frame.view.world_from_reference, by_pose + by_pose_too, rate)
+        if self.settings.correct_tracks:
+            self.tracks.step(view.t_us, drawn.poses, self.parameters.wrenches(drawn, frame.drawn_rows), rate)
         columns = rate * rate_columns(rates.mean, rates.turn_rad, rates.log_scale, rates.logit_opacity, rates.rgb)
         self.parameters.step(drawn, frame.drawn_rows, columns, self.settings.largest_m, weights.opacity, weights.scale)
         self._sky_adam.step(self.sky, by_sky, rate * rates.sky)
@@ -263,7 +267,7 @@ class Optimization:
 
     def scene(self, clip: Clip) -> GaussianScene:
         """The scene as it is now."""
-        fitted = self.parameters.scene()
+        fitted = self.tracks.applied(self.parameters.scene())
         times = {name: clip.camera_times_us(name) for name in clip.rig.cameras}
         exposures = self.responses.all()
         others = [name for name in clip.rig.cameras if name not in exposures]
@@ -278,11 +282,13 @@ class Optimization:
             "steps": self.best_steps if self.best else self.steps,
             **({"held_out_psnr_db": round(self.best_psnr_db, 3)} if self.best else {}),
             **({"poses": self.poses.report()} if self.settings.correct_poses else {}),
+            **({"tracks": self.tracks.report()} if self.settings.correct_tracks else {}),
             "borrowed_responses": [name for name in others if name in exposures],
         }
         return dataclasses.replace(
-            fitted, sky=self.sky.copy(), exposures=exposures, provenance={**fitted.provenance, "refined": done}
-        )
+            fitted, sky=self.sky.copy(), exposures=exposures,
+            provenance={**fitted.provenance, "refined": done},
+        )  # fmt: skip
 
     def _spent(self, seconds: float) -> float:
         """Share of the budget that is spent."""

@@ -13,6 +13,7 @@ from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct.optimize.adam import MEAN, OPACITY, QUAT, RGB, SCALE, VALUES, adam_step, bias_corrections
 from nurec_sim.reconstruct.optimize.placing import place_moving, place_static
+from nurec_sim.reconstruct.optimize.tracks import wrenches
 from nurec_sim.render.cpu.backward.frame import shared_workers, zeros_by_gaussian
 from nurec_sim.render.cpu.backward.repack import RawGaussians
 from nurec_sim.render.cpu.pack import BLOCK, FIELDS, LOG_OPACITY, morton_order, to_blocks
@@ -32,6 +33,7 @@ class Drawn:
     world: RawGaussians
     packed: Float32[np.ndarray, "blocks 21 256"]
     turns: Float64[np.ndarray, "t 4"]
+    poses: Float64[np.ndarray, "t 4 4"]
 
 
 class Parameters:
@@ -73,10 +75,14 @@ class Parameters:
         """Number of Gaussians."""
         return len(self.values)
 
-    def at(self, t_us: int) -> Drawn:
+    def at(self, t_us: int, pose: Callable[[int, int], np.ndarray] | None = None) -> Drawn:
         """All Gaussians at an instant; the opacity of those that are not there is 0.
 
         The arrays are valid until the next call of ``at`` or ``step``.
+
+        Args:
+            t_us: the instant.
+            pose: gives world_from_box of a track, by its index, at an instant; None: by its path.
         """
         dynamic, tracks, static = self._scene.dynamic, self._scene.tracks, self.static_count
         turns, poses, covered = np.zeros((len(tracks), 4)), np.zeros((len(tracks), 4, 4)), np.zeros(len(tracks), bool)
@@ -84,7 +90,7 @@ class Parameters:
             for index in np.unique(dynamic.track[self._rigid]):
                 covered[index] = tracks[index].path.covers(t_us)
                 if covered[index]:
-                    poses[index] = tracks[index].path.at(t_us)
+                    poses[index] = tracks[index].path.at(t_us) if pose is None else pose(index, t_us)
                     turns[index] = geometry.quat_from_matrix(poses[index, :3, :3])
             fade, shift = np.zeros(len(dynamic), np.float32), np.zeros((len(dynamic), 3))
             fade[self._rigid] = covered[dynamic.track[self._rigid]]
@@ -99,7 +105,7 @@ class Parameters:
                 place_moving, moving,
                 (static, self.values, poses, turns, self._row_turn, shift, fade, self._world, self._packed),
             )  # fmt: skip
-        return Drawn(self._world, self._packed, turns)
+        return Drawn(self._world, self._packed, turns, poses)
 
     def step(
         self,
@@ -128,6 +134,13 @@ class Parameters:
              self._thickest),
         )  # fmt: skip
         self._place(rows[rows < self.static_count])
+
+    def wrenches(self, drawn: Drawn, rows: Int32[np.ndarray, " k"]) -> Float64[np.ndarray, "t 6"]:
+        """Gradients by a turn and a shift of each track (``tracks.wrenches``), from ``gradients`` of some Gaussians."""
+        sums, world, by = np.zeros((len(drawn.poses), 6)), drawn.world, self.gradients
+        moving = rows[rows >= self.static_count]
+        wrenches(moving, self._row_turn, drawn.poses, world.mean, world.quat, by.mean, by.quat, sums)
+        return sums
 
     def values_changed(self) -> None:
         """To be called after ``values`` were written from outside."""

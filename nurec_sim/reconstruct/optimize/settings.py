@@ -54,6 +54,15 @@ class PosePriors:
 
 
 @dataclass(frozen=True)
+class TrackPriors:
+    """Standard deviations of the errors that labelled boxes may have, and the weight of their squares in the loss."""
+
+    turn_deg: float = 2.0
+    shift_m: float = 0.2
+    weight: float = 1e-6
+
+
+@dataclass(frozen=True)
 class OptimizeSettings:
     """All settings of ``refine``.
 
@@ -73,6 +82,8 @@ class OptimizeSettings:
         keep_interrupted: whether Ctrl-C ends the optimisation with the best state so far; else it is not caught.
         correct_poses: whether to correct the poses of images and the clocks of cameras.
         poses: how much.
+        correct_tracks: whether to correct the tracks of rigid actors that move.
+        tracks: how much.
     """
 
     seconds: float | None = 300.0
@@ -89,6 +100,8 @@ class OptimizeSettings:
     keep_interrupted: bool = True
     correct_poses: bool = False
     poses: PosePriors = field(default_factory=PosePriors)
+    correct_tracks: bool = True
+    tracks: TrackPriors = field(default_factory=TrackPriors)
 
     def __post_init__(self) -> None:
         """Checks the budget.
