@@ -121,3 +121,19 @@ def test_between_knots_corrections_are_interpolated(with_car):
     for t_us, left in ((path.start_us, 0.0), (middle, 0.05), (path.end_us, 0.1)):
         moved = geometry.inverse(path.at(t_us)) @ corrections.pose(0, t_us)
         assert moved[:3, 3] == pytest.approx([0, left, 0], abs=1e-9)
+
+
+def test_where_no_image_shows_an_actor_its_box_keeps_its_label(with_car):
+    path = with_car.tracks[0].path
+    longer = Trajectory(path.t_us * 4, path.world_from_body)
+    scene = dataclasses.replace(with_car, tracks=(dataclasses.replace(with_car.tracks[0], path=longer),))
+    corrections = TrackCorrections(scene, TrackPriors(shift_m=0.1))
+    assert len(corrections.values) == 6, "2.4 s"
+    corrections.values[:2, 2], corrections.adam.visits[:2] = (1.0, 2.0), 1
+    done = corrections.applied(scene)
+    start, end = (geometry.inverse(longer.world_from_body[k]) @ done.tracks[0].path.world_from_body[k] for k in (0, -1))
+    assert start[:3, 3] == pytest.approx([0, -0.05, 0], abs=1e-9) and end[:3, 3] == pytest.approx(np.zeros(3), abs=1e-9)
+    shift = done.dynamic.gaussians.mean_m - scene.dynamic.gaussians.mean_m
+    assert shift == pytest.approx(np.tile([0, 0.15, 0], (len(shift), 1)), abs=1e-5)
+    untouched = TrackCorrections(scene, TrackPriors()).applied(scene)
+    assert np.array_equal(untouched.dynamic.gaussians.quat_wxyz, scene.dynamic.gaussians.quat_wxyz)

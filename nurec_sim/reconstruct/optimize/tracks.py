@@ -67,22 +67,19 @@ class TrackCorrections:
 
     def pose(self, index: int, t_us: int) -> Float64[np.ndarray, "4 4"]:
         """world_from_box of a track at an instant, corrected."""
+        return self._corrected(index, t_us, self.values)
+
+    def _corrected(self, index: int, t_us: int, values: Float64[np.ndarray, "rows 4"]) -> Float64[np.ndarray, "4 4"]:
         pose = self._tracks[index].path.at(t_us)
         if index not in self._first:
             return pose
-        return pose @ self._change(sum(weight * self.values[row] for row, weight in self._weights(index, t_us)))
+        return pose @ self._change(sum(weight * values[row] for row, weight in self._weights(index, t_us)))
 
     def _change(self, values: Float64[np.ndarray, " 4"]) -> Float64[np.ndarray, "4 4"]:
         turn, *shift = values * self._sigma
         change = geometry.pose_from_xyyaw(0.0, 0.0, turn)
         change[:3, 3] = shift
         return change
-
-    def _mean(self, index: int) -> Float64[np.ndarray, "4 4"]:
-        """The mean change of a track over the knots that images have shown."""
-        rows = self._first[index] + np.arange(self._knots(index))
-        shown = rows[self.adam.visits[rows] > 0]
-        return self._change(self.values[shown].mean(axis=0)) if len(shown) else np.eye(4)
 
     def step(
         self, t_us: int, poses: Float64[np.ndarray, "t 4 4"], wrench: Float64[np.ndarray, "t 6"], rate: float
@@ -109,23 +106,30 @@ class TrackCorrections:
     def applied(self, scene: GaussianScene) -> GaussianScene:
         """A scene with corrected tracks, at the times that these have poses for.
 
-        What is the same at all knots moves the actor's Gaussians in their box, and leaves the box.
+        The mean of the knots that images have shown moves the actor's Gaussians in their box, and leaves the box; so
+        the box keeps its label at knots that none has shown.
         """
-        dynamic, tracks = scene.dynamic, list(scene.tracks)
-        gaussians = dynamic.gaussians[:]
-        knot_m = dynamic.knot_m.copy()
-        for index in self._first:
-            mean, path = self._mean(index), tracks[index].path
-            poses = np.stack([self.pose(index, t_us) for t_us in path.t_us.tolist()]) @ geometry.inverse(mean)
-            tracks[index] = dataclasses.replace(tracks[index], path=Trajectory(path.t_us, poses))
+        dynamic, tracks, values = scene.dynamic, list(scene.tracks), self.values.copy()
+        gaussians, knot_m = dynamic.gaussians, dynamic.knot_m.copy()
+        arrays = {name: getattr(gaussians, name).copy() for name in ("mean_m", "quat_wxyz", "normal")}
+        for index, first in self._first.items():
+            knots = slice(first, first + self._knots(index))
+            shown = self.adam.visits[knots] > 0
+            if not shown.any():
+                continue
+            mean = values[knots][shown].mean(axis=0)
+            values[knots][~shown] = mean
+            path, change = tracks[index].path, self._change(mean)
+            poses = np.stack([self._corrected(index, t_us, values) for t_us in path.t_us.tolist()])
+            tracks[index] = dataclasses.replace(
+                tracks[index], path=Trajectory(path.t_us, poses @ geometry.inverse(change))
+            )
             rows = np.flatnonzero((dynamic.track == index) & dynamic.in_box)
-            moved = transformed(gaussians[rows], mean)
-            for name in ("mean_m", "quat_wxyz", "normal"):
-                values = getattr(gaussians, name).copy()
-                values[rows] = getattr(moved, name)
-                gaussians = dataclasses.replace(gaussians, **{name: values})
+            moved = transformed(gaussians[rows], change)
+            for name, array in arrays.items():
+                array[rows] = getattr(moved, name)
             knot_m[rows] = moved.mean_m[:, None]
-        dynamic = dataclasses.replace(dynamic, gaussians=gaussians, knot_m=knot_m)
+        dynamic = dataclasses.replace(dynamic, gaussians=dataclasses.replace(gaussians, **arrays), knot_m=knot_m)
         return dataclasses.replace(scene, dynamic=dynamic, tracks=tuple(tracks))
 
     def report(self) -> dict[str, Any]:
