@@ -75,7 +75,7 @@ def test_a_clip_is_lifted_and_served_with_its_progress_told(client, clip):
     said = []
     assert client.reconstruct(path=str(clip), progress=lambda *step: said.append(step)) == "clipgt-tiny"
     stages = [stage for stage, _ in said]
-    assert stages[0] == "waiting for its turn" and {"sweeps", "depth", "lifting", "sky"} <= set(stages)
+    assert stages[0] == "waiting for its turn" and {"sweeps", "depth", "lifting", "solving colours"} <= set(stages)
     assert all(0 <= fraction <= 1 for _, fraction in said)
     assert [entry.scene_id for entry in client.scenes().scenes][2:] == ["clipgt-tiny"]
     assert client.scenes().scenes[2].loaded
