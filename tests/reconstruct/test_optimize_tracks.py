@@ -9,7 +9,7 @@ from fitted_street import CROSSING, SMALL, Flicker
 from nurec_sim import geometry
 from nurec_sim.reconstruct import OptimizeSettings, reconstruct
 from nurec_sim.reconstruct.optimize import method
-from nurec_sim.reconstruct.optimize.settings import LearningRates, TrackPriors
+from nurec_sim.reconstruct.optimize.settings import LearningRates, PosePriors, TrackPriors
 from nurec_sim.reconstruct.optimize.tracks import TrackCorrections, wrenches
 from nurec_sim.types import Trajectory
 
@@ -137,3 +137,11 @@ def test_where_no_image_shows_an_actor_its_box_keeps_its_label(with_car):
     assert shift == pytest.approx(np.tile([0, 0.15, 0], (len(shift), 1)), abs=1e-5)
     untouched = TrackCorrections(scene, TrackPriors()).applied(scene)
     assert np.array_equal(untouched.dynamic.gaussians.quat_wxyz, scene.dynamic.gaussians.quat_wxyz)
+
+
+@pytest.mark.parametrize("wrong", [{"shift_m": -0.1}, {"turn_deg": float("nan")}, {"weight": float("inf")}])
+def test_priors_below_0_are_refused(wrong):
+    name, value = next(iter(wrong.items()))
+    for priors in (TrackPriors, PosePriors):
+        with pytest.raises(ValueError, match=f"{name} must be 0 or more and finite, got {value}"):
+            priors(**wrong)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -52,6 +53,10 @@ class PosePriors:
     """Of a camera's clock."""
     weight: float = 1e-4
 
+    def __post_init__(self) -> None:
+        """Checks them: see ``_check_priors``."""
+        _check_priors(self)
+
 
 @dataclass(frozen=True)
 class TrackPriors:
@@ -60,6 +65,21 @@ class TrackPriors:
     turn_deg: float = 2.0
     shift_m: float = 0.2
     weight: float = 1e-6
+
+    def __post_init__(self) -> None:
+        """Checks them: see ``_check_priors``."""
+        _check_priors(self)
+
+
+def _check_priors(priors: PosePriors | TrackPriors) -> None:
+    """Priors are 0 or more.
+
+    Raises:
+        ValueError: one is not.
+    """
+    for name, value in dataclasses.asdict(priors).items():
+        if not 0 <= value < float("inf"):
+            raise ValueError(f"{name} must be 0 or more and finite, got {value}")
 
 
 @dataclass(frozen=True)
