@@ -130,6 +130,7 @@ def test_where_no_image_shows_an_actor_its_box_keeps_its_label(with_car):
     corrections = TrackCorrections(scene, TrackPriors(shift_m=0.1))
     assert len(corrections.values) == 6, "2.4 s"
     corrections.values[:2, 2], corrections.adam.visits[:2] = (1.0, 2.0), 1
+    assert corrections.report()["median_shift_m"] == pytest.approx(0.15), "of 0.1 and 0.2 m"
     done = corrections.applied(scene)
     start, end = (geometry.inverse(longer.world_from_body[k]) @ done.tracks[0].path.world_from_body[k] for k in (0, -1))
     assert start[:3, 3] == pytest.approx([0, -0.05, 0], abs=1e-9) and end[:3, 3] == pytest.approx(np.zeros(3), abs=1e-9)

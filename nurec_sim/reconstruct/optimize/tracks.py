@@ -133,8 +133,8 @@ class TrackCorrections:
         return dataclasses.replace(scene, dynamic=dynamic, tracks=tuple(tracks))
 
     def report(self) -> dict[str, Any]:
-        """Sizes of the corrections in plain JSON."""
-        sizes = self.values * self._sigma
+        """Sizes of the corrections in plain JSON, of the knots that images have shown."""
+        sizes = self.values[self.adam.visits > 0] * self._sigma
         shift, turn = np.linalg.norm(sizes[:, 1:], axis=1), np.degrees(np.abs(sizes[:, 0]))
         return {
             "tracks": len(self._first),
