@@ -286,9 +286,8 @@ class Optimization:
             "borrowed_responses": [name for name in others if name in exposures],
         }
         return dataclasses.replace(
-            fitted, sky=self.sky.copy(), exposures=exposures,
-            provenance={**fitted.provenance, "refined": done},
-        )  # fmt: skip
+            fitted, sky=self.sky.copy(), exposures=exposures, provenance={**fitted.provenance, "refined": done}
+        )
 
     def _spent(self, seconds: float) -> float:
         """Share of the budget that is spent."""
