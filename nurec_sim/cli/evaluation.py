@@ -49,6 +49,8 @@ class LogFlags:
     actors: ActorsName = "auto"
     """CLIP: actors of the reconstruction: the log's boxes (recorded), what moves in its sweeps (found), or none; auto:
     recorded, or found if there are no boxes. Scores are by the log's boxes in any case."""
+    align_actors: bool = True
+    """CLIP: correct tracks of moving objects by the LiDAR returns on them, as in `nurec-sim reconstruct`."""
     input_cameras: tuple[str, ...] = ()
     """CLIP: input cameras of the reconstruction; default: all."""
     target_cameras: tuple[str, ...] = ()
@@ -201,6 +203,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
                 settings=settings,
                 refine=refinement(flags.refine),
                 actors=flags.actors,
+                align_actors=flags.align_actors,
             )
     if flags.json is not None:
         write_file(flags.json, json.dumps(figures, indent=1, sort_keys=True) + "\n")

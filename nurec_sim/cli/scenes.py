@@ -34,6 +34,7 @@ def reconstruct(
     cameras: tuple[str, ...] = (),
     poses: PosesName = "recorded",
     actors: ActorsName = "auto",
+    align_actors: bool = True,
     map_from_gaussians: bool = False,
     refine: float | None = None,
     resume: bool = False,
@@ -61,6 +62,8 @@ def reconstruct(
         actors: whose objects move, instead of being part of the static world: recorded (boxes of the log), found (what
             moves in its LiDAR sweeps, named found-1, found-2, ...), none; auto: recorded, or found if the log has no
             boxes at all.
+        align_actors: correct tracks of moving objects so that the returns of all LiDAR sweeps on an object make one
+            surface (docs/lift.md).
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
         refine: time budget in seconds for optimising the scene on the log's images and sweeps.
@@ -89,6 +92,7 @@ def reconstruct(
             settings=settings,
             refine=fit,
             actors=actors,
+            align_actors=align_actors,
         )
     derived = None
     if map_from_gaussians and world_scene.road_map is None:

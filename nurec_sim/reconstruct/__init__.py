@@ -68,6 +68,7 @@ def reconstruct(
     settings: Any = None,
     refine: OptimizeSettings | None = None,
     actors: ActorsName = "auto",
+    align_actors: bool = True,
 ) -> GaussianScene:
     """Build a Gaussian scene from a clip, at the precision of archives: reading it from one gives the same values.
 
@@ -83,6 +84,7 @@ def reconstruct(
         refine: fit the scene to the images and sweeps afterwards; ``optimized`` is ``lift`` with this step.
         actors: whose objects move: the boxes of the log (``recorded``), what moves in its sweeps (``found``), nobody
             (``none``); ``auto`` takes the boxes, and what moves if there are none.
+        align_actors: correct tracks of moving objects so that the returns of all sweeps on an object make one surface.
 
     Raises:
         ReconstructError: no such method, camera, sweep or choice of actors, settings of another method, or the clip
@@ -108,7 +110,7 @@ def reconstruct(
     if wrong:
         raise ReconstructError(f"clip {clip.id!r} has no sweeps {wrong} to hold out; have 0..{most - 1}")
 
-    from nurec_sim.reconstruct.movers import with_actors
+    from nurec_sim.reconstruct.movers import with_actors, with_aligned_actors
     from nurec_sim.scene.precision import archived
 
     held = {int(index) for index in hold_out_sweeps}
@@ -122,12 +124,15 @@ def reconstruct(
         report("moving objects", share * begun)
 
     clip, note = with_actors(clip, actors, held, search)
+    aligned = 0
+    if align_actors:
+        clip, aligned = with_aligned_actors(clip, held)
 
     def step(stage: str, done: float) -> None:
         report(stage, share * (begun + (1 - begun) * done))
 
     scene = made.reconstruct(clip, settings, cameras=cameras, hold_out_sweeps=held, progress=step)
-    scene = _with_provenance(scene, clip, made.name, chosen, note)
+    scene = _with_provenance(scene, clip, made.name, chosen, note, aligned)
     if refine is not None:
         from nurec_sim.reconstruct.optimize.method import refine as fit_to_log
 
@@ -148,7 +153,7 @@ def reconstruct(
 
 
 def _with_provenance(
-    scene: GaussianScene, clip: Clip, method: str, cameras: list[str], note: str | None
+    scene: GaussianScene, clip: Clip, method: str, cameras: list[str], note: str | None, aligned: int
 ) -> GaussianScene:
     """The scene with the entries that every provenance has, where the method left them out, and a note on its actors.
 
@@ -157,6 +162,8 @@ def _with_provenance(
     known: dict[str, Any] = {"method": method, "cameras": cameras}
     if clip.time_offset_us:
         known["time_offset_us"] = clip.time_offset_us
+    if aligned:
+        known["aligned_tracks"] = aligned
     provenance = known | dict(scene.provenance)
     if note is not None:
         others = [text for text in provenance.get("unknown", ()) if not text.startswith("no boxes:")]

@@ -28,4 +28,5 @@ class Optimized(ShippedMethod):
             progress=progress,
             refine=settings,
             actors="recorded",
+            align_actors=False,
         )
