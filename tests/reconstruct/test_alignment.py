@@ -121,6 +121,15 @@ def test_a_found_box_holds_all_returns_on_its_object(street):
     ).any()
 
 
+def test_a_found_box_of_a_person_keeps_its_size(street):
+    """What swings about a person is no part of a larger box, in which nothing is free space."""
+    half = np.zeros((FRAMES, 4))
+    half[:, 0] = np.where(np.arange(FRAMES) < FRAMES // 2, 0.12, -0.12)
+    track = dataclasses.replace(off_by(street.tracks[0], half), label="person", labelled=False, size_m=(4.1, 1.8, 1.5))
+    log, changed = with_aligned_actors(with_tracks(street, [track]))
+    assert changed == 1 and log.tracks[0].size_m == track.size_m
+
+
 def transformed(box, pose, points):
     """Points of the frame of ``pose`` in that of the box."""
     return geometry.transform_points(geometry.inverse(box) @ pose, points)

@@ -53,6 +53,21 @@ def test_every_layer_is_there(world):
     assert any("random weights" in text for text in result.provenance["unknown"])
 
 
+def test_sweeps_tell_the_road_if_there_are_any(world, clip):
+    result, _ = world
+    assert result.provenance["road_labels"] == "lidar"
+    (lidar,) = clip.rig.lidars
+    everything = range(len(clip.sweep_times_us(lidar)))
+    without = reconstruct(clip, "dense", cameras=["wide"], settings=quick(), hold_out_sweeps=everything)
+    assert without.provenance["road_labels"] == "network"
+    asked = reconstruct(clip, "dense", cameras=["wide"], settings=quick(road_labels="network"))
+    assert asked.provenance["road_labels"] == "network"
+    by_lidar = reconstruct(clip, "dense", cameras=["wide"], settings=quick(road_labels="lidar"))
+    assert not np.array_equal(by_lidar.static.label, asked.static.label)
+    with pytest.raises(ReconstructError, match="road_labels='lidar' needs sweeps that are not held out"):
+        reconstruct(clip, "dense", settings=quick(road_labels="lidar"), hold_out_sweeps=everything)
+
+
 @pytest.mark.slow
 def test_several_chunks_become_one_scene():
     demo = open_clip(Path(__file__).parents[2] / "scenarios" / "demo_clip.zip")

@@ -30,6 +30,7 @@ from nurec_sim.reconstruct.feedforward.tracks.labelled import scene_actors
 from nurec_sim.reconstruct.feedforward.tracks.rigid import rigid_once
 from nurec_sim.reconstruct.feedforward.tracks.standing import standing_pixels
 from nurec_sim.reconstruct.lift.actors import tracks_of
+from nurec_sim.reconstruct.road_labels import NOTE, with_measured_road
 from nurec_sim.types import Clip, DynamicGaussians, GaussianScene, Track
 
 Progress = Callable[[str, float], None]
@@ -65,6 +66,7 @@ def feedforward(
     profile = network.PROFILES[settings.profile or ""]
     chosen = choose_cameras(clip, profile, cameras)
     windows = chunk_windows(clip, chosen, profile, settings)
+    by_lidar = _road_by_lidar(clip, settings, hold_out)
     progress("weights", 0.0)
     model, weights = _model(settings, device)
     ego_images = find_ego_images(clip, chosen, hold_out=hold_out)
@@ -81,7 +83,7 @@ def feedforward(
         chunk_of = np.repeat(np.arange(len(layers)), [len(each.dynamic) for each in layers])
         dynamic = rigid_once(dynamic, chunk_of, scene_actors(clip), clip.span_us)
     tracks, dynamic = _tracks(clip, dynamic)
-    progress("tracks", 1.0)
+    progress("road", CHUNKS_SHARE + 0.08)
     provenance = {
         "method": method,
         "settings": _plain(dataclasses.asdict(settings)),
@@ -89,13 +91,14 @@ def feedforward(
         "cameras": list(chosen),
         "held_out_sweeps": sorted(hold_out),
         "chunks": [{"span_us": list(w.span_us), "frames": {c: list(f) for c, f in w.frames.items()}} for w in windows],
+        "road_labels": "lidar" if by_lidar else "network",
         "lidar_depth": [fit.report() for fit in fits if fit is not None],
         "counts": dict(merged.counts)
         | {"dynamic_merged": len(merged.dynamic), "dynamic": len(dynamic)}
         | {"tracks_found": len(tracks) - len(clip.tracks)},
-        "unknown": _unknown(clip, settings, len(tracks) - len(clip.tracks)),
+        "unknown": _unknown(clip, settings, len(tracks) - len(clip.tracks), by_lidar),
     }
-    return GaussianScene(
+    scene = GaussianScene(
         id=clip.id,
         static=merged.static,
         dynamic=dynamic,
@@ -110,6 +113,24 @@ def feedforward(
         provenance=provenance,
         ego_images=ego_images,
     )
+    if by_lidar:
+        scene = with_measured_road(scene, clip, hold_out)
+    progress("road", 1.0)
+    return scene
+
+
+def _road_by_lidar(clip: Clip, settings: FeedForwardSettings, hold_out: set[int]) -> bool:
+    """Whether sweeps tell the road.
+
+    Raises:
+        ReconstructError: they should, and there are none.
+    """
+    sweeps = any(index not in hold_out for name in clip.rig.lidars for index in range(len(clip.sweep_times_us(name))))
+    if settings.road_labels == "lidar" and not sweeps:
+        raise ReconstructError(
+            f"road_labels='lidar' needs sweeps that are not held out, and clip {clip.id!r} has none; use 'network'"
+        )
+    return sweeps and settings.road_labels != "network"
 
 
 def profile_name(method: str, profile: str | None) -> str:
@@ -218,13 +239,13 @@ def _tracks(clip: Clip, dynamic: DynamicGaussians) -> tuple[tuple[Track, ...], D
     return (*known, *found), dataclasses.replace(dynamic, track=track)
 
 
-def _unknown(clip: Clip, settings: FeedForwardSettings, found: int) -> list[str]:
+def _unknown(clip: Clip, settings: FeedForwardSettings, found: int, by_lidar: bool) -> list[str]:
     """What the log does not contain, as notes for the provenance."""
     notes = []
     if settings.random_weights is not None:
         notes.append("random weights: nothing in this scene means anything")
     if clip.road_map is None:
-        notes.append("no map: the road is what the network labels as road")
+        notes.append(NOTE if by_lidar else "no map: the road is what the network labels as road")
     if not clip.tracks:
         notes.append(f"no boxes: moving objects are what the network says, {found} of them followed over time")
     notes.append("no LiDAR intensity: the network knows colours only")

@@ -33,6 +33,8 @@ class FeedForwardSettings:
         lidar_depth: how predicted depth is fitted to the log's sweeps, per frame: not at all (``off``), by a factor
             (``scale``), by a factor and a slope over inverse depth (``affine``), or by a factor and a field of factors
             that follow the points from surface to surface (``local``).
+        road_labels: what tells road from other ground: the ``network`` or steps in the sweeps (``lidar``); ``auto``
+            takes the sweeps if there are any.
         consensus: whether the images of a chunk agree on where a surface lies, which of them shows it, in what colour,
             and what can move; without, all of them show it where each sees it, as in the paper.
         ego_masks: folder with ``<camera>.png``: pixels of the car's own body, not black where it covers the view.
@@ -55,6 +57,7 @@ class FeedForwardSettings:
     ownership_tolerance_m: float = 5.0
     max_gaussians: int | None = 2_000_000
     lidar_depth: Literal["off", "scale", "affine", "local"] = "off"
+    road_labels: Literal["auto", "network", "lidar"] = "auto"
     consensus: bool = True
     ego_masks: Path | None = None
     sky_px: int = 256

@@ -108,9 +108,10 @@ def _corrected(track: Track, parts: Sequence[Part]) -> Track | None:
     all_poses = track.path.at(times)
     all_poses[np.searchsorted(times, returns.t_us)] = poses @ geometry.inverse(change)
     path, size = Trajectory(times, all_poses), np.array(track.size_m)
-    if track.labelled:
+    if track.labelled or track.label == "person":
         return dataclasses.replace(track, path=path)
-    # A found box followed what each sweep showed; one that keeps its place on the object must hold all of it.
+    # A found box followed what each sweep showed; one that keeps its place on the vehicle must hold all of it. A person
+    # has no length that could be seen in part, and what is around swinging arms and legs is free.
     low, high = np.quantile(moved(returns, values), EXTENT, axis=0)
     low, high = np.minimum(low, -size / 2), np.maximum(high, size / 2)
     low[2] = -size[2] / 2
