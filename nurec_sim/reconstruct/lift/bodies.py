@@ -80,7 +80,7 @@ def surfels_of(
     def made(number: int) -> Surfels:
         if number == 0:
             return _world_surfels(gathered, ground, settings.points.carve)
-        return _actor_surfels(actors[number - 1], gathered, ground)
+        return _actor_surfels(number - 1, actors[number - 1], gathered, ground)
 
     return list(in_order(made, range(1 + len(actors)), 1 + len(actors))), ground
 
@@ -104,10 +104,10 @@ def _world_surfels(gathered: Gathered, ground: Ground, carve: bool) -> Surfels:
     )
 
 
-def _actor_surfels(actor: Actor, gathered: Gathered, ground: Ground) -> Surfels:
-    cloud = gathered.actors[actor.index]
-    if actor.index in gathered.feet:
-        box_feet, world_feet = gathered.feet[actor.index]
+def _actor_surfels(number: int, actor: Actor, gathered: Gathered, ground: Ground) -> Surfels:
+    cloud = gathered.actors[number]
+    if number in gathered.feet:
+        box_feet, world_feet = gathered.feet[number]
         off_ground = ~(np.abs(ground.above(world_feet)) < SHEET_M)
         cloud = Cloud.concatenate([cloud, points.thinned(box_feet[off_ground])])
     cloud, normal, spacing = surfaces.surface_of(cloud)

@@ -20,7 +20,7 @@ from nurec_sim.errors import ReconstructError
 from nurec_sim.geometry import arc_length
 from nurec_sim.reconstruct.ego_images import find_ego_images
 from nurec_sim.reconstruct.lift import actors as actor_layer
-from nurec_sim.reconstruct.lift import colour, points
+from nurec_sim.reconstruct.lift import colour, people, points
 from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels, camera_isp
 from nurec_sim.reconstruct.lift.bodies import surfels_of
 from nurec_sim.reconstruct.lift.colour_solve import solve_colours
@@ -28,7 +28,7 @@ from nurec_sim.reconstruct.lift.pictures import DepthPicture, depth_pictures
 from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
-from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, WorkingView, border_weight, read_views
+from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, WorkingView, border_weight, key_frames, read_views
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene
 
 Progress = Callable[[str, float], None]
@@ -55,7 +55,7 @@ def lift(
     given, settings = settings, settings.for_log(path_m, span_us / 1e6, images)
     stages = _Stages(progress)
     stages.start("sweeps")
-    actors = points.actors_of(clip, settings.points)
+    actors = people.in_windows(points.actors_of(clip, settings.points), clip, key_frames(clip, cameras, settings.views))
     gathered = points.gather(clip, actors, hold_out, settings.points, stages.fraction)
     if gathered.point_count == 0:
         raise ReconstructError(
@@ -80,7 +80,11 @@ def lift(
     pixels = body_pixels(bodies, views, pictures, canonical, settings)
 
     def made(number: int) -> tuple[Gaussians, int]:
-        return body_gaussians(bodies[number], pixels[number], ground, views, pictures, canonical, settings, beams)
+        body = bodies[number]
+        shown = [k for k, view in enumerate(views) if body.present(view.t_us)]
+        lifted = dataclasses.replace(pixels[number], view=np.searchsorted(shown, pixels[number].view).astype(np.int32))
+        mine, depths, colours = [views[k] for k in shown], [pictures[k] for k in shown], [canonical[k] for k in shown]
+        return body_gaussians(body, lifted, ground, mine, depths, colours, settings, beams)
 
     with ThreadPoolExecutor(1) as beside:
         weights = [_sky_weight(picture, view, settings) for picture, view in zip(pictures, views, strict=True)]
@@ -92,7 +96,9 @@ def lift(
             if (actor := bodies[number].actor) is None:
                 static = gaussians
             elif len(gaussians):
-                moving.append(actor_layer.in_box(actor, gaussians))
+                moving.append(
+                    actor_layer.in_box(actor, gaussians) if actor.window_us is None else people.moving(actor, gaussians)
+                )
         sky = far.result()
     dynamic = DynamicGaussians.concatenate(moving)
     counts = {

@@ -55,18 +55,23 @@ CLOUD_FIELDS = ("xyz_m", "eye_m", "spacing_m", "intensity")
 
 @dataclass(frozen=True)
 class Actor:
-    """A labelled object, ``clip.tracks[index]``; a static one has one pose, and exists over the whole clip."""
+    """A labelled object, ``clip.tracks[index]``; a static one has one pose, and exists over the whole clip.
+
+    With ``window_us`` it is the object from the first of these times until before the second.
+    """
 
     index: int
     track: Track
     standing: bool
     path: Trajectory
+    window_us: tuple[int, int] | None = None
 
     def present(self, t_us: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Whether the actor is known to be where its path says."""
         if self.standing:
             return np.ones(np.shape(t_us), bool)
-        return (t_us >= self.path.start_us) & (t_us <= self.path.end_us)
+        known = (t_us >= self.path.start_us) & (t_us <= self.path.end_us)
+        return known if self.window_us is None else known & (t_us >= self.window_us[0]) & (t_us < self.window_us[1])
 
 
 def actors_of(clip: Clip, settings: PointSettings) -> list[Actor]:
@@ -234,7 +239,8 @@ def _between(xyz, low, high):
 class Gathered:
     """What the sweeps gave: the static cloud, one cloud per actor (box frame), and the undecided feet of boxes.
 
-    ``feet`` holds, per actor, the points near its box's bottom in the box frame, and their world positions.
+    Actors have the numbers of their places in the list. ``feet`` holds, per actor, the points near its box's bottom in
+    the box frame, and their world positions.
     ``beams`` are those of the sweeps, at most ``free_space.MOST_SWEEPS`` of them.
     """
 
@@ -272,9 +278,9 @@ def gather(
         settings: ranges, box margin and voxel sizes.
         progress: called with the fraction of the sweeps that is done.
     """
-    static, clouds = _Voxels(), {actor.index: _Voxels() for actor in actors}
-    feet: dict[int, list[Cloud]] = {actor.index: [] for actor in actors}
-    feet_world: dict[int, list[np.ndarray]] = {actor.index: [] for actor in actors}
+    static, clouds = _Voxels(), {number: _Voxels() for number in range(len(actors))}
+    feet: dict[int, list[Cloud]] = {number: [] for number in range(len(actors))}
+    feet_world: dict[int, list[np.ndarray]] = {number: [] for number in range(len(actors))}
     beams, sweeps, points, known = [], 0, 0, False
     carving = set(chosen_sweeps(clip, hold_out))
     every = [(lidar, i) for lidar in clip.rig.lidars for i in range(len(clip.sweep_times_us(lidar)))]
@@ -325,7 +331,10 @@ def _split(
     intensity = np.full(len(xyz), np.nan) if sweep.intensity is None else sweep.intensity[keep].astype(np.float64)
     eye = np.broadcast_to(sweep.world_from_lidar[:3, 3], xyz.shape)
     free, parts = np.ones(len(xyz), bool), {}
-    for actor in actors:
+    for number, actor in enumerate(actors):
+        # A quick answer for most of the many windows of people.
+        if actor.window_us and (actor.window_us[1] <= sweep.start_us or sweep.end_us < actor.window_us[0]):
+            continue
         inside, box_xyz, box_eye, foot = returns_in_box(actor, xyz, eye, t_us, free, settings.box_margin_m)
         if not len(inside):
             continue
@@ -333,7 +342,7 @@ def _split(
         free[inside] = False
         edge = np.full(len(inside), settings.min_voxel_m)
         up = ~foot
-        parts[actor.index] = (
+        parts[number] = (
             _voxel_sums(box_xyz[up], box_eye[up], edge[up], intensity[inside][up]),
             _unthinned(box_xyz[foot], box_eye[foot], edge[foot], intensity[inside][foot]),
             xyz[inside][foot],

@@ -77,18 +77,14 @@ def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
     """Cut a camera into pinhole tiles of at most ``max_field_deg``; one exact reduction if it is a plain pinhole."""
     reduction = settings.reduction_of(camera.width_px)
     lens = camera.ideal_pinhole
-    if lens is not None and abs(lens.fx_px - lens.fy_px) < 1e-3 * lens.fx_px:
+    if lens is not None and _square(camera):
         width, height = camera.width_px // reduction, camera.height_px // reduction
         center = (lens.cx_px / reduction, lens.cy_px / reduction)
         valid = np.ones((height, width), bool)
         tile = Tile(width, height, lens.fx_px / reduction, center, np.eye(3), reduction, None, valid, np.zeros(3))
         return [_with_fraction(tile, camera)]
-    rays, seen = sensors.pixel_rays(sensors.scaled_camera(camera, camera.width_px // 8, camera.height_px // 8))
-    azimuth, elevation = np.arctan2(rays[..., 0], rays[..., 2])[seen], np.arcsin(np.clip(rays[..., 1], -1, 1))[seen]
-    left, right = np.percentile(azimuth, [0.5, 99.5])
-    top, bottom = np.clip(np.percentile(elevation, [0.5, 99.5]), -0.96, 0.96)
-    limit = np.radians(settings.max_field_deg)
-    count = int(np.ceil((right - left) / limit))
+    left, right, top, bottom = _field(camera)
+    count = tile_count(camera, settings)
     focal = _pixels_per_radian(camera) / reduction
     tiles = []
     for k in range(count):
@@ -102,6 +98,29 @@ def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
         )
         tiles.append(_resampled_tile(camera, reduction, focal, (width / 2, -up * focal), (width, height), turn))
     return tiles
+
+
+def tile_count(camera: CameraModel, settings: ViewSettings) -> int:
+    """Number of tiles that a camera is cut into."""
+    if _square(camera):
+        return 1
+    left, right, _, _ = _field(camera)
+    return int(np.ceil((right - left) / np.radians(settings.max_field_deg)))
+
+
+def _square(camera: CameraModel) -> bool:
+    """Whether a camera is a plain pinhole with square pixels."""
+    lens = camera.ideal_pinhole
+    return lens is not None and abs(lens.fx_px - lens.fy_px) < 1e-3 * lens.fx_px
+
+
+def _field(camera: CameraModel) -> tuple[float, float, float, float]:
+    """Field of view: azimuths left and right, elevations top and bottom, radians to the right and down."""
+    rays, seen = sensors.pixel_rays(sensors.scaled_camera(camera, camera.width_px // 8, camera.height_px // 8))
+    azimuth, elevation = np.arctan2(rays[..., 0], rays[..., 2])[seen], np.arcsin(np.clip(rays[..., 1], -1, 1))[seen]
+    left, right = np.percentile(azimuth, [0.5, 99.5])
+    top, bottom = np.clip(np.percentile(elevation, [0.5, 99.5]), -0.96, 0.96)
+    return left, right, top, bottom
 
 
 def without_ego(tile: Tile, camera: CameraModel, body: Box) -> Tile:
@@ -201,6 +220,12 @@ def choose_frames(
         (camera, frame, frame // skip % step == 0) for camera in cameras for frame in range(0, counts[camera], skip)
     ]
     return sorted(chosen, key=lambda row: (int(clip.camera_times_us(row[0])[row[1]].sum()), row))
+
+
+def key_frames(clip: Clip, cameras: Sequence[str], settings: ViewSettings) -> list[tuple[str, int]]:
+    """(camera, frame) of the key frames that ``read_views`` reads, in order of time."""
+    tiles = sum(tile_count(clip.rig.cameras[camera], settings) for camera in cameras)
+    return [(camera, frame) for camera, frame, key in choose_frames(clip, cameras, tiles, settings) if key]
 
 
 def read_views(
