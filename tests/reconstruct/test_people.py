@@ -68,6 +68,14 @@ def test_a_window_holds_the_returns_of_its_time(street):
     assert len(parts.static) == len(whole.static)
 
 
+def test_each_instant_is_in_one_window(street):
+    actors = in_windows(actors_of(street, PointSettings()), street, [("front", frame) for frame in range(FRAMES)])
+    walkers = [actor for actor in actors if actor.track.id == "walker"]
+    times = np.arange(street.t_us[0], street.t_us[-1] + 1, 20_000)
+    assert len(walkers) == 4 and (sum(actor.present(times).astype(int) for actor in walkers) == 1).all()
+    assert not any(actor.present(street.t_us[[0, -1]] + [-1, 1]).any() for actor in walkers)
+
+
 def one_at(xyz):
     return dataclasses.replace(Gaussians.empty(1), mean_m=np.float32([xyz]), scale_m=np.full((1, 3), 0.1, np.float32))
 

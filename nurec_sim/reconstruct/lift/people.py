@@ -18,7 +18,7 @@ from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.scene.transform import transformed
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Trajectory
 
-LABELS = ("person", "rider", "animal")
+LABELS = ("person", "animal")
 SHORTEST_US = 200_000
 """Windows are no shorter; a walking person takes half a second for a step."""
 OFF_M, OFF_RAD = 0.1, np.radians(20.0)
@@ -39,7 +39,8 @@ def in_windows(actors: Sequence[Actor], clip: Clip, frames: Sequence[tuple[str, 
     """
     result: list[Actor] = []
     for actor in actors:
-        if actor.standing or actor.track.label not in LABELS or len(actor.path.t_us) < 2:
+        stands = len(actor.path.t_us) == 1
+        if stands or actor.track.label not in LABELS:
             result.append(actor)
             continue
         ends = _ends_us(actor.path, _seen_us(actor, clip, frames))
