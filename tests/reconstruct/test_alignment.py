@@ -10,6 +10,7 @@ from nurec_sim import geometry
 from nurec_sim.logs.selection import with_tracks
 from nurec_sim.reconstruct import LiftSettings, ViewSettings, reconstruct
 from nurec_sim.reconstruct.movers import registration, with_aligned_actors
+from nurec_sim.reconstruct.movers.alignment import _corrected
 from nurec_sim.reconstruct.movers.registration import Returns, corrections, disagreement, moved
 from nurec_sim.types import Trajectory
 
@@ -205,3 +206,12 @@ def test_a_track_lasts_as_long_as_it_was_labelled(street, wrong):
     assert changed == 1
     expected = np.concatenate([times[:1], path.t_us, times[-1:]])  # the sweeps, and both ends
     assert np.array_equal(log.tracks[0].path.t_us, expected)
+
+
+def test_a_track_stays_if_no_two_sweeps_show_the_same_part(wrong):
+    rng = np.random.default_rng(1)
+    rear, front = (np.column_stack([np.full(40, x), *rng.uniform(-0.7, 0.7, (2, 40))]) for x in (-2.0, 2.0))
+    track = wrong.tracks[0]
+    times = track.path.t_us.tolist()
+    assert _corrected(track, [(times[2], rear), (times[3], rear + (0.1, 0, 0))]) is not None
+    assert _corrected(track, [(times[2], rear), (times[3], front)]) is None

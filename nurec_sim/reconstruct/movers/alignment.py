@@ -101,7 +101,7 @@ def _corrected(track: Track, parts: Sequence[Part]) -> Track | None:
     poses = track.path.at(returns.t_us)
     values = corrections(returns, poses, sigma)
     before, after = disagreement(returns, np.zeros_like(values)), disagreement(returns, values)
-    if (np.abs(values) > LARGEST * sigma).any() or after > BETTER * before:
+    if (np.abs(values) > LARGEST * sigma).any() or after >= BETTER * before:
         return None
     change = np.array([geometry.pose_from_xyyaw(x, y, yaw, z) for x, y, z, yaw in values])
     times = np.union1d(returns.t_us, track.path.t_us[far])
