@@ -52,9 +52,10 @@ def with_aligned_actors(clip: Clip, hold_out: Collection[int] = ()) -> tuple[Cli
         if not actor.standing and np.ptp(actor.path.position_m, axis=0).max() >= MOVED_M
     ]
     seen = _gathered(clip, actors, hold_out)
+    known = [actor for actor in actors if len(seen[actor.index]) > 1]
     tracks, changed = list(clip.tracks), 0
-    for actor in actors:
-        if len(seen[actor.index]) > 1 and (track := _corrected(actor.track, seen[actor.index])) is not None:
+    for actor, track in zip(known, in_order(lambda a: _corrected(a.track, seen[a.index]), known), strict=True):
+        if track is not None:
             tracks[actor.index] = track
             changed += 1
     return (with_tracks(clip, tracks) if changed else clip), changed
