@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from nurec_sim.errors import ReconstructError
-from nurec_sim.reconstruct.lift.ground import find_ground
+from nurec_sim.reconstruct.lift.bodies import ground_of
 from nurec_sim.reconstruct.lift.points import actors_of, gather
 from nurec_sim.reconstruct.lift.settings import GroundSettings, PointSettings
 from nurec_sim.types import Clip, GaussianScene, Label
@@ -42,10 +42,7 @@ def with_measured_road(scene: GaussianScene, clip: Clip, hold_out: set[int]) -> 
             f"clip {clip.id!r} has no LiDAR returns to label the road by, with sweeps {sorted(hold_out)} held out; "
             "the network's own labels need road_labels='network'"
         )
-    feet = [world for _, world in gathered.feet.values()]
-    ground = find_ground(
-        gathered.static.xyz_m, clip.ego.world_from_body, GroundSettings(), np.concatenate(feet) if feet else None
-    )
+    ground = ground_of(clip, gathered, GroundSettings())
     static = scene.static
     near = np.isin(static.label, (Label.ROAD, Label.OTHER)) & (np.abs(ground.above(static.mean_m)) < NEAR_M)
     row, column, _ = ground.cells(static.mean_m[near])

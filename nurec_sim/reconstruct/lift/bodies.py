@@ -13,7 +13,7 @@ from nurec_sim.reconstruct.free_space import SweepBeams, balls, count_beams, in_
 from nurec_sim.reconstruct.lift import points, surfaces
 from nurec_sim.reconstruct.lift.ground import Ground, find_ground
 from nurec_sim.reconstruct.lift.points import Actor, Cloud, Gathered
-from nurec_sim.reconstruct.lift.settings import LiftSettings
+from nurec_sim.reconstruct.lift.settings import GroundSettings, LiftSettings
 from nurec_sim.types import Clip, Gaussians, Label
 
 SHEET_M = 0.08
@@ -73,9 +73,7 @@ def surfels_of(
     Returns:
         The static world's surfels first, then one entry per actor; and the ground.
     """
-    feet = [world for _, world in gathered.feet.values()]
-    under = np.concatenate(feet) if feet else None
-    ground = find_ground(gathered.static.xyz_m, clip.ego.world_from_body, settings.ground, under)
+    ground = ground_of(clip, gathered, settings.ground)
 
     def made(number: int) -> Surfels:
         if number == 0:
@@ -83,6 +81,13 @@ def surfels_of(
         return _actor_surfels(number - 1, actors[number - 1], gathered, ground)
 
     return list(in_order(made, range(1 + len(actors)), 1 + len(actors))), ground
+
+
+def ground_of(clip: Clip, gathered: Gathered, settings: GroundSettings) -> Ground:
+    """The ground under the driven path of a clip, by its gathered sweeps."""
+    feet = [world for _, world in gathered.feet.values()]
+    under = np.concatenate(feet) if feet else None
+    return find_ground(gathered.static.xyz_m, clip.ego.world_from_body, settings, under)
 
 
 def _world_surfels(gathered: Gathered, ground: Ground, carve: bool) -> Surfels:
