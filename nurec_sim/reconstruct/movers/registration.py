@@ -8,6 +8,7 @@ Geman and McClure), no vehicle changes its speed at once, and labels are not far
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -50,6 +51,25 @@ class Returns:
     xyz_m: Float64[np.ndarray, "n 3"]
     sweep: Int64[np.ndarray, " n"]
 
+    @cached_property
+    def planes(self) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
+        """Normals of the planes around returns among those of their own sweep, and how flat it is there, 0 to 1."""
+        normal, flat = np.zeros_like(self.xyz_m), np.zeros(len(self.xyz_m))
+        ends = np.searchsorted(self.sweep, np.arange(len(self.t_us) + 1))
+        for first, last in zip(ends[:-1], ends[1:], strict=True):
+            xyz = self.xyz_m[first:last]
+            if len(xyz) < PLANE_POINTS:
+                continue
+            around = xyz[cKDTree(xyz).query(xyz, PLANE_POINTS)[1]]
+            around = around - around.mean(axis=1, keepdims=True)
+            spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / PLANE_POINTS)
+            thin = np.sqrt(np.maximum(spread[:, 0], 0) / np.maximum(spread[:, 2], 1e-12))
+            # The returns of one beam lie on a line, which has no plane: its second extent vanishes as well.
+            plane = spread[:, 1] > 4 * spread[:, 0]
+            normal[first:last] = axes[:, :, 0]
+            flat[first:last] = np.where(plane, np.clip(1 - thin / FLATNESS, 0, 1), 0)
+        return normal, flat
+
 
 def corrections(
     returns: Returns, world_from_box: Float64[np.ndarray, "k 4 4"], sigma: Float64[np.ndarray, " 4"]
@@ -74,7 +94,7 @@ def _solved(
 ) -> Float64[np.ndarray, "k 4"]:
     """The corrections of one part of a track."""
     count = len(returns.t_us)
-    normal, flat = _planes(returns)
+    normal, flat = returns.planes
     values = np.zeros((count, 4))
     smooth, offset = _accelerations(returns.t_us, world_from_box)
     prior, pull = smooth.T @ smooth + np.diag(np.tile(1 / sigma**2, count)), smooth.T @ offset
@@ -95,7 +115,7 @@ def _solved(
 
 def disagreement(returns: Returns, values: Float64[np.ndarray, "k 4"]) -> float:
     """How far returns are from the planes of other sweeps: 0 on them, 1 if all are farther away than ``DISAGREE_M``."""
-    normal, flat = _planes(returns)
+    normal, flat = returns.planes
     xyz = moved(returns, values)
     near = _neighbours(xyz, returns.sweep, REACH_M[1])
     weight = np.where((near >= 0) & (returns.sweep[near] != returns.sweep[:, None]), flat[near], 0.0)
@@ -127,25 +147,6 @@ def _neighbours(xyz_m: Float64[np.ndarray, "n 3"], sweep: Int64[np.ndarray, " n"
             distance, row = tree.query(xyz_m, range(1, count + 1), distance_upper_bound=reach)
             near.append(np.where(np.isfinite(distance), row + first, -1))
     return np.concatenate(near, axis=1)
-
-
-def _planes(returns: Returns) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-    """Normals of the planes around returns among those of their own sweep, and how flat it is there, 0 to 1."""
-    normal, flat = np.zeros_like(returns.xyz_m), np.zeros(len(returns.xyz_m))
-    ends = np.searchsorted(returns.sweep, np.arange(len(returns.t_us) + 1))
-    for first, last in zip(ends[:-1], ends[1:], strict=True):
-        xyz = returns.xyz_m[first:last]
-        if len(xyz) < PLANE_POINTS:
-            continue
-        around = xyz[cKDTree(xyz).query(xyz, PLANE_POINTS)[1]]
-        around = around - around.mean(axis=1, keepdims=True)
-        spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / PLANE_POINTS)
-        thin = np.sqrt(np.maximum(spread[:, 0], 0) / np.maximum(spread[:, 2], 1e-12))
-        # The returns of one beam lie on a line, which has no plane: its second extent vanishes as well.
-        plane = spread[:, 1] > 4 * spread[:, 0]
-        normal[first:last] = axes[:, :, 0]
-        flat[first:last] = np.where(plane, np.clip(1 - thin / FLATNESS, 0, 1), 0)
-    return normal, flat
 
 
 def _accelerations(
