@@ -160,6 +160,34 @@ def test_corrections_undo_shifts_and_turns():
     assert np.ptp(xyz[:, 0, :, 1].mean(axis=1)) < 0.01 and np.ptp(xyz[:, 1, :, 0].mean(axis=1)) < 0.01
 
 
+def test_labels_that_are_sure_stay():
+    values = np.array([[0.1, -0.05, 0, 0.02], [-0.1, 0.02, 0, -0.03], [0.05, 0.08, 0, 0.0], [-0.05, -0.05, 0, 0.01]])
+    poses = np.array([change(*row) for row in values])
+    assert np.abs(corrections(walls(values), poses, 1e-4 * SIGMA)).max() < 0.01
+
+
+def test_gradients_of_pairs_are_derivatives_of_half_their_squares():
+    """By shift and turn of each of two sweeps; the planes turn with neither, and no pair is an outlier."""
+    rng = np.random.default_rng(4)
+    xyz, normal, flat = rng.normal(size=(6, 3)), rng.normal(size=(6, 3)), rng.uniform(0.2, 1, 6)
+    sweep, near = np.array([0, 0, 0, 1, 1, 1]), np.array([[3, 1], [4, -1], [5, 4], [0, 2], [1, -1], [2, 4]])
+
+    def cost(values):
+        at = moved(Returns(np.arange(2), xyz, sweep), values.reshape(2, 4))
+        pairs = [(i, j) for i, row in enumerate(near) for j in row if j >= 0 and sweep[i] != sweep[j]]
+        return sum(flat[j] * (normal[j] @ (at[i] - at[j])) ** 2 / 2 for i, j in pairs)
+
+    information, gradient = np.zeros((8, 8)), np.zeros(8)
+    registration._add_pairs(near, xyz, np.zeros((6, 3)), normal, flat, sweep, 1e6, information, gradient)
+    steps = 1e-5 * np.eye(8)
+    assert gradient == pytest.approx([(cost(d) - cost(-d)) / 2e-5 for d in steps], abs=1e-6)
+    # Second derivatives by shifts are exact: residuals are linear in them.
+    shifts = [0, 1, 2, 4, 5, 6]
+    steps = 1e-3 * np.eye(8)[shifts]
+    second = [[(cost(a + b) - cost(a - b) - cost(b - a) + cost(-a - b)) / 4e-6 for b in steps] for a in steps]
+    assert information[np.ix_(shifts, shifts)] == pytest.approx(np.array(second), abs=1e-5)
+
+
 def test_where_surfaces_do_not_tell_the_motion_is_steady():
     """Along one wall nothing tells the shift but that speed does not jump: labels zigzag by 0.2 m at 10 Hz, 80 m/s2."""
     zigzag = np.zeros((9, 4))
@@ -181,6 +209,15 @@ def test_long_tracks_are_corrected_in_parts(monkeypatch):
     alone = corrections(Returns(whole.t_us[:4], whole.xyz_m[first], whole.sweep[first]), poses[:4], SIGMA)
     rest = Returns(whole.t_us[4:], whole.xyz_m[~first], whole.sweep[~first] - 4)
     assert np.array_equal(found, np.concatenate([alone, corrections(rest, poses[4:], SIGMA)]))
+
+
+def test_a_part_without_returns_stays(monkeypatch):
+    """Labels at a high rate go on for a second after the last sweep."""
+    seen = walls(np.random.default_rng(2).normal(size=(4, 4)) * OFF * (1, 1, 0, 1))
+    times = np.append(seen.t_us, seen.t_us[-1] + 5_000 * np.arange(1, 5))
+    monkeypatch.setattr(registration, "MOST_TIMES", 4)
+    found = corrections(Returns(times, seen.xyz_m, seen.sweep), np.tile(np.eye(4), (8, 1, 1)), SIGMA)
+    assert np.abs(found[:4]).max() > 0.01 and not found[4:].any()
 
 
 def test_a_reconstruction_has_the_corrected_tracks_unless_told_otherwise(street, wrong):

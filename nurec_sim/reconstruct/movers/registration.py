@@ -94,6 +94,8 @@ def _solved(
 ) -> Float64[np.ndarray, "k 4"]:
     """The corrections of one part of a track."""
     count = len(returns.t_us)
+    if not len(returns.xyz_m):
+        return np.zeros((count, 4))
     normal, flat = returns.planes
     values = np.zeros((count, 4))
     smooth, offset = _accelerations(returns.t_us, world_from_box)
