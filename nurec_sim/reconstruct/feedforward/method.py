@@ -30,7 +30,7 @@ from nurec_sim.reconstruct.feedforward.tracks.labelled import scene_actors
 from nurec_sim.reconstruct.feedforward.tracks.rigid import rigid_once
 from nurec_sim.reconstruct.feedforward.tracks.standing import standing_pixels
 from nurec_sim.reconstruct.lift.actors import tracks_of
-from nurec_sim.reconstruct.road_labels import NOTE, with_measured_road
+from nurec_sim.reconstruct.measured_ground import NOTE, with_measured_ground
 from nurec_sim.types import Clip, DynamicGaussians, GaussianScene, Track
 
 Progress = Callable[[str, float], None]
@@ -114,7 +114,8 @@ def feedforward(
         ego_images=ego_images,
     )
     if by_lidar:
-        scene = with_measured_road(scene, clip, hold_out)
+        scene = with_measured_ground(scene, clip, hold_out)
+    scene.provenance["counts"]["ground_added"] = len(scene.static) - len(merged.static)
     progress("road", 1.0)
     return scene
 

@@ -29,12 +29,13 @@ class FeedForwardSettings:
         merge: ``ownership`` keeps each static Gaussian only where its chunk saw it from nearest, and each vehicle with
             a box once; ``concatenate`` keeps all Gaussians of all images.
         ownership_tolerance_m: how much farther than the nearest chunk an owner may be.
-        max_gaussians: static Gaussians are merged into voxels until at most so many are left; None keeps all.
+        max_gaussians: static Gaussians are merged into voxels until at most so many are left; None keeps all. Ground
+            that only sweeps show is added to them.
         lidar_depth: how predicted depth is fitted to the log's sweeps, per frame: not at all (``off``), by a factor
             (``scale``), by a factor and a slope over inverse depth (``affine``), or by a factor and a field of factors
             that follow the points from surface to surface (``local``).
-        road_labels: what tells road from other ground: the ``network`` or steps in the sweeps (``lidar``); ``auto``
-            takes the sweeps if there are any.
+        road_labels: what tells road from other ground: the ``network`` or steps in the sweeps (``lidar``), which then
+            also add the ground that no image shows; ``auto`` takes the sweeps if there are any.
         consensus: whether the images of a chunk agree on where a surface lies, which of them shows it, in what colour,
             and what can move; without, all of them show it where each sees it, as in the paper.
         ego_masks: folder with ``<camera>.png``: pixels of the car's own body, not black where it covers the view.
