@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
@@ -13,11 +15,13 @@ from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.points import Cloud
 from nurec_sim.types import Gaussians, Label
 
-NEIGHBOURS = 20
+NEIGHBOURS, FOURTH = 20, 4
 PLANE_RATIO = 0.15
 """First over second variance below which neighbours lie on a plane, and points are moved onto it."""
 LINE_RATIO = 0.02
 """Second over first variance below which neighbours lie on one scan line and do not determine the surface."""
+CELL_M, NOISE_SIGMAS = 0.15, 2.0
+"""Planes are looked for in cubes of three cells: noise of 3 cm hides them from the nearest points, 6 cm apart."""
 DISC_SIGMA = 0.45
 """Standard deviation of a disc per metre of the spacing of scattered points."""
 LATTICE_SIGMA = 0.63
@@ -36,49 +40,122 @@ def surface_of(cloud: Cloud, chunk: int = 16_384) -> tuple[Cloud, np.ndarray, np
     """The cloud moved onto its local planes, unit normals that face the sensor, and the spacing between points (m).
 
     Sweeps of a moving car disagree by centimetres, so that walls are thick; a grazing beam would end at their near
-    side. The normal is the direction of least variance of the nearest points. Where these lie on a line (one scan
-    ring), the surface is taken to contain the line and to face the sensor as well as it can.
+    side. Planes are looked for in cells that are wider than this (``CellPlanes``). Elsewhere the normal is the
+    direction of least variance of the nearest points. Where these lie on a line (one scan ring), the surface is taken
+    to contain the line and to face the sensor as well as it can.
     """
     from scipy.spatial import cKDTree
 
     n = len(cloud)
-    xyz = cloud.xyz_m.copy()
-    normals, spacing = np.zeros((n, 3), np.float32), cloud.spacing_m.astype(np.float32).copy()
     to_eye = cloud.eye_m - cloud.xyz_m
     to_eye /= np.maximum(np.linalg.norm(to_eye, axis=1, keepdims=True), 1e-9)
     if n < 4:
-        return cloud, to_eye.astype(np.float32), spacing
+        return cloud, to_eye.astype(np.float32), cloud.spacing_m.astype(np.float32).copy()
     k = min(NEIGHBOURS, n - 1)
     tree = cKDTree(cloud.xyz_m)
+    spacing = np.zeros(n, np.float32)
+    normals, height, flat = CellPlanes.of(cloud.xyz_m).normals_and_heights()
 
-    def fit(start: int) -> None:
-        part = slice(start, min(start + chunk, n))
-        distance, index = tree.query(cloud.xyz_m[part], k=k + 1)
-        offset = cloud.xyz_m[index] - cloud.xyz_m[part][:, None]
-        # Neighbours across a gap belong to another surface.
-        close = distance < np.maximum(4 * distance[:, 3:4], 4 * cloud.spacing_m[part, None])
-        mean, covariance = _moments(offset, close)
-        # Principal axes of the neighbourhood, variances ascending: the first axis is the normal of a plane.
-        variance, axes = np.linalg.eigh(covariance)
-        normal = axes[:, :, 0]
-        line = variance[:, 1] < LINE_RATIO * variance[:, 2]
-        along = axes[:, :, 2]
-        # The direction to the sensor without its part along the line.
-        facing = to_eye[part] - np.sum(to_eye[part] * along, axis=1, keepdims=True) * along
-        facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
-        normal = np.where(line[:, None], facing, normal)
-        plane = ~line & (variance[:, 0] < PLANE_RATIO * variance[:, 1])
-        height = np.where(plane, np.sum(normal * mean, axis=1), 0.0)
-        # Projection onto the local plane through the neighbours' mean; only where they are clearly flat.
-        xyz[part] += height[:, None] * normal
-        flip = np.sum(normal * to_eye[part], axis=1) < 0
-        normals[part] = np.where(flip[:, None], -normal, normal)
+    def fit(part: Int64[np.ndarray, " m"]) -> None:
+        distance, index = tree.query(cloud.xyz_m[part], k=1 + (min(FOURTH, k) if flat[part[0]] else k))
         # The fourth neighbour, not the first: its distance is steadier where sampling is uneven.
-        spacing[part] = np.clip(distance[:, min(4, k)] * 0.7, cloud.spacing_m[part], 3 * cloud.spacing_m[part])
+        fourth = distance[:, min(FOURTH, k)] * 0.7
+        spacing[part] = np.clip(fourth, cloud.spacing_m[part], 3 * cloud.spacing_m[part])
+        if not flat[part[0]]:
+            normals[part], height[part] = _nearest_planes(cloud, part, distance, index, to_eye[part])
 
-    for _ in in_order(fit, range(0, n, chunk)):
+    for _ in in_order(fit, [rows[i : i + chunk] for rows in (np.flatnonzero(~flat), np.flatnonzero(flat))
+                            for i in range(0, len(rows), chunk)]):  # fmt: skip
         pass
-    return dataclasses.replace(cloud, xyz_m=xyz), normals, spacing
+    xyz = cloud.xyz_m + height[:, None] * normals
+    flip = np.sum(normals * to_eye, axis=1) < 0
+    normals[flip] *= -1
+    return dataclasses.replace(cloud, xyz_m=xyz), normals.astype(np.float32), spacing
+
+
+def _nearest_planes(
+    cloud: Cloud,
+    part: Int64[np.ndarray, " m"],
+    distance: Float64[np.ndarray, "m k"],
+    index: Int64[np.ndarray, "m k"],
+    to_eye: Float64[np.ndarray, "m 3"],
+) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
+    """Unit normals of some points by their nearest ones, and how far the planes of these lie along them; 0 if none."""
+    offset = cloud.xyz_m[index] - cloud.xyz_m[part][:, None]
+    # Neighbours across a gap belong to another surface.
+    close = distance < np.maximum(4 * distance[:, 3:4], 4 * cloud.spacing_m[part, None])
+    mean, covariance = _moments(offset, close)
+    # Principal axes of the neighbourhood, variances ascending: the first axis is the normal of a plane.
+    variance, axes = np.linalg.eigh(covariance)
+    normal, along = axes[:, :, 0], axes[:, :, 2]
+    line = variance[:, 1] < LINE_RATIO * variance[:, 2]
+    # The direction to the sensor without its part along the line.
+    facing = to_eye - np.sum(to_eye * along, axis=1, keepdims=True) * along
+    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
+    normal = np.where(line[:, None], facing, normal)
+    plane = ~line & (variance[:, 0] < PLANE_RATIO * variance[:, 1])
+    # Projection onto the local plane through the neighbours' mean; only where they are clearly flat.
+    return normal, np.where(plane, np.sum(normal * mean, axis=1), 0.0)
+
+
+@dataclass(frozen=True)
+class CellPlanes:
+    """Planes through the points of cells of ``CELL_M`` and of their 26 neighbours.
+
+    ``plane`` is the plane of the cell of each point, -1 for none; ``sigma_m`` the standard deviation of the points
+    across it.
+    """
+
+    xyz_m: Float64[np.ndarray, "n 3"]
+    plane: Int64[np.ndarray, " n"]
+    centre_m: Float64[np.ndarray, "planes 3"]
+    normal: Float64[np.ndarray, "planes 3"]
+    sigma_m: Float64[np.ndarray, " planes"]
+
+    @classmethod
+    def of(cls, xyz_m: Float64[np.ndarray, "n 3"]) -> CellPlanes:
+        """The planes of a cloud."""
+        # Small numbers: sums of large squares would lose the digits that variances are made of.
+        origin = xyz_m.mean(axis=0)
+        local = xyz_m - origin
+        index = np.floor((local - local.min(axis=0)) / CELL_M).astype(np.int64) + 1
+        keys, cell = np.unique((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2], return_inverse=True)
+        rows, columns = np.triu_indices(3)
+        values = [np.ones(len(local)), *local.T, *(local[:, rows] * local[:, columns]).T]
+        own = np.stack([np.bincount(cell, each, len(keys)) for each in values], axis=1)
+        total = np.zeros_like(own)
+        for x, y, z in itertools.product((-1, 0, 1), repeat=3):
+            beside = keys + (x << 42) + (y << 21) + z
+            place = np.minimum(np.searchsorted(keys, beside), len(keys) - 1)
+            there = keys[place] == beside
+            total[there] += own[place[there]]
+        enough = np.flatnonzero(total[:, 0] > NEIGHBOURS)
+        total = total[enough] / total[enough, :1]
+        centre, covariance = total[:, 1:4], np.empty((len(enough), 3, 3))
+        covariance[:, rows, columns] = total[:, 4:] - centre[:, rows] * centre[:, columns]
+        covariance[:, columns, rows] = covariance[:, rows, columns]
+        variance, axes = np.linalg.eigh(covariance)
+        plane = (variance[:, 0] < PLANE_RATIO * variance[:, 1]) & (variance[:, 1] > LINE_RATIO * variance[:, 2])
+        found = np.full(len(keys), -1)
+        found[enough[plane]] = np.arange(np.count_nonzero(plane))
+        sigma = np.sqrt(np.maximum(variance[plane, 0], 0))
+        return cls(xyz_m, found[cell], centre[plane] + origin, axes[plane, :, 0], sigma)
+
+    def normals_and_heights(
+        self,
+    ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """For each point: the normal of its cell's plane, how far this lies along it, and whether the point is on it.
+
+        Normal and distance are 0 where it is on none. Points farther from the plane than ``NOISE_SIGMAS`` standard
+        deviations are not on it: a pole before a wall.
+        """
+        normals, heights, on = np.zeros(self.xyz_m.shape), np.zeros(len(self.xyz_m)), self.plane >= 0
+        plane = self.plane[on]
+        height = np.sum(self.normal[plane] * (self.centre_m[plane] - self.xyz_m[on]), axis=1)
+        near = np.abs(height) < NOISE_SIGMAS * self.sigma_m[plane]
+        on[on] = near
+        normals[on], heights[on] = self.normal[plane[near]], height[near]
+        return normals, heights, on
 
 
 @kernel
