@@ -166,6 +166,21 @@ def is_free(passed: Int32[np.ndarray, " n"], stopped: Int32[np.ndarray, " n"]) -
     return (passed >= VOTES) & (passed > stopped)
 
 
+def weighed(gaussians: Gaussians, passed: Int32[np.ndarray, " n"], stopped: Int32[np.ndarray, " n"]) -> Gaussians:
+    """The Gaussians as opaque as recorded beams found them: less, the more beams passed through them.
+
+    A beam that meets a surface goes through about two of its Gaussians, so the opacity falls with the square of the
+    share of beams that ended there. Foliage, bars and what reaches over the edge of a surface let light through.
+
+    Args:
+        gaussians: as opaque as where nothing passes.
+        passed: beams that passed through each (``count_beams``).
+        stopped: beams that ended at each.
+    """
+    share = (stopped + 1) / (stopped + passed + 1)
+    return dataclasses.replace(gaussians, opacity=(gaussians.opacity * share**2).astype(np.float32))
+
+
 def count_beams(
     gaussians: Gaussians,
     sweeps: Sequence[SweepBeams],

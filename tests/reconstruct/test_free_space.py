@@ -16,6 +16,7 @@ from nurec_sim.reconstruct.free_space import (
     count_beams,
     in_free_space,
     sweep_beams,
+    weighed,
 )
 from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels
 from nurec_sim.reconstruct.lift.blocks import LEAST_TOLERANCE
@@ -60,6 +61,28 @@ def at(*places, sigma_m=SIGMA_M):
 def test_what_beams_pass_is_free_and_where_they_end_is_not(parked):
     gaussians = at([10, 0, 0], [20, 0, 0], [25, 0, 0], [10, 8, 0])
     assert in_free_space(gaussians, [sweep_of(parked, 20.0)] * 2).tolist() == [True, False, False, False]
+
+
+def test_what_lets_beams_pass_is_less_opaque():
+    """By the square of the share that ended there, and one more: 1, 4/5 and 1/2."""
+    gaussians = dataclasses.replace(at([10, 0, 0], [10, 1, 0], [10, 2, 0], [10, 3, 0]), opacity=np.float32([0.9] * 4))
+    found = weighed(gaussians, np.array([0, 1, 4, 0]), np.array([7, 3, 3, 0]))
+    np.testing.assert_allclose(found.opacity, [0.9, 0.9 * 0.64, 0.9 * 0.25, 0.9], rtol=1e-6)
+
+
+def test_bodies_keep_what_is_not_free_as_opaque_as_beams_found_it(parked):
+    """Three sweeps end at a place and one passes it, another place is passed by all, and a third by none."""
+    gaussians = at([10, 0, 0], [6, 0, 0], [30, 0, 0], sigma_m=0.01)
+    gaussians = dataclasses.replace(gaussians, opacity=np.ones(3, np.float32))
+    beams = [sweep_of(parked, 10.0)] * 3 + [sweep_of(parked, 20.0)]
+    passed, stopped = count_beams(gaussians, beams)
+    assert stopped[0] > passed[0] > 0
+    nothing, none = Cloud(*np.zeros((2, 0, 3)), *np.zeros((2, 0))), np.zeros(0)
+    world = Surfels(None, nothing, np.zeros((0, 3)), none, none, none)
+    solid, kept = world.outside_free_space(gaussians, beams)
+    assert kept.tolist() == [True, False, True]
+    share = (stopped[0] + 1) / (stopped[0] + passed[0] + 1)
+    np.testing.assert_allclose(solid.opacity, [share**2, 1.0], rtol=1e-6)
 
 
 def test_beams_that_meet_an_ellipsoid_are_found_whatever_its_place_and_turn(parked):

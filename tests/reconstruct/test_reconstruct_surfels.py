@@ -67,6 +67,46 @@ def test_a_rim_that_looks_like_what_lies_behind_it_is_trimmed(grey, kept):
     assert (inverse_depth[:, :5] == np.float32(0.2)).all() and (inverse_depth[:, 5:] == np.float32(0.1)).all()
 
 
+# ------------------------------------------------------------------------------------------------------------ surfaces
+
+
+def noisy_wall(noise_m, seed=0):
+    """A wall 4 m by 3 m at x = 10 m with points as near as 6 cm, measured from the origin with noise along x."""
+    random = np.random.default_rng(seed)
+    y, z = random.uniform(-2, 2, 3300), random.uniform(-1.5, 1.5, 3300)
+    xyz = np.column_stack([10 + random.normal(0, noise_m, len(y)), y, z])
+    return Cloud(xyz, np.zeros_like(xyz), np.full(len(y), 0.06, np.float32), np.zeros(len(y), np.float32))
+
+
+def test_a_wall_thicker_than_its_points_are_apart_becomes_thin():
+    """Noise of 3 cm on points 6 cm apart: the 20 nearest lie as much across the wall as along it."""
+    wall = noisy_wall(0.03)
+    flat, normals, _ = surfaces.surface_of(wall)
+    inner = (np.abs(wall.xyz_m[:, 1]) < 1.8) & (np.abs(wall.xyz_m[:, 2]) < 1.3)
+    # Points beyond two standard deviations, 4.6 % of them, keep their place.
+    assert np.mean(np.abs(flat.xyz_m[inner, 0] - 10) < 0.01) > 0.9
+    assert np.mean(normals[inner, 0] < -np.cos(np.radians(8))) > 0.9
+
+
+def test_a_pole_before_a_wall_stays_before_it():
+    """Its points are too few to hide the plane of the wall, and lie 2.4 standard deviations before it."""
+    wall, z = noisy_wall(0.01), np.arange(-1.4, 1.4, 0.06)
+    pole = np.column_stack([np.full(len(z), 9.88), np.zeros(len(z)), z])
+    same = np.full(len(z), 0.06, np.float32)
+    found, _, _ = surfaces.surface_of(Cloud.concatenate([wall, Cloud(pole, np.zeros_like(pole), same, same)]))
+    assert np.mean(np.abs(found.xyz_m[len(wall) :, 0] - 9.88) < 0.04) > 0.9
+    assert np.mean(np.abs(found.xyz_m[: len(wall), 0] - 10) < 0.01) > 0.9
+
+
+def test_planes_do_not_depend_on_where_the_origin_is():
+    """Sums of squares of coordinates in the hundreds of kilometres would have no digits left for millimetres."""
+    wall, far = noisy_wall(0.03), np.array([5e5, -4e6, 100.0])
+    moved = Cloud(wall.xyz_m + far, wall.eye_m + far, wall.spacing_m, wall.intensity)
+    here, there = surfaces.surface_of(wall), surfaces.surface_of(moved)
+    np.testing.assert_allclose(there[0].xyz_m - far, here[0].xyz_m, atol=1e-6)
+    np.testing.assert_allclose(there[1], here[1], atol=1e-4)
+
+
 # ------------------------------------------------------------------------------------------------------------- owning
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from nurec_sim.compute.cores import in_order
-from nurec_sim.reconstruct.free_space import SweepBeams, balls, count_beams, in_free_space, is_free
+from nurec_sim.reconstruct.free_space import SweepBeams, balls, count_beams, in_free_space, is_free, weighed
 from nurec_sim.reconstruct.lift import points, surfaces
 from nurec_sim.reconstruct.lift.ground import Ground, find_ground
 from nurec_sim.reconstruct.lift.points import Actor, Cloud, Gathered
@@ -45,9 +45,13 @@ class Surfels:
         known = lambda t_us: self.world_from_body(t_us) if self.present(t_us) else None  # noqa: E731
         return count_beams(gaussians, beams, known, self.box_size_m)
 
-    def in_free_space(self, gaussians: Gaussians, beams: Sequence[SweepBeams]) -> Bool[np.ndarray, " n"]:
-        """Gaussians of the body, in its frame, that recorded beams passed through."""
-        return is_free(*self.count_beams(gaussians, beams))
+    def outside_free_space(
+        self, gaussians: Gaussians, beams: Sequence[SweepBeams]
+    ) -> tuple[Gaussians, Bool[np.ndarray, " n"]]:
+        """Those Gaussians of the body that are not in free space, as opaque as beams found them; and which these are."""
+        counts = self.count_beams(gaussians, beams)
+        kept = ~is_free(*counts)
+        return weighed(gaussians, *counts)[kept], kept
 
     @property
     def box_size_m(self) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from nurec_sim.compute.cores import in_order
-from nurec_sim.reconstruct.free_space import SweepBeams
+from nurec_sim.reconstruct.free_space import SweepBeams, weighed
 from nurec_sim.reconstruct.lift import surfaces
 from nurec_sim.reconstruct.lift.blocks import painted
 from nurec_sim.reconstruct.lift.bodies import Surfels
@@ -37,18 +37,17 @@ def outside_free_space(
     Pixels that hover low over the road show the road, and are moved down to it along their rays; dropped, they would
     leave a hole. Footprints at which beams end, and that only reach into free space by their stretch, are made round.
     """
-    footprints = footprints_of(lifted, body, ground, settings)
-    free = body.in_free_space(footprints, beams)
-    parts, rest = [footprints[~free]], lifted[free]
+    solid, kept = body.outside_free_space(footprints_of(lifted, body, ground, settings), beams)
+    parts, rest = [solid], lifted[~kept]
     if body.actor is None:
         low = _low(rest, ground)
         footprints = footprints_of(on_ground(rest, ground), body, ground, settings)
-        parts.append(footprints[~body.in_free_space(footprints, beams)])
+        parts.append(body.outside_free_space(footprints, beams)[0])
         rest = rest[~low]
     footprints = footprints_of(rest, body, ground, settings, 1.0)
     passed, stopped = body.count_beams(footprints, beams)
     stays = (stopped > 0) & (stopped >= passed)
-    parts.append(footprints[stays])
+    parts.append(weighed(footprints, passed, stopped)[stays])
     return Gaussians.concatenate(parts), rest[~stays]
 
 
