@@ -70,21 +70,6 @@ def test_what_lets_beams_pass_is_less_opaque():
     np.testing.assert_allclose(found.opacity, [0.9, 0.9 * 0.64, 0.9 * 0.25, 0.9], rtol=1e-6)
 
 
-def test_bodies_keep_what_is_not_free_as_opaque_as_beams_found_it(parked):
-    """Three sweeps end at a place and one passes it, another place is passed by all, and a third by none."""
-    gaussians = at([10, 0, 0], [6, 0, 0], [30, 0, 0], sigma_m=0.01)
-    gaussians = dataclasses.replace(gaussians, opacity=np.ones(3, np.float32))
-    beams = [sweep_of(parked, 10.0)] * 3 + [sweep_of(parked, 20.0)]
-    passed, stopped = count_beams(gaussians, beams)
-    assert stopped[0] > passed[0] > 0
-    nothing, none = Cloud(*np.zeros((2, 0, 3)), *np.zeros((2, 0))), np.zeros(0)
-    world = Surfels(None, nothing, np.zeros((0, 3)), none, none, none)
-    solid, kept = world.outside_free_space(gaussians, beams)
-    assert kept.tolist() == [True, False, True]
-    share = (stopped[0] + 1) / (stopped[0] + passed[0] + 1)
-    np.testing.assert_allclose(solid.opacity, [share**2, 1.0], rtol=1e-6)
-
-
 def test_beams_that_meet_an_ellipsoid_are_found_whatever_its_place_and_turn(parked):
     """Counts against all beams of the image: within 1.5 of squared Mahalanobis distance, or near the centre."""
     random, count = np.random.default_rng(0), 60
@@ -240,6 +225,28 @@ def level_ground():
 def body_of(xyz_m, normal):
     cloud = dataclasses.replace(Cloud.empty(), xyz_m=xyz_m, intensity=np.full(len(xyz_m), 0.5, np.float32))
     return Surfels(None, cloud, normal, *np.full((2, len(xyz_m)), 0.5, np.float32), np.zeros(len(xyz_m), np.uint8))
+
+
+def test_bodies_keep_what_is_not_free_as_opaque_as_beams_found_it(parked):
+    """Three sweeps end at 8 m and one passes; but the ground, known up to 9 m, stays opaque."""
+    empty = body_of(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+
+    def seen(places, distance_m, normal):
+        beams = [sweep_of(parked, distance_m)] * 3 + [sweep_of(parked, 2 * distance_m)]
+        gaussians = dataclasses.replace(at(*places, sigma_m=0.01), opacity=np.ones(len(places), np.float32),
+                                        normal=np.tile(np.float32(normal), (len(places), 1)))  # fmt: skip
+        passed, stopped = count_beams(gaussians, beams)
+        solid, kept = empty.outside_free_space(gaussians, beams, level_ground())
+        return solid.opacity, kept.tolist(), ((stopped + 1) / (stopped + passed + 1)) ** 2
+
+    for normal in ([0, 0, 1], [1, 0, 0]):
+        opacity, kept, share = seen([[8, 0, 0], [8, 0, 1], [5, 0, 0]], 8.0, normal)
+        assert kept == [True, True, False] and 0.3 < share[1] < 0.8
+        np.testing.assert_allclose(opacity, [1.0, share[1]], rtol=1e-6)
+        # Beyond the known ground what is level may be ground.
+        opacity, kept, share = seen([[12, 0, 0]], 12.0, normal)
+        assert kept == [True] and 0.3 < share[0] < 0.8
+        np.testing.assert_allclose(opacity, [1.0 if normal[2] else share[0]], rtol=1e-6)
 
 
 def test_pixels_low_over_the_road_are_moved_down_to_it_along_their_rays():

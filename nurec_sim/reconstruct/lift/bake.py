@@ -189,7 +189,7 @@ def body_gaussians(
     seen = np.isfinite(pixel)
     colours = np.where(seen[:, None], seen_rgb / np.float32(255), colour.grey_of(cloud.intensity))
     discs = _discs(body, colours, np.flatnonzero(keep), settings.opacity)
-    discs, stays = body.outside_free_space(discs, beams)
+    discs, stays = body.outside_free_space(discs, beams, ground)
     made, lifted = Gaussians.concatenate([*parts, discs]), sum(map(len, parts))
     shown = np.concatenate([np.ones(lifted, bool), seen[keep][stays]])
     return replace(made, rgb=colours_by_likeness(made, shown)), lifted

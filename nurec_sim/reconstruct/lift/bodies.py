@@ -16,6 +16,8 @@ from nurec_sim.reconstruct.lift.points import Actor, Cloud, Gathered
 from nurec_sim.reconstruct.lift.settings import GroundSettings, LiftSettings
 from nurec_sim.types import Clip, Gaussians, Label
 
+LEVEL = 0.97
+"""Vertical part of a normal from which a surface counts as level, as ground is that lies beyond the height grid."""
 SHEET_M = 0.08
 """Points so near to the ground are part of its sheet."""
 
@@ -46,12 +48,20 @@ class Surfels:
         return count_beams(gaussians, beams, known, self.box_size_m)
 
     def outside_free_space(
-        self, gaussians: Gaussians, beams: Sequence[SweepBeams]
+        self, gaussians: Gaussians, beams: Sequence[SweepBeams], ground: Ground
     ) -> tuple[Gaussians, Bool[np.ndarray, " n"]]:
-        """Those Gaussians of the body that are not in free space, as opaque as beams found them; and which these are."""
-        counts = self.count_beams(gaussians, beams)
-        kept = ~is_free(*counts)
-        return weighed(gaussians, *counts)[kept], kept
+        """Those Gaussians of the body that are not in free space, as opaque as beams found them; and which these are.
+
+        The ground, and what is level where none is known, stays opaque: beams graze it, and a centimetre of its height
+        decides whether they pass.
+        """
+        passed, stopped = self.count_beams(gaussians, beams)
+        kept = ~is_free(passed, stopped)
+        if self.actor is None:
+            above = ground.above(gaussians.mean_m)
+            level = np.isinf(above) & (gaussians.normal[:, 2] > LEVEL)
+            passed = np.where(level | (np.abs(above) < SHEET_M), 0, passed)
+        return weighed(gaussians, passed, stopped)[kept], kept
 
     @property
     def box_size_m(self) -> tuple[float, float, float]:

@@ -12,7 +12,7 @@ from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.free_space import SweepBeams, weighed
 from nurec_sim.reconstruct.lift import surfaces
 from nurec_sim.reconstruct.lift.blocks import painted
-from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.bodies import LEVEL, Surfels
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
@@ -21,8 +21,6 @@ from nurec_sim.types import Gaussians, Label
 
 GROUND_M = 0.12
 """Points so near to the ground belong to it."""
-LEVEL = 0.97
-"""Vertical part of a normal from which a surface counts as level, as ground is that lies beyond the height grid."""
 LOW_M, GRAZING = 0.5, 0.03
 """Pixels wrongly this low over the ground show the ground, unless their rays are flatter than this slope."""
 PART = 32_768
@@ -37,12 +35,12 @@ def outside_free_space(
     Pixels that hover low over the road show the road, and are moved down to it along their rays; dropped, they would
     leave a hole. Footprints at which beams end, and that only reach into free space by their stretch, are made round.
     """
-    solid, kept = body.outside_free_space(footprints_of(lifted, body, ground, settings), beams)
+    solid, kept = body.outside_free_space(footprints_of(lifted, body, ground, settings), beams, ground)
     parts, rest = [solid], lifted[~kept]
     if body.actor is None:
         low = _low(rest, ground)
         footprints = footprints_of(on_ground(rest, ground), body, ground, settings)
-        parts.append(body.outside_free_space(footprints, beams)[0])
+        parts.append(body.outside_free_space(footprints, beams, ground)[0])
         rest = rest[~low]
     footprints = footprints_of(rest, body, ground, settings, 1.0)
     passed, stopped = body.count_beams(footprints, beams)
