@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import UInt8
 
 from nurec_sim.compute.cores import in_order
 from nurec_sim.errors import ReconstructError
@@ -55,11 +54,6 @@ def lift(
               for camera, model in clip.rig.cameras.items() if camera in cameras]  # fmt: skip
     given, settings = settings, settings.for_log(path_m, span_us / 1e6, images)
     stages = _Stages(progress)
-
-    def read() -> tuple[dict[str, UInt8[np.ndarray, "h w 4"]], list[WorkingView]]:
-        ego_images = find_ego_images(clip, cameras, hold_out=hold_out)
-        return ego_images, read_views(clip, cameras, ego_images, settings.views)
-
     stages.start("sweeps")
     actors = people.in_windows(points.actors_of(clip, settings.points), clip, key_frames(clip, cameras, settings.views))
     gathered = points.gather(clip, actors, hold_out, settings.points, stages.fraction)
@@ -68,13 +62,11 @@ def lift(
             f"clip {clip.id!r}: method 'lift' needs LiDAR sweeps; have lidars {list(clip.rig.lidars)} "
             f"with no usable points after holding out sweeps {sorted(hold_out)}"
         )
-    # The search for the ground uses one core: images are read beside it.
-    with ThreadPoolExecutor(1) as beside:
-        reading = beside.submit(read)
-        stages.start("ground and surfaces")
-        bodies, ground = surfels_of(clip, actors, gathered, settings)
-        stages.start("images")
-        ego_images, views = reading.result()
+    stages.start("ground and surfaces")
+    bodies, ground = surfels_of(clip, actors, gathered, settings)
+    stages.start("images")
+    ego_images = find_ego_images(clip, cameras, stages.fraction, hold_out)
+    views = read_views(clip, cameras, ego_images, settings.views, stages.fraction)
     stages.start("depth")
     pictures = depth_pictures(views, bodies, settings, stages.fraction)
     views = [view for view in views if view.key]
