@@ -130,9 +130,9 @@ class CellPlanes:
             there = keys[place] == beside
             total[there] += own[place[there]]
         enough = np.flatnonzero(total[:, 0] > NEIGHBOURS)
-        total = total[enough] / total[enough, :1]
-        centre, covariance = total[:, 1:4], np.empty((len(enough), 3, 3))
-        covariance[:, rows, columns] = total[:, 4:] - centre[:, rows] * centre[:, columns]
+        mean = total[enough] / total[enough, :1]
+        centre, covariance = mean[:, 1:4], np.empty((len(enough), 3, 3))
+        covariance[:, rows, columns] = mean[:, 4:] - centre[:, rows] * centre[:, columns]
         covariance[:, columns, rows] = covariance[:, rows, columns]
         variance, axes = np.linalg.eigh(covariance)
         plane = (variance[:, 0] < PLANE_RATIO * variance[:, 1]) & (variance[:, 1] > LINE_RATIO * variance[:, 2])
