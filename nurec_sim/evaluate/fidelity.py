@@ -33,7 +33,7 @@ def measure_fidelity(
 
     Returns:
         JSON-ready figures: ``held_out``, ``images``, ``psnr_db``, ``ssim``, ``sweeps``, ``range_error_m`` (median),
-        ``return_recall``; ``road`` as in ``metrics.offroad_agreement``, None without a map.
+        ``return_recall``; ``road`` as in ``metrics.road_agreement``, None without a map.
     """
     cameras = [camera for camera in scene.provenance.get("cameras", scene.rig.cameras) if camera in clip.rig.cameras]
     held = hold_out(clip, cameras, images_every=hold_out_every)

@@ -22,7 +22,7 @@ from nurec_sim.evaluate.image_scores import score_images
 from nurec_sim.evaluate.lidar_scores import score_free_space, score_sweeps
 from nurec_sim.logs.held_out import HeldOut, hold_out, without_images
 from nurec_sim.logs.selection import with_tracks
-from nurec_sim.metrics.offroad import offroad_agreement
+from nurec_sim.metrics.offroad_agreement import road_agreement
 from nurec_sim.metrics.offroad_grid import scene_offroad_grid
 from nurec_sim.reconstruct.movers import NAME as FOUND
 from nurec_sim.render import make_renderer
@@ -260,11 +260,11 @@ def sensing(scene: GaussianScene, via_grpc: bool, device: str) -> Iterator[Sense
 
 
 def score_road(scene: GaussianScene) -> dict[str, object] | None:
-    """How off-road from Gaussians agrees with the log's map (``metrics.offroad_agreement``); None without a map."""
+    """How off-road from Gaussians agrees with the log's map (``metrics.road_agreement``); None without a map."""
     if scene.road_map is None or not scene.road_map.drivable:
         return None
     try:
-        found = offroad_agreement(scene_offroad_grid(scene), scene.road_map, scene.ego, scene.rig.body)
+        found = road_agreement(scene_offroad_grid(scene), scene.road_map, scene.ego, scene.rig.body)
     except (ReconstructError, ValueError) as error:  # no labelled road, or the car hardly moved
         return {"not_known": str(error)}
     return {name: None if value != value else value for name, value in dataclasses.asdict(found).items()}

@@ -44,7 +44,10 @@ def figure_rows(figures: Mapping[str, Any]) -> list[Row]:
             Row("False obstacles", "recorded returns, for comparison (%)", None if own is None else 100 * own, 2)
         )
     if road := figures["road"]:
-        rows.append(Row("Road", "off-road agrees with the map", road.get("agreement"), 3, 1))
+        rows += [
+            Row("Road", "off-road agrees with the map", road.get("agreement"), 3, 1),
+            Row("Road", "edge beyond the map's, median (m)", road.get("boundary_bias_m"), 3),
+        ]
     if actors := figures.get("actors"):
         rows += _actor_rows(actors)
     if detection := figures.get("detection"):

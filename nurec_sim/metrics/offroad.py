@@ -18,7 +18,7 @@ from nurec_sim.metrics.boxes import body_boxes
 from nurec_sim.metrics.offroad_grid import OffroadGrid
 from nurec_sim.metrics.series import make_series, times_of, unknown_series
 from nurec_sim.scene.opendrive.road_area import drivable_area
-from nurec_sim.types import Box, RoadMap, Rollout, Series, Trajectory
+from nurec_sim.types import Box, RoadMap, Rollout, Series
 
 TOLERANCE_M = 0.3
 SAMPLE_STEP_M = 0.1
@@ -131,72 +131,6 @@ def corners_outside_m(area, world_from_rig: Float64[np.ndarray, "n 4 4"], body: 
 
     corners = geometry.box_corners_xy(body_boxes(world_from_rig, body).world_from_box, *body.size_m[:2])
     return shapely.distance(area, shapely.points(corners)).max(axis=1)
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """Agreement of the Gaussian grid with the true polygon at random placements.
-
-    ``agreement`` excludes unknown placements. ``false_alarms`` are off in the grid only, ``misses`` off in the polygon
-    only. ``error_margin_p95_m``: distance of the true excursion from the tolerance where the two disagree (NaN if they
-    never do).
-    """
-
-    placements: int
-    known: int
-    agreement: float
-    unknown_frac: float
-    false_alarms: int
-    misses: int
-    error_margin_p95_m: float
-
-
-def offroad_agreement(
-    grid: OffroadGrid,
-    road_map: RoadMap,
-    ego: Trajectory,
-    body: Box,
-    placements: int = 900,
-    seed: int = 0,
-    max_offset_m: float = 5.5,
-) -> Agreement:
-    """Compares the grid with the true drivable area at footprints beside the recorded path.
-
-    Placements are uniform along the path and to either side, heading along it.
-
-    Args:
-        grid: road grid of the reconstruction.
-        road_map: the true map.
-        ego: the recorded path.
-        body: the car's body in the rig frame.
-        placements: number of random footprints.
-        seed: of the placements.
-        max_offset_m: largest lateral offset from the path, metres.
-
-    Raises:
-        ValueError: the map has no drivable area, or the path is shorter than a metre.
-    """
-    if not road_map.drivable:
-        raise ValueError("the road map has no drivable area to compare with")
-    line = ego.position_m[:, :2]
-    length = geometry.arc_length(line)
-    if length[-1] < 1.0:
-        raise ValueError(f"the recorded path is {length[-1]:.2f} m long; at least 1 m is needed to place footprints")
-    draw = np.random.default_rng(seed)
-    at, offset = draw.uniform(0, length[-1], placements), draw.uniform(-max_offset_m, max_offset_m, placements)
-    t_us = np.interp(at, length, ego.t_us - ego.t_us[0]).astype(np.int64) + ego.t_us[0]
-    poses = ego.at(t_us)
-    poses[:, :3, 3] += offset[:, None] * poses[:, :3, 1]
-    verdict = judge_footprints(grid, poses, body).verdict
-    beyond = corners_outside_m(drivable_area(road_map), poses, body)
-    truth, known, predicted = beyond > TOLERANCE_M, verdict != RoadState.UNKNOWN, verdict == RoadState.OFF
-    wrong = known & (predicted != truth)
-    margin = float(np.quantile(np.abs(beyond[wrong] - TOLERANCE_M), 0.95)) if wrong.any() else float("nan")
-    count = int(known.sum())
-    return Agreement(
-        placements, count, 1 - float(wrong.sum()) / count if count else float("nan"), 1 - count / placements,
-        int((wrong & predicted).sum()), int((wrong & truth).sum()), margin,
-    )  # fmt: skip
 
 
 def _first_relevant(rollout: Rollout) -> int:

@@ -11,10 +11,11 @@ from nurec_sim.report.template import html_page
 from nurec_sim.study.results import RANKED_BY, StudyResults
 from nurec_sim.study.rollout_sections import (
     braking_section,
+    doubt_section,
     failures_section,
     families_section,
+    road_section,
     scenes_section,
-    support_section,
 )
 
 ENOUGH_SCENES = 10
@@ -26,8 +27,9 @@ def render_study(results: StudyResults) -> str:
     figures = {f"bars-{metric}": comparison_bars(results.comparison, metric) for metric in BARS}
     body = [
         _header(results), _verdict(results), _bars(results), rank_agreement(results.comparison), _seeing(results),
-        _controls(results), support_section(results), braking_section(results), differences(results.comparison),
-        families_section(results), scenes_section(results), _pairs(results), failures_section(results),
+        _controls(results), doubt_section(results), braking_section(results), differences(results.comparison),
+        road_section(results), families_section(results), scenes_section(results), _pairs(results),
+        failures_section(results),
     ]  # fmt: skip
     return html_page(f"{results.config.name} · nurec_sim study", body, stored={"figures": figures, "images": {}})
 

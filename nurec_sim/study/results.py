@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -25,7 +26,8 @@ from nurec_sim.runs import folder as layout
 from nurec_sim.runs.compared import COMPARED, comparison_of
 from nurec_sim.study.braking import Braking, first_braking
 from nurec_sim.study.config import StudyConfig, control_name
-from nurec_sim.study.doubt import Doubt, doubts
+from nurec_sim.study.doubt import Doubt, after_low_support, contradicted
+from nurec_sim.study.road import Road, measure_roads
 from nurec_sim.study.tasks import ROLLOUTS, VALUES
 
 RANKED_BY = ("collision_offroad_mean", "scene_score")
@@ -43,9 +45,10 @@ class StudyResults:
     policies, ``seeing`` the agreements of those that look at a sensor only, by metric and world: blind ones agree by
     construction. ``drops`` is by control and metric how much less than the intact reconstruction it agrees with the
     truth. ``pairs`` is by world the difference of every two policies in (C+O)/2, adjusted by Holm. ``differing`` names
-    blind policies that did not drive the same in all worlds, which is a fault of the simulator. ``doubts`` is by world
-    how often verdicts with and without low support are wrong. ``braking`` is by world and policy that looks at a sensor
-    when it first brakes, against the truth.
+    blind policies that did not drive the same in all worlds, which is a fault of the simulator. ``low_support`` and
+    ``contradicted`` are by world how often verdicts to doubt, and all others, are wrong. ``braking`` is by world and
+    policy that looks at a sensor when it first brakes, against the truth. ``roads`` is by reconstruction how its road
+    agrees with the map, empty if not measured.
     """
 
     config: StudyConfig
@@ -56,8 +59,10 @@ class StudyResults:
     drops: dict[tuple[str, str], Estimate]
     pairs: dict[str, list[tuple[str, str, Difference]]]
     differing: tuple[str, ...]
-    doubts: dict[str, Doubt] = field(default_factory=dict)
+    low_support: dict[str, Doubt] = field(default_factory=dict)
+    contradicted: dict[str, Doubt] = field(default_factory=dict)
     braking: dict[tuple[str, str], Braking] = field(default_factory=dict)
+    roads: dict[str, Road] = field(default_factory=dict)
 
     @property
     def discriminates(self) -> bool | None:
@@ -73,7 +78,7 @@ class StudyResults:
 
 
 def gather(folder: Path, config: StudyConfig, seeing: Sequence[str]) -> StudyResults:
-    """Reads the values of all rollouts, and compares the worlds."""
+    """Reads the values of all rollouts, compares the worlds, and measures the roads of the reconstructions."""
     parts = []
     for scene_id, _, _ in config.scenes:
         for world in config.all_worlds:
@@ -81,11 +86,12 @@ def gather(folder: Path, config: StudyConfig, seeing: Sequence[str]) -> StudyRes
             if not path.exists():
                 raise RunError(f"{path} does not exist: the study is incomplete; run it again")
             parts.append(pl.read_parquet(path))
-    return results_of(config, pl.concat(parts), seeing)
+    results = results_of(config, pl.concat(parts), seeing)
+    return dataclasses.replace(results, roads=measure_roads(folder, config))
 
 
 def results_of(config: StudyConfig, values: pl.DataFrame, seeing: Sequence[str]) -> StudyResults:
-    """All statistics of a study.
+    """All statistics of the rollouts of a study.
 
     Args:
         config: the study.
@@ -125,7 +131,8 @@ def results_of(config: StudyConfig, values: pl.DataFrame, seeing: Sequence[str])
         drops,
         pairs,
         _differing(values, seeing),
-        doubts(values, worlds),
+        after_low_support(values, worlds),
+        contradicted(values, config.worlds, seeing),
         first_braking(values, worlds, sorted(seeing)),
     )
 
@@ -162,7 +169,9 @@ def as_json(results: StudyResults) -> dict[str, Any]:
         "discriminates": results.discriminates,
         "blind_policies_that_differ": list(results.differing),
         "first_braking": {f"{world}/{policy}": asdict(each) for (world, policy), each in results.braking.items()},
-        "verdicts_by_support": {world: asdict(each) for world, each in results.doubts.items()},
+        "verdicts_by_support": {world: asdict(each) for world, each in results.low_support.items()},
+        "verdicts_by_contradiction": {world: asdict(each) for world, each in results.contradicted.items()},
+        "road": {world: asdict(each) for world, each in results.roads.items()},
     })  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Sections of a study's report on single rollouts: support, braking, what scenes expose, disagreement, failures."""
+"""Sections of a study's report on rollouts and scenes: doubt, roads, braking, what scenes expose, failures."""
 
 from __future__ import annotations
 
@@ -16,25 +16,53 @@ from nurec_sim.study.results import StudyResults
 MOST_SCENES = 10
 
 
-def support_section(results: StudyResults) -> str:
-    """How often verdicts with and without low support are wrong; empty if support is unknown."""
-    if not results.doubts:
-        return ""
+def doubt_section(results: StudyResults) -> str:
+    """How often verdicts to doubt are wrong, by why they are doubted; empty if nothing is known."""
+    kinds = {"low support": results.low_support, "another reconstruction differs": results.contradicted}
     rows = []
-    for world, found in results.doubts.items():
-        ratio = "too few to say" if found.ratio is None else f"{found.ratio:.1f} times"
-        shares = [
-            f"{wrong} of {count}" + (f"<small>{100 * wrong / count:.0f} %</small>" if count else "")
-            for wrong, count in ((found.doubtful_wrong, found.doubtful), (found.others_wrong, found.others))
-        ]
-        cells = "".join(f'<td class="n">{cell}</td>' for cell in (*shares, ratio))
-        rows.append(f"<tr><td><b>{escape(world)}</b></td>{cells}</tr>")
+    for why, by_world in kinds.items():
+        for world, found in by_world.items():
+            ratio = "too few to say" if found.ratio is None else f"{found.ratio:.1f} times"
+            shares = [
+                f"{wrong} of {count}" + (f"<small>{100 * wrong / count:.0f} %</small>" if count else "")
+                for wrong, count in ((found.doubtful_wrong, found.doubtful), (found.others_wrong, found.others))
+            ]
+            place = results.comparison.worlds.index(world)
+            cells = "".join(f'<td class="n">{cell}</td>' for cell in (*shares, ratio))
+            rows.append(f"<tr><td><b>{why}</b><small>{dot(place)}{escape(world)}</small></td>{cells}</tr>")
+    if not rows:
+        return ""
     return (
-        '<h2>Does low support warn?</h2><div class="card scroll"><table><thead><tr><th>World</th>'
-        '<th class="n">Wrong with low support</th><th class="n">Wrong of all others</th><th class="n">How often</th>'
-        f'</tr></thead><tbody>{"".join(rows)}</tbody></table><p class="key">Policies with cameras. Wrong: the '
-        "same rollout ends otherwise (collision, off-road) in the true world. Low: before its end the policy got an "
-        f"image of which less than {100 * LOW:.0f} % rests on recorded views.</p></div>"
+        '<h2>Which verdicts to doubt</h2><div class="card scroll"><table><thead><tr><th>Doubted because</th>'
+        '<th class="n">Wrong of the doubted</th><th class="n">Wrong of all others</th><th class="n">How often</th>'
+        f'</tr></thead><tbody>{"".join(rows)}</tbody></table><p class="key">Wrong: the same rollout ends otherwise '
+        "(collision, off-road) in the true world. Low support: policies with cameras; before its end the policy got an "
+        f"image of which less than {100 * LOW:.0f} % rests on recorded views. Another reconstruction differs: policies "
+        "that look at a sensor; the rollout ends otherwise in another reconstruction of the same log.</p></div>"
+    )
+
+
+def road_section(results: StudyResults) -> str:
+    """How the roads of the reconstructions agree with the map; empty if not measured."""
+    rows = []
+    for world, road in results.roads.items():
+        scenes = count_of(road.scenes, "scene") + (f", {road.without_road} without road" if road.without_road else "")
+        cells = (
+            f"{100 * road.agreement:.1f} %<small>least {100 * road.least:.1f} %</small>",
+            f"{100 * road.unknown_frac:.1f} %",
+            f"{100 * road.boundary_bias_m:+.0f} cm<small>most {100 * road.worst_bias_m:+.0f} cm</small>",
+        )
+        place = results.comparison.worlds.index(world)
+        name = f"<b>{dot(place)}{escape(world)}</b><small>{scenes}</small>"
+        rows.append(f"<tr><td>{name}</td>" + "".join(f'<td class="n">{cell}</td>' for cell in cells) + "</tr>")
+    if not rows:
+        return ""
+    return (
+        '<h2>Is the road where the road is?</h2><div class="card scroll"><table><thead><tr><th>Reconstruction</th>'
+        '<th class="n">Off-road agrees</th><th class="n">Unknown</th><th class="n">Boundary, median</th></tr></thead>'
+        f'<tbody>{"".join(rows)}</tbody></table><p class="key">This study judges by the map. A log without a map is '
+        "judged by the road-class Gaussians: here both are compared at cars placed beside the recorded path, where the "
+        "Gaussians know. Boundary: positive where the reconstructed road is too wide.</p></div>"
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from nurec_sim import metrics, plugins, runs, sim
-from nurec_sim.metrics.offroad import offroad_agreement
+from nurec_sim.metrics.offroad_agreement import road_agreement
 from nurec_sim.metrics.offroad_grid import scene_offroad_grid
 from nurec_sim.serving.client import RemoteSensors
 from nurec_sim.serving.driver import DriverServer, RemotePolicy
@@ -52,7 +52,7 @@ def test_offroad_from_gaussians_agrees_with_the_true_polygon(loaded: LoadedScene
     scene = loaded.scene
     assert scene.road_map is not None
     grid = scene_offroad_grid(scene)
-    found = offroad_agreement(grid, scene.road_map, scene.ego, scene.rig.body)
+    found = road_agreement(grid, scene.road_map, scene.ego, scene.rig.body)
     assert found.known >= 500
     assert found.agreement >= 0.95
     assert found.unknown_frac <= 0.05

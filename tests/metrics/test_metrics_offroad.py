@@ -21,12 +21,13 @@ from metrics_worlds import (
 
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
-from nurec_sim.metrics import build_offroad_grid, judge_footprints, offroad_agreement, score_rollout
+from nurec_sim.metrics import build_offroad_grid, judge_footprints, road_agreement, score_rollout
 from nurec_sim.metrics.ground import fit_ground
 from nurec_sim.metrics.offroad import RoadState, corners_outside_m, debounced
+from nurec_sim.metrics.offroad_agreement import boundary_bias_m
 from nurec_sim.metrics.offroad_grid import Cell, OffroadGrid, driven_path
 from nurec_sim.scene.opendrive.road_area import drivable_area
-from nurec_sim.types import Label, RoadMap
+from nurec_sim.types import Label, RoadMap, Trajectory
 
 BODY = rig().body
 EGO = s_curve_path()
@@ -66,7 +67,7 @@ def test_the_grid_agrees_with_the_true_polygon(change, least, unknown):
     wrong = known = 0
     for seed in range(2):
         grid = build_offroad_grid(s_curve_gaussians(seed, **change), ego, BODY)
-        found = offroad_agreement(grid, s_curve_map(), ego, BODY, placements=300, seed=seed)
+        found = road_agreement(grid, s_curve_map(), ego, BODY, placements=300, seed=seed)
         wrong += found.false_alarms + found.misses
         known += found.known
         assert found.misses <= 1, found
@@ -176,10 +177,35 @@ def test_ground_follows_the_driven_deck_not_the_bridge():
 
 def test_agreement_needs_a_map_and_a_path(grid):
     with pytest.raises(ValueError, match="no drivable area"):
-        offroad_agreement(grid, RoadMap(), EGO, BODY)
+        road_agreement(grid, RoadMap(), EGO, BODY)
     still = dataclasses.replace(EGO, t_us=EGO.t_us[:2], world_from_body=standing(2, 0, 0))
     with pytest.raises(ValueError, match="0.00 m long; at least 1 m"):
-        offroad_agreement(grid, s_curve_map(), still, BODY)
+        road_agreement(grid, s_curve_map(), still, BODY)
+
+
+@pytest.mark.parametrize(("left_m", "right_m", "bias"), [(3.3, 3.3, -0.2), (4.0, 3.8, 0.4), (3.7, 3.5, 0.1)])
+def test_the_boundarys_bias_is_the_median_distance_of_the_grids_edge_from_the_true_one(left_m, right_m, bias):
+    """A true road 7 m wide along x: of as many errors to the left as to the right the median is their mean.
+
+    With two thirds of the left edge unknown, three of four errors are those of the right edge.
+    """
+    x = np.linspace(0, 30, 61)
+    ego = Trajectory(
+        (np.arange(61) * 100_000).astype(np.int64),
+        np.stack([geometry.pose_from_xyyaw(at, 0.0, 0.0) for at in x]),
+    )
+    y = (np.arange(200) + 0.5) * 0.1 - 10
+    columns = np.arange(400) * 0.1 - 5
+    state = np.where((y < left_m) & (y > -right_m), Cell.ROAD, Cell.NONROAD)[:, None].repeat(400, axis=1)
+    ring = np.array([[-50.0, -3.5], [80, -3.5], [80, 3.5], [-50, 3.5]])
+    whole = OffroadGrid.from_state((-5.0, -10.0), 0.1, state, 0.1, 0.0)
+    assert boundary_bias_m(whole, RoadMap(drivable=((ring,),)), ego) == pytest.approx(bias, abs=0.021)
+    state[(y > 2)[:, None] & (columns > 10)] = Cell.UNKNOWN
+    hidden = OffroadGrid.from_state((-5.0, -10.0), 0.1, state, 0.1, 0.0)
+    assert boundary_bias_m(hidden, RoadMap(drivable=((ring,),)), ego) == pytest.approx(right_m - 3.5, abs=0.021)
+    state[y > -5] = Cell.UNKNOWN
+    nothing = OffroadGrid.from_state((-5.0, -10.0), 0.1, state, 0.1, 0.0)
+    assert np.isnan(boundary_bias_m(nothing, RoadMap(drivable=((ring,),)), ego))
 
 
 def test_a_parked_cars_shadow_in_the_road_is_filled_but_one_at_the_kerb_is_not_road(grid):

@@ -88,12 +88,35 @@ def test_verdicts_with_low_support_are_counted_apart():
     )
     results = results_of(CONFIG, table, SEEING)
     # Two policies, ten scenes, two trials: 12 of 40 have low support, and of these sees_b is wrong in scenes 1 and 2.
-    assert results.doubts == {"lift": Doubt(12, 4, 28, 0)} and results.doubts["lift"].ratio is None
+    assert results.low_support == {"lift": Doubt(12, 4, 28, 0)} and results.low_support["lift"].ratio is None
     assert Doubt(12, 4, 28, 2).ratio == pytest.approx((4 / 12) / (2 / 28))
     assert Doubt(9, 9, 28, 2).ratio is None and Doubt(12, 4, 9, 2).ratio is None
     assert as_json(results)["verdicts_by_support"]["lift"]["doubtful_wrong"] == 4
     page = render_study(results)
-    assert "Does low support warn?" in page and "too few to say" in page and "4 of 12<small>33 %</small>" in page
+    assert "low support" in page and "too few to say" in page and "4 of 12<small>33 %</small>" in page
+    assert results.contradicted == {} and "another reconstruction differs</b>" not in page, "there is no other"
+
+
+def test_verdicts_that_another_reconstruction_contradicts_are_counted_apart():
+    """sees_b has an event in scene 0 in truth, in 0 to 2 in lift, in 0 and 1 in dense; sees_a in 0 to 7, 7 and 8.
+
+    So they contradict each other in scene 2, where lift is wrong, and in scene 8, where dense is; in scene 1 both are
+    wrong. Blind policies differ as well here, and do not count; the control contradicts nobody.
+    """
+    config = CONFIG.model_copy(update={"worlds": ("truth", "lift", "dense")})
+    table = values(
+        {"truth": TRUE_FRACTIONS, "lift": (0.9, 0.6, 0.8, 0.3), "dense": (0.5, 0.6, 0.9, 0.2)},
+    )
+    control = table.filter(reconstruction="lift").with_columns(
+        pl.lit("lift-faint").alias("reconstruction"),
+        (pl.col("rollout_id") + "-c"),
+        (1 - pl.col("value")).alias("value"),
+    )
+    results = results_of(config, pl.concat([table, control]), SEEING)
+    # 2 policies x 10 scenes x 2 trials.
+    assert results.contradicted == {"lift": Doubt(4, 2, 36, 2), "dense": Doubt(4, 2, 36, 2)}
+    page = render_study(results)
+    assert page.count("another reconstruction differs</b>") == 2 and "2 of 36<small>6 %</small>" in page
 
 
 def test_moments_of_first_braking_are_compared_with_the_truth():

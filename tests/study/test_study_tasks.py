@@ -1,16 +1,20 @@
 """Tasks of a study in a street without a town: worlds that cannot be made, controls, resuming."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
 import pytest
 import study_workers
-from metrics_worlds import flat_street
+from metrics_worlds import flat_street, rig, s_curve_gaussians, s_curve_map, s_curve_path, scene
 
 from nurec_sim.errors import RunError
+from nurec_sim.metrics import road_agreement, scene_offroad_grid
+from nurec_sim.runs.scene_file import record_scene, save_scene_record
 from nurec_sim.scene import write_scene
-from nurec_sim.study import CONTROLS, LocalProcesses, make_study, tasks
+from nurec_sim.study import CONTROLS, LocalProcesses, make_study, road, tasks
+from nurec_sim.study.road import measure_roads
 from nurec_sim.study.run import STUDY, report_again, run_study
 from nurec_sim.study.tasks import Task, drive
 from nurec_sim.types import DynamicGaussians, Gaussians
@@ -113,6 +117,26 @@ def test_a_folder_keeps_to_one_study(tmp_path):
         report_again(CONFIG, tmp_path / "c")
     with pytest.raises(RunError, match="the study is incomplete; run it again"):
         report_again(CONFIG, tmp_path / "a")
+
+
+def test_roads_are_compared_with_the_map_of_each_log(tmp_path, monkeypatch):
+    """The S-curve's road is 7.4 m wide; in the other two towns of lift, and in all of dense, nothing is road."""
+    ego, wide = s_curve_path(), s_curve_map()
+    clip = SimpleNamespace(ego=ego, road_map=wide, rig=rig())
+    monkeypatch.setattr(road.logs, "open_clip", lambda path: clip)
+    config = make_study({"name": "roads", "families": [{"name": "bend", "seeds": [1, 2, 3]}], "policies": POLICIES,
+                         "worlds": ["truth", "lift", "dense"]})  # fmt: skip
+    seen = scene(s_curve_gaussians(), ego, wide)
+    for world in ("lift", "dense"):
+        for each in config.scenes:
+            shown = seen if (world, each[2]) == ("lift", 1) else dataclasses.replace(seen, static=Gaussians.empty())
+            save_scene_record(record_scene(shown), Task(tmp_path, config, *each, world=world).world_folder)
+    (found,) = measure_roads(tmp_path, config).values()
+    expected = road_agreement(scene_offroad_grid(seen), wide, ego, rig().body)
+    assert (found.scenes, found.without_road) == (3, 2)
+    assert found.agreement == found.least == expected.agreement > 0.98
+    assert found.boundary_bias_m == found.worst_bias_m == expected.boundary_bias_m
+    assert abs(found.boundary_bias_m) < 0.15 and found.unknown_frac < 0.02
 
 
 def test_workers_have_one_thread_and_a_dead_one_is_an_error():
