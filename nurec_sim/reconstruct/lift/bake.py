@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -153,6 +153,7 @@ def body_gaussians(
     rgb: Sequence[np.ndarray],
     settings: LiftSettings,
     beams: Sequence[SweepBeams] = (),
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> tuple[Gaussians, int]:
     """Gaussians of one body in its frame, and how many of them were lifted from pixels; none where beams passed.
 
@@ -165,9 +166,12 @@ def body_gaussians(
         rgb: their canonical colours, 0..255 [h,w,3], in the same order.
         settings: opacity, and the depth levels of the matching.
         beams: recorded beams; Gaussians in the space that they passed are dropped.
+        progress: called with the fraction done, about.
     """
     stays = _owned(pixels, body, views, pictures, rgb, settings)
+    progress(0.25)
     pixel_gaussians, dropped = outside_free_space(pixels[stays], body, ground, settings, beams)
+    progress(0.65)
     parts = [pixel_gaussians]
     # Where a pixel's depth is wrong, those of other views take over, and the surfels behind it.
     pictures = marked_free(pictures, dropped)
@@ -181,7 +185,9 @@ def body_gaussians(
         owns = lifting.owning([picture.body for picture in pictures], pixels, stays)
         left = rest[~taken & on_level(rest, ground)]
         more.append(left[_owned(left, body, views, pictures, rgb, settings, owns)])
+    progress(0.8)
     parts.append(outside_free_space(Lifted.concatenate(more), body, ground, settings, beams)[0])
+    progress(0.85)
     cloud = body.cloud
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
     # A view replaces surfels by its pixels unless it sees them so obliquely that surfels are the finer of the two.
@@ -189,6 +195,7 @@ def body_gaussians(
     seen = np.isfinite(pixel)
     colours = np.where(seen[:, None], seen_rgb / np.float32(255), colour.grey_of(cloud.intensity))
     discs = _discs(body, colours, np.flatnonzero(keep), settings.opacity)
+    progress(0.9)
     discs, stays = body.outside_free_space(discs, beams, ground)
     made, lifted = Gaussians.concatenate([*parts, discs]), sum(map(len, parts))
     shown = np.concatenate([np.ones(lifted, bool), seen[keep][stays]])

@@ -84,14 +84,14 @@ def lift(
         shown = [k for k, view in enumerate(views) if body.present(view.t_us)]
         lifted = dataclasses.replace(pixels[number], view=np.searchsorted(shown, pixels[number].view).astype(np.int32))
         mine, depths, colours = [views[k] for k in shown], [pictures[k] for k in shown], [canonical[k] for k in shown]
-        return body_gaussians(body, lifted, ground, mine, depths, colours, settings, beams)
+        # The world takes as long as all actors, which are made beside it: its progress is that of all.
+        report = stages.fraction if body.actor is None else lambda fraction: None
+        return body_gaussians(body, lifted, ground, mine, depths, colours, settings, beams, report)
 
     with ThreadPoolExecutor(1) as beside:
         weights = [_sky_weight(picture, view, settings) for picture, view in zip(pictures, views, strict=True)]
         far = beside.submit(make_sky, views, canonical, weights, settings.sky_px)
-        # The world takes as long as all actors, so they are all begun beside it.
         for number, (gaussians, count) in enumerate(in_order(made, range(len(bodies)), len(bodies))):
-            stages.fraction((number + 1) / len(bodies))
             lifted += count
             if (actor := bodies[number].actor) is None:
                 static = gaussians
