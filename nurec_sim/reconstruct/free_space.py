@@ -30,6 +30,8 @@ MEETS = 1.5
 """Squared Mahalanobis distance within which a beam meets a Gaussian: it would lose half of its light there."""
 MARGIN_M, MARGIN_SHARE = 0.3, 0.02
 """A beam ends at a Gaussian within this distance along it, plus a share of its range: noise of poses and surfaces."""
+NOISE_M, NOISE_SHARE = 0.1, 0.004
+"""The same for how opaque a Gaussian is: noise only. By the margin foliage before a wall would be as opaque as that."""
 FARTHEST_M = 60.0
 """Poses and boxes are too inaccurate to carve farther away."""
 VOTES = 3
@@ -74,6 +76,33 @@ class SweepBeams:
     low: int
     width_rad: float
     fraction: Float64[np.ndarray, " columns"]
+
+
+@dataclass(frozen=True)
+class BeamCounts:
+    """Recorded beams that met n Gaussians, up to about ``ENOUGH`` for each.
+
+    Attributes:
+        passed: those that ended behind it by more than ``MARGIN_M`` and ``MARGIN_SHARE``.
+        stopped: those that ended within this distance before or behind it.
+        through: those that ended behind it by more than ``NOISE_M`` and ``NOISE_SHARE``.
+        ended: those that ended within this distance.
+    """
+
+    passed: Int32[np.ndarray, " n"]
+    stopped: Int32[np.ndarray, " n"]
+    through: Int32[np.ndarray, " n"]
+    ended: Int32[np.ndarray, " n"]
+
+    @property
+    def free(self) -> Bool[np.ndarray, " n"]:
+        """Whether they say that nothing is there: at least ``VOTES`` passed, and more than stopped."""
+        return (self.passed >= VOTES) & (self.passed > self.stopped)
+
+    @property
+    def ended_share(self) -> Float64[np.ndarray, " n"]:
+        """Share that ended there, of those that came so far; 1 where none did."""
+        return (self.ended + 1) / (self.ended + self.through + 1)
 
 
 def sweep_beams(clip: Clip, lidar: str, sweep: Sweep) -> SweepBeams:
@@ -158,15 +187,10 @@ def in_free_space(
 
     What lies in the body's box stays: beams pass through the windows of a car and do not return from black paint.
     """
-    return is_free(*count_beams(gaussians, sweeps, world_from_body, box_m))
+    return count_beams(gaussians, sweeps, world_from_body, box_m).free
 
 
-def is_free(passed: Int32[np.ndarray, " n"], stopped: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Whether the beams that passed and those that ended say that nothing is there."""
-    return (passed >= VOTES) & (passed > stopped)
-
-
-def weighed(gaussians: Gaussians, passed: Int32[np.ndarray, " n"], stopped: Int32[np.ndarray, " n"]) -> Gaussians:
+def weighed(gaussians: Gaussians, ended_share: Float64[np.ndarray, " n"]) -> Gaussians:
     """The Gaussians as opaque as recorded beams found them: less, the more beams passed through them.
 
     A beam that meets a surface goes through about two of its Gaussians, so the opacity falls with the square of the
@@ -174,11 +198,9 @@ def weighed(gaussians: Gaussians, passed: Int32[np.ndarray, " n"], stopped: Int3
 
     Args:
         gaussians: as opaque as where nothing passes.
-        passed: beams that passed through each (``count_beams``).
-        stopped: beams that ended at each.
+        ended_share: see ``BeamCounts``.
     """
-    share = (stopped + 1) / (stopped + passed + 1)
-    return dataclasses.replace(gaussians, opacity=(gaussians.opacity * share**2).astype(np.float32))
+    return dataclasses.replace(gaussians, opacity=(gaussians.opacity * ended_share**2).astype(np.float32))
 
 
 def count_beams(
@@ -186,8 +208,8 @@ def count_beams(
     sweeps: Sequence[SweepBeams],
     world_from_body: Callable[[int], Float64[np.ndarray, "4 4"] | None] = lambda t_us: np.eye(4),
     box_m: Sequence[float] = (0.0, 0.0, 0.0),
-) -> tuple[Int32[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
-    """How many recorded beams passed through each Gaussian, and how many ended at it; both up to about ``ENOUGH``.
+) -> BeamCounts:
+    """How many recorded beams went through each Gaussian, and how many ended at it.
 
     Args:
         gaussians: in the frame of a rigid body.
@@ -196,7 +218,7 @@ def count_beams(
         box_m: size of the body's box, if it has one; what lies in it is not tested.
     """
     tested = np.flatnonzero((np.abs(gaussians.mean_m) >= np.asarray(box_m) / 2).any(axis=1))
-    passed, stopped = np.zeros(len(tested), np.int32), np.zeros(len(tested), np.int32)
+    counts = np.zeros((len(tested), 4), np.int32)
     jobs = []
     # Sweeps far apart first: a few beams then show a Gaussian from different sides. The golden ratio spreads best.
     for k in np.argsort(np.arange(len(sweeps)) * 0.6180339887498949 % 1.0, kind="stable"):
@@ -215,13 +237,13 @@ def count_beams(
         axes = np.ascontiguousarray(np.swapaxes(geometry.matrix_from_quat(quat), 1, 2))
         canonical, extent = axes / scale[:, :, None], axes * (np.sqrt(MEETS) * scale)[:, :, None]
         for job in jobs:
-            _count(xyz, canonical, extent, *job, passed[part], stopped[part])
+            _count(xyz, canonical, extent, *job, counts[part])
 
     for _ in in_order(count, range(0, len(tested), CHUNK)):
         pass
-    counts = np.zeros((2, len(gaussians)), np.int32)
-    counts[:, tested] = passed, stopped
-    return counts[0], counts[1]
+    every = np.zeros((4, len(gaussians)), np.int32)
+    every[:, tested] = counts.T
+    return BeamCounts(*every)
 
 
 @inner
@@ -272,14 +294,13 @@ def _meeting(canonical, o, d):
 
 
 @kernel
-def _count(
-    xyz, canonical, extent, pose, drift, beams, image, reach_m, farthest_m, low, width, fraction, passed, stopped
-):
+def _count(xyz, canonical, extent, pose, drift, beams, image, reach_m, farthest_m, low, width, fraction, counts):
+    """Adds the beams of one sweep to ``counts`` [n,4], in the order of ``BeamCounts``."""
     rows = image.shape[0]
     turn = np.ascontiguousarray(pose[:3, :3].T)
     for i in range(len(xyz)):
-        total = passed[i] + stopped[i]
-        if total >= ENOUGH or (total >= CLEAR and 8 * min(passed[i], stopped[i]) <= total):
+        total = counts[i, 0] + counts[i, 1]
+        if total >= ENOUGH or (total >= CLEAR and 8 * min(counts[i, 0], counts[i, 1]) <= total):
             continue
         px, py, pz = _turned(pose, xyz[i, 0], xyz[i, 1], xyz[i, 2])
         px, py, pz = px + pose[0, 3], py + pose[1, 3], pz + pose[2, 3]
@@ -293,7 +314,7 @@ def _count(
         if distance < NEAREST_M or level < 0.1 * distance:
             continue
         azimuth, elevation = (_angle(y, x) + np.pi) / STEP_RAD, _angle(z, level) / STEP_RAD - low
-        margin = MARGIN_M + MARGIN_SHARE * distance
+        margin, noise = MARGIN_M + MARGIN_SHARE * distance, NOISE_M + NOISE_SHARE * distance
         # Most Gaussians are hidden from most sweeps: all beams around end before them.
         middle = min(max(int(np.floor(elevation)), 0), rows - 1)
         if farthest_m[middle, int(np.floor(azimuth)) % COLUMNS] < distance - margin:
@@ -325,6 +346,10 @@ def _count(
                         continue
                 behind = beams[b, 3] - t
                 if behind > margin:
-                    passed[i] += 1
+                    counts[i, 0] += 1
                 elif behind > -margin:
-                    stopped[i] += 1
+                    counts[i, 1] += 1
+                if behind > noise:
+                    counts[i, 2] += 1
+                elif behind > -noise:
+                    counts[i, 3] += 1

@@ -11,6 +11,7 @@ from nurec_sim.reconstruct import LiftSettings, reconstruct
 from nurec_sim.reconstruct.free_space import (
     MEETS,
     MOST_SWEEPS,
+    BeamCounts,
     balls,
     chosen_sweeps,
     count_beams,
@@ -66,7 +67,8 @@ def test_what_beams_pass_is_free_and_where_they_end_is_not(parked):
 def test_what_lets_beams_pass_is_less_opaque():
     """By the square of the share that ended there, and one more: 1, 4/5 and 1/2."""
     gaussians = dataclasses.replace(at([10, 0, 0], [10, 1, 0], [10, 2, 0], [10, 3, 0]), opacity=np.float32([0.9] * 4))
-    found = weighed(gaussians, np.array([0, 1, 4, 0]), np.array([7, 3, 3, 0]))
+    through, ended = np.array([0, 1, 4, 0]), np.array([7, 3, 3, 0])
+    found = weighed(gaussians, BeamCounts(through, ended, through, ended).ended_share)
     np.testing.assert_allclose(found.opacity, [0.9, 0.9 * 0.64, 0.9 * 0.25, 0.9], rtol=1e-6)
 
 
@@ -81,7 +83,7 @@ def test_beams_that_meet_an_ellipsoid_are_found_whatever_its_place_and_turn(park
                                     quat_wxyz=quat.astype(np.float32))  # fmt: skip
     sweep = sweep_of(parked, 30.0)
     beams = sweep.beams[sweep.image[sweep.image >= 0], :3].astype(np.float64)
-    passed, stopped = count_beams(gaussians, [sweep])
+    counts = count_beams(gaussians, [sweep])
     centre = gaussians.mean_m.astype(np.float64)
     whiten = geometry.matrix_from_quat(gaussians.quat_wxyz.astype(np.float64)) / gaussians.scale_m[:, None]
     o, d = np.einsum("nji,nj->ni", whiten, centre)[:, None], np.einsum("nji,bj->nbi", whiten, beams)
@@ -90,8 +92,8 @@ def test_beams_that_meet_an_ellipsoid_are_found_whatever_its_place_and_turn(park
     width_m = sweep.width_rad * np.linalg.norm(centre, axis=1)[:, None]
     meets = ((mahalanobis <= MEETS) | (aside <= width_m**2)).sum(axis=1)
     assert meets.max() > 3
-    assert np.abs(passed - meets).sum() <= 0.01 * meets.sum()
-    assert not stopped.any()
+    assert np.abs(counts.passed - meets).sum() <= 0.01 * meets.sum()
+    assert not counts.stopped.any()
 
 
 def test_of_beams_in_one_cell_the_nearest_is_found():
@@ -127,9 +129,18 @@ def test_beams_that_pass_beside_a_hidden_centre_count(parked):
     """A post in front hides the middle 0.8 degrees of a Gaussian that is 2.8 degrees wide, but not its sides."""
     azimuth = np.degrees(np.arctan2(directions()[:, 1], directions()[:, 0]))
     post = sweep_of(parked, np.where(np.abs(azimuth) < 0.4, 5.0, 30.0))
-    passed, stopped = count_beams(at([10, 0, 0], sigma_m=0.2), [post])
-    assert passed[0] > 3 and stopped[0] == 0
-    assert not count_beams(at([10, 0, 0], sigma_m=0.2), [sweep_of(parked, 5.0)])[0].any()
+    counts = count_beams(at([10, 0, 0], sigma_m=0.2), [post])
+    assert counts.passed[0] > 3 and counts.stopped[0] == 0
+    assert not count_beams(at([10, 0, 0], sigma_m=0.2), [sweep_of(parked, 5.0)]).passed.any()
+
+
+def test_a_wall_just_behind_foliage_does_not_make_it_opaque(parked):
+    """0.3 m are within the errors of poses, which do not remove anything, but beyond the noise of returns."""
+    one = at([10, 0, 0], sigma_m=0.02)
+    for distance_m, free, share in ((10.08, False, 1.0), (10.3, False, 0.5), (11.0, True, 0.5), (9.7, False, 1.0)):
+        counts = count_beams(one, [sweep_of(parked, distance_m)] * 3)
+        assert counts.free.tolist() == [free]
+        assert (counts.ended_share < share) == [share < 1] and (counts.ended_share == 1) == [share == 1]
 
 
 def test_a_footprint_is_judged_by_the_space_that_it_fills(parked):
@@ -235,9 +246,9 @@ def test_bodies_keep_what_is_not_free_as_opaque_as_beams_found_it(parked):
         beams = [sweep_of(parked, distance_m)] * 3 + [sweep_of(parked, 2 * distance_m)]
         gaussians = dataclasses.replace(at(*places, sigma_m=0.01), opacity=np.ones(len(places), np.float32),
                                         normal=np.tile(np.float32(normal), (len(places), 1)))  # fmt: skip
-        passed, stopped = count_beams(gaussians, beams)
+        counts = count_beams(gaussians, beams)
         solid, kept = empty.outside_free_space(gaussians, beams, level_ground())
-        return solid.opacity, kept.tolist(), ((stopped + 1) / (stopped + passed + 1)) ** 2
+        return solid.opacity, kept.tolist(), counts.ended_share**2
 
     for normal in ([0, 0, 1], [1, 0, 0]):
         opacity, kept, share = seen([[8, 0, 0], [8, 0, 1], [5, 0, 0]], 8.0, normal)

@@ -312,10 +312,10 @@ def test_footprints_have_six_tenths_of_their_pixels():
 
 
 def test_voxels_grow_by_powers_of_two_with_the_distance_from_the_drive():
-    """A hundredth of it, between 6 and 48 cm."""
-    aside = np.array([2.0, 11.9, 12.1, 23.0, 25.0, 47.0, 100.0])
+    """0.75 % of it, between 6 and 24 cm, in powers of two."""
+    aside = np.array([2.0, 15.9, 16.1, 31.0, 33.0, 63.0, 100.0])
     edge = voxel_edge_m(np.column_stack([np.zeros(7), aside, np.zeros(7)]), np.zeros((1, 3)), PointSettings())
-    assert edge == pytest.approx([0.06, 0.06, 0.12, 0.12, 0.24, 0.24, 0.48])
+    assert edge == pytest.approx([0.06, 0.06, 0.12, 0.12, 0.24, 0.24, 0.24])
 
 
 def test_distances_from_a_long_drive_are_those_from_its_nearest_place():

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from nurec_sim.compute.cores import in_order
-from nurec_sim.reconstruct.free_space import SweepBeams, balls, count_beams, in_free_space, is_free, weighed
+from nurec_sim.reconstruct.free_space import BeamCounts, SweepBeams, balls, count_beams, in_free_space, weighed
 from nurec_sim.reconstruct.lift import points, surfaces
 from nurec_sim.reconstruct.lift.ground import Ground, find_ground
 from nurec_sim.reconstruct.lift.points import Actor, Cloud, Gathered
@@ -40,8 +40,8 @@ class Surfels:
         """Where the body is."""
         return np.eye(4) if self.actor is None else self.actor.path.at(t_us)
 
-    def count_beams(self, gaussians: Gaussians, beams: Sequence[SweepBeams]) -> tuple[np.ndarray, np.ndarray]:
-        """Recorded beams that passed through Gaussians of the body, in its frame, and that ended at them."""
+    def count_beams(self, gaussians: Gaussians, beams: Sequence[SweepBeams]) -> BeamCounts:
+        """Recorded beams that met Gaussians of the body, in its frame."""
         if self.actor is None:
             return count_beams(gaussians, beams)
         known = lambda t_us: self.world_from_body(t_us) if self.present(t_us) else None  # noqa: E731
@@ -55,13 +55,13 @@ class Surfels:
         The ground, and what is level where none is known, stays opaque: beams graze it, and a centimetre of its height
         decides whether they pass.
         """
-        passed, stopped = self.count_beams(gaussians, beams)
-        kept = ~is_free(passed, stopped)
+        counts = self.count_beams(gaussians, beams)
+        kept, share = ~counts.free, counts.ended_share
         if self.actor is None:
             above = ground.above(gaussians.mean_m)
             level = np.isinf(above) & (gaussians.normal[:, 2] > LEVEL)
-            passed = np.where(level | (np.abs(above) < SHEET_M), 0, passed)
-        return weighed(gaussians, passed, stopped)[kept], kept
+            share = np.where(level | (np.abs(above) < SHEET_M), 1.0, share)
+        return weighed(gaussians, share)[kept], kept
 
     @property
     def box_size_m(self) -> tuple[float, float, float]:

@@ -43,9 +43,9 @@ def outside_free_space(
         parts.append(body.outside_free_space(footprints, beams, ground)[0])
         rest = rest[~low]
     footprints = footprints_of(rest, body, ground, settings, 1.0)
-    passed, stopped = body.count_beams(footprints, beams)
-    stays = (stopped > 0) & (stopped >= passed)
-    parts.append(weighed(footprints, passed, stopped)[stays])
+    counts = body.count_beams(footprints, beams)
+    stays = (counts.stopped > 0) & (counts.stopped >= counts.passed)
+    parts.append(weighed(footprints, counts.ended_share)[stays])
     return Gaussians.concatenate(parts), rest[~stays]
 
 

@@ -22,8 +22,8 @@ class PointSettings:
     standing_m: float = 0.3
     """A track that moves less than this over its labelled life is static: it is kept over the whole clip."""
     min_voxel_m: float = 0.06
-    max_voxel_m: float = 0.48
-    voxel_per_distance: float = 0.01
+    max_voxel_m: float = 0.24
+    voxel_per_distance: float = 0.0075
     """Voxel edge per metre of distance to the driven path, rounded down to a power of two times ``min_voxel_m``."""
     max_range_m: float = 250.0
     """Farther returns are dropped."""
