@@ -30,7 +30,7 @@ MEETS = 1.5
 """Squared Mahalanobis distance within which a beam meets a Gaussian: it would lose half of its light there."""
 MARGIN_M, MARGIN_SHARE = 0.3, 0.02
 """A beam ends at a Gaussian within this distance along it, plus a share of its range: noise of poses and surfaces."""
-NOISE_M, NOISE_SHARE = 0.1, 0.004
+NOISE_M, NOISE_SHARE = 0.06, 0.006
 """The same for how opaque a Gaussian is: noise only. By the margin foliage before a wall would be as opaque as that."""
 FARTHEST_M = 60.0
 """Poses and boxes are too inaccurate to carve farther away."""
@@ -101,8 +101,13 @@ class BeamCounts:
 
     @property
     def ended_share(self) -> Float64[np.ndarray, " n"]:
-        """Share that ended there, of those that came so far; 1 where none did."""
+        """Share that ended there within the noise, of those that came so far; 1 where none did."""
         return (self.ended + 1) / (self.ended + self.through + 1)
+
+    @property
+    def stopped_share(self) -> Float64[np.ndarray, " n"]:
+        """Share that ended there within the margin for poses, of those that came so far; 1 where none did."""
+        return (self.stopped + 1) / (self.stopped + self.passed + 1)
 
 
 def sweep_beams(clip: Clip, lidar: str, sweep: Sweep) -> SweepBeams:

@@ -260,6 +260,15 @@ def test_bodies_keep_what_is_not_free_as_opaque_as_beams_found_it(parked):
         np.testing.assert_allclose(opacity, [1.0 if normal[2] else share[0]], rtol=1e-6)
 
 
+def test_what_is_low_over_the_ground_is_weighed_by_the_margin_for_poses(parked):
+    """Beams that end 0.3 m behind it, beyond their noise, make grass no less opaque; a bush they do."""
+    empty = body_of(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    low, high = [8, 0, 0.25], [8, 0, 0.35]
+    gaussians = dataclasses.replace(at(low, high, sigma_m=0.1), opacity=np.ones(2, np.float32))
+    solid, kept = empty.outside_free_space(gaussians, [sweep_of(parked, 8.3)] * 3, level_ground())
+    assert kept.all() and solid.opacity[0] == 1.0 and solid.opacity[1] < 0.3
+
+
 def test_pixels_low_over_the_road_are_moved_down_to_it_along_their_rays():
     """From 1.5 m above the road at 45 degrees: 0.2 m over it is 0.2 m before it, and pixels grow with the depth."""
     steep, level = np.array([1.0, 0, -1]) / np.sqrt(2), np.array([1.0, 0, -0.01])

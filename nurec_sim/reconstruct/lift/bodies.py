@@ -20,6 +20,8 @@ LEVEL = 0.97
 """Vertical part of a normal from which a surface counts as level, as ground is that lies beyond the height grid."""
 SHEET_M = 0.08
 """Points so near to the ground are part of its sheet."""
+LOW_M = 0.3
+"""Up to this height beams graze what stands on the ground: the depth of grass along them is not noise of returns."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +55,14 @@ class Surfels:
         """Those Gaussians of the body that are not in free space, as opaque as beams found them; and which these are.
 
         The ground, and what is level where none is known, stays opaque: beams graze it, and a centimetre of its height
-        decides whether they pass.
+        decides whether they pass. What is low over it is as opaque as beams found it within the margin for poses.
         """
         counts = self.count_beams(gaussians, beams)
         kept, share = ~counts.free, counts.ended_share
         if self.actor is None:
             above = ground.above(gaussians.mean_m)
             level = np.isinf(above) & (gaussians.normal[:, 2] > LEVEL)
+            share = np.where(above < LOW_M, counts.stopped_share, share)
             share = np.where(level | (np.abs(above) < SHEET_M), 1.0, share)
         return weighed(gaussians, share)[kept], kept
 
