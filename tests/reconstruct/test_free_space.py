@@ -141,6 +141,7 @@ def test_a_wall_just_behind_foliage_does_not_make_it_opaque(parked):
         counts = count_beams(one, [sweep_of(parked, distance_m)] * 3)
         assert counts.free.tolist() == [free]
         assert (counts.ended_share < share) == [share < 1] and (counts.ended_share == 1) == [share == 1]
+    assert counts.stopped > 0 and counts.ended == 0, "9.7 m: within the margin, but these beams say nothing of 10 m"
 
 
 def test_a_footprint_is_judged_by_the_space_that_it_fills(parked):
