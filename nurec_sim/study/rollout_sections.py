@@ -22,7 +22,7 @@ def doubt_section(results: StudyResults) -> str:
     rows = []
     for why, by_world in kinds.items():
         for world, found in by_world.items():
-            ratio = "too few to say" if found.ratio is None else f"{found.ratio:.1f} times"
+            ratio = "too few to say" if found.ratio is None else f"{found.ratio:.1f}"
             shares = [
                 f"{wrong} of {count}" + (f"<small>{100 * wrong / count:.0f} %</small>" if count else "")
                 for wrong, count in ((found.doubtful_wrong, found.doubtful), (found.others_wrong, found.others))
@@ -34,7 +34,7 @@ def doubt_section(results: StudyResults) -> str:
         return ""
     return (
         '<h2>Which verdicts to doubt</h2><div class="card scroll"><table><thead><tr><th>Doubted because</th>'
-        '<th class="n">Wrong of the doubted</th><th class="n">Wrong of all others</th><th class="n">How often</th>'
+        '<th class="n">Wrong of the doubted</th><th class="n">Wrong of all others</th><th class="n">Times as often</th>'
         f'</tr></thead><tbody>{"".join(rows)}</tbody></table><p class="key">Wrong: the same rollout ends otherwise '
         "(collision, off-road) in the true world. Low support: policies with cameras; before its end the policy got an "
         f"image of which less than {100 * LOW:.0f} % rests on recorded views. Another reconstruction differs: policies "
