@@ -53,13 +53,17 @@ def after_low_support(values: pl.DataFrame, worlds: Sequence[str]) -> dict[str, 
 
 
 def contradicted(values: pl.DataFrame, worlds: Sequence[str], policies: Sequence[str]) -> dict[str, Doubt]:
-    """Verdicts of every reconstruction where another one says otherwise; empty without two reconstructions.
+    """Verdicts of every reconstruction where another one says otherwise.
+
+    Empty without two reconstructions, and without policies that look at something.
 
     Args:
         values: rows of ``rollout_values`` of all rollouts of a study.
         worlds: the true world first, then intact reconstructions.
         policies: those that look at a rendered sensor; all others end alike by construction.
     """
+    if len(worlds) < 3 or not policies:
+        return {}
     ends = _ends(values.filter(pl.col("policy").is_in(list(policies))))
     found = {}
     for world in worlds[1:]:
@@ -68,7 +72,7 @@ def contradicted(values: pl.DataFrame, worlds: Sequence[str], policies: Sequence
         for rival in rivals:
             pairs = pairs.join(ends[rival], on=KEYS, suffix=f"_{rival}")
         pairs = pairs.drop_nulls()
-        if rivals and len(pairs):
+        if len(pairs):
             found[world] = _count(pairs, pl.any_horizontal([_differs(f"_{rival}") for rival in rivals]))
     return found
 

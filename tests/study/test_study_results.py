@@ -117,6 +117,7 @@ def test_verdicts_that_another_reconstruction_contradicts_are_counted_apart():
     assert results.contradicted == {"lift": Doubt(4, 2, 36, 2), "dense": Doubt(4, 2, 36, 2)}
     page = render_study(results)
     assert page.count("another reconstruction differs</b>") == 2 and "2 of 36<small>6 %</small>" in page
+    assert results_of(config, pl.concat([table, control]), ()).contradicted == {}, "blind policies end alike anyway"
 
 
 def test_moments_of_first_braking_are_compared_with_the_truth():
