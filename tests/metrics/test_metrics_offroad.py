@@ -176,7 +176,7 @@ def test_ground_follows_the_driven_deck_not_the_bridge():
 
 
 def test_agreement_needs_a_map_and_a_path(grid):
-    with pytest.raises(ValueError, match="no drivable area"):
+    with pytest.raises(ValueError, match="no road map with a drivable area"):
         road_agreement(grid, RoadMap(), EGO, BODY)
     still = dataclasses.replace(EGO, t_us=EGO.t_us[:2], world_from_body=standing(2, 0, 0))
     with pytest.raises(ValueError, match="0.00 m long; at least 1 m"):

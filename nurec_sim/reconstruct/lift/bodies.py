@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.free_space import BeamCounts, SweepBeams, balls, count_beams, in_free_space, weighed
@@ -49,6 +49,10 @@ class Surfels:
         known = lambda t_us: self.world_from_body(t_us) if self.present(t_us) else None  # noqa: E731
         return count_beams(gaussians, beams, known, self.box_size_m)
 
+    def ended_share(self, counts: BeamCounts) -> Float64[np.ndarray, " n"]:
+        """Share of beams that ended at each Gaussian within their noise; boxes are not so exact: within the margin."""
+        return counts.ended_share if self.actor is None else counts.stopped_share
+
     def outside_free_space(
         self, gaussians: Gaussians, beams: Sequence[SweepBeams], ground: Ground
     ) -> tuple[Gaussians, Bool[np.ndarray, " n"]]:
@@ -58,7 +62,7 @@ class Surfels:
         decides whether they pass. What is low over it is as opaque as beams found it within the margin for poses.
         """
         counts = self.count_beams(gaussians, beams)
-        kept, share = ~counts.free, counts.ended_share
+        kept, share = ~counts.free, self.ended_share(counts)
         if self.actor is None:
             above = ground.above(gaussians.mean_m)
             level = np.isinf(above) & (gaussians.normal[:, 2] > LEVEL)

@@ -45,7 +45,7 @@ def outside_free_space(
     footprints = footprints_of(rest, body, ground, settings, 1.0)
     counts = body.count_beams(footprints, beams)
     stays = (counts.stopped > 0) & (counts.stopped >= counts.passed)
-    parts.append(weighed(footprints, counts.ended_share)[stays])
+    parts.append(weighed(footprints, body.ended_share(counts))[stays])
     return Gaussians.concatenate(parts), rest[~stays]
 
 
