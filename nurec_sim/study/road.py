@@ -5,6 +5,7 @@ Rollouts of a study are judged by the map. Users' logs often have none, and are 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +47,7 @@ def measure_roads(folder: Path, config: StudyConfig) -> dict[str, Road]:
 
     Raises:
         RunError: the record of a scene cannot be read.
-        LogError: a log cannot be read.
+        ClipError: a log cannot be read.
     """
     measured: dict[str, list[RoadAgreement | None]] = {}
     for scene in config.scenes:
@@ -55,7 +56,7 @@ def measure_roads(folder: Path, config: StudyConfig) -> dict[str, Road]:
         for world in config.worlds:
             if world == TRUTH:
                 continue
-            grid = load_scene_record(Task(folder, config, *scene, world=world).world_folder).grid
+            grid = load_scene_record(dataclasses.replace(task, world=world).world_folder).grid
             found = None if grid is None else road_agreement(grid, clip.road_map, clip.ego, clip.rig.body)
             measured.setdefault(world, []).append(found)
     return {world: _over_scenes(found) for world, found in measured.items() if any(found)}
