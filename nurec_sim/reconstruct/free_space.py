@@ -30,8 +30,10 @@ MEETS = 1.5
 """Squared Mahalanobis distance within which a beam meets a Gaussian: it would lose half of its light there."""
 MARGIN_M, MARGIN_SHARE = 0.3, 0.02
 """A beam ends at a Gaussian within this distance along it, plus a share of its range: noise of poses and surfaces."""
-NOISE_M, NOISE_SHARE = 0.06, 0.006
+NOISE_M, NOISE_SHARE = 0.06, 0.003
 """The same for how opaque a Gaussian is: noise only. By the margin foliage before a wall would be as opaque as that."""
+LEAST_FACING = 0.15
+"""Noise is measured across the surface; along a grazing beam it is longer, by one over this cosine at most."""
 FARTHEST_M = 60.0
 """Poses and boxes are too inaccurate to carve farther away."""
 VOTES = 3
@@ -85,7 +87,7 @@ class BeamCounts:
     Attributes:
         passed: those that ended behind it by more than ``MARGIN_M`` and ``MARGIN_SHARE``.
         stopped: those that ended within this distance before or behind it.
-        through: those that ended behind it by more than ``NOISE_M`` and ``NOISE_SHARE``.
+        through: those that ended behind it by more than ``NOISE_M`` and ``NOISE_SHARE``, across its surface.
         ended: those that ended within this distance.
     """
 
@@ -298,6 +300,19 @@ def _meeting(canonical, o, d):
     return ab / bb, aa - ab * ab / bb
 
 
+@inner
+def _facing(canonical, u, v, w):
+    """Cosine between a unit vector and the thinnest axis of a Gaussian: its normal, if it is flat."""
+    thinnest, cosine = 0.0, 1.0
+    for k in range(3):
+        c = canonical[k]
+        square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
+        if square > thinnest:
+            thinnest = square
+            cosine = abs(c[0] * u + c[1] * v + c[2] * w) / np.sqrt(square)
+    return cosine
+
+
 @kernel
 def _count(xyz, canonical, extent, pose, drift, beams, image, reach_m, farthest_m, low, width, fraction, counts):
     """Adds the beams of one sweep to ``counts`` [n,4], in the order of ``BeamCounts``."""
@@ -354,7 +369,9 @@ def _count(xyz, canonical, extent, pose, drift, beams, image, reach_m, farthest_
                     counts[i, 0] += 1
                 elif behind > -margin:
                     counts[i, 1] += 1
-                if behind > noise:
+                # Across the surface noise is as large for all beams; along grazing ones it is longer.
+                facing = max(_facing(canonical[i], *_turned(turn, dx, dy, dz)), LEAST_FACING)
+                if behind > noise / facing:
                     counts[i, 2] += 1
-                elif behind > -noise:
+                elif behind > -noise / facing:
                     counts[i, 3] += 1

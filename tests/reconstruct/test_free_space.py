@@ -144,6 +144,15 @@ def test_a_wall_just_behind_foliage_does_not_make_it_opaque(parked):
     assert counts.stopped > 0 and counts.ended == 0, "9.7 m: within the margin, but these beams say nothing of 10 m"
 
 
+def test_noise_is_measured_across_the_surface(parked):
+    """0.3 m behind are beyond the noise on a wall that faces the beam, and within it on one that the beam grazes."""
+    flat = dataclasses.replace(at([10, 0, 0]), scale_m=np.float32([[0.1, 0.1, 0.003]]))
+    facing = dataclasses.replace(flat, quat_wxyz=np.float32([[np.sqrt(0.5), 0, np.sqrt(0.5), 0]]))
+    beams = [sweep_of(parked, 10.3)] * 3
+    assert count_beams(facing, beams).ended == 0 and count_beams(facing, beams).through > 0
+    assert count_beams(flat, beams).ended > 0 and count_beams(flat, beams).through == 0
+
+
 def test_a_footprint_is_judged_by_the_space_that_it_fills(parked):
     """A disc in the plane of grazing beams touches none of them; tipped by 30 degrees it stands in their way."""
     flat = dataclasses.replace(at([10, 0, -0.1]), scale_m=np.array([[0.5, 0.05, 0.002]], np.float32))
