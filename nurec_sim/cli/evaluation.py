@@ -51,6 +51,9 @@ class LogFlags:
     recorded, or found if there are no boxes. Scores are by the log's boxes in any case."""
     align_actors: bool = True
     """CLIP: correct tracks of moving objects by the LiDAR returns on them, as in `nurec-sim reconstruct`."""
+    align_sweeps: bool = True
+    """CLIP: correct beams and poses of the log by the planes that its sweeps share, as in `nurec-sim reconstruct`; what
+    is held out takes no part, and moves with the rest."""
     input_cameras: tuple[str, ...] = ()
     """CLIP: input cameras of the reconstruction; default: all."""
     target_cameras: tuple[str, ...] = ()
@@ -204,6 +207,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
                 refine=refinement(flags.refine),
                 actors=flags.actors,
                 align_actors=flags.align_actors,
+                align_sweeps=flags.align_sweeps,
             )
     if flags.json is not None:
         write_file(flags.json, json.dumps(figures, indent=1, sort_keys=True) + "\n")

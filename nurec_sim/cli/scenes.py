@@ -35,6 +35,7 @@ def reconstruct(
     poses: PosesName = "recorded",
     actors: ActorsName = "auto",
     align_actors: bool = True,
+    align_sweeps: bool = True,
     map_from_gaussians: bool = False,
     refine: float | None = None,
     resume: bool = False,
@@ -64,6 +65,8 @@ def reconstruct(
             boxes at all.
         align_actors: correct tracks of moving objects so that the returns of all LiDAR sweeps on an object make one
             surface (docs/lift.md).
+        align_sweeps: correct elevations of LiDAR beams, mountings of LiDARs and poses so that all sweeps see the same
+            planes, if they disagree (docs/log_formats.md).
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
         refine: time budget in seconds for optimising the scene on the log's images and sweeps.
@@ -93,6 +96,7 @@ def reconstruct(
             refine=fit,
             actors=actors,
             align_actors=align_actors,
+            align_sweeps=align_sweeps,
         )
     derived = None
     if map_from_gaussians and world_scene.road_map is None:

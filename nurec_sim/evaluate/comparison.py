@@ -18,6 +18,7 @@ from nurec_sim.evaluate.image_scores import image_request
 from nurec_sim.evaluate.log import score_scene, sensing
 from nurec_sim.evaluate.log_tables import side_by_side
 from nurec_sim.evaluate.scores.flip import flip_map
+from nurec_sim.logs.alignment import aligned_as
 from nurec_sim.logs.held_out import HeldOut
 from nurec_sim.runs.video import write_video
 from nurec_sim.types import CameraFrame, Clip, GaussianScene, Sense
@@ -115,7 +116,7 @@ def compare_scenes(
         # All scenes must be scored on the cameras of the first one, otherwise their figures are not comparable.
         target_cameras = figures[name]["target_cameras"]
         with sensing(scene, False, device) as sense:
-            shown[name] = _pictures(clip, target_cameras, sense)
+            shown[name] = _pictures(aligned_as(clip, scene), target_cameras, sense)
     frames = [frame for frame in next(iter(shown.values())) if frame[0] == target_cameras[0]] if target_cameras else []
     worst = _worst_frames(figures)
     report("pictures", 1.0)

@@ -12,6 +12,7 @@ from nurec_sim.evaluate.lidar_scores import score_sweeps
 from nurec_sim.evaluate.log import score_road
 from nurec_sim.evaluate.scores.images import psnr, ssim
 from nurec_sim.logs import hold_out
+from nurec_sim.logs.alignment import aligned_as
 from nurec_sim.types import CameraFrame, Clip, GaussianScene, Sense
 
 IMAGES, SWEEPS = 8, 4
@@ -35,6 +36,7 @@ def measure_fidelity(
         JSON-ready figures: ``held_out``, ``images``, ``psnr_db``, ``ssim``, ``sweeps``, ``range_error_m`` (median),
         ``return_recall``; ``road`` as in ``metrics.road_agreement``, None without a map.
     """
+    clip = aligned_as(clip, scene)
     cameras = [camera for camera in scene.provenance.get("cameras", scene.rig.cameras) if camera in clip.rig.cameras]
     held = hold_out(clip, cameras, images_every=hold_out_every)
     jobs = [

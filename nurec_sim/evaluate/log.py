@@ -20,6 +20,7 @@ from nurec_sim.evaluate.actor_scores import score_actors
 from nurec_sim.evaluate.detection.log import score_log_detections
 from nurec_sim.evaluate.image_scores import score_images
 from nurec_sim.evaluate.lidar_scores import score_free_space, score_sweeps
+from nurec_sim.logs.alignment import FACT, aligned_as, with_aligned_sweeps
 from nurec_sim.logs.held_out import HeldOut, hold_out, without_images
 from nurec_sim.logs.selection import with_tracks
 from nurec_sim.metrics.offroad_agreement import road_agreement
@@ -31,6 +32,8 @@ from nurec_sim.types import CameraFrame, Clip, GaussianScene, Sense, SensorReque
 Progress = Callable[[str, float], None]
 SAME_PATH_M = 0.01
 """A scene of the log has the log's path, to rounding."""
+ALIGNED_PATH_M = 0.5
+"""Alignment of sweeps moves it by centimetres."""
 
 
 def evaluate(
@@ -46,6 +49,7 @@ def evaluate(
     device: str = "auto",
     images_dir: Path | None = None,
     detector: bool = False,
+    align_sweeps: bool = True,
     progress: Progress | None = None,
     **options: Any,
 ) -> dict[str, object]:
@@ -63,6 +67,8 @@ def evaluate(
         device: that renders; see ``render.choose_device``.
         images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
         detector: whether to compare what the camera detector finds in recorded and in rendered images.
+        align_sweeps: whether to align the log by what its other sweeps show (``logs.alignment``), for the method and
+            for the comparison.
         progress: called with the stage and the approximate fraction done.
         options: passed to ``reconstruct``.
 
@@ -81,9 +87,12 @@ def evaluate(
         clip, cameras, images_every=hold_out_every, sweeps_every=hold_out_sweeps_every, sweeps=hold_out_sweeps
     )
     stages = _StageClock(_part(report, 0.0, 0.6))
+    if align_sweeps:
+        stages("aligning sweeps", 0.0)
+        clip = with_aligned_sweeps(clip, held.sweeps)
     scene = reconstruct(
         without_images(clip, held), method, cameras=input_cameras, hold_out_sweeps=sorted(held.sweeps), progress=stages,
-        **options,
+        align_sweeps=False, **options,
     )  # fmt: skip
     stages.stop()
     seconds = {f"reconstruct: {stage}": round(spent, 3) for stage, spent in stages.seconds.items()}
@@ -141,6 +150,7 @@ def score_scene(
         ReconstructError: an unknown camera, or a scene of another log.
     """
     held, report = held or HeldOut(), progress or (lambda stage, fraction: None)
+    clip = as_made(clip, scene)
     found, recorded = score_actors(clip, scene), clip
     if not clip.tracks:
         # What moves in the log is in free space at other times, with a label or without.
@@ -148,7 +158,6 @@ def score_scene(
     inputs = [camera for camera in scene.provenance.get("cameras", scene.rig.cameras) if camera in clip.rig.cameras]
     targets = inputs if target_cameras is None else list(target_cameras)
     _check_cameras(clip, targets)
-    _check_path(clip, scene)
     seconds = {}
     with sensing(scene, via_grpc, device) as sense:
         started = time.perf_counter()
@@ -198,7 +207,18 @@ def _check_cameras(clip: Clip, cameras: Sequence[str]) -> None:
         raise ReconstructError(f"clip {clip.id!r} has no camera {unknown}; have {list(clip.rig.cameras)}")
 
 
-def _check_path(clip: Clip, scene: GaussianScene) -> None:
+def as_made(clip: Clip, scene: GaussianScene) -> Clip:
+    """The log as the scene was made from it, its sweeps aligned if they were.
+
+    Raises:
+        ReconstructError: it is a scene of another log.
+        ClipError: the scene's provenance is damaged.
+    """
+    _check_path(clip, scene, ALIGNED_PATH_M if FACT in scene.provenance else SAME_PATH_M)
+    return aligned_as(clip, scene)
+
+
+def _check_path(clip: Clip, scene: GaussianScene, within_m: float) -> None:
     """Poses of a scene of another log, or of another cut of it, would be scored as errors of the pictures."""
     times = clip.ego.t_us[(clip.ego.t_us >= scene.ego.start_us) & (clip.ego.t_us <= scene.ego.end_us)]
     if not len(times):
@@ -207,7 +227,7 @@ def _check_path(clip: Clip, scene: GaussianScene) -> None:
             f"against {clip.ego.start_us} to {clip.ego.end_us} us"
         )
     apart = np.linalg.norm((scene.ego.at(times) - clip.ego.at(times))[:, :3, 3], axis=1).max()
-    if apart > SAME_PATH_M:
+    if apart > within_m:
         raise ReconstructError(f"scene {scene.id!r} was not made from clip {clip.id!r}: paths are {apart:.2f} m apart")
 
 

@@ -83,5 +83,5 @@ def without_images(clip: Clip, held: HeldOut) -> Clip:
     }
     return ContextClip(
         clip.id, clip.rig, clip.ego, clip.span_us, shots, turns, tuple(clip.tracks), clip.time_offset_us, clip.road_map,
-        clip.ego_mask,
+        clip.ego_mask, getattr(clip, "facts", {}),
     )  # fmt: skip

@@ -49,6 +49,7 @@ class ContextClip:
         time_offset_us: offset of all times from the log's own.
         road_map: the road map, if any.
         ego_mask: pixels of a camera in which the car sees itself, or None.
+        facts: other metadata of the log, plain JSON.
     """
 
     id: str
@@ -61,6 +62,7 @@ class ContextClip:
     time_offset_us: int = 0
     road_map: RoadMap | None = None
     ego_mask: Callable[[str], Bool[np.ndarray, "h w"] | None] = lambda camera_id: None
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
     def camera_times_us(self, camera_id: str) -> Int64[np.ndarray, "frames 2"]:
         """Exposure start and end of every frame."""

@@ -11,6 +11,7 @@ from jaxtyping import Float64, Int64
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import LIMITS
+from nurec_sim.logs.beam_errors import BeamErrors
 from nurec_sim.types import LidarModel, Matrix4, Spin, Sweep, SweepPoints, Trajectory
 
 INSTANT_US = 20
@@ -30,6 +31,7 @@ class SweepRecord:
             own motion between their time and ``t_us``.
         origin_m: where its beams start in the axes of the stored points, if not at their origin (``logs.origins``);
             ``world_from_lidar`` is the pose there.
+        beam_errors: what its points are off by, if that was found (``logs.levelling``).
     """
 
     file: str
@@ -39,6 +41,7 @@ class SweepRecord:
     world_from_lidar: Matrix4
     compensated: bool = True
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    beam_errors: BeamErrors | None = None
 
     def from_origin(self, origin_m: Float64[np.ndarray, " 3"]) -> SweepRecord:
         """The sweep with its LiDAR moved to where its beams start, given in its present frame."""
@@ -62,6 +65,8 @@ def compensated_sweep(record: SweepRecord, stored: SweepPoints, lidar: LidarMode
     xyz_m, intensity, dt_us = _checked(stored)
     xyz_m = xyz_m - record.origin_m if any(record.origin_m) else xyz_m
     point_t_us = _point_times(lidar, record, dt_us, xyz_m)
+    if record.beam_errors is not None:
+        xyz_m = record.beam_errors.removed(xyz_m)
     if not record.compensated:
         xyz_m = _compensated(ego, record, xyz_m, point_t_us)
     xyz_m, point_t_us = _read_only(xyz_m), _read_only(point_t_us)

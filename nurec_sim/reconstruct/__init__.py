@@ -69,6 +69,7 @@ def reconstruct(
     refine: OptimizeSettings | None = None,
     actors: ActorsName = "auto",
     align_actors: bool = True,
+    align_sweeps: bool = True,
 ) -> GaussianScene:
     """Build a Gaussian scene from a clip, at the precision of archives: reading it from one gives the same values.
 
@@ -85,6 +86,8 @@ def reconstruct(
         actors: whose objects move: the boxes of the log (``recorded``), what moves in its sweeps (``found``), nobody
             (``none``); ``auto`` takes the boxes, and what moves if there are none.
         align_actors: correct tracks of moving objects so that the returns of all sweeps on an object make one surface.
+        align_sweeps: correct elevations of beams, mountings of LiDARs and poses of a log that was opened from disk, so
+            that all sweeps see the same planes (``logs.alignment``); the scene's path is the corrected one.
 
     Raises:
         ReconstructError: no such method, camera, sweep or choice of actors, settings of another method, or the clip
@@ -110,6 +113,7 @@ def reconstruct(
     if wrong:
         raise ReconstructError(f"clip {clip.id!r} has no sweeps {wrong} to hold out; have 0..{most - 1}")
 
+    from nurec_sim.logs.alignment import with_aligned_sweeps
     from nurec_sim.reconstruct.movers import with_actors, with_aligned_actors
     from nurec_sim.scene.precision import archived
 
@@ -117,6 +121,9 @@ def reconstruct(
     report = progress or (lambda stage, fraction: None)
     share = 1.0 if refine is None else START_SHARE
     begun = 0.0
+    if align_sweeps:
+        report("aligning sweeps", 0.0)
+        clip = with_aligned_sweeps(clip, held)
 
     def search(done: float) -> None:
         nonlocal begun
@@ -159,11 +166,15 @@ def _with_provenance(
 
     The note says more than what methods say about logs without boxes, and replaces it.
     """
+    from nurec_sim.logs.alignment import FACT
+
     known: dict[str, Any] = {"method": method, "cameras": cameras}
     if clip.time_offset_us:
         known["time_offset_us"] = clip.time_offset_us
     if aligned:
         known["aligned_tracks"] = aligned
+    if FACT in (facts := getattr(clip, "facts", {})):
+        known[FACT] = facts[FACT]
     provenance = known | dict(scene.provenance)
     if note is not None:
         others = [text for text in provenance.get("unknown", ()) if not text.startswith("no boxes:")]

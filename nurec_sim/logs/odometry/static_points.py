@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from nurec_sim import geometry
 from nurec_sim.logs.clip import Clip
-from nurec_sim.types import Track
+from nurec_sim.types import Sweep, Track
 
 NEAREST_M, FURTHEST_M = 2.5, 80.0
 MARGIN_M = 0.3
@@ -39,19 +39,25 @@ def _speed_mps(track: Track) -> float:
 
 def static_points(clip: Clip, lidar_id: str, index: int, moving: Sequence[Track]) -> Points:
     """Points of a sweep in the rig frame at its time, motion compensated, without ``moving`` and the car itself."""
-    sweep = clip.sweep(lidar_id, index)
+    keep, points = standing(clip, clip.sweep(lidar_id, index), moving)
+    return points[keep]
+
+
+def standing(clip: Clip, sweep: Sweep, moving: Sequence[Track]) -> tuple[Bool[np.ndarray, " n"], Points]:
+    """Which points of a sweep are near and belong neither to ``moving`` nor the car, and all in the rig frame then."""
     world_from_rig = clip.ego.at(sweep.t_us)
     points = geometry.transform_points(geometry.inverse(world_from_rig) @ sweep.world_from_lidar, sweep.xyz_m)
     distance = np.linalg.norm(points, axis=1)
     body = clip.rig.body
-    outside = ~geometry.points_in_box(points - np.asarray(body.center_m), body.size_m, MARGIN_M)
-    points = points[(distance > NEAREST_M) & (distance < FURTHEST_M) & outside]
+    keep = (distance > NEAREST_M) & (distance < FURTHEST_M)
+    keep &= ~geometry.points_in_box(points - np.asarray(body.center_m), body.size_m, MARGIN_M)
     for track in moving:
         if track.path.covers(sweep.t_us):
             box_from_rig = geometry.inverse(track.path.at(sweep.t_us)) @ world_from_rig
-            local = geometry.transform_points(box_from_rig, points)
-            points = points[~geometry.points_in_box(local, track.size_m, MARGIN_M)]
-    return points
+            kept = np.flatnonzero(keep)
+            local = geometry.transform_points(box_from_rig, points[kept])
+            keep[kept] = ~geometry.points_in_box(local, track.size_m, MARGIN_M)
+    return keep, points
 
 
 def thinned(points: Points, cell_m: float) -> Points:

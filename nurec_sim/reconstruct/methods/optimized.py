@@ -29,4 +29,5 @@ class Optimized(ShippedMethod):
             refine=settings,
             actors="recorded",
             align_actors=False,
+            align_sweeps=False,
         )

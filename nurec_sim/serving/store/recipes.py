@@ -15,7 +15,7 @@ import nurec_sim
 from nurec_sim.reconstruct import OptimizeSettings, load_method
 from nurec_sim.types import Clip, GaussianScene, Method, Progress
 
-_CODE = ("reconstruct", "network")
+_CODE = ("logs", "reconstruct", "network")
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ class Recipe:
             ClipError, ReconstructError, WeightsError: see ``reconstruct.reconstruct``.
         """
         from nurec_sim.logs import hold_out, open_clip, without_images
+        from nurec_sim.logs.alignment import with_aligned_sweeps
         from nurec_sim.reconstruct import reconstruct
 
         chosen: dict[str, Any] = {}
@@ -62,7 +63,8 @@ class Recipe:
         clip: Clip = open_clip(clip_path)
         if self.hold_out_every:
             held = hold_out(clip, self.cameras or list(clip.rig.cameras), images_every=self.hold_out_every)
-            clip, chosen["hold_out_sweeps"] = without_images(clip, held), sorted(held.sweeps)
+            clip = without_images(with_aligned_sweeps(clip, held.sweeps), held)
+            chosen["hold_out_sweeps"] = sorted(held.sweeps)
         return reconstruct(clip, self.method, progress=progress, **chosen)
 
     def text(self) -> str:

@@ -1,0 +1,10 @@
+"""Sweeps of a log aligned: beams, mountings of LiDARs and poses corrected until all see the same planes.
+
+On grazing ground a beam that is off by a twentieth of a degree is off by decimetres of range. Scanners are calibrated
+no better, nor are roll and pitch of most logs; but every stretch of road is seen from far and from near, by many beams.
+"""
+
+from nurec_sim.logs.alignment.align import with_aligned_sweeps
+from nurec_sim.logs.alignment.stored import FACT, aligned_as
+
+__all__ = ["FACT", "aligned_as", "with_aligned_sweeps"]

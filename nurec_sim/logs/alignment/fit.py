@@ -1,0 +1,166 @@
+"""Errors of beams, mountings and poses by which all sweeps of a log see the same planes.
+
+Along the normal of its plane, a recorded point is where the plane is, plus what the error of its beam, the turn of its
+LiDAR and the error of its pose move it. The offsets of planes are eliminated; what remains is linear in the errors, and
+solved by least squares with Cauchy weights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy import sparse
+from scipy.spatial.transform import Rotation
+
+from nurec_sim import geometry
+from nurec_sim.logs.alignment.planes import PlanePoints
+from nurec_sim.logs.beam_errors import BeamErrors
+from nurec_sim.types import Matrix4, Trajectory
+
+KNOTS_RAD = np.radians(np.arange(-60.0, 30.01, 0.25))
+"""Elevations at which errors of beams are solved for: finer than the beams of common scanners are apart."""
+BEAM_RAD, STEP_RAD, TURN_RAD = np.radians(0.1), np.radians(0.03), np.radians(0.1)
+"""Standard deviations of the error of a beam, of its change from one knot to the next, and of the mounting."""
+SHIFT_M, TILT_RAD = 0.05, np.radians(0.1)
+"""Standard deviations of errors of poses."""
+SIGMA_M = 0.025
+"""Standard deviation of points around their plane; those that are farther away count less."""
+COMMON = 0.001
+"""Weight of places as recorded against corrected ones. Where all is a plane, beams that are all lower look like a
+sensor that is higher; this decides for neither, and takes 0.1 % of what points say."""
+ROUNDS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """What was found.
+
+    Attributes:
+        beams: errors of the beams of each LiDAR, in the order of the rig.
+        turns_rad: rotation vector from true to recorded directions of each LiDAR, in its frame.
+        t_us: times of the corrections of poses.
+        shift_m: recorded minus true position of the car then, in the world.
+        tilt_rad: rotation vector from the true to the recorded pose then, about the axes of the world.
+        apart_m: median distance of points from the median of their plane, as recorded and without these errors.
+    """
+
+    beams: list[BeamErrors]
+    turns_rad: Float64[np.ndarray, "lidars 3"]
+    t_us: Int64[np.ndarray, " k"]
+    shift_m: Float64[np.ndarray, "k 3"]
+    tilt_rad: Float64[np.ndarray, "k 3"]
+    apart_m: tuple[float, float]
+
+    def correction(self, ego: Trajectory) -> Trajectory:
+        """``aligned_from_recorded`` in the world at ``t_us``; turns about the car."""
+        at = ego.at(self.t_us)[:, :3, 3]
+        poses = np.tile(np.eye(4), (len(at), 1, 1))
+        poses[:, :3, :3] = Rotation.from_rotvec(-self.tilt_rad).as_matrix()
+        poses[:, :3, 3] = at - self.shift_m - np.einsum("nij,nj->ni", poses[:, :3, :3], at)
+        return Trajectory(self.t_us, poses)
+
+    def mounting(self, lidar: int) -> Matrix4:
+        """``recorded_from_true`` frame of a LiDAR: its recorded pose times this is its true one."""
+        return geometry.pose(Rotation.from_rotvec(-self.turns_rad[lidar]).as_matrix(), np.zeros(3))
+
+
+def errors_of(points: PlanePoints, lidars: int, t_us: Int64[np.ndarray, " k"], ego: Trajectory) -> Errors:
+    """The errors that explain why sweeps disagree about planes.
+
+    Args:
+        points: points on planes.
+        lidars: number of LiDARs.
+        t_us: times at which poses are corrected, ascending; linear in between.
+        ego: recorded poses of the car.
+    """
+    kinds = [_of_beams(points, lidars), _of_turns(points, lidars), _of_poses(points, t_us, ego)]
+    columns = sparse.hstack(kinds).tocsr()
+    prior = _prior(lidars, len(t_us)) + COMMON * sparse.block_diag([each.T @ each for each in kinds]).toarray()
+    planes = sparse.csr_matrix((np.ones(len(points)), (points.plane, np.arange(len(points)))))
+    across = points.across_m
+    weight, found = np.ones(len(points)), np.zeros(columns.shape[1])
+    for _ in range(ROUNDS):
+        total = planes @ weight
+        weighted = sparse.diags(weight) @ columns
+        mean = sparse.diags(1 / total) @ (planes @ weighted)
+        normal = columns.T @ weighted - mean.T @ sparse.diags(total) @ mean
+        right = weighted.T @ across - mean.T @ (planes @ (weight * across))
+        found = np.linalg.solve(normal.toarray() + prior, right)
+        left = across - columns @ found
+        left -= ((planes @ (weight * left)) / total)[points.plane]
+        weight = 1 / (1 + (left / SIGMA_M) ** 2)
+    beams, turns, poses = np.split(found, np.cumsum([kind.shape[1] for kind in kinds])[:2])
+    shift, tilt = poses.reshape(2, 3, len(t_us)).transpose(0, 2, 1)
+    return Errors(
+        beams=[BeamErrors(KNOTS_RAD, each) for each in beams.reshape(lidars, len(KNOTS_RAD))],
+        turns_rad=turns.reshape(lidars, 3),
+        t_us=t_us,
+        shift_m=shift,
+        tilt_rad=tilt,
+        apart_m=(_apart(across, points.plane), _apart(across - columns @ found, points.plane)),
+    )
+
+
+def _of_beams(points: PlanePoints, lidars: int) -> sparse.csr_matrix:
+    """Motion of each point along its normal by the unit error of each knot of each LiDAR."""
+    xyz = points.beam_m
+    level = np.maximum(np.hypot(xyz[:, 0], xyz[:, 1]), 1e-9)
+    elevation = np.arctan2(xyz[:, 2], level)
+    low = np.clip(np.searchsorted(KNOTS_RAD, elevation, side="right") - 1, 0, len(KNOTS_RAD) - 2)
+    share = np.clip((elevation - KNOTS_RAD[low]) / np.diff(KNOTS_RAD)[low], 0, 1)
+    # One radian more elevation moves a point along the meridian by its distance.
+    raised = np.column_stack([-xyz[:, :2] * (xyz[:, 2] / level)[:, None], level])
+    along = np.sum(raised * _normals(points), axis=1)
+    column = points.lidar[points.sweep] * len(KNOTS_RAD) + low
+    return _sparse([(1 - share) * along, share * along], [column, column + 1], lidars * len(KNOTS_RAD))
+
+
+def _of_turns(points: PlanePoints, lidars: int) -> sparse.csr_matrix:
+    """The same by a turn w of each LiDAR about each of its axes: ``n . (w x p) = w . (p x n)``."""
+    turned = np.cross(points.beam_m, _normals(points))
+    first = 3 * points.lidar[points.sweep]
+    return _sparse(list(turned.T), [first + axis for axis in range(3)], 3 * lidars)
+
+
+def _normals(points: PlanePoints) -> Float64[np.ndarray, "n 3"]:
+    """Normals in the frames of the LiDARs."""
+    return np.einsum("nji,nj->ni", points.turn[points.sweep], points.normal)
+
+
+def _of_poses(points: PlanePoints, t_us: Int64[np.ndarray, " k"], ego: Trajectory) -> sparse.csr_matrix:
+    """The same by a shift along and a turn about each axis of the world at each time."""
+    k = len(t_us)
+    low = np.clip(np.searchsorted(t_us, points.t_us, side="right") - 1, 0, max(k - 2, 0))
+    high = np.minimum(low + 1, k - 1)
+    share = np.clip((points.t_us - t_us[low]) / np.maximum(t_us[high] - t_us[low], 1), 0, 1)
+    low, high, share = low[points.sweep], high[points.sweep], share[points.sweep]
+    arm = points.xyz_m - ego.at(points.t_us)[points.sweep, :3, 3]
+    parts = [*points.normal.T, *np.cross(arm, points.normal).T]
+    values = [part * each for part in parts for each in (1 - share, share)]
+    return _sparse(values, [number * k + each for number in range(6) for each in (low, high)], 6 * k)
+
+
+def _sparse(values: list[np.ndarray], columns: list[np.ndarray], width: int) -> sparse.csr_matrix:
+    """A matrix with one row per point, from its values and their columns."""
+    rows = np.tile(np.arange(len(values[0])), len(values))
+    return sparse.csr_matrix((np.concatenate(values), (rows, np.concatenate(columns))), shape=(len(values[0]), width))
+
+
+def _prior(lidars: int, times: int) -> Float64[np.ndarray, "p p"]:
+    """Inverse covariance of all errors, in units of that of a point."""
+    k = len(KNOTS_RAD)
+    steps = np.diff(np.eye(k), axis=0)
+    beams = np.eye(k) / BEAM_RAD**2 + steps.T @ steps / STEP_RAD**2
+    turns, poses = np.eye(3) / TURN_RAD**2, np.repeat([1 / SHIFT_M**2, 1 / TILT_RAD**2], 3 * times)
+    return SIGMA_M**2 * sparse.block_diag([*[beams] * lidars, *[turns] * lidars, np.diag(poses)]).toarray()
+
+
+def _apart(across: Float64[np.ndarray, " n"], plane: Int64[np.ndarray, " n"]) -> float:
+    """Median distance from the median of the same plane."""
+    order = np.lexsort((across, plane))
+    start = np.flatnonzero(np.diff(plane[order], prepend=-1))
+    count = np.diff(np.append(start, len(plane)))
+    median = (across[order[start + (count - 1) // 2]] + across[order[start + count // 2]]) / 2
+    return float(np.median(np.abs(across - median[plane])))
