@@ -122,8 +122,7 @@ def reconstruct(
     share = 1.0 if refine is None else START_SHARE
     begun = 0.0
     if align_sweeps:
-        report("aligning sweeps", 0.0)
-        clip = with_aligned_sweeps(clip, held)
+        clip = with_aligned_sweeps(clip, held, report)
 
     def search(done: float) -> None:
         nonlocal begun

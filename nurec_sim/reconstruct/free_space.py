@@ -30,7 +30,7 @@ MEETS = 1.5
 """Squared Mahalanobis distance within which a beam meets a Gaussian: it would lose half of its light there."""
 MARGIN_M, MARGIN_SHARE = 0.3, 0.02
 """A beam ends at a Gaussian within this distance along it, plus a share of its range: noise of poses and surfaces."""
-NOISE_M, NOISE_SHARE = 0.06, 0.003
+NOISE_M, NOISE_SHARE = 0.04, 0.002
 """The same for how opaque a Gaussian is: noise only. By the margin foliage before a wall would be as opaque as that."""
 LEAST_FACING = 0.15
 """Noise is measured across the surface; along a grazing beam it is longer, by one over this cosine at most."""

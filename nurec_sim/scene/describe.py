@@ -69,8 +69,18 @@ def summary(scene: GaussianScene) -> list[tuple[str, str]]:
         ("LiDARs", ", ".join(lidars) or "none"),
         ("road map", "none" if scene.road_map is None else str(scene.road_map)),
         ("method", str(scene.provenance.get("method", "unknown"))),
+        *_alignment(scene.provenance.get("sweep_alignment")),
         ("in memory", f"{sum(array.nbytes for array in arrays.values()) / 2**20:.1f} MiB"),
     ]
+
+
+def _alignment(found: object) -> list[tuple[str, str]]:
+    """The row about sweeps that disagreed and were aligned."""
+    apart = found.get("apart_m") if isinstance(found, Mapping) else None
+    if not (isinstance(apart, list) and len(apart) == 2 and all(isinstance(each, float) for each in apart)):
+        return []
+    before, after = (1000 * each for each in apart)
+    return [("sweeps aligned", f"points were {before:.1f} mm off the planes that sweeps share, and are {after:.1f} mm")]
 
 
 def _tracks(scene: GaussianScene) -> str:

@@ -137,7 +137,7 @@ def test_beams_that_pass_beside_a_hidden_centre_count(parked):
 def test_a_wall_just_behind_foliage_does_not_make_it_opaque(parked):
     """0.3 m are within the errors of poses, which do not remove anything, but beyond the noise of returns."""
     one = at([10, 0, 0], sigma_m=0.02)
-    for distance_m, free, share in ((10.08, False, 1.0), (10.3, False, 0.5), (11.0, True, 0.5), (9.7, False, 1.0)):
+    for distance_m, free, share in ((10.05, False, 1.0), (10.3, False, 0.5), (11.0, True, 0.5), (9.7, False, 1.0)):
         counts = count_beams(one, [sweep_of(parked, distance_m)] * 3)
         assert counts.free.tolist() == [free]
         assert (counts.ended_share < share) == [share < 1] and (counts.ended_share == 1) == [share == 1]
@@ -261,7 +261,7 @@ def test_bodies_keep_what_is_not_free_as_opaque_as_beams_found_it(parked):
         return solid.opacity, kept.tolist(), counts.ended_share**2
 
     for normal in ([0, 0, 1], [1, 0, 0]):
-        opacity, kept, share = seen([[8, 0, 0], [8, 0, 1], [5, 0, 0]], 8.0, normal)
+        opacity, kept, share = seen([[8, 0, 0], [7.94, 0, 1], [5, 0, 0]], 8.0, normal)
         assert kept == [True, True, False] and 0.3 < share[1] < 0.8
         np.testing.assert_allclose(opacity, [1.0, share[1]], rtol=1e-6)
         # Beyond the known ground what is level may be ground.

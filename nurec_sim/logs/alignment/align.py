@@ -11,7 +11,7 @@ from nurec_sim.logs.alignment.planes import plane_points
 from nurec_sim.logs.alignment.stored import FACT, plain, with_beams
 from nurec_sim.logs.clip import Clip as LoadedClip
 from nurec_sim.logs.moved import corrected
-from nurec_sim.types import Clip
+from nurec_sim.types import Clip, Progress
 
 FEWEST_POINTS = 2_000
 BETTER = 0.9
@@ -20,7 +20,9 @@ MOST_TIMES = 600
 """At most so many poses are corrected, evenly chosen; those in between follow."""
 
 
-def with_aligned_sweeps(clip: Clip, hold_out: Collection[int] = ()) -> Clip:
+def with_aligned_sweeps(
+    clip: Clip, hold_out: Collection[int] = (), progress: Progress = lambda stage, done: None
+) -> Clip:
     """The log with elevations of beams, mountings of LiDARs and poses corrected by planes that its sweeps share.
 
     Tracks and images move with the poses. A log that is nearly exact, or shows too few planes, stays as it is, and so
@@ -30,6 +32,7 @@ def with_aligned_sweeps(clip: Clip, hold_out: Collection[int] = ()) -> Clip:
     Args:
         clip: the log.
         hold_out: indices of sweeps that must not be read, of every LiDAR; they move with what is found in the others.
+        progress: called with the stage and the fraction done, if there is anything to do.
 
     Raises:
         ClipError: a sweep cannot be read.
@@ -37,12 +40,14 @@ def with_aligned_sweeps(clip: Clip, hold_out: Collection[int] = ()) -> Clip:
     if not isinstance(clip, LoadedClip):
         return clip
     names = list(clip.rig.lidars)
-    if FACT in clip.facts or not any(clip.sweep_count(name) > 1 for name in names):
+    read = [sum(index not in hold_out for index in range(clip.sweep_count(name))) for name in names]
+    if FACT in clip.facts or max(read, default=0) < 2:
         return clip
+    progress("aligning sweeps", 0.0)
     points = plane_points(clip, hold_out)
     if len(points) < FEWEST_POINTS:
         return clip
-    most = max(names, key=clip.sweep_count)
+    most = names[int(np.argmax(read))]
     t_us = np.unique([record.t_us for i, record in enumerate(clip.sweep_records(most)) if i not in hold_out])
     errors = errors_of(points, len(names), t_us[:: len(t_us) // MOST_TIMES + 1], clip.ego)
     before, after = errors.apart_m

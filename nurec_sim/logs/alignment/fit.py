@@ -30,7 +30,7 @@ SIGMA_M = 0.025
 COMMON = 0.001
 """Weight of places as recorded against corrected ones. Where all is a plane, beams that are all lower look like a
 sensor that is higher; this decides for neither, and takes 0.1 % of what points say."""
-ROUNDS = 6
+ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
