@@ -27,6 +27,8 @@ SHIFT_M, TILT_RAD = 0.05, np.radians(0.1)
 """Standard deviations of errors of poses."""
 SIGMA_M = 0.025
 """Standard deviation of points around their plane; those that are farther away count less."""
+ALIKE = 10
+"""So many points count as one: those near each other on a plane err alike."""
 COMMON = 0.001
 """Weight of places as recorded against corrected ones. Where all is a plane, beams that are all lower look like a
 sensor that is higher; this decides for neither, and takes 0.1 % of what points say."""
@@ -154,7 +156,7 @@ def _prior(lidars: int, times: int) -> Float64[np.ndarray, "p p"]:
     steps = np.diff(np.eye(k), axis=0)
     beams = np.eye(k) / BEAM_RAD**2 + steps.T @ steps / STEP_RAD**2
     turns, poses = np.eye(3) / TURN_RAD**2, np.repeat([1 / SHIFT_M**2, 1 / TILT_RAD**2], 3 * times)
-    return SIGMA_M**2 * sparse.block_diag([*[beams] * lidars, *[turns] * lidars, np.diag(poses)]).toarray()
+    return ALIKE * SIGMA_M**2 * sparse.block_diag([*[beams] * lidars, *[turns] * lidars, np.diag(poses)]).toarray()
 
 
 def _apart(across: Float64[np.ndarray, " n"], plane: Int64[np.ndarray, " n"]) -> float:
