@@ -95,7 +95,7 @@ def test_the_reconstruction_never_gets_what_is_held_out(monkeypatch):
     class AskedError(Exception):
         pass
 
-    def asked(clip, method, *, cameras, hold_out_sweeps, progress):
+    def asked(clip, method, *, cameras, hold_out_sweeps, progress, align_sweeps):
         raise AskedError(len(clip.camera_times_us("left")), hold_out_sweeps)
 
     monkeypatch.setattr("nurec_sim.reconstruct.reconstruct", asked)
