@@ -31,7 +31,7 @@ class SweepRecord:
             own motion between their time and ``t_us``.
         origin_m: where its beams start in the axes of the stored points, if not at their origin (``logs.origins``);
             ``world_from_lidar`` is the pose there.
-        beam_errors: what its points are off by, if that was found (``logs.levelling``).
+        beam_errors: what its points are off by, if that was found (``logs.alignment``).
     """
 
     file: str
