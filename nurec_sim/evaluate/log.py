@@ -149,7 +149,7 @@ def score_scene(
         ReconstructError: an unknown camera, or a scene of another log.
     """
     held, report = held or HeldOut(), progress or (lambda stage, fraction: None)
-    clip = as_made(clip, scene)
+    clip = _as_made(clip, scene)
     found, recorded = score_actors(clip, scene), clip
     if not clip.tracks:
         # What moves in the log is in free space at other times, with a label or without.
@@ -206,7 +206,7 @@ def _check_cameras(clip: Clip, cameras: Sequence[str]) -> None:
         raise ReconstructError(f"clip {clip.id!r} has no camera {unknown}; have {list(clip.rig.cameras)}")
 
 
-def as_made(clip: Clip, scene: GaussianScene) -> Clip:
+def _as_made(clip: Clip, scene: GaussianScene) -> Clip:
     """The log as the scene was made from it, its sweeps aligned if they were.
 
     Raises:
