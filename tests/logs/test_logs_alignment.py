@@ -107,7 +107,7 @@ def test_what_is_exact_or_shows_nothing_stays_as_it_is(exact, tmp_path):
     assert with_aligned_sweeps(no_lidar) is no_lidar
     alone = exact.replaced(sweeps={LIDAR: exact.sweep_records(LIDAR)[:1]})
     assert with_aligned_sweeps(alone) is alone
-    assert with_aligned_sweeps(exact, range(1, SWEEPS)) is exact
+    assert with_aligned_sweeps(exact, range(1, SWEEPS)) is exact and with_aligned_sweeps(exact, range(SWEEPS)) is exact
     right = with_aligned_sweeps(miscalibrated(exact))
     assert with_aligned_sweeps(right) is right
 
