@@ -101,7 +101,7 @@ def test_what_is_held_out_is_not_read_and_moves_with_the_rest(exact):
     assert not set(points.t_us[points.sweep]) & {exact.sweep_records(LIDAR)[index].t_us for index in held}
 
 
-def test_what_is_exact_or_shows_nothing_stays_as_it_is(exact, tmp_path):
+def test_what_is_exact_or_shows_nothing_stays_as_it_is(exact):
     assert with_aligned_sweeps(exact) is exact
     no_lidar = logs.Clip("dark", Rig({}, {}), exact.ego, {}, {}, exact.source)
     assert with_aligned_sweeps(no_lidar) is no_lidar
