@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from nurec_sim import geometry, sensors
+from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import LIMITS
 from nurec_sim.logs.beam_errors import BeamErrors
@@ -124,8 +124,11 @@ def _compensated(
     # Poses at instants 20 us apart: at 50 m/s that errs by half a millimetre, the grain of the files, and costs a
     # twentieth of a pose for each point.
     instants, place = np.unique(point_t_us // INSTANT_US, return_inverse=True)
-    poses = longer.at(instants * INSTANT_US + INSTANT_US // 2) @ lidar_from_rig
-    return sensors.compensate_sweep(xyz, poses[place], record.world_from_lidar)
+    fired = longer.at(instants * INSTANT_US + INSTANT_US // 2) @ lidar_from_rig
+    # As ``sensors.compensate_sweep`` does, with the poses multiplied before they are repeated for each point.
+    moved = geometry.inverse(record.world_from_lidar) @ fired
+    turn, shift = np.ascontiguousarray(moved[:, :3, :3]), np.ascontiguousarray(moved[:, :3, 3])
+    return np.einsum("nij,nj->ni", turn[place], xyz) + shift[place]
 
 
 def prolonged(ego: Trajectory, margin_us: int) -> Trajectory | None:

@@ -289,35 +289,41 @@ def _half_width(axes, u, v, w):
 
 
 @inner
-def _meeting(canonical, o, d):
-    """Where along a beam d it is nearest to a Gaussian, and the squared Mahalanobis distance there."""
-    aa, ab, bb = 0.0, 0.0, 0.0
+def _in_axes(canonical, turn, result):
+    """Rows of a Gaussian's ``canonical`` matrix in the axes of the LiDAR, into ``result``; returns the thinnest one.
+
+    ``canonical`` times a vector is that vector in standard deviations along the Gaussian's axes.
+    """
+    thinnest, largest = 0, 0.0
     for k in range(3):
-        c = canonical[k]
-        a = c[0] * o[0] + c[1] * o[1] + c[2] * o[2]
-        e = c[0] * d[0] + c[1] * d[1] + c[2] * d[2]
-        aa, ab, bb = aa + a * a, ab + a * e, bb + e * e
-    return ab / bb, aa - ab * ab / bb
+        c, square = canonical[k], 0.0
+        for m in range(3):
+            part = c[0] * turn[0, m] + c[1] * turn[1, m] + c[2] * turn[2, m]
+            result[k, m] = part
+            square += part * part
+        if square > largest:
+            thinnest, largest = k, square
+    return thinnest, np.sqrt(largest)
 
 
 @inner
-def _facing(canonical, u, v, w):
-    """Cosine between a unit vector and the thinnest axis of a Gaussian: its normal, if it is flat."""
-    thinnest, cosine = 0.0, 1.0
-    for k in range(3):
-        c = canonical[k]
-        square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
-        if square > thinnest:
-            thinnest = square
-            cosine = abs(c[0] * u + c[1] * v + c[2] * w) / np.sqrt(square)
-    return cosine
+def _meeting(canonical, ax, ay, az, dx, dy, dz):
+    """Where along a beam (dx, dy, dz) it is nearest to a Gaussian, and the squared Mahalanobis distance there.
+
+    ``a`` is the Gaussian's centre as seen from the beam's origin, in its standard deviations.
+    """
+    u = canonical[0, 0] * dx + canonical[0, 1] * dy + canonical[0, 2] * dz
+    v = canonical[1, 0] * dx + canonical[1, 1] * dy + canonical[1, 2] * dz
+    w = canonical[2, 0] * dx + canonical[2, 1] * dy + canonical[2, 2] * dz
+    ab, bb = ax * u + ay * v + az * w, u * u + v * v + w * w
+    return ab / bb, ax * ax + ay * ay + az * az - ab * ab / bb
 
 
 @kernel
 def _count(xyz, canonical, extent, pose, drift, beams, image, reach_m, farthest_m, low, width, fraction, counts):
     """Adds the beams of one sweep to ``counts`` [n,4], in the order of ``BeamCounts``."""
     rows = image.shape[0]
-    turn = np.ascontiguousarray(pose[:3, :3].T)
+    turn, own = np.ascontiguousarray(pose[:3, :3].T), np.empty((3, 3))
     for i in range(len(xyz)):
         total = counts[i, 0] + counts[i, 1]
         if total >= ENOUGH or (total >= CLEAR and 8 * min(counts[i, 0], counts[i, 1]) <= total):
@@ -345,6 +351,9 @@ def _count(xyz, canonical, extent, pose, drift, beams, image, reach_m, farthest_
         upward = _half_width(extent[i], *_turned(turn, back * x, back * y, up)) / distance
         across = min(max(across, width) / STEP_RAD, MOST_CELLS)
         upward = min(max(upward, width) / STEP_RAD, MOST_CELLS)
+        thinnest, inverse_m = _in_axes(canonical[i], turn, own)
+        cx, cy, cz = _turned(own, px, py, pz)
+        mx, my, mz = _turned(own, drift[0], drift[1], drift[2])
         for row in range(
             max(int(np.floor(elevation - upward)), 0), min(int(np.floor(elevation + upward)), rows - 1) + 1
         ):
@@ -361,7 +370,7 @@ def _count(xyz, canonical, extent, pose, drift, beams, image, reach_m, farthest_
                 dx, dy, dz = beams[b, 0], beams[b, 1], beams[b, 2]
                 t = ox * dx + oy * dy + oz * dz
                 if ox * ox + oy * oy + oz * oz - t * t > (width * distance) ** 2:
-                    t, square = _meeting(canonical[i], _turned(turn, ox, oy, oz), _turned(turn, dx, dy, dz))
+                    t, square = _meeting(own, cx - f * mx, cy - f * my, cz - f * mz, dx, dy, dz)
                     if square > MEETS:
                         continue
                 behind = beams[b, 3] - t
@@ -370,7 +379,8 @@ def _count(xyz, canonical, extent, pose, drift, beams, image, reach_m, farthest_
                 elif behind > -margin:
                     counts[i, 1] += 1
                 # Across the surface noise is as large for all beams; along grazing ones it is longer.
-                facing = max(_facing(canonical[i], *_turned(turn, dx, dy, dz)), LEAST_FACING)
+                along = abs(own[thinnest, 0] * dx + own[thinnest, 1] * dy + own[thinnest, 2] * dz)
+                facing = max(along / inverse_m, LEAST_FACING)
                 if behind > noise / facing:
                     counts[i, 2] += 1
                 elif behind > -noise / facing:

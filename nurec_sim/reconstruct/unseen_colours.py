@@ -18,14 +18,14 @@ from nurec_sim.types import Gaussians, Label
 NEIGHBOURS = 8
 MOST_SEEN = 20_000
 """The scene is thinned to so many Gaussians to learn from, evenly: with ten times as many the colours are no better."""
-INEXACT = 0.5
+INEXACT = 1.0
 """A neighbour may be so much farther than the nearest one, as a share; looking for the very nearest takes ten times as
-long."""
+long, and colours are no better by it."""
 ACROSS_M, UP_M = 10.0, 1.0
 """Distances along and across the ground that count like one standard deviation of the intensity, and like a surface
 that is level instead of upright: what is as high above the ground is alike over a long way along a street."""
-SMOOTHED, THINNED = 8, 3
-"""Intensities of what is not seen are medians of so many nearest ones, of every third Gaussian: single returns differ
+SMOOTHED, THINNED = 5, 10
+"""Intensities of what is not seen are medians of so many nearest ones, of every tenth Gaussian: single returns differ
 by the laser and the angle as much as by the surface, and would give a road the colours of all of them side by side."""
 
 

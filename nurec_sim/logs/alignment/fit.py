@@ -15,6 +15,7 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from nurec_sim import geometry
+from nurec_sim.compute.kernels import kernel
 from nurec_sim.logs.alignment.planes import PlanePoints
 from nurec_sim.logs.beam_errors import BeamErrors
 from nurec_sim.types import Matrix4, Trajectory
@@ -79,7 +80,9 @@ def errors_of(points: PlanePoints, lidars: int, t_us: Int64[np.ndarray, " k"], e
     """
     kinds = [_of_beams(points, lidars), _of_turns(points, lidars), _of_poses(points, t_us, ego)]
     columns = sparse.hstack(kinds).tocsr()
-    prior = _prior(lidars, len(t_us)) + COMMON * sparse.block_diag([each.T @ each for each in kinds]).toarray()
+    kind = np.repeat(np.arange(len(kinds)), [each.shape[1] for each in kinds])
+    alone = _products(columns, np.ones(len(points))) * (kind[:, None] == kind)
+    prior = _prior(lidars, len(t_us)) + COMMON * alone
     planes = sparse.csr_matrix((np.ones(len(points)), (points.plane, np.arange(len(points)))))
     across = points.across_m
     weight, found = np.ones(len(points)), np.zeros(columns.shape[1])
@@ -87,9 +90,9 @@ def errors_of(points: PlanePoints, lidars: int, t_us: Int64[np.ndarray, " k"], e
         total = planes @ weight
         weighted = sparse.diags(weight) @ columns
         mean = sparse.diags(1 / total) @ (planes @ weighted)
-        normal = columns.T @ weighted - mean.T @ sparse.diags(total) @ mean
+        normal = _products(columns, weight) - _products(mean, total)
         right = weighted.T @ across - mean.T @ (planes @ (weight * across))
-        found = np.linalg.solve(normal.toarray() + prior, right)
+        found = np.linalg.solve(normal + prior, right)
         left = across - columns @ found
         left -= ((planes @ (weight * left)) / total)[points.plane]
         weight = 1 / (1 + (left / SIGMA_M) ** 2)
@@ -146,8 +149,29 @@ def _of_poses(points: PlanePoints, t_us: Int64[np.ndarray, " k"], ego: Trajector
 
 def _sparse(values: list[np.ndarray], columns: list[np.ndarray], width: int) -> sparse.csr_matrix:
     """A matrix with one row per point, from its values and their columns."""
-    rows = np.tile(np.arange(len(values[0])), len(values))
-    return sparse.csr_matrix((np.concatenate(values), (rows, np.concatenate(columns))), shape=(len(values[0]), width))
+    count, each = len(values[0]), len(values)
+    starts = np.arange(0, (count + 1) * each, each)
+    value, column = np.stack(values, axis=1).ravel(), np.stack(columns, axis=1).ravel()
+    return sparse.csr_matrix((value, column, starts), shape=(count, width))
+
+
+def _products(rows: sparse.csr_matrix, weight: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "p p"]:
+    """``rows.T @ diag(weight) @ rows``; a product of sparse matrices takes several times as long."""
+    half = _half(rows.indptr, rows.indices, rows.data, weight, rows.shape[1])
+    return half + half.T
+
+
+@kernel
+def _half(starts, column, value, weight, width):
+    """Sum of the weighted outer products of rows with themselves, each pair of their parts once, equal ones halved."""
+    half = np.zeros((width, width))
+    for i in range(len(weight)):
+        for a in range(starts[i], starts[i + 1]):
+            weighted = weight[i] * value[a]
+            half[column[a], column[a]] += 0.5 * weighted * value[a]
+            for b in range(a + 1, starts[i + 1]):
+                half[column[a], column[b]] += weighted * value[b]
+    return half
 
 
 def _prior(lidars: int, times: int) -> Float64[np.ndarray, "p p"]:
