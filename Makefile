@@ -60,7 +60,8 @@ bench-serving: $(VENV)/.installed ## 32 clients for 60 s against one, written to
 
 gpu-parity: $(VENV)/.installed ## the CUDA kernels against the reference, on this machine's GPU
 	$(BIN)/python -m nurec_sim.render.gpu
-	$(BIN)/python -m pytest -m needs_gpu tests/render/test_render_gpu.py tests/render/test_render_gpu_gradients.py
+	$(BIN)/python -m pytest -m needs_gpu tests/render/test_render_gpu.py tests/render/test_render_gpu_gradients.py \
+		tests/render/test_render_gpu_frame.py tests/reconstruct/test_optimize.py
 
 gpu-bench: $(VENV)/.installed ## GPU timings, written to build/bench_gpu.json
 	$(BIN)/python benchmarks/gpu.py

@@ -26,7 +26,11 @@ from render import write
 from scenes import SCENES, BenchScene
 
 from nurec_sim.errors import GpuError
+from nurec_sim.reconstruct import OptimizeSettings
+from nurec_sim.reconstruct.optimize.method import Optimization
+from nurec_sim.reconstruct.optimize.views import Returns, TrainingView
 from nurec_sim.render.cpu.backward.gradients import GaussianTensors
+from nurec_sim.render.gpu.frame import GpuFrames
 from nurec_sim.render.gpu.gradients import DifferentiableRenderer
 from nurec_sim.render.gpu.launcher import CudaLauncher, Launcher
 from nurec_sim.render.gpu.renderer import GpuRenderer
@@ -41,6 +45,7 @@ CASES = {
     "tick-8": EIGHT,
 }
 TRAINED = ("pinhole-960", "lidar-128")
+OPTIMIZED = "pinhole-960"
 DETAILED = ("pinhole-1920", "lidar-128", "tick-8")
 SceneName = Literal[tuple(SCENES)]  # type: ignore[valid-type]
 SensorName = Literal[tuple(CASES)]  # type: ignore[valid-type]
@@ -91,7 +96,7 @@ def main() -> int:
 def scene_rows(
     name: str, bench: BenchScene, launcher: Launcher, timed: Timed, options: Options
 ) -> Iterator[dict[str, Any]]:
-    """A row per sensor, and one for the gradients of some."""
+    """A row per sensor, and ones for the gradients of some and for steps of the optimisation."""
     full, path = GpuRenderer(bench.scene, launcher), next(iter(bench.paths))
     rows = [(full, sensor, "") for sensor in options.sensors]
     detailed = [sensor for sensor in options.sensors if sensor in DETAILED and options.detail_px]
@@ -112,6 +117,8 @@ def scene_rows(
         yield {**facts(name, sensor + kind, path, bench, ms), "sense_ms_median": float(np.median(wall)), **against}
         if sensor in TRAINED and not kind:
             yield backward_row(name, sensor, path, bench, launcher, timed, options)
+        if sensor == OPTIMIZED and not kind:
+            yield step_row(name, sensor, path, bench, renderer, launcher, options)
 
 
 def backward_row(
@@ -133,6 +140,26 @@ def backward_row(
             leaf.grad = None
     row = facts(name, f"{sensor} backward", path, bench, backward[1:])
     return {**row, "forward_ms_median": float(np.median(forward[1:]))}
+
+
+def step_row(
+    name: str, sensor: str, path: str, bench: BenchScene, renderer: GpuRenderer, launcher: Launcher, options: Options
+) -> dict[str, Any]:
+    """Wall time of steps of the per-scene optimisation, whose images are a little darker than the scene shows them."""
+    views = []
+    for (asked,) in cases.tick_requests(bench, CASES[sensor], path, max(2, options.frames // 4)):
+        (frame,) = renderer.sense([asked])
+        poses = np.broadcast_to(np.asarray(asked.world_from_sensor, np.float64), (2, 4, 4))
+        nothing = Returns(np.zeros((0, 2)), np.zeros(0))
+        views.append(TrainingView(asked.sensor, len(views), asked.start_us, poses, frame.rgb // 8 * 7, nothing))
+    settings = OptimizeSettings(seconds=None, steps=len(views), check_every=0)
+    run = Optimization(bench.scene, views, settings, frames=GpuFrames(launcher))
+    ms = []
+    for number in range(len(views)):
+        began = time.perf_counter()
+        run.step(number, 1.0)
+        ms.append((time.perf_counter() - began) * 1e3)
+    return facts(name, f"{sensor} step", path, bench, ms[1:])
 
 
 def timed_on_gpu(work: Callable[[], Any]) -> tuple[Any, float]:

@@ -218,7 +218,7 @@ def drive(
     scenario = sim.load_scenario(scenario_path)
     if not sources and scenario.clip is None:
         raise NurecSimError(f"scenario {scenario.name!r} has no clip; give clips or scenes")
-    fit = refinement(refine)
+    fit = refinement(refine, device)
     if fit is not None and address is not None:
         raise NurecSimError("--refine cannot be used with --address: the scenes are those of the running server")
     if scenario.added_actors and address is not None:

@@ -175,9 +175,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
     from nurec_sim.evaluate import figure_rows
 
     render_device = network.device
-    if flags.method not in ("dense", "selective"):
-        network = dataclasses.replace(network, device=NO_FLAGS.device)  # its renderer alone uses it
-    settings = method_settings(flags.method, network, flags.set)
+    settings = method_settings(flags.method, network, flags.set, refined=True)  # the device renders anyway
     log = logs.open_clip(path)
     if flags.json is not None:
         check_writable(flags.json)
@@ -204,7 +202,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
                 detector=flags.detector,
                 progress=advance,
                 settings=settings,
-                refine=refinement(flags.refine),
+                refine=refinement(flags.refine, device),
                 actors=flags.actors,
                 align_actors=flags.align_actors,
                 align_sweeps=flags.align_sweeps,

@@ -73,17 +73,17 @@ def reconstruct(
         resume: go on with an optimisation that was interrupted, from its state in OUT.refine.npz; its archive is
             replaced.
         overwrite: replace an existing archive.
-        network: network settings.
+        network: network settings; --device also applies to --refine and `optimized`.
     """
     from nurec_sim import logs, scene
     from nurec_sim.reconstruct import reconstruct as run_method
 
-    settings = method_settings(method, network, changes)
+    settings = method_settings(method, network, changes, refined=refine is not None)
     log = logs.open_clip(clip)
     target = out_path or Path(f"{log.id}.usdz")
     if target.exists() and not overwrite and not resume:
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
-    settings, fit = _with_checkpoint(method, settings, refinement(refine), target, resume)
+    settings, fit = _with_checkpoint(method, settings, refinement(refine, network.device), target, resume)
     check_writable(target)
     log = with_poses(log, poses)
     with progress("reconstructing") as advance:
@@ -150,8 +150,14 @@ def render(
     out.print(f"wrote {out_path}", soft_wrap=True)
 
 
-def method_settings(method: str, network: FeedForwardSettings, given: Sequence[str] = ()) -> Any:
+def method_settings(method: str, network: FeedForwardSettings, given: Sequence[str] = (), refined: bool = False) -> Any:
     """Settings of a method: the flags of the network for those that use it, changed as ``--set NAME=VALUE`` says.
+
+    Args:
+        method: reference as ``load_method`` takes it.
+        network: the flags.
+        given: changes.
+        refined: whether its result will be optimised, on the device that the flags name.
 
     Raises:
         NurecSimError: flags of the network were given to a method without one, or a setting does not exist or fit.
@@ -159,17 +165,21 @@ def method_settings(method: str, network: FeedForwardSettings, given: Sequence[s
     from nurec_sim.reconstruct import load_method
 
     made = load_method(method).settings
+    optimizes = made is OptimizeSettings
     if made is not FeedForwardSettings:
         flags = [
             "--" + each.name.replace("_", "-")
             for each in dataclasses.fields(network)
             if getattr(network, each.name) != getattr(NO_FLAGS, each.name)
+            and not (each.name == "device" and (refined or optimizes))
         ]
         if flags:
             raise NurecSimError(
                 f"method {method!r} does not use {', '.join(flags)}; choose --method dense or selective"
             )
-    settings = network if made is FeedForwardSettings else None
+    settings = (
+        network if made is FeedForwardSettings else OptimizeSettings(device=network.device) if optimizes else None
+    )
     for text in given:
         name, equals, value = text.partition("=")
         if not equals:
@@ -198,8 +208,8 @@ def _changed(settings: Any, name: str, path: Sequence[str], value: str) -> Any:
         raise NurecSimError(f"--set {name}={value}: {why}") from None
 
 
-def refinement(seconds: float | None) -> OptimizeSettings | None:
-    """Optimisation settings for a time budget.
+def refinement(seconds: float | None, device: str = "auto") -> OptimizeSettings | None:
+    """Optimisation settings for a time budget and a device.
 
     Raises:
         NurecSimError: the budget is not positive.
@@ -207,7 +217,7 @@ def refinement(seconds: float | None) -> OptimizeSettings | None:
     if seconds is None:
         return None
     try:
-        return OptimizeSettings(seconds=seconds)
+        return OptimizeSettings(seconds=seconds, device=device)
     except ValueError as error:
         raise NurecSimError(f"--refine: {error}") from None
 

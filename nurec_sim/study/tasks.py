@@ -131,8 +131,8 @@ def rebuild(task: Task) -> list[str]:
     method = load_method(task.world)
     settings: Any = None
     if method.settings is OptimizeSettings:
-        # Steps, not seconds: the same result on every machine, whatever else it does.
-        settings = OptimizeSettings(seconds=None, steps=task.config.optimize_steps)
+        # Steps, not seconds, and on the CPU: the same result on every machine, whatever else it does.
+        settings = OptimizeSettings(seconds=None, steps=task.config.optimize_steps, device="cpu")
     try:
         scene = reconstruct(logs.open_clip(task.scene_folder / LOG), method, settings=settings, actors="recorded")
     except ReconstructError as error:

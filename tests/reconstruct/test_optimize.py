@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tiny_clip
 from fitted_street import SMALL, image_of
+from gpu_on_cpu.places import PLACES, launcher_at
 
 from nurec_sim import cli
 from nurec_sim.errors import ReconstructError
@@ -17,10 +18,12 @@ from nurec_sim.evaluate.scores.images import psnr
 from nurec_sim.reconstruct import OptimizeSettings, reconstruct
 from nurec_sim.reconstruct.optimize import method
 from nurec_sim.reconstruct.optimize.checkpoint import write_checkpoint
+from nurec_sim.reconstruct.optimize.frames import cpu_frames
 from nurec_sim.reconstruct.optimize.parameters import Parameters
 from nurec_sim.reconstruct.optimize.responses import FrameResponses
 from nurec_sim.reconstruct.optimize.settings import LearningRates, PosePriors
 from nurec_sim.reconstruct.optimize.views import training_views
+from nurec_sim.render.gpu.frame import GpuFrames
 from nurec_sim.scene import read_scene, scene_hash, write_scene
 from nurec_sim.scene.precision import archived
 
@@ -181,6 +184,35 @@ def test_a_wrong_pose_is_corrected(street, lifted):
     assert max(np.abs(run.poses.of(k)[4]) for k in (0, 1, 3)) < 0.02
     told = run.scene(street).provenance["refined"]["poses"]["front"]
     assert told["largest_shift_m"] > 0.02 and abs(told["time_offset_ms"]) < 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", PLACES)
+def test_steps_on_a_gpu_are_those_on_the_cpu(street, lifted, place):
+    """The kernels of the GPU in place of those of the CPU, beside the same losses and the same Adam."""
+    views, drawn = training_views(street, lifted, ["front"], set())[:2], []
+    frames_on_gpu = GpuFrames(launcher_at(place))
+
+    def gpu_frames(camera, pair):
+        drawn.append(camera)
+        return frames_on_gpu(camera, pair)
+
+    runs = [
+        method.Optimization(lifted, views, OptimizeSettings(seconds=None, steps=2, check_every=0), frames=frames)
+        for frames in (cpu_frames, gpu_frames)
+    ]
+    losses = [run.step(0, 1.0) for run in runs]
+    cpu, gpu = (run.parameters.first for run in runs)
+    assert np.linalg.norm(gpu - cpu) < 0.01 * np.linalg.norm(cpu) != 0
+    # Column by column, so that large gradients do not hide small ones; one of the quaternion's is not used.
+    used = np.linalg.norm(cpu, axis=0) > 0
+    assert used.sum() == 13
+    assert (np.linalg.norm(gpu - cpu, axis=0)[used] < 0.02 * np.linalg.norm(cpu, axis=0)[used]).all()
+    # The first step of Adam has the size of the rate however small the gradient: rounding turns some of them around.
+    losses += [run.step(1, 1.0) for run in runs]
+    assert losses[1::2] == pytest.approx(losses[::2], rel=2e-3)
+    assert runs[1].psnr_db(0) == pytest.approx(runs[0].psnr_db(0), abs=0.05)
+    assert len(drawn) == 3
 
 
 @pytest.mark.slow

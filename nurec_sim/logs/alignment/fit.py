@@ -162,7 +162,9 @@ def _products(rows: sparse.csr_matrix, weight: Float64[np.ndarray, " n"]) -> Flo
 
 
 @kernel
-def _half(starts, column, value, weight, width):
+def _half(
+    starts: np.ndarray, column: np.ndarray, value: np.ndarray, weight: np.ndarray, width: int
+) -> Float64[np.ndarray, "p p"]:
     """Sum of the weighted outer products of rows with themselves, each pair of their parts once, equal ones halved."""
     half = np.zeros((width, width))
     for i in range(len(weight)):

@@ -12,6 +12,7 @@ import dataclasses
 import hashlib
 import itertools
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -22,6 +23,7 @@ from nurec_sim.reconstruct.optimize.adam import SkyAdam
 from nurec_sim.reconstruct.optimize.checkpoint import read_checkpoint, write_checkpoint
 from nurec_sim.reconstruct.optimize.compositing import Composite
 from nurec_sim.reconstruct.optimize.depth_loss import depth_loss
+from nurec_sim.reconstruct.optimize.frames import Frames, cpu_frames, frames_on
 from nurec_sim.reconstruct.optimize.free import CLEARINGS, recorded_beams, take_out
 from nurec_sim.reconstruct.optimize.image_loss import colour_loss
 from nurec_sim.reconstruct.optimize.interruption import whole_steps
@@ -32,7 +34,7 @@ from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 from nurec_sim.reconstruct.optimize.tracks import TrackCorrections
 from nurec_sim.reconstruct.optimize.unseen import colour_unseen, shown_by
 from nurec_sim.reconstruct.optimize.views import TrainingView, training_views
-from nurec_sim.render.cpu.backward.frame import SENSORS, Frame
+from nurec_sim.render.device import choose_device
 from nurec_sim.scene import scene_hash
 from nurec_sim.types import Clip, GaussianScene
 
@@ -67,14 +69,16 @@ def refine(
 
     Raises:
         ReconstructError: no camera, no image, or view-dependent colours.
+        GpuError: ``settings.device`` cannot be used.
     """
+    settings = dataclasses.replace(settings, device=choose_device(settings.device).name)
     if not cameras:
         raise ReconstructError(f"clip {clip.id!r}: an optimisation needs images; have no cameras")
     progress("reading images", 0.0)
     views = training_views(clip, scene, cameras, hold_out)
     if not views:
         raise ReconstructError(f"clip {clip.id!r}: an optimisation needs images; cameras {list(cameras)} have none")
-    run = Optimization(scene, views, settings, recorded_beams(clip, hold_out))
+    run = Optimization(scene, views, settings, recorded_beams(clip, hold_out), frames_on(settings.device))
     if settings.checkpoint is not None:
         run.key = _key(scene, cameras, hold_out, settings)
         if settings.resume:
@@ -94,7 +98,15 @@ def _key(scene: GaussianScene, cameras: Sequence[str], hold_out: set[int], setti
 
 
 class Optimization:
-    """What changes while a scene is fitted."""
+    """What changes while a scene is fitted.
+
+    Args:
+        scene: as it is at the start.
+        views: the images to fit.
+        settings: budget, rates and weights.
+        beams: recorded beams, by which free space is known.
+        frames: where images are drawn.
+    """
 
     def __init__(
         self,
@@ -102,21 +114,21 @@ class Optimization:
         views: Sequence[TrainingView],
         settings: OptimizeSettings,
         beams: Sequence[SweepBeams] = (),
+        frames: Frames = cpu_frames,
     ) -> None:
         self.settings, self.views, self.beams, self.key = settings, views, beams, ""
+        self._frame = frames
         self.parameters = Parameters(scene)
         self.sky = scene.sky.astype(np.float32).copy()
         self._sky_adam = SkyAdam(self.sky)
-        frames = {view.camera.id: 0 for view in views}
-        for view in views:
-            frames[view.camera.id] += 1
+        counts = Counter(view.camera.id for view in views)
         self.poses = PoseCorrections(views, settings.poses)
         self.tracks = TrackCorrections(scene, settings.tracks)
-        self.responses = FrameResponses(scene, frames)
+        self.responses = FrameResponses(scene, counts)
         every = settings.check_every
         self.checked = [
             number for number, view in enumerate(views)
-            if every and frames[view.camera.id] >= 2 * every and view.frame % every == every // 2
+            if every and counts[view.camera.id] >= 2 * every and view.frame % every == every // 2
         ]  # fmt: skip
         self._clear: dict[int, np.ndarray] = {}
         self.steps, self._seconds_before, self._cleared = 0, 0.0, 0
@@ -180,7 +192,7 @@ class Optimization:
     def psnr_db(self, number: int) -> float:
         """How well an image is shown."""
         view = self.views[number]
-        frame = Frame(SENSORS.tables(view.camera), self.poses.pair(number), False)
+        frame = self._frame(view.camera, self.poses.pair(number))
         frame.draw_packed(self.parameters.at(view.t_us, self.tracks.pose).packed)
         shown = Composite(frame, self.sky).shown(self.responses.of(view.camera.id, view.frame))
         shown = np.clip(shown, 0, 1)
@@ -227,7 +239,7 @@ class Optimization:
         """Fit one view, with learning rates ``rate`` times those at the start; the loss before the step."""
         view, weights, rates = self.views[number], self.settings.weights, self.settings.rates
         height, width = view.image.shape[:2]
-        frame = Frame(SENSORS.tables(view.camera), self.poses.pair(number), False)
+        frame = self._frame(view.camera, self.poses.pair(number))
         drawn = self.parameters.at(view.t_us, self.tracks.pose)
         alpha, distance = frame.draw_packed(drawn.packed)[[0, 4], :height, :width]
         composite = Composite(frame, self.sky)

@@ -104,6 +104,7 @@ class OptimizeSettings:
         poses: how much.
         correct_tracks: whether to correct the tracks of rigid actors that move.
         tracks: how much.
+        device: where images are drawn: ``auto``, ``cpu``, ``cuda`` or ``cuda:N`` (``render.choose_device``).
     """
 
     seconds: float | None = 300.0
@@ -122,6 +123,7 @@ class OptimizeSettings:
     poses: PosePriors = field(default_factory=PosePriors)
     correct_tracks: bool = True
     tracks: TrackPriors = field(default_factory=TrackPriors)
+    device: str = "auto"
 
     def __post_init__(self) -> None:
         """Checks the budget.

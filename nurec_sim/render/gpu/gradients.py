@@ -226,13 +226,13 @@ class _Blend(torch.autograd.Function):
             rows[11:14].T.to(ctx.feature_kind),
         )
         poses: list[Tensor | None] = [
-            _pose_gradient(mean, unit, part[:, : len(opacity)], reference)
+            pose_gradient(mean, unit, part[:, : len(opacity)], reference)
             for part, reference in zip(by_view, ctx.references, strict=False)
         ]
         return None, None, None, *results, *(poses or [None] * len(ctx.references))
 
 
-def _pose_gradient(mean: Tensor, unit_quat: Tensor, rows: Tensor, reference: Tensor) -> Float64[Tensor, "4 4"]:
+def pose_gradient(mean: Tensor, unit_quat: Tensor, rows: Tensor, reference: Tensor) -> Float64[Tensor, "4 4"]:
     """Gradient by one view's ``world_from_reference``; only its part along rigid motions means anything.
 
     To move the sensor is to move all Gaussians the other way.

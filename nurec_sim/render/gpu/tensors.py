@@ -50,8 +50,13 @@ def blocks_of(
     rows[:, pack.INTENSITY : pack.INTENSITY + 3] = given[:, 10:13]
     rows[:, pack.LOG_OPACITY] = torch.where(sound, given[:, 13].clamp(max=pack.MAX_OPACITY).log(), pack.NEVER_SEEN)
     fields = columns.reshape(blocks, pack.BLOCK, pack.FIELDS).transpose(1, 2).contiguous()
+    return Blocks(fields, torch.zeros((0, 0, 0), device=device), unbounded_spheres(blocks, device))
+
+
+def unbounded_spheres(blocks: int, device: torch.device) -> Float[Tensor, "blocks 6"]:
+    """Spheres of blocks of a single level of detail that no view can miss."""
     spheres = torch.zeros((blocks, SPHERE), device=device)
-    # Unbounded, so no block is culled; parent -1: a single level of detail.
     spheres[:, 3] = EVERYWHERE_M
+    # No parent.
     spheres.view(torch.int32)[:, 5] = -1
-    return Blocks(fields, torch.zeros((0, 0, 0), device=device), spheres)
+    return spheres
