@@ -175,7 +175,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
     from nurec_sim.evaluate import figure_rows
 
     render_device = network.device
-    settings = method_settings(flags.method, network, flags.set, refined=True)  # the device renders anyway
+    settings = method_settings(flags.method, network, flags.set, flags.refine, renders=True)
     log = logs.open_clip(path)
     if flags.json is not None:
         check_writable(flags.json)

@@ -78,7 +78,7 @@ def reconstruct(
     from nurec_sim import logs, scene
     from nurec_sim.reconstruct import reconstruct as run_method
 
-    settings = method_settings(method, network, changes, refined=refine is not None)
+    settings = method_settings(method, network, changes, refine)
     log = logs.open_clip(clip)
     target = out_path or Path(f"{log.id}.usdz")
     if target.exists() and not overwrite and not resume:
@@ -150,36 +150,44 @@ def render(
     out.print(f"wrote {out_path}", soft_wrap=True)
 
 
-def method_settings(method: str, network: FeedForwardSettings, given: Sequence[str] = (), refined: bool = False) -> Any:
+def method_settings(
+    method: str,
+    network: FeedForwardSettings,
+    given: Sequence[str] = (),
+    refine: float | None = None,
+    renders: bool = False,
+) -> Any:
     """Settings of a method: the flags of the network for those that use it, changed as ``--set NAME=VALUE`` says.
 
     Args:
         method: reference as ``load_method`` takes it.
-        network: the flags.
+        network: the flags. The device is also that of an optimisation.
         given: changes.
-        refined: whether its result will be optimised, on the device that the flags name.
+        refine: seconds for optimising what the method makes; None for none.
+        renders: whether the command renders on the device.
 
     Raises:
         NurecSimError: flags of the network were given to a method without one, or a setting does not exist or fit.
+        GpuError: the device of an optimisation cannot be used.
     """
     from nurec_sim.reconstruct import load_method
 
     made = load_method(method).settings
     optimizes = made is OptimizeSettings
+    used = {"device"} if optimizes or refine is not None or renders else set()
     if made is not FeedForwardSettings:
         flags = [
             "--" + each.name.replace("_", "-")
             for each in dataclasses.fields(network)
-            if getattr(network, each.name) != getattr(NO_FLAGS, each.name)
-            and not (each.name == "device" and (refined or optimizes))
+            if getattr(network, each.name) != getattr(NO_FLAGS, each.name) and each.name not in used
         ]
         if flags:
             raise NurecSimError(
                 f"method {method!r} does not use {', '.join(flags)}; choose --method dense or selective"
             )
-    settings = (
-        network if made is FeedForwardSettings else OptimizeSettings(device=network.device) if optimizes else None
-    )
+    settings: Any = network if made is FeedForwardSettings else None
+    if optimizes and refine is None and network.device != NO_FLAGS.device:
+        settings = refinement(OptimizeSettings().seconds, network.device)
     for text in given:
         name, equals, value = text.partition("=")
         if not equals:
@@ -213,11 +221,14 @@ def refinement(seconds: float | None, device: str = "auto") -> OptimizeSettings 
 
     Raises:
         NurecSimError: the budget is not positive.
+        GpuError: the device cannot be used; better told now than after the reconstruction.
     """
     if seconds is None:
         return None
+    from nurec_sim.render.device import choose_device
+
     try:
-        return OptimizeSettings(seconds=seconds, device=device)
+        return OptimizeSettings(seconds=seconds, device=choose_device(device).name)
     except ValueError as error:
         raise NurecSimError(f"--refine: {error}") from None
 

@@ -24,8 +24,8 @@ from nurec_sim.reconstruct.range_maps.settings import LidarSettings
 if TYPE_CHECKING:
     from nurec_sim.types import ActorsName, Clip, GaussianScene, Method
 
-START_SHARE = 0.15
-"""Share of all work, about, that is done before the optimisation starts."""
+START_S, STEP_S = 40.0, 0.3
+"""What a reconstruction, and a step of its optimisation, take about; progress is shared out by them."""
 MOVERS_SHARE = 0.15
 """Share of the work of a method, about, that it takes to find what moves."""
 
@@ -119,7 +119,7 @@ def reconstruct(
 
     held = {int(index) for index in hold_out_sweeps}
     report = progress or (lambda stage, fraction: None)
-    share = 1.0 if refine is None else START_SHARE
+    share = 1.0 if refine is None else _start_share(refine)
     begun = 0.0
     if align_sweeps:
         clip = with_aligned_sweeps(clip, held, report)
@@ -156,6 +156,12 @@ def reconstruct(
 
         scene = with_ray_drop(scene, clip, held, lambda done: report("ray drop", 1.0))
     return archived(scene)
+
+
+def _start_share(refine: OptimizeSettings) -> float:
+    """Share of all work, about, that is done before the optimisation starts."""
+    budgets = refine.seconds, None if refine.steps is None else STEP_S * refine.steps
+    return START_S / (START_S + min(each for each in budgets if each is not None))
 
 
 def _with_provenance(

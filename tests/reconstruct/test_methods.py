@@ -10,11 +10,11 @@ from doc_examples import example, names_of
 from reconstruct_street import Street, camera
 
 from nurec_sim import plugins
-from nurec_sim.cli.scenes import NO_FLAGS, method_settings
-from nurec_sim.errors import NurecSimError, ReconstructError
+from nurec_sim.cli.scenes import NO_FLAGS, method_settings, refinement
+from nurec_sim.errors import GpuError, NurecSimError, ReconstructError
 from nurec_sim.evaluate import contenders
 from nurec_sim.evaluate.methods import describe
-from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, available_methods, reconstruct
+from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, OptimizeSettings, available_methods, reconstruct
 from nurec_sim.reconstruct.conformance import check_method
 from nurec_sim.serving.store.recipes import Recipe, content_key
 
@@ -107,6 +107,23 @@ def test_settings_from_the_command_line(file):
         method_settings("dense", NO_FLAGS, ["overlap=3"])
     with pytest.raises(NurecSimError, match="method 'lift' does not use --frames"):
         method_settings("lift", dataclasses.replace(NO_FLAGS, frames=4))
+
+
+def test_the_device_is_that_of_an_optimisation_too():
+    on_cpu, on_none = (dataclasses.replace(NO_FLAGS, device=name) for name in ("cpu", "cuda:99"))
+    assert (
+        method_settings("optimized", on_cpu) == OptimizeSettings(device="cpu") and refinement(None, "cuda:99") is None
+    )
+    assert refinement(7.0, "cpu") == OptimizeSettings(seconds=7.0, device="cpu")
+    # With --refine its settings are those of the method, or it would have them twice.
+    assert method_settings("optimized", on_cpu, refine=7.0) is None is method_settings("optimized", NO_FLAGS)
+    assert method_settings("lift", on_cpu, refine=7.0) is None is method_settings("lift", on_cpu, renders=True)
+    with pytest.raises(NurecSimError, match="method 'lift' does not use --device"):
+        method_settings("lift", on_cpu)
+    # Before the start of minutes of reconstruction.
+    for call in (lambda: refinement(7.0, "cuda:99"), lambda: method_settings("optimized", on_none)):
+        with pytest.raises(GpuError, match="device 'cuda:99' cannot be used"):
+            call()
 
 
 @dataclass(frozen=True)
