@@ -88,7 +88,7 @@ def evaluate(
     )
     stages = _StageClock(_part(report, 0.0, 0.6))
     if align_sweeps:
-        clip = with_aligned_sweeps(clip, held.sweeps, stages)
+        clip = with_aligned_sweeps(clip, held.sweeps, stages, cameras, held.images)
     scene = reconstruct(
         without_images(clip, held), method, cameras=input_cameras, hold_out_sweeps=sorted(held.sweeps), progress=stages,
         align_sweeps=False, **options,

@@ -122,7 +122,7 @@ def reconstruct(
     share = 1.0 if refine is None else _start_share(refine)
     begun = 0.0
     if align_sweeps:
-        clip = with_aligned_sweeps(clip, held, report)
+        clip = with_aligned_sweeps(clip, held, report, chosen)
 
     def search(done: float) -> None:
         nonlocal begun

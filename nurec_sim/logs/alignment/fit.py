@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from nurec_sim import geometry
 from nurec_sim.compute.kernels import kernel
+from nurec_sim.logs.alignment.followed import FollowedPoints
 from nurec_sim.logs.alignment.planes import PlanePoints
 from nurec_sim.logs.beam_errors import BeamErrors
 from nurec_sim.types import Matrix4, Trajectory
@@ -26,6 +27,8 @@ BEAM_RAD, STEP_RAD, TURN_RAD = np.radians(0.1), np.radians(0.03), np.radians(0.1
 """Standard deviations of the error of a beam, of its change from one knot to the next, and of the mounting."""
 SHIFT_M, TILT_RAD = 0.05, np.radians(0.1)
 """Standard deviations of errors of poses."""
+WALK_US, SHIFT_WALK_M, TILT_WALK_RAD = 25_000, 0.01, np.radians(0.03)
+"""Standard deviations of their change within such a time: a car shakes while a LiDAR turns once."""
 SIGMA_M = 0.025
 """Standard deviation of points around their plane; those that are farther away count less."""
 ALIKE = 10
@@ -33,6 +36,10 @@ ALIKE = 10
 COMMON = 0.001
 """Weight of places as recorded against corrected ones. Where all is a plane, beams that are all lower look like a
 sensor that is higher; this decides for neither, and takes 0.1 % of what points say."""
+SIGMA_PX = 0.5
+"""Standard deviation of a followed point around where it is expected; those that are farther away count less."""
+ALIKE_PX = 40
+"""So many of them count as one: those near each other in an image err alike."""
 ROUNDS = 4
 
 
@@ -47,6 +54,7 @@ class Errors:
         shift_m: recorded minus true position of the car then, in the world.
         tilt_rad: rotation vector from the true to the recorded pose then, about the axes of the world.
         apart_m: median distance of points from the median of their plane, as recorded and without these errors.
+        apart_px: median distance of followed points from where they are expected, likewise; 0 if there are none.
     """
 
     beams: list[BeamErrors]
@@ -55,6 +63,7 @@ class Errors:
     shift_m: Float64[np.ndarray, "k 3"]
     tilt_rad: Float64[np.ndarray, "k 3"]
     apart_m: tuple[float, float]
+    apart_px: tuple[float, float]
 
     def correction(self, ego: Trajectory) -> Trajectory:
         """``aligned_from_recorded`` in the world at ``t_us``; turns about the car."""
@@ -69,11 +78,14 @@ class Errors:
         return geometry.pose(Rotation.from_rotvec(-self.turns_rad[lidar]).as_matrix(), np.zeros(3))
 
 
-def errors_of(points: PlanePoints, lidars: int, t_us: Int64[np.ndarray, " k"], ego: Trajectory) -> Errors:
-    """The errors that explain why sweeps disagree about planes.
+def errors_of(
+    points: PlanePoints, followed: FollowedPoints, lidars: int, t_us: Int64[np.ndarray, " k"], ego: Trajectory
+) -> Errors:
+    """The errors that explain why sweeps disagree about planes, and images about where their points are.
 
     Args:
         points: points on planes.
+        followed: points of images found in others.
         lidars: number of LiDARs.
         t_us: times at which poses are corrected, ascending; linear in between.
         ego: recorded poses of the car.
@@ -82,7 +94,10 @@ def errors_of(points: PlanePoints, lidars: int, t_us: Int64[np.ndarray, " k"], e
     columns = sparse.hstack(kinds).tocsr()
     kind = np.repeat(np.arange(len(kinds)), [each.shape[1] for each in kinds])
     alone = _products(columns, np.ones(len(points))) * (kind[:, None] == kind)
-    prior = _prior(lidars, len(t_us)) + COMMON * alone
+    prior = _prior(lidars, t_us) + COMMON * alone
+    images, off = _of_followed(followed, columns.shape[1], t_us, ego), followed.off_px.ravel()
+    counts = ALIKE / ALIKE_PX * (SIGMA_M / SIGMA_PX) ** 2
+    seen = np.ones(len(off))
     planes = sparse.csr_matrix((np.ones(len(points)), (points.plane, np.arange(len(points)))))
     across = points.across_m
     weight, found = np.ones(len(points)), np.zeros(columns.shape[1])
@@ -92,10 +107,13 @@ def errors_of(points: PlanePoints, lidars: int, t_us: Int64[np.ndarray, " k"], e
         mean = sparse.diags(1 / total) @ (planes @ weighted)
         normal = _products(columns, weight) - _products(mean, total)
         right = weighted.T @ across - mean.T @ (planes @ (weight * across))
+        normal += counts * _products(images, seen)
+        right += counts * (images.T @ (seen * off))
         found = np.linalg.solve(normal + prior, right)
         left = across - columns @ found
         left -= ((planes @ (weight * left)) / total)[points.plane]
         weight = 1 / (1 + (left / SIGMA_M) ** 2)
+        seen = 1 / (1 + ((off - images @ found) / SIGMA_PX) ** 2)
     beams, turns, poses = np.split(found, np.cumsum([kind.shape[1] for kind in kinds])[:2])
     shift, tilt = poses.reshape(2, 3, len(t_us)).transpose(0, 2, 1)
     return Errors(
@@ -105,6 +123,7 @@ def errors_of(points: PlanePoints, lidars: int, t_us: Int64[np.ndarray, " k"], e
         shift_m=shift,
         tilt_rad=tilt,
         apart_m=(_apart(across, points.plane), _apart(across - columns @ found, points.plane)),
+        apart_px=(_size(off), _size(off - images @ found)),
     )
 
 
@@ -136,13 +155,47 @@ def _normals(points: PlanePoints) -> Float64[np.ndarray, "n 3"]:
 
 def _of_poses(points: PlanePoints, t_us: Int64[np.ndarray, " k"], ego: Trajectory) -> sparse.csr_matrix:
     """The same by a shift along and a turn about each axis of the world at each time."""
+    car = ego.at(points.t_us)[points.sweep, :3, 3]
+    return _moved(points.normal, points.xyz_m, car, points.at_us, t_us)
+
+
+def _of_followed(
+    followed: FollowedPoints, width: int, t_us: Int64[np.ndarray, " k"], ego: Trajectory
+) -> sparse.csr_matrix:
+    """Motion of each followed point in its second image, first to the right and then down, by the unit errors of all.
+
+    An error of the first pose moves the point in the world; one of the second moves the point for the camera, the other
+    way, so that it is found as much off as the second moves it, less the first.
+    """
+    direction, xyz = followed.by_xyz.reshape(-1, 3), followed.xyz_m.repeat(2, axis=0)
+    first, second = (
+        _moved(direction, xyz, ego.at(times)[:, :3, 3].repeat(2, axis=0), times.repeat(2), t_us)
+        for times in (followed.first_us, followed.second_us)
+    )
+    return sparse.hstack([sparse.csr_matrix((len(xyz), width - 6 * len(t_us))), second - first]).tocsr()
+
+
+def _moved(
+    direction: Float64[np.ndarray, "n 3"],
+    xyz_m: Float64[np.ndarray, "n 3"],
+    car_m: Float64[np.ndarray, "n 3"],
+    at_us: Int64[np.ndarray, " n"],
+    t_us: Int64[np.ndarray, " k"],
+) -> sparse.csr_matrix:
+    """Motion of points along directions by a shift along and a turn about each axis of the world at each time.
+
+    Args:
+        direction: what their motion is multiplied by.
+        xyz_m: points in the world.
+        car_m: where the car was, about which it turns.
+        at_us: time of each.
+        t_us: times of the errors, which are linear in between.
+    """
     k = len(t_us)
-    low = np.clip(np.searchsorted(t_us, points.t_us, side="right") - 1, 0, max(k - 2, 0))
+    low = np.clip(np.searchsorted(t_us, at_us, side="right") - 1, 0, max(k - 2, 0))
     high = np.minimum(low + 1, k - 1)
-    share = np.clip((points.t_us - t_us[low]) / np.maximum(t_us[high] - t_us[low], 1), 0, 1)
-    low, high, share = low[points.sweep], high[points.sweep], share[points.sweep]
-    arm = points.xyz_m - ego.at(points.t_us)[points.sweep, :3, 3]
-    parts = [*points.normal.T, *np.cross(arm, points.normal).T]
+    share = np.clip((at_us - t_us[low]) / np.maximum(t_us[high] - t_us[low], 1), 0, 1)
+    parts = [*direction.T, *np.cross(xyz_m - car_m, direction).T]
     values = [part * each for part in parts for each in (1 - share, share)]
     return _sparse(values, [number * k + each for number in range(6) for each in (low, high)], 6 * k)
 
@@ -176,13 +229,18 @@ def _half(
     return half
 
 
-def _prior(lidars: int, times: int) -> Float64[np.ndarray, "p p"]:
+def _prior(lidars: int, t_us: Int64[np.ndarray, " k"]) -> Float64[np.ndarray, "p p"]:
     """Inverse covariance of all errors, in units of that of a point."""
     k = len(KNOTS_RAD)
     steps = np.diff(np.eye(k), axis=0)
     beams = np.eye(k) / BEAM_RAD**2 + steps.T @ steps / STEP_RAD**2
-    turns, poses = np.eye(3) / TURN_RAD**2, np.repeat([1 / SHIFT_M**2, 1 / TILT_RAD**2], 3 * times)
-    return ALIKE * SIGMA_M**2 * sparse.block_diag([*[beams] * lidars, *[turns] * lidars, np.diag(poses)]).toarray()
+    # Of poses, steps are a random walk: their variance grows with the time between.
+    walk = np.diff(np.eye(len(t_us)), axis=0) / np.sqrt(np.diff(t_us) / WALK_US)[:, None]
+    walk, still = walk.T @ walk, np.eye(len(t_us))
+    shifts, tilts = still / SHIFT_M**2 + walk / SHIFT_WALK_M**2, still / TILT_RAD**2 + walk / TILT_WALK_RAD**2
+    turns = np.eye(3) / TURN_RAD**2
+    parts = [*[beams] * lidars, *[turns] * lidars, *[shifts] * 3, *[tilts] * 3]
+    return ALIKE * SIGMA_M**2 * sparse.block_diag(parts).toarray()
 
 
 def _apart(across: Float64[np.ndarray, " n"], plane: Int64[np.ndarray, " n"]) -> float:
@@ -192,3 +250,8 @@ def _apart(across: Float64[np.ndarray, " n"], plane: Int64[np.ndarray, " n"]) ->
     count = np.diff(np.append(start, len(plane)))
     median = (across[order[start + (count - 1) // 2]] + across[order[start + count // 2]]) / 2
     return float(np.median(np.abs(across - median[plane])))
+
+
+def _size(off_px: Float64[np.ndarray, " 2n"]) -> float:
+    """Median length of offsets."""
+    return float(np.median(np.linalg.norm(off_px.reshape(-1, 2), axis=1))) if len(off_px) else 0.0

@@ -39,7 +39,8 @@ class PlanePoints:
         t_us: its time.
         turn: its rotation ``world_from_lidar``.
         sweep: of each point, the index of its sweep.
-        beam_m: the point in the frame of its LiDAR when it was fired, as recorded.
+        at_us: when the point was measured.
+        beam_m: the point in the frame of its LiDAR then, as recorded.
         xyz_m: the point in the world.
         normal: of its plane.
         plane: number of its plane, counted from 0.
@@ -49,6 +50,7 @@ class PlanePoints:
     t_us: Int64[np.ndarray, " sweeps"]
     turn: Float64[np.ndarray, "sweeps 3 3"]
     sweep: Int64[np.ndarray, " n"]
+    at_us: Int64[np.ndarray, " n"]
     beam_m: Vectors
     xyz_m: Vectors
     normal: Vectors
@@ -88,7 +90,7 @@ def plane_points(clip: Clip, hold_out: Collection[int] = ()) -> PlanePoints:
     parts = list(in_order(lambda job: _of_sweep(clip, *job[1:], moving, most), jobs))
     records = [clip.sweep_records(name)[index] for _, name, index in jobs]
     t_us = np.array([record.t_us for record in records], np.int64)
-    beam, xyz, low = (np.concatenate(column) for column in zip(*parts, strict=True))
+    at_us, beam, xyz, low = (np.concatenate(column) for column in zip(*parts, strict=True))
     sweep = np.repeat(np.arange(len(jobs)), [len(part[0]) for part in parts])
     ground, up = _ground(xyz, t_us[sweep], low), np.array([0.0, 0.0, 1.0])
     wall, normals = _walls(xyz, t_us[sweep], ~low)
@@ -99,6 +101,7 @@ def plane_points(clip: Clip, hold_out: Collection[int] = ()) -> PlanePoints:
         t_us=t_us,
         turn=np.array([record.world_from_lidar[:3, :3] for record in records]),
         sweep=sweep[found],
+        at_us=at_us[found],
         beam_m=beam[found],
         xyz_m=xyz[found],
         normal=np.where((ground >= 0)[:, None], up, normals)[found],
@@ -108,8 +111,8 @@ def plane_points(clip: Clip, hold_out: Collection[int] = ()) -> PlanePoints:
 
 def _of_sweep(
     clip: Clip, lidar: str, index: int, moving: list[Track], most: int
-) -> tuple[Vectors, Vectors, Bool[np.ndarray, " n"]]:
-    """Some points of a sweep that stand still: as fired, in the world, and whether they are near the ground."""
+) -> tuple[Int64[np.ndarray, " n"], Vectors, Vectors, Bool[np.ndarray, " n"]]:
+    """Some points of a sweep that stand still: times, as fired, in the world, and whether they are near the ground."""
     sweep = clip.sweep(lidar, index)
     keep, rig_m = standing(clip, sweep, moving)
     level = np.hypot(rig_m[:, 0], rig_m[:, 1])
@@ -118,7 +121,8 @@ def _of_sweep(
     beam = sweep.xyz_m[found]
     if not clip.sweep_records(lidar)[index].compensated:
         beam = beam + _driven_m(clip, sweep.t_us, sweep.point_t_us[found]) @ sweep.world_from_lidar[:3, :3]
-    return beam, sweep.xyz_world_m[found], np.abs(rig_m[found, 2]) < HEIGHT_M + SLOPE * level[found]
+    low = np.abs(rig_m[found, 2]) < HEIGHT_M + SLOPE * level[found]
+    return sweep.point_t_us[found], beam, sweep.xyz_world_m[found], low
 
 
 def _driven_m(clip: Clip, t_us: int, point_t_us: Int64[np.ndarray, " n"]) -> Vectors:

@@ -62,8 +62,11 @@ class Recipe:
             chosen["refine"] = dataclasses.replace(self.refine, keep_interrupted=False)
         clip: Clip = open_clip(clip_path)
         if self.hold_out_every:
-            held = hold_out(clip, self.cameras or list(clip.rig.cameras), images_every=self.hold_out_every)
-            clip = without_images(with_aligned_sweeps(clip, held.sweeps), held)
+            cameras = self.cameras or list(clip.rig.cameras)
+            held = hold_out(clip, cameras, images_every=self.hold_out_every)
+            clip = without_images(
+                with_aligned_sweeps(clip, held.sweeps, cameras=cameras, held_images=held.images), held
+            )
             chosen["hold_out_sweeps"] = sorted(held.sweeps)
         return reconstruct(clip, self.method, progress=progress, **chosen)
 
