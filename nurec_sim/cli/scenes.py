@@ -66,7 +66,7 @@ def reconstruct(
         align_actors: correct tracks of moving objects so that the returns of all LiDAR sweeps on an object make one
             surface (docs/lift.md).
         align_sweeps: correct elevations of LiDAR beams, mountings of LiDARs and poses so that all sweeps see the same
-            planes, if they disagree (docs/log_formats.md).
+            planes and images show them where they are, if they disagree (docs/log_formats.md).
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
         refine: time budget in seconds for optimising the scene on the log's images and sweeps.

@@ -67,8 +67,8 @@ def evaluate(
         device: that renders; see ``render.choose_device``.
         images_dir: folder for recorded (top) and rendered (bottom) images, PNG.
         detector: whether to compare what the camera detector finds in recorded and in rendered images.
-        align_sweeps: whether to align the log by what its other sweeps show (``logs.alignment``), for the method and
-            for the comparison.
+        align_sweeps: whether to align the log by what its other sweeps and the images of input cameras that are not
+            held out show (``logs.alignment``), for the method and for the comparison.
         progress: called with the stage and the approximate fraction done.
         options: passed to ``reconstruct``.
 

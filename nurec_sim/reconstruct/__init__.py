@@ -87,7 +87,8 @@ def reconstruct(
             (``none``); ``auto`` takes the boxes, and what moves if there are none.
         align_actors: correct tracks of moving objects so that the returns of all sweeps on an object make one surface.
         align_sweeps: correct elevations of beams, mountings of LiDARs and poses of a log that was opened from disk, so
-            that all sweeps see the same planes (``logs.alignment``); the scene's path is the corrected one.
+            that all sweeps see the same planes, and images of these cameras the same points (``logs.alignment``); the
+            scene's path is the corrected one.
 
     Raises:
         ReconstructError: no such method, camera, sweep or choice of actors, settings of another method, or the clip

@@ -11,10 +11,12 @@ from scipy.spatial.transform import Rotation
 from nurec_sim import geometry, logs
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.alignment import FACT, aligned_as, with_aligned_sweeps
-from nurec_sim.logs.alignment.planes import plane_points
+from nurec_sim.logs.alignment.fit import errors_of
+from nurec_sim.logs.alignment.followed import FollowedPoints
+from nurec_sim.logs.alignment.planes import PlanePoints, plane_points
 from nurec_sim.logs.alignment.stored import errors_from, plain
 from nurec_sim.logs.beam_errors import BeamErrors
-from nurec_sim.types import Rig
+from nurec_sim.types import Rig, Trajectory
 
 SWEEPS = 24
 
@@ -162,6 +164,29 @@ def test_alignment_of_a_real_drive_makes_its_sweeps_agree(realdata):
     fired, _ = logs.as_fired(clip, "lidar", clip.sweep("lidar", 0))
     place = {tuple(xyz): index for index, xyz in enumerate(clip.sweep("lidar", 0).xyz_world_m.tolist())}
     mine = np.flatnonzero(points.sweep == 0)[::50]
+    assert np.ptp(points.at_us[mine]) > 80_000 and abs(np.median(points.at_us[mine]) - record.t_us) < 20_000
     theirs = fired[[place[tuple(xyz)] for xyz in points.xyz_m[mine].tolist()]]
     elevation = [np.degrees(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))) for p in (points.beam_m[mine], theirs)]
     assert np.median(np.abs(elevation[0] - elevation[1])) < 0.03
+
+
+def test_a_car_that_heaves_within_a_sweep_is_levelled_at_each_time():
+    """Squares of level ground on all sides, each seen in every sweep at the time when the LiDAR looks there."""
+    random, sweeps, squares = np.random.default_rng(4), 12, 40
+    bearing = np.linspace(-np.pi, np.pi, squares, endpoint=False)
+    centre = np.column_stack([12 * np.cos(bearing), 12 * np.sin(bearing), np.zeros(squares)])
+    sweep, plane = (each.ravel().repeat(20) for each in np.meshgrid(range(sweeps), range(squares), indexing="ij"))
+    t_us = 100_000 * np.arange(1, sweeps + 1)
+    at_us = t_us[sweep] + np.rint(50_000 * bearing[plane] / np.pi).astype(np.int64)
+
+    def heave_m(times):
+        return 0.02 * np.sin(2 * np.pi * times / 200_000)
+
+    xyz = centre[plane] + np.column_stack([random.uniform(-0.2, 0.2, (len(plane), 2)), heave_m(at_us)])
+    up, turns = np.tile([0.0, 0.0, 1.0], (len(plane), 1)), np.tile(np.eye(3), (sweeps, 1, 1))
+    points = PlanePoints(np.zeros(sweeps, np.int64), t_us, turns, sweep, at_us, xyz, xyz, up, plane)
+    ego = Trajectory(np.array([0, 2_000_000]), np.tile(np.eye(4), (2, 1, 1)))
+    knots = np.arange(50_000, 1_250_001, 25_000)
+    found = errors_of(points, FollowedPoints.concatenate([]), 1, knots, ego).shift_m[2:-2, 2]
+    assert np.corrcoef(found, heave_m(knots)[2:-2])[0, 1] > 0.95
+    assert 0.01 < np.abs(found).max() < 0.02  # the prior takes a part

@@ -1,5 +1,7 @@
 """Poses corrected by points of sweeps that images show elsewhere than expected: a part of the demo log, shaken."""
 
+import types
+
 import numpy as np
 import pytest
 from misaligned import LIDAR, street, turned
@@ -7,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from nurec_sim import geometry, logs
 from nurec_sim.logs.alignment import FACT, with_aligned_sweeps
+from nurec_sim.logs.alignment.align import worth_it
 from nurec_sim.logs.alignment.followed import FollowedPoints, followed_points
 from nurec_sim.logs.moved import corrected
 from nurec_sim.types import Trajectory
@@ -79,7 +82,7 @@ def test_images_tell_turns_that_planes_do_not(yawed, exact):
     assert px[1] < 0.6 * px[0]
     # A camera that is not to be used tells nothing.
     alone = with_aligned_sweeps(wrong, cameras=[])
-    assert np.std(yaw_error_deg(alone, exact)) > 1.5 * after
+    assert alone.facts[FACT]["apart_px"] == [0, 0] and np.std(yaw_error_deg(alone, exact)) > after
 
 
 def test_images_that_are_held_out_are_not_read_and_move_with_the_rest(yawed, exact):
@@ -110,6 +113,23 @@ def test_a_log_without_images_or_points_in_them_has_no_followed_points(exact):
     assert len(followed_points(exact, [], (), {})) == len(FollowedPoints.concatenate([])) == 0
     assert len(followed_points(exact, [CAMERA], range(SWEEPS), {})) == 0
     assert len(followed_points(exact, [CAMERA], (), {CAMERA: range(1, exact.frame_count(CAMERA))})) == 0
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "apart_px", "followed", "worth"),
+    [
+        ((0.010, 0.008), (1.0, 1.0), 1000, True),
+        ((0.010, 0.0095), (1.0, 0.95), 1000, False),
+        ((0.0002, 0.0009), (1.0, 0.5), 1000, True),  # less than a millimetre is no loss
+        ((0.010, 0.0115), (1.0, 0.5), 1000, False),
+        ((0.010, 0.008), (0.1, 0.14), 1000, True),
+        ((0.010, 0.008), (1.0, 1.1), 1000, False),
+        ((0.010, 0.008), (1.0, 1.1), 100, True),  # too few to count
+        ((0.010, 0.010), (1.0, 0.5), 100, False),
+    ],
+)
+def test_a_log_is_aligned_if_one_gains_and_none_loses(apart_m, apart_px, followed, worth):
+    assert worth_it(types.SimpleNamespace(apart_m=apart_m, apart_px=apart_px), followed) is worth
 
 
 def test_images_of_a_real_drive_agree_once_it_is_aligned(realdata):

@@ -63,12 +63,21 @@ def with_aligned_sweeps(
         clip, list(clip.rig.cameras if cameras is None else cameras), hold_out, held_images or {}
     )
     errors = errors_of(points, followed, len(names), _times(clip, names[int(np.argmax(read))]), clip.ego)
+    return without(clip, errors) if worth_it(errors, len(followed)) else clip
+
+
+def worth_it(errors: Errors, followed: int) -> bool:
+    """Whether sweeps or images agree clearly better without these errors, and neither worse.
+
+    Args:
+        errors: what was found.
+        followed: number of followed points; few of them do not count.
+    """
     sizes = [(*errors.apart_m, WORSE_M)]
-    if len(followed) >= FEWEST_FOLLOWED:
+    if followed >= FEWEST_FOLLOWED:
         sizes.append((*errors.apart_px, WORSE_PX))
-    better = any(after < BETTER * before for before, after, _ in sizes)
     worse = any(after > WORSE * before + least for before, after, least in sizes)
-    return without(clip, errors) if better and not worse else clip
+    return not worse and any(after < BETTER * before for before, after, _ in sizes)
 
 
 def _times(clip: LoadedClip, lidar: str) -> Int64[np.ndarray, " k"]:

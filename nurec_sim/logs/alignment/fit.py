@@ -1,7 +1,8 @@
-"""Errors of beams, mountings and poses by which all sweeps of a log see the same planes.
+"""Errors of beams, mountings and poses by which sweeps of a log see the same planes, and images the same points.
 
 Along the normal of its plane, a recorded point is where the plane is, plus what the error of its beam, the turn of its
-LiDAR and the error of its pose move it. The offsets of planes are eliminated; what remains is linear in the errors, and
+LiDAR and the error of its pose move it. The offsets of planes are eliminated. A point of a sweep that is followed from
+an image to another is found as many pixels off as the errors of both poses move it. Both are linear in the errors, and
 solved by least squares with Cauchy weights.
 """
 

@@ -39,8 +39,9 @@ class PlanePoints:
         t_us: its time.
         turn: its rotation ``world_from_lidar``.
         sweep: of each point, the index of its sweep.
-        at_us: when the point was measured.
-        beam_m: the point in the frame of its LiDAR then, as recorded.
+        at_us: time of the pose that moves the point: when it was measured, or, where the log has compensated for the
+            motion of the car already, the time of the sweep.
+        beam_m: the point in the frame of its LiDAR when it was measured, as recorded.
         xyz_m: the point in the world.
         normal: of its plane.
         plane: number of its plane, counted from 0.
@@ -118,11 +119,12 @@ def _of_sweep(
     level = np.hypot(rig_m[:, 0], rig_m[:, 1])
     found = np.flatnonzero(keep & (level < FARTHEST_M))
     found = found[:: len(found) // most + 1]
-    beam = sweep.xyz_m[found]
+    beam, at_us = sweep.xyz_m[found], np.full(len(found), sweep.t_us, np.int64)
     if not clip.sweep_records(lidar)[index].compensated:
+        at_us = sweep.point_t_us[found]
         beam = beam + _driven_m(clip, sweep.t_us, sweep.point_t_us[found]) @ sweep.world_from_lidar[:3, :3]
     low = np.abs(rig_m[found, 2]) < HEIGHT_M + SLOPE * level[found]
-    return sweep.point_t_us[found], beam, sweep.xyz_world_m[found], low
+    return at_us, beam, sweep.xyz_world_m[found], low
 
 
 def _driven_m(clip: Clip, t_us: int, point_t_us: Int64[np.ndarray, " n"]) -> Vectors:
