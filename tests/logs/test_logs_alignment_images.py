@@ -8,7 +8,8 @@ from misaligned import LIDAR, street, turned
 from scipy.spatial.transform import Rotation
 
 from nurec_sim import geometry, logs
-from nurec_sim.logs.alignment import FACT, with_aligned_sweeps
+from nurec_sim.errors import ClipError
+from nurec_sim.logs.alignment import FACT, followed, with_aligned_sweeps
 from nurec_sim.logs.alignment.align import worth_it
 from nurec_sim.logs.alignment.followed import FollowedPoints, followed_points
 from nurec_sim.logs.moved import corrected
@@ -40,13 +41,13 @@ def yaw_error_deg(clip: logs.Clip, exact: logs.Clip) -> np.ndarray:
 
 
 def test_points_are_found_where_the_poses_say(exact):
-    followed = followed_points(exact, [CAMERA], (), {})
-    assert len(followed) > 500 and (followed.second_us > followed.first_us).all()
-    assert np.median(np.linalg.norm(followed.off_px, axis=1)) < 0.4
+    found = followed_points(exact, [CAMERA], (), {})
+    assert len(found) > 500 and (found.second_us > found.first_us).all()
+    assert np.median(np.linalg.norm(found.off_px, axis=1)) < 0.4
     # A point one metre farther to a side is so many pixels farther in the image: by its own projection.
-    index = len(followed) // 2
+    index = len(found) // 2
     times = exact.camera_times_us(CAMERA).sum(axis=1) // 2
-    frame = int(np.flatnonzero(times == followed.second_us[index])[0])
+    frame = int(np.flatnonzero(times == found.second_us[index])[0])
     camera, pose = exact.rig.cameras[CAMERA], exact.world_from_camera(CAMERA, frame)[0]
     step = np.array([0.01, -0.02, 0.005])
 
@@ -54,8 +55,8 @@ def test_points_are_found_where_the_poses_say(exact):
         x, y, z = geometry.transform_points(geometry.inverse(pose), xyz)
         return np.array([camera.lens.fx_px * x / z, camera.lens.fy_px * y / z])
 
-    moved = pixel(followed.xyz_m[index] + step) - pixel(followed.xyz_m[index])
-    assert followed.by_xyz[index] @ step == pytest.approx(moved, abs=0.02)
+    moved = pixel(found.xyz_m[index] + step) - pixel(found.xyz_m[index])
+    assert found.by_xyz[index] @ step == pytest.approx(moved, abs=0.02)
 
 
 def test_an_image_from_a_turned_camera_shows_points_to_the_side(exact):
@@ -66,11 +67,11 @@ def test_an_image_from_a_turned_camera_shows_points_to_the_side(exact):
     at = exact.ego.at(knots)
     jolts = np.array([turned([0, 0, each]) for each in (0, 0, 0.2, 0.2)])
     late = corrected(exact, Trajectory(knots, at @ jolts @ geometry.inverse(at)))
-    followed = followed_points(late, [CAMERA], (), {})
-    across = (followed.first_us < middle) & (followed.second_us >= middle)
+    found = followed_points(late, [CAMERA], (), {})
+    across = (found.first_us < middle) & (found.second_us >= middle)
     expected_px = -np.tan(np.radians(0.2)) * exact.rig.cameras[CAMERA].lens.fx_px
-    assert np.median(followed.off_px[across, 0]) == pytest.approx(expected_px, rel=0.25)
-    assert abs(np.median(followed.off_px[~across, 0])) < 0.2 * abs(expected_px)
+    assert np.median(found.off_px[across, 0]) == pytest.approx(expected_px, rel=0.25)
+    assert abs(np.median(found.off_px[~across, 0])) < 0.2 * abs(expected_px)
 
 
 def test_images_tell_turns_that_planes_do_not(yawed, exact):
@@ -104,15 +105,35 @@ def test_images_that_are_held_out_are_not_read_and_move_with_the_rest(yawed, exa
     assert FACT in right.facts
     poses = [clip.world_from_camera(CAMERA, min(held)) for clip in (wrong, right)]
     assert np.abs(poses[0] - poses[1]).max() > 1e-5
-    followed = followed_points(wrong, [CAMERA], sweeps, {CAMERA: held})
+    found = followed_points(wrong, [CAMERA], sweeps, {CAMERA: held})
     times = exact.camera_times_us(CAMERA).sum(axis=1) // 2
-    assert not set(times[sorted(held)].tolist()) & {*followed.first_us.tolist(), *followed.second_us.tolist()}
+    assert not set(times[sorted(held)].tolist()) & {*found.first_us.tolist(), *found.second_us.tolist()}
 
 
 def test_a_log_without_images_or_points_in_them_has_no_followed_points(exact):
     assert len(followed_points(exact, [], (), {})) == len(FollowedPoints.concatenate([])) == 0
     assert len(followed_points(exact, [CAMERA], range(SWEEPS), {})) == 0
     assert len(followed_points(exact, [CAMERA], (), {CAMERA: range(1, exact.frame_count(CAMERA))})) == 0
+
+
+def test_images_that_cannot_be_read_are_left_out_and_many_are_thinned(exact, monkeypatch):
+    class Damaged:
+        def image(self, camera_id, index):
+            if index == 4:
+                raise ClipError("image 4 is damaged")
+            return exact.source.image(camera_id, index)
+
+        def __getattr__(self, name):
+            return getattr(exact.source, name)
+
+    damaged = exact.replaced()
+    damaged.source = Damaged()
+    times = exact.camera_times_us(CAMERA).sum(axis=1) // 2
+    seen = followed_points(damaged, [CAMERA], (), {})
+    assert {*seen.first_us.tolist(), *seen.second_us.tolist()} == set(np.delete(times, 4).tolist())
+    monkeypatch.setattr(followed, "MOST_IMAGES", exact.frame_count(CAMERA) - 1)
+    seen = followed_points(exact, [CAMERA], (), {})
+    assert {*seen.first_us.tolist(), *seen.second_us.tolist()} == set(times[::2].tolist())
 
 
 @pytest.mark.parametrize(

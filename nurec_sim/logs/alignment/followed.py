@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from nurec_sim import geometry, sensors
 from nurec_sim.compute.cores import in_order
+from nurec_sim.errors import ClipError
 from nurec_sim.logs.clip import Clip
 from nurec_sim.logs.odometry.static_points import moving_tracks, standing
 from nurec_sim.types import CameraModel, Track
@@ -27,6 +28,8 @@ APART_US = 60_000
 """An image's points are those of a sweep that is at most so far away in time."""
 FARTHEST_S = 1.0
 """Images farther apart than this do not show the same."""
+MOST_IMAGES = 300
+"""Of all cameras."""
 WIDEST_PX = 1300
 """Wider images are reduced by a whole number to about this: tenths of a pixel suffice."""
 MOST_POINTS, CANDIDATES = 400, 3
@@ -77,7 +80,9 @@ class FollowedPoints:
 def followed_points(
     clip: Clip, cameras: Sequence[str], hold_out: Collection[int], held_images: Mapping[str, Collection[int]]
 ) -> FollowedPoints:
-    """Points of the sweeps of a log followed through the images of some cameras.
+    """Points of the sweeps of a log followed through the images of some cameras; of many images through every n-th.
+
+    Images that cannot be read are left out: it is for who needs them to say so.
 
     Args:
         clip: the log.
@@ -86,14 +91,17 @@ def followed_points(
         held_images: indices of images that must not be read, by camera.
 
     Raises:
-        ClipError: an image or a sweep cannot be read.
+        ClipError: a sweep cannot be read.
     """
     moving = moving_tracks(clip)
     parts: list[FollowedPoints] = []
+    every = sum(clip.frame_count(camera) for camera in cameras) // MOST_IMAGES + 1
     for camera in cameras:
-        frames = [k for k in range(clip.frame_count(camera)) if k not in held_images.get(camera, ())]
+        chosen = [k for k in range(clip.frame_count(camera)) if k not in held_images.get(camera, ())][::every]
         # Each image is decoded once: it is the second of one pair and the first of another.
-        grays = dict(zip(frames, in_order(partial(_gray, clip, camera), frames), strict=True))
+        read = zip(chosen, in_order(partial(_gray, clip, camera), chosen), strict=True)
+        grays = {k: gray for k, gray in read if gray is not None}
+        frames = list(grays)
 
         def follow(
             place: int, camera: str = camera, frames: list[int] = frames, grays: Grays = grays
@@ -112,9 +120,16 @@ def _model(clip: Clip, camera: str) -> CameraModel:
     return model if by == 1 else sensors.scaled_camera(model, model.width_px // by, model.height_px // by)
 
 
-def _gray(clip: Clip, camera: str, frame: int) -> UInt8[np.ndarray, "h w"]:
-    """An image with its contrast evened out locally, so that shadows have corners too and exposures do not matter."""
-    gray, model = cv2.cvtColor(clip.image(camera, frame), cv2.COLOR_RGB2GRAY), _model(clip, camera)
+def _gray(clip: Clip, camera: str, frame: int) -> UInt8[np.ndarray, "h w"] | None:
+    """An image with its contrast evened out locally, so that shadows have corners too and exposures do not matter.
+
+    None if it cannot be read.
+    """
+    try:
+        rgb = clip.image(camera, frame)
+    except ClipError:
+        return None
+    gray, model = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _model(clip, camera)
     by = clip.rig.cameras[camera].width_px // model.width_px
     if by > 1:
         part = gray[: by * model.height_px, : by * model.width_px]
