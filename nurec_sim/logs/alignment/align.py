@@ -58,7 +58,6 @@ def with_aligned_sweeps(
     points = plane_points(clip, hold_out)
     if len(points) < FEWEST_POINTS:
         return clip
-    progress("aligning sweeps", 0.5)
     followed = followed_points(
         clip, list(clip.rig.cameras if cameras is None else cameras), hold_out, held_images or {}
     )
