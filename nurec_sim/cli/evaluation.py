@@ -174,14 +174,13 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
     from nurec_sim.evaluate import evaluate as run_evaluation
     from nurec_sim.evaluate import figure_rows
 
-    render_device = network.device
     settings = method_settings(flags.method, network, flags.set, flags.refine, renders=True)
     log = logs.open_clip(path)
     if flags.json is not None:
         check_writable(flags.json)
     if flags.images is not None:
         check_writable(flags.images, folder=True)
-    device = chosen_device(render_device)
+    device = chosen_device(network.device)
     if flags.scene is not None and (changed := [name for name in given(flags, NO_LOG_FLAGS) if name in NOT_OF_A_SCENE]):
         raise NurecSimError(f"{', '.join(changed)}: for a new reconstruction, and --scene is a finished one")
     log = with_poses(log, flags.poses)
