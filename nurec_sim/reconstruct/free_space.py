@@ -290,7 +290,9 @@ def _half_width(axes, u, v, w):
 
 @inner
 def _in_axes(canonical, turn, result):
-    """Rows of a Gaussian's ``canonical`` matrix in the axes of the LiDAR, into ``result``; returns the thinnest one.
+    """Rows of a Gaussian's ``canonical`` matrix in the axes of the LiDAR, into ``result``.
+
+    Returns the number of the thinnest one, and one over the standard deviation along it.
 
     ``canonical`` times a vector is that vector in standard deviations along the Gaussian's axes.
     """

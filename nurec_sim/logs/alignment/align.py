@@ -46,7 +46,7 @@ def with_aligned_sweeps(
         held_images: indices of images that must not be read, by camera.
 
     Raises:
-        ClipError: a sweep or an image cannot be read.
+        ClipError: a sweep cannot be read.
     """
     if not isinstance(clip, LoadedClip):
         return clip
