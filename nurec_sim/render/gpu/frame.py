@@ -92,12 +92,11 @@ class GpuFrame(Frame):
         import torch
 
         launcher = self._frames.launcher
-        none = torch.zeros((0, 0, 0), device=launcher.device)
-        spheres = unbounded_spheres(len(packed), launcher.device)
-        self._blocks = Blocks(launcher.upload(packed), none, spheres)
+        none, spheres = Blocks.none(launcher.device), unbounded_spheres(len(packed), launcher.device)
+        self._blocks = Blocks(launcher.upload(packed), none.sh_rest, spheres)
 
         def attempt(room: Room) -> tuple[np.ndarray, Drawn]:
-            drawn = draw(launcher, self._batch, self._blocks, Blocks.none(launcher.device), room, keep_rows=True)
+            drawn = draw(launcher, self._batch, self._blocks, none, room, keep_rows=True)
             return launcher.read(drawn.totals), drawn
 
         first = Room.first(len(packed) * BLOCK)
