@@ -21,7 +21,7 @@ from nurec_sim.reconstruct.optimize.checkpoint import write_checkpoint
 from nurec_sim.reconstruct.optimize.frames import cpu_frames
 from nurec_sim.reconstruct.optimize.parameters import Parameters
 from nurec_sim.reconstruct.optimize.responses import FrameResponses
-from nurec_sim.reconstruct.optimize.settings import LearningRates, PosePriors
+from nurec_sim.reconstruct.optimize.settings import LearningRates, LossWeights, PosePriors, StartPriors
 from nurec_sim.reconstruct.optimize.views import training_views
 from nurec_sim.render.gpu.frame import GpuFrames
 from nurec_sim.scene import read_scene, scene_hash, write_scene
@@ -252,3 +252,30 @@ def test_reconstruct_keeps_the_state_beside_its_output_and_resumes_only_an_optim
     with pytest.raises(SystemExit):
         cli.main(["reconstruct", "street", "--resume"])
     assert "--resume goes on with an optimisation; give --refine" in capsys.readouterr().err
+
+
+def test_the_start_holds_once_for_all_images_together(street, lifted, monkeypatch):
+    """As strongly as pixels are wrong; of four images two are fitted."""
+    views, taken, step = training_views(street, lifted, ["front"], set()), [], Parameters.step
+
+    def noted(parameters, *arguments, keep, images_per_step):
+        taken.append((keep, images_per_step))
+        step(parameters, *arguments, keep=keep, images_per_step=images_per_step)
+
+    monkeypatch.setattr(Parameters, "step", noted)
+    settings = OptimizeSettings(
+        steps=3, check_every=2, start=StartPriors(0.5, 0.25, np.inf, 0.1), weights=LossWeights(0, 0, 0, 0)
+    )
+    run = method.Optimization(lifted, views, settings)
+    # Without the other terms the loss is the mean absolute error.
+    losses = [run.step(number, 1.0) for number in (0, 2, 0)]
+    assert [images for _, images in taken] == [2 / 1, 2 / 2, 2 / 3]
+    deviations = np.array([0.5] * 3 + [np.inf] * 7 + [np.inf] + [0.1] * 3)
+    deviations[7:10] = 0.25
+    for loss, (keep, _) in zip(losses, taken, strict=True):
+        assert keep == pytest.approx(loss / (128 * 64) / np.square(deviations), rel=1e-4)
+
+
+def test_deviations_of_the_start_are_positive():
+    with pytest.raises(ValueError, match=r"rgb must be positive \(infinity: not held\), got 0"):
+        StartPriors(rgb=0)

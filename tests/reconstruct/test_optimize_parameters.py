@@ -7,9 +7,9 @@ import pytest
 from reconstruct_street import Street, camera
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.optimize.adam import MEAN, OPACITY, QUAT, SCALE
+from nurec_sim.reconstruct.optimize.adam import MEAN, OPACITY, QUAT, RGB, SCALE
 from nurec_sim.reconstruct.optimize.compositing import Composite
-from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
+from nurec_sim.reconstruct.optimize.parameters import Parameters, per_value
 from nurec_sim.reconstruct.optimize.responses import borrowed_responses
 from nurec_sim.render.cpu.backward.frame import SENSORS, Frame, zeros_by_gaussian
 from nurec_sim.render.cpu.backward.repack import repack
@@ -76,7 +76,7 @@ def test_gradients_in_the_world_go_back_to_the_box(lifted):
     by.mean[row] = (0, 1, 0)
     parameters.values[row, QUAT : QUAT + 4] = (1, 0, 0, 0)
     by.quat[row] = (0, 0, 0, 1)  # by the world's quaternion (c, 0, 0, s) of 90 degrees, c = s = 0.7071
-    parameters.step(drawn, np.array([row, row + 1], np.int32), rate_columns(0, 0, 0, 0, 0), 1.0)
+    parameters.step(drawn, np.array([row, row + 1], np.int32), per_value(0, 0, 0, 0, 0), 1.0)
     assert not by.mean.any() and not by.quat.any(), "the next frame adds to zeros"
     assert parameters.visits[row] == 1 and parameters.visits[row + 1] == 0, "no gradient, no step"
     assert parameters.first[row, MEAN : MEAN + 3] == pytest.approx([0.1, 0, 0], abs=1e-6)
@@ -90,10 +90,40 @@ def test_opacity_and_scale_are_pulled_down_where_there_is_a_gradient(lifted):
     parameters.gradients.mean[0] = (1e-9, 0, 0)
     rows = np.array([0, 1], np.int32)
     opacity, scale = drawn.world.opacity[0].copy(), drawn.world.scale[0].copy()
-    parameters.step(drawn, rows, rate_columns(0, 0, 0, 0, 0), 1.0, opacity=0.2, scale=0.4)
+    parameters.step(drawn, rows, per_value(0, 0, 0, 0, 0), 1.0, opacity=0.2, scale=0.4)
     # d sigmoid(x) / dx = s (1 - s), d exp(x) / dx = exp(x); means over two Gaussians; a tenth in the first moment.
     assert parameters.first[0, OPACITY] == pytest.approx(0.1 * 0.2 / 2 * opacity * (1 - opacity), rel=1e-4)
     assert parameters.first[0, SCALE : SCALE + 3] == pytest.approx(0.1 * 0.4 / 2 * scale, rel=1e-4)
+    assert not parameters.first[1].any()
+
+
+@pytest.mark.parametrize(("images_per_step", "images"), [(3.0, 3), (0.25, 1)])
+def test_values_are_held_near_the_start_by_all_images_that_show_them_together(lifted, images_per_step, images):
+    """Its x axis lies along the world's y, its y axis along -x; the first visit of as many images as there are."""
+    parameters = Parameters(lifted)
+    start = parameters.values[0].copy()
+    parameters.values[0, MEAN : MEAN + 3] += (0.01, 0.02, 0.001)
+    parameters.values[0, QUAT : QUAT + 4] = (np.sqrt(0.5), 0, 0, np.sqrt(0.5))
+    parameters.values[0, SCALE : SCALE + 3] = np.log([0.5, 0.1, 0.002])
+    parameters.values[0, OPACITY] -= 0.7
+    parameters.values[0, RGB : RGB + 3] += (0.1, -0.2, 0.3)
+    parameters.values_changed()
+    drawn = parameters.at(lifted.span_us[0])
+    parameters.gradients.mean[0] = (1e-12, 0, 0)
+    moved = parameters.values[0, MEAN : MEAN + 3] - start[MEAN : MEAN + 3]
+    grown = parameters.values[0, SCALE : SCALE + 3] - start[SCALE : SCALE + 3]
+    parameters.step(drawn, np.array([0, 1], np.int32), per_value(0, 0, 0, 0, 0), 1.0,
+                    keep=per_value(4.0, 9.0, 2.0, 3.0, 5.0), images_per_step=images_per_step)  # fmt: skip
+    # A tenth of a gradient goes into the first moment.
+    share = 0.1 / images
+    own = np.array([moved[1], -moved[0], moved[2]])
+    assert parameters.first[0, MEAN : MEAN + 3] == pytest.approx(
+        share * 4 * own / np.square([0.5, 0.1, 0.002]), rel=1e-3
+    )
+    assert not parameters.first[0, QUAT : QUAT + 4].any()
+    assert parameters.first[0, SCALE : SCALE + 3] == pytest.approx(share * 2 * grown, rel=1e-3)
+    assert parameters.first[0, OPACITY] == pytest.approx(share * 3 * -0.7, rel=1e-3)
+    assert parameters.first[0, RGB : RGB + 3] == pytest.approx(share * 5 * np.array([0.1, -0.2, 0.3]), rel=1e-3)
     assert not parameters.first[1].any()
 
 
@@ -155,7 +185,7 @@ def test_a_mean_moves_along_the_axes_in_proportion_to_its_standard_deviations(li
     before = parameters.values[0, MEAN : MEAN + 3].copy()
     parameters.gradients.mean[0] = (-3e-4, 2e-4, 1e-4)
     drawn = parameters.at(lifted.span_us[0])
-    parameters.step(drawn, np.array([0], np.int32), rate_columns(0.2, 0, 0, 0, 0), 1.0)
+    parameters.step(drawn, np.array([0], np.int32), per_value(0.2, 0, 0, 0, 0), 1.0)
     # Adam's first step is the rate against the gradient's sign: a fifth of 0.1, 0.5 and 0.002 m.
     moved = parameters.values[0, MEAN : MEAN + 3] - before
     assert moved == pytest.approx([0.02, -0.1, -0.0004], rel=1e-3, abs=1e-6)
@@ -173,7 +203,7 @@ def test_a_disc_is_tilted_less_the_thinner_it_is(lifted):
     quat = np.array([half, 0, half, 0])
     parameters.gradients.quat[0] = -sum(geometry.quat_multiply(quat, each) for each in turn)
     drawn = parameters.at(lifted.span_us[0])
-    parameters.step(drawn, np.array([0], np.int32), rate_columns(0, 0.02, 0, 0, 0), 1.0)
+    parameters.step(drawn, np.array([0], np.int32), per_value(0, 0.02, 0, 0, 0), 1.0)
     after = geometry.matrix_from_quat(parameters.values[0, QUAT : QUAT + 4].astype(float))
     turned = before.T @ after
     tilt = 0.02 * 0.002 / 0.08
@@ -189,12 +219,12 @@ def test_a_disc_grows_wider_and_not_thicker_and_a_ball_grows_in_all_directions(l
     disc, ball = np.exp(parameters.values[:, SCALE + 1]).argsort()
     before = parameters.values[:, SCALE : SCALE + 3].copy()
     parameters.gradients.scale[:2] = -1
-    parameters.step(parameters.at(lifted.span_us[0]), np.array([0, 1], np.int32), rate_columns(0, 0, 0.1, 0, 0), 1.0)
+    parameters.step(parameters.at(lifted.span_us[0]), np.array([0, 1], np.int32), per_value(0, 0, 0.1, 0, 0), 1.0)
     change = parameters.values[:, SCALE : SCALE + 3] - before
     assert change[disc] == pytest.approx([0.1, 0.0, 0.1], abs=1e-4)
     assert change[ball] == pytest.approx([0.1, 0.1, 0.1], abs=1e-4)
     # Thinner it may become.
     for _ in range(40):
         parameters.gradients.scale[:2] = 1
-        parameters.step(parameters.at(lifted.span_us[0]), np.array([0, 1], np.int32), rate_columns(0, 0, 0.1, 0, 0), 1)
+        parameters.step(parameters.at(lifted.span_us[0]), np.array([0, 1], np.int32), per_value(0, 0, 0.1, 0, 0), 1)
     assert parameters.values[disc, SCALE + 1] == pytest.approx(np.log(1e-3), abs=1e-3)

@@ -85,6 +85,29 @@ def _freedom(a, b):
     return min(np.float32(1), a * b / max(abs(a * a - b * b), TINY))
 
 
+@inner
+def _keep_near(values, start, axes, scale, keep, images, gradient):
+    """Add the gradient of what holds a Gaussian near its start: a prior, once per Gaussian and not once per image.
+
+    Args:
+        values: [14] as they are.
+        start: [14] as they were.
+        axes: see ``_to_own_axes``; ``gradient`` is by these.
+        scale: standard deviations along them.
+        keep: [14] weights, see ``adam_step``.
+        images: how many share them.
+        gradient: [14] changed.
+    """
+    for k in range(3):
+        moved = np.float32(0)
+        for j in range(3):
+            moved += axes[j, k] * (values[MEAN + j] - start[MEAN + j])
+        # In standard deviations u = moved / scale, and d/d moved of u^2 / 2 is u / scale.
+        gradient[MEAN + k] += keep[MEAN + k] / images * moved / (scale[k] * scale[k])
+    for k in range(SCALE, VALUES):
+        gradient[k] += keep[k] / images * (values[k] - start[k])
+
+
 @kernel
 def adam_step(
     rows,
@@ -102,6 +125,9 @@ def adam_step(
     pulls,
     largest_m,
     thickest,
+    start,
+    keep,
+    images_per_step,
 ):
     """One step on some Gaussians; those without any gradient, which others hide, are left as they are.
 
@@ -123,6 +149,11 @@ def adam_step(
         pulls: [2] float32 weights of a Gaussian's opacity, and of the sum of its standard deviations, in the loss.
         largest_m: standard deviations end here.
         thickest: [n,3] the largest log standard deviation along each axis, besides ``largest_m``.
+        start: [n,14] ``values`` at the start.
+        keep: [14] float32 gradient of the loss of all images by a value's difference to the start, that of a mean in
+            standard deviations along each axis; turns are free. The images that show a Gaussian share it.
+        images_per_step: float32 number of images divided by that of the steps so far: times a Gaussian's visits, it is
+            the number of images that show it.
     """
     gradient, change, axes = np.zeros(VALUES, np.float32), np.zeros(VALUES, np.float32), np.zeros((3, 3), np.float32)
     low, high = np.float32(np.log(SMALLEST_M)), np.float32(np.log(largest_m))
@@ -165,6 +196,7 @@ def adam_step(
         c1, c2 = correction[0], correction[1]
         quat = values[i, QUAT : QUAT + 4]
         _to_own_axes(quat, axes, gradient)
+        _keep_near(values[i], start[i], axes, scale[i], keep, max(visits[i] * images_per_step, np.float32(1)), gradient)
         # Float32 throughout, so that the fourteen values are a vector.
         for k in range(VALUES):
             g = gradient[k]

@@ -27,7 +27,7 @@ from nurec_sim.reconstruct.optimize.frames import Frames, cpu_frames, frames_on
 from nurec_sim.reconstruct.optimize.free import CLEARINGS, recorded_beams, take_out
 from nurec_sim.reconstruct.optimize.image_loss import colour_loss
 from nurec_sim.reconstruct.optimize.interruption import whole_steps
-from nurec_sim.reconstruct.optimize.parameters import Parameters, rate_columns
+from nurec_sim.reconstruct.optimize.parameters import Drawn, Parameters, per_value
 from nurec_sim.reconstruct.optimize.poses import PoseCorrections
 from nurec_sim.reconstruct.optimize.responses import FrameResponses, borrowed_responses
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
@@ -270,12 +270,27 @@ class Optimization:
             self.poses.step(number, frame.view.world_from_reference, by_pose + by_pose_too, rate)
         if self.settings.correct_tracks:
             self.tracks.step(view.t_us, drawn.poses, self.parameters.wrenches(drawn, frame.drawn_rows), rate)
-        columns = rate * rate_columns(rates.mean, rates.turn_rad, rates.log_scale, rates.logit_opacity, rates.rgb)
-        self.parameters.step(drawn, frame.drawn_rows, columns, self.settings.largest_m, weights.opacity, weights.scale)
+        error = float(np.abs(shown - view.colours_beside(shown)).mean(dtype=np.float64))
+        self._step_gaussians(drawn, frame.drawn_rows, error / (height * width), rate)
         self._sky_adam.step(self.sky, by_sky, rate * rates.sky)
         self.responses.step(view.camera.id, view.frame, by_response, rate * rates.response, weights.response)
         self.steps += 1
         return loss
+
+    def _step_gaussians(self, drawn: Drawn, rows: np.ndarray, pixel_error: float, rate: float) -> None:
+        """Adam on the Gaussians that an image shows; its mean absolute error is ``pixel_error`` times its pixels.
+
+        Errors of pixels are like |e| / b (Laplace), with b their mean. A prior d^2 / (2 s^2), once per Gaussian, beside
+        the sum of |e| / b over all images is b d^2 / (2 s^2) / pixels beside the means of |e| that are the loss.
+        """
+        settings, rates, start = self.settings, self.settings.rates, self.settings.start
+        by_value = per_value(rates.mean, rates.turn_rad, rates.log_scale, rates.logit_opacity, rates.rgb)
+        deviation = per_value(start.mean, np.inf, start.log_scale, start.logit_opacity, start.rgb)
+        self.parameters.step(
+            drawn, rows, rate * by_value, settings.largest_m, settings.weights.opacity, settings.weights.scale,
+            keep=pixel_error / np.square(deviation),
+            images_per_step=(len(self.views) - len(self.checked)) / (self.steps + 1),
+        )  # fmt: skip
 
     def scene(self, clip: Clip) -> GaussianScene:
         """The scene as it is now."""

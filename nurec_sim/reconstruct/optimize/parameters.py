@@ -58,7 +58,7 @@ class Parameters:
         everything = Gaussians.concatenate([self._scene.static, scene.dynamic.gaussians])
         self.values = _values(everything)
         count = len(everything)
-        self._thickest = _thickest(self.values)
+        self._thickest, self._start = _thickest(self.values), self.values.copy()
         self.first, self.second = np.zeros((count, VALUES), np.float32), np.zeros((count, VALUES), np.float32)
         self.visits = np.zeros(count, np.int32)
         self._corrections = bias_corrections()
@@ -115,6 +115,8 @@ class Parameters:
         largest_m: float,
         opacity: float = 0.0,
         scale: float = 0.0,
+        keep: Float64[np.ndarray, " 14"] | None = None,
+        images_per_step: float = 1.0,
     ) -> None:
         """One step of Adam on the Gaussians ``rows`` that a frame has rendered, by ``gradients``, which end as 0.
 
@@ -125,13 +127,16 @@ class Parameters:
             largest_m: standard deviations end here.
             opacity: weight of their mean opacity in the loss.
             scale: weight of their mean sum of standard deviations (m) in the loss.
+            keep: how strongly each value is held near the start (``adam_step``); None: not at all.
+            images_per_step: number of images fitted divided by that of the steps so far, with this one.
         """
+        kept = np.zeros(VALUES) if keep is None else keep
         pulls = np.array([opacity, scale], np.float32) / max(len(rows), 1)
         self._parts(
             adam_step, rows,
             (self.values, self.first, self.second, self.visits, self._corrections, drawn.turns, self._row_turn,
              self.gradients, drawn.world.scale, drawn.world.opacity, rates.astype(np.float32), pulls, largest_m,
-             self._thickest),
+             self._thickest, self._start, kept.astype(np.float32), np.float32(images_per_step)),
         )  # fmt: skip
         self._place(rows[rows < self.static_count])
 
@@ -172,17 +177,17 @@ class Parameters:
         )
 
 
-def rate_columns(mean: float, turn_rad: float, log_scale: float, logit_opacity: float, rgb: float) -> np.ndarray:
-    """Learning rates per value, [14], in the order of ``adam.MEAN`` and the others.
+def per_value(mean: float, turn: float, log_scale: float, logit_opacity: float, rgb: float) -> np.ndarray:
+    """A number for each of a Gaussian's values, [14], in the order of ``adam.MEAN`` and the others.
 
     Args:
-        mean: of means, in standard deviations.
-        turn_rad: of turns.
-        log_scale: of log standard deviations.
-        logit_opacity: of opacity logits.
-        rgb: of colours.
+        mean: of its mean.
+        turn: of its rotation.
+        log_scale: of its log standard deviations.
+        logit_opacity: of the logit of its opacity.
+        rgb: of its colour.
     """
-    return np.repeat([mean, turn_rad, log_scale, logit_opacity, rgb], [3, 4, 3, 1, 3]).astype(np.float64)
+    return np.repeat([mean, turn, log_scale, logit_opacity, rgb], [3, 4, 3, 1, 3]).astype(np.float64)
 
 
 def _values(gaussians: Gaussians) -> Float32[np.ndarray, "n 14"]:

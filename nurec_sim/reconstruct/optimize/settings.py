@@ -44,6 +44,27 @@ class LossWeights:
 
 
 @dataclass(frozen=True)
+class StartPriors:
+    """Standard deviations of the errors that a Gaussian's values may have at the start; infinity: not held at all."""
+
+    mean: float = 0.6
+    """Of means along the axes of their Gaussian, in its standard deviations along them."""
+    log_scale: float = 0.6
+    logit_opacity: float = 2.0
+    rgb: float = 0.02
+
+    def __post_init__(self) -> None:
+        """Checks them.
+
+        Raises:
+            ValueError: one is not positive.
+        """
+        for name, value in dataclasses.asdict(self).items():
+            if not value > 0:
+                raise ValueError(f"{name} must be positive (infinity: not held), got {value}")
+
+
+@dataclass(frozen=True)
 class PosePriors:
     """Standard deviations of the errors that poses of images may have, and the weight of their squares in the loss."""
 
@@ -94,6 +115,7 @@ class OptimizeSettings:
         largest_m: no standard deviation may grow beyond this.
         rates: learning rates.
         weights: of the loss.
+        start: how strongly Gaussians are held near the scene given.
         check_every: hold out every so many images of a camera to choose the best state by, where it has twice as many
             or more; 0: none, the last state counts.
         checkpoint: file for the state, written every ``checkpoint_s`` seconds and removed at the end; None: none.
@@ -114,6 +136,7 @@ class OptimizeSettings:
     largest_m: float = 1.5
     rates: LearningRates = field(default_factory=LearningRates)
     weights: LossWeights = field(default_factory=LossWeights)
+    start: StartPriors = field(default_factory=StartPriors)
     check_every: int = 16
     checkpoint: Path | None = None
     checkpoint_s: float = 60.0
