@@ -264,18 +264,28 @@ def test_the_start_holds_once_for_all_images_together(street, lifted, monkeypatc
 
     monkeypatch.setattr(Parameters, "step", noted)
     settings = OptimizeSettings(
-        steps=3, check_every=2, start=StartPriors(0.5, 0.25, np.inf, 0.1), weights=LossWeights(0, 0, 0, 0)
+        steps=3, check_every=2, start=StartPriors(0.5, 0.25, 1e9, 0.1), weights=LossWeights(0, 0, 0, 0)
     )
     run = method.Optimization(lifted, views, settings)
     # Without the other terms the loss is the mean absolute error.
     losses = [run.step(number, 1.0) for number in (0, 2, 0)]
     assert [images for _, images in taken] == [2 / 1, 2 / 2, 2 / 3]
-    deviations = np.array([0.5] * 3 + [np.inf] * 7 + [np.inf] + [0.1] * 3)
+    deviations = np.array([0.5] * 3 + [np.inf] * 7 + [1e9] + [0.1] * 3)
     deviations[7:10] = 0.25
     for loss, (keep, _) in zip(losses, taken, strict=True):
         assert keep == pytest.approx(loss / (128 * 64) / np.square(deviations), rel=1e-4)
 
 
-def test_deviations_of_the_start_are_positive():
-    with pytest.raises(ValueError, match=r"rgb must be positive \(infinity: not held\), got 0"):
-        StartPriors(rgb=0)
+@pytest.mark.parametrize(
+    ("group", "wrong", "said"),
+    [
+        (StartPriors, {"rgb": 0}, "rgb must be above 0: it is a standard deviation"),
+        (StartPriors, {"mean": float("inf")}, "mean must be 0 or more and finite, got inf"),
+        (LearningRates, {"turn_rad": float("nan")}, "turn_rad must be 0 or more and finite, got nan"),
+        (LossWeights, {"sky": -1}, "sky must be 0 or more and finite, got -1"),
+        (OptimizeSettings, {"largest_m": float("inf")}, "largest_m must be positive and finite, got inf"),
+    ],
+)
+def test_settings_that_an_archive_cannot_keep_or_a_fit_cannot_take_are_refused(group, wrong, said):
+    with pytest.raises(ValueError, match=said):
+        group(**wrong)

@@ -22,6 +22,10 @@ class LearningRates:
     response: float = 0.005
     """Of the logarithm of a frame's gains, and of its offsets."""
 
+    def __post_init__(self) -> None:
+        """Checks them: see ``_check_group``."""
+        _check_group(self)
+
 
 @dataclass(frozen=True)
 class LossWeights:
@@ -42,10 +46,14 @@ class LossWeights:
     response: float = 1e-3
     """Squares of a frame's log gains and offsets: how far a frame may differ from its camera."""
 
+    def __post_init__(self) -> None:
+        """Checks them: see ``_check_group``."""
+        _check_group(self)
+
 
 @dataclass(frozen=True)
 class StartPriors:
-    """Standard deviations of the errors that a Gaussian's values may have at the start; infinity: not held at all."""
+    """Standard deviations of the errors that a Gaussian's values may have at the start; a large one does not hold."""
 
     mean: float = 0.6
     """Of means along the axes of their Gaussian, in its standard deviations along them."""
@@ -54,14 +62,15 @@ class StartPriors:
     rgb: float = 0.02
 
     def __post_init__(self) -> None:
-        """Checks them.
+        """Checks them: see ``_check_group``.
 
         Raises:
-            ValueError: one is not positive.
+            ValueError: one is 0.
         """
+        _check_group(self)
         for name, value in dataclasses.asdict(self).items():
-            if not value > 0:
-                raise ValueError(f"{name} must be positive (infinity: not held), got {value}")
+            if value == 0:
+                raise ValueError(f"{name} must be above 0: it is a standard deviation")
 
 
 @dataclass(frozen=True)
@@ -75,8 +84,8 @@ class PosePriors:
     weight: float = 1e-4
 
     def __post_init__(self) -> None:
-        """Checks them: see ``_check_priors``."""
-        _check_priors(self)
+        """Checks them: see ``_check_group``."""
+        _check_group(self)
 
 
 @dataclass(frozen=True)
@@ -88,17 +97,17 @@ class TrackPriors:
     weight: float = 1e-6
 
     def __post_init__(self) -> None:
-        """Checks them: see ``_check_priors``."""
-        _check_priors(self)
+        """Checks them: see ``_check_group``."""
+        _check_group(self)
 
 
-def _check_priors(priors: PosePriors | TrackPriors) -> None:
-    """Priors are 0 or more.
+def _check_group(group: LearningRates | LossWeights | StartPriors | PosePriors | TrackPriors) -> None:
+    """Rates, weights and deviations are finite and 0 or more: archives keep them, as JSON, which has no infinity.
 
     Raises:
         ValueError: one is not.
     """
-    for name, value in dataclasses.asdict(priors).items():
+    for name, value in dataclasses.asdict(group).items():
         if not 0 <= value < float("inf"):
             raise ValueError(f"{name} must be 0 or more and finite, got {value}")
 
@@ -152,11 +161,11 @@ class OptimizeSettings:
         """Checks the budget.
 
         Raises:
-            ValueError: no budget, or one that is not positive.
+            ValueError: no budget, or a budget, rate or bound that is not positive and finite.
         """
         if self.seconds is None and self.steps is None:
             raise ValueError("an optimisation needs a budget: seconds, steps or both")
-        for name in ("seconds", "steps"):
+        for name in ("seconds", "steps", "final_rate", "largest_m"):
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"{name} must be positive and finite, got {value}")
