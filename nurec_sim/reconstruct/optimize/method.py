@@ -248,7 +248,9 @@ class Optimization:
             self.responses.start(view.camera.id, view.frame, before, view.colours_beside(before))
         response = self.responses.of(view.camera.id, view.frame)
         shown = composite.shown(response)
-        loss, by_shown = colour_loss(shown, view.colours_beside(shown), weights.dssim)
+        recorded = view.colours_beside(shown)
+        loss, by_shown = colour_loss(shown, recorded, weights.dssim)
+        error = float(np.abs(shown - recorded).mean(dtype=np.float64))
 
         by_planes, by_sky, by_pose, by_response = composite.back(response, shown, by_shown)
         by_alpha, by_distance = by_planes[0, :height, :width], by_planes[4, :height, :width]
@@ -270,7 +272,6 @@ class Optimization:
             self.poses.step(number, frame.view.world_from_reference, by_pose + by_pose_too, rate)
         if self.settings.correct_tracks:
             self.tracks.step(view.t_us, drawn.poses, self.parameters.wrenches(drawn, frame.drawn_rows), rate)
-        error = float(np.abs(shown - view.colours_beside(shown)).mean(dtype=np.float64))
         self._step_gaussians(drawn, frame.drawn_rows, error / (height * width), rate)
         self._sky_adam.step(self.sky, by_sky, rate * rates.sky)
         self.responses.step(view.camera.id, view.frame, by_response, rate * rates.response, weights.response)
