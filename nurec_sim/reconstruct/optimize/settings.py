@@ -8,7 +8,22 @@ from pathlib import Path
 
 
 @dataclass(frozen=True)
-class LearningRates:
+class _Group:
+    """Rates, weights or deviations: finite and 0 or more. Archives keep them, as JSON, which has no infinity.
+
+    Raises:
+        ValueError: one is not.
+    """
+
+    def __post_init__(self) -> None:
+        """Checks them."""
+        for name, value in dataclasses.asdict(self).items():
+            if not 0 <= value < float("inf"):
+                raise ValueError(f"{name} must be 0 or more and finite, got {value}")
+
+
+@dataclass(frozen=True)
+class LearningRates(_Group):
     """Step sizes at the start; all fall by ``OptimizeSettings.final_rate`` until the end of the budget."""
 
     mean: float = 0.2
@@ -22,13 +37,9 @@ class LearningRates:
     response: float = 0.005
     """Of the logarithm of a frame's gains, and of its offsets."""
 
-    def __post_init__(self) -> None:
-        """Checks them: see ``_check_group``."""
-        _check_group(self)
-
 
 @dataclass(frozen=True)
-class LossWeights:
+class LossWeights(_Group):
     """Weights of the terms of the loss; each term is a mean over the pixels or returns that it concerns."""
 
     dssim: float = 0.2
@@ -46,13 +57,9 @@ class LossWeights:
     response: float = 1e-3
     """Squares of a frame's log gains and offsets: how far a frame may differ from its camera."""
 
-    def __post_init__(self) -> None:
-        """Checks them: see ``_check_group``."""
-        _check_group(self)
-
 
 @dataclass(frozen=True)
-class StartPriors:
+class StartPriors(_Group):
     """Standard deviations of the errors that a Gaussian's values may have at the start; a large one does not hold."""
 
     mean: float = 0.6
@@ -62,19 +69,19 @@ class StartPriors:
     rgb: float = 0.02
 
     def __post_init__(self) -> None:
-        """Checks them: see ``_check_group``.
+        """Checks them: see ``_Group``.
 
         Raises:
             ValueError: one is 0.
         """
-        _check_group(self)
+        super().__post_init__()
         for name, value in dataclasses.asdict(self).items():
             if value == 0:
                 raise ValueError(f"{name} must be above 0: it is a standard deviation")
 
 
 @dataclass(frozen=True)
-class PosePriors:
+class PosePriors(_Group):
     """Standard deviations of the errors that poses of images may have, and the weight of their squares in the loss."""
 
     turn_deg: float = 0.1
@@ -83,33 +90,14 @@ class PosePriors:
     """Of a camera's clock."""
     weight: float = 1e-4
 
-    def __post_init__(self) -> None:
-        """Checks them: see ``_check_group``."""
-        _check_group(self)
-
 
 @dataclass(frozen=True)
-class TrackPriors:
+class TrackPriors(_Group):
     """Standard deviations of the errors that labelled boxes may have, and the weight of their squares in the loss."""
 
     turn_deg: float = 2.0
     shift_m: float = 0.2
     weight: float = 1e-6
-
-    def __post_init__(self) -> None:
-        """Checks them: see ``_check_group``."""
-        _check_group(self)
-
-
-def _check_group(group: LearningRates | LossWeights | StartPriors | PosePriors | TrackPriors) -> None:
-    """Rates, weights and deviations are finite and 0 or more: archives keep them, as JSON, which has no infinity.
-
-    Raises:
-        ValueError: one is not.
-    """
-    for name, value in dataclasses.asdict(group).items():
-        if not 0 <= value < float("inf"):
-            raise ValueError(f"{name} must be 0 or more and finite, got {value}")
 
 
 @dataclass(frozen=True)
