@@ -25,7 +25,7 @@ from nurec_sim.cli.console import (
     print_table,
     progress,
 )
-from nurec_sim.cli.scenes import refinement
+from nurec_sim.cli.scenes import NO_OPTIMISATION, refinement
 from nurec_sim.errors import NurecSimError
 from nurec_sim.files.new_files import check_writable, write_file
 
@@ -54,6 +54,7 @@ def run(
     plan_timeout: float = 60.0,
     device: str = "auto",
     refine: float | None = None,
+    budget: int | None = None,
 ) -> None:
     """Run policies closed-loop in scenes, compute metrics, and write a report; exit status 1 if a rollout failed.
 
@@ -81,10 +82,11 @@ def run(
         plan_timeout: time limit in seconds for creating a policy and for each plan.
         device: render device without --address: auto (a GPU if available), cpu, cuda or cuda:N.
         refine: time budget in seconds for optimising the reconstruction of each clip on its images and sweeps.
+        budget: with --refine, the most static Gaussians of a scene: more are merged before the optimisation.
     """
     drive(
         sources, scenario, policies, seeds, out_path, resume, address, cache, video, true_world, plan_timeout, device,
-        methods, hold_out if methods else 0, clip, refine,
+        methods, hold_out if methods else 0, clip, refine, budget,
     )  # fmt: skip
 
 
@@ -97,6 +99,7 @@ def demo(
     cache: Path | None = None,
     device: str = "auto",
     refine: float | None = None,
+    budget: int | None = None,
 ) -> None:
     """Run the whole chain on the bundled demo log: about two minutes on two cores.
 
@@ -107,10 +110,11 @@ def demo(
         cache: where the reconstructed scene is kept; $NUREC_SIM_CACHE or ~/.cache/nurec_sim if not given.
         device: render device: auto (a GPU if available), cpu, cuda or cuda:N.
         refine: time budget in seconds for optimising the reconstruction on the log's images and sweeps.
+        budget: with --refine, the most static Gaussians: more are merged before the optimisation.
     """
     if save_log is not None:
         return _save_demo_log(save_log)
-    drive((), "demo", (), (), out_path, resume, None, cache, True, device=device, refine=refine)
+    drive((), "demo", (), (), out_path, resume, None, cache, True, device=device, refine=refine, budget=budget)
 
 
 def _save_demo_log(path: Path) -> None:
@@ -185,6 +189,7 @@ def drive(
     hold_out_every: int = 0,
     clip: Path | None = None,
     refine: float | None = None,
+    budget: int | None = None,
 ) -> None:
     """Policies, scenes, server, rollouts and report, for `run` and `demo`.
 
@@ -205,6 +210,7 @@ def drive(
         hold_out_every: every N-th image of a log is kept out of its reconstructions.
         clip: log of the archives.
         refine: seconds for optimising each reconstructed clip.
+        budget: the most static Gaussians of what is optimised.
     """
     from nurec_sim import logs, runs, sim
     from nurec_sim.evaluate import measure_fidelity
@@ -218,7 +224,9 @@ def drive(
     scenario = sim.load_scenario(scenario_path)
     if not sources and scenario.clip is None:
         raise NurecSimError(f"scenario {scenario.name!r} has no clip; give clips or scenes")
-    fit = refinement(refine, device)
+    if budget is not None and refine is None:
+        raise NurecSimError(NO_OPTIMISATION.format("with --refine"))
+    fit = refinement(refine, device, budget)
     if fit is not None and address is not None:
         raise NurecSimError("--refine cannot be used with --address: the scenes are those of the running server")
     if scenario.added_actors and address is not None:

@@ -44,6 +44,8 @@ class LogFlags:
     """CLIP: a setting of the method, as in `nurec-sim reconstruct`: --set views.width_px=1280."""
     refine: float | None = None
     """CLIP: time budget in seconds for optimising the scene on its input images and sweeps."""
+    budget: int | None = None
+    """CLIP: the most static Gaussians of an optimised scene, as in `nurec-sim reconstruct`."""
     poses: PosesName = "recorded"
     """CLIP: poses of the log, or refined by its LiDAR (docs/log_formats.md)."""
     actors: ActorsName = "auto"
@@ -105,7 +107,7 @@ class ProtocolFlags:
 LogGroup = Annotated[LogFlags, tyro.conf.arg(name="")]
 ProtocolGroup = Annotated[ProtocolFlags, tyro.conf.arg(name="")]
 NO_LOG_FLAGS, NO_PROTOCOL_FLAGS = LogFlags(), ProtocolFlags()
-NOT_OF_A_SCENE = ("--set", "--refine")
+NOT_OF_A_SCENE = ("--set", "--refine", "--budget")
 """Flags that say how to reconstruct."""
 
 
@@ -174,7 +176,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
     from nurec_sim.evaluate import evaluate as run_evaluation
     from nurec_sim.evaluate import figure_rows
 
-    settings = method_settings(flags.method, network, flags.set, flags.refine, renders=True)
+    settings = method_settings(flags.method, network, flags.set, flags.refine, renders=True, budget=flags.budget)
     log = logs.open_clip(path)
     if flags.json is not None:
         check_writable(flags.json)
@@ -201,7 +203,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
                 detector=flags.detector,
                 progress=advance,
                 settings=settings,
-                refine=refinement(flags.refine, device),
+                refine=refinement(flags.refine, device, flags.budget),
                 actors=flags.actors,
                 align_actors=flags.align_actors,
                 align_sweeps=flags.align_sweeps,

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 MethodName = Annotated[str, tyro.conf.arg(metavar="NAME|FILE.py:CLASS|MODULE:CLASS")]
 NetworkFlags = Annotated[FeedForwardSettings, tyro.conf.arg(name="")]
 NO_FLAGS = FeedForwardSettings()
+NO_OPTIMISATION = "--budget bounds the Gaussians of an optimisation: give it {}"
+"""When there is none."""
 
 
 @app.command
@@ -38,6 +40,7 @@ def reconstruct(
     align_sweeps: bool = True,
     map_from_gaussians: bool = False,
     refine: float | None = None,
+    budget: int | None = None,
     resume: bool = False,
     overwrite: bool = False,
     changes: Annotated[
@@ -70,6 +73,7 @@ def reconstruct(
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
         refine: time budget in seconds for optimising the scene on the log's images and sweeps.
+        budget: with --refine or `optimized`, the most static Gaussians: more are merged before the optimisation.
         resume: go on with an optimisation that was interrupted, from its state in OUT.refine.npz; its archive is
             replaced.
         overwrite: replace an existing archive.
@@ -78,12 +82,12 @@ def reconstruct(
     from nurec_sim import logs, scene
     from nurec_sim.reconstruct import reconstruct as run_method
 
-    settings = method_settings(method, network, changes, refine)
+    settings = method_settings(method, network, changes, refine, budget=budget)
     log = logs.open_clip(clip)
     target = out_path or Path(f"{log.id}.usdz")
     if target.exists() and not overwrite and not resume:
         raise NurecSimError(f"{target} exists; give another --out, or --overwrite")
-    settings, fit = _with_checkpoint(method, settings, refinement(refine, network.device), target, resume)
+    settings, fit = _with_checkpoint(method, settings, refinement(refine, network.device, budget), target, resume)
     check_writable(target)
     log = with_poses(log, poses)
     with progress("reconstructing") as advance:
@@ -156,6 +160,7 @@ def method_settings(
     given: Sequence[str] = (),
     refine: float | None = None,
     renders: bool = False,
+    budget: int | None = None,
 ) -> Any:
     """Settings of a method: the flags of the network for those that use it, changed as ``--set NAME=VALUE`` says.
 
@@ -165,15 +170,19 @@ def method_settings(
         given: changes.
         refine: seconds for optimising what the method makes; None for none.
         renders: whether the command renders on the device.
+        budget: the most static Gaussians of an optimisation.
 
     Raises:
-        NurecSimError: flags of the network were given to a method without one, or a setting does not exist or fit.
+        NurecSimError: flags of the network were given to a method without one, a budget without an optimisation, or a
+            setting does not exist or fit.
         GpuError: the device of an optimisation cannot be used.
     """
     from nurec_sim.reconstruct import load_method
 
     made = load_method(method).settings
     optimizes = made is OptimizeSettings
+    if budget is not None and refine is None and not optimizes:
+        raise NurecSimError(NO_OPTIMISATION.format("with --refine or --method optimized"))
     used = {"device"} if optimizes or refine is not None or renders else set()
     if made is not FeedForwardSettings:
         flags = [
@@ -186,8 +195,8 @@ def method_settings(
                 f"method {method!r} does not use {', '.join(flags)}; choose --method dense or selective"
             )
     settings: Any = network if made is FeedForwardSettings else None
-    if optimizes and refine is None and network.device != NO_FLAGS.device:
-        settings = refinement(OptimizeSettings().seconds, network.device)
+    if optimizes and refine is None and (network.device != NO_FLAGS.device or budget is not None):
+        settings = refinement(OptimizeSettings().seconds, network.device, budget)
     for text in given:
         name, equals, value = text.partition("=")
         if not equals:
@@ -216,11 +225,11 @@ def _changed(settings: Any, name: str, path: Sequence[str], value: str) -> Any:
         raise NurecSimError(f"--set {name}={value}: {why}") from None
 
 
-def refinement(seconds: float | None, device: str = "auto") -> OptimizeSettings | None:
-    """Optimisation settings for a time budget and a device.
+def refinement(seconds: float | None, device: str = "auto", budget: int | None = None) -> OptimizeSettings | None:
+    """Optimisation settings for a budget of time, a device and a budget of Gaussians; None without time.
 
     Raises:
-        NurecSimError: the budget is not positive.
+        NurecSimError: a budget is not positive.
         GpuError: the device cannot be used; better told now than after the reconstruction.
     """
     if seconds is None:
@@ -228,9 +237,10 @@ def refinement(seconds: float | None, device: str = "auto") -> OptimizeSettings 
     from nurec_sim.render.device import choose_device
 
     try:
-        return OptimizeSettings(seconds=seconds, device=choose_device(device).name)
+        return OptimizeSettings(seconds=seconds, device=choose_device(device).name, max_gaussians=budget)
     except ValueError as error:
-        raise NurecSimError(f"--refine: {error}") from None
+        flag = "--budget" if str(error).startswith("max_gaussians") else "--refine"
+        raise NurecSimError(f"{flag}: {error}") from None
 
 
 def _checkpoint_of(target: Path) -> Path:

@@ -151,6 +151,8 @@ def test_a_demo_log_is_not_written_elsewhere(tmp_path: Path, name: str, text: st
         (["run", "--scenario", "short"], "has no clip"),
         (["demo", "--refine", "0"], "--refine: seconds must be positive and finite, got 0.0"),
         (["run", "--scenario", "demo", "--refine", "5", "--address", "127.0.0.1:9"], "--refine cannot be used with"),
+        (["demo", "--budget", "9"], "--budget bounds the Gaussians of an optimisation: give it with --refine"),
+        (["demo", "--refine", "5", "--budget", "0"], "--budget: max_gaussians must be positive and finite, got 0"),
         (["render", "nowhere.usdz"], "nowhere.usdz does not exist"),
         (["lidar", "nowhere.usdz"], "nowhere.usdz does not exist"),
         (["lidar", "nowhere.usdz", "--out", "a.txt"], "--out must end in .npz, .ply, .png, got 'a.txt'"),

@@ -109,7 +109,7 @@ def test_settings_from_the_command_line(file):
         method_settings("lift", dataclasses.replace(NO_FLAGS, frames=4))
 
 
-def test_the_device_is_that_of_an_optimisation_too():
+def test_device_and_budget_are_those_of_an_optimisation_too():
     on_cpu, on_none = (dataclasses.replace(NO_FLAGS, device=name) for name in ("cpu", "cuda:99"))
     assert (
         method_settings("optimized", on_cpu) == OptimizeSettings(device="cpu") and refinement(None, "cuda:99") is None
@@ -120,6 +120,11 @@ def test_the_device_is_that_of_an_optimisation_too():
     assert method_settings("lift", on_cpu, refine=7.0) is None is method_settings("lift", on_cpu, renders=True)
     with pytest.raises(NurecSimError, match="method 'lift' does not use --device"):
         method_settings("lift", on_cpu)
+    assert method_settings("optimized", NO_FLAGS, budget=9).max_gaussians == 9
+    assert refinement(7.0, "cpu", 9) == OptimizeSettings(seconds=7.0, device="cpu", max_gaussians=9)
+    assert method_settings("lift", NO_FLAGS, refine=7.0, budget=9) is None
+    with pytest.raises(NurecSimError, match="--budget bounds .* give it with --refine or --method optimized"):
+        method_settings("lift", NO_FLAGS, budget=9)
     # Before the start of minutes of reconstruction.
     for call in (lambda: refinement(7.0, "cuda:99"), lambda: method_settings("optimized", on_none)):
         with pytest.raises(GpuError, match="device 'cuda:99' cannot be used"):

@@ -60,6 +60,21 @@ def test_the_same_steps_give_the_same_bytes_and_an_archive_keeps_them(street, li
     assert np.array_equal(image_of(back, street, "front", 1), image_of(kept, street, "front", 1))
 
 
+def test_a_budget_of_gaussians_is_kept(street, lifted):
+    before = len(lifted.static)
+    half = OptimizeSettings(seconds=None, steps=3, max_gaussians=before // 2)
+    scene = method.refine(lifted, street, ["front"], set(), lambda *_: None, half)
+    assert 0.9 * before // 2 <= len(scene.static) <= before // 2
+    told = scene.provenance["merged"]
+    assert told["from"] == before and 0 < told["voxel_m"] < 1
+    assert scene.provenance["refined"]["settings"]["max_gaussians"] == before // 2
+    enough = method.refine(lifted, street, ["front"], set(), lambda *_: None,
+                           OptimizeSettings(seconds=None, steps=3, max_gaussians=before))  # fmt: skip
+    assert len(enough.static) == before and "merged" not in enough.provenance
+    with pytest.raises(ReconstructError, match="max_gaussians: a budget of 1 is less than the number of labels, 2"):
+        method.refine(lifted, street, ["front"], set(), lambda *_: None, dataclasses.replace(half, max_gaussians=1))
+
+
 def test_frames_begin_with_the_response_that_the_scene_comes_with(lifted):
     """No frame is fitted: the responses are those of the scene, per frame, not those of the camera."""
     darker = np.stack([np.hstack([np.eye(3) * (0.5 + 0.1 * k), np.full((3, 1), 0.01)]) for k in range(4)])

@@ -110,6 +110,8 @@ class OptimizeSettings:
         seed: of the order of images.
         final_rate: learning rates at the end of the budget, relative to those at its start.
         largest_m: no standard deviation may grow beyond this.
+        max_gaussians: static Gaussians are merged before the fit until at most so many are left
+            (``reconstruct.budget``); None keeps all.
         rates: learning rates.
         weights: of the loss.
         start: how strongly Gaussians are held near the scene given.
@@ -131,6 +133,7 @@ class OptimizeSettings:
     seed: int = 0
     final_rate: float = 0.1
     largest_m: float = 1.5
+    max_gaussians: int | None = None
     rates: LearningRates = field(default_factory=LearningRates)
     weights: LossWeights = field(default_factory=LossWeights)
     start: StartPriors = field(default_factory=StartPriors)
@@ -153,7 +156,7 @@ class OptimizeSettings:
         """
         if self.seconds is None and self.steps is None:
             raise ValueError("an optimisation needs a budget: seconds, steps or both")
-        for name in ("seconds", "steps", "final_rate", "largest_m"):
+        for name in ("seconds", "steps", "final_rate", "largest_m", "max_gaussians"):
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"{name} must be positive and finite, got {value}")

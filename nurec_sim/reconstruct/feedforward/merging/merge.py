@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from nurec_sim.errors import ReconstructError
+from nurec_sim.reconstruct.budget import reduce_to_budget
 from nurec_sim.reconstruct.feedforward.chunks import ChunkLayers
 from nurec_sim.reconstruct.feedforward.merging.alignment import aligned_chunks, merged_isp, merged_sky
 from nurec_sim.reconstruct.feedforward.merging.ownership import owned
-from nurec_sim.reconstruct.feedforward.merging.voxels import reduce_to_budget
 from nurec_sim.reconstruct.feedforward.settings import FeedForwardSettings
 from nurec_sim.render.layers import drawable
 from nurec_sim.types import DynamicGaussians, Gaussians

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from render_scenes import camera, cloud, gaussians, psnr_db, request, scene
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.feedforward.merging.voxels import (
+from nurec_sim.reconstruct.budget import (
     FILL,
     MAX_GROWTH,
     merge_voxels,
