@@ -19,6 +19,7 @@ from nurec_sim.reconstruct import OptimizeSettings, reconstruct
 from nurec_sim.reconstruct.optimize import method
 from nurec_sim.reconstruct.optimize.checkpoint import write_checkpoint
 from nurec_sim.reconstruct.optimize.frames import cpu_frames
+from nurec_sim.reconstruct.optimize.merged import merged
 from nurec_sim.reconstruct.optimize.parameters import Parameters
 from nurec_sim.reconstruct.optimize.responses import FrameResponses
 from nurec_sim.reconstruct.optimize.settings import LearningRates, LossWeights, PosePriors, StartPriors
@@ -60,19 +61,31 @@ def test_the_same_steps_give_the_same_bytes_and_an_archive_keeps_them(street, li
     assert np.array_equal(image_of(back, street, "front", 1), image_of(kept, street, "front", 1))
 
 
-def test_a_budget_of_gaussians_is_kept(street, lifted):
+def test_a_fit_begins_with_fewer_gaussians(street, lifted):
+    few = OptimizeSettings(seconds=None, steps=3)
     before = len(lifted.static)
-    half = OptimizeSettings(seconds=None, steps=3, max_gaussians=before // 2)
-    scene = method.refine(lifted, street, ["front"], set(), lambda *_: None, half)
-    assert 0.9 * before // 2 <= len(scene.static) <= before // 2
-    told = scene.provenance["merged"]
-    assert told["from"] == before and 0 < told["voxel_m"] < 1
-    assert scene.provenance["refined"]["settings"]["max_gaussians"] == before // 2
-    enough = method.refine(lifted, street, ["front"], set(), lambda *_: None,
-                           OptimizeSettings(seconds=None, steps=3, max_gaussians=before))  # fmt: skip
-    assert len(enough.static) == before and "merged" not in enough.provenance
+    scene = method.refine(lifted, street, ["front"], set(), lambda *_: None, few)
+    # fx is 120 pixels: 7.5 of them are 0.62 m 10 m away, more than the largest voxel.
+    assert scene.provenance["merged"] == {"from": before, "voxel_m": 0.1} and len(scene.static) < before
+    cells = np.rint(lifted.static.mean_m.astype(float) / 0.1).astype(int)
+    alike = len(np.unique(np.column_stack([cells, lifted.static.label]), axis=0))
+    assert len(scene.static) == alike
+    whole = method.refine(
+        lifted, street, ["front"], set(), lambda *_: None, dataclasses.replace(few, voxel_px=0.0, max_gaussians=before)
+    )
+    assert len(whole.static) == before and "merged" not in whole.provenance
+
+
+def test_a_budget_of_gaussians_is_kept(lifted):
+    cameras, before = [lifted.rig.cameras["front"]], len(lifted.static)
+    fine = merged(lifted, cameras, 0.5)
+    assert fine.provenance["merged"]["voxel_m"] == pytest.approx(0.5 * 10 / 120, rel=0.1)
+    half = merged(lifted, cameras, 0.5, before // 2)
+    assert 0.9 * before // 2 <= len(half.static) <= before // 2 < len(fine.static)
+    assert half.provenance["merged"]["voxel_m"] > fine.provenance["merged"]["voxel_m"]
+    assert len(merged(lifted, cameras, 0.5, len(fine.static)).static) == len(fine.static)
     with pytest.raises(ReconstructError, match="max_gaussians: a budget of 1 is less than the number of labels, 2"):
-        method.refine(lifted, street, ["front"], set(), lambda *_: None, dataclasses.replace(half, max_gaussians=1))
+        merged(lifted, cameras, 0.5, 1)
 
 
 def test_frames_begin_with_the_response_that_the_scene_comes_with(lifted):
@@ -238,6 +251,10 @@ def test_the_method_is_lift_and_a_fit_and_needs_images(street):
         reconstruct(street, "lift", cameras=[], settings=SMALL, refine=OptimizeSettings(steps=1))
     with pytest.raises(ValueError, match="needs a budget"):
         OptimizeSettings(seconds=None)
+    with pytest.raises(ValueError, match="voxel_px must be 0 or more and finite, got -1"):
+        OptimizeSettings(voxel_px=-1.0)
+    with pytest.raises(ValueError, match="max_gaussians must be positive and finite, got 0"):
+        OptimizeSettings(max_gaussians=0)
     with pytest.raises(ValueError, match="seconds must be positive and finite, got -1"):
         OptimizeSettings(seconds=-1)
 

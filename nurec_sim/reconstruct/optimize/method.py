@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 
 from nurec_sim.errors import ReconstructError
-from nurec_sim.reconstruct.budget import reduce_to_budget
 from nurec_sim.reconstruct.free_space import SweepBeams
 from nurec_sim.reconstruct.optimize.adam import SkyAdam
 from nurec_sim.reconstruct.optimize.checkpoint import read_checkpoint, write_checkpoint
@@ -28,6 +27,7 @@ from nurec_sim.reconstruct.optimize.frames import Frames, cpu_frames, frames_on
 from nurec_sim.reconstruct.optimize.free import CLEARINGS, recorded_beams, take_out
 from nurec_sim.reconstruct.optimize.image_loss import colour_loss
 from nurec_sim.reconstruct.optimize.interruption import whole_steps
+from nurec_sim.reconstruct.optimize.merged import merged
 from nurec_sim.reconstruct.optimize.parameters import Drawn, Parameters, per_value
 from nurec_sim.reconstruct.optimize.poses import PoseCorrections
 from nurec_sim.reconstruct.optimize.responses import FrameResponses, borrowed_responses
@@ -69,13 +69,13 @@ def refine(
         settings: budget, rates and weights.
 
     Raises:
-        ReconstructError: no camera, no image, view-dependent colours, or a budget below the number of labels.
+        ReconstructError: no camera, no image, view-dependent colours, or fewer Gaussians allowed than there are labels.
         GpuError: ``settings.device`` cannot be used.
     """
     settings = dataclasses.replace(settings, device=choose_device(settings.device).name)
     if not cameras:
         raise ReconstructError(f"clip {clip.id!r}: an optimisation needs images; have no cameras")
-    scene = _within(scene, settings.max_gaussians)
+    scene = merged(scene, [clip.rig.cameras[name] for name in cameras], settings.voxel_px, settings.max_gaussians)
     progress("reading images", 0.0)
     views = training_views(clip, scene, cameras, hold_out)
     if not views:
@@ -88,18 +88,6 @@ def refine(
     run.run(progress)
     run.colour_unseen()
     return run.scene(clip)
-
-
-def _within(scene: GaussianScene, budget: int | None) -> GaussianScene:
-    """A scene with at most so many static Gaussians; those that share a voxel are merged."""
-    try:
-        static, voxel_m = reduce_to_budget(scene.static, budget)
-    except ValueError as error:
-        raise ReconstructError(f"max_gaussians: {error}") from None
-    if voxel_m is None:
-        return scene
-    told = {"merged": {"from": len(scene.static), "voxel_m": round(voxel_m, 4)}}
-    return dataclasses.replace(scene, static=static, provenance={**scene.provenance, **told})
 
 
 def _key(scene: GaussianScene, cameras: Sequence[str], hold_out: set[int], settings: OptimizeSettings) -> str:
