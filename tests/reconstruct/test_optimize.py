@@ -12,7 +12,7 @@ import tiny_clip
 from fitted_street import SMALL, image_of
 from gpu_on_cpu.places import PLACES, launcher_at
 
-from nurec_sim import cli
+from nurec_sim import cli, sensors
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate.scores.images import psnr
 from nurec_sim.reconstruct import OptimizeSettings, reconstruct
@@ -80,6 +80,8 @@ def test_a_budget_of_gaussians_is_kept(lifted):
     cameras, before = [lifted.rig.cameras["front"]], len(lifted.static)
     fine = merged(lifted, cameras, 0.5)
     assert fine.provenance["merged"]["voxel_m"] == pytest.approx(0.5 * 10 / 120, rel=0.1)
+    coarse = sensors.scaled_camera(cameras[0], 64, 32)
+    assert merged(lifted, [coarse, *cameras], 0.5).provenance == fine.provenance, "the finest camera counts"
     half = merged(lifted, cameras, 0.5, before // 2)
     assert 0.9 * before // 2 <= len(half.static) <= before // 2 < len(fine.static)
     assert half.provenance["merged"]["voxel_m"] > fine.provenance["merged"]["voxel_m"]
