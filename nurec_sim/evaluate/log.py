@@ -194,8 +194,9 @@ def score_scene(
         "actors": found,
         **({} if detection is None else {"detection": detection}),
         "seconds": seconds,
-        "counts": {"static": len(scene.static), "dynamic": len(scene.dynamic)}
-        | dict(scene.provenance.get("counts", {})),
+        # A method counts what it made; a fit, or an edit, may have changed it.
+        "counts": dict(scene.provenance.get("counts", {}))
+        | {"static": len(scene.static), "dynamic": len(scene.dynamic)},
         "unknown": list(scene.provenance.get("unknown", [])),
     }
 

@@ -226,6 +226,7 @@ def test_a_scene_has_few_holes_and_one_without_gaussians_only_holes(figures):
     empty = dataclasses.replace(scene, static=scene.static[none])
     bare = score_scene(clip, empty, held, target_cameras=["right"], via_grpc=False)
     assert all(share == 1 for share in bare["image"]["unseen"]["holes"].values() if share is not None)
+    assert bare["counts"]["static"] == 0 < scores["counts"]["static"] == len(scene.static)
 
 
 def test_no_false_obstacles_on_the_path_but_before_a_board_in_the_way(figures):

@@ -65,9 +65,9 @@ def test_a_fit_begins_with_fewer_gaussians(street, lifted):
     few = OptimizeSettings(seconds=None, steps=3)
     before = len(lifted.static)
     scene = method.refine(lifted, street, ["front"], set(), lambda *_: None, few)
-    # fx is 120 pixels: 7.5 of them are 0.62 m 10 m away, more than the largest voxel.
-    assert scene.provenance["merged"] == {"from": before, "voxel_m": 0.1} and len(scene.static) < before
-    cells = np.rint(lifted.static.mean_m.astype(float) / 0.1).astype(int)
+    # fx is 120 pixels: 5 of them are 0.42 m 10 m away, more than the largest voxel.
+    assert scene.provenance["merged"] == {"from": before, "voxel_m": 0.07} and len(scene.static) < before
+    cells = np.rint(lifted.static.mean_m.astype(float) / 0.07).astype(int)
     alike = len(np.unique(np.column_stack([cells, lifted.static.label]), axis=0))
     assert len(scene.static) == alike
     whole = method.refine(

@@ -18,7 +18,7 @@ from nurec_sim.types import CameraModel, GaussianScene
 AT_M = 10.0
 """Voxels have one size everywhere: some pixels of the finest camera, as seen from here. Voxels that grow with the
 distance from the path were no better."""
-LARGEST_M = 0.1
+LARGEST_M = 0.07
 """Of the edge of a voxel, however coarse cameras are: LiDAR knows surfaces better. Budgets may need larger ones."""
 
 

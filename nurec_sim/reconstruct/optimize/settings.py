@@ -111,7 +111,7 @@ class OptimizeSettings:
         final_rate: learning rates at the end of the budget, relative to those at its start.
         largest_m: no standard deviation may grow beyond this.
         voxel_px: static Gaussians of one label that share a voxel are merged before the fit (``optimize.merged``); its
-            edge is so many pixels of the finest camera 10 m away, 0.1 m at most; 0: none.
+            edge is so many pixels of the finest camera 10 m away, 0.07 m at most; 0: none.
         max_gaussians: voxels are larger where these leave more than so many; None: any number.
         rates: learning rates.
         weights: of the loss.
@@ -134,7 +134,7 @@ class OptimizeSettings:
     seed: int = 0
     final_rate: float = 0.1
     largest_m: float = 1.5
-    voxel_px: float = 7.5
+    voxel_px: float = 5.0
     max_gaussians: int | None = None
     rates: LearningRates = field(default_factory=LearningRates)
     weights: LossWeights = field(default_factory=LossWeights)
