@@ -182,9 +182,16 @@ def body_gaussians(
         # Along grazing ground rings of distance are a few pixels wide, so that each of two views may leave a surface to
         # the other. There in the end only pixels that are still there own.
         stays[~stays] = taken
-        owns = lifting.owning([picture.body for picture in pictures], pixels, stays)
         left = rest[~taken & on_level(rest, ground)]
-        more.append(left[_owned(left, body, views, pictures, rgb, settings, owns)])
+        shown = [picture.body for picture in pictures]
+
+        def in_gaps(owners: Lifted, kept: np.ndarray) -> np.ndarray:
+            return _owned(left, body, views, pictures, rgb, settings, lifting.owning(shown, owners, kept))
+
+        left = left[in_gaps(pixels, stays)]
+        # Of all that lie in a gap the nearest: from afar pixels are metres long, and as bright as ground seen along it.
+        nearest = in_gaps(left, np.ones(len(left), bool))
+        more.append(left[nearest | in_gaps(left, nearest)])
     progress(0.8)
     parts.append(outside_free_space(Lifted.concatenate(more), body, ground, settings, beams)[0])
     progress(0.85)

@@ -75,12 +75,15 @@ def solve_colours(
         return scene
     step = -(-len(frames) // settings.colours.images)
     chosen = [(camera, k) for camera in cameras for k in range(0, len(times[camera]), step)]
-    solve = ColourSolve(scene, settings.colours.trust, settings.colours.gain_pull)
-    weights = {camera: _pixel_weights(scene, camera, settings.views, len(cameras) > 1) for camera in cameras}
     # In random order: of neighbours in time, which show the same, the later would correct the earlier.
     random, rounds = np.random.default_rng(0), settings.colours.images // len(chosen)
     order = [random.permutation(len(chosen)) for _ in range(min(max(rounds, 1), settings.colours.rounds))]
     images = [chosen[k] for k in np.concatenate(order)]
+    taken = [(model.width_px, model.height_px, sum(name == camera for name, _ in images))
+             for camera, model in clip.rig.cameras.items() if camera in cameras]  # fmt: skip
+    views = replace(settings.views, pixels=settings.colours.pixels, max_frames=len(images)).widened(taken)
+    weights = {camera: _pixel_weights(scene, camera, views, len(cameras) > 1) for camera in cameras}
+    solve = ColourSolve(scene, settings.colours.trust, settings.colours.gain_pull)
     for done, image in enumerate(in_order(lambda each: _read(clip, each[0], each[1], weights[each[0]]), images)):
         solve.step(image)
         progress((done + 1) / len(images))

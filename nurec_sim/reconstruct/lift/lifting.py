@@ -183,7 +183,7 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
                     keep[i] = False
                     break
                 # Views from farther resolve the surface less: by the area of their pixels on it.
-                share = MIXING * (depth[i] / max(z, depth[i])) ** 2
+                share = MIXING * (depth[i] / z) ** 2
                 total += share
                 for c in range(3):
                     mixed[c] += share * pictures[k, int(v), int(u), c]

@@ -137,7 +137,9 @@ class ColourSettings:
     images: int = 60
     """Images taken in all, about: those of a short log several times, those of a long one evenly thinned. Responses of
     frames between them are interpolated."""
-    trust: float = 0.5
+    pixels: int = 50_000_000
+    """Images are taken with more pixels than working views as long as all that are taken have at most this many."""
+    trust: float = 0.1
     """The first colour of a Gaussian counts like this many pixels."""
     gain_pull: float = 0.01
     """Weight of a frame's gains being 1, next to that of the errors of all of its pixels; of offsets being 0: more."""
@@ -147,7 +149,7 @@ class ColourSettings:
 class LiftSettings:
     """All settings of ``reconstruct(clip, "lift")``.
 
-    The limits ``max_views``, ``max_frames``, ``pixels`` and ``budget`` of ``views``, and ``images`` of ``colours``, are
+    The limits ``max_views``, ``max_frames``, ``pixels`` and ``budget`` of ``views``, and ``images`` and ``pixels`` of ``colours``,
     for logs of up to ``path_m`` and ``duration_s`` whose cameras have ``detail_px``; others get more (``for_log``).
     """
 
@@ -198,4 +200,5 @@ class LiftSettings:
         detail = math.sqrt(sum(width * height for width, height in reduced) / self.detail_px)
         limits = min(lengths * min(max(detail, 1.0), self.most_detail), self.most_lengths)
         views = replace(views, budget=round(limits * self.views.budget))
-        return replace(self, views=views, colours=replace(self.colours, images=round(limits * self.colours.images)))
+        colours = {name: round(limits * getattr(self.colours, name)) for name in ("images", "pixels")}
+        return replace(self, views=views, colours=replace(self.colours, **colours))
