@@ -80,6 +80,23 @@ def test_the_method_solves(street, solved):
     assert scene.exposures["front"] == pytest.approx(solved.exposures["front"], abs=0.01)
 
 
+@pytest.mark.parametrize(("pixels", "size"), [(8 * 4 * 128 * 64, (64, 128)), (8 * 4 * 128 * 64 - 1, (32, 64))])
+def test_images_are_taken_whole_if_all_that_are_taken_have_few_enough_pixels(street, lifted, monkeypatch, pixels, size):
+    """Eight times each of four images, beside working views of half their size."""
+    sizes, step = set(), colour_solve.ColourSolve.step
+
+    def spied(self, image):
+        sizes.add(image.rgb.shape[:2])
+        return step(self, image)
+
+    monkeypatch.setattr(colour_solve.ColourSolve, "step", spied)
+    settings = dataclasses.replace(
+        SETTINGS, views=ViewSettings(width_px=64, levels=32), colours=ColourSettings(pixels=pixels)
+    )
+    colour_solve.solve_colours(lifted, street, ["front"], settings, lambda fraction: None)
+    assert sizes == {size}
+
+
 def test_what_no_image_shows_keeps_its_colour(street, lifted):
     behind = dataclasses.replace(lifted.static[:5], mean_m=np.full((5, 3), -30.0, np.float32))
     more = dataclasses.replace(lifted, static=Gaussians.concatenate([lifted.static, behind]))

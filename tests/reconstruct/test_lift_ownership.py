@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from nurec_sim import geometry
+from nurec_sim.reconstruct.lift import bake
 from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.ground import Ground
-from nurec_sim.reconstruct.lift.lifting import FARTHER, OWNER_BORDER, OWNER_RING, Lifted, owned, owning
+from nurec_sim.reconstruct.lift.lifting import FARTHER, MIXING, OWNER_BORDER, OWNER_RING, Lifted, owned, owning
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
 from nurec_sim.reconstruct.lift.points import Cloud
 from nurec_sim.reconstruct.lift.settings import LiftSettings
@@ -76,44 +77,73 @@ def test_a_hidden_matched_point_that_another_view_confirms_stays():
     assert kept(5.0, [3.0, 3.0, 7.0], [1.0, 1.5, 2.0], matched=True)
 
 
+def test_colours_are_mixed_with_those_of_other_views_by_the_area_of_their_pixels():
+    """A point 10 m away, which a view from 5 m (that owns nothing) and one from 12.5 m show brighter."""
+    depth_m = np.array([10.0, 5.0, 12.5])
+    inverse = np.repeat(1 / depth_m, SIZE[0] * SIZE[1]).astype(np.float32).reshape(3, SIZE[1], SIZE[0])
+    pictures = np.repeat([0, 200, 100], inverse[0].size * 3).astype(np.uint8).reshape(*inverse.shape, 3)
+    packed = np.stack([view_at(each - 10.0) for each in depth_m])
+    rgb = np.full((1, 3), 90, np.float32)
+    one = np.array([[0.2, -0.1, 10.0]]), depth_m[:1], np.zeros(1, np.int32), np.zeros(1, bool), rgb
+    owns = np.zeros(inverse.shape, bool)
+    assert owned(*one, packed, inverse, owns, pictures, np.ones(3, bool), TOLERANCE, OWNER_RING, OWNER_BORDER)[0]
+    near, far = MIXING * 4, MIXING * 0.64
+    assert rgb[0] == pytest.approx((90 + near * 200 + far * 100) / (1 + near + far), abs=0.01)
+
+
+def looking_down(*ahead_m):
+    """Views that look down, each from so many metres lower, their pictures by depth, and bare ground below them."""
+    shape, turn = (8, 8), np.diag([1.0, -1.0, -1.0])
+    tile = Tile(8, 8, 16.0, (4.0, 4.0), np.eye(3), 1, None, np.ones(shape, bool), np.zeros(3))
+    rgb = np.full((*shape, 3), 99, np.uint8)
+    poses = [geometry.pose(turn, np.array([0, 0, -each])) for each in ahead_m]
+    views = [WorkingView("front", k, 1_000_000, True, tile, pose, np.zeros(3), rgb) for k, pose in enumerate(poses)]
+    nothing = np.zeros((0, 3), np.float32), *np.zeros((2, 0), np.float32), np.zeros(0, np.uint8)
+    none = np.zeros((4, 4), bool)
+    ground = Ground(np.zeros(2), 0.1, np.zeros((4, 4), np.float32), none, none, none, np.ones((4, 4), np.uint8))
+
+    def pictures(*depths_m):
+        flags = np.zeros(shape, np.int32), np.full(shape, -1, np.int32), *np.zeros((2, *shape), bool)
+        return [DepthPicture(np.full(shape, 1 / m, np.float32), *flags) for m in depths_m]
+
+    body, settings = Surfels(None, Cloud.empty(), *nothing), LiftSettings(opacity=0.5)
+    return views, pictures, body, ground, settings, [rgb] * len(views)
+
+
 def test_two_views_that_leave_level_ground_to_each_other_both_keep_it():
     """Rings of distance end at exp(2.3) = 9.97 m. Both views look down, the second from 0.3 m lower.
 
     What the first sees at 10.0 m is at 9.7 m for the second, one ring nearer, which hence owns it. What the second sees
     at 9.4 m is at 9.7 m for the first, in the same ring, and the first of two views owns.
     """
-    shape, turn = (8, 8), np.diag([1.0, -1.0, -1.0])
-    tile = Tile(8, 8, 16.0, (4.0, 4.0), np.eye(3), 1, None, np.ones(shape, bool), np.zeros(3))
-    rgb = np.full((*shape, 3), 99, np.uint8)
-    views = [
-        WorkingView(
-            "front", k, 1_000_000, True, tile, geometry.pose(turn, np.array([0, 0, -ahead_m])), np.zeros(3), rgb
-        )
-        for k, ahead_m in enumerate((0.0, 0.3))
-    ]
-    nothing = np.zeros((0, 3), np.float32), *np.zeros((2, 0), np.float32), np.zeros(0, np.uint8)
-    body = Surfels(None, Cloud.empty(), *nothing)
-    none = np.zeros((4, 4), bool)
-    ground = Ground(np.zeros(2), 0.1, np.zeros((4, 4), np.float32), none, none, none, np.ones((4, 4), np.uint8))
-    settings = LiftSettings(opacity=0.5)
+    views, pictures_at, body, ground, settings, rgb = looking_down(0.0, 0.3)
 
     def centres(first_m, second_m):
-        pictures = [
-            DepthPicture(
-                np.full(shape, 1 / m, np.float32),
-                np.zeros(shape, np.int32),
-                np.full(shape, -1, np.int32),
-                *np.zeros((2, *shape), bool),
-            )  # fmt: skip
-            for m in (first_m, second_m)
-        ]
-        pixels = body_pixels([body], views, pictures, [rgb] * 2, settings)[0]
-        gaussians, _ = body_gaussians(body, pixels, ground, views, pictures, [rgb] * 2, settings)
+        pictures = pictures_at(first_m, second_m)
+        pixels = body_pixels([body], views, pictures, rgb, settings)[0]
+        gaussians, _ = body_gaussians(body, pixels, ground, views, pictures, rgb, settings)
         middle = (np.abs(gaussians.mean_m[:, :2]) < 0.5).all(axis=1)
         return sorted({round(-float(z), 1) for z in gaussians.mean_m[middle, 2]})
 
     assert centres(10.0, 9.4) == [9.7, 10.0]
     assert centres(10.3, 10.0) == [10.3], "both in the same ring: the first owns, once"
+
+
+def test_of_pixels_in_a_gap_of_the_ground_the_nearest_stay(monkeypatch):
+    """Two views show one gap: each left it to others in the end, but only where another pixel is still there."""
+    views, pictures_at, body, ground, settings, rgb = looking_down(0.0, -0.5)
+    pictures = pictures_at(10.0, 10.5)
+    pixels = body_pixels([body], views, pictures, rgb, settings)[0]
+
+    def owned(everything, *rest):
+        """Every pixel is left to others at first; then to the same pixel of a nearer view, if that owns."""
+        owns = rest[-1] if len(rest) == 6 else None
+        first = np.zeros(len(everything), bool)
+        return first if owns is None else (everything.view == 0) | ~owns[0].ravel()[everything.pixel]
+
+    monkeypatch.setattr(bake, "_owned", owned)
+    gaussians, _ = body_gaussians(body, pixels, ground, views, pictures, rgb, settings)
+    assert len(gaussians) == np.count_nonzero(pixels.view == 0) > 0
 
 
 def test_pixels_of_a_kept_block_own_and_those_of_other_bodies_do():

@@ -350,7 +350,7 @@ def test_limits_follow_the_length_of_the_log(path_m, duration_s, lengths):
     views = longer.views
     assert (views.max_views, views.max_frames) == (40 * lengths, 240 * lengths)
     assert (views.budget, views.pixels) == (900_000 * lengths, 10**6 * lengths)
-    assert longer.colours.images == 60 * lengths
+    assert (longer.colours.images, longer.colours.pixels) == (60 * lengths, 50 * 10**6 * lengths)
     assert views.width_px == 640 and longer.points == given.points
 
 

@@ -149,8 +149,9 @@ class ColourSettings:
 class LiftSettings:
     """All settings of ``reconstruct(clip, "lift")``.
 
-    The limits ``max_views``, ``max_frames``, ``pixels`` and ``budget`` of ``views``, and ``images`` and ``pixels`` of ``colours``,
-    for logs of up to ``path_m`` and ``duration_s`` whose cameras have ``detail_px``; others get more (``for_log``).
+    The limits ``max_views``, ``max_frames``, ``pixels`` and ``budget`` of ``views``, and ``images`` and ``pixels`` of
+    ``colours``, are for logs of up to ``path_m`` and ``duration_s`` whose cameras have ``detail_px``; others get more
+    (``for_log``).
     """
 
     points: PointSettings = field(default_factory=PointSettings)
@@ -167,7 +168,7 @@ class LiftSettings:
     detail_px: int = 350_000
     """Pixels of the working views of one instant, all cameras together."""
     most_detail: float = 2.0
-    """``budget`` and ``images`` grow no further than this with the square root of the pixels."""
+    """``budget``, ``images`` and the ``pixels`` of ``colours`` grow no further than this with the square root of the pixels."""
 
     def __post_init__(self) -> None:
         """Checks the lengths.
