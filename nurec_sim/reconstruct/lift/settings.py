@@ -168,7 +168,7 @@ class LiftSettings:
     detail_px: int = 350_000
     """Pixels of the working views of one instant, all cameras together."""
     most_detail: float = 2.0
-    """``budget``, ``images`` and the ``pixels`` of ``colours`` grow no further than this with the square root of the pixels."""
+    """``budget`` and the limits of ``colours`` grow no further than this with the square root of the pixels."""
 
     def __post_init__(self) -> None:
         """Checks the lengths.
