@@ -361,6 +361,8 @@ def test_limits_follow_the_length_of_the_log(path_m, duration_s, lengths):
         (ViewSettings, {"levels": 1}, "levels must be 2 or more, got 1"),
         (ViewSettings, {"neighbours": -1}, "neighbours must be 0 or more, got -1"),
         (ViewSettings, {"min_depth_m": 200.0}, "below max_depth_m, got 200.0 and 150.0"),
+        (ColourSettings, {"images": 0}, "images must be 1 or more, got 0"),
+        (ColourSettings, {"trust": -0.1}, "trust must be 0 or more, got -0.1"),
         (LiftSettings, {"duration_s": 0.0}, "duration_s must be positive and finite, got 0.0"),
         (LiftSettings, {"most_lengths": 0.5}, "most_lengths must be 1 or more, got 0.5"),
         (LiftSettings, {"most_detail": 0.0}, "most_detail must be 1 or more, got 0.0"),

@@ -144,6 +144,16 @@ class ColourSettings:
     gain_pull: float = 0.01
     """Weight of a frame's gains being 1, next to that of the errors of all of its pixels; of offsets being 0: more."""
 
+    def __post_init__(self) -> None:
+        """Checks the limits.
+
+        Raises:
+            ValueError: one is too small.
+        """
+        for name, least in {"rounds": 0, "images": 1, "pixels": 1, "trust": 0, "gain_pull": 0}.items():
+            if not getattr(self, name) >= least:
+                raise ValueError(f"{name} must be {least} or more, got {getattr(self, name)}")
+
 
 @dataclass(frozen=True)
 class LiftSettings:
