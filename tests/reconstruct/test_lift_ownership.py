@@ -10,7 +10,7 @@ from nurec_sim.reconstruct.lift import bake
 from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.ground import Ground
-from nurec_sim.reconstruct.lift.lifting import FARTHER, MIXING, OWNER_BORDER, OWNER_RING, Lifted, owned, owning
+from nurec_sim.reconstruct.lift.lifting import FARTHER, OWNER_BORDER, OWNER_RING, Lifted, owned, owning
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
 from nurec_sim.reconstruct.lift.points import Cloud
 from nurec_sim.reconstruct.lift.settings import LiftSettings
@@ -75,20 +75,6 @@ def test_masked_pixels_of_other_views_do_not_hide_a_point():
 
 def test_a_hidden_matched_point_that_another_view_confirms_stays():
     assert kept(5.0, [3.0, 3.0, 7.0], [1.0, 1.5, 2.0], matched=True)
-
-
-def test_colours_are_mixed_with_those_of_other_views_by_the_area_of_their_pixels():
-    """A point 10 m away, which a view from 5 m (that owns nothing) and one from 12.5 m show brighter."""
-    depth_m = np.array([10.0, 5.0, 12.5])
-    inverse = np.repeat(1 / depth_m, SIZE[0] * SIZE[1]).astype(np.float32).reshape(3, SIZE[1], SIZE[0])
-    pictures = np.repeat([0, 200, 100], inverse[0].size * 3).astype(np.uint8).reshape(*inverse.shape, 3)
-    packed = np.stack([view_at(each - 10.0) for each in depth_m])
-    rgb = np.full((1, 3), 90, np.float32)
-    one = np.array([[0.2, -0.1, 10.0]]), depth_m[:1], np.zeros(1, np.int32), np.zeros(1, bool), rgb
-    owns = np.zeros(inverse.shape, bool)
-    assert owned(*one, packed, inverse, owns, pictures, np.ones(3, bool), TOLERANCE, OWNER_RING, OWNER_BORDER)[0]
-    near, far = MIXING * 4, MIXING * 0.64
-    assert rgb[0] == pytest.approx((90 + near * 200 + far * 100) / (1 + near + far), abs=0.01)
 
 
 def looking_down(*ahead_m):

@@ -158,8 +158,12 @@ def test_other_views_mix_into_a_colour_with_three_tenths_of_its_weight():
     assert owned([AGREES, (2.5, 1 / 12.5, 200)])[1] == pytest.approx((100 + share * 200) / (1 + share))
 
 
-def test_a_nearer_view_mixes_in_no_more_than_one_as_near():
-    assert owned([(0.9, 1 / 10.9, 100), (0.0, 0.1, 200)], depth_m=10.9)[1] == pytest.approx((100 + 0.3 * 200) / 1.3)
+def test_a_nearer_view_mixes_in_by_as_much_more():
+    """From 10 m pixels are 1 / 1.09 as wide as from 10.9 m."""
+    share = 0.3 * 1.09**2
+    assert owned([(0.9, 1 / 10.9, 100), (0.0, 0.1, 200)], depth_m=10.9)[1] == pytest.approx(
+        (100 + share * 200) / (1 + share)
+    )
 
 
 def view_of(rgb):
