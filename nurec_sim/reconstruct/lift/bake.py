@@ -183,10 +183,10 @@ def body_gaussians(
         # the other. There in the end only pixels that are still there own.
         stays[~stays] = taken
         left = rest[~taken & on_level(rest, ground)]
-        shown = [picture.body for picture in pictures]
+        numbers = [picture.body for picture in pictures]
 
         def in_gaps(owners: Lifted, kept: np.ndarray) -> np.ndarray:
-            return _owned(left, body, views, pictures, rgb, settings, lifting.owning(shown, owners, kept))
+            return _owned(left, body, views, pictures, rgb, settings, lifting.owning(numbers, owners, kept))
 
         left = left[in_gaps(pixels, stays)]
         # Of all that lie in a gap the nearest: from afar pixels are metres long, and as bright as ground seen along it.
