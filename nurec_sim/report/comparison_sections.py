@@ -9,7 +9,7 @@ from nurec_sim.metrics.agreement import CONFIDENCE, EQUIVALENCE_MARGIN, Agreemen
 from nurec_sim.report.cells import count_of, escape, list_items
 from nurec_sim.report.charts import BARS
 from nurec_sim.report.data import Comparison, ReportRollout, ReportScene, RunReport
-from nurec_sim.report.events import EXTRAPOLATED_M, farthest_apart, verdict
+from nurec_sim.report.events import EXTRAPOLATED_M, changed_by_seed, farthest_apart, verdict
 from nurec_sim.report.rollout_card import SAME_M, dot
 from nurec_sim.report.support import support_by_distance
 
@@ -295,5 +295,20 @@ def trust(rollouts: Sequence[ReportRollout], worlds: Sequence[str]) -> str:
         f'<table><thead><tr><th>Policy</th><th class="n">farthest</th>{heads}</tr></thead>'
         f"<tbody>{''.join(rows)}</tbody></table>"
         '<p class="key">Share of the time that the policy drove, by distance from the recorded path.</p>'
-        f"{support_by_distance(rollouts, worlds)}</div>"
+        f"{support_by_distance(rollouts, worlds)}{_changed_by_seed(rollouts)}</div>"
+    )
+
+
+def _changed_by_seed(rollouts: Sequence[ReportRollout]) -> str:
+    """Which verdicts hold for one start only; empty with one seed."""
+    if len({entry.rollout.seed for entry in rollouts}) < 2:
+        return ""
+    changed = sorted(changed_by_seed(rollouts))
+    names = [f"<b>{escape(policy)}</b> in {escape(scene)} ({escape(world)})" for scene, world, policy in changed]
+    said = f"These end differently from one seed to another:<ul>{_first_five(names)}</ul>" if names else "None changes."
+    return (
+        f"<h3>Verdicts that change with the seed</h3><p>{said}</p>"
+        '<p class="key">Seeds differ in the start, as far as the scenario scatters it, and in the noise of policies. '
+        "In studies verdicts that change with the seed contradicted the true world several times as often as "
+        "others (docs/trust.md).</p>"
     )

@@ -70,6 +70,19 @@ def verdict(entry: ReportRollout) -> tuple[str, ...]:
     return tuple(words)
 
 
+def changed_by_seed(entries: Iterable[ReportRollout]) -> set[tuple[str, str, str]]:
+    """Scene, reconstruction and policy of the rollouts that end differently from another seed."""
+    ends: dict[tuple[str, str, str], set[tuple[str, ...]]] = {}
+    for entry in entries:
+        ends.setdefault(drive_of(entry), set()).add(verdict(entry))
+    return {drive for drive, verdicts in ends.items() if len(verdicts) > 1}
+
+
+def drive_of(entry: ReportRollout) -> tuple[str, str, str]:
+    """What all seeds of a rollout share: scene, reconstruction and policy."""
+    return entry.rollout.scene_id, entry.rollout.reconstruction, entry.rollout.policy
+
+
 def farthest_apart(group: Sequence[ReportRollout]) -> tuple[float, float]:
     """Largest distance (m) of the car between the first and any other rollout, and when (s after the start)."""
     first, best = group[0].rollout, (0.0, 0.0)

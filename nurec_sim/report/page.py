@@ -13,7 +13,7 @@ from nurec_sim.report.cells import by_policy, count_of, escape, fact_list, full_
 from nurec_sim.report.charts import BARS, collision_bars, comparison_bars, time_view
 from nurec_sim.report.comparison_sections import fidelity, rank_agreement, trust, what_differs
 from nurec_sim.report.data import ReportScene, RunReport
-from nurec_sim.report.events import grouped
+from nurec_sim.report.events import changed_by_seed, grouped
 from nurec_sim.report.plan import PlanAxes, plan_view
 from nurec_sim.report.rollout_card import rollout_card
 from nurec_sim.report.template import html_page
@@ -47,6 +47,7 @@ def render_report(report: RunReport) -> str:
     comparison = report.comparison
     worlds = comparison.worlds if comparison is not None else ()
     groups = grouped(report.rollouts, worlds)
+    changing = changed_by_seed(report.rollouts)
     embed = _video_bytes(report) < MAX_EMBEDDED_BYTES
     scenes = {(scene.id, scene.reconstruction): scene for scene in report.scenes}
     views: dict[tuple[str, str], PlanAxes] = {}
@@ -63,7 +64,7 @@ def render_report(report: RunReport) -> str:
             driven = [entry for entry in group if entry.rollout.states]
             figures[f"plan{index}"] = plan_view(driven, view, image_key, scene.road_map)
             figures[f"time{index}"] = time_view(driven)
-        cards.append(rollout_card(index, group, scene, report, embed))
+        cards.append(rollout_card(index, group, scene, report, changing, embed))
     opening = []
     if comparison is not None:
         figures |= {f"bars-{metric}": comparison_bars(comparison, metric) for metric in BARS}

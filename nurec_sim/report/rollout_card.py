@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import polars as pl
 
 from nurec_sim.report.cells import escape, list_items, meaning, shown
 from nurec_sim.report.data import ReportRollout, ReportScene, RunReport, Video
-from nurec_sim.report.events import farthest_apart, happenings, verdict
+from nurec_sim.report.events import drive_of, farthest_apart, happenings, verdict
 from nurec_sim.report.figure import world_colour
-from nurec_sim.report.support import doubtful
+from nurec_sim.report.support import low_support
 
 OPEN_ROLLOUTS = 1
 SAME_M = 1e-9
+Changing = Collection[tuple[str, str, str]]
 BAD = ("failed", "front collision", "lateral collision", "rear collision", "off-road")
 
 
-def rollout_card(index: int, group: Sequence[ReportRollout], scene: ReportScene, report: RunReport, embed: bool) -> str:
+def rollout_card(
+    index: int, group: Sequence[ReportRollout], scene: ReportScene, report: RunReport, changing: Changing, embed: bool
+) -> str:
     """The HTML card of one rollout; figures ``plan<index>`` and ``time<index>`` are rendered when it is opened.
 
     Args:
@@ -26,11 +29,13 @@ def rollout_card(index: int, group: Sequence[ReportRollout], scene: ReportScene,
         group: the rollout in each reconstruction.
         scene: of the first reconstruction, for videos of the recorded drive.
         report: the whole report, for the metric values.
+        changing: ``changed_by_seed`` of all rollouts.
         embed: whether videos are embedded as base64 instead of linked.
     """
     rollout, alone = group[0].rollout, len(group) == 1
     where = f"{rollout.scene_id} · {rollout.reconstruction} · " if alone else f"{rollout.scene_id} · "
-    tags = _tags(group[0]) if alone else _apart(group) + "".join(_world(place, e) for place, e in enumerate(group))
+    worlds = (_world(place, entry, changing) for place, entry in enumerate(group))
+    tags = _tags(group[0], changing) if alone else _apart(group) + "".join(worlds)
     summary = (
         f"<summary>{escape(rollout.policy)} <span class='where'>· {escape(where)}seed {rollout.seed}</span>{tags}"
         "</summary>"
@@ -66,16 +71,16 @@ def rollout_card(index: int, group: Sequence[ReportRollout], scene: ReportScene,
     return f'<details class="card rollout" id="rollout{index}"{is_open}>{summary}{"".join(parts)}</details>'
 
 
-def _tags(entry: ReportRollout) -> str:
+def _tags(entry: ReportRollout, changing: Changing) -> str:
     words = verdict(entry)
     tags = [f'<span class="tag {"bad" if word in BAD else "warn"}">{escape(word)}</span>' for word in words]
-    doubt = doubtful(entry)
-    shown_doubt = f'<span class="tag warn">{escape(doubt)}</span>' if doubt else ""
-    return ("".join(tags) or '<span class="tag good">no event</span>') + shown_doubt
+    doubts = [low_support(entry), "another seed ends differently" if drive_of(entry) in changing else ""]
+    shown_doubts = "".join(f'<span class="tag warn">{escape(doubt)}</span>' for doubt in doubts if doubt)
+    return ("".join(tags) or '<span class="tag good">no event</span>') + shown_doubts
 
 
-def _world(place: int, entry: ReportRollout) -> str:
-    return f'<span class="world">{dot(place)}{escape(entry.rollout.reconstruction)}{_tags(entry)}</span>'
+def _world(place: int, entry: ReportRollout, changing: Changing) -> str:
+    return f'<span class="world">{dot(place)}{escape(entry.rollout.reconstruction)}{_tags(entry, changing)}</span>'
 
 
 def _apart(group: Sequence[ReportRollout]) -> str:

@@ -38,7 +38,7 @@ def verdict_support(entry: ReportRollout) -> float | None:
     return float(values.min()) if len(values) else None
 
 
-def doubtful(entry: ReportRollout) -> str:
+def low_support(entry: ReportRollout) -> str:
     """A few words if the verdict rests on images with little support, else empty."""
     least = verdict_support(entry)
     return "" if least is None or least >= LOW else f"low support: {100 * least:.0f} %"

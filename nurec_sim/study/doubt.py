@@ -1,6 +1,7 @@
-"""Which verdicts to doubt? Those after images with little support, and those that another reconstruction contradicts.
+"""Which verdicts to doubt? A study counts how often those with a reason for doubt are wrong, against all others.
 
-Both are known without the truth. A study counts how often such verdicts are wrong, against all others.
+Reasons are known without the truth: an image with little support, another start or another reconstruction that ends
+otherwise.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ VERDICT = ("collision_any", "offroad")
 ENOUGH = 10
 """With fewer verdicts on either side nothing can be said."""
 KEYS = ("clipgt_id", "policy", "seed")
+LOW_SUPPORT, OTHER_START, OTHER_WORLD = "low support", "another start differs", "another reconstruction differs"
+ANY = "any of these"
 
 
 @dataclass(frozen=True)
@@ -35,54 +38,52 @@ class Doubt:
         return (self.doubtful_wrong / self.doubtful) / (self.others_wrong / self.others)
 
 
-def after_low_support(values: pl.DataFrame, worlds: Sequence[str]) -> dict[str, Doubt]:
-    """Verdicts after an image with support below ``LOW``; of every reconstruction in which support is known.
+def doubts(values: pl.DataFrame, worlds: Sequence[str], policies: Sequence[str]) -> dict[str, dict[str, Doubt]]:
+    """Doubtful verdicts by reason and reconstruction; without what is not known.
 
-    Args:
-        values: rows of ``rollout_values`` of all rollouts of a study.
-        worlds: the true world first.
-    """
-    ends = _ends(values, "support_least")
-    truth = ends[worlds[0]].drop("support_least")
-    found = {}
-    for world in worlds[1:]:
-        pairs = ends[world].drop_nulls().join(truth, on=KEYS, suffix="_true").drop_nulls()
-        if len(pairs):
-            found[world] = _count(pairs, pl.col("support_least") < LOW)
-    return found
-
-
-def contradicted(values: pl.DataFrame, worlds: Sequence[str], policies: Sequence[str]) -> dict[str, Doubt]:
-    """Verdicts of every reconstruction where another one says otherwise.
-
-    Empty without two reconstructions, and without policies that look at something.
+    ``LOW_SUPPORT``: before its end the policy got an image with support below ``LOW``. ``OTHER_START``: another trial
+    in the same scene and reconstruction ends otherwise. ``OTHER_WORLD``: so does the same trial in another
+    reconstruction. ``ANY``: one of these, if several are known.
 
     Args:
         values: rows of ``rollout_values`` of all rollouts of a study.
         worlds: the true world first, then intact reconstructions.
         policies: those that look at a rendered sensor; all others end alike by construction.
     """
-    if len(worlds) < 3 or not policies:
-        return {}
     ends = _ends(values.filter(pl.col("policy").is_in(list(policies))))
-    found = {}
-    for world in worlds[1:]:
-        rivals = [other for other in worlds[1:] if other != world]
-        pairs = ends[world].join(ends[worlds[0]], on=KEYS, suffix="_true")
+    found: dict[str, dict[str, Doubt]] = {}
+    for world in [world for world in worlds[1:] if world in ends]:
+        pairs = ends[world].join(ends[worlds[0]], on=KEYS, suffix="_true").drop_nulls(_columns("", "_true"))
+        rivals = [other for other in worlds[1:] if other != world and other in ends]
         for rival in rivals:
-            pairs = pairs.join(ends[rival], on=KEYS, suffix=f"_{rival}")
-        pairs = pairs.drop_nulls()
-        if len(pairs):
-            found[world] = _count(pairs, pl.any_horizontal([_differs(f"_{rival}") for rival in rivals]))
+            pairs = pairs.join(ends[rival], on=KEYS, suffix=f"_{rival}", how="left")
+        several = pl.len().over("clipgt_id", "policy") > 1
+        changes = pl.any_horizontal([pl.col(name).n_unique().over("clipgt_id", "policy") > 1 for name in VERDICT])
+        reasons = {
+            LOW_SUPPORT: pl.col("support_least") < LOW,
+            OTHER_START: pl.when(several).then(changes),
+            OTHER_WORLD: pl.any_horizontal([_differs(f"_{rival}") for rival in rivals]) if rivals else pl.lit(None),
+        }
+        rows = pairs.select(_differs("_true").alias("wrong"), **reasons)
+        known = [reason for reason in reasons if rows[reason].count()]
+        if len(known) > 1:
+            rows, known = rows.with_columns(pl.any_horizontal(known).fill_null(False).alias(ANY)), [*known, ANY]
+        for reason in known:
+            found.setdefault(reason, {})[world] = _count(rows.drop_nulls(reason), reason)
     return found
 
 
-def _ends(values: pl.DataFrame, *also: str) -> dict[str, pl.DataFrame]:
-    """By world, one row per rollout with its verdict and more metrics; missing ones are null."""
-    wide = values.filter(pl.col("name").is_in([*VERDICT, *also])).pivot(
-        on="name", index=[*KEYS, "reconstruction"], values="value"
+def _ends(values: pl.DataFrame) -> dict[str, pl.DataFrame]:
+    """By world, one row per rollout with its verdict and ``support_least``; missing ones are null."""
+    names = [*VERDICT, "support_least"]
+    wide = values.filter(pl.col("name").is_in(names)).pivot(
+        on="name", on_columns=names, index=[*KEYS, "reconstruction"], values="value"
     )
     return {str(world): rows.drop("reconstruction") for (world,), rows in wide.group_by("reconstruction")}
+
+
+def _columns(*suffixes: str) -> list[str]:
+    return [name + suffix for suffix in suffixes for name in VERDICT]
 
 
 def _differs(suffix: str) -> pl.Expr:
@@ -90,6 +91,6 @@ def _differs(suffix: str) -> pl.Expr:
     return pl.any_horizontal([pl.col(name) != pl.col(f"{name}{suffix}") for name in VERDICT])
 
 
-def _count(pairs: pl.DataFrame, doubtful: pl.Expr) -> Doubt:
-    wrong, doubted = pairs.select(_differs("_true")).to_series(), pairs.select(doubtful).to_series()
-    return Doubt(int(doubted.sum()), int((doubted & wrong).sum()), int((~doubted).sum()), int((~doubted & wrong).sum()))
+def _count(rows: pl.DataFrame, reason: str) -> Doubt:
+    doubted, others = rows.filter(reason)["wrong"], rows.filter(~pl.col(reason))["wrong"]
+    return Doubt(len(doubted), int(doubted.sum()), len(others), int(others.sum()))

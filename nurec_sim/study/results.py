@@ -26,7 +26,7 @@ from nurec_sim.runs import folder as layout
 from nurec_sim.runs.compared import COMPARED, comparison_of
 from nurec_sim.study.braking import Braking, first_braking
 from nurec_sim.study.config import StudyConfig, control_name
-from nurec_sim.study.doubt import Doubt, after_low_support, contradicted
+from nurec_sim.study.doubt import Doubt, doubts
 from nurec_sim.study.road import Road, measure_roads
 from nurec_sim.study.tasks import ROLLOUTS, VALUES
 
@@ -45,10 +45,10 @@ class StudyResults:
     policies, ``seeing`` the agreements of those that look at a sensor only, by metric and world: blind ones agree by
     construction. ``drops`` is by control and metric how much less than the intact reconstruction it agrees with the
     truth. ``pairs`` is by world the difference of every two policies in (C+O)/2, adjusted by Holm. ``differing`` names
-    blind policies that did not drive the same in all worlds, which is a fault of the simulator. ``low_support`` and
-    ``contradicted`` are by world how often verdicts to doubt, and all others, are wrong. ``braking`` is by world and
-    policy that looks at a sensor when it first brakes, against the truth. ``roads`` is by reconstruction how its road
-    agrees with the map, empty if not measured.
+    blind policies that did not drive the same in all worlds, which is a fault of the simulator. ``doubts`` is by
+    reason and reconstruction how often verdicts to doubt, and all others, are wrong. ``braking`` is by world and policy
+    that looks at a sensor when it first brakes, against the truth. ``roads`` is by reconstruction how its road agrees
+    with the map, empty if not measured.
     """
 
     config: StudyConfig
@@ -59,8 +59,7 @@ class StudyResults:
     drops: dict[tuple[str, str], Estimate]
     pairs: dict[str, list[tuple[str, str, Difference]]]
     differing: tuple[str, ...]
-    low_support: dict[str, Doubt] = field(default_factory=dict)
-    contradicted: dict[str, Doubt] = field(default_factory=dict)
+    doubts: dict[str, dict[str, Doubt]] = field(default_factory=dict)
     braking: dict[tuple[str, str], Braking] = field(default_factory=dict)
     roads: dict[str, Road] = field(default_factory=dict)
 
@@ -131,8 +130,7 @@ def results_of(config: StudyConfig, values: pl.DataFrame, seeing: Sequence[str])
         drops,
         pairs,
         _differing(values, seeing),
-        after_low_support(values, worlds),
-        contradicted(values, config.worlds, seeing),
+        doubts(values, config.worlds, seeing),
         first_braking(values, worlds, sorted(seeing)),
     )
 
@@ -169,8 +167,10 @@ def as_json(results: StudyResults) -> dict[str, Any]:
         "discriminates": results.discriminates,
         "blind_policies_that_differ": list(results.differing),
         "first_braking": {f"{world}/{policy}": asdict(each) for (world, policy), each in results.braking.items()},
-        "verdicts_by_support": {world: asdict(each) for world, each in results.low_support.items()},
-        "verdicts_by_contradiction": {world: asdict(each) for world, each in results.contradicted.items()},
+        "verdicts_to_doubt": {
+            reason: {world: asdict(each) for world, each in by_world.items()}
+            for reason, by_world in results.doubts.items()
+        },
         "road": {world: asdict(each) for world, each in results.roads.items()},
     })  # fmt: skip
 

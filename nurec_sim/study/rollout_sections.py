@@ -11,6 +11,7 @@ from nurec_sim.report.cells import count_of, escape, list_items, shown
 from nurec_sim.report.rollout_card import dot
 from nurec_sim.report.support import LOW
 from nurec_sim.study.braking import SAME_S
+from nurec_sim.study.doubt import LOW_SUPPORT, OTHER_START, OTHER_WORLD
 from nurec_sim.study.results import StudyResults
 
 MOST_SCENES = 10
@@ -18,9 +19,8 @@ MOST_SCENES = 10
 
 def doubt_section(results: StudyResults) -> str:
     """How often verdicts to doubt are wrong, by why they are doubted; empty if nothing is known."""
-    kinds = {"low support": results.low_support, "another reconstruction differs": results.contradicted}
     rows = []
-    for why, by_world in kinds.items():
+    for why, by_world in results.doubts.items():
         for world, found in by_world.items():
             ratio = "too few to say" if found.ratio is None else f"{found.ratio:.1f}"
             shares = [
@@ -35,10 +35,12 @@ def doubt_section(results: StudyResults) -> str:
     return (
         '<h2>Which verdicts to doubt</h2><div class="card scroll"><table><thead><tr><th>Doubted because</th>'
         '<th class="n">Wrong of the doubted</th><th class="n">Wrong of all others</th><th class="n">Times as often</th>'
-        f'</tr></thead><tbody>{"".join(rows)}</tbody></table><p class="key">Wrong: the same rollout ends otherwise '
-        "(collision, off-road) in the true world. Low support: policies with cameras; before its end the policy got an "
-        f"image of which less than {100 * LOW:.0f} % rests on recorded views. Another reconstruction differs: policies "
-        "that look at a sensor; the rollout ends otherwise in another reconstruction of the same log.</p></div>"
+        f'</tr></thead><tbody>{"".join(rows)}</tbody></table><p class="key">Policies that look at a sensor. Wrong: the '
+        f"same rollout ends otherwise (collision, off-road) in the true world. {LOW_SUPPORT.capitalize()}: before its "
+        f"end the policy got an image of which less than {100 * LOW:.0f} % rests on recorded views. "
+        f"{OTHER_START.capitalize()}: another trial in the same reconstruction, from a start slightly elsewhere, ends "
+        f"otherwise. {OTHER_WORLD.capitalize()}: the rollout ends otherwise in another reconstruction of the log.</p>"
+        "</div>"
     )
 
 

@@ -1,6 +1,7 @@
 """Support in the report: the curve, the mark of doubtful verdicts, and the distance from which they are."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ from metrics_worlds import rollout, standing, straight_poses
 from nurec_sim.metrics import find_contacts, score_rollout
 from nurec_sim.report import ReportRollout
 from nurec_sim.report.charts import time_view
+from nurec_sim.report.comparison_sections import trust
+from nurec_sim.report.events import changed_by_seed, drive_of
 from nurec_sim.report.rollout_card import _tags
-from nurec_sim.report.support import LOW, doubtful, support_by_distance, verdict_support
+from nurec_sim.report.support import LOW, low_support, support_by_distance, verdict_support
 
 
 def entry(support, y=0.0, actors=None, first=0):
@@ -38,9 +41,25 @@ def test_images_of_the_replayed_log_do_not_count():
 
 
 def test_a_doubtful_verdict_is_marked():
-    assert doubtful(entry({1.0: LOW - 0.2})) == f"low support: {100 * (LOW - 0.2):.0f} %"
-    assert doubtful(entry({1.0: LOW})) == "" and doubtful(entry({})) == ""
-    assert "low support" in _tags(entry({1.0: 0.1})) and "low support" not in _tags(entry({1.0: 0.9}))
+    assert low_support(entry({1.0: LOW - 0.2})) == f"low support: {100 * (LOW - 0.2):.0f} %"
+    assert low_support(entry({1.0: LOW})) == "" and low_support(entry({})) == ""
+    assert "low support" in _tags(entry({1.0: 0.1}), ()) and "low support" not in _tags(entry({1.0: 0.9}), ())
+
+
+def test_verdicts_that_change_with_the_seed_are_marked():
+    """The second seed meets a parked car; another policy's seeds end alike."""
+    parked = {"parked": standing(30, 16.0, 0.0)}
+    free, hit, other = entry({}), entry({}, actors=parked), entry({})
+    hit = replace(hit, rollout=replace(hit.rollout, seed=1))
+    others = [replace(other, rollout=replace(other.rollout, policy="other", seed=seed)) for seed in (0, 1)]
+    changing = changed_by_seed([free, hit, *others])
+    assert changing == {drive_of(free)} == {drive_of(hit)} and drive_of(others[0]) not in changing
+    tag = "another seed ends differently"
+    assert tag in _tags(free, changing) and tag in _tags(hit, changing) and tag not in _tags(others[0], changing)
+    said = words(trust([free, hit, *others], [free.rollout.reconstruction]))
+    assert f"from one seed to another: {free.rollout.policy} in {free.rollout.scene_id}" in said and "None" not in said
+    assert "None changes" in words(trust(others, [free.rollout.reconstruction]))
+    assert "change with the seed" not in words(trust([free], [free.rollout.reconstruction])), "one seed says nothing"
 
 
 def test_the_curve_stands_below_the_others_where_support_is_known():

@@ -10,7 +10,7 @@ from nurec_sim.metrics.aggregate import DERIVED
 from nurec_sim.metrics.agreement import tau_b_drop
 from nurec_sim.metrics.series import METRICS
 from nurec_sim.study import make_study
-from nurec_sim.study.doubt import Doubt
+from nurec_sim.study.doubt import ANY, LOW_SUPPORT, OTHER_START, OTHER_WORLD, Doubt
 from nurec_sim.study.page import render_study
 from nurec_sim.study.results import agreement_rows, as_json, results_of
 
@@ -47,7 +47,7 @@ def values(by_world, failed=()):
                     ok = key not in failed
                     for name, unit in units.items():
                         found = {"offroad": event, "collision_offroad_mean": event / 2, "offroad_or_collision": event,
-                                 "scene_score": 1 - event}  # fmt: skip
+                                 "scene_score": 1 - event, "support_least": None}  # fmt: skip
                         rows.append((scene_id, "reconstruction", world, policy, trial, seed, "/".join(map(str, key)),
                                      "ok" if ok else "failed", "" if ok else "lens <cap> on", name, unit,
                                      found.get(name, 0.0) if ok else None, ok))  # fmt: skip
@@ -83,18 +83,31 @@ def test_verdicts_with_low_support_are_counted_apart():
     mine = (pl.col("name") == "support_least") & (pl.col("reconstruction") == "lift")
     least = pl.when(town < 3).then(0.3).otherwise(0.9)
     sees = pl.col("policy").is_in(list(SEEING))
-    table = table.with_columns(
-        pl.when(pl.col("name") != "support_least").then("value").when(mine & sees).then(least).alias("value")
-    )
+    table = table.with_columns(pl.when(mine & sees).then(least).otherwise("value").alias("value"))
     results = results_of(CONFIG, table, SEEING)
     # Two policies, ten scenes, two trials: 12 of 40 have low support, and of these sees_b is wrong in scenes 1 and 2.
-    assert results.low_support == {"lift": Doubt(12, 4, 28, 0)} and results.low_support["lift"].ratio is None
+    assert results.doubts[LOW_SUPPORT] == {"lift": Doubt(12, 4, 28, 0)}
+    assert results.doubts[LOW_SUPPORT]["lift"].ratio is None
     assert Doubt(12, 4, 28, 2).ratio == pytest.approx((4 / 12) / (2 / 28))
     assert Doubt(9, 9, 28, 2).ratio is None and Doubt(12, 4, 9, 2).ratio is None
-    assert as_json(results)["verdicts_by_support"]["lift"]["doubtful_wrong"] == 4
+    assert as_json(results)["verdicts_to_doubt"][LOW_SUPPORT]["lift"]["doubtful_wrong"] == 4
     page = render_study(results)
     assert "low support" in page and "too few to say" in page and "4 of 12<small>33 %</small>" in page
-    assert results.contradicted == {} and "another reconstruction differs</b>" not in page, "there is no other"
+    assert OTHER_WORLD not in results.doubts and f"{OTHER_WORLD}</b>" not in page, "there is no other"
+
+
+def test_verdicts_that_another_start_changes_are_counted_apart():
+    """In lift both policies end otherwise in one trial of scenes 8 and 9, where in truth none has an event."""
+    table = values({"truth": TRUE_FRACTIONS, "lift": TRUE_FRACTIONS, "lift-faint": TRUE_FRACTIONS})
+    late = pl.col("clipgt_id").str.ends_with("-8") | pl.col("clipgt_id").str.ends_with("-9")
+    mine = (pl.col("reconstruction") == "lift") & (pl.col("name") == "collision_any") & (pl.col("trial") == 1)
+    table = table.with_columns(pl.when(late & mine).then(1.0).otherwise("value").alias("value"))
+    results = results_of(CONFIG, table, SEEING)
+    # Two policies, two scenes: both trials are doubted, and the second is wrong.
+    assert results.doubts[OTHER_START] == {"lift": Doubt(8, 4, 32, 0)}
+    assert ANY not in results.doubts, "no other reason is known"
+    once = results_of(CONFIG, table.filter(pl.col("trial") == 1), SEEING)
+    assert OTHER_START not in once.doubts, "a single trial says nothing of another"
 
 
 def test_verdicts_that_another_reconstruction_contradicts_are_counted_apart():
@@ -113,11 +126,12 @@ def test_verdicts_that_another_reconstruction_contradicts_are_counted_apart():
         (1 - pl.col("value")).alias("value"),
     )
     results = results_of(config, pl.concat([table, control]), SEEING)
-    # 2 policies x 10 scenes x 2 trials.
-    assert results.contradicted == {"lift": Doubt(4, 2, 36, 2), "dense": Doubt(4, 2, 36, 2)}
+    # 2 policies x 10 scenes x 2 trials; both trials end alike, so either reason for doubt is this one.
+    assert results.doubts[OTHER_WORLD] == {"lift": Doubt(4, 2, 36, 2), "dense": Doubt(4, 2, 36, 2)}
+    assert results.doubts[ANY] == results.doubts[OTHER_WORLD]
     page = render_study(results)
-    assert page.count("another reconstruction differs</b>") == 2 and "2 of 36<small>6 %</small>" in page
-    assert results_of(config, pl.concat([table, control]), ()).contradicted == {}, "blind policies end alike anyway"
+    assert page.count(f"{OTHER_WORLD}</b>") == 2 and "2 of 36<small>6 %</small>" in page
+    assert results_of(config, pl.concat([table, control]), ()).doubts == {}, "blind policies end alike anyway"
 
 
 def test_moments_of_first_braking_are_compared_with_the_truth():
