@@ -70,6 +70,11 @@ def list_items(items: Sequence[str]) -> str:
     return "".join(f"<li>{item}</li>" for item in items)
 
 
+def first_five(items: Sequence[str]) -> str:
+    """``list_items`` of the first five, and how many more there are."""
+    return list_items([*items[:5], f"and {len(items) - 5} more"] if len(items) > 5 else items)
+
+
 def count_of(number: int, one: str, many: str = "") -> str:
     """A number with its noun."""
     return f"{number} {one if number == 1 else many or one + 's'}"

@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from nurec_sim.metrics.agreement import CONFIDENCE, EQUIVALENCE_MARGIN, Agreement, Difference, Estimate
-from nurec_sim.report.cells import count_of, escape, list_items
+from nurec_sim.report.cells import count_of, escape, first_five, list_items
 from nurec_sim.report.charts import BARS
 from nurec_sim.report.data import Comparison, ReportRollout, ReportScene, RunReport
-from nurec_sim.report.events import EXTRAPOLATED_M, changed_by_seed, farthest_apart, verdict
+from nurec_sim.report.events import farthest_apart, verdict
 from nurec_sim.report.rollout_card import SAME_M, dot
-from nurec_sim.report.support import support_by_distance
 
 SHOWN = {
     "collision_any": "Collision C",
@@ -21,7 +20,6 @@ SHOWN = {
     "progress": "Progress",
 }
 ALPHA = 1 - CONFIDENCE
-DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
 
 
 def what_differs(report: RunReport, comparison: Comparison, groups: Sequence[Sequence[ReportRollout]]) -> str:
@@ -69,7 +67,7 @@ def _sentences(comparison: Comparison, groups: Sequence[Sequence[ReportRollout]]
     if differ:
         sentences.append(
             f'<span class="bad">{count_of(len(differ), "rollout")} of {len(groups)} end differently</span>: '
-            f"<ul>{_first_five(differ)}</ul>"
+            f"<ul>{first_five(differ)}</ul>"
         )
     else:
         sentences.append(
@@ -79,7 +77,7 @@ def _sentences(comparison: Comparison, groups: Sequence[Sequence[ReportRollout]]
     if other:
         sentences.append(
             f"{count_of(len(other), 'rollout')} with the same verdict drove differently, farthest apart:"
-            f"<ul>{_first_five(other)}</ul>"
+            f"<ul>{first_five(other)}</ul>"
         )
     if same:
         sentences.append(
@@ -87,10 +85,6 @@ def _sentences(comparison: Comparison, groups: Sequence[Sequence[ReportRollout]]
             "Policies that see nothing rendered must; it shows that nothing but the sensors differs."
         )
     return sentences
-
-
-def _first_five(items: Sequence[str]) -> str:
-    return list_items([*items[:5], f"and {len(items) - 5} more"] if len(items) > 5 else items)
 
 
 def _interval_text(report: RunReport) -> str:
@@ -254,61 +248,3 @@ def _fidelity_row(scene: ReportScene, place: int) -> str:
 
 def _number(value: object, form: str) -> str:
     return form.format(value) if isinstance(value, (int, float)) else '<span class="none">none</span>'
-
-
-def trust(rollouts: Sequence[ReportRollout], worlds: Sequence[str]) -> str:
-    """How far from the recorded path each policy drove: what its sensors showed there was extrapolated.
-
-    Args:
-        rollouts: all rollouts.
-        worlds: order of the reconstructions.
-    """
-    rows = []
-    by_policy: dict[tuple[str, str], list[ReportRollout]] = {}
-    for entry in rollouts:
-        by_policy.setdefault((entry.rollout.policy, entry.rollout.reconstruction), []).append(entry)
-    for policy, world in sorted(by_policy, key=lambda key: (key[0], worlds.index(key[1]))):
-        distances = [
-            float(value)
-            for entry in by_policy[policy, world]
-            for value, valid in zip(
-                entry.series["dist_to_gt_trajectory"].values, entry.series["dist_to_gt_trajectory"].valid, strict=True
-            )
-            if valid
-        ]
-        name = f"<small>{dot(worlds.index(world))}{escape(world)}</small>" if len(worlds) > 1 else ""
-        if not distances:
-            cells = '<td class="n"><span class="none">unknown</span></td>' * (len(DISTANCES_M) + 1)
-        else:
-            shares = [sum(d > limit for d in distances) / len(distances) for limit in DISTANCES_M]
-            cells = f'<td class="n">{max(distances):.1f} m</td>' + "".join(
-                f'<td class="n{" bad" if share and limit >= EXTRAPOLATED_M else ""}">{100 * share:.0f} %</td>'
-                for share, limit in zip(shares, DISTANCES_M, strict=True)
-            )
-        rows.append(f"<tr><td><b>{escape(policy)}</b>{name}</td>{cells}</tr>")
-    heads = "".join(f'<th class="n">beyond {limit:g} m</th>' for limit in DISTANCES_M)
-    return (
-        '<h2>What was extrapolated</h2><div class="card scroll"><p>Cameras and LiDARs recorded the scene from the '
-        "recorded path only. The farther a policy drives from it, the more of what its sensors show was never seen "
-        f"from there. Trust verdicts that fall within {EXTRAPOLATED_M:g} m; look at the video before you believe "
-        "others.</p>"
-        f'<table><thead><tr><th>Policy</th><th class="n">farthest</th>{heads}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table>"
-        '<p class="key">Share of the time that the policy drove, by distance from the recorded path.</p>'
-        f"{support_by_distance(rollouts, worlds)}{_changed_by_seed(rollouts)}</div>"
-    )
-
-
-def _changed_by_seed(rollouts: Sequence[ReportRollout]) -> str:
-    """Which verdicts hold for one start only; empty with one seed."""
-    if len({entry.rollout.seed for entry in rollouts}) < 2:
-        return ""
-    changed = sorted(changed_by_seed(rollouts))
-    names = [f"<b>{escape(policy)}</b> in {escape(scene)} ({escape(world)})" for scene, world, policy in changed]
-    said = f"These end differently from one seed to another:<ul>{_first_five(names)}</ul>" if names else "None changes."
-    return (
-        f"<h3>Verdicts that change with the seed</h3><p>{said}</p>"
-        '<p class="key">Seeds differ in the start, as far as the scenario scatters it, and in the noise of policies. '
-        "In studies verdicts that change with the seed contradicted the true world several times as often as "
-        "others (docs/trust.md).</p>"
-    )

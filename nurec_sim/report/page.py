@@ -11,12 +11,13 @@ from nurec_sim.metrics.collision import AT_FAULT_RULE
 from nurec_sim.metrics.series import METRICS
 from nurec_sim.report.cells import by_policy, count_of, escape, fact_list, full_name, list_items, meaning, summary_cell
 from nurec_sim.report.charts import BARS, collision_bars, comparison_bars, time_view
-from nurec_sim.report.comparison_sections import fidelity, rank_agreement, trust, what_differs
+from nurec_sim.report.comparison_sections import fidelity, rank_agreement, what_differs
 from nurec_sim.report.data import ReportScene, RunReport
 from nurec_sim.report.events import changed_by_seed, grouped
 from nurec_sim.report.plan import PlanAxes, plan_view
 from nurec_sim.report.rollout_card import rollout_card
 from nurec_sim.report.template import html_page
+from nurec_sim.report.trust import trust
 
 MAX_EMBEDDED_BYTES = 40_000_000
 OFTEN_WITHOUT_VALUE = (

@@ -10,10 +10,10 @@ from metrics_worlds import rollout, standing, straight_poses
 from nurec_sim.metrics import find_contacts, score_rollout
 from nurec_sim.report import ReportRollout
 from nurec_sim.report.charts import time_view
-from nurec_sim.report.comparison_sections import trust
 from nurec_sim.report.events import changed_by_seed, drive_of
 from nurec_sim.report.rollout_card import _tags
 from nurec_sim.report.support import LOW, low_support, support_by_distance, verdict_support
+from nurec_sim.report.trust import trust
 
 
 def entry(support, y=0.0, actors=None, first=0):
@@ -58,7 +58,9 @@ def test_verdicts_that_change_with_the_seed_are_marked():
     assert tag in _tags(free, changing) and tag in _tags(hit, changing) and tag not in _tags(others[0], changing)
     said = words(trust([free, hit, *others], [free.rollout.reconstruction]))
     assert f"from one seed to another: {free.rollout.policy} in {free.rollout.scene_id}" in said and "None" not in said
-    assert "None changes" in words(trust(others, [free.rollout.reconstruction]))
+    assert "All seeds drove the same" in words(trust(others, [free.rollout.reconstruction]))
+    beside = replace(others[1], rollout=replace(entry({}, y=0.1).rollout, policy="other", seed=1))
+    assert "None does." in words(trust([others[0], beside], [free.rollout.reconstruction]))
     assert "change with the seed" not in words(trust([free], [free.rollout.reconstruction])), "one seed says nothing"
 
 
