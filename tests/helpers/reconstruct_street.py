@@ -88,8 +88,11 @@ class Street:
         direction = np.nan_to_num(rays.reshape(-1, 3) @ pose[:3, :3].T)
         distance, what = self.cast(pose[:3, 3], direction, index)
         hit = pose[:3, 3] + np.where(np.isfinite(distance), distance, 0)[:, None] * direction
-        rgb = colour_of(what, hit) * self.gains.get(camera_id, 1.0)
+        rgb = self.colours(what, hit, index) * self.gains.get(camera_id, 1.0)
         return np.clip(rgb * 255, 0, 255).astype(np.uint8).reshape(rays.shape)
+
+    def colours(self, what: np.ndarray, hit: np.ndarray, index: int) -> np.ndarray:
+        return colour_of(what, hit)
 
     def ego_mask(self, camera_id: str) -> None:
         return None
