@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reconstruct_street import Street, camera, colour_of
+from reconstruct_street import Street, camera
 
-from nurec_sim import geometry, sensors
+from nurec_sim import geometry
 from nurec_sim.reconstruct import ColourSettings, LiftSettings, ViewSettings, reconstruct
 from nurec_sim.reconstruct.lift.colour_solve import solve_colours
-from nurec_sim.reconstruct.lift.shade import shading_boxes, unweigh_shaded
+from nurec_sim.reconstruct.lift.shade import movers, shading_boxes, unweigh_shaded
 from nurec_sim.types import Track, Trajectory
 
 SIZE = (4.0, 2.0, 1.5)
@@ -47,25 +47,21 @@ def test_ground_beneath_and_beside_a_mover_is_shaded(point, shaded):
 
 
 def test_what_stands_or_is_not_there_shades_nothing():
-    assert len(shading_boxes([track(4.0)], 500_000)) == 1
-    assert len(shading_boxes([track(0.5)], 0)) == len(shading_boxes([track(4.0)], 1_500_000)) == 0
+    moves, stands = track(4.0), track(0.5)
+    assert movers([moves, stands]) == [moves]
+    assert len(shading_boxes([moves], 500_000)) == 1 and len(shading_boxes([moves], 1_500_000)) == 0
 
 
 class Shaded(Street):
     """A street in which boxes shade the road up to 0.7 m beside them."""
 
-    def image(self, camera_id, index):
-        rays, _ = sensors.pixel_rays(self.rig.cameras[camera_id])
-        pose = self.world_from_camera(camera_id, index)[0]
-        direction = rays.reshape(-1, 3) @ pose[:3, :3].T
-        distance, what = self.cast(pose[:3, 3], direction, index)
-        hit = pose[:3, 3] + np.where(np.isfinite(distance), distance, 0)[:, None] * direction
-        rgb = colour_of(what, hit)
+    def colours(self, what, hit, index):
+        rgb = super().colours(what, hit, index)
         for name, (size, _) in self.boxes.items():
             from_box = np.abs(hit - self._box_poses(name)[index][:3, 3])
             near = (from_box[:, 0] < size[0] / 2 + 0.7) & (from_box[:, 1] < size[1] / 2 + 0.7)
             rgb[near & (what == 1)] *= 0.3
-        return np.clip(rgb * 255, 0, 255).astype(np.uint8).reshape(rays.shape)
+        return rgb
 
 
 @pytest.mark.slow

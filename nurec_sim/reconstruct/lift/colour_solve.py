@@ -22,7 +22,7 @@ from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.ego_images import shows_ego
 from nurec_sim.reconstruct.lift.colour import SATURATED
 from nurec_sim.reconstruct.lift.settings import LiftSettings, ViewSettings
-from nurec_sim.reconstruct.lift.shade import shading_boxes, unweigh_shaded
+from nurec_sim.reconstruct.lift.shade import movers, shading_boxes, unweigh_shaded
 from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, border_weight
 from nurec_sim.reconstruct.optimize.responses import borrowed_responses
 from nurec_sim.render.cpu.backward.colours import spread_errors, spread_sky_errors
@@ -153,7 +153,7 @@ class ColourSolve:
     """
 
     def __init__(self, scene: GaussianScene, trust: float, gain_pull: float) -> None:
-        self._scene, self._gain_pull = scene, gain_pull
+        self._scene, self._gain_pull, self._movers = scene, gain_pull, movers(scene.tracks)
         self._static, self._moving = pack(scene.static), PackedMoving.of(scene.dynamic, scene.tracks)
         self._sky = np.array(scene.sky, np.float32)
         shapes = ((len(self._static), BLOCK), (len(self._moving), BLOCK), self._sky.shape[:3])
@@ -186,7 +186,7 @@ class ColourSolve:
             right = (recorded > SATURATED) & (error < 0)
             error[right] = 0
             weight, sky_weight = (weights * ~(right[0] & right[1] & right[2])).astype(np.float32)
-            unweigh_shaded(view.directions, turn, eye, planes, shading_boxes(self._scene.tracks, image.t_us), weight)
+            unweigh_shaded(view.directions, turn, eye, planes, shading_boxes(self._movers, image.t_us), weight)
             shares = spread_errors(picture, planes, weight, error, self._workers)
             texels = np.zeros((*self._sky.shape[:3], 4), np.float32)
             spread_sky_errors(view.directions, turn, sky_weight * clear, error, texels)

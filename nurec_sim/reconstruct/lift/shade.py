@@ -19,11 +19,16 @@ ABOVE_M, BELOW_M = 0.1, 0.4
 """The ground lies between these, above and below the underside of the box."""
 
 
+def movers(tracks: Sequence[Track]) -> list[Track]:
+    """Those that move."""
+    return [track for track in tracks if np.ptp(track.path.position_m, axis=0).max() > MOVES_M]
+
+
 def shading_boxes(tracks: Sequence[Track], t_us: int) -> Float64[np.ndarray, "k 15"]:
-    """Boxes of the tracks that move, at a time: rows of ``unweigh_shaded``."""
+    """Boxes of movers that are there at a time: rows of ``unweigh_shaded``."""
     rows = []
     for track in tracks:
-        if track.path.covers(t_us) and np.ptp(track.path.position_m, axis=0).max() > MOVES_M:
+        if track.path.covers(t_us):
             box_from_world = geometry.inverse(track.path.at(t_us))
             length, width, height = track.size_m
             rows.append([*box_from_world[:3].ravel(), length / 2 + REACH_M, width / 2 + REACH_M, -height / 2])
@@ -42,12 +47,12 @@ def unweigh_shaded(direction, turn, eye, planes, boxes, weight):
         boxes: [k,15] see ``shading_boxes``: box_from_world, half the length and width of its reach, and its underside.
         weight: [h,w] changed.
     """
+    point = np.empty(3)
     for v in range(weight.shape[0]):
         for u in range(weight.shape[1]):
             if weight[v, u] == 0 or planes[0, v, u] < 0.5:
                 continue
             distance = planes[4, v, u] / planes[0, v, u]
-            point = np.empty(3)
             for r in range(3):
                 point[r] = eye[r]
                 for c in range(3):
