@@ -14,7 +14,7 @@ DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
 
 
 def trust(rollouts: Sequence[ReportRollout], worlds: Sequence[str]) -> str:
-    """How far from the recorded path each policy drove: what its sensors showed there was extrapolated.
+    """How far from the recorded path each policy drove, what its sensors showed there, and what another seed changes.
 
     Args:
         rollouts: all rollouts.
