@@ -46,12 +46,17 @@ def shown(value: object, unit: object) -> str:
 
 
 def fact_list(facts: Mapping[str, object]) -> str:
-    """Names and values side by side."""
-    rows = []
-    for key, value in facts.items():
-        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-        rows.append(f"<dt>{escape(str(key))}</dt><dd>{escape(str(text)[:2000])}</dd>")
+    """Names and values side by side; values that have names of their own are folded."""
+    rows = [f"<dt>{escape(str(name))}</dt><dd>{_fact(value)}</dd>" for name, value in facts.items()]
     return f"<dl>{''.join(rows)}</dl>"
+
+
+def _fact(value: object) -> str:
+    if isinstance(value, Mapping) and value:
+        names = ", ".join(escape(str(name)) for name in value)
+        return f"<details><summary>{names}</summary>{fact_list(value)}</details>"
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return escape(text[:2000])
 
 
 def meaning(name: str) -> str:

@@ -37,7 +37,7 @@ pre { white-space:pre-wrap; overflow-wrap:anywhere; background:#f1f5f9; border-r
 .plot { width:100%; min-height:120px; } #collisions { min-height:0; }
 ul { margin:6px 0; padding-left:22px; } li { margin:3px 0; }
 dl { display:grid; grid-template-columns:max-content 1fr; gap:3px 16px; margin:8px 0; } dt { color:var(--soft); }
-dd { margin:0; overflow-wrap:anywhere; }
+dd { margin:0; overflow-wrap:anywhere; } dd summary { cursor:pointer; }
 .columns { columns:2; column-gap:28px; } .columns table { break-inside:avoid; }
 .key { font-size:13px; color:var(--soft); margin:4px 0 0; }
 .dot { display:inline-block; width:10px; height:10px; border-radius:50%; margin-right:5px; }

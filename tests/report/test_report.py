@@ -21,6 +21,7 @@ from nurec_sim import geometry
 from nurec_sim.metrics import build_offroad_grid, find_contacts, metric_table, rollout_values, score_rollout, summarize
 from nurec_sim.metrics.series import METRICS
 from nurec_sim.report import ReportRollout, ReportScene, RunReport, Video, render_report
+from nurec_sim.report.cells import fact_list
 from nurec_sim.report.plan import PlanAxes, plan_view
 from nurec_sim.types import Trajectory
 
@@ -186,3 +187,12 @@ def test_many_scenes_get_intervals(report):
     page = words(render_report(RunReport("r", "alpasim", (), tuple(entries), values, summarize(values))))
     assert "[0 %, 100 %]" in page and "bootstrap interval over scenes" in page and "collisions unknown" in page
     assert "truncated when the ego is 4 m off the recorded path" in page
+
+
+def test_settings_within_settings_are_folded_and_escaped():
+    shown = fact_list({"method": "lift", "settings": {"views": {"levels": 72}, "<sky>": 512}})
+    views = "<details><summary>levels</summary><dl><dt>levels</dt><dd>72</dd></dl></details>"
+    assert shown == (
+        "<dl><dt>method</dt><dd>lift</dd><dt>settings</dt><dd><details><summary>views, &lt;sky&gt;</summary>"
+        f"<dl><dt>views</dt><dd>{views}</dd><dt>&lt;sky&gt;</dt><dd>512</dd></dl></details></dd></dl>"
+    )
