@@ -17,7 +17,7 @@ from nurec_sim.network.lidar.profiles import LIDAR_PROFILES
 from nurec_sim.reconstruct import FeedForwardSettings, LidarSettings, LiftSettings, OptimizeSettings, load_method
 from nurec_sim.render import make_renderer
 from nurec_sim.render.device import Renderer
-from nurec_sim.types import CameraFrame, CameraModel, Clip, GaussianScene, Sense, SensorRequest
+from nurec_sim.types import ActorsName, CameraFrame, CameraModel, Clip, GaussianScene, Sense, SensorRequest
 
 Show = Callable[[SensorRequest], CameraFrame]
 """Renders a camera image; without ``depth_m`` if the method has no depth."""
@@ -158,6 +158,7 @@ def describe(contender: Contender) -> dict[str, Any]:
     settings = contender.settings
     if settings is None:
         return described
+    described["actors"] = _actors_for(contender)
     values = dataclasses.asdict(settings)
     if isinstance(settings, (FeedForwardSettings, LidarSettings)):
         from nurec_sim.network.checkpoints.download import find_weights, sha256
@@ -187,7 +188,11 @@ def build(contender: Contender, window: Window, device: str = "auto") -> Built:
     _look(window, sweeps=_sees_lidar(contender))
     started = time.perf_counter()
     scene = reconstruct(
-        window.clip, contender.method, cameras=window.cameras, settings=contender.settings, actors="recorded"
+        window.clip,
+        contender.method,
+        cameras=window.cameras,
+        settings=contender.settings,
+        actors=_actors_for(contender),
     )
     renderer, spent = make_renderer(scene, device), time.perf_counter() - started
     return Built(lambda request: renderer.render_camera(request, ("rgb", "depth")), scene, spent, renderer)
@@ -196,6 +201,11 @@ def build(contender: Contender, window: Window, device: str = "auto") -> Built:
 def _sees_lidar(contender: Contender) -> bool:
     settings = contender.settings
     return settings.lidar_depth != "off" if isinstance(settings, FeedForwardSettings) else settings is not None
+
+
+def _actors_for(contender: Contender) -> ActorsName:
+    """Whose objects move. Without boxes, methods that read sweeps find what moves in them, as ``reconstruct`` does."""
+    return "auto" if _sees_lidar(contender) else "recorded"
 
 
 def _look(window: Window, sweeps: bool) -> None:

@@ -8,7 +8,7 @@ from evaluation_worlds import StreetProtocol
 
 from nurec_sim.errors import ReconstructError, RunError, WeightsError
 from nurec_sim.evaluate import contenders, run_protocol
-from nurec_sim.evaluate.methods import CHOICES, describe, without_weights
+from nurec_sim.evaluate.methods import CHOICES, build, describe, without_weights
 from nurec_sim.reconstruct import FeedForwardSettings, LiftSettings, PointSettings, ViewSettings
 
 pytestmark = pytest.mark.slow
@@ -110,6 +110,30 @@ def test_a_method_that_fails_is_a_row_with_its_error():
     assert "max_chunks is 1" in results["windows"][0]["methods"]["dense"]["error"]
     assert dense["failed"] == 1 and dense["full"]["psnr_db"] is None
     assert results["summary"]["methods"]["copy"]["full"]["psnr_db"] > 5
+
+
+def test_without_boxes_methods_that_read_sweeps_find_what_moves(monkeypatch):
+    given = {}
+
+    def spy(clip, method, *, actors, settings, **rest):
+        given[method, getattr(settings, "lidar_depth", None)] = actors
+        raise ReconstructError("enough")
+
+    monkeypatch.setattr("nurec_sim.reconstruct.reconstruct", spy)
+    methods = contenders(("dense", "selective", "dense-lidar", "lidar", "lift", "optimized"), NETWORK)
+    with StreetProtocol("storm", (1,)).window(0) as window:
+        for method in methods:
+            with pytest.raises(ReconstructError, match="enough"):
+                build(method, window)
+    assert given == {
+        ("dense", "off"): "recorded",
+        ("selective", "off"): "recorded",
+        ("dense", "local"): "auto",
+        ("lidar", None): "auto",
+        ("lift", None): "auto",
+        ("optimized", None): "auto",
+    }
+    assert [describe(method)["actors"] for method in methods] == list(given.values())
 
 
 def test_choosing_methods():
