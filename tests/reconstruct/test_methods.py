@@ -63,7 +63,7 @@ def test_installed_methods_are_listed_and_compared(dots, file, monkeypatch):
     assert available_methods() == ["dense", "dots", "lidar", "lift", "optimized", "selective"]
     one, two = contenders(("dots", "copy"))
     assert (one.name, one.settings) == ("dots", dots.settings()) and two.name == "copy"
-    assert describe(one) == {"method": "dots", "settings": {"every": 10, "radius_m": 0.1}}
+    assert describe(one) == {"method": "dots", "actors": "auto", "settings": {"every": 10, "radius_m": 0.1}}
     (by_file,) = contenders((str(file),))
     assert by_file.name == "dots"
     with pytest.raises(
