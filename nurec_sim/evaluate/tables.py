@@ -62,7 +62,9 @@ def _paper_table(results: Mapping[str, Any]) -> Table:
         cells = [name, *_paper_cells(row["full"])]
         rows.append(tuple(cells + _paper_cells(row["dynamic"]) if storm else cells))
     views = max((row["views"] for row in methods.values()), default=0)
-    boxes = "with the log's boxes" if protocol["boxes"] else "without boxes, as the paper's network; those that read sweeps find what moves in them"
+    boxes = "with the log's boxes"
+    if not protocol["boxes"]:
+        boxes = "without boxes, as the paper's network; those that read sweeps find what moves in them"
     windows = count_of(len(results["windows"]), "window")
     note = (
         f"{windows}, {views} views per method. Depth after per-frame least-squares scale, as in the paper; true depth "
