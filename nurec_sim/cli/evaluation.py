@@ -91,7 +91,8 @@ class ProtocolFlags:
     clips: tuple[Path, ...] = ()
     """Protocol: recorded logs instead of procedural worlds."""
     boxes: bool = False
-    """Protocol: give the methods the log's boxes of movable objects; the paper's network uses none."""
+    """Protocol: give the methods the log's boxes of movable objects; the paper's network uses none. Without them,
+    methods that read sweeps find what moves."""
     seconds: float = 10.0
     """Protocol: length of a clip, 2 to 20."""
     clip_cameras: Literal[1, 3] = 3
