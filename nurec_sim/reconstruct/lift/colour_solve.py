@@ -21,6 +21,7 @@ from nurec_sim.compute.cores import in_order, usable_cores
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.ego_images import shows_ego
 from nurec_sim.reconstruct.lift.colour import SATURATED
+from nurec_sim.reconstruct.lift.image_errors import BYTE, LEAST_CLEAR, image_errors
 from nurec_sim.reconstruct.lift.settings import LiftSettings, ViewSettings
 from nurec_sim.reconstruct.lift.shade import movers, shading_boxes, unweigh_shaded
 from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, border_weight
@@ -162,8 +163,8 @@ class ColourSolve:
         self.responses: dict[tuple[str, int], np.ndarray] = {}
         """By camera and frame, [3,4]."""
 
-    def step(self, image: SolvedImage) -> float:
-        """Take the errors of an image back to the colours; returns the mean of their squares, before."""
+    def step(self, image: SolvedImage) -> None:
+        """Take the errors of an image back to the colours."""
         with self._buffers.lend() as scratch:
             sensor = SENSORS.tables(image.camera)
             view = ExactView.of(sensor.grid, image.world_from_camera)
@@ -175,21 +176,18 @@ class ColourSolve:
             planes = draw([picture], self._workers)[0]
             height, width = image.rgb.shape[:2]
             clear = 1 - planes[0, :height, :width]
-            shown = planes[1:4, :height, :width]
-            shown = shown + clear * draw_sky(view.directions, turn, self._sky, self._workers, clear)
-            recorded = image.rgb.transpose(2, 0, 1).astype(np.float32) / np.float32(255)
-            weights = image.weights * (sensor.grid.valid > 0)
-            response = self._fit_response(image, shown, recorded, weights[0])
-            back = np.linalg.inv(response[:, :3])
-            wanted = np.einsum("ij,jhw->ihw", back, recorded - response[:, 3, None, None]).astype(np.float32)
-            error = wanted - shown
-            right = (recorded > SATURATED) & (error < 0)
-            error[right] = 0
-            weight, sky_weight = (weights * ~(right[0] & right[1] & right[2])).astype(np.float32)
+            clear[clear < LEAST_CLEAR] = 0
+            behind = draw_sky(view.directions, turn, self._sky, self._workers, clear)
+            response = self._fit_response(image, planes, clear, behind, sensor.grid.valid)
+            error, weight, sky_weight = np.empty_like(behind), np.empty_like(clear), np.empty_like(clear)
+            self._workers.run(image_errors, [
+                (*rows, image.rgb, response, planes, clear, behind, image.weights, sensor.grid.valid, error, weight,
+                 sky_weight) for rows in self._workers.ranges(height, 16)
+            ])  # fmt: skip
             unweigh_shaded(view.directions, turn, eye, planes, shading_boxes(self._movers, image.t_us), weight)
             shares = spread_errors(picture, planes, weight, error, self._workers)
             texels = np.zeros((*self._sky.shape[:3], 4), np.float32)
-            spread_sky_errors(view.directions, turn, sky_weight * clear, error, texels)
+            spread_sky_errors(view.directions, turn, sky_weight, error, texels)
             # Placed blocks of the moving layer follow each other as those they were made from.
             placed = np.flatnonzero(np.isin(self._moving.index[:, 0], moving.index.reshape(-1, BLOCK)[:, 0]))
             changes = [(layers[0][1], layers[0][1], shares[0], self._seen[0], self._static.fields),
@@ -199,21 +197,23 @@ class ColourSolve:
                   for low, high in self._workers.ranges(len(blocks), 16)),
                 *((_change_sky, *face) for face in zip(texels, self._seen[2], self._sky, strict=True)),
             ])  # fmt: skip
-        return float((weight * error**2).mean())
 
     def _fit_response(
         self,
         image: SolvedImage,
-        shown: Float32[np.ndarray, "3 h w"],
-        recorded: Float32[np.ndarray, "3 h w"],
-        weight: Float32[np.ndarray, "h w"],
+        planes: Float32[np.ndarray, "6 y x"],
+        clear: Float32[np.ndarray, "h w"],
+        behind: Float32[np.ndarray, "3 h w"],
+        valid: Float32[np.ndarray, "h w"],
     ) -> Float64[np.ndarray, "3 4"]:
         """The frame's response: its camera's, then a gain and an offset per channel, by robust least squares."""
         isp = np.asarray(self._scene.isp.get(image.camera.id, np.eye(3, 4)), np.float64)
-        some = (slice(None, None, FIT_PX), slice(None, None, FIT_PX))
-        x = np.einsum("ij,jn->in", isp[:, :3], shown[:, *some].reshape(3, -1)) + isp[:, 3:]
-        y = recorded[:, *some].reshape(3, -1).astype(np.float64)
-        counts = weight[some].ravel() * (y < SATURATED)
+        height, width = clear.shape
+        some = (slice(0, height, FIT_PX), slice(0, width, FIT_PX))
+        shown = (planes[1:4, *some] + clear[some] * behind[:, *some]).reshape(3, -1)
+        x = np.einsum("ij,jn->in", isp[:, :3], shown) + isp[:, 3:]
+        y = (image.rgb[some].reshape(-1, 3).T.astype(np.float32) / BYTE).astype(np.float64)
+        counts = (image.weights[0][some] * (valid[some] > 0)).ravel() * (y < SATURATED)
         response = isp.copy()
         for c in range(3):
             gain, offset, pull = 1.0, 0.0, self._gain_pull * counts[c].sum() + 1e-9

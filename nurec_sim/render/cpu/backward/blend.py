@@ -42,7 +42,9 @@ S_XX, S_XY, S_YY, S_XW, S_YW, S_WX, S_WY, S_WW, S_FLAT, S_FADE, S_FEATURE = 0, 1
 SUMS = 16
 
 COLOURS = 3
-"""An output kind of the backward pass alone: sums of weights times features, and of weights (in S_FADE), no more."""
+"""An output kind of the backward pass alone: sums of weights (in S_FADE) and of weights times features, no more."""
+COLOUR_SUMS = 4
+"""So many, from S_FADE on."""
 
 
 def _carrying_back(mode: int, output_kind: int, check_near: bool) -> Callable[..., Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
-from nurec_sim.render.cpu.backward.blend import COLOURS, IMAGE_PLANES, S_FADE, S_FEATURE
+from nurec_sim.render.cpu.backward.blend import COLOUR_SUMS, COLOURS, IMAGE_PLANES
 from nurec_sim.render.cpu.backward.frame import carry_back
 from nurec_sim.render.cpu.blend.background import find_face, find_place, turned
 from nurec_sim.render.cpu.kernel import kernel
@@ -35,9 +35,8 @@ def _gather(first, count, projected, slots, shares):
         tiles = tile_count(spans, i)
         row = projected.sources[i]
         for slot in range(slots.first[i], slots.first[i] + tiles):
-            shares[row, 0] += slots.sums[slot, S_FADE]
-            for k in range(3):
-                shares[row, 1 + k] += slots.sums[slot, S_FEATURE + k]
+            for k in range(COLOUR_SUMS):
+                shares[row, k] += slots.sums[slot, k]
 
 
 def spread_errors(

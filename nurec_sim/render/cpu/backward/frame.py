@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from nurec_sim.compute.cores import usable_cores
-from nurec_sim.render.cpu.backward.blend import IMAGE_PLANES, SUMS
+from nurec_sim.render.cpu.backward.blend import COLOUR_SUMS, COLOURS, IMAGE_PLANES, SUMS
 from nurec_sim.render.cpu.backward.project import project_back
 from nurec_sim.render.cpu.backward.repack import RawGaussians, repack
 from nurec_sim.render.cpu.backward.tiles import RecordSlots, draw_tiles_back, number_slots
@@ -201,7 +201,8 @@ def carry_back(
     counts = np.array([count for _, _, count in picture.runs], np.int64)
     first_slot = picture.scratch("first slot", (picture.capacity,), np.int64)
     pairs = number_slots(picture.projected.spans, starts, counts, first_slot)
-    slots = RecordSlots(first_slot, picture.scratch("slots", (pairs, SUMS), np.float32))
+    width = COLOUR_SUMS if output_kind == COLOURS else SUMS
+    slots = RecordSlots(first_slot, picture.scratch("slots", (pairs, width), np.float32))
     rays = sensor_rays(picture)
     workers.run(
         draw_tiles_back,

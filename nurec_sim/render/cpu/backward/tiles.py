@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from nurec_sim.render.cpu.backward.blend import (
+    COLOUR_SUMS,
     COLOURS,
+    S_FADE,
     STATE_PLANES,
     SUMS,
     back_affine_camera,
@@ -68,7 +70,7 @@ class RecordSlots(NamedTuple):
     first: Int64[np.ndarray, " n"]
     """First slot of each record, see ``number_slots``."""
     sums: Float32[np.ndarray, "slots 16"]
-    """See ``blend``."""
+    """See ``blend``; of COLOURS only those from S_FADE on, [slots,4]: slots lie all over the memory."""
 
 
 @inner
@@ -102,8 +104,12 @@ def _keep_sums(sums, lists, first, last, spans, slots, row, column):
         # Slots of a record are numbered row by row over its span of tiles.
         slot = np.uint64(slots.first[i] + (row - top) * (right - left + 1) + column - left)
         entry = np.uint64(j - first)
-        for k in range(SUMS):
-            slots.sums[slot, np.uint64(k)] = sums[entry, np.uint64(k)]
+        if slots.sums.shape[1] == COLOUR_SUMS:
+            for k in range(COLOUR_SUMS):
+                slots.sums[slot, np.uint64(k)] = sums[entry, np.uint64(S_FADE + k)]
+        else:
+            for k in range(SUMS):
+                slots.sums[slot, np.uint64(k)] = sums[entry, np.uint64(k)]
 
 
 @kernel
