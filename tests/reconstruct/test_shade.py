@@ -42,7 +42,7 @@ def test_ground_beneath_and_beside_a_mover_is_shaded(point, shaded):
     direction = (turn.T @ ray / distance).reshape(1, 1, 3)
     planes = np.array([0.8, 0, 0, 0, 0.8 * distance, 0]).reshape(6, 1, 1)
     weight = np.ones((1, 1), np.float32)
-    unweigh_shaded(direction, turn, eye, planes, shading_boxes([track(4.0)], 0), weight)
+    unweigh_shaded(0, len(weight), direction, turn, eye, planes, shading_boxes([track(4.0)], 0), weight)
     assert weight[0, 0] == (not shaded)
 
 

@@ -10,6 +10,7 @@ an offset per channel, because exposure changes from frame to frame.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -160,6 +161,7 @@ class ColourSolve:
         shapes = ((len(self._static), BLOCK), (len(self._moving), BLOCK), self._sky.shape[:3])
         self._seen = [np.full(shape, trust, np.float32) for shape in shapes]
         self._workers, self._buffers = Workers(usable_cores()), Buffers()
+        self._beside = ThreadPoolExecutor(1)
         self.responses: dict[tuple[str, int], np.ndarray] = {}
         """By camera and frame, [3,4]."""
 
@@ -180,14 +182,16 @@ class ColourSolve:
             behind = draw_sky(view.directions, turn, self._sky, self._workers, clear)
             response = self._fit_response(image, planes, clear, behind, sensor.grid.valid)
             error, weight, sky_weight = np.empty_like(behind), np.empty_like(clear), np.empty_like(clear)
-            self._workers.run(image_errors, [
-                (*rows, image.rgb, response, planes, clear, behind, image.weights, sensor.grid.valid, error, weight,
-                 sky_weight) for rows in self._workers.ranges(height, 16)
-            ])  # fmt: skip
-            unweigh_shaded(view.directions, turn, eye, planes, shading_boxes(self._movers, image.t_us), weight)
-            shares = spread_errors(picture, planes, weight, error, self._workers)
+            rows, valid = self._workers.ranges(height, 16), sensor.grid.valid
+            pixels = (image.rgb, response, planes, clear, behind, image.weights, valid, error, weight, sky_weight)
+            self._workers.run(image_errors, [(*part, *pixels) for part in rows])
+            if len(boxes := shading_boxes(self._movers, image.t_us)):
+                shaded = (view.directions, turn, eye, planes, boxes, weight)
+                self._workers.run(unweigh_shaded, [(*part, *shaded) for part in rows])
             texels = np.zeros((*self._sky.shape[:3], 4), np.float32)
-            spread_sky_errors(view.directions, turn, sky_weight, error, texels)
+            sky = self._beside.submit(spread_sky_errors, view.directions, turn, sky_weight, error, texels)
+            shares = spread_errors(picture, planes, weight, error, self._workers)
+            sky.result()
             # Placed blocks of the moving layer follow each other as those they were made from.
             placed = np.flatnonzero(np.isin(self._moving.index[:, 0], moving.index.reshape(-1, BLOCK)[:, 0]))
             changes = [(layers[0][1], layers[0][1], shares[0], self._seen[0], self._static.fields),

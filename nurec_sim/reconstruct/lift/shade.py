@@ -36,10 +36,12 @@ def shading_boxes(tracks: Sequence[Track], t_us: int) -> Float64[np.ndarray, "k 
 
 
 @kernel
-def unweigh_shaded(direction, turn, eye, planes, boxes, weight):
-    """Weights of 0 for pixels that show ground beneath or beside a box.
+def unweigh_shaded(first, last, direction, turn, eye, planes, boxes, weight):
+    """Weights of 0 for pixels of some rows that show ground beneath or beside a box.
 
     Args:
+        first: first row.
+        last: one behind the last.
         direction: [h,w,3] unit rays of the pixels.
         turn: [3,3] from their frame to the world.
         eye: [3] where they start, metres.
@@ -48,7 +50,7 @@ def unweigh_shaded(direction, turn, eye, planes, boxes, weight):
         weight: [h,w] changed.
     """
     point = np.empty(3)
-    for v in range(weight.shape[0]):
+    for v in range(first, last):
         for u in range(weight.shape[1]):
             if weight[v, u] == 0 or planes[0, v, u] < 0.5:
                 continue
