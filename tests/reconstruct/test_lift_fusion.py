@@ -9,6 +9,7 @@ import pytest
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lift import depth, fusion, lifting
 from nurec_sim.reconstruct.lift.settings import ViewSettings
+from nurec_sim.reconstruct.lift.smoothing import PRIOR_COST, UNIT
 from nurec_sim.reconstruct.lift.splat import project_point, world_point
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 
@@ -129,18 +130,18 @@ def test_levels_are_four_times_finer_at_infinity_than_on_average():
 
 def test_the_sky_is_charged_for_surfaces_and_surfaces_for_all_levels_of_the_sky():
     """Levels at infinity, 500, 286, 100 and 50 m."""
-    cost = np.zeros((1, 3, 5), np.float32)
-    sky = np.array([[depth.SKY, depth.NOT_SKY, depth.MAYBE_SKY]], np.uint8)
-    depth.add_prior(cost, np.zeros((1, 3), np.float32), sky, np.array([0, 0.002, 0.0035, 0.01, 0.02]))
-    assert cost[0].tolist() == [[0, 0, 0, 60, 60], [40, 40, 40, 0, 0], [0, 0, 0, 0, 0]]
+    cost = np.zeros((3, 5), np.int16)
+    sky = np.array([depth.SKY, depth.NOT_SKY, depth.MAYBE_SKY], np.uint8)
+    levels = np.array([0, 0.002, 0.0035, 0.01, 0.02])
+    depth.add_sky(cost, sky, depth.surface_levels(levels))
+    assert (cost / UNIT).tolist() == [[0, 0, 0, 60, 60], [40, 40, 40, 0, 0], [0, 0, 0, 0, 0]]
 
 
-def test_a_measured_depth_between_two_levels_costs_by_its_distance_in_levels():
-    """0.0125 lies a quarter of the way from the level 0.01 to the next."""
-    cost = np.zeros((1, 1, 4), np.float32)
-    prior = np.full((1, 1), 0.0125, np.float32)
-    depth.add_prior(cost, prior, np.zeros((1, 1), np.uint8), np.array([0, 0.01, 0.02, 0.04]))
-    assert cost[0, 0].tolist() == pytest.approx([40 * 1.25, 40 * 0.25, 40 * 0.75, 40 * 1.75], rel=1e-4)
+def test_measured_depths_lie_between_levels():
+    """0.0125 lies a quarter of the way from the level 0.01 to the next, 0.05 half a level beyond the last."""
+    prior = np.array([[0.0125, 0, 0.05]], np.float32)
+    at = depth.measured_levels(prior, np.array([0, 0.01, 0.02, 0.04]))
+    assert at.tolist() == [[1.25 * PRIOR_COST, -1, 3.5 * PRIOR_COST]]
 
 
 def test_sky_reaches_the_upper_end_and_is_wider_than_a_pole():

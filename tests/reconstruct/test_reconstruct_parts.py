@@ -9,6 +9,7 @@ from reconstruct_street import KERB_M, STEP_M, Street, camera
 from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.lift import colour, depth, lifting, road, splat
 from nurec_sim.reconstruct.lift.ground import find_ground
+from nurec_sim.reconstruct.lift.matching import census
 from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather
 from nurec_sim.reconstruct.lift.settings import (
     ColourSettings,
@@ -182,7 +183,7 @@ def test_census_tells_the_clearly_darker_neighbours_row_by_row():
     """Of the middle of 7 x 7 equal pixels the first neighbour is 2 darker, the last 3, the second 1: too little."""
     gray = np.full((7, 7), 100, np.uint8)
     gray[0, 0], gray[0, 1], gray[6, 6] = 98, 99, 97
-    assert int(depth.census(gray)[3, 3]) == (1 << 47) | 1
+    assert int(census(gray)[3, 3]) == (1 << 47) | 1
 
 
 def test_one_scan_line_faces_the_sensor():
@@ -291,7 +292,7 @@ def test_depth_is_found_by_matching_where_nothing_was_measured():
     views = read_views(clip, ["front"], {}, ViewSettings())
     step, levels = 1 / 3.5 / 47, 48
     empty = np.zeros((96, 192), np.float32)
-    around = [(v.packed, v.rgb, depth.census(v.rgb.mean(axis=-1).astype(np.uint8))) for v in views[1:]]
+    around = [(v.packed, v.rgb, census(v.rgb.mean(axis=-1).astype(np.uint8))) for v in views[1:]]
     no_sky = np.full((96, 192), depth.NOT_SKY, np.uint8)
     found = depth.dense_inverse_depth(views[0].packed, views[0].world_from_view, views[0].rgb, empty, no_sky, around,
                                       step * np.arange(levels))  # fmt: skip
