@@ -10,16 +10,21 @@ from jaxtyping import Bool, Float32, Int32
 
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
+from nurec_sim.compute.kernels import inner, kernel
 from nurec_sim.reconstruct.lift import depth, lifting
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.fusion import fused_depths
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
 from nurec_sim.reconstruct.lift.settings import LiftSettings
-from nurec_sim.reconstruct.lift.splat import draw_surfels, trim_silhouettes
+from nurec_sim.reconstruct.lift.splat import draw_surfels, trim_silhouettes, world_point
 from nurec_sim.reconstruct.lift.views import WorkingView
 
 OUTLINE_M = 0.6
 """Unmeasured pixels up to this far outside of a box may show its object."""
+MARGIN_M = 0.1
+"""Pixels this far outside of a box belong to it: boxes are not exact."""
+FARTHEST = 1e-3
+"""1/m; pixels at infinity are taken to lie at this inverse depth."""
 
 
 @dataclass(frozen=True)
@@ -116,29 +121,66 @@ def _draw(view: WorkingView, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.
 def _bodies_of_pixels(view: WorkingView, bodies: Sequence[Surfels], dense: np.ndarray, drawn: np.ndarray) -> np.ndarray:
     """Body number per pixel: that of the actor's surfel, else of the box that the pixel lies in, else the world (0)."""
     body = np.where(drawn >= 0, drawn, 0).astype(np.int32)
-    open_pixels = (drawn <= 0) & (dense > 0)
-    if len(bodies) > 1 and open_pixels.any():
-        xyz = lifting.points_of(view, dense)[open_pixels]
-        found, unmeasured = np.zeros(len(xyz), np.int32), (drawn < 0)[open_pixels]
-        for number, surfels in enumerate(bodies[1:], start=1):
-            if not surfels.present(view.t_us):
-                continue
-            world_from_box, size = surfels.world_from_body(view.t_us), surfels.box_size_m
-            # Only pixels near the box are taken into its frame: most are far from most boxes.
-            reach = float(np.linalg.norm(np.array(size) / 2 + OUTLINE_M))
-            near = np.flatnonzero(geometry.points_in_box(xyz - world_from_box[:3, 3], (0.0, 0.0, 0.0), reach))
-            box = geometry.transform_points(geometry.inverse(world_from_box), xyz[near])
-            # The lowest 15 cm of a box are road more often than tyre.
-            upper = box[:, 2] > -size[2] / 2 + 0.15
-            inside = geometry.points_in_box(box, size, 0.1) & upper
-            free = found[near] <= 0
-            # Unmeasured pixels just outside a box are its silhouette at a wrong depth: nobody's.
-            rim = ~inside & (found[near] == 0) & unmeasured[near]
-            rim &= geometry.points_in_box(box, size, OUTLINE_M) & upper
-            found[near[inside & free]] = number
-            found[near[rim]] = NOBODY
-        body[open_pixels] = found
+    numbers = [n for n, surfels in enumerate(bodies) if n > 0 and surfels.present(view.t_us)]
+    if numbers:
+        world_from_box = np.stack([bodies[n].world_from_body(view.t_us) for n in numbers])
+        size = np.array([bodies[n].box_size_m for n in numbers], np.float64)
+        numbers_of_pixels(
+            view.packed, view.world_from_view, dense, drawn, np.array(numbers), world_from_box,
+            geometry.inverse(world_from_box), size, body,
+        )  # fmt: skip
     return body
+
+
+@kernel
+def numbers_of_pixels(view, world_from_view, dense, drawn, numbers, world_from_box, box_from_world, size, body):
+    """Write into ``body`` the box that open pixels lie in: those that show no actor's surfel, and are not at infinity.
+
+    Args:
+        view: [23] packed projection of the view.
+        world_from_view: [4,4] its pose.
+        dense: [h,w] inverse depth, 1/m; NaN where there is none.
+        drawn: [h,w] body of the surfel that a pixel shows, negative where none does.
+        numbers: [k] of the boxes' bodies; of several the first one counts.
+        world_from_box: [k,4,4].
+        box_from_world: [k,4,4].
+        size: [k,3] metres.
+        body: [h,w] changed.
+    """
+    m = world_from_view
+    reach = np.sqrt(((size / 2 + OUTLINE_M) ** 2).sum(axis=1))
+    for row in range(dense.shape[0]):
+        for column in range(dense.shape[1]):
+            if drawn[row, column] > 0 or not dense[row, column] > 0:
+                continue
+            x, y, z = world_point(view, m, column + 0.5, row + 0.5, max(np.float64(dense[row, column]), FARTHEST))
+            for k in range(len(numbers)):
+                # Most pixels are far from most boxes.
+                dx, dy = x - world_from_box[k, 0, 3], y - world_from_box[k, 1, 3]
+                if abs(dx) > reach[k] or abs(dy) > reach[k] or abs(z - world_from_box[k, 2, 3]) > reach[k]:
+                    continue
+                up = _along(box_from_world, k, 2, x, y, z)
+                # The lowest 15 cm of a box are road more often than tyre.
+                if not up > -size[k, 2] / 2 + 0.15:
+                    continue
+                ahead, left = abs(_along(box_from_world, k, 0, x, y, z)), abs(_along(box_from_world, k, 1, x, y, z))
+                off = max(max(ahead - size[k, 0] / 2, left - size[k, 1] / 2), abs(up) - size[k, 2] / 2)
+                if off <= MARGIN_M:
+                    body[row, column] = numbers[k]
+                    break
+                # Unmeasured pixels just outside a box are its silhouette at a wrong depth: nobody's.
+                if off <= OUTLINE_M and drawn[row, column] < 0:
+                    body[row, column] = NOBODY
+
+
+@inner
+def _along(box_from_world, k, axis, x, y, z):
+    return (
+        box_from_world[k, axis, 0] * x
+        + box_from_world[k, axis, 1] * y
+        + box_from_world[k, axis, 2] * z
+        + box_from_world[k, axis, 3]
+    )
 
 
 def neighbours_of(views: Sequence[WorkingView], k: int, count: int) -> list[int]:
