@@ -15,6 +15,7 @@ from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 
 SHAPE, FOCAL, TOLERANCE = (6, 12), 20.0, 0.001
 WALL = np.float32(0.1)
+NUMBERS = np.arange(72).reshape(SHAPE)
 
 
 def view_at(right_m, drift_m=(0.0, 0.0, 0.0), fraction=(0.0, 0.0, 0.0), turn=None):
@@ -80,7 +81,7 @@ def test_a_farther_depth_wins_only_if_more_neighbours_look_through_the_near_one(
     shown = np.stack([np.full(SHAPE, np.float32(w)) for w in seen])
     view = view_at(0.0)
     found = fusion.fuse(
-        own, np.zeros(SHAPE, bool), candidates, view.packed, view.world_from_view, others, shown, TOLERANCE
+        own, NUMBERS, candidates.reshape(3, -1), view.packed, view.world_from_view, others, shown, TOLERANCE
     )
     assert found[3, 6] == pytest.approx(result, rel=1e-6)
 
@@ -89,7 +90,7 @@ def test_the_own_depth_stays_where_another_has_no_more_support():
     own, view = np.full(SHAPE, np.float32(0.2)), view_at(0.0)
     candidates = np.stack([np.full(SHAPE, np.float32(w)) for w in (0.3, 0.2, 0.3)])
     none = np.zeros((0, 23)), np.zeros((0, *SHAPE), np.float32)
-    found = fusion.fuse(own, np.zeros(SHAPE, bool), candidates, view.packed, view.world_from_view, *none, TOLERANCE)
+    found = fusion.fuse(own, NUMBERS, candidates.reshape(3, -1), view.packed, view.world_from_view, *none, TOLERANCE)
     assert found[3, 6] == pytest.approx(0.2, rel=1e-6)
 
 
@@ -97,9 +98,16 @@ def test_the_nearest_of_what_falls_into_a_pixel_is_shown():
     """A pole at 5 m moves right by 2 pixels, the wall by 1: the pole hides the wall's next column and bares its own."""
     depths = walls(1)[0]
     depths[:, 6] = 0.2
-    shown = np.full(SHAPE, np.nan, np.float32)
-    fusion.warp(view_at(0.0).packed, view_at(0.0).world_from_view, depths, view_at(-0.5).packed, shown)
-    assert shown[3].tolist() == pytest.approx([np.nan] + [0.1] * 6 + [np.nan, 0.2] + [0.1] * 3, nan_ok=True)
+    depths[3, 11] = np.nan
+    points = fusion.points_of(view_at(0.0).packed, view_at(0.0).world_from_view, depths, np.ones(SHAPE, bool))
+    assert len(points) == 6 * 12 - 1
+    # The second row is not asked about.
+    asked = np.where(np.arange(6)[:, None] == 1, -1, NUMBERS - 12 * (NUMBERS >= 24))
+    shown = np.full(60, np.nan, np.float32)
+    fusion.warp(points, view_at(-0.5).packed, asked, shown)
+    assert shown.reshape(5, 12)[2].tolist() == pytest.approx(
+        [np.nan] + [0.1] * 6 + [np.nan, 0.2] + [0.1] * 3, nan_ok=True
+    )
 
 
 def test_neighbours_are_the_nearest_that_look_the_same_way():

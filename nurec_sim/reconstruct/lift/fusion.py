@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int32
 
 from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import kernel
@@ -46,26 +46,45 @@ def fused_depths(
         tolerance: 1/m, see ``AGREE``.
         rounds: each spreads agreement to the neighbours of neighbours.
     """
-    around = nearest_views(views)
+    around, everyone = nearest_views(views), range(len(views))
     packed = np.stack([view.packed for view in views]) if views else np.zeros((0, 23))
     poses = [view.world_from_view for view in views]
+    numbers = [_numbered(~kept & (depth >= 0)) for depth, kept in zip(depths, fixed, strict=True)]
+
+    def shown(k: int, points: Sequence[np.ndarray], seen: Float32[np.ndarray, "n open"]) -> np.ndarray:
+        for row, n in enumerate(around[k]):
+            warp(points[n], packed[k], numbers[k], seen[row])
+        return seen
 
     def one(k: int) -> Float32[np.ndarray, "h w"]:
         near = around[k]
         if not near:
             return before[k]
-        candidates = np.full((len(near), *before[k].shape), np.nan, np.float32)
-        for shown, n in zip(candidates, near, strict=True):
-            warp(packed[n], poses[n], before[n], packed[k], shown)
         return fuse(
-            before[k], fixed[k], candidates, packed[k], poses[k], packed[near], stacked([before[n] for n in near]),
-            tolerance,
+            before[k], numbers[k], shown(k, points, measured[k].copy()), packed[k], poses[k], packed[near],
+            stacked([before[n] for n in near]), tolerance,
         )  # fmt: skip
 
+    def points_where(masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+        return list(in_order(lambda k: points_of(packed[k], poses[k], before[k], masks[k]), everyone))
+
     before = list(depths)
+    if not rounds:
+        return before
+    # What is measured stays, so its points are taken to the neighbours only once.
+    points = points_where(fixed)
+    nothing = [np.full((len(near), number.max(initial=-1) + 1), np.nan, np.float32)
+               for near, number in zip(around, numbers, strict=True)]  # fmt: skip
+    measured = list(in_order(lambda k: shown(k, points, nothing[k]), everyone))
     for _ in range(rounds):
-        before = list(in_order(one, range(len(views))))
+        points = points_where([number >= 0 for number in numbers])
+        before = list(in_order(one, everyone))
     return before
+
+
+def _numbered(mask: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "h w"]:
+    """The pixels of a mask numbered row by row; -1 elsewhere."""
+    return np.where(mask, np.cumsum(mask).reshape(mask.shape) - 1, -1).astype(np.int32)
 
 
 def nearest_views(views: Sequence[WorkingView]) -> list[list[int]]:
@@ -82,37 +101,54 @@ def nearest_views(views: Sequence[WorkingView]) -> list[list[int]]:
 
 
 @kernel
-def warp(view, world_from_view, depth, other, shown):
-    """What another view shows if the world is as this view sees it: its nearest points, in the pixels they fall in.
+def points_of(view, world_from_view, depth, mask):
+    """World points [n,3] of a view's pixels in a mask.
 
     Args:
         view: [23] packed projection (``WorkingView.packed``).
         world_from_view: [4,4] its pose.
-        depth: [h,w] its inverse depth, 1/m.
-        other: [23] packed projection of the other view.
-        shown: [h',w'] inverse depth in the other view; NaN where nothing falls. Changed.
+        depth: [h,w] its inverse depth, 1/m; pixels without one, NaN, are left out.
+        mask: [h,w].
     """
+    points, count = np.empty((mask.sum(), 3)), 0
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
             w = depth[row, column]
-            if not w >= 0.0:  # NaN
-                continue
-            x, y, z = world_point(view, world_from_view, column + 0.5, row + 0.5, max(w, FARTHEST))
-            u, v, far = project_point(other, x, y, z)
-            if far <= 0.3 or u < 0 or v < 0 or u >= shown.shape[1] or v >= shown.shape[0]:
-                continue
-            if not shown[int(v), int(u)] >= 1.0 / far:
-                shown[int(v), int(u)] = 1.0 / far
+            if mask[row, column] and w >= 0.0:
+                x, y, z = world_point(view, world_from_view, column + 0.5, row + 0.5, max(w, FARTHEST))
+                points[count, 0], points[count, 1], points[count, 2] = x, y, z
+                count += 1
+    return points[:count].copy()
 
 
 @kernel
-def fuse(own, fixed, candidates, view, world_from_view, others, other_depths, tolerance):
+def warp(points, other, numbers, shown):
+    """What a view shows of points: the nearest ones, in the pixels they fall in.
+
+    Args:
+        points: [n,3] world.
+        other: [23] packed projection of the view.
+        numbers: [h,w] of the pixels that are asked about, negative for others.
+        shown: [open] inverse depth in these pixels, 1/m; NaN where nothing falls. Changed.
+    """
+    height, width = numbers.shape
+    for i in range(len(points)):
+        u, v, far = project_point(other, points[i, 0], points[i, 1], points[i, 2])
+        if far <= 0.3 or u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        number = numbers[int(v), int(u)]
+        if number >= 0 and not shown[number] >= 1.0 / far:
+            shown[number] = 1.0 / far
+
+
+@kernel
+def fuse(own, numbers, candidates, view, world_from_view, others, other_depths, tolerance):
     """The fused inverse depth [h,w] of a view.
 
     Args:
-        own: [h,w] its inverse depth, 1/m; 0 is infinitely far, NaN stays.
-        fixed: [h,w] pixels that stay.
-        candidates: [n,h,w] what its neighbours show there (``warp``).
+        own: [h,w] its inverse depth, 1/m; 0 is infinitely far.
+        numbers: [h,w] of the pixels that are fused, negative for others.
+        candidates: [n,open] what the neighbours show there (``warp``).
         view: [23] packed projection of the view.
         world_from_view: [4,4] its pose.
         others: [n,23] packed projections of the neighbours.
@@ -122,12 +158,13 @@ def fuse(own, fixed, candidates, view, world_from_view, others, other_depths, to
     result, some = own.copy(), np.empty(len(candidates) + 1, np.float32)
     for row in range(own.shape[0]):
         for column in range(own.shape[1]):
-            if fixed[row, column] or not own[row, column] >= 0.0:
+            number = numbers[row, column]
+            if number < 0:
                 continue
             some[0], count = own[row, column], 1
             for n in range(len(candidates)):
-                if candidates[n, row, column] >= 0.0:
-                    some[count] = candidates[n, row, column]
+                if candidates[n, number] >= 0.0:
+                    some[count] = candidates[n, number]
                     count += 1
             best, support, own_support = 0, 0, 0
             for i in range(count):
