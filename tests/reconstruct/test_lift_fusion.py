@@ -121,7 +121,7 @@ def test_world_point_is_the_reverse_of_projecting_with_a_rolling_shutter():
     turn = geometry.matrix_from_quat(np.array([0.9, 0.1, -0.3, 0.2]) / np.linalg.norm([0.9, 0.1, -0.3, 0.2]))
     view = view_at(0.7, drift_m=(0.1, -0.05, 0.4), fraction=(0.0, 1 / SHAPE[0], -0.5), turn=turn)
     x, y, z = world_point.py_func(view.packed, view.world_from_view, 2.5, 4.5, 0.25)
-    u, v, far = project_point.py_func(view.packed, x, y, z)
+    u, v, far = project_point.py_func(view.packed[None], 0, x, y, z)
     # The camera is 0.1 m to the right at the row's time, a quarter of the exposure after its middle, of 0.4 m ahead.
     assert (u, v, far) == pytest.approx((2.5, 4.5, 4.0), abs=1e-3)
 

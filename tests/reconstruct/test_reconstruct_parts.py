@@ -252,7 +252,7 @@ def test_views_project_like_their_camera(lens):
         points = lifting.points_of(view, np.full(tile.valid.shape, 0.1, np.float32))[v[some], u[some]]
         uv, seen = sensors.project(front, geometry.transform_points(geometry.inverse(world_from_camera), points))
         for x, pixel, ok, row, column in zip(points, uv, seen, v[some], u[some], strict=True):
-            a, b, z = splat.project_point(view.packed, *x)
+            a, b, z = splat.project_point(view.packed[None], 0, *x)
             assert (a, b) == pytest.approx((column + 0.5, row + 0.5), abs=1e-3) and z == pytest.approx(10, rel=1e-5)
             recorded = clip.image("front", 0)
             if ok and 1 < pixel[0] < 319 and 1 < pixel[1] < 159:

@@ -43,15 +43,14 @@ def seen_colours(xyz, normal, packed, inverse_depth, free, pictures, present, to
     n = len(xyz)
     rgb, pixel = np.zeros((n, 3), np.float32), np.full(n, np.inf, np.float32)
     through = np.zeros(n, np.int32)
+    weights, best = np.zeros(3), np.zeros((3, 3))
     for i in range(n):
-        weights = np.zeros(3)
-        best = np.zeros((3, 3))
+        weights[:], best[:] = 0.0, 0.0
         for k in range(len(packed)):
-            view = packed[k]
             if not present[k]:
                 continue
-            u, v, z = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
-            if z <= 0.3 or u < 1 or v < 1 or u >= view[3] - 1 or v >= view[4] - 1:
+            u, v, z = project_point(packed, k, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+            if z <= 0.3 or u < 1 or v < 1 or u >= packed[k, 3] - 1 or v >= packed[k, 4] - 1:
                 continue
             row, column = int(v), int(u)
             if free[k, row, column] and z - 1.0 / inverse_depth[k, row, column] > MARGIN_M + MARGIN_SHARE * z:
@@ -60,28 +59,31 @@ def seen_colours(xyz, normal, packed, inverse_depth, free, pictures, present, to
             if not abs(inverse_depth[k, row, column] - 1.0 / z) <= tolerance + 0.08 / z:
                 through[i] += inverse_depth[k, row, column] < 1.0 / z
                 continue
-            rx, ry = (u - view[1]) / view[0], (v - view[2]) / view[0]
+            focal = packed[k, 0]
+            rx, ry = (u - packed[k, 1]) / focal, (v - packed[k, 2]) / focal
             length = np.sqrt(rx * rx + ry * ry + 1)
             facing = 0.0
             for j in range(3):
-                facing += normal[i, j] * (view[5 + j] * rx + view[8 + j] * ry + view[11 + j])
+                facing += normal[i, j] * (packed[k, 5 + j] * rx + packed[k, 8 + j] * ry + packed[k, 11 + j])
             # Cosine of the incidence: a pixel covers 1 / cosine as much of a slanted surface. The floor keeps grazing
             # views finite.
             facing = max(abs(facing) / length, 0.02)
-            size = z / view[0] / facing
+            size = z / focal / facing
             if size < pixel[i]:
                 pixel[i] = size
             # Proportional to the solid angle of the surface, so to the number of pixels that measure it.
             weight = facing / (z * z)
-            slot = np.argmin(weights)
+            slot = 0
+            for j in range(1, 3):
+                slot = j if weights[j] < weights[slot] else slot
             if weight > weights[slot]:
                 weights[slot] = weight
                 for j in range(3):
                     best[slot, j] = pictures[k, row, column, j]
-        total = weights.sum()
+        total = weights[0] + weights[1] + weights[2]
         if total > 0:
             for j in range(3):
-                rgb[i, j] = (weights * best[:, j]).sum() / total
+                rgb[i, j] = (weights[0] * best[0, j] + weights[1] * best[1, j] + weights[2] * best[2, j]) / total
     return rgb, pixel, through
 
 

@@ -131,9 +131,9 @@ def warp(points, other, numbers, shown):
         numbers: [h,w] of the pixels that are asked about, negative for others.
         shown: [open] inverse depth in these pixels, 1/m; NaN where nothing falls. Changed.
     """
-    height, width = numbers.shape
+    (height, width), others = numbers.shape, other.reshape(1, -1)
     for i in range(len(points)):
-        u, v, far = project_point(other, points[i, 0], points[i, 1], points[i, 2])
+        u, v, far = project_point(others, 0, points[i, 0], points[i, 1], points[i, 2])
         if far <= 0.3 or u < 0 or v < 0 or u >= width or v >= height:
             continue
         number = numbers[int(v), int(u)]
@@ -179,7 +179,7 @@ def fuse(own, numbers, candidates, view, world_from_view, others, other_depths, 
                 x, y, z = world_point(view, world_from_view, column + 0.5, row + 0.5, some[0])
                 agree, through = 0, 0
                 for n in range(len(others)):
-                    u, v, far = project_point(others[n], x, y, z)
+                    u, v, far = project_point(others, n, x, y, z)
                     if far <= 0.3 or u < 0 or v < 0 or u >= others[n, 3] or v >= others[n, 4]:
                         continue
                     there, here = other_depths[n, int(v), int(u)], 1.0 / far

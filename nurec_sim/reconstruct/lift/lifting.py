@@ -151,20 +151,20 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
     Returns:
         [n] True where the point stays.
     """
-    keep = np.ones(len(xyz), np.bool_)
+    keep, mixed = np.ones(len(xyz), np.bool_), np.empty(3, np.float32)
     for i in range(len(xyz)):
         agree, through, hidden, total = 0, 0, 0, 1.0
         far_agree, far_through = 0, 0
         # Rings instead of plain distance: neighbouring pixels then share one owner, and the surface does not become a
         # patchwork of views with slightly different depth.
         own_ring = np.floor(np.log(depth[i]) / ring)
-        mixed = rgb[i].copy()
+        for c in range(3):
+            mixed[c] = rgb[i, c]
         for k in range(len(packed)):
             if k == own_view[i] or not present[k]:
                 continue
-            view = packed[k]
-            u, v, z = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
-            if z <= 0.3 or u < 0 or v < 0 or u >= view[3] or v >= view[4]:
+            u, v, z = project_point(packed, k, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+            if z <= 0.3 or u < 0 or v < 0 or u >= packed[k, 3] or v >= packed[k, 4]:
                 continue
             farther = z > FARTHER * depth[i]
             if farther and not matched[i]:
@@ -176,8 +176,9 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
                 far_through += not agrees and w < here
             elif agrees:
                 agree += 1
-                margin = border * view[3]
-                inside = margin < u < view[3] - margin and 0.5 * margin < v < view[4] - 0.5 * margin
+                width, height = packed[k, 3], packed[k, 4]
+                margin = border * width
+                inside = margin < u < width - margin and 0.5 * margin < v < height - 0.5 * margin
                 owner = inside and owns[k, int(v), int(u)]
                 if owner and (np.floor(np.log(z) / ring), k) < (own_ring, own_view[i]):
                     keep[i] = False
@@ -196,7 +197,8 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
         elif matched[i] and agree + far_agree == 0 and (far_through > 0 or hidden >= HIDING):
             keep[i] = False
         if keep[i]:
-            rgb[i] = mixed / total
+            for c in range(3):
+                rgb[i, c] = mixed[c] / total
     return keep
 
 

@@ -15,31 +15,36 @@ SPLAT_RADIUS = 0.5
 
 
 @inner
-def project_point(view, x, y, z):
+def project_point(views, k, x, y, z):
     """Pixel and depth of a point: (u, v, depth); depth <= 0 if behind.
 
     Args:
-        view: [23] packed projection (``WorkingView.packed``).
-        x: of the point, metres, in the frame that ``view`` projects from.
+        views: [n,23] packed projections (``WorkingView.packed``). All of them: to take one out in an inner loop would
+            count its references, which takes as long as the projection.
+        k: which of them.
+        x: of the point, metres, in the frame that the view projects from.
         y: likewise.
         z: likewise.
     """
-    a = view[5] * x + view[6] * y + view[7] * z + view[14]
-    b = view[8] * x + view[9] * y + view[10] * z + view[15]
-    c = view[11] * x + view[12] * y + view[13] * z + view[16]
+    a = views[k, 5] * x + views[k, 6] * y + views[k, 7] * z + views[k, 14]
+    b = views[k, 8] * x + views[k, 9] * y + views[k, 10] * z + views[k, 15]
+    c = views[k, 11] * x + views[k, 12] * y + views[k, 13] * z + views[k, 16]
     if c <= 1e-3:
         return 0.0, 0.0, -1.0
-    u, v = view[0] * a / c + view[1], view[0] * b / c + view[2]
-    if view[17] != 0.0 or view[18] != 0.0 or view[19] != 0.0:
+    u, v = views[k, 0] * a / c + views[k, 1], views[k, 0] * b / c + views[k, 2]
+    if views[k, 17] != 0.0 or views[k, 18] != 0.0 or views[k, 19] != 0.0:
         # Where a point is shown depends on when its row was exposed, and the other way round: a fixed point, which
         # contracts fast because the drift is small against the depth.
         for _ in range(3):
-            f = min(max(view[20] * u + view[21] * v + view[22], -0.5), 0.5)
-            d = c - view[19] * f
+            f = min(max(views[k, 20] * u + views[k, 21] * v + views[k, 22], -0.5), 0.5)
+            d = c - views[k, 19] * f
             if d <= 1e-3:
                 return 0.0, 0.0, -1.0
-            u, v = view[0] * (a - view[17] * f) / d + view[1], view[0] * (b - view[18] * f) / d + view[2]
-        c -= view[19] * f
+            u, v = (
+                views[k, 0] * (a - views[k, 17] * f) / d + views[k, 1],
+                views[k, 0] * (b - views[k, 18] * f) / d + views[k, 2],
+            )
+        c -= views[k, 19] * f
     return u, v, c
 
 
@@ -70,10 +75,10 @@ def world_point(view, world_from_view, u, v, inverse_depth):
 @kernel
 def project_surfels(view, xyz):
     """Rows [m] of the points [n,3] that may reach into the image, and their pixels and depths [m,3] (u, v, metres)."""
-    width, height = int(view[3]), int(view[4])
+    width, height, views = int(view[3]), int(view[4]), view.reshape(1, -1)
     rows, places, count = np.empty(len(xyz), np.int64), np.empty((len(xyz), 3)), 0
     for i in range(len(xyz)):
-        u, v, depth = project_point(view, xyz[i, 0], xyz[i, 1], xyz[i, 2])
+        u, v, depth = project_point(views, 0, xyz[i, 0], xyz[i, 1], xyz[i, 2])
         if depth >= 0.3 and u >= -8 and v >= -8 and u <= width + 8 and v <= height + 8:
             rows[count], places[count, 0], places[count, 1], places[count, 2] = i, u, v, depth
             count += 1
