@@ -16,6 +16,7 @@ from nurec_sim.reconstruct.lift.blocks import (
     painted,
     tolerance_for,
 )
+from nurec_sim.reconstruct.lift.sky_cubemap import sums_by_texel
 
 
 def plain(height=8, width=8):
@@ -116,3 +117,10 @@ def test_means_and_maxima_over_blocks():
     first = np.array([0, 4, 14], np.int32)
     assert block_means(values[..., None], first, edge)[:, 0].tolist() == [3.5, 4.0, (14 + 15 + 20 + 21) / 4]
     assert block_maxima(values.astype(np.int32), first, edge).tolist() == [7, 4, 21]
+
+
+def test_texels_of_the_sky_sum_weighted_colours():
+    texel, weight = np.array([7, 2, 7]), np.array([1.0, 2.0, 0.5])
+    shown, sums = sums_by_texel(texel, weight, np.array([[0.1, 0.2, 0.3], [1, 0, 1], [0.4, 0, 0]]), 9)
+    assert shown.tolist() == [7, 2]
+    assert sums.ravel().tolist() == pytest.approx([1.5, 0.1 + 0.2, 0.2, 0.3, 2, 2, 0, 2])

@@ -239,6 +239,11 @@ def test_the_response_of_a_camera_is_not_that_of_the_glare_in_it():
     assert isp["b"] @ [0.4, 0.4, 0.4, 1] == pytest.approx([0.32] * 3, abs=0.02)
 
 
+def test_pixels_without_depth_have_no_point_and_those_at_infinity_lie_at_1000_m():
+    points = lifting.points_of(view_of(np.zeros((1, 3, 3), np.uint8)), np.array([[np.nan, 0, 0.1]], np.float32))
+    assert np.isnan(points[0, 0]).all() and points[0, 1:, 0] == pytest.approx([1000, 10])
+
+
 @pytest.mark.parametrize(("count", "compared"), [(299, False), (300, True)])
 def test_cameras_are_compared_from_300_shared_points_on(count, compared):
     true = np.random.default_rng(0).uniform(0.1, 0.9, (1000, 3)).astype(np.float32)

@@ -113,7 +113,8 @@ def block_means(values, first, edge):
             for c in range(column, column + edge[i]):
                 for k in range(channels):
                     means[i, k] += values[r, c, k]
-        means[i] /= edge[i] * edge[i]
+        for k in range(channels):
+            means[i, k] /= np.int64(edge[i]) * np.int64(edge[i])
     return means
 
 

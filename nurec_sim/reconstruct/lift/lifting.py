@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
-from nurec_sim import geometry
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.blocks import painted
 from nurec_sim.reconstruct.lift.depth import MAYBE_SKY, NOT_SKY, SKY
@@ -82,13 +81,25 @@ def rays_of(view: WorkingView) -> Float64[np.ndarray, "h w 3"]:
 
 def points_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
     """World points of all pixels; pixels at infinity lie at 1000 m."""
-    depth = 1.0 / np.maximum(inverse_depth.astype(np.float64), 1e-3)
-    local = rays_of(view) * depth[..., None]
-    if view.drift_m.any():
-        v, u = np.mgrid[0 : view.tile.height, 0 : view.tile.width] + 0.5
-        a, b, c = view.tile.fraction
-        local = local + np.clip(a * u + b * v + c, -0.5, 0.5)[..., None] * view.drift_m
-    return geometry.transform_points(view.world_from_view, local)
+    return _points(view.packed, view.world_from_view, inverse_depth)
+
+
+@kernel
+def _points(view, world_from_view, inverse_depth):
+    """``points_of`` a packed view."""
+    height, width = inverse_depth.shape
+    points, m = np.empty((height, width, 3)), world_from_view
+    for row in range(height):
+        for column in range(width):
+            u, v, w = column + 0.5, row + 0.5, np.float64(inverse_depth[row, column])
+            depth = 1.0 / (1e-3 if w < 1e-3 else w)  # NaN stays
+            f = min(max(view[20] * u + view[21] * v + view[22], -0.5), 0.5)
+            x = (u - view[1]) / view[0] * depth + f * view[17]
+            y = (v - view[2]) / view[0] * depth + f * view[18]
+            z = depth + f * view[19]
+            for k in range(3):
+                points[row, column, k] = m[k, 0] * x + m[k, 1] * y + m[k, 2] * z + m[k, 3]
+    return points
 
 
 def normals_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w 3"]:
@@ -97,26 +108,35 @@ def normals_of(view: WorkingView, inverse_depth: Float32[np.ndarray, "h w"]) -> 
     In inverse depth a plane is linear in the pixel: w = n.ray / d, so its gradient gives the normal without noise
     growing with distance.
     """
-    w = inverse_depth.astype(np.float64)
-    tile = view.tile
-    pad = np.pad(w, 2, mode="edge")
-    height, width = w.shape
+    return _normals(view.packed, view.world_from_view, inverse_depth)
 
-    def shifted(dy: int, dx: int) -> np.ndarray:
-        return pad[2 + dy : 2 + dy + height, 2 + dx : 2 + dx + width]
 
-    # Central differences over four pixels: a shorter baseline would show the noise of matched depth.
-    slope_u = (shifted(0, 2) - shifted(0, -2)) / 4 * tile.focal_px
-    slope_v = (shifted(2, 0) - shifted(-2, 0)) / 4 * tile.focal_px
-    rays = rays_of(view)
-    normal = np.stack([slope_u, slope_v, w - slope_u * rays[..., 0] - slope_v * rays[..., 1]], axis=-1)
-    # The second difference is zero on a plane and large across an edge of depth.
-    bend = np.maximum(np.abs(shifted(0, 2) + shifted(0, -2) - 2 * w), np.abs(shifted(2, 0) + shifted(-2, 0) - 2 * w))
-    size = np.linalg.norm(normal, axis=-1, keepdims=True)
-    unit_ray = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    smooth = (bend < 0.05 * w) & (size[..., 0] > 1e-9)
-    normal = np.where(smooth[..., None], normal / np.maximum(size, 1e-12), unit_ray)
-    return geometry.rotate_vectors(-view.world_from_view[:3, :3], normal)
+@kernel
+def _normals(view, world_from_view, inverse_depth):
+    """``normals_of`` a packed view."""
+    height, width = inverse_depth.shape
+    normals, m, focal = np.empty((height, width, 3)), world_from_view, view[0]
+    for row in range(height):
+        above, below = max(row - 2, 0), min(row + 2, height - 1)
+        for column in range(width):
+            w = np.float64(inverse_depth[row, column])
+            # Central differences over four pixels: a shorter baseline would show the noise of matched depth.
+            left = np.float64(inverse_depth[row, max(column - 2, 0)])
+            right = np.float64(inverse_depth[row, min(column + 2, width - 1)])
+            upper, lower = np.float64(inverse_depth[above, column]), np.float64(inverse_depth[below, column])
+            slope_u, slope_v = (right - left) / 4 * focal, (lower - upper) / 4 * focal
+            ray_x, ray_y = (column + 0.5 - view[1]) / focal, (row + 0.5 - view[2]) / focal
+            x, y, z = slope_u, slope_v, w - slope_u * ray_x - slope_v * ray_y
+            size = np.sqrt(x * x + y * y + z * z)
+            # The second difference is zero on a plane and large across an edge of depth.
+            flat = abs(right + left - 2 * w) < 0.05 * w and abs(lower + upper - 2 * w) < 0.05 * w
+            if not (flat and size > 1e-9):
+                x, y, z = ray_x, ray_y, 1.0
+                size = np.sqrt(x * x + y * y + 1.0)
+            x, y, z = x / size, y / size, z / size
+            for k in range(3):
+                normals[row, column, k] = -m[k, 0] * x + -m[k, 1] * y + -m[k, 2] * z
+    return normals
 
 
 @kernel

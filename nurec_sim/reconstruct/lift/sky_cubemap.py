@@ -9,6 +9,7 @@ from jaxtyping import Float32, Float64
 
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
+from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.lifting import rays_of
 from nurec_sim.reconstruct.lift.views import WorkingView
 from nurec_sim.reconstruct.sky_fill import fill_unseen
@@ -36,11 +37,10 @@ def make_sky(
         direction = geometry.rotate_vectors(view.world_from_view[:3, :3], rays_of(view)[mask])
         face, s, t = geometry.cubemap_coordinates(direction)
         column, row = (np.clip((x * size).astype(np.int64), 0, size - 1) for x in (s, t))
-        shown, place = np.unique((face * size + row) * size + column, return_inverse=True)
+        texel = (face * size + row) * size + column
         # By solid angle: a longer lens, with more pixels in a texel, counts like the others.
         weight, rgb = weights[k][mask] / view.tile.focal_px**2, colours[k][mask] / 255
-        sums = [np.bincount(place, values, len(shown)) for values in (weight, *(weight[:, None] * rgb).T)]
-        return shown, np.stack(sums, axis=1)
+        return sums_by_texel(texel, weight, rgb, 6 * size * size)
 
     for shown, sums in in_order(texels, range(len(views))):
         count[shown] += sums[:, 0]
@@ -49,3 +49,27 @@ def make_sky(
     colour = np.where(known[:, None], total / np.where(known, count, 1.0)[:, None], 0.0)
     seen = known.reshape(6, size, size).astype(np.float32)
     return fill_unseen(colour.reshape(6, size, size, 3).astype(np.float32), seen)
+
+
+@kernel
+def sums_by_texel(texel, weight, rgb, count):
+    """Texels [m] that occur among those of pixels [n], and the sums [m,4] there of weight and of weighted colour.
+
+    Args:
+        texel: [n] 0..``count`` - 1.
+        weight: [n].
+        rgb: [n,3].
+        count: number of all texels.
+    """
+    place, shown, sums = np.full(count, -1, np.int32), np.empty(len(texel), np.int64), np.zeros((len(texel), 4))
+    found = 0
+    for i in range(len(texel)):
+        at = place[texel[i]]
+        if at < 0:
+            at = found
+            place[texel[i]], shown[found] = found, texel[i]
+            found += 1
+        sums[at, 0] += weight[i]
+        for k in range(3):
+            sums[at, 1 + k] += weight[i] * rgb[i, k]
+    return shown[:found].copy(), sums[:found].copy()
