@@ -200,16 +200,20 @@ def interpolate_poses(
     # Index of the pose before each time; the last time belongs to the last interval.
     low = np.clip(np.searchsorted(t_us, clamped, side="right") - 1, 0, len(t_us) - 2)
     fraction = (clamped - t_us[low]) / (t_us[low + 1] - t_us[low])
-    before, after = poses[low], poses[low + 1]
-    result = before.copy()
-    result[:, :3, 3] += fraction[:, None] * (after[:, :3, 3] - before[:, :3, 3])
-    # Slerp only where the rotation changes: it is the expensive part, and the others stay exact.
-    turning = np.flatnonzero((before[:, :3, :3] != after[:, :3, :3]).any(axis=(1, 2)) & (fraction > 0))
+    result = poses[low]
+    result[:, :3, 3] += fraction[:, None] * (poses[low + 1, :3, 3] - poses[low, :3, 3])
+    # Slerp only where the rotation changes: it is the expensive part, and the others stay exact. Rotations become
+    # quaternions once for all times between the same two poses.
+    between = np.zeros(len(t_us) - 1, bool)
+    between[low] = True
+    pairs = np.flatnonzero(between)
+    rotations = poses[:, :3, :3]
+    turned = (rotations[pairs] != rotations[pairs + 1]).any(axis=(1, 2))
+    place = (np.cumsum(between) - 1)[low]
+    turning = np.flatnonzero(turned[place] & (fraction > 0))
     if len(turning):
-        quats = slerp(
-            quat_from_matrix(before[turning, :3, :3]), quat_from_matrix(after[turning, :3, :3]), fraction[turning]
-        )
-        result[turning, :3, :3] = matrix_from_quat(quats)
+        before, after = quat_from_matrix(rotations[np.stack([pairs, pairs + 1])])[:, place[turning]]
+        result[turning, :3, :3] = matrix_from_quat(slerp(before, after, fraction[turning]))
     return result.reshape(*query.shape, 4, 4)
 
 

@@ -117,6 +117,18 @@ def test_poses_at_known_times_are_returned_exactly():
     assert np.array_equal(geometry.interpolate_poses(times[:1], known[:1], 5), known[0])
 
 
+def test_poses_are_interpolated_between_their_own_neighbours():
+    rng = np.random.default_rng(0)
+    known = np.stack(
+        [geometry.pose(geometry.matrix_from_quat(rng.normal(size=4)), rng.normal(size=3)) for _ in range(9)]
+    )
+    known[4, :3, :3] = known[3, :3, :3]
+    times, asked = np.arange(9) * 100, rng.integers(0, 800, 300)
+    low, share = asked // 100, asked % 100 / 100
+    expected = [geometry.interpolate_pose_pair(known[k : k + 2], f) for k, f in zip(low, share, strict=True)]
+    np.testing.assert_allclose(geometry.interpolate_poses(times, known, asked), expected, atol=1e-14)
+
+
 # -------------------------------------------------------------------------------------------------- boxes, polygons
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import LIMITS
 from nurec_sim.logs.clip import ImageRecord
+from nurec_sim.logs.points import unpacked_points
 from nurec_sim.logs.storage import Storage
 from nurec_sim.logs.sweeps import SweepRecord
 from nurec_sim.types import Matrix4, SweepPoints
@@ -71,12 +71,11 @@ class StoredFiles(ImageFiles):
     def sweep(self, lidar_id: str, index: int) -> SweepPoints:
         """The points of one sweep."""
         arrays = _checked_arrays(self.storage, self.sweeps[lidar_id][index].file)
-        # Summed in int64: integers accumulate no rounding error, and int32 could overflow.
-        xyz_m = np.cumsum(arrays["dxyz_mm"], axis=1, dtype=np.int64).T / 1000.0
+        xyz_m = unpacked_points(arrays["dxyz_mm"], self.lidar_from_file)
         intensity = arrays.get("intensity")
         if intensity is not None:
             intensity = np.clip(intensity / self.intensity_scale[lidar_id], 0.0, 1.0).astype(np.float32)
-        return SweepPoints(geometry.transform_points(self.lidar_from_file, xyz_m), intensity, arrays.get("dt_us"))
+        return SweepPoints(xyz_m, intensity, arrays.get("dt_us"))
 
 
 def encode_points(xyz_m: Float64[np.ndarray, "n 3"]) -> np.ndarray:

@@ -12,6 +12,7 @@ from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import LIMITS
 from nurec_sim.logs.beam_errors import BeamErrors
+from nurec_sim.logs.points import moved_points, numbered, turn_times_us
 from nurec_sim.types import LidarModel, Matrix4, Spin, Sweep, SweepPoints, Trajectory
 
 INSTANT_US = 20
@@ -109,8 +110,7 @@ def _point_times(
         return np.full(len(xyz), record.t_us, np.int64)
     # The turn begins and ends behind the car and looks straight ahead at the reference time.
     sign = -1.0 if lidar.spin is Spin.CLOCKWISE else 1.0
-    turn = sign * np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi)
-    return record.t_us + np.rint(turn * (record.end_us - record.start_us)).astype(np.int64)
+    return record.t_us + turn_times_us(xyz, sign * (record.end_us - record.start_us))
 
 
 def _compensated(
@@ -123,12 +123,10 @@ def _compensated(
     lidar_from_rig = geometry.inverse(ego.at(record.t_us)) @ record.world_from_lidar
     # Poses at instants 20 us apart: at 50 m/s that errs by half a millimetre, the grain of the files, and costs a
     # twentieth of a pose for each point.
-    instants, place = np.unique(point_t_us // INSTANT_US, return_inverse=True)
+    instants, place = numbered(point_t_us // INSTANT_US)
     fired = longer.at(instants * INSTANT_US + INSTANT_US // 2) @ lidar_from_rig
     # As ``sensors.compensate_sweep`` does, with the poses multiplied before they are repeated for each point.
-    moved = geometry.inverse(record.world_from_lidar) @ fired
-    turn, shift = np.ascontiguousarray(moved[:, :3, :3]), np.ascontiguousarray(moved[:, :3, 3])
-    return np.einsum("nij,nj->ni", turn[place], xyz) + shift[place]
+    return moved_points(xyz, geometry.inverse(record.world_from_lidar) @ fired, place)
 
 
 def prolonged(ego: Trajectory, margin_us: int) -> Trajectory | None:
