@@ -8,6 +8,7 @@ solved by least squares with Cauchy weights.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +17,9 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from nurec_sim import geometry
-from nurec_sim.compute.kernels import kernel
 from nurec_sim.logs.alignment.followed import FollowedPoints
 from nurec_sim.logs.alignment.planes import PlanePoints
+from nurec_sim.logs.alignment.products import Rows, add_products, median_apart, solved
 from nurec_sim.logs.beam_errors import BeamErrors
 from nurec_sim.types import Matrix4, Trajectory
 
@@ -92,43 +93,66 @@ def errors_of(
         ego: recorded poses of the car.
     """
     kinds = [_of_beams(points, lidars), _of_turns(points, lidars), _of_poses(points, t_us, ego)]
-    columns = sparse.hstack(kinds).tocsr()
-    kind = np.repeat(np.arange(len(kinds)), [each.shape[1] for each in kinds])
-    alone = _products(columns, np.ones(len(points))) * (kind[:, None] == kind)
+    rows = _rows(kinds, points.plane)
+    columns, kind = rows.matrix, np.repeat(np.arange(len(kinds)), [each.width for each in kinds])
+    alone = rows.products(np.ones(len(points))) * (kind[:, None] == kind)
     prior = _prior(lidars, t_us) + COMMON * alone
     images, off = _of_followed(followed, columns.shape[1], t_us, ego), followed.off_px.ravel()
     counts = ALIKE / ALIKE_PX * (SIGMA_M / SIGMA_PX) ** 2
     seen = np.ones(len(off))
-    planes = sparse.csr_matrix((np.ones(len(points)), (points.plane, np.arange(len(points)))))
     across = points.across_m
     weight, found = np.ones(len(points)), np.zeros(columns.shape[1])
     for _ in range(ROUNDS):
-        total = planes @ weight
-        weighted = sparse.diags(weight) @ columns
-        mean = sparse.diags(1 / total) @ (planes @ weighted)
-        normal = _products(columns, weight) - _products(mean, total)
-        right = weighted.T @ across - mean.T @ (planes @ (weight * across))
-        normal += counts * _products(images, seen)
+        total = np.bincount(points.plane, weight)
+        mean = rows.means(weight, total)
+        normal = rows.products(weight)
+        add_products(normal, mean, -total)
+        right = columns.T @ (weight * across) - mean.T @ np.bincount(points.plane, weight * across)
+        add_products(normal, images, counts * seen)
         right += counts * (images.T @ (seen * off))
-        found = np.linalg.solve(normal + prior, right)
+        normal += prior
+        found = solved(normal, right)
         left = across - columns @ found
-        left -= ((planes @ (weight * left)) / total)[points.plane]
+        left -= (np.bincount(points.plane, weight * left) / total)[points.plane]
         weight = 1 / (1 + (left / SIGMA_M) ** 2)
         seen = 1 / (1 + ((off - images @ found) / SIGMA_PX) ** 2)
-    beams, turns, poses = np.split(found, np.cumsum([kind.shape[1] for kind in kinds])[:2])
-    shift, tilt = poses.reshape(2, 3, len(t_us)).transpose(0, 2, 1)
+    beams, turns, poses = np.split(found, np.cumsum([each.width for each in kinds])[:2])
+    shift, tilt = poses.reshape(len(t_us), 2, 3).transpose(1, 0, 2)
     return Errors(
         beams=[BeamErrors(KNOTS_RAD, each) for each in beams.reshape(lidars, len(KNOTS_RAD))],
         turns_rad=turns.reshape(lidars, 3),
         t_us=t_us,
         shift_m=shift,
         tilt_rad=tilt,
-        apart_m=(_apart(across, points.plane), _apart(across - columns @ found, points.plane)),
+        apart_m=(median_apart(across, points.plane), median_apart(across - columns @ found, points.plane)),
         apart_px=(_size(off), _size(off - images @ found)),
     )
 
 
-def _of_beams(points: PlanePoints, lidars: int) -> sparse.csr_matrix:
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """How points depend on unknowns of one kind.
+
+    Attributes:
+        values: for each entry of a row, the values of all points.
+        columns: their columns.
+        width: number of unknowns.
+    """
+
+    values: list[Float64[np.ndarray, " n"]]
+    columns: list[Int64[np.ndarray, " n"]]
+    width: int
+
+
+def _rows(kinds: Sequence[_Columns], plane: Int64[np.ndarray, " n"]) -> Rows:
+    """All kinds side by side."""
+    before = np.cumsum([0, *(each.width for each in kinds)])
+    values = np.stack([value for each in kinds for value in each.values], axis=1)
+    columns = [column + first for each, first in zip(kinds, before, strict=False) for column in each.columns]
+    return Rows(values, np.stack(columns, axis=1), int(before[-1]), plane)
+
+
+def _of_beams(points: PlanePoints, lidars: int) -> _Columns:
     """Motion of each point along its normal by the unit error of each knot of each LiDAR."""
     xyz = points.beam_m
     level = np.maximum(np.hypot(xyz[:, 0], xyz[:, 1]), 1e-9)
@@ -139,14 +163,14 @@ def _of_beams(points: PlanePoints, lidars: int) -> sparse.csr_matrix:
     raised = np.column_stack([-xyz[:, :2] * (xyz[:, 2] / level)[:, None], level])
     along = np.sum(raised * _normals(points), axis=1)
     column = points.lidar[points.sweep] * len(KNOTS_RAD) + low
-    return _sparse([(1 - share) * along, share * along], [column, column + 1], lidars * len(KNOTS_RAD))
+    return _Columns([(1 - share) * along, share * along], [column, column + 1], lidars * len(KNOTS_RAD))
 
 
-def _of_turns(points: PlanePoints, lidars: int) -> sparse.csr_matrix:
+def _of_turns(points: PlanePoints, lidars: int) -> _Columns:
     """The same by a turn w of each LiDAR about each of its axes: ``n . (w x p) = w . (p x n)``."""
     turned = np.cross(points.beam_m, _normals(points))
     first = 3 * points.lidar[points.sweep]
-    return _sparse(list(turned.T), [first + axis for axis in range(3)], 3 * lidars)
+    return _Columns(list(turned.T), [first + axis for axis in range(3)], 3 * lidars)
 
 
 def _normals(points: PlanePoints) -> Float64[np.ndarray, "n 3"]:
@@ -154,7 +178,7 @@ def _normals(points: PlanePoints) -> Float64[np.ndarray, "n 3"]:
     return np.einsum("nji,nj->ni", points.turn[points.sweep], points.normal)
 
 
-def _of_poses(points: PlanePoints, t_us: Int64[np.ndarray, " k"], ego: Trajectory) -> sparse.csr_matrix:
+def _of_poses(points: PlanePoints, t_us: Int64[np.ndarray, " k"], ego: Trajectory) -> _Columns:
     """The same by a shift along and a turn about each axis of the world at each time."""
     car = ego.at(points.t_us)[points.sweep, :3, 3]
     return _moved(points.normal, points.xyz_m, car, points.at_us, t_us)
@@ -170,10 +194,12 @@ def _of_followed(
     """
     direction, xyz = followed.by_xyz.reshape(-1, 3), followed.xyz_m.repeat(2, axis=0)
     first, second = (
-        _moved(direction, xyz, ego.at(times)[:, :3, 3].repeat(2, axis=0), times.repeat(2), t_us)
+        _matrix(_moved(direction, xyz, ego.at(times)[:, :3, 3].repeat(2, axis=0), times.repeat(2), t_us))
         for times in (followed.first_us, followed.second_us)
     )
-    return sparse.hstack([sparse.csr_matrix((len(xyz), width - 6 * len(t_us))), second - first]).tocsr()
+    rows = sparse.hstack([sparse.csr_matrix((len(xyz), width - 6 * len(t_us))), second - first]).tocsr()
+    rows.sort_indices()
+    return rows
 
 
 def _moved(
@@ -182,7 +208,7 @@ def _moved(
     car_m: Float64[np.ndarray, "n 3"],
     at_us: Int64[np.ndarray, " n"],
     t_us: Int64[np.ndarray, " k"],
-) -> sparse.csr_matrix:
+) -> _Columns:
     """Motion of points along directions by a shift along and a turn about each axis of the world at each time.
 
     Args:
@@ -198,36 +224,15 @@ def _moved(
     share = np.clip((at_us - t_us[low]) / np.maximum(t_us[high] - t_us[low], 1), 0, 1)
     parts = [*direction.T, *np.cross(xyz_m - car_m, direction).T]
     values = [part * each for part in parts for each in (1 - share, share)]
-    return _sparse(values, [number * k + each for number in range(6) for each in (low, high)], 6 * k)
+    return _Columns(values, [6 * each + number for number in range(6) for each in (low, high)], 6 * k)
 
 
-def _sparse(values: list[np.ndarray], columns: list[np.ndarray], width: int) -> sparse.csr_matrix:
-    """A matrix with one row per point, from its values and their columns."""
-    count, each = len(values[0]), len(values)
+def _matrix(kind: _Columns) -> sparse.csr_matrix:
+    """A matrix with one row per point."""
+    count, each = len(kind.values[0]), len(kind.values)
     starts = np.arange(0, (count + 1) * each, each)
-    value, column = np.stack(values, axis=1).ravel(), np.stack(columns, axis=1).ravel()
-    return sparse.csr_matrix((value, column, starts), shape=(count, width))
-
-
-def _products(rows: sparse.csr_matrix, weight: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "p p"]:
-    """``rows.T @ diag(weight) @ rows``; a product of sparse matrices takes several times as long."""
-    half = _half(rows.indptr, rows.indices, rows.data, weight, rows.shape[1])
-    return half + half.T
-
-
-@kernel
-def _half(
-    starts: np.ndarray, column: np.ndarray, value: np.ndarray, weight: np.ndarray, width: int
-) -> Float64[np.ndarray, "p p"]:
-    """Sum of the weighted outer products of rows with themselves, each pair of their parts once, equal ones halved."""
-    half = np.zeros((width, width))
-    for i in range(len(weight)):
-        for a in range(starts[i], starts[i + 1]):
-            weighted = weight[i] * value[a]
-            half[column[a], column[a]] += 0.5 * weighted * value[a]
-            for b in range(a + 1, starts[i + 1]):
-                half[column[a], column[b]] += weighted * value[b]
-    return half
+    value, column = np.stack(kind.values, axis=1).ravel(), np.stack(kind.columns, axis=1).ravel()
+    return sparse.csr_matrix((value, column, starts), shape=(count, kind.width))
 
 
 def _prior(lidars: int, t_us: Int64[np.ndarray, " k"]) -> Float64[np.ndarray, "p p"]:
@@ -240,17 +245,9 @@ def _prior(lidars: int, t_us: Int64[np.ndarray, " k"]) -> Float64[np.ndarray, "p
     walk, still = walk.T @ walk, np.eye(len(t_us))
     shifts, tilts = still / SHIFT_M**2 + walk / SHIFT_WALK_M**2, still / TILT_RAD**2 + walk / TILT_WALK_RAD**2
     turns = np.eye(3) / TURN_RAD**2
-    parts = [*[beams] * lidars, *[turns] * lidars, *[shifts] * 3, *[tilts] * 3]
+    poses = np.kron(shifts, np.diag([1, 1, 1, 0, 0, 0])) + np.kron(tilts, np.diag([0, 0, 0, 1, 1, 1]))
+    parts = [*[beams] * lidars, *[turns] * lidars, poses]
     return ALIKE * SIGMA_M**2 * sparse.block_diag(parts).toarray()
-
-
-def _apart(across: Float64[np.ndarray, " n"], plane: Int64[np.ndarray, " n"]) -> float:
-    """Median distance from the median of the same plane."""
-    order = np.lexsort((across, plane))
-    start = np.flatnonzero(np.diff(plane[order], prepend=-1))
-    count = np.diff(np.append(start, len(plane)))
-    median = (across[order[start + (count - 1) // 2]] + across[order[start + count // 2]]) / 2
-    return float(np.median(np.abs(across - median[plane])))
 
 
 def _size(off_px: Float64[np.ndarray, " 2n"]) -> float:
