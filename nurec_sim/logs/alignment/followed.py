@@ -169,10 +169,13 @@ def _points_in(
     sweep = clip.sweep(lidar, index)
     xyz = sweep.xyz_world_m[standing(clip, sweep, moving)[0]]
     pair = np.asarray(clip.world_from_camera(camera, frame), np.float64)
-    uv, seen, _ = sensors.project_rolling(_model(clip, camera), pair, xyz)
     depth = geometry.transform_points(geometry.inverse(pair[0]), xyz)[:, 2]
+    # Most points of a turn are behind the camera.
+    ahead = depth > NEAREST_M
+    xyz, depth = xyz[ahead], depth[ahead]
+    uv, seen, _ = sensors.project_rolling(_model(clip, camera), pair, xyz)
     height, width = gray.shape
-    seen &= (depth > NEAREST_M) & _inside(uv, width, height)
+    seen &= _inside(uv, width, height)
     uv, xyz, depth = uv[seen], xyz[seen], depth[seen]
     if len(uv) < 4:
         return nothing
