@@ -8,8 +8,8 @@ from reconstruct_street import Street
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct import LiftSettings, reconstruct
+from nurec_sim.reconstruct.beam_counting import BLOCK, CLEAR, MEETS, THINNEST_M, ellipsoids
 from nurec_sim.reconstruct.free_space import (
-    MEETS,
     MOST_SWEEPS,
     BeamCounts,
     balls,
@@ -26,11 +26,11 @@ from nurec_sim.reconstruct.lift.footprints import footprints_of, marked_free, on
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
-from nurec_sim.reconstruct.lift.points import Cloud
+from nurec_sim.reconstruct.lift.points import Actor, Cloud
 from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.reconstruct.lift.surfaces import PIXEL_SIGMA
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView
-from nurec_sim.types import Gaussians, Sweep, Trajectory
+from nurec_sim.types import Gaussians, Label, Sweep, Track, Trajectory
 
 SIGMA_M = 0.05
 
@@ -94,6 +94,53 @@ def test_beams_that_meet_an_ellipsoid_are_found_whatever_its_place_and_turn(park
     assert meets.max() > 3
     assert np.abs(counts.passed - meets).sum() <= 0.01 * meets.sum()
     assert not counts.stopped.any()
+
+
+def test_gaussians_are_counted_alike_however_many_there_are_and_decided_ones_are_left_out(parked):
+    """Directions are found block by block, of those that need more beams; here these are every third."""
+    random = np.random.default_rng(1)
+    places = random.uniform(5, 40, (3 * BLOCK, 1)) * random.permutation(directions())[: 3 * BLOCK]
+    places[np.arange(len(places)) % 3 != 0] = [3.0, 0.0, 0.0]
+    gaussians, sweeps = at(*places), [sweep_of(parked, distance_m) for distance_m in (20.0, 25.0, 30.0)]
+    together = count_beams(gaussians, sweeps)
+    for i in (0, 1, 300, len(places) - 3):
+        alone = count_beams(gaussians[np.array([i])], sweeps)
+        assert [each[i] for each in vars(together).values()] == [each[0] for each in vars(alone).values()]
+    assert together.passed[1] > CLEAR and together.free[::3].any() and not together.free[::3].all()
+
+
+def test_axes_of_ellipsoids_are_those_of_their_quaternions():
+    random = np.random.default_rng(2)
+    quat = random.normal(size=(20, 4)).astype(np.float32)
+    scale = random.uniform(0.01, 0.3, (20, 3)).astype(np.float32)
+    scale[0, 1] = 0.0
+    xyz, canonical, extent, radius, thinness, thinnest = ellipsoids(quat[:, :3], quat, scale)
+    axes, sigma = (
+        np.swapaxes(geometry.matrix_from_quat(quat.astype(np.float64)), 1, 2),
+        np.maximum(scale.astype(np.float64), THINNEST_M),
+    )
+    np.testing.assert_array_equal(xyz, quat[:, :3])
+    np.testing.assert_allclose(canonical, axes / sigma[:, :, None], rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(extent, axes * np.sqrt(MEETS) * sigma[:, :, None], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(radius, np.sqrt(MEETS) * sigma.max(axis=1))
+    np.testing.assert_allclose(thinness, sigma.min(axis=1))
+    np.testing.assert_array_equal(thinnest, sigma.argmin(axis=1))
+
+
+def test_a_body_is_where_its_path_is_at_the_time_of_each_sweep_and_not_outside_of_it():
+    """It drives from x = 10 m to 20 m; its Gaussian is outside of its box, and beams pass at these two times only."""
+    clip = Street(frames=4, speed_mps=0.0)
+    sweeps = [sweep_of(clip, distance_m, k) for k, distance_m in enumerate((30.0, 15.0, 30.0, 30.0))]
+    times = [sweep.middle_us for sweep in sweeps]
+    ends = np.stack([geometry.pose_from_xyyaw(x, 0.0, 0.0) for x in (10.0, 20.0)])
+    track = Track("car", Label.MOVABLE, (0.5, 0.5, 0.5), Trajectory(np.array([times[0], times[2]]), ends))
+    body = dataclasses.replace(
+        body_of(np.zeros((0, 3)), np.zeros((0, 3), np.float32)), actor=Actor(0, track, False, track.path)
+    )
+    one = at([0.0, 0.5, 0.0], sigma_m=0.005)
+    counts, expected = body.count_beams(one, sweeps), count_beams(one, sweeps[:3], track.path.at)
+    assert counts.passed == expected.passed and counts.stopped == expected.stopped
+    assert counts.passed > 0 and counts.stopped > 0
 
 
 def test_of_beams_in_one_cell_the_nearest_is_found():

@@ -46,8 +46,11 @@ class Surfels:
         """Recorded beams that met Gaussians of the body, in its frame."""
         if self.actor is None:
             return count_beams(gaussians, beams)
-        known = lambda t_us: self.world_from_body(t_us) if self.present(t_us) else None  # noqa: E731
-        return count_beams(gaussians, beams, known, self.box_size_m)
+        times_us = np.array([sweep.middle_us for sweep in beams], np.int64)
+        times_us = times_us[self.actor.present(times_us)]
+        # All at once: one pose of a path takes nearly as long as hundreds.
+        poses = dict(zip(times_us.tolist(), self.actor.path.at(times_us), strict=True))
+        return count_beams(gaussians, beams, poses.get, self.box_size_m)
 
     def ended_share(self, counts: BeamCounts) -> Float64[np.ndarray, " n"]:
         """Share of beams that ended at each Gaussian within their noise; boxes are not so exact: within the margin."""

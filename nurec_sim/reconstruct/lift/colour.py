@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from nurec_sim import geometry
 from nurec_sim.compute.kernels import kernel
-from nurec_sim.reconstruct.free_space import MARGIN_M, MARGIN_SHARE
+from nurec_sim.reconstruct.beam_counting import MARGIN_M, MARGIN_SHARE
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import WorkingView
 

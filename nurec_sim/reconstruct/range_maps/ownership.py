@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float32, Float64
 
 from nurec_sim import geometry
 from nurec_sim.compute.kernels import kernel
-from nurec_sim.reconstruct.free_space import BEAM_SHARE, COLUMNS, MARGIN_M, MARGIN_SHARE, STEP_RAD, SweepBeams
+from nurec_sim.reconstruct.beam_counting import COLUMNS, MARGIN_M, MARGIN_SHARE, STEP_RAD
+from nurec_sim.reconstruct.free_space import BEAM_SHARE, SweepBeams
 
 FINEST_M = 0.04
 """Edge of the finest voxels; coarser ones are doubled. Footprints near the sensor are widened to it."""
