@@ -18,6 +18,8 @@ from nurec_sim.types.rows import rows_of
 
 FOOT_M = 0.3
 """Points this close to the bottom of a box may be road; the ground decides."""
+NEAREST_M, BODY_MARGIN_M = 0.5, 0.3
+"""Returns from nearer, or this near to the ego car's box, are of the car."""
 
 
 @dataclass(frozen=True)
@@ -153,13 +155,46 @@ def _voxel_sums(
     Returns:
         Keys [m], and [m,10]: point, eye, edge, intensity, points with intensity, points.
     """
-    cell = np.floor(xyz / edge[:, None]).astype(np.int64) + (1 << 18)
     level = np.clip(np.round(np.log2(edge / 0.001)).astype(np.int64), 0, 31)
-    # One int64 per voxel (5 bits of level, 19 per axis) sorts far faster than rows of four columns.
-    key = ((level << 57) | (cell[:, 0] << 38) | (cell[:, 1] << 19) | cell[:, 2]).astype(np.int64)
-    known = np.isfinite(intensity)
-    rows = np.column_stack([xyz, eye, edge, np.where(known, intensity, 0.0), known, np.ones(len(xyz))])
-    return _sum_by_key(key, [rows])
+    key = _keys(xyz, edge, level)
+    order = np.argsort(key, kind="stable")
+    return _sums_in_order(key, order, xyz, eye, edge, intensity)
+
+
+@kernel
+def _keys(xyz, edge, level):
+    """Number of each point's voxel. One int64 (5 bits of level, 19 per axis) sorts far faster than rows of four."""
+    key = np.empty(len(xyz), np.int64)
+    for i in range(len(xyz)):
+        number = level[i]
+        for k in range(3):
+            number = (number << 19) | (np.int64(np.floor(xyz[i, k] / edge[i])) + (1 << 18))
+        key[i] = number
+    return key
+
+
+@kernel
+def _sums_in_order(key, order, xyz, eye, edge, intensity):
+    """Keys and sums of ``_voxel_sums`` of points in the order of their keys."""
+    count = 0
+    for j in range(len(order)):
+        count += j == 0 or key[order[j]] != key[order[j - 1]]
+    keys, sums = np.empty(count, np.int64), np.zeros((count, 10))
+    place = -1
+    for j in range(len(order)):
+        i = order[j]
+        if place < 0 or key[i] != keys[place]:
+            place += 1
+            keys[place] = key[i]
+        for k in range(3):
+            sums[place, k] += xyz[i, k]
+            sums[place, 3 + k] += eye[i, k]
+        sums[place, 6] += edge[i]
+        if np.isfinite(intensity[i]):
+            sums[place, 7] += intensity[i]
+            sums[place, 8] += 1
+        sums[place, 9] += 1
+    return keys, sums
 
 
 def _sum_by_key(key: np.ndarray, parts: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -232,6 +267,26 @@ def _between(xyz, low, high):
         if low[0] <= xyz[i, 0] <= high[0] and low[1] <= xyz[i, 1] <= high[1] and low[2] <= xyz[i, 2] <= high[2]:
             found[count] = i
             count += 1
+    return found[:count]
+
+
+@kernel
+def _usable(xyz, xyz_world, farthest_m, rig_from_world, centre, half):
+    """Indices of the returns [n,3] of a sweep that are neither too near or far nor of the ego car, a box in the rig."""
+    found = np.empty(len(xyz), np.int64)
+    count = 0
+    for i in range(len(xyz)):
+        distance = np.sqrt(xyz[i, 0] * xyz[i, 0] + xyz[i, 1] * xyz[i, 1] + xyz[i, 2] * xyz[i, 2])
+        # False where a coordinate is not a number.
+        if not NEAREST_M < distance < farthest_m:
+            continue
+        x, y, z = xyz_world[i, 0], xyz_world[i, 1], xyz_world[i, 2]
+        inside = True
+        for k in range(3):
+            m = rig_from_world[k]
+            inside &= abs(m[0] * x + m[1] * y + m[2] * z + m[3] - centre[k]) <= half[k]
+        found[count] = i
+        count += not inside
     return found[:count]
 
 
@@ -321,12 +376,10 @@ def _split(
     clip: Clip, actors: Sequence[Actor], settings: PointSettings, lidar: str, index: int, carving: bool
 ) -> _SweepParts:
     sweep = clip.sweep(lidar, index)
-    distance = np.linalg.norm(sweep.xyz_m, axis=1)
-    keep = np.isfinite(sweep.xyz_m).all(axis=1) & (distance < settings.max_range_m) & (distance > 0.5)
-    xyz = sweep.xyz_world_m
+    xyz, body = sweep.xyz_world_m, clip.rig.body
+    half_m = np.asarray(body.size_m) / 2 + BODY_MARGIN_M
     rig_from_world = geometry.inverse(clip.ego.at(sweep.t_us))
-    body = clip.rig.body
-    keep &= ~geometry.points_in_box(geometry.transform_points(rig_from_world, xyz) - body.center_m, body.size_m, 0.3)
+    keep = _usable(sweep.xyz_m, xyz, settings.max_range_m, rig_from_world, np.asarray(body.center_m, float), half_m)
     xyz, t_us = xyz[keep], sweep.point_t_us[keep]
     intensity = np.full(len(xyz), np.nan) if sweep.intensity is None else sweep.intensity[keep].astype(np.float64)
     eye = np.broadcast_to(sweep.world_from_lidar[:3, 3], xyz.shape)
@@ -347,9 +400,10 @@ def _split(
             _unthinned(box_xyz[foot], box_eye[foot], edge[foot], intensity[inside][foot]),
             xyz[inside][foot],
         )
-    edge = voxel_edge_m(xyz[free], clip.ego.position_m, settings)
+    outside = xyz[free]
+    edge = voxel_edge_m(outside, clip.ego.position_m, settings)
     return _SweepParts(
-        _voxel_sums(xyz[free], eye[free], edge, intensity[free]),
+        _voxel_sums(outside, eye[: len(outside)], edge, intensity[free]),
         parts,
         sweep_beams(clip, lidar, sweep) if carving else None,
         len(xyz),
