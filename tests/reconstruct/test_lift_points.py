@@ -25,7 +25,8 @@ def test_returns_of_the_ego_car_too_near_ones_and_far_ones_are_no_points():
     xyz[:3] = [[np.nan, 0, 9], [0, np.inf, 0], [0.1, 0.2, 0.3]]
     pose = geometry.pose_from_xyyaw(3.0, -2.0, 0.4)
     centre, half = np.array([1.0, 0.0, 0.5]), np.array([2.0, 1.0, 0.8]) + BODY_MARGIN_M
-    distance, rig = np.linalg.norm(xyz, axis=1), geometry.transform_points(pose, xyz)
+    with np.errstate(invalid="ignore"):
+        distance, rig = np.linalg.norm(xyz, axis=1), geometry.transform_points(pose, xyz)
     expected = (distance > NEAREST_M) & (distance < 8.0) & (np.abs(rig - centre) > half).any(axis=1)
     np.testing.assert_array_equal(_usable(xyz, xyz, 8.0, pose, centre, half), np.flatnonzero(expected))
     assert 0 < expected.sum() < (distance < 8.0).sum() < len(xyz)

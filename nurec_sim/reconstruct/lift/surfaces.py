@@ -13,6 +13,7 @@ from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.points import Cloud
+from nurec_sim.reconstruct.lift.principal_axes import principal_axes
 from nurec_sim.types import Gaussians, Label
 
 NEIGHBOURS, FOURTH = 20, 4
@@ -81,12 +82,11 @@ def _nearest_planes(
     to_eye: Float64[np.ndarray, "m 3"],
 ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
     """Unit normals of some points by their nearest ones, and how far the planes of these lie along them; 0 if none."""
-    offset = cloud.xyz_m[index] - cloud.xyz_m[part][:, None]
     # Neighbours across a gap belong to another surface.
-    close = distance < np.maximum(4 * distance[:, 3:4], 4 * cloud.spacing_m[part, None])
-    mean, covariance = _moments(offset, close)
+    reach = np.maximum(4 * distance[:, 3], 4 * cloud.spacing_m[part])
+    mean, covariance = _moments(cloud.xyz_m, part, index, distance, reach)
     # Principal axes of the neighbourhood, variances ascending: the first axis is the normal of a plane.
-    variance, axes = np.linalg.eigh(covariance)
+    variance, axes = principal_axes(covariance)
     normal, along = axes[:, :, 0], axes[:, :, 2]
     line = variance[:, 1] < LINE_RATIO * variance[:, 2]
     # The direction to the sensor without its part along the line.
@@ -134,7 +134,7 @@ class CellPlanes:
         centre, covariance = mean[:, 1:4], np.empty((len(enough), 3, 3))
         covariance[:, rows, columns] = mean[:, 4:] - centre[:, rows] * centre[:, columns]
         covariance[:, columns, rows] = covariance[:, rows, columns]
-        variance, axes = np.linalg.eigh(covariance)
+        variance, axes = principal_axes(covariance)
         plane = (variance[:, 0] < PLANE_RATIO * variance[:, 1]) & (variance[:, 1] > LINE_RATIO * variance[:, 2])
         found = np.full(len(keys), -1)
         found[enough[plane]] = np.arange(np.count_nonzero(plane))
@@ -159,24 +159,32 @@ class CellPlanes:
 
 
 @kernel
-def _moments(offset, close):
-    """Mean [n,3] and covariance [n,3,3] of the ``close`` [n,k] ones of points [n,k,3]."""
-    n, k, _ = offset.shape
-    mean, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
-    for i in range(n):
+def _moments(xyz, part, index, distance, reach):
+    """Mean [m,3], seen from each point of a part, and covariance [m,3,3] of its neighbours nearer than ``reach``.
+
+    Args:
+        xyz: [n,3] all points, metres.
+        part: [m] the points asked for.
+        index: [m,k] their neighbours.
+        distance: [m,k] how far these are away, metres.
+        reach: [m] metres.
+    """
+    m, k = index.shape
+    mean, covariance, offset = np.zeros((m, 3)), np.zeros((m, 3, 3)), np.empty((k, 3))
+    for i in range(m):
         count = 0
         for j in range(k):
-            if close[i, j]:
-                count += 1
+            if distance[i, j] < reach[i]:
                 for a in range(3):
-                    mean[i, a] += offset[i, j, a]
+                    offset[count, a] = xyz[index[i, j], a] - xyz[part[i], a]
+                    mean[i, a] += offset[count, a]
+                count += 1
         for a in range(3):
             mean[i, a] /= count
-        for j in range(k):
-            if close[i, j]:
-                for a in range(3):
-                    for b in range(a + 1):
-                        covariance[i, a, b] += (offset[i, j, a] - mean[i, a]) * (offset[i, j, b] - mean[i, b])
+        for j in range(count):
+            for a in range(3):
+                for b in range(a + 1):
+                    covariance[i, a, b] += (offset[j, a] - mean[i, a]) * (offset[j, b] - mean[i, b])
         for a in range(3):
             for b in range(a + 1):
                 covariance[i, a, b] /= count
