@@ -77,10 +77,10 @@ def _half_width(axes, u, v, w):
 
 @_inner
 def _wrapped(column):
-    """A column less than a turn outside of the image."""
+    """A column less than a turn outside of the image, in it; what is farther outside, as of no number, at its edge."""
     if column < 0:
-        return column + COLUMNS
-    return column - COLUMNS if column >= COLUMNS else column
+        return max(column + COLUMNS, 0)
+    return min(column - COLUMNS, COLUMNS - 1) if column >= COLUMNS else column
 
 
 @_inner
