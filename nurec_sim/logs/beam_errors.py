@@ -29,7 +29,8 @@ class BeamErrors:
 
     def removed(self, xyz_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """Recorded points moved to where they were measured, at the same range and azimuth."""
-        return _lowered(np.ascontiguousarray(xyz_m, np.float64), self.elevation_rad, self.error_rad)
+        slope = np.diff(self.error_rad) / np.diff(self.elevation_rad)
+        return _lowered(np.ascontiguousarray(xyz_m, np.float64), self.elevation_rad, self.error_rad, slope)
 
 
 @njit(nogil=True, error_model="numpy")
@@ -42,8 +43,10 @@ def _sine_cosine(angle: float) -> tuple[float, float]:
     return sine, 1 - square * 0.5 * (1 - square * (1 / 12) * (1 - square * (1 / 30)))
 
 
-def _lowered_points(xyz: np.ndarray, knots: np.ndarray, errors: np.ndarray) -> Float64[np.ndarray, "n 3"]:
-    last, slope = len(knots) - 1, np.diff(errors) / np.diff(knots)
+def _lowered_points(
+    xyz: np.ndarray, knots: np.ndarray, errors: np.ndarray, slope: np.ndarray
+) -> Float64[np.ndarray, "n 3"]:
+    last = len(knots) - 1
     # Blocks that fit into the fastest cache, their coordinates apart: compilers then do several angles at once.
     level, height, elevation = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
     # Consecutive points are of one beam, or of the next, so that a search begins where the last one ended.

@@ -132,18 +132,9 @@ def _group_means(
 
 def median_apart(across: Float64[np.ndarray, " n"], group: Int64[np.ndarray, " n"]) -> float:
     """Median distance from the median of the same group."""
-    order = np.argsort(group, kind="stable")
-    starts = np.searchsorted(group[order], np.arange(group.max() + 2))
-    return float(np.median(_from_medians(across[order], starts)))
-
-
-@kernel
-def _from_medians(across: np.ndarray, starts: np.ndarray) -> Float64[np.ndarray, " n"]:
-    result = np.empty(len(across))
-    for group in range(len(starts) - 1):
-        first, count = starts[group], starts[group + 1] - starts[group]
-        ordered = np.sort(across[first : first + count])
-        median = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
-        for i in range(first, first + count):
-            result[i] = abs(across[i] - median)
-    return result
+    order = np.lexsort((across, group))
+    ordered, count = across[order], np.bincount(group)
+    count = count[count > 0]
+    start = np.cumsum(count) - count
+    median = (ordered[start + (count - 1) // 2] + ordered[start + count // 2]) / 2
+    return float(np.median(np.abs(ordered - np.repeat(median, count))))

@@ -24,7 +24,10 @@ def diagonalise(matrix, axes):
         off = a[0, 1] * a[0, 1] + a[0, 2] * a[0, 2] + a[1, 2] * a[1, 2]
         if not off > NEGLIGIBLE * (a[0, 0] * a[0, 0] + a[1, 1] * a[1, 1] + a[2, 2] * a[2, 2]):
             break
-        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+        # Pairs (0, 1), (0, 2) and (1, 2); by loops over tuples this would take four times as long to compile.
+        for turn in range(3):
+            p, r = turn // 2, 2 - turn
+            q = 3 - p - r
             if a[p, q] == 0.0:
                 continue
             half = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
@@ -40,7 +43,8 @@ def diagonalise(matrix, axes):
             for k in range(3):
                 x, y = axes[k, p], axes[k, q]
                 axes[k, p], axes[k, q] = c * x - s * y, s * x + c * y
-    for p, q in ((0, 1), (1, 2), (0, 1)):
+    for turn in range(3):
+        p, q = turn % 2, turn % 2 + 1
         if a[p, p] > a[q, q]:
             a[p, p], a[q, q] = a[q, q], a[p, p]
             for k in range(3):
