@@ -15,8 +15,8 @@ def errors(rgb, opacity, colours, sky, counts=(3.0, 5.0), valid=1.0):
     clear, behind = np.float32([[1 - opacity]]), np.array(sky, np.float32).reshape(3, 1, 1)
     error, weight, sky_weight = np.empty((3, 1, 1), np.float32), *np.empty((2, 1, 1), np.float32)
     recorded, each = np.array(rgb, np.uint8).reshape(1, 1, 3), np.array(counts, np.float32).reshape(2, 1, 1)
-    here = np.float32([[valid]])
-    image_errors(0, 1, recorded, RESPONSE, planes, clear, behind, each, here, error, weight, sky_weight)
+    here, back = np.float32([[valid]]), (np.linalg.inv(RESPONSE[:, :3]), RESPONSE[:, 3].copy())
+    image_errors(0, 1, recorded, *back, planes, clear, behind, each, here, error, weight, sky_weight)
     return error.ravel(), float(weight[0, 0]), float(sky_weight[0, 0])
 
 

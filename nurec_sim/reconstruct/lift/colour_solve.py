@@ -183,7 +183,8 @@ class ColourSolve:
             response = self._fit_response(image, planes, clear, behind, sensor.grid.valid)
             error, weight, sky_weight = np.empty_like(behind), np.empty_like(clear), np.empty_like(clear)
             rows, valid = self._workers.ranges(height, 16), sensor.grid.valid
-            pixels = (image.rgb, response, planes, clear, behind, image.weights, valid, error, weight, sky_weight)
+            back = np.linalg.inv(response[:, :3]), response[:, 3].copy()
+            pixels = (image.rgb, *back, planes, clear, behind, image.weights, valid, error, weight, sky_weight)
             self._workers.run(image_errors, [(*part, *pixels) for part in rows])
             if len(boxes := shading_boxes(self._movers, image.t_us)):
                 shaded = (view.directions, turn, eye, planes, boxes, weight)

@@ -13,14 +13,15 @@ LEAST_CLEAR = np.float32(1 / 512)
 
 
 @kernel
-def image_errors(first, last, rgb, response, planes, clear, behind, counts, valid, error, weight, sky_weight):
+def image_errors(first, last, rgb, back, offset, planes, clear, behind, counts, valid, error, weight, sky_weight):
     """Errors of some rows of a picture. What is white in the image may be any brighter in the scene.
 
     Args:
         first: first row.
         last: one behind the last.
         rgb: [h,w,3] uint8, the recorded image.
-        response: [3,4] float64, from colours of the scene to those of the image.
+        back: [3,3] float64, from colours of the image, without their offset, to those of the scene.
+        offset: [3] float64.
         planes: what ``draw`` returned: opacity, colours.
         clear: [h,w] what the pixels let through of the sky.
         behind: [3,h,w] the sky's colours; 0 where ``clear`` is.
@@ -30,13 +31,12 @@ def image_errors(first, last, rgb, response, planes, clear, behind, counts, vali
         weight: [h,w] output: what they count in the colours of Gaussians.
         sky_weight: [h,w] output: what they count in the sky, times its share of the pixel.
     """
-    back = np.linalg.inv(np.ascontiguousarray(response[:, :3]))
     light = np.empty(3)
     for row in range(first, last):
         for column in range(rgb.shape[1]):
             white = 0
             for c in range(3):
-                light[c] = np.float32(rgb[row, column, c]) / BYTE - response[c, 3]
+                light[c] = np.float32(rgb[row, column, c]) / BYTE - offset[c]
             for c in range(3):
                 wanted = np.float32(back[c, 0] * light[0] + back[c, 1] * light[1] + back[c, 2] * light[2])
                 shown = planes[1 + c, row, column] + clear[row, column] * behind[c, row, column]
