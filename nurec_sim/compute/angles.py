@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from nurec_sim.compute.kernels import unchecked_inner
 
 _FLAT, _STEEP = math.tan(math.pi / 8), math.tan(3 * math.pi / 8)
 _P = (-8.750608600031904122785e-1, -1.615753718733365076637e1, -7.500855792314704667340e1, -1.228866684490136173410e2,
@@ -16,7 +16,7 @@ _REST = 6.123233995736765886130e-17
 """What pi / 2 as a float lacks."""
 
 
-@njit(nogil=True, error_model="numpy")  # a test for division by zero would keep compilers from doing several at once
+@unchecked_inner
 def arctan2(y: float, x: float) -> float:
     """The angle of a finite vector as ``math.atan2`` gives it, within three units of the last digit; 0 for no vector.
 

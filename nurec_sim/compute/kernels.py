@@ -62,3 +62,16 @@ def kernel(function: Callable) -> Callable:
 def inner(function: Callable) -> Callable:
     """A device function, callable from kernels only."""
     return njit(nogil=True)(function)
+
+
+def unchecked_kernel(function: Callable) -> Callable:
+    """A ``kernel`` whose divisions by zero give infinity or NaN.
+
+    A check of each divisor is a branch, and a loop with a branch does not become vector instructions.
+    """
+    return entry_point(function, nogil=True, error_model="numpy")
+
+
+def unchecked_inner(function: Callable) -> Callable:
+    """The same of ``inner``, for unchecked kernels."""
+    return njit(nogil=True, error_model="numpy")(function)

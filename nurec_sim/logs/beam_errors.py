@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
-from numba import njit
 
 from nurec_sim.compute.angles import arctan2
-from nurec_sim.compute.kernels import entry_point
+from nurec_sim.compute.kernels import unchecked_inner, unchecked_kernel
 
 BLOCK = 1024
 
@@ -33,7 +32,7 @@ class BeamErrors:
         return _lowered(np.ascontiguousarray(xyz_m, np.float64), self.elevation_rad, self.error_rad, slope)
 
 
-@njit(nogil=True, error_model="numpy")
+@unchecked_inner
 def _sine_cosine(angle: float) -> tuple[float, float]:
     """Sine and cosine, of small angles by their series, whose next terms are below the last digit."""
     if abs(angle) > 0.02:
@@ -43,9 +42,8 @@ def _sine_cosine(angle: float) -> tuple[float, float]:
     return sine, 1 - square * 0.5 * (1 - square * (1 / 12) * (1 - square * (1 / 30)))
 
 
-def _lowered_points(
-    xyz: np.ndarray, knots: np.ndarray, errors: np.ndarray, slope: np.ndarray
-) -> Float64[np.ndarray, "n 3"]:
+@unchecked_kernel
+def _lowered(xyz: np.ndarray, knots: np.ndarray, errors: np.ndarray, slope: np.ndarray) -> Float64[np.ndarray, "n 3"]:
     last = len(knots) - 1
     # Blocks that fit into the fastest cache, their coordinates apart: compilers then do several angles at once.
     level, height, elevation = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
@@ -72,6 +70,3 @@ def _lowered_points(
             result[start + i, 0], result[start + i, 1] = part[i, 0] * shrunk, part[i, 1] * shrunk
             result[start + i, 2] = height[i] * cosine - level[i] * sine
     return result
-
-
-_lowered = entry_point(_lowered_points, nogil=True, error_model="numpy")

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from nurec_sim.compute.angles import arctan2
-from nurec_sim.compute.kernels import entry_point, kernel
+from nurec_sim.compute.kernels import kernel, unchecked_kernel
 from nurec_sim.types import Matrix4
 
 BLOCK = 1024
@@ -75,7 +75,8 @@ def _unpacked(steps_mm: np.ndarray, pose: np.ndarray) -> Float64[np.ndarray, "n 
     return result
 
 
-def _turn_times_of(xyz: np.ndarray, turn_us: float) -> Int64[np.ndarray, " n"]:
+@unchecked_kernel
+def _turn_times(xyz: np.ndarray, turn_us: float) -> Int64[np.ndarray, " n"]:
     # Blocks that fit into the fastest cache, their coordinates apart: compilers then do several angles at once.
     across, along, result = np.empty(BLOCK), np.empty(BLOCK), np.empty(len(xyz), np.int64)
     for start in range(0, len(xyz), BLOCK):
@@ -87,9 +88,6 @@ def _turn_times_of(xyz: np.ndarray, turn_us: float) -> Int64[np.ndarray, " n"]:
         for i in range(count):
             result[start + i] = np.int64(across[i])
     return result
-
-
-_turn_times = entry_point(_turn_times_of, nogil=True, error_model="numpy")
 
 
 @kernel

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numba import njit
 
-from nurec_sim.compute.kernels import entry_point
+from nurec_sim.compute.kernels import unchecked_inner, unchecked_kernel
 
 STEP_RAD = np.radians(0.2)
 """Cells of a sweep's image: about one beam of a scanner with 64 rows each."""
@@ -34,16 +31,7 @@ ROUNDING = 1e-6
 """Beams are stored in single precision: their squared lengths are 1 within a fraction of this."""
 
 
-def _kernel(function: Callable) -> Callable:
-    """A kernel in strict arithmetic whose divisions raise nothing: loops with others are not vectorised."""
-    return entry_point(function, nogil=True, error_model="numpy")
-
-
-def _inner(function: Callable) -> Callable:
-    return njit(nogil=True, error_model="numpy")(function)
-
-
-@_inner
+@unchecked_inner
 def _angle(y, x):
     """Angle of the direction (x, y) within 2e-8 rad, by Abramowitz and Stegun 4.4.49; a fifth of ``arctan2``'s time."""
     wide, high = abs(x), abs(y)
@@ -59,7 +47,7 @@ def _angle(y, x):
     return -angle if y < 0 else angle
 
 
-@_inner
+@unchecked_inner
 def _turned(turn, x, y, z):
     return (
         turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z,
@@ -68,14 +56,14 @@ def _turned(turn, x, y, z):
     )
 
 
-@_inner
+@unchecked_inner
 def _half_width(axes, u, v, w):
     """Half of the width along a unit vector of an ellipsoid with the given half axes (rows)."""
     a, b, c = _turned(axes, u, v, w)
     return np.sqrt(a * a + b * b + c * c)
 
 
-@_inner
+@unchecked_inner
 def _wrapped(column):
     """A column less than a turn outside of the image, in it; what is farther outside, as of no number, at its edge."""
     if column < 0:
@@ -83,7 +71,7 @@ def _wrapped(column):
     return min(column - COLUMNS, COLUMNS - 1) if column >= COLUMNS else column
 
 
-@_inner
+@unchecked_inner
 def _undecided(counts, found):
     """Numbers of the Gaussians that need more beams, into ``found``; returns how many."""
     n = 0
@@ -95,7 +83,7 @@ def _undecided(counts, found):
     return n
 
 
-@_kernel
+@unchecked_kernel
 def ellipsoids(mean_m, quat_wxyz, scale_m):
     """Gaussians as ``count`` needs them.
 
@@ -135,7 +123,7 @@ def ellipsoids(mean_m, quat_wxyz, scale_m):
     return xyz, canonical, extent, radius, thinness, thinnest
 
 
-@_kernel
+@unchecked_kernel
 def count(
     xyz, canonical, extent, radius, thinness, thinnest,
     pose, drift, beams, image, reach_m, farthest_m, low, width, fraction, counts,

@@ -12,7 +12,7 @@ import pytest
 from nurec_sim.compute import kernels
 
 PACKAGE = Path(kernels.__file__).parents[1]
-DECORATORS = {"kernel", "inner", "vector_kernel", "intrinsic", "entry_point"}
+DECORATORS = {"kernel", "inner", "unchecked_kernel", "unchecked_inner", "vector_kernel", "intrinsic", "entry_point"}
 SOURCES = {path: path.read_text() for path in sorted(PACKAGE.rglob("*.py"))}
 WITH_KERNELS = [
     path

@@ -22,11 +22,12 @@ from nurec_sim.reconstruct.free_space import (
 from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels
 from nurec_sim.reconstruct.lift.blocks import LEAST_TOLERANCE
 from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.cloud import Cloud
 from nurec_sim.reconstruct.lift.footprints import footprints_of, marked_free, on_ground, outside_free_space
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
-from nurec_sim.reconstruct.lift.points import Actor, Cloud
+from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.reconstruct.lift.surfaces import PIXEL_SIGMA
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView

@@ -9,10 +9,10 @@ from nurec_sim import geometry
 from nurec_sim.reconstruct.lift import bake
 from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels
 from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.cloud import Cloud
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import FARTHER, OWNER_BORDER, OWNER_RING, Lifted, owned, owning
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
-from nurec_sim.reconstruct.lift.points import Cloud
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.lift.points import BODY_MARGIN_M, NEAREST_M, Cloud, _usable, thinned
+from nurec_sim.reconstruct.lift.cloud import Cloud, thinned
+from nurec_sim.reconstruct.lift.points import BODY_MARGIN_M, NEAREST_M, _usable
 
 
 def test_points_of_one_voxel_are_averaged_and_unknown_intensity_is_left_out():

@@ -5,8 +5,9 @@ from nurec_sim.reconstruct.lift import lifting
 from nurec_sim.reconstruct.lift.actors import in_box, standing_knots_us, tracks_of
 from nurec_sim.reconstruct.lift.bake import body_pixels
 from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.cloud import Cloud
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
-from nurec_sim.reconstruct.lift.points import Cloud, actors_of
+from nurec_sim.reconstruct.lift.points import actors_of
 from nurec_sim.reconstruct.lift.settings import LiftSettings, PointSettings
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 from nurec_sim.types import Gaussians, Track, Trajectory

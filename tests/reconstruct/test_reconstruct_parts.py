@@ -8,9 +8,10 @@ from reconstruct_street import KERB_M, STEP_M, Street, camera
 
 from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.lift import colour, depth, lifting, road, splat
+from nurec_sim.reconstruct.lift.cloud import Cloud
 from nurec_sim.reconstruct.lift.ground import find_ground
 from nurec_sim.reconstruct.lift.matching import census
-from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather
+from nurec_sim.reconstruct.lift.points import actors_of, gather
 from nurec_sim.reconstruct.lift.settings import (
     ColourSettings,
     GroundSettings,

@@ -7,7 +7,8 @@ from reconstruct_street import Street
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lift import colour, lifting, splat, surfaces
 from nurec_sim.reconstruct.lift.bodies import surfels_of
-from nurec_sim.reconstruct.lift.points import Cloud, actors_of, gather, voxel_edge_m
+from nurec_sim.reconstruct.lift.cloud import Cloud
+from nurec_sim.reconstruct.lift.points import actors_of, gather, voxel_edge_m
 from nurec_sim.reconstruct.lift.settings import LiftSettings, PointSettings
 from nurec_sim.reconstruct.lift.smoothing import UNIT, smooth_depth
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView

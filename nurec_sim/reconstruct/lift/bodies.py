@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.free_space import BeamCounts, SweepBeams, balls, count_beams, in_free_space, weighed
-from nurec_sim.reconstruct.lift import points, surfaces
+from nurec_sim.reconstruct.lift import surfaces
+from nurec_sim.reconstruct.lift.cloud import Cloud, thinned
 from nurec_sim.reconstruct.lift.ground import Ground, find_ground
-from nurec_sim.reconstruct.lift.points import Actor, Cloud, Gathered
+from nurec_sim.reconstruct.lift.points import Actor, Gathered
 from nurec_sim.reconstruct.lift.settings import GroundSettings, LiftSettings
 from nurec_sim.types import Clip, Gaussians, Label
 
@@ -138,7 +139,7 @@ def _actor_surfels(number: int, actor: Actor, gathered: Gathered, ground: Ground
     if number in gathered.feet:
         box_feet, world_feet = gathered.feet[number]
         off_ground = ~(np.abs(ground.above(world_feet)) < SHEET_M)
-        cloud = Cloud.concatenate([cloud, points.thinned(box_feet[off_ground])])
+        cloud = Cloud.concatenate([cloud, thinned(box_feet[off_ground])])
     cloud, normal, spacing = surfaces.surface_of(cloud)
     sigma, label = surfaces.DISC_SIGMA * spacing, np.full(len(cloud), Label.MOVABLE, np.uint8)
     return Surfels(actor, cloud, normal, spacing, sigma, label)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from nurec_sim.reconstruct.lift.points import Cloud
+from nurec_sim.reconstruct.lift.cloud import Cloud
 from nurec_sim.reconstruct.lift.road import DRIVEN_M, FILL_M, grow_road
 from nurec_sim.reconstruct.lift.settings import GroundSettings
 

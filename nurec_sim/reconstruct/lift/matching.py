@@ -6,12 +6,12 @@ have no branches where they can, and index whole arrays, so that they become vec
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int16, UInt8, UInt64
 
-from nurec_sim.compute.kernels import entry_point, inner, kernel
+from nurec_sim.compute.kernels import inner, kernel, unchecked_kernel
 from nurec_sim.reconstruct.lift.smoothing import UNIT
 
 BIT_COST, COLOUR_COST, MOST_COST = 20, 6, 500
@@ -99,12 +99,7 @@ def _fill_texels(rgb, codes, texels):
             texels[row, column, 1] = word | np.uint64(rgb[row, column, 2]) << np.uint64(16)
 
 
-def _without_checks(function: Callable) -> Callable:
-    """A kernel that does not compare each divisor with zero, which would be a branch."""
-    return entry_point(function, nogil=True, error_model="numpy")
-
-
-@_without_checks
+@unchecked_kernel
 def matching_cost(view, world_from_view, open_pixels, others, rgb, codes, texels, across, inverse_depths, cost):
     """Fill ``cost``: see ``open_costs``.
 

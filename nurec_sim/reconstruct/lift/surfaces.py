@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import kernel
-from nurec_sim.reconstruct.lift.points import Cloud
+from nurec_sim.reconstruct.lift.cloud import Cloud
 from nurec_sim.reconstruct.lift.principal_axes import principal_axes
 from nurec_sim.types import Gaussians, Label
 
