@@ -7,7 +7,7 @@ import pytest
 from reconstruct_street import Street
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct import LiftSettings, reconstruct
+from nurec_sim.reconstruct import LiftSettings, beam_counting, reconstruct
 from nurec_sim.reconstruct.beam_counting import BLOCK, CLEAR, MEETS, THINNEST_M, ellipsoids
 from nurec_sim.reconstruct.free_space import (
     MOST_SWEEPS,
@@ -401,3 +401,8 @@ def test_footprints_on_level_surfaces_stretch_as_far_as_they_are_seen_flat_and_o
     body = body_of(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
     made = footprints_of(lifted, body, level_ground(), LiftSettings())
     assert made.scale_m[:, 0] / made.scale_m[:, 1] == pytest.approx([20, 5, 5], rel=1e-4)
+
+
+@pytest.mark.parametrize(("column", "there"), [(-1, 1799), (0, 0), (1800, 0), (-(2**63), 0), (2**62, 1799)])
+def test_columns_wrap_and_those_of_no_number_stay_in_the_image(column, there):
+    assert beam_counting._wrapped.py_func(column) == there
