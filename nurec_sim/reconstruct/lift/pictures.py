@@ -13,7 +13,7 @@ from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import inner, kernel
 from nurec_sim.reconstruct.lift import depth, lifting
 from nurec_sim.reconstruct.lift.bodies import Surfels
-from nurec_sim.reconstruct.lift.fusion import fused_depths
+from nurec_sim.reconstruct.lift.fusion import FARTHEST, fused_depths
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.splat import draw_surfels, trim_silhouettes, world_point
@@ -23,8 +23,6 @@ OUTLINE_M = 0.6
 """Unmeasured pixels up to this far outside of a box may show its object."""
 MARGIN_M = 0.1
 """Pixels this far outside of a box belong to it: boxes are not exact."""
-FARTHEST = 1e-3
-"""1/m; pixels at infinity are taken to lie at this inverse depth."""
 
 
 @dataclass(frozen=True)
