@@ -68,15 +68,14 @@ def sum_paths(cost, measured, gray, jumps, small, inverse_depths, forwards, tota
     height, width, levels = total.shape
     sign, pixel = (1, -1) if forwards else (-1, len(cost))
     own, sums = np.empty(levels, np.int16), np.empty(levels, np.uint16)
-    # L of the row before and of this one, and their least values. One more level at both ends spares the inner loop a
-    # test of whether there is a next one, one more column at both sides a test of whether there is a pixel before:
-    # after an L of zero, a path begins anew.
-    line, fresh = np.zeros((4, width + 2, levels + 2), np.int16), np.zeros((4, width + 2, levels + 2), np.int16)
-    low_line, low_fresh = np.zeros((4, width + 2), np.int16), np.zeros((4, width + 2), np.int16)
+    # L of this row and of the one before, in turn, and their least values. One more level at both ends spares the inner
+    # loop a test of whether there is a next one, one more column at both sides a test of whether there is a pixel
+    # before: after an L of zero, a path begins anew.
+    along, low = np.zeros((2, 4, width + 2, levels + 2), np.int16), np.zeros((2, 4, width + 2), np.int16)
     for edge in (0, levels + 1):
-        line[:, :, edge], fresh[:, :, edge] = MOST, MOST
+        along[:, :, :, edge] = MOST
     for number in range(height):
-        row = number if forwards else height - 1 - number
+        row, now = number if forwards else height - 1 - number, number % 2
         above = min(max(row - sign, 0), height - 1)
         for step in range(width):
             column = step if forwards else width - 1 - step
@@ -93,46 +92,35 @@ def sum_paths(cost, measured, gray, jumps, small, inverse_depths, forwards, tota
                 place = column + sign * BEFORE[n]
                 beside = min(max(place, 0), width - 1)
                 jump = jumps[abs(shade - np.int64(gray[row if n == 0 else above, beside]))]
-                least = np.int16(MOST)
-                if n == 0:
-                    low = low_fresh[0, place + 1]
-                    far = np.int16(low + jump)
-                    for k in range(levels):
-                        near = np.int16(min(fresh[0, place + 1, k], fresh[0, place + 1, k + 2]) + small)
-                        best = min(min(fresh[0, place + 1, k + 1], far), near)
-                        here = np.int16(own[k] + np.int16(best - low))
-                        fresh[0, column + 1, k + 1] = here
-                        least = min(least, here)
-                else:
-                    low = low_line[n, place + 1]
-                    far = np.int16(low + jump)
-                    for k in range(levels):
-                        near = np.int16(min(line[n, place + 1, k], line[n, place + 1, k + 2]) + small)
-                        best = min(min(line[n, place + 1, k + 1], far), near)
-                        here = np.int16(own[k] + np.int16(best - low))
-                        fresh[n, column + 1, k + 1] = here
-                        least = min(least, here)
-                low_fresh[n, column + 1] = least
+                # The first path comes from this row, the others from the one before.
+                then, least = now if n == 0 else 1 - now, np.int16(MOST)
+                before = low[then, n, place + 1]
+                far = np.int16(before + jump)
+                for k in range(levels):
+                    near = np.int16(min(along[then, n, place + 1, k], along[then, n, place + 1, k + 2]) + small)
+                    best = min(min(along[then, n, place + 1, k + 1], far), near)
+                    here = np.int16(own[k] + np.int16(best - before))
+                    along[now, n, column + 1, k + 1] = here
+                    least = min(least, here)
+                low[now, n, column + 1] = least
             if forwards:
                 for k in range(levels):
-                    total[row, column, k] = _four(fresh, column + 1, k + 1)
+                    total[row, column, k] = _four(along, now, column + 1, k + 1)
             else:
                 low_sum = np.uint16(0xFFFF)
                 for k in range(levels):
-                    here_sum = np.uint16(total[row, column, k] + _four(fresh, column + 1, k + 1))
+                    here_sum = np.uint16(total[row, column, k] + _four(along, now, column + 1, k + 1))
                     sums[k] = here_sum
                     low_sum = min(low_sum, here_sum)
                 result[row, column] = _depth_of(sums, low_sum, inverse_depths)
-        # Only the row before is read, so two rows of L suffice.
-        line, fresh = fresh, line
-        low_line, low_fresh = low_fresh, low_line
 
 
 @inner
-def _four(costs, column, k):
+def _four(costs, now, column, k):
     """Sum of the four paths."""
     return np.uint16(
-        np.uint16(costs[0, column, k] + costs[1, column, k]) + np.uint16(costs[2, column, k] + costs[3, column, k])
+        np.uint16(costs[now, 0, column, k] + costs[now, 1, column, k])
+        + np.uint16(costs[now, 2, column, k] + costs[now, 3, column, k])
     )
 
 
