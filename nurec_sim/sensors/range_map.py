@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Complex128, Float32, Float64, Int32, Int64
 
+from nurec_sim.sensors.range_map_kernels import cone_apex, phase_sums
 from nurec_sim.types import LidarModel, Spin
 
 Points = Float64[np.ndarray, "n 3"]
@@ -115,9 +116,9 @@ def range_map(lidar: LidarModel, xyz_fired_m: Points) -> RangeMap:
     # From half a column before the first one, so that points at the seam do not become the last ones of a turn.
     half = np.pi / len(lidar.azimuth_rad)
     turned = (sign * (azimuth - lidar.azimuth_rad[0] - offset[row]) + half) % (2 * np.pi) - half
-    grid = _columns(lidar, row, turned)
+    order = _in_turn(row, turned, len(elevation))
+    grid = _columns(lidar, row, turned, order)
     columns, step = len(grid), (grid[-1] - grid[0]) / max(len(grid) - 1, 1)
-    order = np.lexsort((turned, row))
     place = np.empty(len(xyz), np.int64)
     column = np.interp(turned, np.append(grid, grid[-1] + step), np.arange(columns + 1))
     # Rows fire with a phase of their own: rounding without it would put neighbours onto one column, then skip one.
@@ -201,10 +202,28 @@ def _nearest(falling: Values, value: Values) -> Int64[np.ndarray, " n"]:
 
 def _medians(group: Int64[np.ndarray, " n"], value: Values, missing: Values) -> Values:
     """Median of each group; ``missing`` where it is empty."""
-    order = np.lexsort((value, group))
-    count = np.bincount(group, minlength=len(missing))
-    middle = np.minimum(np.cumsum(count) - count + count // 2, max(len(value) - 1, 0))
-    return np.where(count > 0, value[order][middle], missing) if len(value) else missing
+    result, (order, ends) = np.array(missing, np.float64), _by_row(group, len(missing))
+    for k, (start, end) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+        if start < end:
+            middle = (end - start) // 2
+            result[k] = np.partition(value[order[start:end]], middle)[middle]
+    return result
+
+
+def _by_row(row: Int64[np.ndarray, " n"], rows: int) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " rows+1"]]:
+    """Indices of points sorted by row, in their order within each row, and where each row starts and the last ends."""
+    # Numbers of 16 bits are not compared but counted.
+    order = np.argsort(row.astype(np.uint16) if rows <= 1 << 16 else row, kind="stable")
+    return order, np.concatenate([[0], np.cumsum(np.bincount(row, minlength=rows))])
+
+
+def _in_turn(row: Int64[np.ndarray, " n"], turned: Values, rows: int) -> Int64[np.ndarray, " n"]:
+    """Indices of points sorted by row, and by angle within each row."""
+    order, ends = _by_row(row, rows)
+    for start, end in zip(ends[:-1], ends[1:], strict=True):
+        mine = order[start:end]
+        order[start:end] = mine[np.argsort(turned[mine], kind="stable")]
+    return order
 
 
 def _cones(row: Int64[np.ndarray, " n"], height: Values, across: Values) -> tuple[Values, Values]:
@@ -215,21 +234,18 @@ def _cones(row: Int64[np.ndarray, " n"], height: Values, across: Values) -> tupl
     count = row.max() + 1
     apex = np.full(count, np.nan)
     usable = np.flatnonzero(across > NEAREST_M)
-    usable = usable[np.argsort(row[usable], kind="stable")]
-    ends = np.searchsorted(row[usable], np.arange(count + 1))
+    order, ends = _by_row(row[usable], count)
+    usable = usable[order]
+    height_of, across_of = height[usable], across[usable]
     for k in range(count):
-        chosen = usable[ends[k] : ends[k + 1]]
-        z, rho = height[chosen], across[chosen]
-        if len(z) < FEWEST_POINTS or np.ptp(rho) < LEAST_SPREAD * np.median(rho):
+        z, rho = height_of[ends[k] : ends[k + 1]], across_of[ends[k] : ends[k + 1]]
+        if len(z) < FEWEST_POINTS:
             continue
-        weight = 1 / rho
-        for _ in range(5):
-            # Normal equations of weight (z - a - slope rho).
-            one, by_rho = weight * weight, weight * weight * rho
-            left = [[one.sum(), by_rho.sum()], [by_rho.sum(), by_rho @ rho]]
-            a, slope = np.linalg.solve(left, [one @ z, by_rho @ z])
-            # Weights approach those of the smallest sum of absolute angles.
-            weight = 1 / rho / np.sqrt(np.maximum(np.abs(z - a - slope * rho) / rho, 1e-4))
+        spread, most = np.ptp(rho), rho.max()
+        # The median is at most the largest one, which is known at once.
+        if spread < LEAST_SPREAD * most and spread < LEAST_SPREAD * np.median(rho):
+            continue
+        a = cone_apex(z, rho)
         apex[k] = a if abs(a) < HIGHEST_APEX_M else np.nan
     fitted = np.flatnonzero(np.isfinite(apex))
     if len(fitted):
@@ -246,15 +262,15 @@ def _spacing(falling: Values) -> Values:
     return np.minimum(np.append(gap, gap[-1]), np.insert(gap, 0, gap[0]))
 
 
-def _columns(lidar: LidarModel, row: Int64[np.ndarray, " n"], turned: Values) -> Values:
+def _columns(lidar: LidarModel, row: Int64[np.ndarray, " n"], turned: Values, order: Int64[np.ndarray, " n"]) -> Values:
     """Angle turned at each column, from the distance between neighbouring points of a row; the model's if too few.
 
-    The rate of a turn varies by some percent, so the distance is measured in sectors.
+    The rate of a turn varies by some percent, so the distance is measured in sectors. ``order`` sorts points by row and
+    angle.
     """
     columns = len(lidar.azimuth_rad)
     step = abs(float(lidar.azimuth_rad[-1] - lidar.azimuth_rad[0])) / max(columns - 1, 1) or 2 * np.pi
     span = step * columns
-    order = np.lexsort((turned, row))
     gap, at = np.diff(turned[order]), turned[order][1:]
     # An encoder's steps average out; gaps of several columns are left out.
     near = (np.diff(row[order]) == 0) & (gap > 0.3 * step) & (gap < 1.45 * step)
@@ -282,10 +298,8 @@ def _phases(
     The drift is that from sector to sector, of all rows together, summed up: 0 in the first one.
     """
     rows = int(row.max(initial=0)) + 1
-    cell = row * SECTORS + np.clip(turned / span * SECTORS, 0, SECTORS - 1).astype(np.int64)
-    turn = np.exp(2j * np.pi * column)
-    total = np.bincount(cell, turn.real, rows * SECTORS) + 1j * np.bincount(cell, turn.imag, rows * SECTORS)
-    total = total.reshape(rows, SECTORS)
+    real, imaginary = phase_sums(row, turned, column, float(span), rows, SECTORS)
+    total = (real + 1j * imaginary).reshape(rows, SECTORS)
     steps = np.angle((total[:, 1:] * total[:, :-1].conj()).sum(axis=0)) / (2 * np.pi)
     return total, np.concatenate([[0.0], np.cumsum(steps)])
 
