@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from nurec_sim import geometry
+from nurec_sim.logs.points import moved_points, numbered
 from nurec_sim.logs.sweeps import INSTANT_US, prolonged
 from nurec_sim.types import Clip, Sweep
 
@@ -17,11 +18,14 @@ def as_fired(clip: Clip, lidar: str, sweep: Sweep) -> tuple[Float64[np.ndarray, 
     # The sweep's own pose in the log is the reference; the ego trajectory only contributes the motion around it.
     fix = sweep.world_from_lidar @ geometry.inverse(ego.at(sweep.t_us) @ rig_from_lidar)
     poses = fix @ ego.at(np.array([sweep.start_us, sweep.end_us])) @ rig_from_lidar
-    _, first, place = np.unique(sweep.point_t_us // INSTANT_US, return_index=True, return_inverse=True)
+    if not len(sweep.point_t_us):
+        return np.zeros((0, 3)), poses
+    instants, place = numbered(sweep.point_t_us // INSTANT_US)
+    # The first point of each instant: the last one that is written.
+    first = np.empty(len(instants), np.int64)
+    first[place[::-1]] = np.arange(len(place))[::-1]
     fired = fix @ ego.at(sweep.point_t_us[first]) @ rig_from_lidar
-    lidar_from_world = geometry.inverse(fired)[place]
-    xyz = np.einsum("nij,nj->ni", lidar_from_world[:, :3, :3], sweep.xyz_world_m) + lidar_from_world[:, :3, 3]
-    return xyz, poses
+    return moved_points(sweep.xyz_world_m, geometry.inverse(fired), place), poses
 
 
 def fired_fraction(sweep: Sweep) -> Float64[np.ndarray, " n"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -47,13 +48,13 @@ class SweepWindow:
         xyz = self.image.xyz_m[self.image.returned].astype(np.float64)
         return geometry.transform_points(self.world_from_image, xyz)
 
-    @property
+    @cached_property
     def range_m(self) -> Float32[np.ndarray, " n"]:
         """Range of the returns."""
-        ray = self.image.xyz_m - self.image.eye_m
-        return np.linalg.norm(ray[self.image.returned], axis=1)
+        x, y, z = (self.image.xyz_m - self.image.eye_m)[self.image.returned].T
+        return np.sqrt(x * x + y * y + z * z)
 
-    @property
+    @cached_property
     def spacing_m(self) -> Float32[np.ndarray, " n"]:
         """Distance between beams at the returns, along rows or columns, the smaller one."""
         step = np.minimum(self.image.row_step_rad, self.image.column_step_rad)[:, None]
