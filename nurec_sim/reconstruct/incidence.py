@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from nurec_sim.compute.cores import usable_cores
+from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.free_space import chosen_sweeps
 from nurec_sim.types import Clip, Gaussians, GaussianScene
 
@@ -99,11 +100,19 @@ def _returns(clip: Clip, hold_out: Collection[int]) -> tuple[np.ndarray, np.ndar
 def _cosines(gaussians: Gaussians, eye: Float32[np.ndarray, "m 3"], place: np.ndarray) -> Float64[np.ndarray, "n k"]:
     """Cosine of incidence on each Gaussian from where each of its returns was seen."""
     cosine = np.empty(place.shape)
-    for k in range(place.shape[1]):
-        away = gaussians.mean_m - eye[place[:, k]]
-        length = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
-        cosine[:, k] = np.minimum(np.abs(np.einsum("ni,ni->n", away, gaussians.normal)) / length, 1)
+    _fill_cosines(gaussians.mean_m, gaussians.normal, eye, place, cosine)
     return cosine
+
+
+@kernel
+def _fill_cosines(mean, normal, eye, place, cosine):
+    for i in range(len(place)):
+        for k in range(place.shape[1]):
+            j = place[i, k]
+            x, y, z = mean[i, 0] - eye[j, 0], mean[i, 1] - eye[j, 1], mean[i, 2] - eye[j, 2]
+            length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-6))
+            across = abs(x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2])
+            cosine[i, k] = min(across / length, np.float32(1))
 
 
 def at_normal(

@@ -7,8 +7,8 @@ import pytest
 from reconstruct_street import Street
 
 from nurec_sim.reconstruct import reconstruct
-from nurec_sim.reconstruct.incidence import at_normal, best_falloff, with_incidence
-from nurec_sim.types import Sweep
+from nurec_sim.reconstruct.incidence import _cosines, at_normal, best_falloff, with_incidence
+from nurec_sim.types import Gaussians, Sweep
 
 HELD = 3
 FALLOFF = 0.6
@@ -66,3 +66,12 @@ def test_intensity_at_normal_incidence_is_a_least_squares_fit():
     assert straight == pytest.approx([0.56]) and error == pytest.approx([0.12])
     assert best_falloff(shown, cosine, weight) == (0.5, pytest.approx(1.0))
     assert best_falloff(shown[:, :1], cosine[:, :1], weight[:, :1]) == (0.0, 0.0)  # one angle tells nothing
+
+
+def test_cosines_are_those_between_normals_and_the_ways_to_where_returns_were_seen_from():
+    up = np.tile(np.float32([0, 0, 1]), (2, 1))
+    surfaces = dataclasses.replace(Gaussians.empty(2), mean_m=np.float32([[0, 0, 0], [3, 0, 0]]), normal=up)
+    eye = np.float32([[0, 0, 5], [3, 4, 0], [0, 0, -4], [0, 0, 0]])
+    # From above, along the surface, from below, and from where the Gaussian itself is.
+    wanted = [[1, 0, 1, 0], [5 / np.hypot(3, 5), 0, 0.8, 0]]
+    np.testing.assert_allclose(_cosines(surfaces, eye, np.tile(np.arange(4), (2, 1))), wanted, atol=1e-7)
