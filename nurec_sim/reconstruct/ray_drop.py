@@ -20,6 +20,7 @@ from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order, usable_cores
 from nurec_sim.logs.fired import as_fired
 from nurec_sim.reconstruct.free_space import chosen_sweeps
+from nurec_sim.reconstruct.ray_drop_fit import logistic, sigmoid
 from nurec_sim.render import make_renderer
 from nurec_sim.render.device import Renderer
 from nurec_sim.sensors import RangeMap, beam_sectors, blocked_beams, range_map
@@ -40,10 +41,6 @@ VOXEL_M = 0.3
 PRIOR_VOTES = 2.0
 """Beams that the regression counts for in a voxel."""
 BOX_MARGIN_M = 0.3
-RIDGE = 1.0
-"""Pull of the regression's coefficients to 0, in votes."""
-SETTLED = 1e-9
-"""The regression ends when no coefficient changes by more."""
 LEAST_MOVED_M = 5.0
 """Only a car that moves can tell blocked beams from dark surfaces beside it."""
 MEETING, BLOCKED = 0.5, 0.1
@@ -127,7 +124,7 @@ def with_ray_drop(
     keys = [_keys(gaussians.mean_m.astype(np.float64), body) for gaussians, body in layers]
     normals = _voxel_normals(votes, layers, keys)
     features = _features(votes.xyz_m, votes.eye_m, normals, votes.intensity)
-    weights = _logistic(features, votes.dropped)
+    weights = logistic(features, votes.dropped)
     drops = _drop_probabilities(votes, features, weights, layers, keys)
     dynamic = scene.dynamic
     if len(dynamic):
@@ -260,24 +257,6 @@ def _features(xyz: np.ndarray, eye: np.ndarray, normal: np.ndarray, intensity: n
     return np.column_stack([np.ones(len(xyz)), reach, reach**2, incidence, shown])
 
 
-def _logistic(features: np.ndarray, dropped: np.ndarray) -> np.ndarray:
-    """Coefficients of the logistic regression, by Newton's method with a ridge."""
-    weights = np.zeros(features.shape[1])
-    for _ in range(12):
-        p = _sigmoid(features @ weights)
-        gradient = features.T @ (dropped - p) - RIDGE * weights
-        curvature = (features * (p * (1 - p))[:, None]).T @ features + RIDGE * np.eye(len(weights))
-        step = np.linalg.solve(curvature, gradient)
-        weights = weights + step
-        if np.abs(step).max() < SETTLED:
-            break
-    return weights
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-np.clip(x, -30, 30)))
-
-
 def _logit(p: np.ndarray) -> np.ndarray:
     return np.log(p) - np.log1p(-p)
 
@@ -304,10 +283,10 @@ def _drop_probabilities(
     voxel, where = np.unique(votes.key, return_inverse=True)
     count = np.bincount(where)
     dropped = np.bincount(where, votes.dropped)
-    expected = np.bincount(where, _sigmoid(features @ weights)) / count
+    expected = np.bincount(where, sigmoid(features @ weights)) / count
     share = (dropped + PRIOR_VOTES * expected) / (count + PRIOR_VOTES)
     shift = _shift(share[where], int(votes.dropped.sum()))
-    share = _sigmoid(_logit(share) - shift)
+    share = sigmoid(_logit(share) - shift)
     eyes = np.round(votes.eye_m[votes.body < 0], 3)
     # Votes of one sweep follow each other: sorting all of them would take long.
     eyes = np.unique(eyes[np.append(np.ones(min(len(eyes), 1), bool), (eyes[1:] != eyes[:-1]).any(axis=1))], axis=0)
@@ -323,6 +302,6 @@ def _drop_probabilities(
             xyz = gaussians.mean_m[missing].astype(np.float64)
             eye = eyes[cKDTree(eyes).query(xyz, workers=usable_cores())[1]]
             inputs = _features(xyz, eye, gaussians.normal[missing], gaussians.intensity[missing])
-            drop[missing] = _sigmoid(inputs @ weights - shift)
+            drop[missing] = sigmoid(inputs @ weights - shift)
         out.append(drop)
     return out

@@ -7,8 +7,9 @@ import pytest
 from reconstruct_street import Street
 
 from nurec_sim import logs, sensors
-from nurec_sim.reconstruct import reconstruct
-from nurec_sim.reconstruct.ray_drop import _logistic, _shift
+from nurec_sim.reconstruct import ray_drop_fit, reconstruct
+from nurec_sim.reconstruct.ray_drop import _shift
+from nurec_sim.reconstruct.ray_drop_fit import RIDGE, logistic, sigmoid
 from nurec_sim.render import make_renderer
 from nurec_sim.types import SensorRequest, Sweep
 
@@ -107,7 +108,19 @@ def test_the_regression_finds_the_coefficients_that_made_the_outcomes():
     features = np.column_stack([np.ones(50_000), rng.normal(size=(50_000, 2))])
     true = np.array([-1.0, 0.8, -0.5])
     dropped = rng.random(50_000) < 1 / (1 + np.exp(-features @ true))
-    assert np.allclose(_logistic(features, dropped), true, atol=0.05)
+    assert np.allclose(logistic(features, dropped), true, atol=0.05)
+
+
+def test_a_start_from_some_beams_does_not_change_the_regression(monkeypatch):
+    rng = np.random.default_rng(1)
+    features = np.column_stack([np.ones(250_000), rng.normal(size=(250_000, 2))])
+    # The beams that it starts from say something else.
+    dropped = rng.random(250_000) < np.where(np.arange(250_000) % 5 == 0, 0.6, 0.2)
+    found = logistic(features, dropped)
+    gradient = features.T @ (dropped - sigmoid(features @ found)) - RIDGE * found
+    assert np.abs(gradient).max() < 1e-6
+    monkeypatch.setattr(ray_drop_fit, "MANY", 1_000_000)
+    np.testing.assert_allclose(found, logistic(features, dropped), atol=1e-12)
 
 
 def test_as_many_beams_are_dropped_as_were_recorded():
