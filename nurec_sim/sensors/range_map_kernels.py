@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from jaxtyping import Float64, Int64
 
 from nurec_sim.compute.kernels import unchecked_inner, unchecked_kernel
 
+Values = Float64[np.ndarray, " n"]
 BLOCK = 1024
 ROUNDS = 5
 LEAST_ANGLE_RAD = 1e-4
@@ -20,7 +22,7 @@ _C4, _C5, _C6 = 2.48015872888517045348e-5, -1.38888888888730564116e-3, 4.1666666
 
 
 @unchecked_kernel
-def cone_apex(height, across):
+def cone_apex(height: Values, across: Values) -> float:
     """Height at which the cone of a row starts: height = apex + across * slope, of the smallest sum of angles, about.
 
     Args:
@@ -50,7 +52,9 @@ def cone_apex(height, across):
 
 
 @unchecked_kernel
-def phase_sums(row, turned, column, span, rows, sectors):
+def phase_sums(
+    row: Int64[np.ndarray, " n"], turned: Values, column: Values, span: float, rows: int, sectors: int
+) -> tuple[Float64[np.ndarray, " cells"], Float64[np.ndarray, " cells"]]:
     """Sums of cosines and sines of the points' phases, one turn per column, by row and sector: [rows * sectors] each.
 
     Args:
@@ -80,7 +84,7 @@ def phase_sums(row, turned, column, span, rows, sectors):
 
 
 @unchecked_inner
-def _of_turns(turns):
+def _of_turns(turns: float) -> tuple[float, float]:
     """Cosine and sine of an angle in turns."""
     quarter = np.rint(4 * turns)
     x = 2 * math.pi * (turns - quarter / 4)
