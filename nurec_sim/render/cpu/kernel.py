@@ -32,6 +32,15 @@ def inner(function: Callable) -> Callable:
     return njit(**_INLINE, **_OPTIONS)(function)
 
 
+def fixed(number: int) -> tuple[int, ...]:
+    """A small number that a kernel is compiled for: a tuple as long as it says.
+
+    The length of a tuple is part of its type, so each number has machine code of its own, made when it is first used.
+    Of branches on ``len(argument)`` only the one that is taken is compiled.
+    """
+    return (0,) * number
+
+
 @inner
 def keep_alive(array):
     """Use an array again: Numba frees it after its last use by name, whoever still works with its address."""

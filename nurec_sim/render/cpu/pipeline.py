@@ -115,8 +115,8 @@ def draw(pictures: Sequence[Picture], workers: Workers) -> list[Float32[np.ndarr
                 if picture.output_kind == LIDAR:
                     calls.append((draw_beams, rays, picture.projected, picture.binned, tiles, planes, done))
                     continue
-                calls.append((draw_tiles, rays, picture.projected, picture.binned, normals, picture.output_kind, tiles,
-                              planes, done))  # fmt: skip
+                calls.append((draw_tiles, rays.mode, picture.output_kind, rays, picture.projected, picture.binned,
+                              normals, tiles, planes, done))  # fmt: skip
         workers.run_calls(calls)
     for picture, done in counts:
         picture.stats.evaluations += int(done[0])

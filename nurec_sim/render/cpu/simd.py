@@ -240,6 +240,16 @@ class Lanes:
         """One float from memory in all lanes."""
         return self.spread(self.b.load(self.pointer(base, offset), typ=F32, align=4))
 
+    def table(self, name: str, numbers: Sequence[int]) -> ir.Value:
+        """The address (int64) of a table of int64 constants, by a name of its own."""
+        kind = ir.ArrayType(I64, len(numbers))
+        known = self.b.module.globals.get(name)
+        if known is None:
+            known = ir.GlobalVariable(self.b.module, kind, name)
+            known.global_constant, known.linkage = True, "private"
+            known.initializer = ir.Constant(kind, list(numbers))
+        return self.b.ptrtoint(known, I64)
+
     def gather(self, base: ir.Value, index: ir.Value) -> Vector:
         """``base[index]`` for int32 lanes ``index`` (in floats)."""
         wide, pointers = ir.VectorType(I64, LANES), ir.VectorType(_POINTER, LANES)
@@ -351,11 +361,15 @@ def vector_kernel(arguments: str) -> Callable[[Callable[..., Any]], Any]:
 
     Args:
         arguments: a letter per argument, i for int64 (numbers and addresses), f for float32. The function gets LLVM
-            values, and may return an int64 value; 0 is returned where it returns None.
+            values, and may return an int64 value; 0 is returned where it returns None. Arguments with an n, which come
+            first, are numbers that are known when it is compiled (``kernel.fixed``); it gets them as Python numbers.
     """
+    known = arguments.count("n")
 
     def decorate(function: Callable[..., Any]) -> Any:
-        signature = types.int64(*[_SCALARS[letter] for letter in arguments])
+        def typed(*given: Any) -> tuple[Any, Callable[..., Any]]:
+            """The signature for arguments of some types, and what emits the call."""
+            return types.int64(*given[:known], *[_SCALARS[letter] for letter in arguments[known:]]), generate
 
         def generate(context: Any, b: ir.IRBuilder, sig: Any, values: Sequence[ir.Value]) -> ir.Value:
             """Emit the call in place.
@@ -366,13 +380,13 @@ def vector_kernel(arguments: str) -> Callable[[Callable[..., Any]], Any]:
                 sig: signature of the call.
                 values: LLVM values of the arguments.
             """
-            result = function(Lanes(b), *values)
+            result = function(Lanes(b), *[len(kind) for kind in sig.args[:known]], *values[known:])
             return ir.Constant(I64, 0) if result is None else result
 
         # Numba matches arguments by position, so the typing function needs exactly as many parameters.
         names = ", ".join(f"a{k}" for k in range(len(arguments)))
-        scope: dict[str, Any] = {"signature": signature, "generate": generate}
-        exec(f"def {function.__name__}(context, {names}):\n    return signature, generate\n", scope)
+        scope: dict[str, Any] = {"typed": typed}
+        exec(f"def {function.__name__}(context, {names}):\n    return typed({names})\n", scope)
         return intrinsic(scope[function.__name__])
 
     return decorate

@@ -11,13 +11,9 @@ afterwards (``backward.project``), so no coordinate of a ray or pixel enters the
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 from llvmlite import ir
 
 from nurec_sim.render.cpu.blend.responses import (
-    CAMERA,
     LIDAR,
     LIDAR_MIN_TRANSMITTANCE,
     Bundle,
@@ -27,7 +23,7 @@ from nurec_sim.render.cpu.blend.responses import (
     initial_transmittance,
     run_records,
 )
-from nurec_sim.render.cpu.blend.tiles import AFFINE, C_FEATURE, MOVING, RAYS, TABLE, WIDE
+from nurec_sim.render.cpu.blend.tiles import C_FEATURE, RAYS, WIDE
 from nurec_sim.render.cpu.simd import F32, I32, I64, LANES, Lanes, Vector, vector_kernel
 
 # Planes of a block's state behind the transmittance: G less what has been added so far, and the gradients of the sums.
@@ -47,100 +43,92 @@ COLOUR_SUMS = 4
 """So many, from S_FADE on."""
 
 
-def _carrying_back(mode: int, output_kind: int, check_near: bool) -> Callable[..., Any]:
-    @vector_kernel("iiiiiiifff")
-    def carry_back(
-        v: Lanes,
-        state: ir.Value,
-        numbers: ir.Value,
-        count: ir.Value,
-        coefficients: ir.Value,
-        rays: ir.Value,
-        basis: ir.Value,
-        sums: ir.Value,
-        x0: ir.Value,
-        y0: ir.Value,
-        near: ir.Value,
-    ) -> ir.Value:
-        """Add a block's part to its records; returns 1 while any ray has transmittance left.
+@vector_kernel("nnniiiiiiifff")
+def carry_back(
+    v: Lanes,
+    mode: int,
+    output_kind: int,
+    check_near: int,
+    state: ir.Value,
+    numbers: ir.Value,
+    count: ir.Value,
+    coefficients: ir.Value,
+    rays: ir.Value,
+    basis: ir.Value,
+    sums: ir.Value,
+    x0: ir.Value,
+    y0: ir.Value,
+    near: ir.Value,
+) -> ir.Value:
+    """Add a block's part to its records; returns 1 while any ray has transmittance left.
 
-        Args:
-            v: vectors.
-            state: address of [STATE_PLANES,32].
-            numbers: as for ``blocks.blend``, like all up to ``near`` that is not named here.
-            count: see numbers.
-            coefficients: see numbers.
-            rays: see numbers.
-            basis: see numbers.
-            sums: address of [BATCH,SUMS], added to.
-            x0: see numbers.
-            y0: see numbers.
-            near: near plane.
-        """
-        b = v.b
+    Args:
+        v: vectors.
+        mode: AFFINE, TABLE or MOVING.
+        output_kind: CAMERA, LIDAR or COLOURS.
+        check_near: as for ``blocks.blend``.
+        state: address of [STATE_PLANES,32].
+        numbers: as for ``blocks.blend``, like all up to ``near`` that is not named here.
+        count: see numbers.
+        coefficients: see numbers.
+        rays: see numbers.
+        basis: see numbers.
+        sums: address of [BATCH,SUMS], added to.
+        x0: see numbers.
+        y0: see numbers.
+        near: near plane.
+    """
+    b = v.b
 
-        def by_features(group: RayGroup, weight: Bundle) -> dict[int, Bundle]:
-            return {S_FEATURE + c: weight * group.plane(state, G_FEATURE + c) for c in range(3)}
+    def by_features(group: RayGroup, weight: Bundle) -> dict[int, Bundle]:
+        return {S_FEATURE + c: weight * group.plane(state, G_FEATURE + c) for c in range(3)}
 
-        def keep(number: ir.Value, sums_of: dict[int, Bundle]) -> None:
-            # Lane k of the result is sum k over the group's rays: one store of SUMS floats per record.
-            totals = [sums_of[k].total() if k in sums_of else v.number(0) for k in range(SUMS)]
-            # 64 bytes a record: SUMS float32.
-            place_of_sums = v.address(sums, b.shl(number, ir.Constant(I64, 6)))
-            for first in range(0, SUMS, LANES):
-                old = v.load(place_of_sums, 4 * first)
-                v.store(old + v.sums(totals[first : first + LANES]), place_of_sums, 4 * first)
+    def keep(number: ir.Value, sums_of: dict[int, Bundle]) -> None:
+        # Lane k of the result is sum k over the group's rays: one store of SUMS floats per record.
+        totals = [sums_of[k].total() if k in sums_of else v.number(0) for k in range(SUMS)]
+        # 64 bytes a record: SUMS float32.
+        place_of_sums = v.address(sums, b.shl(number, ir.Constant(I64, 6)))
+        for first in range(0, SUMS, LANES):
+            old = v.load(place_of_sums, 4 * first)
+            v.store(old + v.sums(totals[first : first + LANES]), place_of_sums, 4 * first)
 
-        def step(group: RayGroup, number: ir.Value, coefficient: Coefficient, values: list[Bundle]) -> list[Bundle]:
-            # Forwards once more: the same responses, so the same rays are hit and T is what it was.
-            """One more record; ``values``: transmittance before it, and G less what has been added so far."""
-            meeting, alpha, hit = hits_of(
-                v, mode, output_kind, group, coefficient, rays, basis, near if check_near else None
-            )
-            before = values[0]
-            if output_kind == LIDAR:
-                hit = hit & (before > LIDAR_MIN_TRANSMITTANCE)
-            meeting.forget_misses(hit)
-            alpha = hit.where(alpha, 0)
-            weight = alpha * before
-            after = before - weight
-            if output_kind == COLOURS:
-                keep(number, {S_FADE: weight * group.plane(state, G_ALPHA)} | by_features(group, weight))
-                return [after]
+    def step(group: RayGroup, number: ir.Value, coefficient: Coefficient, values: list[Bundle]) -> list[Bundle]:
+        # Forwards once more: the same responses, so the same rays are hit and T is what it was.
+        """One more record; ``values``: transmittance before it, and G less what has been added so far."""
+        meeting, alpha, hit = hits_of(
+            v, mode, output_kind, group, coefficient, rays, basis, near if check_near else None
+        )
+        before = values[0]
+        if output_kind == LIDAR:
+            hit = hit & (before > LIDAR_MIN_TRANSMITTANCE)
+        meeting.forget_misses(hit)
+        alpha = hit.where(alpha, 0)
+        weight = alpha * before
+        after = before - weight
+        if output_kind == COLOURS:
+            keep(number, {S_FADE: weight * group.plane(state, G_ALPHA)} | by_features(group, weight))
+            return [after]
 
-            # Backwards: q is what a unit of this record's weight changes the loss by, ``rest`` what all behind it add.
-            by_mean = group.plane(state, G_DISTANCE)
-            q = group.plane(state, G_ALPHA) + by_mean * meeting.distance
-            for c in range(3):
-                q = q + group.plane(state, G_FEATURE + c) * coefficient(C_FEATURE + c)
-            rest = values[1] - weight * q
-            # A change of alpha changes this record's weight, and scales all weights behind it by 1 / (1 - alpha);
-            # opacities are capped at 0.99, so the division is safe.
-            by_alpha = before * q - rest * (1 - alpha).reciprocal(False)
-            by_exponent, by_distance = alpha * by_alpha * -8, weight * by_mean  # alpha = exp(-8 exponent)
-            if output_kind == LIDAR:
-                # The half distance is the distance of one hit; which hit it is has no gradient.
-                crossing = (before > 0.5) & (after <= 0.5)
-                by_distance = by_distance + crossing.where(group.plane(state, G_HALF), 0)
-            sums_of = [*meeting.sums(by_exponent, by_distance), by_exponent]
-            keep(number, dict(enumerate(sums_of)) | by_features(group, weight))
-            return [after, rest]
+        # Backwards: q is what a unit of this record's weight changes the loss by, ``rest`` what all behind it add.
+        by_mean = group.plane(state, G_DISTANCE)
+        q = group.plane(state, G_ALPHA) + by_mean * meeting.distance
+        for c in range(3):
+            q = q + group.plane(state, G_FEATURE + c) * coefficient(C_FEATURE + c)
+        rest = values[1] - weight * q
+        # A change of alpha changes this record's weight, and scales all weights behind it by 1 / (1 - alpha);
+        # opacities are capped at 0.99, so the division is safe.
+        by_alpha = before * q - rest * (1 - alpha).reciprocal(False)
+        by_exponent, by_distance = alpha * by_alpha * -8, weight * by_mean  # alpha = exp(-8 exponent)
+        if output_kind == LIDAR:
+            # The half distance is the distance of one hit; which hit it is has no gradient.
+            crossing = (before > 0.5) & (after <= 0.5)
+            by_distance = by_distance + crossing.where(group.plane(state, G_HALF), 0)
+        sums_of = [*meeting.sums(by_exponent, by_distance), by_exponent]
+        keep(number, dict(enumerate(sums_of)) | by_features(group, weight))
+        return [after, rest]
 
-        changing = 1 if output_kind == COLOURS else REST + 1
-        return run_records(v, state, changing, numbers, count, coefficients, (x0, y0), output_kind, step)
-
-    return carry_back
-
-
-back_affine_camera = _carrying_back(AFFINE, CAMERA, False)
-back_affine_camera_near = _carrying_back(AFFINE, CAMERA, True)
-back_affine_colours = _carrying_back(AFFINE, COLOURS, True)
-back_table_colours = _carrying_back(TABLE, COLOURS, True)
-back_moving_colours = _carrying_back(MOVING, COLOURS, True)
-back_table_camera = _carrying_back(TABLE, CAMERA, True)
-back_table_lidar = _carrying_back(TABLE, LIDAR, True)
-back_moving_camera = _carrying_back(MOVING, CAMERA, True)
-back_moving_lidar = _carrying_back(MOVING, LIDAR, True)
+    changing = 1 if output_kind == COLOURS else REST + 1
+    return run_records(v, state, changing, numbers, count, coefficients, (x0, y0), output_kind, step)
 
 
 @vector_kernel("iiiiii")

@@ -206,7 +206,7 @@ def carry_back(
     rays = sensor_rays(picture)
     workers.run(
         draw_tiles_back,
-        [(rays, picture.projected, picture.binned, output_kind, tiles, planes, gradients, slots)
+        [(rays.mode, output_kind, rays, picture.projected, picture.binned, tiles, planes, gradients, slots)
          for tiles in tile_ranges(picture, workers.threads)],
     )  # fmt: skip
     return slots

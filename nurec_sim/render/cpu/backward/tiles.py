@@ -13,22 +13,16 @@ from jaxtyping import Float32, Int64
 
 from nurec_sim.render.cpu.backward.blend import (
     COLOUR_SUMS,
-    COLOURS,
     S_FADE,
     STATE_PLANES,
     SUMS,
-    back_affine_camera,
-    back_affine_camera_near,
-    back_affine_colours,
-    back_moving_camera,
-    back_moving_colours,
-    back_moving_lidar,
-    back_table_camera,
-    back_table_colours,
-    back_table_lidar,
+    carry_back,
     open_gradients,
 )
-from nurec_sim.render.cpu.blend.draw import RAY_BYTES, aligned, batch_scratch, prepare_batch, tile_geometry
+from nurec_sim.render.cpu.blend.binning import TileLists
+from nurec_sim.render.cpu.blend.blocks import ALL_FAR, CHECK_NEAR
+from nurec_sim.render.cpu.blend.draw import RAY_BYTES, BatchScratch, aligned, prepare_batch, tile_geometry
+from nurec_sim.render.cpu.blend.rays import SensorRays
 from nurec_sim.render.cpu.blend.responses import CAMERA, LIDAR
 from nurec_sim.render.cpu.blend.tiles import (
     ACROSS,
@@ -39,11 +33,10 @@ from nurec_sim.render.cpu.blend.tiles import (
     HIGH,
     LIST,
     RAYS,
-    TABLE,
     WIDE,
 )
-from nurec_sim.render.cpu.kernel import f4, inner, keep_alive, kernel
-from nurec_sim.render.cpu.records import MACRO, tile_count, tiles_of
+from nurec_sim.render.cpu.kernel import f4, fixed, inner, kernel
+from nurec_sim.render.cpu.records import MACRO, Projected, tile_count, tiles_of
 
 
 @kernel
@@ -74,28 +67,6 @@ class RecordSlots(NamedTuple):
 
 
 @inner
-def _carry_back(mode, output_kind, close, state, numbers, count, coefficients, rays, basis, sums, x0, y0, near):
-    """Carry a block's gradients back with the code for a mode and an output kind; see ``backward.blend``."""
-    if mode == AFFINE:
-        if output_kind == COLOURS:
-            return back_affine_colours(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
-        if close:
-            return back_affine_camera_near(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
-        return back_affine_camera(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
-    if mode == TABLE:
-        if output_kind == COLOURS:
-            return back_table_colours(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
-        if output_kind == CAMERA:
-            return back_table_camera(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
-        return back_table_lidar(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
-    if output_kind == COLOURS:
-        return back_moving_colours(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
-    if output_kind == CAMERA:
-        return back_moving_camera(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
-    return back_moving_lidar(state, numbers, count, coefficients, rays, basis, sums, x0, y0, near)
-
-
-@inner
 def _keep_sums(sums, lists, first, last, spans, slots, row, column):
     """Write a batch's sums to the slots of its records for the macro tile at a row and a column."""
     for j in range(first, last):
@@ -113,29 +84,32 @@ def _keep_sums(sums, lists, first, last, spans, slots, row, column):
 
 
 @kernel
-def draw_tiles_back(rays, projected, binned, output_kind, tiles, planes, gradients, slots):
+def _draw_tiles_back(mode, output_kind, rays, projected, binned, tiles, planes, gradients, slots, state, sums, scratch):
     """Carry gradients of the given macro tiles back to ``slots``.
 
     Args:
-        rays: as ``draw.draw_tiles`` was given, like all up to ``planes``; the mode is AFFINE, TABLE or MOVING.
+        mode: AFFINE, TABLE or MOVING, ``fixed``.
+        output_kind: CAMERA, LIDAR, or COLOURS, ``fixed``.
+        rays: as ``draw.draw_tiles`` was given, like the next two.
         projected: see rays.
         binned: see rays.
-        output_kind: CAMERA, LIDAR, or COLOURS.
         tiles: numbers of the macro tiles to do.
         planes: [6,h,w] what ``draw.draw_tiles`` made.
         gradients: [6,h,w] gradients of ``planes``; 0 where there is no valid ray.
         slots: output, see ``RecordSlots``: all slots of the tiles' records are written.
+        state: [BLOCKS,STATE_PLANES,RAYS] scratch, on a cache line.
+        sums: [BATCH,SUMS] scratch, on a cache line.
+        scratch: see ``draw.BatchScratch``.
     """
-    state, sums = aligned(BLOCKS * STATE_PLANES * RAYS), aligned(BATCH * SUMS).reshape(BATCH, SUMS)
-    turned, basis, coefficients, chosen, listed = batch_scratch()
-    batch = BATCH if output_kind == LIDAR else CAMERA_BATCH
+    batch = BATCH if len(output_kind) == LIDAR else CAMERA_BATCH
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
     block_bytes = 4 * STATE_PLANES * RAYS
-    state_at, coefficients_at, chosen_at = state.ctypes.data, coefficients.ctypes.data, chosen.ctypes.data
+    state_at, coefficients_at = state.ctypes.data, scratch.coefficients.ctypes.data
+    chosen_at, listed = scratch.chosen.ctypes.data, scratch.listed
     records_at, sums_at, lists = projected.records.ctypes.data, sums.ctypes.data, binned.lists
     for index in range(tiles.shape[0]):
         tile = np.int64(tiles[index])
-        row, column, rays_at, basis_at, alive = tile_geometry(rays, tile, turned, basis)
+        row, column, rays_at, basis_at, alive = tile_geometry(mode, rays, tile, scratch)
         for block in range(BLOCKS):
             if (alive >> block) & 1:
                 y, x = row * MACRO + block // ACROSS * HIGH, column * MACRO + block % ACROSS * WIDE
@@ -152,24 +126,32 @@ def draw_tiles_back(rays, projected, binned, output_kind, tiles, planes, gradien
             # Sums of a batch are gathered over the tile's blocks and stored once per record.
             sums[:] = f4(0)
             if alive != 0:
-                close = prepare_batch(
-                    rays.mode, lists, first, last, end, records_at, alive, basis_at, coefficients, chosen, listed
-                )
+                close = prepare_batch(mode, lists, first, last, end, records_at, alive, basis_at, scratch)
                 for block in range(BLOCKS):
                     n = listed[block]
                     if n > 0:
-                        more = _carry_back(
-                            rays.mode, output_kind, close != 0, state_at + block * block_bytes,
-                            chosen_at + block * LIST, n, coefficients_at, rays_at + block * RAY_BYTES, basis_at,
-                            sums_at,
-                            f4(block % ACROSS * WIDE) - f4(15.5), f4(block // ACROSS * HIGH) - f4(15.5), rays.near,
-                        )  # fmt: skip
+                        block_at, numbers_at = state_at + block * block_bytes, chosen_at + block * LIST
+                        block_rays_at = rays_at + block * RAY_BYTES
+                        x0, y0 = f4(block % ACROSS * WIDE) - f4(15.5), f4(block // ACROSS * HIGH) - f4(15.5)
+                        if len(mode) == AFFINE and len(output_kind) == CAMERA and close == 0:
+                            more = carry_back(mode, output_kind, ALL_FAR, block_at, numbers_at, n, coefficients_at,
+                                              block_rays_at, basis_at, sums_at, x0, y0, rays.near)  # fmt: skip
+                        else:
+                            more = carry_back(mode, output_kind, CHECK_NEAR, block_at, numbers_at, n, coefficients_at,
+                                              block_rays_at, basis_at, sums_at, x0, y0, rays.near)  # fmt: skip
                         if more == 0:
                             alive &= ~(1 << block)
             _keep_sums(sums, lists, first, last, projected.spans, slots, row, column)
             first = last
-    keep_alive(state)
-    keep_alive(chosen)
-    keep_alive(turned)
-    keep_alive(coefficients)
-    keep_alive(basis)
+
+
+def draw_tiles_back(
+    mode: int, output_kind: int, rays: SensorRays, projected: Projected, binned: TileLists,
+    tiles: Int64[np.ndarray, " t"], planes: Float32[np.ndarray, "6 h w"], gradients: Float32[np.ndarray, "6 h w"],
+    slots: RecordSlots,
+) -> None:  # fmt: skip
+    """Carry gradients of macro tiles back; see ``_draw_tiles_back``."""
+    _draw_tiles_back(
+        fixed(mode), fixed(output_kind), rays, projected, binned, tiles, planes, gradients, slots,
+        aligned(BLOCKS, STATE_PLANES, RAYS), aligned(BATCH, SUMS), BatchScratch.empty(),
+    )  # fmt: skip

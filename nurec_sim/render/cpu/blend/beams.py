@@ -7,16 +7,16 @@ of 8 x 2 beams that its span overlaps, from the state of a tile that stays in th
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32, Int64
 from llvmlite import ir
 
-from nurec_sim.render.cpu.blend.binning import longest_list, sort_tile
+from nurec_sim.render.cpu.blend.binning import SortScratch, TileLists, sort_tile
 from nurec_sim.render.cpu.blend.blocks import FEATURES, PLANES, open_block, write_block_6
 from nurec_sim.render.cpu.blend.draw import RAY_BYTES, aligned
-from nurec_sim.render.cpu.blend.rays import turn_rays
+from nurec_sim.render.cpu.blend.rays import SensorRays, turn_rays
 from nurec_sim.render.cpu.blend.responses import (
     LIDAR,
     LIDAR_MIN_TRANSMITTANCE,
@@ -39,8 +39,8 @@ from nurec_sim.render.cpu.blend.tiles import (
     TABLE,
     WIDE,
 )
-from nurec_sim.render.cpu.kernel import inner, keep_alive, kernel
-from nurec_sim.render.cpu.records import FADE, FEATURE, FLAT, MACRO, RECORD, WROW, XROW, YROW, lowest_bit
+from nurec_sim.render.cpu.kernel import fixed, inner, kernel
+from nurec_sim.render.cpu.records import FADE, FEATURE, FLAT, MACRO, RECORD, WROW, XROW, YROW, Projected, lowest_bit
 from nurec_sim.render.cpu.simd import LANES, Lanes, prefetch, vector_kernel
 
 WIDE_BITS, LOW_BITS = 3, 1
@@ -53,53 +53,50 @@ STATE_BYTES = 4 * PLANES_LIDAR * RAYS
 """Of a block's sums."""
 
 
-def _beaming(mode: int) -> Callable[..., Any]:
-    @vector_kernel("iiiif")
-    def blend_patch(
-        v: Lanes, state: ir.Value, rays: ir.Value, record: ir.Value, drift: ir.Value, near: ir.Value
-    ) -> ir.Value:
-        """Blend a record into a patch; returns 1 while any of its beams still has transmittance.
+@vector_kernel("niiiif")
+def blend_patch(
+    v: Lanes, mode: int, state: ir.Value, rays: ir.Value, record: ir.Value, drift: ir.Value, near: ir.Value
+) -> ir.Value:
+    """Blend a record into a patch; returns 1 while any of its beams still has transmittance.
 
-        Args:
-            v: vectors.
-            state: address of the patch's sums, in planes of 32.
-            rays: address of the patch's rays, in planes of 32.
-            record: address of the record.
-            drift: address of its rows times the sensor's velocity; only read for MOVING.
-            near: near plane.
-        """
-        group = RayGroup(v, [4 * LANES * k for k in range(PATCH // LANES)], v.number(0), Bundle([]))
-        places = {C_FLAT: FLAT, C_FADE: FADE}
+    Args:
+        v: vectors.
+        mode: TABLE or MOVING.
+        state: address of the patch's sums, in planes of 32.
+        rays: address of the patch's rays, in planes of 32.
+        record: address of the record.
+        drift: address of its rows times the sensor's velocity; only read for MOVING.
+        near: near plane.
+    """
+    group = RayGroup(v, 0, [4 * LANES * k for k in range(PATCH // LANES)], v.number(0), Bundle([]))
+    places = {C_FLAT: FLAT, C_FADE: FADE}
 
-        def coefficient(row: int) -> Any:
-            if row >= C_DRIFT:
-                return v.broadcast(drift, 4 * (row - C_DRIFT))
-            return v.broadcast(record, 4 * places.get(row, row))
+    def coefficient(row: int) -> Any:
+        if row >= C_DRIFT:
+            return v.broadcast(drift, 4 * (row - C_DRIFT))
+        return v.broadcast(record, 4 * places.get(row, row))
 
-        meeting, alpha, hit = hits_of(v, mode, LIDAR, group, coefficient, rays, rays, near)
-        distance = hit.where(meeting.distance, 0)  # no NaN from a miss
-        sums = [group.plane(state, plane) for plane in range(PLANES[LIDAR])]
-        before = sums[T]
-        # Beams end one by one, as in ``spec``.
-        hit = hit & (before > LIDAR_MIN_TRANSMITTANCE)
-        weight = hit.where(alpha * before, 0)
-        after = before - weight
-        result = [after]
-        for k, plane in enumerate(sums[FEATURES:-2]):
-            result.append(plane + weight * v.broadcast(record, 4 * (FEATURE + k)))
-        result.append(sums[-2] + weight * distance)
-        # An echo comes from the surface that stops half of the beam, not from the mean of several.
-        crossing = (before > 0.5) & (after <= 0.5)
-        result.append(crossing.where(distance, sums[-1]))
-        for row, bundle in enumerate(result):
-            for offset, part in zip(group.offsets, bundle.parts, strict=True):
-                v.store(part, state, 4 * RAYS * row + offset)
-        return still_open(after.parts, LIDAR)
-
-    return blend_patch
+    meeting, alpha, hit = hits_of(v, mode, LIDAR, group, coefficient, rays, rays, near)
+    distance = hit.where(meeting.distance, 0)  # no NaN from a miss
+    sums = [group.plane(state, plane) for plane in range(PLANES[LIDAR])]
+    before = sums[T]
+    # Beams end one by one, as in ``spec``.
+    hit = hit & (before > LIDAR_MIN_TRANSMITTANCE)
+    weight = hit.where(alpha * before, 0)
+    after = before - weight
+    result = [after]
+    for k, plane in enumerate(sums[FEATURES:-2]):
+        result.append(plane + weight * v.broadcast(record, 4 * (FEATURE + k)))
+    result.append(sums[-2] + weight * distance)
+    # An echo comes from the surface that stops half of the beam, not from the mean of several.
+    crossing = (before > 0.5) & (after <= 0.5)
+    result.append(crossing.where(distance, sums[-1]))
+    for plane, values in enumerate(result):
+        group.keep(values, state, plane)
+    return still_open(after.parts, LIDAR)
 
 
-_blend_still, _blend_moving = _beaming(TABLE), _beaming(MOVING)
+_STILL, _MOVING = fixed(TABLE), fixed(MOVING)
 # Rows of a record stand where coefficients have theirs, so most of them need no translation.
 assert (XROW, YROW, WROW) == (0, 3, 6)
 
@@ -126,7 +123,7 @@ def _drift(records, number, motion, drift):
 
 
 @kernel
-def draw_beams(rays, projected, binned, tiles, planes, counts):
+def _draw_beams(rays, projected, binned, tiles, planes, counts, state, turned, drift, sorting):
     """Blend the given macro tiles of a LiDAR into ``planes``.
 
     Args:
@@ -136,13 +133,11 @@ def draw_beams(rays, projected, binned, tiles, planes, counts):
         tiles: numbers of the macro tiles to do.
         planes: [6,h,w] output, sides rounded up to whole blocks: alpha, features, distance, half distance.
         counts: [1] int64, the number of responses evaluated is added.
+        state: [BLOCKS,PLANES_LIDAR,RAYS] scratch, on a cache line.
+        turned: [BLOCKS,RAY_PLANES,RAYS] scratch, on a cache line.
+        drift: [3] float32 scratch.
+        sorting: see ``binning.SortScratch``.
     """
-    state, turned = (
-        aligned(BLOCKS * STATE_BYTES // 4),
-        aligned(BLOCKS * RAY_PLANES * RAYS).reshape(BLOCKS, RAY_PLANES, RAYS),
-    )
-    spare, starts = np.empty(longest_list(binned, tiles), np.uint64), np.empty((2, 2049), np.int64)
-    drift = np.zeros(3, np.float32)
     row_bytes, plane_bytes = 4 * planes.shape[2], 4 * planes.shape[1] * planes.shape[2]
     columns = (rays.width + MACRO - 1) // MACRO
     state_at, records_at, spans = state.ctypes.data, projected.records.ctypes.data, projected.spans
@@ -154,13 +149,11 @@ def draw_beams(rays, projected, binned, tiles, planes, counts):
         row, column = tile // columns, tile % columns
         rays_at = np.int64(rays.table.ctypes.data) + tile * (BLOCKS * RAY_BYTES)
         if moving:
-            turn_rays(
-                rays.table[tile], rays.line[tile], (rays.turns, rays.places), turned.reshape(BLOCKS, RAY_PLANES, RAYS)
-            )
+            turn_rays(rays.table[tile], rays.line[tile], (rays.turns, rays.places), turned)
             rays_at = np.int64(turned.ctypes.data)
         for block in range(BLOCKS):
             open_block(state_at + block * STATE_BYTES, PLANES_LIDAR, rays_at + block * RAY_BYTES)
-        sort_tile(binned, tile, spare, starts)
+        sort_tile(binned, tile, sorting)
         first, end = np.int64(binned.starts[tile]), np.int64(binned.starts[tile + 1])
         # A bit for each patch that is not yet opaque.
         alive = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -185,9 +178,9 @@ def draw_beams(rays, projected, binned, tiles, planes, counts):
                 where = state_at + block * STATE_BYTES + half * (4 * PATCH)
                 ray_at = rays_at + block * RAY_BYTES + half * (4 * PATCH)
                 if moving:
-                    more = _blend_moving(where, ray_at, record_at, drift_at, rays.near)
+                    more = blend_patch(_MOVING, where, ray_at, record_at, drift_at, rays.near)
                 else:
-                    more = _blend_still(where, ray_at, record_at, drift_at, rays.near)
+                    more = blend_patch(_STILL, where, ray_at, record_at, drift_at, rays.near)
                 alive &= ~(np.uint64(1 - more) << np.uint64(patch))
             if alive == 0:
                 break
@@ -197,7 +190,15 @@ def draw_beams(rays, projected, binned, tiles, planes, counts):
             if bx < wide and by < high:
                 target = planes.ctypes.data + (row * MACRO + by) * row_bytes + 4 * (column * MACRO + bx)
                 write_block_6(state_at + block * STATE_BYTES, target, row_bytes, plane_bytes)
-    keep_alive(state)
-    keep_alive(turned)
-    keep_alive(drift)
     counts[0] += evaluations
+
+
+def draw_beams(
+    rays: SensorRays, projected: Projected, binned: TileLists, tiles: Int64[np.ndarray, " t"],
+    planes: Float32[np.ndarray, "6 h w"], counts: Int64[np.ndarray, " 1"],
+) -> None:  # fmt: skip
+    """Blend macro tiles of a LiDAR; see ``_draw_beams``."""
+    _draw_beams(
+        rays, projected, binned, tiles, planes, counts, aligned(BLOCKS, PLANES_LIDAR, RAYS),
+        aligned(BLOCKS, RAY_PLANES, RAYS), np.zeros(3, np.float32), SortScratch.empty(binned, tiles),
+    )  # fmt: skip

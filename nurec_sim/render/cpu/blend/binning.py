@@ -27,6 +27,20 @@ class TileLists(NamedTuple):
     """Numbers of records, front to back; written by ``sort_tile``. LANES more entries than used."""
 
 
+class SortScratch(NamedTuple):
+    """Scratch of ``sort_tile``."""
+
+    spare: UInt64[np.ndarray, " most"]
+    """As long as the longest list."""
+    starts: Int64[np.ndarray, "2 2049"]
+
+    @classmethod
+    def empty(cls, binned: TileLists, tiles: Int64[np.ndarray, " t"]) -> SortScratch:
+        """New scratch for some macro tiles."""
+        most = int((binned.starts[tiles + 1] - binned.starts[tiles]).max())
+        return cls(np.empty(most, np.uint64), np.empty((2, MANY + 1), np.int64))
+
+
 @kernel
 def count_tiles(spans, first, last, columns, counts):
     """Count the records that touch each macro tile.
@@ -71,7 +85,7 @@ def fill_tiles(spans, keys, first, last, columns, position, items):
 
 
 @inner
-def sort_tile(binned, tile, spare, starts):
+def sort_tile(binned, tile, scratch):
     """Sort the list of a macro tile by depth; equal depths by the number of the record, whatever thread wrote it.
 
     Two passes of a radix sort over the leading bits, of those in which the tile's depths differ, leave a nearly sorted
@@ -80,9 +94,9 @@ def sort_tile(binned, tile, spare, starts):
     Args:
         binned: see ``TileLists``; the tile's ``lists`` are written, its ``items`` changed.
         tile: number of the macro tile.
-        spare: [..] uint64 scratch, as long as the list.
-        starts: [2,2049] int64 scratch.
+        scratch: see ``SortScratch``.
     """
+    spare, starts = scratch.spare, scratch.starts
     begin, end = np.uint64(binned.starts[tile]), np.uint64(binned.starts[tile + 1])
     now = binned.items[begin:end]
     n = len(now)
@@ -124,12 +138,3 @@ def sort_tile(binned, tile, spare, starts):
         now[i] = item
     for j in range(n):
         binned.lists[begin + np.uint64(j)] = np.int32(now[j] & np.uint64(LOW_HALF))
-
-
-@inner
-def longest_list(binned, tiles):
-    """The length of the longest list of some macro tiles."""
-    most = 0
-    for tile in tiles:
-        most = max(most, binned.starts[tile + 1] - binned.starts[tile])
-    return most

@@ -24,7 +24,8 @@ from nurec_sim.render.cpu.blend.responses import (
     initial_transmittance,
     run_records,
 )
-from nurec_sim.render.cpu.blend.tiles import AFFINE, C_FEATURE, C_NORMAL, C_TAG, MOVING, RAYS, TABLE, WIDE
+from nurec_sim.render.cpu.blend.tiles import C_FEATURE, C_NORMAL, C_TAG, RAYS, WIDE
+from nurec_sim.render.cpu.kernel import fixed
 from nurec_sim.render.cpu.records import LABEL_BITS
 from nurec_sim.render.cpu.simd import I32, I64, INTS, LANES, Lanes, Vector, vector_kernel
 
@@ -33,76 +34,72 @@ FEATURES = 1
 PLANES = {CAMERA: 6, NORMALS: 9, LIDAR: 6}
 """T, 3 features, (3 more,) distance, and the largest weight or the half distance."""
 MOST_PLANES = 9
+ALL_FAR, CHECK_NEAR = fixed(0), fixed(1)
+"""Whether records may reach the near plane."""
 _COLOURS, _NORMALS = [C_FEATURE + k for k in range(3)], [C_NORMAL + k for k in range(3)]
 FEATURE_ROWS = {CAMERA: _COLOURS, NORMALS: _COLOURS + _NORMALS}
 """Rows of the coefficients that are summed up, by output kind."""
 
 
-def _blending(mode: int, output_kind: int, check_near: bool) -> Callable[..., Any]:
-    @vector_kernel("iiiiiifff")
-    def blend(
-        v: Lanes,
-        state: ir.Value,
-        numbers: ir.Value,
-        count: ir.Value,
-        coefficients: ir.Value,
-        rays: ir.Value,
-        basis: ir.Value,
-        x0: ir.Value,
-        y0: ir.Value,
-        near: ir.Value,
-    ) -> ir.Value:
-        """Blend records into a block; returns 1 while any of its rays still has transmittance.
+@vector_kernel("nnniiiiiifff")
+def blend(
+    v: Lanes,
+    mode: int,
+    output_kind: int,
+    check_near: int,
+    state: ir.Value,
+    numbers: ir.Value,
+    count: ir.Value,
+    coefficients: ir.Value,
+    rays: ir.Value,
+    basis: ir.Value,
+    x0: ir.Value,
+    y0: ir.Value,
+    near: ir.Value,
+) -> ir.Value:
+    """Blend records into a block; returns 1 while any of its rays still has transmittance.
 
-        Args:
-            v: vectors.
-            state: address of [planes,32].
-            numbers: address of the records' numbers in the batch, a byte each.
-            count: how many, at least 1.
-            coefficients: address of [COEFFICIENTS,BATCH].
-            rays: address of the block's [RAY_PLANES,32].
-            basis: address of the tile's basis.
-            x0: first cell's x from the tile's centre.
-            y0: the same for y.
-            near: near plane.
-        """
-        b = v.b
+    Args:
+        v: vectors.
+        mode: projection mode.
+        output_kind: CAMERA or NORMALS.
+        check_near: ALL_FAR or CHECK_NEAR.
+        state: address of [planes,32].
+        numbers: address of the records' numbers in the batch, a byte each.
+        count: how many, at least 1.
+        coefficients: address of [COEFFICIENTS,BATCH].
+        rays: address of the block's [RAY_PLANES,32].
+        basis: address of the tile's basis.
+        x0: first cell's x from the tile's centre.
+        y0: the same for y.
+        near: near plane.
+    """
+    b = v.b
 
-        def step(group: RayGroup, number: ir.Value, coefficient: Coefficient, sums: list[Bundle]) -> list[Bundle]:
-            """The rays' sums (planes of the block's state) after one more record."""
-            meeting, alpha, hit = hits_of(
-                v, mode, output_kind, group, coefficient, rays, basis, near if check_near else None
-            )
-            distance = hit.where(meeting.distance, 0)  # no NaN from a miss
-            before = sums[T]
-            # Front to back: a record's weight is its alpha times what the nearer ones have let through. Rays continue
-            # until the whole block is opaque, which adds at most 1e-4 to a ray.
-            weight = hit.where(alpha * before, 0)
-            after = before - weight
-            result = [after]
-            for plane, feature in zip(sums[FEATURES:-2], FEATURE_ROWS[output_kind], strict=True):
-                result.append(plane + weight * coefficient(feature))
-            result.append(sums[-2] + weight * distance)
-            # The label replaces the lowest bits of the weight, so that one maximum finds weight and label.
-            label = b.and_(coefficient(C_TAG).bits(), ir.Constant(INTS, [LABEL_BITS] * LANES))
-            # 8 of 23 mantissa bits: weights are compared to 1 part in 2^15.
-            keep = ir.Constant(INTS, [~LABEL_BITS] * LANES)
-            tagged = [v.from_bits(b.or_(b.and_(w.bits(), keep), label)) for w in weight.parts]
-            result.append(Bundle(p.max(w) for p, w in zip(sums[-1].parts, tagged, strict=True)))
-            return result
+    def step(group: RayGroup, number: ir.Value, coefficient: Coefficient, sums: list[Bundle]) -> list[Bundle]:
+        """The rays' sums (planes of the block's state) after one more record."""
+        meeting, alpha, hit = hits_of(
+            v, mode, output_kind, group, coefficient, rays, basis, near if check_near else None
+        )
+        distance = hit.where(meeting.distance, 0)  # no NaN from a miss
+        before = sums[T]
+        # Front to back: a record's weight is its alpha times what the nearer ones have let through. Rays continue
+        # until the whole block is opaque, which adds at most 1e-4 to a ray.
+        weight = hit.where(alpha * before, 0)
+        after = before - weight
+        result = [after]
+        for plane, feature in zip(sums[FEATURES:-2], FEATURE_ROWS[output_kind], strict=True):
+            result.append(plane + weight * coefficient(feature))
+        result.append(sums[-2] + weight * distance)
+        # The label replaces the lowest bits of the weight, so that one maximum finds weight and label.
+        label = b.and_(coefficient(C_TAG).bits(), ir.Constant(INTS, [LABEL_BITS] * LANES))
+        # 8 of 23 mantissa bits: weights are compared to 1 part in 2^15.
+        keep = ir.Constant(INTS, [~LABEL_BITS] * LANES)
+        tagged = [v.from_bits(b.or_(b.and_(w.bits(), keep), label)) for w in weight.parts]
+        result.append(Bundle(p.max(w) for p, w in zip(sums[-1].parts, tagged, strict=True)))
+        return result
 
-        return run_records(v, state, PLANES[output_kind], numbers, count, coefficients, (x0, y0), output_kind, step)
-
-    return blend
-
-
-blend_affine_camera = _blending(AFFINE, CAMERA, False)
-blend_affine_camera_near = _blending(AFFINE, CAMERA, True)
-blend_affine_normals = _blending(AFFINE, NORMALS, True)
-blend_table_camera = _blending(TABLE, CAMERA, True)
-blend_table_normals = _blending(TABLE, NORMALS, True)
-blend_moving_camera = _blending(MOVING, CAMERA, True)
-blend_moving_normals = _blending(MOVING, NORMALS, True)
+    return run_records(v, state, PLANES[output_kind], numbers, count, coefficients, (x0, y0), output_kind, step)
 
 
 @vector_kernel("iii")

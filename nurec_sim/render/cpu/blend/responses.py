@@ -17,7 +17,6 @@ import numpy as np
 from llvmlite import ir
 
 from nurec_sim.render.cpu.blend.tiles import (
-    AFFINE,
     B_D0,
     B_DX,
     B_DY,
@@ -28,11 +27,12 @@ from nurec_sim.render.cpu.blend.tiles import (
     C_W,
     C_X,
     C_Y,
+    LINEAR,
     MOVING,
     RAYS,
     WIDE,
 )
-from nurec_sim.render.cpu.simd import I8, I64, LANES, Lanes, Vector
+from nurec_sim.render.cpu.simd import F32, I8, I64, LANES, Lanes, Vector
 
 CAMERA, NORMALS, LIDAR = 0, 1, 2
 """Output kinds: what is summed up. Three features, distance and label; the same and three more features; three
@@ -52,6 +52,7 @@ VECTORS = RAYS // LANES
 """Vectors that cover a block."""
 AT_ONCE = 2
 """Vectors of rays that are blended at once: as many as the registers hold."""
+ROWS_AT_ONCE = AT_ONCE * LANES // WIDE
 
 
 def _exponential() -> list[float]:
@@ -139,16 +140,26 @@ class Bundle:
 
 @dataclass(frozen=True)
 class RayGroup:
-    """``AT_ONCE`` vectors of a block's rays: byte offsets within a plane, and cells from the tile's centre."""
+    """``AT_ONCE`` vectors of a block's rays: where they lie in a plane, and cells from the tile's centre."""
 
     v: Lanes
+    start: ir.Value | int
+    """Byte offset of the first ray."""
     offsets: list[int]
+    """Byte offsets of the vectors from there."""
     x: Vector
     y: Bundle
 
     def plane(self, base: ir.Value, number: int) -> Bundle:
         """Values of the group's rays in a plane [32] of the block at an address."""
-        return Bundle(self.v.load(base, 4 * RAYS * number + offset) for offset in self.offsets)
+        first = self.v.address(base, self.start)
+        return Bundle(self.v.load(first, 4 * RAYS * number + offset) for offset in self.offsets)
+
+    def keep(self, values: Bundle, base: ir.Value, number: int) -> None:
+        """Store values of the group's rays in a plane of the block at an address."""
+        first = self.v.address(base, self.start)
+        for value, offset in zip(values.parts, self.offsets, strict=True):
+            self.v.store(value, first, 4 * RAYS * number + offset)
 
 
 class StillMeeting:
@@ -244,16 +255,16 @@ def meeting_of(
     """A record along the rays of a group, and its exponent with the fading of its opacity: Q1 / Q2 + FADE.
 
     Args:
-        mode: AFFINE, TABLE or MOVING.
+        mode: projection mode.
         group: the rays.
         coefficient: gives a row of the record's coefficients (``tiles``) in all lanes.
-        rays: address of the block's [RAY_PLANES,32]; not read for AFFINE.
+        rays: address of the block's [RAY_PLANES,32]; not read for LINEAR ones.
         refined: whether distances need more than 14 bits (LiDARs).
     """
     rows = [[coefficient(start + k) for k in range(3)] for start in (C_X, C_Y, C_W)]
     many = len(group.offsets)
     flat, fade = Bundle([coefficient(C_FLAT)] * many), coefficient(C_FADE)
-    if mode == AFFINE:
+    if mode in LINEAR:
         # Values at the tile's centre, per cell along x, and per cell along y. The part along x is shared by the group's
         # vectors, whose cells differ in y only.
         x, y, w = (group.y * row[2] + (row[0] + row[1] * group.x) for row in rows)
@@ -276,13 +287,13 @@ def behind_near_plane(
 
     Args:
         v: vectors.
-        mode: AFFINE, TABLE or MOVING.
-        basis: address of the tile's basis; only read for AFFINE.
+        mode: projection mode.
+        basis: address of the tile's basis; only read for LINEAR modes.
         group: the rays.
         distance: place of each hit along its ray, in lengths of the ray's direction.
         near: near plane (m, float32).
     """
-    if mode != AFFINE:
+    if mode not in LINEAR:
         return distance >= v.spread(near)
     d = [[v.broadcast(basis, 4 * (start + c)) for start in (B_D0, B_DX, B_DY)] for c in range(3)]
     # A pinhole's rays have z = 1 and not unit length, so t is not yet a distance.
@@ -299,7 +310,7 @@ def hits_of(
 
     Args:
         v: vectors.
-        mode: AFFINE, TABLE or MOVING.
+        mode: projection mode.
         output_kind: the distances of LIDAR are refined.
         group: the rays.
         coefficient: see ``meeting_of``.
@@ -364,20 +375,16 @@ def run_records(
         step: what a record does to the sums.
     """
     b = v.b
-    # 32 rays are two (AVX-512) or four vectors; AT_ONCE of them go through the whole list, then the next ones.
-    alive: ir.Value | None = None
-    for part in range(0, VECTORS, AT_ONCE):
-        group = RayGroup(
-            v,
-            [4 * LANES * (part + k) for k in range(AT_ONCE)],
-            v.numbers([lane % WIDE for lane in range(LANES)]) + v.spread(corner[0]),
-            Bundle(
-                v.numbers([((part + k) * LANES + lane) // WIDE for lane in range(LANES)]) + v.spread(corner[1])
-                for k in range(AT_ONCE)
-            ),
-        )
+    x = v.numbers([lane % WIDE for lane in range(LANES)]) + v.spread(corner[0])
+    rows = [v.numbers([(k * LANES + lane) // WIDE for lane in range(LANES)]) for k in range(AT_ONCE)]
 
-        def body(i: ir.Value, values: list[Vector], group: RayGroup = group) -> list[Vector]:
+    def blend_part(part: ir.Value, clearest: list[Vector]) -> list[Vector]:
+        """Take the list through ``AT_ONCE`` vectors; returns the largest transmittance of these and earlier parts."""
+        first_row = v.spread(b.fadd(corner[1], b.sitofp(b.mul(part, ir.Constant(I64, ROWS_AT_ONCE)), F32)))
+        start = b.mul(part, ir.Constant(I64, 4 * LANES * AT_ONCE))
+        group = RayGroup(v, start, [4 * LANES * k for k in range(AT_ONCE)], x, Bundle(row + first_row for row in rows))
+
+        def body(i: ir.Value, values: list[Vector]) -> list[Vector]:
             # Coefficients are stored by rows of BATCH records, so a record's are one broadcast each.
             number = b.zext(b.load(v.pointer(numbers, i), typ=I8, align=1), I64)
             where = v.address(coefficients, b.shl(number, ir.Constant(I64, 2)))
@@ -388,10 +395,9 @@ def run_records(
         initial = [value for plane in range(planes) for value in group.plane(state, plane).parts]
         final = v.repeat(count, initial, body)
         for plane in range(planes):
-            for k, offset in enumerate(group.offsets):
-                v.store(final[plane * AT_ONCE + k], state, 4 * RAYS * plane + offset)
-        # A block stays open until the most transparent of its rays is opaque.
-        left = still_open(final[:AT_ONCE], output_kind)
-        alive = left if alive is None else b.or_(alive, left)
-    assert alive is not None
-    return alive
+            group.keep(Bundle(final[plane * AT_ONCE : (plane + 1) * AT_ONCE]), state, plane)
+        return [functools.reduce(Vector.max, final[:AT_ONCE], *clearest)]
+
+    # 32 rays are two (AVX-512) or four vectors; AT_ONCE of them go through the whole list, then the next ones. A block
+    # stays open until the most transparent of its rays is opaque.
+    return still_open(v.repeat(ir.Constant(I64, VECTORS // AT_ONCE), [v.number(0)], blend_part), output_kind)

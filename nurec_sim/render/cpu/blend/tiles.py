@@ -9,13 +9,13 @@ rows of a macro tile has a linear fit of its own, which holds up to ``bend``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from llvmlite import ir
 
 from nurec_sim.render.cpu.records import FADE, FEATURE, FLAT, INSIDE, LIM, LOG_255, MACRO, RECORD, TAG, WROW, XROW, YROW
 from nurec_sim.render.cpu.simd import (
     BITS,
+    F32,
     I1,
     I8,
     I32,
@@ -32,6 +32,7 @@ from nurec_sim.render.cpu.simd import (
 
 WIDE, HIGH = 8, 4
 """Sides of a block, in cells."""
+ACROSS_BITS = 2
 ACROSS, DOWN = MACRO // WIDE, MACRO // HIGH
 BLOCKS, RAYS = ACROSS * DOWN, WIDE * HIGH
 BAND = 8
@@ -58,8 +59,18 @@ AFFINE, ROLLING, TABLE, MOVING = 0, 1, 2, 3
 """Projection modes, how a tile's rays are described: linear directions, the same from a pose that moves along y, a
 table of directions, and a table of directions with origins."""
 
+LINEAR = (AFFINE, ROLLING)
+"""Modes whose coefficients are linear in the cell."""
+
 NEEDLE = 1e-3
 """Records thinner than this, seen from the side, go to all blocks of their tiles: their centre is ill-conditioned."""
+
+
+_CHOSEN_LANES = [
+    sum(lane << 8 * place for place, lane in enumerate(lane for lane in range(8) if chosen >> lane & 1))
+    for chosen in range(256)
+]
+"""For each set of eight lanes, their numbers, a byte each, lowest first."""
 
 
 def _load_records(v: Lanes, ids: ir.Value, records: ir.Value, count: ir.Value) -> list[Vector]:
@@ -130,8 +141,13 @@ def _rolled(
     return [centre, along_x, [a + change for a, change in zip(along_y, shear, strict=True)]], flat
 
 
-def _least_over_blocks(at: list[list[Vector]], rows: int, v: Lanes) -> tuple[list[Vector], Mask]:
+Squares = Callable[[ir.Value], list[Vector]]
+"""Gives the least X^2 + Y^2 over each block of a row of them."""
+
+
+def _least_over_blocks(at: list[list[Vector]], rows: int, v: Lanes) -> tuple[Squares, Mask]:
     """The least X^2 + Y^2 over each block of ``rows`` rows of them, and where it could not be found."""
+    b = v.b
     (x0, y0, _), (xx, yx, _), (xy, yy, _) = at
     # Q1 = a (x - mx)^2 + b2 (x - mx)(y - my) + c (y - my)^2 about the centre (mx, my), where X = Y = 0.
     a, c, b2 = xx * xx + yx * yx, xy * xy + yy * yy, (xx * xy + yx * yy) * 2
@@ -142,30 +158,29 @@ def _least_over_blocks(at: list[list[Vector]], rows: int, v: Lanes) -> tuple[lis
     mx, my = (y0 * xy - x0 * yy) * inverse, (x0 * yx - y0 * xx) * inverse
     half_b = b2 * -0.5
     slope_c, slope_a = half_b / c.max(1e-30), half_b / a.max(1e-30)
-
-    def spans(count: int, size: int, middle: Vector) -> list[tuple[Vector, Vector]]:
-        low = [size * (k - count / 2) + 0.5 for k in range(count)]
-        return [(edge - middle, edge + (size - 1) - middle) for edge in low]
-
-    span_x, span_y = spans(ACROSS, WIDE, mx), spans(rows, HIGH, my)
     zero = v.number(0)
     # Candidates: the side of the square nearest to the centre along one axis, the best place along the other.
+    lefts = [WIDE * (k - ACROSS / 2) + 0.5 for k in range(ACROSS)]
+    span_x = [(left - mx, left + (WIDE - 1) - mx) for left in lefts]
     near_x = [x.max(zero.min(x1)) for x, x1 in span_x]
-    near_y = [y.max(zero.min(y1)) for y, y1 in span_y]
-    best_y, best_x = [slope_c * x for x in near_x], [slope_a * y for y in near_y]
+    best_y = [slope_c * x for x in near_x]
     ax2, bx = [a * x * x for x in near_x], [b2 * x for x in near_x]
-    cy2, by = [c * y * y for y in near_y], [b2 * y for y in near_y]
-    least = []
-    for row in range(rows):
+
+    def squares(row: ir.Value) -> list[Vector]:
+        top = b.fadd(b.sitofp(b.mul(row, ir.Constant(I64, HIGH)), F32), ir.Constant(F32, 0.5 - HIGH * rows / 2))
+        first, last = v.spread(top) - my, v.spread(b.fadd(top, ir.Constant(F32, HIGH - 1.0))) - my
+        near = first.max(zero.min(last))
+        best_x, cy2, by = slope_a * near, c * near * near, b2 * near
+        least = []
         for column in range(ACROSS):
             # A convex quadratic over a rectangle that does not hold its centre has its least value on one of the two
             # sides that face the centre: the better of both candidates. Where the centre is inside, both are zero.
-            y = best_y[column].max(span_y[row][0]).min(span_y[row][1])
-            x = best_x[row].max(span_x[column][0]).min(span_x[column][1])
-            first = ax2[column] + (bx[column] + c * y) * y
-            second = cy2[row] + (by[row] + a * x) * x
-            least.append(first.min(second))
-    return least, unsure
+            y = best_y[column].max(first).min(last)
+            x = best_x.max(span_x[column][0]).min(span_x[column][1])
+            least.append((ax2[column] + (bx[column] + c * y) * y).min(cy2 + (by + a * x) * x))
+        return least
+
+    return squares, unsure
 
 
 def _widened(
@@ -186,114 +201,134 @@ def _widened(
     return limit, sideways
 
 
-def _append(v: Lanes, mask: ir.Value, numbers: ir.Value, lists: ir.Value, counts: ir.Value, block: int) -> None:
-    """Append the numbers of the lanes in a mask to a block's list of bytes."""
+def _append(v: Lanes, chosen: ir.Value, entry: ir.Value, lists: ir.Value, counts: ir.Value, block: ir.Value) -> None:
+    """Append ``entry`` + k for every bit k of ``chosen`` to a block's list of bytes."""
     b = v.b
-    compress = declare(b, f"llvm.experimental.vector.compress.v{LANES}i32", INTS, [INTS, BITS, INTS])
-    bits = ir.IntType(LANES)
-    count_bits = declare(b, f"llvm.ctpop.i{LANES}", bits, [bits])
-    # Compress moves the chosen lanes to the front; the whole vector is stored and the count decides what is valid,
-    # which is why a list has LANES entries of spare room.
-    small = b.trunc(b.call(compress, [numbers, mask, ir.Constant(INTS, ir.Undefined)]), ir.VectorType(I8, LANES))
-    counter = v.pointer(counts, 8 * block)
+    counter = v.pointer(counts, b.shl(block, ir.Constant(I64, 3)))
     count = b.load(counter, typ=I64, align=8)
-    b.store(small, v.pointer(v.address(lists, LIST * block), count), align=1)
-    b.store(b.add(count, b.zext(b.call(count_bits, [b.bitcast(mask, bits)]), I64)), counter, align=8)
+    end = v.pointer(v.address(lists, b.mul(block, ir.Constant(I64, LIST))), count)
+    # All lanes are stored, the chosen ones in front, and the count decides what is valid, which is why a list has LANES
+    # entries of spare room.
+    if LANES == 8:
+        # Eight bytes are a number: those of a table, which has them for all sets of lanes, and ``entry`` eight times.
+        table = v.pointer(v.table("chosen_lanes", _CHOSEN_LANES), b.shl(b.zext(chosen, I64), ir.Constant(I64, 3)))
+        lanes = b.load(table, typ=I64, align=8)
+        b.store(b.add(lanes, b.mul(entry, ir.Constant(I64, 0x0101010101010101))), end, align=1)
+    else:
+        compress = declare(b, f"llvm.experimental.vector.compress.v{LANES}i32", INTS, [INTS, BITS, INTS])
+        numbers = b.add(spread(b, b.trunc(entry, I32), INTS), ir.Constant(INTS, list(range(LANES))))
+        front = b.call(compress, [numbers, b.bitcast(chosen, BITS), ir.Constant(INTS, ir.Undefined)])
+        b.store(b.trunc(front, ir.VectorType(I8, LANES)), end, align=1)
+    count_bits = declare(b, f"llvm.ctpop.i{LANES}", chosen.type, [chosen.type])
+    b.store(b.add(count, b.zext(b.call(count_bits, [chosen]), I64)), counter, align=8)
 
 
-def _preparation(mode: int) -> Callable[..., Any]:
-    linear, moving = mode in (AFFINE, ROLLING), mode in (ROLLING, MOVING)
+@vector_kernel("niiiiiiiii")
+def prepare(
+    v: Lanes,
+    mode: int,
+    ids: ir.Value,
+    records: ir.Value,
+    count: ir.Value,
+    alive: ir.Value,
+    basis: ir.Value,
+    coefficients: ir.Value,
+    lists: ir.Value,
+    counts: ir.Value,
+    entry: ir.Value,
+) -> ir.Value:
+    """Coefficients of up to LANES records, and their numbers appended to the lists of the blocks that see them.
 
-    @vector_kernel("iiiiiiiii")
-    def prepare(
-        v: Lanes,
-        ids: ir.Value,
-        records: ir.Value,
-        count: ir.Value,
-        alive: ir.Value,
-        basis: ir.Value,
-        coefficients: ir.Value,
-        lists: ir.Value,
-        counts: ir.Value,
-        entry: ir.Value,
-    ) -> ir.Value:
-        """Coefficients of up to LANES records, and their numbers appended to the lists of the blocks that see them.
+    Args:
+        v: vectors.
+        mode: projection mode.
+        ids: address of their record numbers (int32).
+        records: address of the records.
+        count: how many there are, at least 1.
+        alive: bit k is set while block k is still open (not all of its rays are opaque).
+        basis: address of the tile's basis, or of those of its bands.
+        coefficients: address of [COEFFICIENTS,BATCH].
+        lists: address of [BLOCKS,LIST] bytes.
+        counts: address of [BLOCKS] int64.
+        entry: number of the first record within the batch.
 
-        Args:
-            v: vectors.
-            ids: address of their record numbers (int32).
-            records: address of the records.
-            count: how many there are, at least 1.
-            alive: bit k is set while block k is still open (not all of its rays are opaque).
-            basis: address of the tile's basis, or of those of its bands.
-            coefficients: address of [COEFFICIENTS,BATCH].
-            lists: address of [BLOCKS,LIST] bytes.
-            counts: address of [BLOCKS] int64.
-            entry: number of the first record within the batch.
+    Returns:
+        1 if any of them is close (TAG), else 0.
+    """
+    b, linear, moving = v.b, mode in LINEAR, mode in (ROLLING, MOVING)
+    column = _load_records(v, ids, records, count)
+    rows = [column[k : k + 3] for k in (XROW, YROW, WROW)]
+    where = v.address(coefficients, b.shl(entry, ir.Constant(I64, 2)))
+    lane = ir.Constant(INTS, list(range(LANES)))
+    given = b.icmp_signed("<", lane, spread(b, b.trunc(count, I32), INTS))
+    bands = 1 if linear else BANDS
+    motion = [v.broadcast(basis, 4 * (B_MOTION + k)) for k in range(3)] if moving else []
+    drift = _times(rows, motion) if moving else []
+    lane_bits = ir.IntType(LANES)
 
-        Returns:
-            1 if any of them is close (TAG), else 0.
-        """
-        b = v.b
-        column = _load_records(v, ids, records, count)
-        rows = [column[k : k + 3] for k in (XROW, YROW, WROW)]
-        where = v.address(coefficients, b.shl(entry, ir.Constant(I64, 2)))
-        lane = ir.Constant(INTS, list(range(LANES)))
-        given = b.icmp_signed("<", lane, spread(b, b.trunc(count, I32), INTS))
-        numbers = b.add(spread(b, b.trunc(entry, I32), INTS), lane)
-        bands = 1 if linear else BANDS
-        flat, shown = column[FLAT], [row[k] for row in rows for k in range(3)]
-        for band in range(bands):
-            base = [v.broadcast(basis, 4 * (BASIS * band + k)) for k in range(BASIS)]
-            at = [_times(rows, base[k : k + 3]) for k in (B_D0, B_DX, B_DY)]
-            limit, slack = column[LIM], v.number(0)
-            drift = _times(rows, base[B_MOTION : B_MOTION + 3]) if moving else []
-            if mode == ROLLING:
-                at, flat = _rolled(at, drift, flat, base[B_MIDDLE], base[B_RATE])
-                limit, _ = _widened(column, drift, base, flat, base[B_HALF])
-            # The largest W in the tile or band: the cone Q1 < LIM W^2 is tested at its widest.
-            height = MACRO / 2 / bands
-            widest = at[0][2] + at[1][2].abs() * (MACRO / 2) + at[2][2].abs() * height
-            if not linear:
-                # |(X, Y)| changes by at most the norm of the rows times the fit's largest error; likewise W by its
-                # row's.
-                slope = (sum((x * x for x in rows[0] + rows[1]), start=v.number(0))).sqrt()
-                slack = slope * base[B_BEND]
-                depth = (rows[2][0] * rows[2][0] + rows[2][1] * rows[2][1] + rows[2][2] * rows[2][2]).sqrt()
-                widest = widest + depth * base[B_BEND]
-            if mode == MOVING:
-                # Records hold the reference point; rays of this band start up to ``reach`` of the way from it.
-                reach = base[B_HALF] + base[B_MIDDLE].abs()
-                limit, sideways = _widened(column, drift, base, flat, reach)
-                # Shifted by the band's middle place; the spread about it becomes slack.
-                at = [[x + w * base[B_MIDDLE] * drift[0], y + w * base[B_MIDDLE] * drift[1], w] for x, y, w in at]
-                slack = slack + base[B_HALF] * sideways * widest.max(0)
-                slack = slack + reach * drift[2].abs() * (limit.min(1e6).sqrt() * widest.max(0))
-            # 1 % for float32: a block too many costs time, one too few would be a hole.
-            room = limit.min(INSIDE).sqrt() * widest.max(0) * 1.01 + slack
-            least, unsure = _least_over_blocks(at, DOWN // bands, v)
-            # Around the eye (INSIDE) every ray meets it.
-            always = unsure | (limit >= INSIDE)
-            seen = widest > 0
-            for k, value in enumerate(least):
-                block = BLOCKS // bands * band + k
-                open_ = spread(b, b.trunc(b.lshr(alive, ir.Constant(I64, block)), I1), BITS)
-                mask = (((value < room * room) & seen) | always).value
-                _append(v, b.and_(b.and_(mask, given), open_), numbers, lists, counts, block)
-        if linear:
-            shown = [at[j][k] for k in range(3) for j in range(3)]
-        values = [*shown, flat, column[FADE], column[TAG], *column[FEATURE : FEATURE + 3]]
+    def keep(first: int, values: list[Vector]) -> None:
+        """Store rows of the coefficients."""
         for k, value in enumerate(values):
-            v.store(value, where, 4 * BATCH * k)
+            v.store(value, where, 4 * BATCH * (first + k))
+
+    def list_band(band: ir.Value, _: list[Vector]) -> list[Vector]:
+        flat = column[FLAT]
+        band_basis = v.address(basis, b.mul(band, ir.Constant(I64, 4 * BASIS)))
+        base = [v.broadcast(band_basis, 4 * k) for k in range(BASIS)]
+        at = [_times(rows, base[k : k + 3]) for k in (B_D0, B_DX, B_DY)]
+        limit, slack = column[LIM], v.number(0)
+        if mode == ROLLING:
+            at, flat = _rolled(at, drift, flat, base[B_MIDDLE], base[B_RATE])
+            limit, _ = _widened(column, drift, base, flat, base[B_HALF])
+        # The largest W in the tile or band: the cone Q1 < LIM W^2 is tested at its widest.
+        height = MACRO / 2 / bands
+        widest = at[0][2] + at[1][2].abs() * (MACRO / 2) + at[2][2].abs() * height
+        if not linear:
+            # |(X, Y)| changes by at most the norm of the rows times the fit's largest error; likewise W by its
+            # row's.
+            slope = (sum((x * x for x in rows[0] + rows[1]), start=v.number(0))).sqrt()
+            slack = slope * base[B_BEND]
+            depth = (rows[2][0] * rows[2][0] + rows[2][1] * rows[2][1] + rows[2][2] * rows[2][2]).sqrt()
+            widest = widest + depth * base[B_BEND]
         if mode == MOVING:
-            for k in range(3):
-                v.store(drift[k], where, 4 * BATCH * (C_DRIFT + k))
+            # Records hold the reference point; rays of this band start up to ``reach`` of the way from it.
+            reach = base[B_HALF] + base[B_MIDDLE].abs()
+            limit, sideways = _widened(column, drift, base, flat, reach)
+            # Shifted by the band's middle place; the spread about it becomes slack.
+            at = [[x + w * base[B_MIDDLE] * drift[0], y + w * base[B_MIDDLE] * drift[1], w] for x, y, w in at]
+            slack = slack + base[B_HALF] * sideways * widest.max(0)
+            slack = slack + reach * drift[2].abs() * (limit.min(1e6).sqrt() * widest.max(0))
+        # 1 % for float32: a block too many costs time, one too few would be a hole.
+        room = limit.min(INSIDE).sqrt() * widest.max(0) * 1.01 + slack
+        squares, unsure = _least_over_blocks(at, DOWN // bands, v)
+        # Around the eye (INSIDE) every ray meets it.
+        always = unsure | (limit >= INSIDE)
+        seen, room = widest > 0, room * room
 
-        # CLOSE_BIT is the sign bit of TAG.
-        near = b.icmp_signed("<", column[TAG].bits(), ir.Constant(INTS, [0] * LANES))
-        return Mask(b, b.and_(near, given)).any()
+        def list_row(row: ir.Value, _: list[Vector]) -> list[Vector]:
+            first = b.shl(b.add(b.mul(band, ir.Constant(I64, DOWN // bands)), row), ir.Constant(I64, ACROSS_BITS))
+            for k, square in enumerate(squares(row)):
+                block = b.add(first, ir.Constant(I64, k))
+                mask = b.and_((((square < room) & seen) | always).value, given)
+                open_ = b.trunc(b.lshr(alive, block), I1)
+                chosen = b.select(open_, b.bitcast(mask, lane_bits), ir.Constant(lane_bits, 0))
+                _append(v, chosen, entry, lists, counts, block)
+            return []
 
-    return prepare
+        v.repeat(ir.Constant(I64, DOWN // bands), [], list_row)
+        if linear:
+            keep(C_X, [at[j][k] for k in range(3) for j in range(3)])
+        if mode == ROLLING:
+            keep(C_FLAT, [flat])
+        return []
 
+    keep(C_FLAT, [column[FLAT], column[FADE], column[TAG], *column[FEATURE : FEATURE + 3]])
+    if not linear:
+        keep(C_X, [row[k] for row in rows for k in range(3)])
+    if mode == MOVING:
+        keep(C_DRIFT, drift)
+    v.repeat(ir.Constant(I64, bands), [], list_band)
 
-prepare_affine, prepare_rolling, prepare_table, prepare_moving = (_preparation(mode) for mode in range(4))
+    # CLOSE_BIT is the sign bit of TAG.
+    near = b.icmp_signed("<", column[TAG].bits(), ir.Constant(INTS, [0] * LANES))
+    return Mask(b, b.and_(near, given)).any()
