@@ -243,12 +243,10 @@ class Lanes:
     def table(self, name: str, numbers: Sequence[int]) -> ir.Value:
         """The address (int64) of a table of int64 constants, by a name of its own."""
         kind = ir.ArrayType(I64, len(numbers))
-        known = self.b.module.globals.get(name)
-        if known is None:
-            known = ir.GlobalVariable(self.b.module, kind, name)
-            known.global_constant, known.linkage = True, "private"
-            known.initializer = ir.Constant(kind, list(numbers))
-        return self.b.ptrtoint(known, I64)
+        if name not in self.b.module.globals:
+            made = ir.GlobalVariable(self.b.module, kind, name)
+            made.global_constant, made.linkage, made.initializer = True, "private", ir.Constant(kind, list(numbers))
+        return self.b.ptrtoint(self.b.module.globals[name], I64)
 
     def gather(self, base: ir.Value, index: ir.Value) -> Vector:
         """``base[index]`` for int32 lanes ``index`` (in floats)."""
@@ -308,6 +306,8 @@ class Lanes:
         self, count: ir.Value, state: Sequence[Vector], body: Callable[[ir.Value, list[Vector]], Sequence[Vector]]
     ) -> list[Vector]:
         """Run ``body(i, state)`` for i in 0..count - 1 (at least once), the state kept in registers."""
+        if isinstance(count, ir.Constant) and count.constant == 1:
+            return list(body(ir.Constant(I64, 0), list(state)))
         b = self.b
         before, start, end = b.block, b.append_basic_block("loop"), b.append_basic_block("done")
         b.branch(start)

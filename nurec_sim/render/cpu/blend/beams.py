@@ -91,8 +91,8 @@ def blend_patch(
     # An echo comes from the surface that stops half of the beam, not from the mean of several.
     crossing = (before > 0.5) & (after <= 0.5)
     result.append(crossing.where(distance, sums[-1]))
-    for plane, values in enumerate(result):
-        group.keep(values, state, plane)
+    for number, values in enumerate(result):
+        group.keep(values, state, number)
     return still_open(after.parts, LIDAR)
 
 

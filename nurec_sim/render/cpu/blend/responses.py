@@ -52,7 +52,6 @@ VECTORS = RAYS // LANES
 """Vectors that cover a block."""
 AT_ONCE = 2
 """Vectors of rays that are blended at once: as many as the registers hold."""
-ROWS_AT_ONCE = AT_ONCE * LANES // WIDE
 
 
 def _exponential() -> list[float]:
@@ -152,14 +151,13 @@ class RayGroup:
 
     def plane(self, base: ir.Value, number: int) -> Bundle:
         """Values of the group's rays in a plane [32] of the block at an address."""
-        first = self.v.address(base, self.start)
-        return Bundle(self.v.load(first, 4 * RAYS * number + offset) for offset in self.offsets)
+        place = self.v.address(base, self.start)
+        return Bundle(self.v.load(place, 4 * RAYS * number + offset) for offset in self.offsets)
 
     def keep(self, values: Bundle, base: ir.Value, number: int) -> None:
         """Store values of the group's rays in a plane of the block at an address."""
-        first = self.v.address(base, self.start)
         for value, offset in zip(values.parts, self.offsets, strict=True):
-            self.v.store(value, first, 4 * RAYS * number + offset)
+            self.v.store(value, self.v.address(base, self.start), 4 * RAYS * number + offset)
 
 
 class StillMeeting:
@@ -310,11 +308,11 @@ def hits_of(
 
     Args:
         v: vectors.
-        mode: projection mode.
+        mode: see ``meeting_of``, like group, coefficient and rays.
         output_kind: the distances of LIDAR are refined.
-        group: the rays.
-        coefficient: see ``meeting_of``.
-        rays: address of the block's [RAY_PLANES,32].
+        group: see mode.
+        coefficient: see mode.
+        rays: see mode.
         basis: address of the tile's basis.
         near: near plane (m); None where no record reaches it.
     """
@@ -380,7 +378,7 @@ def run_records(
 
     def blend_part(part: ir.Value, clearest: list[Vector]) -> list[Vector]:
         """Take the list through ``AT_ONCE`` vectors; returns the largest transmittance of these and earlier parts."""
-        first_row = v.spread(b.fadd(corner[1], b.sitofp(b.mul(part, ir.Constant(I64, ROWS_AT_ONCE)), F32)))
+        first_row = v.spread(b.fadd(corner[1], b.sitofp(b.mul(part, ir.Constant(I64, AT_ONCE * LANES // WIDE)), F32)))
         start = b.mul(part, ir.Constant(I64, 4 * LANES * AT_ONCE))
         group = RayGroup(v, start, [4 * LANES * k for k in range(AT_ONCE)], x, Bundle(row + first_row for row in rows))
 
@@ -392,8 +390,7 @@ def run_records(
             changed = step(group, number, lambda k: v.broadcast(where, 4 * BATCH * k), sums)
             return [value for bundle in changed for value in bundle.parts]
 
-        initial = [value for plane in range(planes) for value in group.plane(state, plane).parts]
-        final = v.repeat(count, initial, body)
+        final = v.repeat(count, [value for plane in range(planes) for value in group.plane(state, plane).parts], body)
         for plane in range(planes):
             group.keep(Bundle(final[plane * AT_ONCE : (plane + 1) * AT_ONCE]), state, plane)
         return [functools.reduce(Vector.max, final[:AT_ONCE], *clearest)]

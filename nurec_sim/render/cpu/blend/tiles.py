@@ -271,7 +271,7 @@ def prepare(
         for k, value in enumerate(values):
             v.store(value, where, 4 * BATCH * (first + k))
 
-    def list_band(band: ir.Value, _: list[Vector]) -> list[Vector]:
+    def list_band(band: ir.Value, nothing: list[Vector]) -> list[Vector]:
         flat = column[FLAT]
         band_basis = v.address(basis, b.mul(band, ir.Constant(I64, 4 * BASIS)))
         base = [v.broadcast(band_basis, 4 * k) for k in range(BASIS)]
@@ -305,7 +305,7 @@ def prepare(
         always = unsure | (limit >= INSIDE)
         seen, room = widest > 0, room * room
 
-        def list_row(row: ir.Value, _: list[Vector]) -> list[Vector]:
+        def list_row(row: ir.Value, nothing: list[Vector]) -> list[Vector]:
             first = b.shl(b.add(b.mul(band, ir.Constant(I64, DOWN // bands)), row), ir.Constant(I64, ACROSS_BITS))
             for k, square in enumerate(squares(row)):
                 block = b.add(first, ir.Constant(I64, k))
@@ -313,14 +313,14 @@ def prepare(
                 open_ = b.trunc(b.lshr(alive, block), I1)
                 chosen = b.select(open_, b.bitcast(mask, lane_bits), ir.Constant(lane_bits, 0))
                 _append(v, chosen, entry, lists, counts, block)
-            return []
+            return nothing
 
         v.repeat(ir.Constant(I64, DOWN // bands), [], list_row)
         if linear:
             keep(C_X, [at[j][k] for k in range(3) for j in range(3)])
         if mode == ROLLING:
             keep(C_FLAT, [flat])
-        return []
+        return nothing
 
     keep(C_FLAT, [column[FLAT], column[FADE], column[TAG], *column[FEATURE : FEATURE + 3]])
     if not linear:
