@@ -15,6 +15,9 @@ import numpy as np
 import pytest
 from render_scenes import START_US, camera, cloud, moved, psnr_db, request, scene
 
+from nurec_sim.render.cpu.kernel import fixed, inner
+from nurec_sim.render.cpu.simd import vector_kernel
+
 X86 = platform.machine() in ("x86_64", "AMD64")
 MACHINES = {
     "AVX2, chosen": ({"NUREC_SIM_SIMD": "avx2"}, "avx2", 8),
@@ -98,3 +101,21 @@ def draw_and_compare():
 
 if __name__ == "__main__":
     print(json.dumps(draw_and_compare()))
+
+
+def test_a_fixed_number_is_known_when_a_kernel_is_compiled():
+    """Each has machine code of its own, without the branches that it does not take."""
+    emitted = []
+
+    @vector_kernel("ni")
+    def times(v, number, x):
+        emitted.append(number)
+        return v.b.mul(x, x.type(number))
+
+    @inner
+    def twice_or_not(number, x):
+        return times(number, x) if len(number) == 2 else x + times(fixed_3, x)
+
+    fixed_3 = fixed(3)
+    assert twice_or_not(fixed(2), 10) == 20 and emitted == [2]
+    assert twice_or_not(fixed(0), 10) == 40 and emitted == [2, 3]
