@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 from nurec_sim.compute.cores import usable_cores
 from nurec_sim.types import Gaussians, Label
 
-NEIGHBOURS = 8
+NEIGHBOURS = 32
+"""Of fewer, single ones show as specks."""
 MOST_SEEN = 20_000
 """The scene is thinned to so many Gaussians to learn from, evenly: with ten times as many the colours are no better."""
 INEXACT = 1.0

@@ -173,7 +173,7 @@ def test_normals_of_a_plane_face_the_sensor(seed):
     normal /= np.linalg.norm(normal)
     basis = np.linalg.svd(normal[None])[2][1:]
     xyz = random.uniform(-2, 2, (400, 2)) @ basis + random.normal(0, 0.02, (400, 1)) * normal
-    moved, found, spacing = surface_of(cloud_of(xyz, eye=5 * normal))
+    moved, found, spacing, _ = surface_of(cloud_of(xyz, eye=5 * normal))
     assert np.median(found @ normal) > 0.98
     assert (found @ normal > 0).all()
     assert np.std(moved.xyz_m @ normal) < 0.7 * np.std(xyz @ normal)
@@ -189,7 +189,7 @@ def test_census_tells_the_clearly_darker_neighbours_row_by_row():
 
 def test_one_scan_line_faces_the_sensor():
     xyz = np.column_stack([np.linspace(-1, 1, 50), np.full(50, 5.0), np.zeros(50)])
-    _, normal, _ = surface_of(cloud_of(xyz, eye=(0, 0, 0)))
+    _, normal, _, _ = surface_of(cloud_of(xyz, eye=(0, 0, 0)))
     assert np.median(-normal[:, 1]) > 0.99
 
 

@@ -83,7 +83,7 @@ def noisy_wall(noise_m, seed=0):
 def test_a_wall_thicker_than_its_points_are_apart_becomes_thin():
     """Noise of 3 cm on points 6 cm apart: the 20 nearest lie as much across the wall as along it."""
     wall = noisy_wall(0.03)
-    flat, normals, _ = surfaces.surface_of(wall)
+    flat, normals, _, _ = surfaces.surface_of(wall)
     inner = (np.abs(wall.xyz_m[:, 1]) < 1.8) & (np.abs(wall.xyz_m[:, 2]) < 1.3)
     # Points beyond two standard deviations, 4.6 % of them, keep their place.
     assert np.mean(np.abs(flat.xyz_m[inner, 0] - 10) < 0.01) > 0.9
@@ -95,7 +95,7 @@ def test_a_pole_before_a_wall_stays_before_it():
     wall, z = noisy_wall(0.01), np.arange(-1.4, 1.4, 0.06)
     pole = np.column_stack([np.full(len(z), 9.88), np.zeros(len(z)), z])
     same = np.full(len(z), 0.06, np.float32)
-    found, _, _ = surfaces.surface_of(Cloud.concatenate([wall, Cloud(pole, np.zeros_like(pole), same, same)]))
+    found, _, _, _ = surfaces.surface_of(Cloud.concatenate([wall, Cloud(pole, np.zeros_like(pole), same, same)]))
     assert np.mean(np.abs(found.xyz_m[len(wall) :, 0] - 9.88) < 0.04) > 0.9
     assert np.mean(np.abs(found.xyz_m[: len(wall), 0] - 10) < 0.01) > 0.9
 
@@ -296,7 +296,7 @@ def test_a_scan_line_with_noise_of_its_ranges_faces_the_sensor():
     """Its points spread least across the plane of its beams, which says nothing of the wall that they hit."""
     noise_m = np.random.default_rng(0).normal(0, 0.01, 50)
     line = np.column_stack([np.linspace(-1, 1, 50), 5 + noise_m, np.zeros(50)])
-    _, normal, _ = surfaces.surface_of(cloud_of(line))
+    _, normal, _, _ = surfaces.surface_of(cloud_of(line))
     assert (-normal[:, 1] > 0.95).all()
 
 
@@ -316,8 +316,33 @@ def test_the_sheet_of_the_ground_has_no_gaps():
     corner = world.spacing_m[sheet] / np.sqrt(2)
     each = 0.95 * np.exp(-((corner / world.sigma_m[sheet]) ** 2) / 2)
     assert sheet.sum() > 100 and ((1 - each) ** 4 < 0.1).all()
-    standing = ~sheet
-    assert world.sigma_m[standing] == pytest.approx(0.45 * world.spacing_m[standing])
+
+
+def lattice(*counts, pitch_m):
+    """Points of a lattice, 0.1 m voxels each, and which of them are not at its border."""
+    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    wide = [axis for axis in range(3) if counts[axis] > 1]
+    inner = np.all((index[:, wide] >= 2) & (index[:, wide] < np.array(counts)[wide] - 2), axis=1)
+    n = len(index)
+    return Cloud(index * pitch_m, np.full((n, 3), 50.0), np.full(n, 0.1, np.float32), np.zeros(n, np.float32)), inner
+
+
+@pytest.mark.parametrize(("pitch_m", "spacing_m", "sigma_m"), [
+    (0.05, 0.1, 0.063), (0.12, 0.12, 0.0756), (0.2, 0.2, 0.126), (0.25, 0.25, 0.126), (0.4, 0.3, 0.126)])  # fmt: skip
+def test_discs_close_a_wall_that_beams_sampled_in_rows_and_columns(pitch_m, spacing_m, sigma_m):
+    """0.63 of the distance between points, of two to three edges of a voxel (0.1 m) at most."""
+    wall, inner = lattice(1, 12, 12, pitch_m=pitch_m)
+    _, _, spacing, sigma = surfaces.surface_of(wall)
+    assert spacing[inner] == pytest.approx(spacing_m)
+    assert sigma[inner] == pytest.approx(sigma_m)
+
+
+def test_discs_of_foliage_leave_gaps():
+    """Points that fill a volume: 0.7 of the distance of the fourth neighbour, and 0.45 of that."""
+    leaves, inner = lattice(9, 9, 9, pitch_m=0.2)
+    _, _, spacing, sigma = surfaces.surface_of(leaves)
+    assert spacing[inner] == pytest.approx(0.14)
+    assert sigma[inner] == pytest.approx(0.063)
 
 
 def test_footprints_have_six_tenths_of_their_pixels():

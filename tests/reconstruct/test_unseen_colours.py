@@ -70,11 +70,11 @@ def test_one_return_brighter_than_those_around_it_keeps_their_colour():
     assert colours_by_likeness(made, np.arange(25) != 12)[12] == pytest.approx(RED, abs=0.02)
 
 
-def test_eight_are_mixed_and_nothing_changes_if_all_or_none_are_seen(monkeypatch):
-    made = street([[0, 0, 0], *[[0, 0, 1.0]] * 8, [0, 0, 1.1]], [GREY, *[RED] * 8, GREEN])
-    some = np.arange(10) > 0
-    assert colours_by_likeness(made, some)[0] == pytest.approx(RED), "the ninth does not count"
-    for seen in (np.ones(10, bool), np.zeros(10, bool)):
+def test_thirty_two_are_mixed_and_nothing_changes_if_all_or_none_are_seen(monkeypatch):
+    made = street([[0, 0, 0], *[[0, 0, 1.0]] * 32, [0, 0, 1.1]], [GREY, *[RED] * 32, GREEN])
+    some = np.arange(34) > 0
+    assert colours_by_likeness(made, some)[0] == pytest.approx(RED), "the 33rd does not count"
+    for seen in (np.ones(34, bool), np.zeros(34, bool)):
         np.testing.assert_array_equal(colours_by_likeness(made, seen), made.rgb)
     monkeypatch.setattr(unseen_colours, "MOST_SEEN", 1)
-    assert colours_by_likeness(made, np.arange(10) > 8)[0] == pytest.approx(GREEN)
+    assert colours_by_likeness(made, np.arange(34) > 32)[0] == pytest.approx(GREEN)

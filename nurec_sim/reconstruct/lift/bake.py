@@ -198,7 +198,7 @@ def body_gaussians(
     cloud = body.cloud
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
     # A view replaces surfels by its pixels unless it sees them so obliquely that surfels are the finer of the two.
-    keep = (pixel > 3 * body.spacing_m) & (np.isfinite(pixel) | (through == 0))
+    keep = (pixel > 2 * body.spacing_m) & (np.isfinite(pixel) | (through == 0))
     seen = np.isfinite(pixel)
     colours = np.where(seen[:, None], seen_rgb / np.float32(255), colour.grey_of(cloud.intensity))
     discs = _discs(body, colours, np.flatnonzero(keep), settings.opacity)

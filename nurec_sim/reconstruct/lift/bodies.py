@@ -121,7 +121,7 @@ def _world_surfels(gathered: Gathered, ground: Ground, carve: bool) -> Surfels:
     if carve:
         ghosts = in_free_space(balls(standing.xyz_m, surfaces.DISC_SIGMA * standing.spacing_m), gathered.beams)
         standing = standing[~ghosts]
-    standing, normal, spacing = surfaces.surface_of(standing)
+    standing, normal, spacing, sigma = surfaces.surface_of(standing)
     row, column, _ = ground.cells(sheet.xyz_m)
     road = ground.road[row, column]
     return Surfels(
@@ -129,7 +129,7 @@ def _world_surfels(gathered: Gathered, ground: Ground, carve: bool) -> Surfels:
         Cloud.concatenate([standing, sheet]),
         np.concatenate([normal, ground.normals[row, column].astype(np.float32)]),
         np.concatenate([spacing, sheet.spacing_m]),
-        np.concatenate([surfaces.DISC_SIGMA * spacing, surfaces.LATTICE_SIGMA * sheet.spacing_m]),
+        np.concatenate([sigma, surfaces.LATTICE_SIGMA * sheet.spacing_m]),
         np.concatenate([np.full(len(standing), Label.OTHER), np.where(road, Label.ROAD, Label.OTHER)]).astype(np.uint8),
     )
 
@@ -140,6 +140,5 @@ def _actor_surfels(number: int, actor: Actor, gathered: Gathered, ground: Ground
         box_feet, world_feet = gathered.feet[number]
         off_ground = ~(np.abs(ground.above(world_feet)) < SHEET_M)
         cloud = Cloud.concatenate([cloud, thinned(box_feet[off_ground])])
-    cloud, normal, spacing = surfaces.surface_of(cloud)
-    sigma, label = surfaces.DISC_SIGMA * spacing, np.full(len(cloud), Label.MOVABLE, np.uint8)
-    return Surfels(actor, cloud, normal, spacing, sigma, label)
+    cloud, normal, spacing, sigma = surfaces.surface_of(cloud)
+    return Surfels(actor, cloud, normal, spacing, sigma, np.full(len(cloud), Label.MOVABLE, np.uint8))

@@ -27,7 +27,13 @@ DISC_SIGMA = 0.45
 """Standard deviation of a disc per metre of the spacing of scattered points."""
 LATTICE_SIGMA = 0.63
 """The same on a square lattice, whose widest gaps are where four discs meet, at 1.12 standard deviations: discs of
-opacity 0.95 then hide 94 % of what is behind."""
+opacity 0.95 then hide 94 % of what is behind. Beams sample planes in rows and columns, so on these it is a lattice,
+too."""
+SCATTERED = 0.7
+"""Spacing of scattered points by the distance of the fourth neighbour, which on a square lattice is the spacing."""
+MOST_SPACING, MOST_CLOSED = 3.0, 2.0
+"""Bounds of the spacing, in edges of a point's voxel: of any point, and of discs that close a plane. Wider ones would
+reach far over its edges."""
 PIXEL_SIGMA = 0.6
 """The same for footprints of pixels, whose lattice shears where the surface is curved."""
 MOST_STRETCH, MOST_STRETCH_OF_GROUND = 5.0, 30.0
@@ -37,33 +43,37 @@ THINNEST_M = 0.003
 """Thicker discs would catch grazing LiDAR beams far in front of the ground."""
 
 
-def surface_of(cloud: Cloud, chunk: int = 16_384) -> tuple[Cloud, np.ndarray, np.ndarray]:
-    """The cloud moved onto its local planes, unit normals that face the sensor, and the spacing between points (m).
+def surface_of(cloud: Cloud, chunk: int = 16_384) -> tuple[Cloud, np.ndarray, np.ndarray, np.ndarray]:
+    """The cloud on its local planes, unit normals that face the sensor, spacing of points and sigma of their discs (m).
 
     Sweeps of a moving car disagree by centimetres, so that walls are thick; a grazing beam would end at their near
     side. Planes are looked for in cells that are wider than this (``CellPlanes``). Elsewhere the normal is the
     direction of least variance of the nearest points. Where these lie on a line (one scan ring), the surface is taken
     to contain the line and to face the sensor as well as it can.
+
+    Discs on planes are so wide that they hide what is behind; from where the sensor was, beams between the points are
+    as good as none, but a view from beside its path sees through them. Discs of foliage and edges are smaller.
     """
     from scipy.spatial import cKDTree
 
     n = len(cloud)
     to_eye = cloud.eye_m - cloud.xyz_m
     to_eye /= np.maximum(np.linalg.norm(to_eye, axis=1, keepdims=True), 1e-9)
+    edge = cloud.spacing_m.astype(np.float32)
     if n < 4:
-        return cloud, to_eye.astype(np.float32), cloud.spacing_m.astype(np.float32).copy()
+        return cloud, to_eye.astype(np.float32), edge.copy(), DISC_SIGMA * edge
     k = min(NEIGHBOURS, n - 1)
     tree = cKDTree(cloud.xyz_m)
-    spacing = np.zeros(n, np.float32)
+    fourth = np.zeros(n, np.float32)
     normals, height, flat = CellPlanes.of(cloud.xyz_m).normals_and_heights()
+    on_plane = flat.copy()
 
     def fit(part: Int64[np.ndarray, " m"]) -> None:
         distance, index = tree.query(cloud.xyz_m[part], k=1 + (min(FOURTH, k) if flat[part[0]] else k))
         # The fourth neighbour, not the first: its distance is steadier where sampling is uneven.
-        fourth = distance[:, min(FOURTH, k)] * 0.7
-        spacing[part] = np.clip(fourth, cloud.spacing_m[part], 3 * cloud.spacing_m[part])
+        fourth[part] = distance[:, min(FOURTH, k)]
         if not flat[part[0]]:
-            normals[part], height[part] = _nearest_planes(cloud, part, distance, index, to_eye[part])
+            normals[part], height[part], on_plane[part] = _nearest_planes(cloud, part, distance, index, to_eye[part])
 
     for _ in in_order(fit, [rows[i : i + chunk] for rows in (np.flatnonzero(~flat), np.flatnonzero(flat))
                             for i in range(0, len(rows), chunk)]):  # fmt: skip
@@ -71,7 +81,10 @@ def surface_of(cloud: Cloud, chunk: int = 16_384) -> tuple[Cloud, np.ndarray, np
     xyz = cloud.xyz_m + height[:, None] * normals
     flip = np.sum(normals * to_eye, axis=1) < 0
     normals[flip] *= -1
-    return dataclasses.replace(cloud, xyz_m=xyz), normals.astype(np.float32), spacing
+    spacing = np.clip(np.where(on_plane, fourth, np.float32(SCATTERED) * fourth), edge, MOST_SPACING * edge)
+    closed = LATTICE_SIGMA * np.minimum(spacing, MOST_CLOSED * edge)
+    sigma = np.where(on_plane, closed, DISC_SIGMA * spacing)
+    return dataclasses.replace(cloud, xyz_m=xyz), normals.astype(np.float32), spacing, sigma
 
 
 def _nearest_planes(
@@ -80,8 +93,8 @@ def _nearest_planes(
     distance: Float64[np.ndarray, "m k"],
     index: Int64[np.ndarray, "m k"],
     to_eye: Float64[np.ndarray, "m 3"],
-) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"]]:
-    """Unit normals of some points by their nearest ones, and how far the planes of these lie along them; 0 if none."""
+) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    """Unit normals of some points by their nearest ones, how far the planes of these lie along them, whether any."""
     # Neighbours across a gap belong to another surface.
     reach = np.maximum(4 * distance[:, 3], 4 * cloud.spacing_m[part])
     mean, covariance = _moments(cloud.xyz_m, part, index, distance, reach)
@@ -95,7 +108,7 @@ def _nearest_planes(
     normal = np.where(line[:, None], facing, normal)
     plane = ~line & (variance[:, 0] < PLANE_RATIO * variance[:, 1])
     # Projection onto the local plane through the neighbours' mean; only where they are clearly flat.
-    return normal, np.where(plane, np.sum(normal * mean, axis=1), 0.0)
+    return normal, np.where(plane, np.sum(normal * mean, axis=1), 0.0), plane
 
 
 @dataclass(frozen=True)
