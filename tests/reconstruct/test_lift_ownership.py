@@ -7,7 +7,7 @@ import pytest
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lift import bake
-from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels
+from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels, not_replaced
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.cloud import Cloud
 from nurec_sim.reconstruct.lift.ground import Ground
@@ -141,3 +141,10 @@ def test_pixels_of_a_kept_block_own_and_those_of_other_bodies_do():
     masks = owning([body, body], two, np.array([False, True]))
     assert masks[0].astype(int).tolist() == [[0, 0, 0, 0, 1, 1, 1, 1, 1]] * 2 + [[0, 0, 0, 0, 0, 0, 1, 1, 1]] * 2
     assert masks[1].astype(int).tolist() == [[0, 0, 0, 0, 0, 0, 1, 1, 1]] * 4
+
+
+def test_surfels_stay_where_pixels_are_twice_as_wide_or_no_view_came_near():
+    """Surfels 0.1 m apart: seen sharply, seen obliquely, seen by none, looked through."""
+    pixel_m = np.array([0.19, 0.21, np.inf, np.inf], np.float32)
+    through = np.array([3, 3, 0, 1], np.int32)
+    assert not_replaced(pixel_m, through, np.full(4, 0.1, np.float32)).tolist() == [False, True, True, False]

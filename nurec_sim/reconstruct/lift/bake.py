@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Bool, Float32, Int32
 
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
@@ -24,6 +25,8 @@ from nurec_sim.types import Gaussians
 
 OWNING_SHARE = 0.4
 """Share of the blocks of all views that owns a surface, about; to meet the budget before ownership is known."""
+COARSE_PIXEL = 2.0
+"""Pixels replace surfels unless they are so many times as wide as surfels are apart."""
 
 
 def camera_isp(
@@ -197,9 +200,7 @@ def body_gaussians(
     progress(0.85)
     cloud = body.cloud
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
-    # A view replaces surfels by its pixels unless it sees them so obliquely that surfels are the finer of the two.
-    keep = (pixel > 2 * body.spacing_m) & (np.isfinite(pixel) | (through == 0))
-    seen = np.isfinite(pixel)
+    seen, keep = np.isfinite(pixel), not_replaced(pixel, through, body.spacing_m)
     colours = np.where(seen[:, None], seen_rgb / np.float32(255), colour.grey_of(cloud.intensity))
     discs = _discs(body, colours, np.flatnonzero(keep), settings.opacity)
     progress(0.9)
@@ -207,6 +208,19 @@ def body_gaussians(
     made, lifted = Gaussians.concatenate([*parts, discs]), sum(map(len, parts))
     shown = np.concatenate([np.ones(lifted, bool), seen[keep][stays]])
     return replace(made, rgb=colours_by_likeness(made, shown)), lifted
+
+
+def not_replaced(
+    pixel_m: Float32[np.ndarray, " n"], through: Int32[np.ndarray, " n"], spacing_m: Float32[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Which surfels stay: those that views see so obliquely that surfels are the finer of the two, or not at all.
+
+    Args:
+        pixel_m: width of the pixels that show them, along the surface; infinite where none does.
+        through: how many views look through them.
+        spacing_m: distance between surfels.
+    """
+    return (pixel_m > COARSE_PIXEL * spacing_m) & (np.isfinite(pixel_m) | (through == 0))
 
 
 def _discs(body: Surfels, colours: np.ndarray, rows: np.ndarray, opacity: float) -> Gaussians:
