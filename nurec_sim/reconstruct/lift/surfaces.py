@@ -29,13 +29,13 @@ LATTICE_SIGMA = 0.63
 """The same on a square lattice, whose widest gaps are where four discs meet, at 1.12 standard deviations: discs of
 opacity 0.95 then hide 94 % of what is behind. Beams sample planes in rows and columns, so on these it is a lattice,
 too."""
+PIXEL_SIGMA = 0.6
+"""The same for footprints of pixels, whose lattice shears where the surface is curved."""
 SCATTERED = 0.7
 """Spacing of scattered points by the distance of the fourth neighbour, which on a square lattice is the spacing."""
 MOST_SPACING, MOST_CLOSED = 3.0, 2.0
 """Bounds of the spacing, in edges of a point's voxel: of any point, and of discs that close a plane. Wider ones would
 reach far over its edges."""
-PIXEL_SIGMA = 0.6
-"""The same for footprints of pixels, whose lattice shears where the surface is curved."""
 MOST_STRETCH, MOST_STRETCH_OF_GROUND = 5.0, 30.0
 """Length over width of a footprint at most. The ground and other level surfaces are known to be flat; from a camera at
 1.65 m they are stretched by 15 at 25 m."""

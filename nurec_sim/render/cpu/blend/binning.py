@@ -37,7 +37,7 @@ class SortScratch(NamedTuple):
     @classmethod
     def empty(cls, binned: TileLists, tiles: Int64[np.ndarray, " t"]) -> SortScratch:
         """New scratch for some macro tiles."""
-        most = int((binned.starts[tiles + 1] - binned.starts[tiles]).max())
+        most = int((binned.starts[tiles + 1] - binned.starts[tiles]).max(initial=0))
         return cls(np.empty(most, np.uint64), np.empty((2, MANY + 1), np.int64))
 
 
