@@ -8,7 +8,7 @@ from reconstruct_street import Street, camera
 
 from nurec_sim.evaluate.scores.images import psnr
 from nurec_sim.reconstruct import ColourSettings, LiftSettings, ViewSettings, reconstruct
-from nurec_sim.reconstruct.lift import colour_solve
+from nurec_sim.reconstruct.lift import colour_solve, method
 from nurec_sim.render import CpuRenderer
 from nurec_sim.scene import scene_hash
 from nurec_sim.scene.usd.dome_texture import sample_cubemap
@@ -16,6 +16,7 @@ from nurec_sim.types import DynamicGaussians, Gaussians, Pinhole, SensorRequest
 
 SETTINGS = LiftSettings(sky_px=32, views=ViewSettings(levels=32), colours=ColourSettings(rounds=0))
 SOLVED = dataclasses.replace(SETTINGS, colours=ColourSettings())
+RED, BLUE, WHITE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 1.0)
 CROSSING = {"moving": ((4.0, 1.8, 1.5), np.column_stack([np.linspace(12, 16, 4), np.full(4, 2.2)]))}
 
 
@@ -38,7 +39,7 @@ def lifted(street):
 
 
 def solved_from(scene, street):
-    return colour_solve.solve_colours(scene, street, ["front"], SOLVED, lambda fraction: None)
+    return colour_solve.solve_colours(scene, street, ["front"], SOLVED, lambda fraction: None).scene
 
 
 @pytest.fixture(scope="module")
@@ -76,10 +77,40 @@ def test_results_do_not_depend_on_the_number_of_threads(street, lifted, solved, 
 def test_the_method_solves(street, lifted):
     # More trust, as colours of few pixels would follow that ``lifted`` was rounded to half floats, as archives are.
     settings = dataclasses.replace(SOLVED, colours=ColourSettings(trust=0.5))
-    solved = colour_solve.solve_colours(lifted, street, ["front"], settings, lambda fraction: None)
+    solved, pixels = colour_solve.solve_colours(lifted, street, ["front"], settings, lambda fraction: None)
     scene = reconstruct(street, settings=settings, cameras=["front"])
-    assert np.abs(scene.static.rgb - solved.static.rgb).max() < 0.01
+    shown = pixels > 2 * method.SHOWN_PX
+    assert shown.any() and np.abs(scene.static.rgb - solved.static.rgb)[shown].max() < 0.01
     assert scene.exposures["front"] == pytest.approx(solved.exposures["front"], abs=0.01)
+
+
+def surfels_after_a_solve(monkeypatch, colour, pixels):
+    """Colours of surfels that have this one after the solve, where all pixels that were lifted are red."""
+    street = Street(frames=2, cameras=(camera(width=64, height=32),))
+
+    def solve(scene, *_):
+        lifted = np.arange(len(scene.static)) < scene.provenance["counts"]["lifted"]
+        static = dataclasses.replace(scene.static, rgb=np.where(lifted[:, None], RED, colour).astype(np.float32))
+        return colour_solve.Solved(dataclasses.replace(scene, static=static), np.where(lifted, 0.0, pixels))
+
+    monkeypatch.setattr(method, "solve_colours", solve)
+    scene = reconstruct(street, settings=SETTINGS)
+    lifted = scene.provenance["counts"]["lifted"]
+    assert 0 < lifted < len(scene.static)
+    assert scene.static.rgb[:lifted] == pytest.approx(np.tile(RED, (lifted, 1)), abs=1e-3), "they keep theirs"
+    return scene.static.rgb[lifted:]
+
+
+@pytest.mark.parametrize(("pixels", "colour"), [(0.0, RED), (0.09, RED), (0.11, BLUE)])
+def test_surfels_that_images_hardly_show_are_coloured_by_the_others(monkeypatch, pixels, colour):
+    got = surfels_after_a_solve(monkeypatch, BLUE, pixels)
+    assert got == pytest.approx(np.tile(colour, (len(got), 1)), abs=1e-3)
+
+
+def test_surfels_that_are_white_in_images_stay_white(monkeypatch):
+    """Pixels that are white in image and scene count nothing in the solve; other surfels no image shows."""
+    white = (surfels_after_a_solve(monkeypatch, WHITE, 0.0) > 0.99).all(axis=1)
+    assert 0 < white.sum() < len(white)
 
 
 @pytest.mark.parametrize(("pixels", "size"), [(8 * 4 * 128 * 64, (64, 128)), (8 * 4 * 128 * 64 - 1, (32, 64))])
@@ -110,7 +141,7 @@ def test_what_no_image_shows_keeps_its_colour(street, lifted):
 
 def test_few_images_are_taken_of_a_long_log_and_the_others_lie_between(street, lifted):
     settings = dataclasses.replace(SOLVED, colours=ColourSettings(images=2))
-    exposures = colour_solve.solve_colours(lifted, street, ["front"], settings, lambda fraction: None).exposures
+    exposures = colour_solve.solve_colours(lifted, street, ["front"], settings, lambda fraction: None).scene.exposures
     first, second, third, last = exposures["front"]
     assert second == pytest.approx((first + third) / 2) and last == pytest.approx(third)
 
@@ -130,7 +161,7 @@ def test_the_image_of_a_longer_lens_leaves_no_edge_in_the_sky(lifted):
     sky = np.full((6, 128, 128, 3), 0.5, np.float32)
     empty = dataclasses.replace(lifted, static=Gaussians.empty(), dynamic=DynamicGaussians.empty(), tracks=(), sky=sky)
     empty = dataclasses.replace(empty, rig=street.rig, isp={})
-    solved = colour_solve.solve_colours(empty, street, ["front", "long"], SOLVED, lambda fraction: None)
+    solved = colour_solve.solve_colours(empty, street, ["front", "long"], SOLVED, lambda fraction: None).scene
     bearing = np.linspace(-20, 20, 400)  # the long lens ends at 10 degrees, where it is 12 % too bright or dark
     ahead = np.stack([np.cos(np.radians(bearing)), np.sin(np.radians(bearing)), 0 * bearing], axis=1)
     grey = sample_cubemap(solved.sky, ahead).mean(axis=1)

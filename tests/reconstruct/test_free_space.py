@@ -366,7 +366,7 @@ def test_a_pixel_in_free_space_leaves_its_place_to_the_surfels_behind_it(parked)
     settings = LiftSettings(opacity=0.5)
     pixels = body_pixels([body], [view], [picture], [rgb], settings)[0]
     for beams, left, discs in (([], 8, 0), ([sweep_of(parked, 10.7 / directions()[:, 0])] * 3, 4, 1)):
-        gaussians, lifted = body_gaussians(body, pixels, level_ground(), [view], [picture], [rgb], settings, beams)
+        gaussians, lifted, _ = body_gaussians(body, pixels, level_ground(), [view], [picture], [rgb], settings, beams)
         assert lifted == left and len(gaussians) - lifted == discs
     assert gaussians.mean_m[-1] == pytest.approx(wall[0])
     wrong = pixels[pixels.depth_m < 10.5]

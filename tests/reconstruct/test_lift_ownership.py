@@ -107,7 +107,7 @@ def test_two_views_that_leave_level_ground_to_each_other_both_keep_it():
     def centres(first_m, second_m):
         pictures = pictures_at(first_m, second_m)
         pixels = body_pixels([body], views, pictures, rgb, settings)[0]
-        gaussians, _ = body_gaussians(body, pixels, ground, views, pictures, rgb, settings)
+        gaussians, *_ = body_gaussians(body, pixels, ground, views, pictures, rgb, settings)
         middle = (np.abs(gaussians.mean_m[:, :2]) < 0.5).all(axis=1)
         return sorted({round(-float(z), 1) for z in gaussians.mean_m[middle, 2]})
 
@@ -128,7 +128,7 @@ def test_of_pixels_in_a_gap_of_the_ground_the_nearest_stay(monkeypatch):
         return first if owns is None else (everything.view == 0) | ~owns[0].ravel()[everything.pixel]
 
     monkeypatch.setattr(bake, "_owned", owned)
-    gaussians, _ = body_gaussians(body, pixels, ground, views, pictures, rgb, settings)
+    gaussians, *_ = body_gaussians(body, pixels, ground, views, pictures, rgb, settings)
     assert len(gaussians) == np.count_nonzero(pixels.view == 0) > 0
 
 

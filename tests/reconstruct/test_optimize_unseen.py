@@ -9,7 +9,7 @@ from nurec_sim.reconstruct import OptimizeSettings, unseen_colours
 from nurec_sim.reconstruct.optimize import method
 from nurec_sim.reconstruct.optimize.adam import RGB
 from nurec_sim.reconstruct.optimize.parameters import Parameters
-from nurec_sim.reconstruct.optimize.unseen import colour_unseen, shown_by
+from nurec_sim.reconstruct.optimize.unseen import SHOWN_PX, colour_unseen, pixel_shares
 from nurec_sim.reconstruct.optimize.views import training_views
 from nurec_sim.types import DynamicGaussians, Label
 
@@ -30,7 +30,7 @@ def test_an_image_shows_what_is_before_it_and_not_what_is_behind(street, lifted)
     deep = small[np.array([0, 1, 2, 2, 2, 3])]
     parameters = Parameters(dataclasses.replace(lifted, static=deep, dynamic=DynamicGaussians.empty(), tracks=()))
     x = parameters.static_gaussians(np.arange(6)).mean_m - eye.astype(np.float32)
-    seen = shown_by(parameters, [view])
+    seen = pixel_shares(parameters, [view]) > SHOWN_PX
     assert seen[x[:, 0] < 0].tolist() == [False]
     assert seen[(x[:, 0] == 20) & (x[:, 1] == 0)].tolist() == [True]
     assert seen[(x[:, 1] > 3)].tolist() == [False]
@@ -71,8 +71,9 @@ def test_a_fit_colours_what_no_image_shows(street, lifted):
     run = method.Optimization(lifted, views, OptimizeSettings(seconds=None, steps=3))
     run.run(lambda *_: None)
     fitted = run.parameters.visits[: run.parameters.static_count] > 0
-    seen = fitted | shown_by(run.parameters, views)
+    seen = pixel_shares(run.parameters, views) > SHOWN_PX
     assert 0 < seen.sum() < len(seen) and (seen & ~fitted).any(), "three of the four images have been fitted"
+    assert (fitted & ~seen).any(), "shares of less than a pixel change colours, and do not determine them"
     before = run.parameters.values.copy()
     run.colour_unseen()
     after = run.parameters.values

@@ -73,7 +73,7 @@ def test_the_road_keeps_its_colour_where_a_mover_passed():
     lifted = reconstruct(Street(**street), settings=settings)
     settings = replace(settings, colours=ColourSettings())
     lit, shaded = (
-        solve_colours(lifted, kind(**street), ["front"], settings, lambda fraction: None).static
+        solve_colours(lifted, kind(**street), ["front"], settings, lambda fraction: None).scene.static
         for kind in (Street, Shaded)
     )
     x, y, z = lit.mean_m.T

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
@@ -20,7 +21,6 @@ from nurec_sim.reconstruct.lift.lifting import NOBODY, Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.views import WorkingView
-from nurec_sim.reconstruct.unseen_colours import colours_by_likeness
 from nurec_sim.types import Gaussians
 
 OWNING_SHARE = 0.4
@@ -147,6 +147,16 @@ def _in_body(points: Lifted, view: WorkingView, body: Surfels) -> Lifted:
     )
 
 
+class Baked(NamedTuple):
+    """Gaussians of one body, in its frame."""
+
+    gaussians: Gaussians
+    lifted: int
+    """How many of them, the first ones, were lifted from pixels."""
+    shown: Bool[np.ndarray, " n"]
+    """Which of them have a colour from an image."""
+
+
 def body_gaussians(
     body: Surfels,
     pixels: Lifted,
@@ -157,8 +167,8 @@ def body_gaussians(
     settings: LiftSettings,
     beams: Sequence[SweepBeams] = (),
     progress: Callable[[float], None] = lambda fraction: None,
-) -> tuple[Gaussians, int]:
-    """Gaussians of one body in its frame, and how many of them were lifted from pixels; none where beams passed.
+) -> Baked:
+    """Gaussians of one body; none where beams passed. Surfels that no image shows are grey, by their intensity.
 
     Args:
         body: its measured surface.
@@ -205,9 +215,8 @@ def body_gaussians(
     discs = _discs(body, colours, np.flatnonzero(keep), settings.opacity)
     progress(0.9)
     discs, stays = body.outside_free_space(discs, beams, ground)
-    made, lifted = Gaussians.concatenate([*parts, discs]), sum(map(len, parts))
-    shown = np.concatenate([np.ones(lifted, bool), seen[keep][stays]])
-    return replace(made, rgb=colours_by_likeness(made, shown)), lifted
+    lifted = sum(map(len, parts))
+    return Baked(Gaussians.concatenate([*parts, discs]), lifted, np.append(np.ones(lifted, bool), seen[keep][stays]))
 
 
 def not_replaced(

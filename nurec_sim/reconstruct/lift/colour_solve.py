@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -60,9 +61,17 @@ class SolvedImage:
     """Of each pixel, in the colours of Gaussians and in those of the sky."""
 
 
+class Solved(NamedTuple):
+    """A scene with solved colours."""
+
+    scene: GaussianScene
+    pixels: Float32[np.ndarray, " n"] | None
+    """Shares of each static Gaussian of all pixels of the images, added up; None: nothing was solved for."""
+
+
 def solve_colours(
     scene: GaussianScene, clip: Clip, cameras: Sequence[str], settings: LiftSettings, progress: Callable[[float], None]
-) -> GaussianScene:
+) -> Solved:
     """The scene with the colours, sky and responses that fit the images best.
 
     Args:
@@ -75,7 +84,7 @@ def solve_colours(
     times = {camera: np.asarray(clip.camera_times_us(camera), np.int64) for camera in clip.rig.cameras}
     frames = [(camera, k) for camera in cameras for k in range(len(times[camera]))]
     if not frames or not settings.colours.rounds:
-        return scene
+        return Solved(scene, None)
     step = -(-len(frames) // settings.colours.images)
     chosen = [(camera, k) for camera in cameras for k in range(0, len(times[camera]), step)]
     # In random order: of neighbours in time, which show the same, the later would correct the earlier.
@@ -99,7 +108,7 @@ def solve_colours(
         responses[camera] = np.stack(columns, axis=1).reshape(-1, 3, 4)
     others = [camera for camera in clip.rig.cameras if camera not in responses]
     responses |= borrowed_responses(responses, times, clip.rig, others)
-    return replace(solve.scene(), exposures=responses)
+    return Solved(replace(solve.scene(), exposures=responses), solve.pixels() / len(order))
 
 
 def _pixel_weights(
@@ -159,6 +168,7 @@ class ColourSolve:
         self._static, self._moving = pack(scene.static), PackedMoving.of(scene.dynamic, scene.tracks)
         self._sky = np.array(scene.sky, np.float32)
         shapes = ((len(self._static), BLOCK), (len(self._moving), BLOCK), self._sky.shape[:3])
+        self._trust = np.float32(trust)
         self._seen = [np.full(shape, trust, np.float32) for shape in shapes]
         self._workers, self._buffers = Workers(usable_cores()), Buffers()
         self._beside = ThreadPoolExecutor(1)
@@ -234,6 +244,13 @@ class ColourSolve:
             response[c, 3] += offset
         self.responses[image.camera.id, image.frame] = response
         return response
+
+    def pixels(self) -> Float32[np.ndarray, " n"]:
+        """Shares of each static Gaussian of the pixels so far, added up."""
+        index = self._static.index
+        pixels = np.zeros(len(self._scene.static), np.float32)
+        pixels[index[index >= 0]] = self._seen[0].ravel()[index >= 0] - self._trust
+        return pixels
 
     def scene(self) -> GaussianScene:
         """The scene with the present colours."""

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from jaxtyping import Bool
 
 from nurec_sim.compute.cores import in_order
 from nurec_sim.errors import ReconstructError
@@ -21,7 +22,7 @@ from nurec_sim.geometry import arc_length
 from nurec_sim.reconstruct.ego_images import find_ego_images
 from nurec_sim.reconstruct.lift import actors as actor_layer
 from nurec_sim.reconstruct.lift import colour, people, points
-from nurec_sim.reconstruct.lift.bake import body_gaussians, body_pixels, camera_isp
+from nurec_sim.reconstruct.lift.bake import Baked, body_gaussians, body_pixels, camera_isp
 from nurec_sim.reconstruct.lift.bodies import surfels_of
 from nurec_sim.reconstruct.lift.colour_solve import solve_colours
 from nurec_sim.reconstruct.lift.pictures import DepthPicture, depth_pictures
@@ -29,9 +30,12 @@ from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
 from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, WorkingView, border_weight, key_frames, read_views
+from nurec_sim.reconstruct.unseen_colours import colours_by_likeness
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene
 
 Progress = Callable[[str, float], None]
+SHOWN_PX = 0.1
+"""Images show a surfel if its shares of all their pixels add up to more than this."""
 
 
 def lift(
@@ -75,30 +79,30 @@ def lift(
     # Responses first: colours of different cameras are mixed from here on.
     canonical = [colour.to_canonical(view.rgb, isp[view.camera_id]).astype(np.uint8) for view in views]
     stages.start("lifting")
-    static, moving, lifted = Gaussians.empty(), [], 0
+    static, moving, lifted = Baked(Gaussians.empty(), 0, np.zeros(0, bool)), [], 0
     beams = gathered.beams if settings.points.carve else []
     pixels = body_pixels(bodies, views, pictures, canonical, settings)
 
-    def made(number: int) -> tuple[Gaussians, int]:
+    def made(number: int) -> Baked:
         body = bodies[number]
         shown = [k for k, view in enumerate(views) if body.present(view.t_us)]
         lifted = dataclasses.replace(pixels[number], view=np.searchsorted(shown, pixels[number].view).astype(np.int32))
         mine, depths, colours = [views[k] for k in shown], [pictures[k] for k in shown], [canonical[k] for k in shown]
         # The world takes as long as all actors, which are made beside it: its progress is that of all.
         report = stages.fraction if body.actor is None else lambda fraction: None
-        return body_gaussians(body, lifted, ground, mine, depths, colours, settings, beams, report)
+        baked = body_gaussians(body, lifted, ground, mine, depths, colours, settings, beams, report)
+        return baked._replace(gaussians=_coloured(baked.gaussians, baked.shown))
 
     with ThreadPoolExecutor(1) as beside:
         weights = [_sky_weight(picture, view, settings) for picture, view in zip(pictures, views, strict=True)]
         far = beside.submit(make_sky, views, canonical, weights, settings.sky_px)
-        for number, (gaussians, count) in enumerate(in_order(made, range(len(bodies)), len(bodies))):
-            lifted += count
+        for number, baked in enumerate(in_order(made, range(len(bodies)), len(bodies))):
+            lifted += baked.lifted
             if (actor := bodies[number].actor) is None:
-                static = gaussians
-            elif len(gaussians):
-                moving.append(
-                    actor_layer.in_box(actor, gaussians) if actor.window_us is None else people.moving(actor, gaussians)
-                )
+                static = baked
+            elif len(baked.gaussians):
+                place = actor_layer.in_box if actor.window_us is None else people.moving
+                moving.append(place(actor, baked.gaussians))
         sky = far.result()
     dynamic = DynamicGaussians.concatenate(moving)
     counts = {
@@ -106,7 +110,7 @@ def lift(
         "points": gathered.point_count,
         "views": len(views),
         "lifted": lifted,
-        "static": len(static),
+        "static": len(static.gaussians),
         "dynamic": len(dynamic),
     }
     provenance = {
@@ -119,7 +123,7 @@ def lift(
     }
     scene = GaussianScene(
         id=clip.id,
-        static=static,
+        static=static.gaussians,
         dynamic=dynamic,
         sky=sky,
         isp=isp,
@@ -133,9 +137,20 @@ def lift(
         ego_images=ego_images,
     )
     stages.start("solving colours")
-    scene = solve_colours(scene, clip, cameras, settings, stages.fraction)
+    scene, pixels = solve_colours(scene, clip, cameras, settings, stages.fraction)
+    shown = static.shown
+    if pixels is not None:
+        # An image that should show a surfel, by its depth, may show it through a gap only, and in the colour of what is
+        # around that. Pixels that are white in image and scene count nothing in the solve.
+        white = scene.static.rgb.min(axis=1) > colour.SATURATED
+        shown = (np.arange(len(shown)) < static.lifted) | (pixels > SHOWN_PX) | (static.shown & white)
     stages.stop()
-    return scene
+    return dataclasses.replace(scene, static=_coloured(scene.static, shown))
+
+
+def _coloured(gaussians: Gaussians, shown: Bool[np.ndarray, " n"]) -> Gaussians:
+    """Gaussians of which those that no image shows take colours of what is like them."""
+    return dataclasses.replace(gaussians, rgb=colours_by_likeness(gaussians, shown))
 
 
 def _sky_weight(picture: DepthPicture, view: WorkingView, settings: LiftSettings) -> np.ndarray:

@@ -33,7 +33,7 @@ from nurec_sim.reconstruct.optimize.poses import PoseCorrections
 from nurec_sim.reconstruct.optimize.responses import FrameResponses, borrowed_responses
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 from nurec_sim.reconstruct.optimize.tracks import TrackCorrections
-from nurec_sim.reconstruct.optimize.unseen import colour_unseen, shown_by
+from nurec_sim.reconstruct.optimize.unseen import SHOWN_PX, colour_unseen, pixel_shares
 from nurec_sim.reconstruct.optimize.views import TrainingView, training_views
 from nurec_sim.render.device import choose_device
 from nurec_sim.scene import scene_hash
@@ -86,6 +86,7 @@ def refine(
         if settings.resume:
             run.restore(read_checkpoint(settings.checkpoint, run.key))
     run.run(progress)
+    progress("colours of what no image shows", 1.0)
     run.colour_unseen()
     return run.scene(clip)
 
@@ -167,11 +168,8 @@ class Optimization:
         self._clear_free_space()
 
     def colour_unseen(self) -> None:
-        """Give what no image shows the colours of what is like it."""
-        parameters = self.parameters
-        # What was fitted has been seen; the other images are looked at now, so that a short run knows as much.
-        others = [view for number, view in enumerate(self.views) if number not in self._clear]
-        colour_unseen(parameters, (parameters.visits[: parameters.static_count] > 0) | shown_by(parameters, others))
+        """Give what no image shows, or hardly, the colours of what is like it."""
+        colour_unseen(self.parameters, pixel_shares(self.parameters, self.views) > SHOWN_PX)
 
     def _clear_free_space(self) -> None:
         """Take out what recorded beams have passed through."""

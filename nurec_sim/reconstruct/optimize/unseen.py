@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float32
 
 from nurec_sim import sensors
 from nurec_sim.reconstruct.optimize.adam import RGB
@@ -16,13 +16,18 @@ from nurec_sim.render.cpu.backward.frame import SENSORS, Frame
 
 WIDTH_PX = 480
 """Images are drawn at about this width to see what they show."""
-LEAST_PX = 1e-3
-"""A Gaussian is shown by an image if its shares of all pixels add up to this much."""
+SHOWN_PX = 0.3
+"""Images show a Gaussian if its shares of all their pixels add up to more than this; fewer do not determine colours."""
 
 
-def shown_by(parameters: Parameters, views: Sequence[TrainingView]) -> Bool[np.ndarray, " n"]:
-    """Which static Gaussians take part in any pixel of some images."""
-    seen = np.zeros(parameters.static_count, bool)
+def pixel_shares(parameters: Parameters, views: Sequence[TrainingView]) -> Float32[np.ndarray, " n"]:
+    """Shares of each static Gaussian of all pixels of some images, added up, in pixels of the images' full size.
+
+    Args:
+        parameters: of the scene.
+        views: the images.
+    """
+    pixels = np.zeros(parameters.static_count, np.float32)
     for view in views:
         reduction = max(1, round(view.camera.width_px / WIDTH_PX))
         width, height = view.camera.width_px // reduction, view.camera.height_px // reduction
@@ -31,14 +36,14 @@ def shown_by(parameters: Parameters, views: Sequence[TrainingView]) -> Bool[np.n
         drawn = parameters.at(view.t_us)
         frame.draw_packed(drawn.packed)
         by_planes, world, shares = frame.empty_planes(), drawn.world, parameters.gradients
-        # A colour is linear in those of the Gaussians; their shares of it are never negative.
+        # A colour is linear in those of the Gaussians, so the gradient of the sum of all pixels is the sum of shares.
         valid = frame.sensor.grid.valid
         by_planes[1:4, : valid.shape[0], : valid.shape[1]] = valid
         frame.draw_back(world.mean, world.quat, world.scale, world.opacity, by_planes, shares)
-        seen |= shares.features[: len(seen), 0] > LEAST_PX
+        pixels += shares.features[: len(pixels), 0] * np.float32(reduction**2)
         for array in shares:
             array.fill(0)
-    return seen
+    return pixels
 
 
 def colour_unseen(parameters: Parameters, seen: Bool[np.ndarray, " n"]) -> None:
