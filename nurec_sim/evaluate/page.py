@@ -26,7 +26,12 @@ TITLES = {
     "lidar": "Held-out LiDAR sweeps on the driven path and beside it",
     "detection": "A camera detector on true and on rendered images",
 }
-CURVES = {"psnr_db": "PSNR (dB)", "abs_rel": "AbsRel (aligned)", "abs_rel_metric": "AbsRel (metres)"}
+CURVES = {
+    "psnr_db": "PSNR (dB)",
+    "shown_psnr_db": "PSNR (dB) of what inputs show",
+    "abs_rel": "AbsRel (aligned)",
+    "abs_rel_metric": "AbsRel (metres)",
+}
 SWEEP_CURVES = {"cd_l1_sum": "Chamfer distance (m)", "median_abs_range_error_m": "median range error (m)"}
 COLOURS = ("#1d4ed8", "#b45309", "#15803d", "#7e22ce", "#64748b")
 MORE_STYLE = "img { max-width:100%; border-radius:6px; display:block; } .plots { display:grid; gap:16px; }"
@@ -104,7 +109,8 @@ def _curves(methods: Mapping[str, Any]) -> dict[str, Any]:
     for column, title in columns.items():
         traces = []
         for number, (name, row) in enumerate(methods.items()):
-            points = [(float(at), values[column]) for at, values in row[part].items() if values[column] is not None]
+            values = {float(at): figures.get(column) for at, figures in row[part].items()}
+            points = [(at, value) for at, value in values.items() if value is not None]
             if points:
                 colour = COLOURS[number % len(COLOURS)]
                 traces.append({

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 
 import numpy as np
 from jaxtyping import Int64
 
 from nurec_sim import geometry
+from nurec_sim.evaluate.covisible import TrueImage, covisible
 from nurec_sim.evaluate.detection.sights import Sight
 from nurec_sim.evaluate.views import reduced, reduced_mask
 from nurec_sim.evaluate.windows import EvaluationView
@@ -70,6 +71,11 @@ class EvaluationWorld:
         pose = self.ego.at(t_us) @ beside @ camera.rig_from_camera
         return SensorRequest("", camera, t_us, t_us + 1, np.stack([pose, pose]))
 
+    def image(self, camera_id: str, t_us: int) -> TrueImage:
+        """A camera image with its ground truth."""
+        request = self.request(camera_id, t_us)
+        return TrueImage(request, self.world.view(request))
+
     def shots(self, times_us: Int64[np.ndarray, " n"]) -> dict[str, tuple[Shot, ...]]:
         """Frames of all cameras of the rig at these times."""
         return {name: tuple(self._shot(name, int(t)) for t in times_us) for name in self.rig.cameras}
@@ -80,8 +86,9 @@ class EvaluationWorld:
         return Shot(t_us, t_us, request.world_from_sensor, cache(lambda: self.world.view(request).rgb))
 
     def target(
-        self, name: str, camera_id: str, t_us: int, left_m: float = 0.0, beyond: bool = False, sight: bool = False
-    ) -> EvaluationView:
+        self, name: str, camera_id: str, t_us: int, left_m: float = 0.0, beyond: bool = False, sight: bool = False,
+        inputs: Sequence[TrueImage] = (),
+    ) -> EvaluationView:  # fmt: skip
         """A target view with its ground truth.
 
         Args:
@@ -91,12 +98,16 @@ class EvaluationWorld:
             left_m: lateral offset of the car from the recorded drive, left positive.
             beyond: whether the instant is before the first or after the last input frame.
             sight: whether it gets what a detector needs.
+            inputs: input images, to know what of the view they show.
         """
         request = self.request(camera_id, t_us, left_m)
         seen = self.world.view(request)
         movable = reduced_mask(LABEL_OF_CLASS[seen.surface] == Label.MOVABLE)
         depth_m = np.where(seen.surface == SurfaceClass.SKY, np.float32(0), seen.depth_m)
         view = EvaluationView(name, request, reduced(seen.rgb, depth_m), movable, left_m, beyond)
+        if inputs:
+            shown = covisible(TrueImage(request, seen), inputs, self.world.plan.tracks())
+            view = dataclasses.replace(view, shown=~reduced_mask(~shown))
         if not sight:
             return view
         camera, pose = self.rig.cameras[camera_id], request.world_from_sensor[0]

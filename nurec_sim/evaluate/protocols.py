@@ -179,12 +179,15 @@ def _beside(
     times, span_us = _storm_times(start_us)
     clip = source.clip(id, times[list(STORM_CONTEXT)], span_us, protocol.boxes)
     camera = next(iter(source.rig.cameras))
+    inputs = [] if sight else [source.image(camera, int(times[frame])) for frame in STORM_CONTEXT]
     places = [0.0, *(side * shift for shift in shifts_m for side in (1, -1))]
     targets = []
     for count, left_m in enumerate(places):
         report("rendering", 0.1 + 0.9 * count / len(places))
         for frame in SHIFT_FRAMES:
-            target = source.target(f"{frame:02d}{left_m:+.1f}", camera, int(times[frame]), left_m, sight=sight)
+            target = source.target(
+                f"{frame:02d}{left_m:+.1f}", camera, int(times[frame]), left_m, sight=sight, inputs=inputs
+            )
             if not _inside_something(target):
                 targets.append(target)
     return Made(clip, targets)

@@ -101,9 +101,10 @@ def _support(built: Built, window: Window) -> Support | None:
 
 
 def score_view(view: ScoredView, target: EvaluationView) -> dict[str, Figures | None]:
-    """Scores of one view: ``full``; with a known dynamic region also ``dynamic`` and ``static``.
+    """Scores of one view: ``full``; with a known dynamic region also ``dynamic`` and ``static``, and ``shown``.
 
-    ``static`` is the complement of ``dynamic``; either is None if empty. Each has ``psnr_db``, ``ssim``, and with known
+    ``static`` is the complement of ``dynamic``, ``shown`` what an input image shows, with its ``share`` of all pixels,
+    where that is known; each is None if empty. Each has ``psnr_db``, ``ssim``, and with known
     depth ``abs_rel`` and ``delta1`` after the frame's least-squares scale over all pixels, ``abs_rel_metric`` and
     ``delta1_metric`` as predicted; ``full`` also ``depth_scale`` and ``depth_coverage``. Values that cannot be computed
     are None.
@@ -118,7 +119,11 @@ def score_view(view: ScoredView, target: EvaluationView) -> dict[str, Figures | 
         full |= {"depth_scale": scale, "depth_coverage": _known(whole.coverage)}
     full |= _depth_figures(view, true, scale, None)
     parts = {"dynamic": mask, "static": None if mask is None else ~mask}
-    return {"full": full} | {name: _figures_inside(view, true, scale, part) for name, part in parts.items()}
+    figures = {"full": full} | {name: _figures_inside(view, true, scale, part) for name, part in parts.items()}
+    if target.shown is not None:
+        shown = _figures_inside(view, true, scale, target.shown)
+        figures["shown"] = None if shown is None else {**shown, "share": float(target.shown.mean())}
+    return figures
 
 
 def _figures_inside(

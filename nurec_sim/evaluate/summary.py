@@ -31,6 +31,8 @@ PAIRS = (
 """Pairs of methods whose difference is reported."""
 RESAMPLES = 2000
 CURVE = ("psnr_db", "ssim", "abs_rel", "abs_rel_metric", "depth_coverage")
+SHOWN = ("psnr_db", "abs_rel", "share")
+"""Columns of the curves of what an input image shows."""
 
 
 def summarize(windows: Sequence[Record], methods: Iterable[str]) -> dict[str, Any]:
@@ -91,12 +93,23 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def _curve(rows: Sequence[Record]) -> dict[str, dict[str, float | None]]:
-    """Means by distance from the path, both sides combined; empty without lateral offsets."""
+    """Means by distance from the path, both sides combined; empty without lateral offsets.
+
+    ``shown_`` before a name: over what an input image shows (``scoring.score_view``).
+    """
     offsets = sorted({abs(row["left_m"]) for row in rows})
     if len(offsets) < 2:
         return {}
-    at = {offset: [row["full"] for row in rows if abs(row["left_m"]) == offset] for offset in offsets}
-    return {f"{offset:g}": {**_means(views, CURVE), "views": len(views)} for offset, views in at.items()}
+    curve = {}
+    for offset in offsets:
+        at = [row for row in rows if abs(row["left_m"]) == offset]
+        shown = _means([row.get("shown") or {} for row in at], SHOWN)
+        curve[f"{offset:g}"] = {
+            **_means([row["full"] for row in at], CURVE),
+            **{f"shown_{name}": value for name, value in shown.items()},
+            "views": len(at),
+        }
+    return curve
 
 
 def doubling_offset(abs_rel: Mapping[float, float | None]) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -24,6 +25,7 @@ def tables(results: Mapping[str, Any]) -> list[Table]:
         made += [
             _curve(methods, "psnr_db", "PSNR (dB)", 2),
             _curve(methods, "abs_rel", "AbsRel", 3),
+            *_shown(methods),
             _doubling(methods),
             *support_tables(methods),
         ]
@@ -139,6 +141,21 @@ def _curve(methods: Mapping[str, Any], column: str, title: str, digits: int) -> 
     counts = ", ".join(f"{offset} m: {views[offset]['views']}" for offset in offsets if offset in views)
     note = f"Views left and right of the path combined ({counts}); those inside objects are skipped."
     return Table(f"shift_{column}", f"{title} by lateral offset", ("method", *(f"{o} m" for o in offsets)), rows, note)
+
+
+def _shown(methods: Mapping[str, Any]) -> list[Table]:
+    """Curves of what an input image shows; none where that is not known."""
+    curves = [row["curve"] for row in methods.values()]
+    shares = {offset: figures.get("shown_share") for curve in curves for offset, figures in curve.items()}
+    if not any(shares.values()):
+        return []
+    text = ", ".join(f"{offset} m: {100 * share:.0f} %" for offset, share in shares.items() if share is not None)
+    note = f"Pixels that show what an input image shows, too, by true depth ({text} of all)."
+    made = [
+        _curve(methods, "shown_psnr_db", "PSNR (dB) of what an input image shows", 2),
+        _curve(methods, "shown_abs_rel", "AbsRel of what an input image shows", 3),
+    ]
+    return [dataclasses.replace(table, note=note) for table in made]
 
 
 def _doubling(methods: Mapping[str, Any]) -> Table:

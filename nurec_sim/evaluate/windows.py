@@ -25,6 +25,7 @@ class EvaluationView:
         movable: mask of vehicles and other movable objects, moving or not; None if unknown.
         left_m: lateral offset from the driven path, left positive.
         beyond: whether it is before the first or after the last input frame.
+        shown: mask of what an input image shows; None if unknown.
         sight: the image at its full size with the objects before the camera, where a detector is asked.
     """
 
@@ -34,6 +35,7 @@ class EvaluationView:
     movable: Bool[np.ndarray, "h w"] | None
     left_m: float = 0.0
     beyond: bool = False
+    shown: Bool[np.ndarray, "h w"] | None = None
     sight: Sight | None = None
 
 

@@ -162,6 +162,27 @@ def test_the_doubling_offset_lies_on_the_line_between_its_neighbours():
     assert doubling_offset({1.0: 0.1}) is None
 
 
+def test_what_an_input_image_shows_is_scored_apart():
+    """An error of 0.1 in the half that is shown, of 0.5 in the other."""
+    target = street_window(boxes=False).targets[0]
+    left = np.arange(target.true.rgb.shape[1]) < target.true.rgb.shape[1] // 2
+    shown = np.broadcast_to(left, target.true.rgb.shape[:2])
+    grey = ScoredView(np.full_like(target.true.rgb, 0.4), target.true.depth_m)
+    wrong = ScoredView(grey.rgb + np.where(shown, 0.1, 0.5)[..., None], target.true.depth_m)
+    figures = score_view(wrong, replace(target, true=grey, shown=shown))["shown"]
+    assert figures["psnr_db"] == pytest.approx(20, abs=1e-3) and figures["share"] == pytest.approx(0.5, abs=0.02)
+    assert "shown" not in score_view(wrong, target)
+    rows = [{**row(25), "shown": {"psnr_db": 30.0, "abs_rel": 0.1, "share": 1.0}},
+            {**row(15, left_m=1.0), "shown": {"psnr_db": 20.0, "abs_rel": 0.2, "share": 0.25}},
+            {**row(10, left_m=-1.0), "shown": None}]  # fmt: skip
+    windows = [{"id": "a", "methods": {"dense": record(*rows)}}]
+    results = {"protocol": {"name": "shift"}, "windows": windows, "summary": summarize(windows, ["dense"])}
+    made = {table.name: table for table in tables(results)}
+    assert made["shift_shown_psnr_db"].rows == (("dense", "30.00", "20.00"),)
+    assert made["shift_shown_abs_rel"].rows == (("dense", "0.100", "0.200"),)
+    assert "0 m: 100 %, 1 m: 25 % of all" in made["shift_shown_psnr_db"].note
+
+
 @pytest.mark.parametrize("name", ["storm", "clip", "shift"])
 def test_tables_say_what_is_not_known(name):
     rows = (row(20, 0.1), row(18, 0.15, left_m=1.0))
@@ -170,6 +191,7 @@ def test_tables_say_what_is_not_known(name):
     results = {"protocol": {"name": name, "boxes": False}, "windows": windows,
                "summary": summarize(windows, ["dense", "copy"])}  # fmt: skip
     made = {table.name: table for table in tables(results)}
+    assert "shift_shown_psnr_db" not in made
     if name == "shift":
         assert made["shift_doubling"].rows == (
             ("dense", "not reached up to 1 m", "-"),
