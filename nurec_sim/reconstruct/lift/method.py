@@ -137,13 +137,13 @@ def lift(
         ego_images=ego_images,
     )
     stages.start("solving colours")
-    scene, pixels = solve_colours(scene, clip, cameras, settings, stages.fraction)
+    scene, taken_px = solve_colours(scene, clip, cameras, settings, stages.fraction)
     shown = static.shown
-    if pixels is not None:
+    if taken_px is not None:
         # An image that should show a surfel, by its depth, may show it through a gap only, and in the colour of what is
         # around that. Pixels that are white in image and scene count nothing in the solve.
         white = scene.static.rgb.min(axis=1) > colour.SATURATED
-        shown = (np.arange(len(shown)) < static.lifted) | (pixels > SHOWN_PX) | (static.shown & white)
+        shown = (np.arange(len(shown)) < static.lifted) | (taken_px > SHOWN_PX) | (static.shown & white)
     stages.stop()
     return dataclasses.replace(scene, static=_coloured(scene.static, shown))
 

@@ -33,7 +33,7 @@ from nurec_sim.reconstruct.optimize.poses import PoseCorrections
 from nurec_sim.reconstruct.optimize.responses import FrameResponses, borrowed_responses
 from nurec_sim.reconstruct.optimize.settings import OptimizeSettings
 from nurec_sim.reconstruct.optimize.tracks import TrackCorrections
-from nurec_sim.reconstruct.optimize.unseen import SHOWN_PX, colour_unseen, pixel_shares
+from nurec_sim.reconstruct.optimize.unseen import colour_hardly_shown, pixel_shares
 from nurec_sim.reconstruct.optimize.views import TrainingView, training_views
 from nurec_sim.render.device import choose_device
 from nurec_sim.scene import scene_hash
@@ -86,8 +86,8 @@ def refine(
         if settings.resume:
             run.restore(read_checkpoint(settings.checkpoint, run.key))
     run.run(progress)
-    progress("colours of what no image shows", 1.0)
-    run.colour_unseen()
+    progress("colours of what images hardly show", 1.0)
+    run.colour_hardly_shown()
     return run.scene(clip)
 
 
@@ -167,9 +167,11 @@ class Optimization:
         self._restore(self.best)
         self._clear_free_space()
 
-    def colour_unseen(self) -> None:
-        """Give what no image shows, or hardly, the colours of what is like it."""
-        colour_unseen(self.parameters, pixel_shares(self.parameters, self.views) > SHOWN_PX)
+    def colour_hardly_shown(self) -> None:
+        """Give what images hardly show the colours of what is like it."""
+        colour_hardly_shown(self.parameters, pixel_shares(self.parameters, self.views))
+        if self.best:
+            self.best_psnr_db = self._checked_psnr_db()
 
     def _clear_free_space(self) -> None:
         """Take out what recorded beams have passed through."""
@@ -184,10 +186,14 @@ class Optimization:
         """Keep the state if it shows the images that are held out better than all before."""
         if not self.checked:
             return
-        psnr_db = float(np.mean([self.psnr_db(number) for number in self.checked]))
+        psnr_db = self._checked_psnr_db()
         if psnr_db > self.best_psnr_db:
             self.best_psnr_db, self.best_steps = psnr_db, self.steps
             self.best = {name: array.copy() for name, array in self._result().items()}
+
+    def _checked_psnr_db(self) -> float:
+        """How well the images that are held out are shown."""
+        return float(np.mean([self.psnr_db(number) for number in self.checked]))
 
     def psnr_db(self, number: int) -> float:
         """How well an image is shown."""

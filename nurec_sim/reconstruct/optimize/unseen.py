@@ -1,11 +1,11 @@
-"""Which static Gaussians the images of a log show; the others get the colours of what is like them."""
+"""Which static Gaussians the images of a log hardly show; these get the colours of what is like them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from nurec_sim import sensors
 from nurec_sim.reconstruct.optimize.adam import RGB
@@ -16,8 +16,9 @@ from nurec_sim.render.cpu.backward.frame import SENSORS, Frame
 
 WIDTH_PX = 480
 """Images are drawn at about this width to see what they show."""
-SHOWN_PX = 0.3
-"""Images show a Gaussian if its shares of all their pixels add up to more than this; fewer do not determine colours."""
+LEAST_PX, SHOWN_PX = 1e-3, 0.3
+"""Images hardly show a Gaussian if its shares of all their pixels add up to something in between: enough to change its
+colour, and too little to determine it."""
 
 
 def pixel_shares(parameters: Parameters, views: Sequence[TrainingView]) -> Float32[np.ndarray, " n"]:
@@ -46,14 +47,17 @@ def pixel_shares(parameters: Parameters, views: Sequence[TrainingView]) -> Float
     return pixels
 
 
-def colour_unseen(parameters: Parameters, seen: Bool[np.ndarray, " n"]) -> None:
-    """Change the colours of the static Gaussians that are not seen to those of what is like them.
+def colour_hardly_shown(parameters: Parameters, pixels: Float32[np.ndarray, " n"]) -> None:
+    """Change the colours of the static Gaussians that images hardly show to those of what is like them.
+
+    What no image shows keeps its colour, which the method has found by more than the Gaussians alone.
 
     Args:
         parameters: changed.
-        seen: which static ones keep their colours; if none or all are, nothing changes.
+        pixels: see ``pixel_shares``.
     """
-    static = parameters.static_count
-    gaussians = parameters.static_gaussians(np.arange(static))
-    parameters.values[:static, RGB : RGB + 3][~seen] = colours_by_likeness(gaussians, seen)[~seen]
+    some = np.flatnonzero(pixels > LEAST_PX)
+    shown = pixels[some] > SHOWN_PX
+    colours = colours_by_likeness(parameters.static_gaussians(some), shown)
+    parameters.values[some[~shown], RGB : RGB + 3] = colours[~shown]
     parameters.values_changed()
