@@ -74,6 +74,10 @@ def test_shift_moves_the_car_to_its_left_and_skips_what_is_inside_of_things():
             assert np.allclose(rig[:3, 3], (0, target.left_m, 0), atol=1e-6)
             depth = target.true.depth_m
             assert ((depth > 0) & (depth < 1)).mean() <= 0.2
+        on_path, beside = (
+            [target.shown.mean() for target in window.targets if abs(target.left_m) == at] for at in (0.0, 2.0)
+        )
+        assert 0.9 < np.mean(on_path) and 0.3 < np.mean(beside) < np.mean(on_path) - 0.05, "what input images show"
     assert 0.0 in offsets and {1.0, -1.0} & offsets and max(offsets) <= 3.5
 
 

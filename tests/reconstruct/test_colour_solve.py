@@ -130,6 +130,20 @@ def test_images_are_taken_whole_if_all_that_are_taken_have_few_enough_pixels(str
     assert sizes == {size}
 
 
+def test_shares_of_pixels_add_up_to_their_opacity(street, lifted):
+    """Each image once, however often it is taken."""
+    bare = dataclasses.replace(lifted, dynamic=DynamicGaussians.empty(), tracks=())
+    _, pixels = colour_solve.solve_colours(bare, street, ["front"], SOLVED, lambda fraction: None)
+    opaque = 0.0
+    for k in range(street.frames):
+        t_us = int(street.t_us[k])
+        pose = street.world_from_camera("front", k)
+        request = SensorRequest(bare.id, street.rig.cameras["front"], t_us, t_us + 1, pose)
+        opaque += CpuRenderer(bare, threads=1).render_camera(request, ("rgb", "alpha")).alpha.sum()
+    assert pixels.min() >= 0
+    assert pixels.sum() == pytest.approx(opaque, rel=0.05)
+
+
 def test_what_no_image_shows_keeps_its_colour(street, lifted):
     behind = dataclasses.replace(lifted.static[:5], mean_m=np.full((5, 3), -30.0, np.float32))
     more = dataclasses.replace(lifted, static=Gaussians.concatenate([lifted.static, behind]))
