@@ -58,8 +58,11 @@ def test_an_image_shows_all_that_itself_shows():
 
 def test_what_lies_beyond_the_border_is_not_shown():
     """2 m to the right the wall 10 m ahead moves by 8 pixels, the sky not at all."""
-    shown = covisible(image(right_m=2.0), [image()], ())
-    assert shown[: HEIGHT // 2].all(), "the sky is as far as can be"
+    other = image()
+    # A pixel in the corner as far as what lies beyond the right border: not the same.
+    other.view.surface[0, 0], other.view.range_m[0, 0] = SurfaceClass.BUILDING, 15.0
+    shown = covisible(image(right_m=2.0), [other], ())
+    assert shown[1 : HEIGHT // 2].all(), "the sky is as far as can be"
     assert columns(shown, slice(HEIGHT // 2, None)).tolist() == list(range(72))
     both = covisible(image(right_m=2.0), [image(), image(right_m=4.0)], ())
     assert both.all(), "the other image shows the rest"
