@@ -107,6 +107,7 @@ class EvaluationWorld:
         view = EvaluationView(name, request, reduced(seen.rgb, depth_m), movable, left_m, beyond)
         if inputs:
             shown = covisible(TrueImage(request, seen), inputs, self.world.plan.tracks())
+            # Of the scored pixels those whose pixels are all shown: colours of the others are mixed with what is not.
             view = dataclasses.replace(view, shown=~reduced_mask(~shown))
         if not sight:
             return view

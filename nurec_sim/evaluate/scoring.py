@@ -104,10 +104,9 @@ def score_view(view: ScoredView, target: EvaluationView) -> dict[str, Figures | 
     """Scores of one view: ``full``; with a known dynamic region also ``dynamic`` and ``static``, and ``shown``.
 
     ``static`` is the complement of ``dynamic``, ``shown`` what an input image shows, with its ``share`` of all pixels,
-    where that is known; each is None if empty. Each has ``psnr_db``, ``ssim``, and with known
-    depth ``abs_rel`` and ``delta1`` after the frame's least-squares scale over all pixels, ``abs_rel_metric`` and
-    ``delta1_metric`` as predicted; ``full`` also ``depth_scale`` and ``depth_coverage``. Values that cannot be computed
-    are None.
+    where that is known; each is None if empty. Each has ``psnr_db``, ``ssim``, and with known depth ``abs_rel`` and
+    ``delta1`` after the frame's least-squares scale over all pixels, ``abs_rel_metric`` and ``delta1_metric`` as
+    predicted; ``full`` also ``depth_scale`` and ``depth_coverage``. Values that cannot be computed are None.
     """
     true, mask = target.true, target.movable
     full: Figures = {"psnr_db": _capped(psnr(view.rgb, true.rgb)), "ssim": ssim(view.rgb, true.rgb)}
