@@ -1,5 +1,9 @@
 """Normal equations of many points, against dense matrices."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from scipy import sparse
@@ -54,11 +58,28 @@ def test_products_of_sparse_rows_are_added():
     np.testing.assert_allclose(total, expected, atol=1e-12)
 
 
-def test_equations_are_solved_from_the_lower_triangle():
+@pytest.mark.parametrize("size", [1, 20, 64, 65, 300])
+def test_equations_are_solved_from_the_lower_triangle(size):
     rng = np.random.default_rng(3)
-    root, right = rng.normal(size=(20, 20)), rng.normal(size=20)
-    matrix = root @ root.T + np.eye(20)
+    root, right = rng.normal(size=(size, size)), rng.normal(size=size)
+    matrix = root @ root.T + np.eye(size)
     np.testing.assert_allclose(solved(np.tril(matrix), right), np.linalg.solve(matrix, right), rtol=1e-9)
+
+
+def test_equations_have_the_same_solution_whatever_the_number_of_threads():
+    code = """
+import sys, numpy as np
+from nurec_sim.logs.alignment.products import solved
+root = np.random.default_rng(3).normal(size=(500, 20))
+sys.stdout.buffer.write(solved(np.einsum("ik,jk->ij", root, root) + np.eye(500), root[:, 0]).tobytes())
+"""
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", code], env=os.environ | {"OPENBLAS_NUM_THREADS": threads}, stdout=-1, check=True
+        ).stdout
+        for threads in ("1", "2")
+    }
+    assert len(found) == 1
 
 
 def test_points_are_apart_from_the_median_of_their_group():

@@ -5,13 +5,16 @@ Matrices of products are symmetric: only their lower triangle is computed.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy import linalg, sparse
+from scipy import sparse
 
 from nurec_sim.compute.kernels import kernel
 
 Square = Float64[np.ndarray, "p p"]
+BLOCK = 64
 
 
 class Rows:
@@ -72,9 +75,51 @@ def add_products(total: Square, rows: sparse.csr_matrix, weight: Float64[np.ndar
 
 
 def solved(lower: Square, right: Float64[np.ndarray, " p"]) -> Float64[np.ndarray, " p"]:
-    """The solution of positive definite equations whose matrix is given by its lower triangle; it is overwritten."""
-    # Transposed, the triangle is the upper one in the order of LAPACK, which then needs no copy.
-    return linalg.cho_solve(linalg.cho_factor(lower.T, lower=False, overwrite_a=True), right)
+    """The solution of positive definite equations whose matrix is given by its lower triangle.
+
+    By blocks (Cholesky). Their products are too small for libraries to spread over threads, which would wait for each
+    other, and sum in another order on another number of cores.
+    """
+    count = -(-len(right) // BLOCK)
+    padded = np.eye(count * BLOCK)
+    padded[: len(right), : len(right)] = lower
+    columns = padded.reshape(count, BLOCK, count, BLOCK).transpose(2, 0, 1, 3).copy()
+    inverses = np.empty((count, BLOCK, BLOCK))
+    for j, column in enumerate(columns):
+        for before in columns[:j]:
+            column[j:] -= before[j:] @ before[j].T.copy()
+        _invert_root(column[j], inverses[j])
+        column[j + 1 :] = column[j + 1 :] @ inverses[j].T
+    result = np.zeros((count, BLOCK))
+    result.ravel()[: len(right)] = right
+    for j, column in enumerate(columns):
+        result[j] = inverses[j] @ result[j]
+        result[j + 1 :] -= column[j + 1 :] @ result[j]
+    for j in reversed(range(count)):
+        below = columns[j, j + 1 :].transpose(0, 2, 1) @ result[j + 1 :, :, None]
+        result[j] = inverses[j].T @ (result[j] - below.sum(axis=(0, 2)))
+    return result.ravel()[: len(right)]
+
+
+@kernel
+def _invert_root(square: np.ndarray, inverse: np.ndarray) -> None:
+    """Inverse of the lower triangular root of a positive definite matrix, whose lower triangle is overwritten."""
+    count = len(square)
+    inverse[:] = 0.0
+    for j in range(count):
+        square[j, j] = math.sqrt(square[j, j])
+        for i in range(j + 1, count):
+            square[i, j] /= square[j, j]
+        for k in range(j + 1, count):
+            for i in range(k, count):
+                square[i, k] -= square[i, j] * square[k, j]
+    for i in range(count):
+        for k in range(i):
+            for j in range(k + 1):
+                inverse[i, j] -= square[i, k] * inverse[k, j]
+        inverse[i, i] = 1.0
+        for j in range(i + 1):
+            inverse[i, j] /= square[i, i]
 
 
 @kernel
