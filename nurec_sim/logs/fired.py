@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from nurec_sim import geometry
-from nurec_sim.logs.points import moved_points, numbered
-from nurec_sim.logs.sweeps import INSTANT_US, prolonged
+from nurec_sim.logs.points import instants_of, moved_points
+from nurec_sim.logs.sweeps import prolonged
 from nurec_sim.types import Clip, Sweep
 
 
@@ -20,12 +20,9 @@ def as_fired(clip: Clip, lidar: str, sweep: Sweep) -> tuple[Float64[np.ndarray, 
     poses = fix @ ego.at(np.array([sweep.start_us, sweep.end_us])) @ rig_from_lidar
     if not len(sweep.point_t_us):
         return np.zeros((0, 3)), poses
-    instants, place = numbered(sweep.point_t_us // INSTANT_US)
-    # The first point of each instant: the last one that is written.
-    first = np.empty(len(instants), np.int64)
-    first[place[::-1]] = np.arange(len(place))[::-1]
-    fired = fix @ ego.at(sweep.point_t_us[first]) @ rig_from_lidar
-    return moved_points(sweep.xyz_world_m, geometry.inverse(fired), place), poses
+    instants = instants_of(sweep.point_t_us, ego)
+    fired = fix @ ego.at(instants) @ rig_from_lidar
+    return moved_points(sweep.xyz_world_m, sweep.point_t_us, instants, geometry.inverse(fired)), poses
 
 
 def fired_fraction(sweep: Sweep) -> Float64[np.ndarray, " n"]:

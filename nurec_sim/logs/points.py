@@ -9,9 +9,12 @@ from jaxtyping import Float64, Int64
 
 from nurec_sim.compute.angles import arctan2
 from nurec_sim.compute.kernels import kernel, unchecked_kernel
-from nurec_sim.types import Matrix4
+from nurec_sim.types import Matrix4, Trajectory
 
 BLOCK = 1024
+APART_US = 500
+"""Between poses so far apart, their matrices are interpolated: at ten radians a second that errs by 0.3 mm at 80 m,
+less than the grain of the files, and needs a thousandth of a pose for each point."""
 
 
 def unpacked_points(steps_mm: np.ndarray, out_from_stored: Matrix4) -> Float64[np.ndarray, "n 3"]:
@@ -30,34 +33,33 @@ def turn_times_us(xyz: Float64[np.ndarray, "n 3"], turn_us: float) -> Int64[np.n
     return _turn_times(np.ascontiguousarray(xyz, np.float64), float(turn_us))
 
 
+def instants_of(t_us: Int64[np.ndarray, " n"], path: Trajectory) -> Int64[np.ndarray, " k"]:
+    """Two instants or more, ``APART_US`` apart at most, from the first point of a sweep to its last (``moved_points``).
+
+    Args:
+        t_us: times of points, at least one.
+        path: poses of the car, which are constant before it and after it.
+    """
+    first, last = np.clip([t_us.min(), t_us.max()], path.start_us, path.end_us).tolist()
+    return np.rint(np.linspace(first, last, (last - first) // APART_US + 2)).astype(np.int64)
+
+
 def moved_points(
-    xyz: Float64[np.ndarray, "n 3"], poses: Float64[np.ndarray, "k 4 4"], place: Int64[np.ndarray, " n"]
+    xyz: Float64[np.ndarray, "n 3"],
+    t_us: Int64[np.ndarray, " n"],
+    instants_us: Int64[np.ndarray, " k"],
+    poses: Float64[np.ndarray, "k 4 4"],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Each point moved by one of several poses.
+    """Each point moved by the pose at its time.
 
     Args:
         xyz: points.
-        poses: the poses.
-        place: of each point, the index of its pose.
+        t_us: their times.
+        instants_us: instants at equal distances, two or more (``instants_of``).
+        poses: the poses then; constant before and after.
     """
-    return _moved(np.ascontiguousarray(xyz, np.float64), np.ascontiguousarray(poses[:, :3]), place)
-
-
-def numbered(values: Int64[np.ndarray, " n"]) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " n"]]:
-    """The different values, ascending, and the place of each value among them; not sorted if they are close together.
-
-    Args:
-        values: at least one.
-    """
-    first = int(values.min())
-    span = int(values.max()) - first + 1
-    if span > max(len(values), 1 << 16):
-        different, place = np.unique(values, return_inverse=True)
-        return different, place
-    place = values - first
-    found = np.zeros(span, bool)
-    found[place] = True
-    return np.flatnonzero(found) + first, (np.cumsum(found) - 1)[place]
+    rows = np.ascontiguousarray(poses[:, :3])
+    return _moved(np.ascontiguousarray(xyz, np.float64), t_us, int(instants_us[0]), int(instants_us[-1]), rows)
 
 
 @kernel
@@ -91,10 +93,17 @@ def _turn_times(xyz: np.ndarray, turn_us: float) -> Int64[np.ndarray, " n"]:
 
 
 @kernel
-def _moved(xyz: np.ndarray, poses: np.ndarray, place: np.ndarray) -> Float64[np.ndarray, "n 3"]:
-    result = np.empty(xyz.shape)
+def _moved(
+    xyz: np.ndarray, t_us: np.ndarray, first_us: int, last_us: int, poses: np.ndarray
+) -> Float64[np.ndarray, "n 3"]:
+    result, last = np.empty(xyz.shape), len(poses) - 1
+    by = last / max(last_us - first_us, 1)
     for i in range(len(xyz)):
-        pose, x, y, z = poses[place[i]], xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        place = min(max((t_us[i] - first_us) * by, 0.0), float(last))
+        low = min(int(place), last - 1)
+        share, before, after = place - low, poses[low], poses[low + 1]
         for k in range(3):
-            result[i, k] = (pose[k, 0] * x + pose[k, 2] * z) + pose[k, 1] * y + pose[k, 3]
+            from_before = before[k, 0] * xyz[i, 0] + before[k, 1] * xyz[i, 1] + before[k, 2] * xyz[i, 2] + before[k, 3]
+            from_after = after[k, 0] * xyz[i, 0] + after[k, 1] * xyz[i, 1] + after[k, 2] * xyz[i, 2] + after[k, 3]
+            result[i, k] = from_before + share * (from_after - from_before)
     return result

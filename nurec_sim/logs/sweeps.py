@@ -12,10 +12,8 @@ from nurec_sim import geometry
 from nurec_sim.errors import ClipError
 from nurec_sim.files.decoding import LIMITS
 from nurec_sim.logs.beam_errors import BeamErrors
-from nurec_sim.logs.points import moved_points, numbered, turn_times_us
+from nurec_sim.logs.points import instants_of, moved_points, turn_times_us
 from nurec_sim.types import LidarModel, Matrix4, Spin, Sweep, SweepPoints, Trajectory
-
-INSTANT_US = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +119,10 @@ def _compensated(
     if longer is None or (point_t_us == record.t_us).all():
         return xyz
     lidar_from_rig = geometry.inverse(ego.at(record.t_us)) @ record.world_from_lidar
-    # Poses at instants 20 us apart: at 50 m/s that errs by half a millimetre, the grain of the files, and costs a
-    # twentieth of a pose for each point.
-    instants, place = numbered(point_t_us // INSTANT_US)
-    fired = longer.at(instants * INSTANT_US + INSTANT_US // 2) @ lidar_from_rig
+    instants = instants_of(point_t_us, longer)
+    fired = longer.at(instants) @ lidar_from_rig
     # As ``sensors.compensate_sweep`` does, with the poses multiplied before they are repeated for each point.
-    return moved_points(xyz, geometry.inverse(record.world_from_lidar) @ fired, place)
+    return moved_points(xyz, point_t_us, instants, geometry.inverse(record.world_from_lidar) @ fired)
 
 
 def prolonged(ego: Trajectory, margin_us: int) -> Trajectory | None:

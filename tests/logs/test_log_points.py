@@ -9,7 +9,8 @@ from nurec_sim import geometry
 from nurec_sim.compute.angles import arctan2
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.logs.beam_errors import BeamErrors
-from nurec_sim.logs.points import moved_points, numbered, turn_times_us, unpacked_points
+from nurec_sim.logs.points import APART_US, instants_of, moved_points, turn_times_us, unpacked_points
+from nurec_sim.types import Trajectory
 
 
 @kernel
@@ -56,20 +57,31 @@ def test_times_of_points_follow_their_azimuth(turn_us):
     np.testing.assert_array_equal(turn_times_us(xyz, turn_us), expected)
 
 
-def test_each_point_is_moved_by_its_own_pose():
+@pytest.mark.parametrize("late_us", [0, 40_000])
+def test_each_point_is_moved_by_the_pose_at_its_time(late_us):
+    """On the way, and up to 40 ms after it, where the car stands still."""
     rng, xyz = np.random.default_rng(3), _points(3_000)
-    poses = np.stack([geometry.pose_from_xyyaw(*rng.normal(size=3), z=k) for k in range(7)])
-    place = rng.integers(0, 7, len(xyz))
-    expected = [geometry.transform_points(poses[k], each[None])[0] for k, each in zip(place, xyz, strict=True)]
-    np.testing.assert_allclose(moved_points(xyz, poses, place), expected, rtol=1e-12, atol=1e-12)
+    path = Trajectory(
+        np.array([10**15, 10**15 + 60_000, 10**15 + 100_000]),
+        np.stack([geometry.pose_from_xyyaw(2.0 * k, 0.0, 0.01 * k * k) for k in range(3)]),
+    )
+    t_us = path.start_us + rng.integers(0, 100_001, len(xyz)) + late_us
+    instants = instants_of(t_us, path)
+    assert 0 < np.diff(instants).max() <= APART_US
+    expected = np.einsum("nij,nj->ni", path.at(t_us), np.column_stack([xyz, np.ones(len(xyz))]))[:, :3]
+    # Where the speed changes, the pose is off by at most that change within a quarter of a step.
+    np.testing.assert_allclose(moved_points(xyz, t_us, instants, path.at(instants)), expected, atol=0.003)
+    even = t_us < path.t_us[1] - APART_US
+    moved = moved_points(xyz[even], t_us[even], instants, path.at(instants))
+    np.testing.assert_allclose(moved, expected[even], atol=5e-5)
 
 
-@pytest.mark.parametrize("far", [0, 10**15])
-def test_values_are_numbered_as_unique_does(far):
-    values = np.random.default_rng(4).integers(-50, 80, 1_000) + 10**15
-    values[10] += far
-    for found, expected in zip(numbered(values), np.unique(values, return_inverse=True), strict=True):
-        np.testing.assert_array_equal(found, expected)
+@pytest.mark.parametrize("t_us", [[500], [500, 500], [500, 501]])
+def test_points_of_one_instant_are_moved_by_its_pose(t_us):
+    path = Trajectory(np.array([0, 1_000]), np.stack([np.eye(4), geometry.pose_from_xyyaw(1.0, 0.0, 0.0)]))
+    instants = instants_of(np.array(t_us), path)
+    found = moved_points(np.zeros((len(t_us), 3)), np.array(t_us), instants, path.at(instants))
+    np.testing.assert_allclose(found[:, 0], np.array(t_us) / 1_000, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [0.001, 0.3])
