@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -16,11 +14,25 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from nurec_sim import display
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.describe import SENSOR_COLUMNS, describe_clip
+from nurec_sim.logs.kept import Kept, Recent
 from nurec_sim.logs.sweeps import SweepRecord, compensated_sweep
-from nurec_sim.types import CameraModel, LidarModel, LogSource, Matrix4, Rig, RoadMap, Sweep, Track, Trajectory
+from nurec_sim.types import (
+    CameraModel,
+    LidarModel,
+    LogSource,
+    Matrix4,
+    Rig,
+    RoadMap,
+    Sweep,
+    SweepPoints,
+    Track,
+    Trajectory,
+)
 
 IMAGES_KEPT = 6
 SWEEPS_KEPT = 2
+STORED_BYTES = 256 << 20
+"""Of sweeps as their log stores them, decoded: those of 80 turns of an HDL-64."""
 
 T = TypeVar("T")
 
@@ -49,28 +61,6 @@ class EncodedImages(Protocol):
     def encoded_image(self, camera_id: str, index: int) -> bytes:
         """The file of one frame."""
         ...
-
-
-class _Recent:
-    """A small least-recently-used cache."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._values: OrderedDict[Any, Any] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: Any, make: Callable[[], T]) -> T:
-        with self._lock:
-            if key in self._values:
-                self._values.move_to_end(key)
-                return self._values[key]
-        # Without the lock: loading is slow, and a duplicate load by another thread does no harm.
-        value = make()
-        with self._lock:
-            self._values[key] = value
-            while len(self._values) > self._size:
-                self._values.popitem(last=False)
-        return value
 
 
 class Clip:
@@ -126,8 +116,8 @@ class Clip:
         starts = [ego.start_us, *(record.start_us for record in records)]
         ends = [ego.end_us, *(record.end_us for record in records)]
         self._span_us = (min(starts), max(ends) + 1)
-        self._recent_images = _Recent(IMAGES_KEPT)
-        self._recent_sweeps = _Recent(SWEEPS_KEPT)
+        self._recent_images = Recent(IMAGES_KEPT)
+        self._recent_sweeps = Recent(SWEEPS_KEPT)
 
     def __repr__(self) -> str:
         return f"Clip({self.id!r}, cameras={list(self.rig.cameras)}, lidars={list(self.rig.lidars)})"
@@ -168,8 +158,20 @@ class Clip:
             rig_from_log=self.rig_from_log,
         )
         clip.path, clip.format = self.path, self.format
+        # What is stored is the same, whatever is known about poses, beams and times.
+        clip._stored_sweeps = self._stored_sweeps
         clip.time_offset_us = self.time_offset_us if time_offset_us is None else time_offset_us
         return clip
+
+    @property
+    def source(self) -> LogSource:
+        """Loads images and sweeps."""
+        return self._source
+
+    @source.setter
+    def source(self, source: LogSource) -> None:
+        self._source = source
+        self._stored_sweeps: Kept[SweepPoints] = Kept(STORED_BYTES, _size)
 
     @property
     def span_us(self) -> tuple[int, int]:
@@ -290,7 +292,7 @@ class Clip:
 
     def _read_sweep(self, lidar_id: str, index: int, record: SweepRecord) -> Sweep:
         with self._reading(f"sweep {record.file}"):
-            stored = self.source.sweep(lidar_id, index)
+            stored = self._stored_sweeps.get((lidar_id, index), lambda: self.source.sweep(lidar_id, index))
             return compensated_sweep(record, stored, self.rig.lidars[lidar_id], self.ego)
 
     @contextlib.contextmanager
@@ -310,3 +312,8 @@ def _named(clip_id: str, kind: str, name: str, known: Mapping[str, T]) -> T:
     if name not in known:
         raise ClipError(f"clip {clip_id!r} has no {kind} {name!r}; have {list(known)}")
     return known[name]
+
+
+def _size(points: SweepPoints) -> int:
+    """Bytes of a sweep as stored."""
+    return sum(np.asarray(each).nbytes for each in (points.xyz_m, points.intensity, points.dt_us) if each is not None)

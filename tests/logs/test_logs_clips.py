@@ -9,7 +9,9 @@ import tiny_clip
 
 from nurec_sim import geometry, logs
 from nurec_sim.errors import ClipError
-from nurec_sim.logs.stored import encode_points
+from nurec_sim.logs.kept import Kept
+from nurec_sim.logs.moved import later
+from nurec_sim.logs.stored import StoredFiles, encode_points
 from nurec_sim.logs.sweeps import prolonged
 from nurec_sim.types import Pinhole, Rig, Track, Trajectory
 
@@ -185,6 +187,29 @@ def test_images_and_sweeps_are_read_only_and_kept(tmp_path):
         clip.image("front", 0)[0, 0] = 0
     with pytest.raises(ValueError, match="read-only"):
         clip.sweep("top", 0).xyz_m[0] = 0
+
+
+def test_a_sweep_is_decoded_once_for_a_log_and_those_made_from_it(tmp_path, monkeypatch):
+    clip = logs.open_clip(tiny_clip.write(tmp_path / "clip"))
+    read, plain = [], type(clip.source).sweep
+    monkeypatch.setattr(type(clip.source), "sweep", lambda self, *key: read.append(key) or plain(self, *key))
+    before = clip.sweep("top", 1).xyz_m
+    changed = later(clip, 1_000)
+    assert changed.sweep("top", 1).t_us == clip.sweep("top", 1).t_us + 1_000
+    np.testing.assert_array_equal(changed.sweep("top", 1).xyz_m, before)
+    assert read == [("top", 1)]
+    other = logs.open_clip(tmp_path / "clip").replaced()
+    changed = other.replaced()
+    changed.source = StoredFiles(*(getattr(other.source, name) for name in vars(other.source)))
+    assert len(other.sweep("top", 1).xyz_m) == len(changed.sweep("top", 1).xyz_m) and len(read) == 3
+
+
+def test_what_is_kept_is_bounded_and_the_first_stay():
+    kept, made = Kept(10, len), []
+    for _ in range(2):
+        for text in ("four", "five5", "more", "1"):
+            assert kept.get(text, lambda text=text: made.append(text) or text) == text
+    assert made == ["four", "five5", "more", "1", "more"]
 
 
 def test_unknown_sensors_and_frames_are_named(tmp_path):
