@@ -167,12 +167,11 @@ def _points_in(
         return nothing
     _, lidar, index = min(near)
     sweep = clip.sweep(lidar, index)
-    xyz = sweep.xyz_world_m[standing(clip, sweep, moving)[0]]
     pair = np.asarray(clip.world_from_camera(camera, frame), np.float64)
-    depth = geometry.transform_points(geometry.inverse(pair[0]), xyz)[:, 2]
+    depth = geometry.transform_points(geometry.inverse(pair[0]) @ sweep.world_from_lidar, sweep.xyz_m)[:, 2]
     # Most points of a turn are behind the camera.
-    ahead = depth > NEAREST_M
-    xyz, depth = xyz[ahead], depth[ahead]
+    ahead = np.flatnonzero(standing(clip, sweep, moving)[0] & (depth > NEAREST_M))
+    xyz, depth = geometry.transform_points(sweep.world_from_lidar, sweep.xyz_m[ahead]), depth[ahead]
     uv, seen, _ = sensors.project_rolling(_model(clip, camera), pair, xyz)
     height, width = gray.shape
     seen &= _inside(uv, width, height)
@@ -182,10 +181,13 @@ def _points_in(
     texture = cv2.cornerMinEigenVal(gray, 7)[tuple(uv.astype(int).T[::-1])]
     # The best of each square of the image, and of these the best.
     order = np.argsort(-texture, kind="stable")
-    cell = (uv[order] // SPACING_PX).astype(np.int64)
-    _, first = np.unique(cell[:, 1] << 32 | cell[:, 0], return_index=True)
-    best = order[np.sort(first)[: CANDIDATES * MOST_POINTS]]
-    distance, beside = cKDTree(uv).query(uv[best], k=4)
+    across, down = (uv[order] // SPACING_PX).astype(np.int64).T
+    row = width // SPACING_PX + 1
+    first = np.full(row * (height // SPACING_PX + 1), len(uv))
+    np.minimum.at(first, down * row + across, np.arange(len(uv)))
+    best = order[np.sort(first[first < len(uv)])[: CANDIDATES * MOST_POINTS]]
+    # Of few points, the neighbours are found sooner in a tree that is not balanced.
+    distance, beside = cKDTree(uv, compact_nodes=False, balanced_tree=False).query(uv[best], k=4)
     spread = depth[beside].max(axis=1) - depth[beside].min(axis=1)
     chosen = best[(distance[:, -1] < SURFACE_PX) & (spread < SURFACE_SHARE * depth[best])][:MOST_POINTS]
     return uv[chosen], xyz[chosen]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from nurec_sim import geometry
+from nurec_sim.compute.kernels import kernel
 from nurec_sim.logs.clip import Clip
 from nurec_sim.types import Sweep, Track
 
@@ -47,10 +49,8 @@ def standing(clip: Clip, sweep: Sweep, moving: Sequence[Track]) -> tuple[Bool[np
     """Which points of a sweep are near and belong neither to ``moving`` nor the car, and all in the rig frame then."""
     world_from_rig = clip.ego.at(sweep.t_us)
     points = geometry.transform_points(geometry.inverse(world_from_rig) @ sweep.world_from_lidar, sweep.xyz_m)
-    distance = np.linalg.norm(points, axis=1)
     body = clip.rig.body
-    keep = (distance > NEAREST_M) & (distance < FURTHEST_M)
-    keep &= ~geometry.points_in_box(points - np.asarray(body.center_m), body.size_m, MARGIN_M)
+    keep = _near(points, np.asarray(body.center_m, np.float64), np.asarray(body.size_m) / 2 + MARGIN_M)
     for track in moving:
         if track.path.covers(sweep.t_us):
             box_from_rig = geometry.inverse(track.path.at(sweep.t_us)) @ world_from_rig
@@ -58,6 +58,17 @@ def standing(clip: Clip, sweep: Sweep, moving: Sequence[Track]) -> tuple[Bool[np
             local = geometry.transform_points(box_from_rig, points[kept])
             keep[kept] = ~geometry.points_in_box(local, track.size_m, MARGIN_M)
     return keep, points
+
+
+@kernel
+def _near(points: np.ndarray, center: np.ndarray, half: np.ndarray) -> Bool[np.ndarray, " n"]:
+    keep = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        x, y, z = points[i]
+        distance = math.sqrt(x * x + y * y + z * z)
+        inside = abs(x - center[0]) <= half[0] and abs(y - center[1]) <= half[1] and abs(z - center[2]) <= half[2]
+        keep[i] = NEAREST_M < distance < FURTHEST_M and not inside
+    return keep
 
 
 def thinned(points: Points, cell_m: float) -> Points:
