@@ -116,8 +116,8 @@ class Clip:
         starts = [ego.start_us, *(record.start_us for record in records)]
         ends = [ego.end_us, *(record.end_us for record in records)]
         self._span_us = (min(starts), max(ends) + 1)
-        self._recent_images = Recent(IMAGES_KEPT)
-        self._recent_sweeps = Recent(SWEEPS_KEPT)
+        self._recent_images: Recent[UInt8[np.ndarray, "h w 3"]] = Recent(IMAGES_KEPT)
+        self._recent_sweeps: Recent[Sweep] = Recent(SWEEPS_KEPT)
 
     def __repr__(self) -> str:
         return f"Clip({self.id!r}, cameras={list(self.rig.cameras)}, lidars={list(self.rig.lidars)})"
