@@ -1,5 +1,6 @@
 """The command line as a stranger meets it: help, mistakes, exit codes."""
 
+import os
 import re
 import rlcompleter
 import subprocess
@@ -220,6 +221,15 @@ def test_a_server_lives_on_beside_a_corrupt_clip(spoilt_clip: Path, tmp_path: Pa
 
 
 # --------------------------------------------------------------------------------------------------------- first steps
+
+
+@pytest.mark.parametrize(("given", "used"), [(None, "1"), ("3", "3")])
+def test_matrices_are_multiplied_by_one_thread_unless_the_user_says_otherwise(monkeypatch, given, used) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    if given:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", given)
+    cli.main(["--version"])
+    assert os.environ["OPENBLAS_NUM_THREADS"] == used
 
 
 def test_version_and_first_steps_need_nothing_heavy(capsys: pytest.CaptureFixture[str]) -> None:
