@@ -138,10 +138,7 @@ class CellPlanes:
         own = np.stack([np.bincount(cell, each, len(keys)) for each in values], axis=1)
         total = np.zeros_like(own)
         for x, y, z in itertools.product((-1, 0, 1), repeat=3):
-            beside = keys + (x << 42) + (y << 21) + z
-            place = np.minimum(np.searchsorted(keys, beside), len(keys) - 1)
-            there = keys[place] == beside
-            total[there] += own[place[there]]
+            _add_beside(keys, (x << 42) + (y << 21) + z, own, total)
         enough = np.flatnonzero(total[:, 0] > NEIGHBOURS)
         mean = total[enough] / total[enough, :1]
         centre, covariance = mean[:, 1:4], np.empty((len(enough), 3, 3))
@@ -169,6 +166,18 @@ class CellPlanes:
         on[on] = near
         normals[on], heights[on] = self.normal[plane[near]], height[near]
         return normals, heights, on
+
+
+@kernel
+def _add_beside(keys, step, own, total):
+    """Add the rows [n,c] of the cells ``keys + step``, where there are such, to those of ``keys``, which ascend."""
+    place = 0
+    for i in range(len(keys)):
+        while place < len(keys) and keys[place] < keys[i] + step:
+            place += 1
+        if place < len(keys) and keys[place] == keys[i] + step:
+            for c in range(own.shape[1]):
+                total[i, c] += own[place, c]
 
 
 @kernel
