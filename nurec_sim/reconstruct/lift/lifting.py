@@ -180,8 +180,10 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
         own_ring = np.floor(np.log(depth[i]) / ring)
         for c in range(3):
             mixed[c] = rgb[i, c]
-        for k in range(len(packed)):
-            if k == own_view[i] or not present[k]:
+        # From the next view on: where another view owns the point, it is most often this one, which is nearer.
+        for step in range(1, len(packed)):
+            k = (own_view[i] + step) % len(packed)
+            if not present[k]:
                 continue
             u, v, z = project_point(packed, k, xyz[i, 0], xyz[i, 1], xyz[i, 2])
             if z <= 0.3 or u < 0 or v < 0 or u >= packed[k, 3] or v >= packed[k, 4]:
