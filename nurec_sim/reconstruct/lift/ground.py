@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
+from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.cloud import Cloud
 from nurec_sim.reconstruct.lift.road import DRIVEN_M, FILL_M, grow_road
 from nurec_sim.reconstruct.lift.settings import GroundSettings
@@ -42,16 +43,11 @@ class Ground:
 
     def cells(self, xyz_m: Float64[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, " n"]]:
         """Row and column (clipped to the grid) of points, and whether they lie in it."""
-        index = np.floor((np.asarray(xyz_m)[:, :2] - self.corner_m) / self.cell_m).astype(np.int64)
-        rows, columns = self.height_m.shape
-        inside = (index[:, 1] >= 0) & (index[:, 1] < rows) & (index[:, 0] >= 0) & (index[:, 0] < columns)
-        return np.clip(index[:, 1], 0, rows - 1), np.clip(index[:, 0], 0, columns - 1), inside
+        return _cells(np.asarray(xyz_m, np.float64), *self.corner_m, self.cell_m, *self.height_m.shape)
 
     def above(self, xyz_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
         """Height of points above the ground; infinite outside of the known ground and its short fills."""
-        row, column, inside = self.cells(xyz_m)
-        height = np.asarray(xyz_m)[:, 2] - self.height_m[row, column]
-        return np.where(inside & self.near[row, column], height, np.inf)
+        return _above(np.asarray(xyz_m, np.float64), *self.cells(xyz_m), self.height_m, self.near)
 
     def is_road(self, xyz_m: Float64[np.ndarray, "n 3"], tolerance_m: float = 0.12) -> Bool[np.ndarray, " n"]:
         """Points on the road surface."""
@@ -97,6 +93,27 @@ class Ground:
         slope_y, slope_x = np.gradient(smooth.astype(np.float64), self.cell_m)
         normal = np.stack([-slope_x, -slope_y, np.ones_like(slope_x)], axis=-1)
         return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+@kernel
+def _cells(xyz, x, y, cell, rows, columns):
+    """``Ground.cells`` of a grid that starts at x, y."""
+    row, column, inside = np.empty(len(xyz), np.int64), np.empty(len(xyz), np.int64), np.empty(len(xyz), np.bool_)
+    for i in range(len(xyz)):
+        a, b = np.floor((xyz[i, 0] - x) / cell), np.floor((xyz[i, 1] - y) / cell)
+        inside[i] = 0 <= a < columns and 0 <= b < rows
+        row[i], column[i] = np.int64(min(max(b, 0.0), rows - 1.0)), np.int64(min(max(a, 0.0), columns - 1.0))
+    return row, column, inside
+
+
+@kernel
+def _above(xyz, row, column, inside, height_m, near):
+    """``Ground.above``."""
+    result = np.full(len(xyz), np.inf)
+    for i in range(len(xyz)):
+        if inside[i] and near[row[i], column[i]]:
+            result[i] = xyz[i, 2] - height_m[row[i], column[i]]
+    return result
 
 
 def find_ground(
