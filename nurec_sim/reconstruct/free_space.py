@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
 from nurec_sim import geometry
+from nurec_sim.compute.angles import arctan2
 from nurec_sim.compute.cores import in_order
-from nurec_sim.compute.kernels import kernel
+from nurec_sim.compute.kernels import kernel, unchecked_kernel
 from nurec_sim.reconstruct import beam_counting
 from nurec_sim.reconstruct.beam_counting import COLUMNS, MOST_CELLS, NEAREST_M, STEP_RAD
 from nurec_sim.types import Clip, Gaussians, Sweep
@@ -126,21 +127,15 @@ def sweep_beams(clip: Clip, lidar: str, sweep: Sweep) -> SweepBeams:
 
 
 def _beams(t_us, world_from_lidar, drift_m, along, fired) -> SweepBeams:
-    distance = np.linalg.norm(along, axis=1)
-    good = np.isfinite(distance) & (distance > NEAREST_M)
-    along, distance, fired = along[good] / distance[good, None], distance[good], fired[good]
-    row = np.floor(np.arcsin(np.clip(along[:, 2], -1, 1)) / STEP_RAD).astype(np.int64)
-    column = np.floor((np.arctan2(along[:, 1], along[:, 0]) + np.pi) / STEP_RAD).astype(np.int64) % COLUMNS
+    beams, distance, row, column, count, total = _in_cells(along, fired)
     low = int(row.min(initial=0))
     image = np.full((int(row.max(initial=0)) - low + 1, COLUMNS), -1, np.int32)
     _fill_image(row - low, column, distance, image)
-    count = np.bincount(column, minlength=COLUMNS)
-    mean = np.bincount(column, fired, minlength=COLUMNS) / np.maximum(count, 1)
+    mean = total / np.maximum(count, 1)
     # Columns without returns were fired after the one before them.
     last = np.maximum.accumulate(np.where(count > 0, np.arange(COLUMNS), -1))
     last[last < 0] = last[-1]
     width = BEAM_SHARE * STEP_RAD * np.sqrt(len(image) * np.count_nonzero(count) / max(len(distance), 1))
-    beams = np.column_stack([along, distance, fired]).astype(np.float32)
     reach = np.where(image >= 0, beams[image, 3], np.float32(-1)) if len(beams) else np.full_like(image, -1, np.float32)
     farthest = _farthest(reach)
     return SweepBeams(t_us, world_from_lidar, drift_m, beams, image, reach, farthest, low, width, mean[last])
@@ -152,6 +147,31 @@ def _farthest(reach_m: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarra
     around = np.concatenate([reach_m[:, -cells:], reach_m, reach_m[:, :cells]], axis=1)
     window = np.ones((2 * cells + 1, 2 * cells + 1), np.uint8)
     return np.ascontiguousarray(cv2.dilate(around, window)[:, cells:-cells])
+
+
+@unchecked_kernel
+def _in_cells(along, fired):
+    """Beams [n,5] that ended farther than ``NEAREST_M``, their exact ranges and the rows and columns of their cells.
+
+    And for each column: how many there are, and the sum of their firing times.
+    """
+    beams, distance = np.empty((len(along), 5), np.float32), np.empty(len(along))
+    row, column = np.empty(len(along), np.int64), np.empty(len(along), np.int64)
+    count, total = np.zeros(COLUMNS, np.int64), np.zeros(COLUMNS)
+    n = 0
+    for i in range(len(along)):
+        x, y, z = along[i, 0], along[i, 1], along[i, 2]
+        size = np.sqrt(x * x + y * y + z * z)
+        if not NEAREST_M < size < np.inf:
+            continue
+        beams[n, 0], beams[n, 1], beams[n, 2], beams[n, 3], beams[n, 4] = x / size, y / size, z / size, size, fired[i]
+        distance[n] = size
+        row[n] = np.int64(np.floor(arctan2(z, np.sqrt(x * x + y * y)) / STEP_RAD))
+        column[n] = np.int64(np.floor((arctan2(y, x) + np.pi) / STEP_RAD)) % COLUMNS
+        count[column[n]] += 1
+        total[column[n]] += fired[i]
+        n += 1
+    return beams[:n], distance[:n], row[:n], column[:n], count, total
 
 
 @kernel

@@ -82,12 +82,12 @@ def _distance_m(xyz, parts, centre, radius):
     result = np.empty(len(xyz))
     nearest = 0
     for i in range(len(xyz)):
-        best = np.inf
+        best, best_m = np.inf, np.inf
         # That of the point before comes first: beams fired one after the other end near each other.
         for n in range(-1, len(parts)):
             k = nearest if n < 0 else n
             a, b, c = xyz[i, 0] - centre[k, 0], xyz[i, 1] - centre[k, 1], xyz[i, 2] - centre[k, 2]
-            reach = np.sqrt(best) + radius[k]
+            reach = best_m + radius[k]
             if a * a + b * b + c * c >= reach * reach:
                 continue
             for j in range(PATH_PART):
@@ -95,7 +95,8 @@ def _distance_m(xyz, parts, centre, radius):
                 square = a * a + b * b + c * c
                 if square < best:
                     best, nearest = square, k
-        result[i] = np.sqrt(best)
+            best_m = np.sqrt(best)
+        result[i] = best_m
     return result
 
 
