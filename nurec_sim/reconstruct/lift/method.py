@@ -67,10 +67,12 @@ def lift(
             f"with no usable points after holding out sweeps {sorted(hold_out)}"
         )
     stages.start("ground and surfaces")
-    bodies, ground = surfels_of(clip, actors, gathered, settings)
-    stages.start("images")
-    ego_images = find_ego_images(clip, cameras, stages.fraction, hold_out)
-    views = read_views(clip, cameras, ego_images, settings.views, stages.fraction)
+    with ThreadPoolExecutor(1) as beside:
+        # Images do not depend on surfaces, whose first steps use one core.
+        seen = beside.submit(_images, clip, cameras, hold_out, settings)
+        bodies, ground = surfels_of(clip, actors, gathered, settings)
+        stages.start("images")
+        ego_images, views = seen.result()
     stages.start("depth")
     pictures = depth_pictures(views, bodies, settings, stages.fraction)
     views = [view for view in views if view.key]
@@ -148,6 +150,14 @@ def lift(
     return dataclasses.replace(scene, static=_coloured(scene.static, shown))
 
 
+def _images(
+    clip: Clip, cameras: Sequence[str], hold_out: set[int], settings: LiftSettings
+) -> tuple[dict[str, np.ndarray], list[WorkingView]]:
+    """What cameras see of the ego vehicle (``find_ego_images``), and the working views without it."""
+    ego_images = find_ego_images(clip, cameras, hold_out=hold_out)
+    return ego_images, read_views(clip, cameras, ego_images, settings.views)
+
+
 def _coloured(gaussians: Gaussians, shown: Bool[np.ndarray, " n"]) -> Gaussians:
     """Gaussians of which those that no image shows take colours of what is like them."""
     return dataclasses.replace(gaussians, rgb=colours_by_likeness(gaussians, shown))
@@ -162,7 +172,7 @@ def _sky_weight(picture: DepthPicture, view: WorkingView, settings: LiftSettings
 
 _ENDS = {
     "sweeps": 0.1,
-    "ground and surfaces": 0.21,
+    "ground and surfaces": 0.23,
     "images": 0.24,
     "depth": 0.5,
     "colours": 0.51,

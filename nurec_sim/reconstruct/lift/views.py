@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from nurec_sim import geometry, sensors
+from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.ego_images import shows_ego
 from nurec_sim.reconstruct.lift.settings import ViewSettings
 from nurec_sim.types import Box, CameraModel, Clip, Shutter
@@ -253,20 +254,27 @@ def read_views(
             for tile in tiles_of(model, settings)
         ]
     frames = choose_frames(clip, cameras, sum(map(len, tiles.values())), settings)
-    views = []
-    for done, (camera, frame, key) in enumerate(frames):
-        progress(done / len(frames))
+
+    def read(chosen: tuple[str, int, bool]) -> list[WorkingView]:
+        camera, frame, key = chosen
         image = clip.image(camera, frame)
         start_us, end_us = (int(t) for t in clip.camera_times_us(camera)[frame])
         pair = np.asarray(clip.world_from_camera(camera, frame), np.float64)
         world_from_camera = geometry.interpolate_pose_pair(pair, np.array(0.5))
         # Rotation during the exposure is neglected: kernels know one pose per view and a shift.
         travel = world_from_camera[:3, :3].T @ (pair[1, :3, 3] - pair[0, :3, 3])
+        views = []
         for tile in tiles[camera]:
             pose = world_from_camera @ geometry.pose(tile.camera_from_tile, np.zeros(3))
             rgb = _resample(image, tile)
             drift = tile.camera_from_tile.T @ travel if tile.fraction.any() else np.zeros(3)
             views.append(WorkingView(camera, frame, (start_us + end_us) // 2, key, tile, pose, drift, rgb))
+        return views
+
+    views = []
+    for done, found in enumerate(in_order(read, frames)):
+        progress(done / len(frames))
+        views += found
     return views
 
 
