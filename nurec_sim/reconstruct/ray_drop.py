@@ -221,8 +221,11 @@ def _in_bodies(
         path, size = scene.tracks[track].path, scene.tracks[track].size_m
         if not path.covers(t_us):
             continue
-        near = np.flatnonzero((body < 0) & (np.abs(xyz - path.at(t_us)[:3, 3]) < max(size) + BOX_MARGIN_M).all(axis=1))
-        box_from_world = geometry.inverse(path.at(t_us))
+        world_from_box, reach = path.at(t_us), max(size) + BOX_MARGIN_M
+        # One axis first: it leaves few of all beams for the others.
+        near = np.flatnonzero(np.abs(xyz[:, 0] - world_from_box[0, 3]) < reach)
+        near = near[(body[near] < 0) & (np.abs(xyz[near] - world_from_box[:3, 3]) < reach).all(axis=1)]
+        box_from_world = geometry.inverse(world_from_box)
         inside = near[geometry.points_in_box(geometry.transform_points(box_from_world, xyz[near]), size, BOX_MARGIN_M)]
         xyz[inside] = geometry.transform_points(box_from_world, xyz[inside])
         eye[inside] = geometry.transform_points(box_from_world, eye[inside])
