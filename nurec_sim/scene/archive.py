@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -76,14 +77,19 @@ def write_scene(
         raise ArchiveError(f"{path} exists; pass overwrite=True to replace it")
     check_scene(scene)
     scene = archived(scene)
-    digest = scene_hash(scene)
     fits = ftheta_fits(scene)
+    with ThreadPoolExecutor(1) as beside:
+        hashed, texture = beside.submit(scene_hash, scene), beside.submit(latlong_exr, scene.sky)
+        layers = {
+            "default.usda": root_layer(scene, FORMAT_VERSION),
+            STATIC_LAYER: static_layer(scene.static),
+            ACTORS_LAYER: actors_layer(scene),
+            CAMERAS_LAYER: cameras_layer(scene, fits),
+        }
+        digest, sky = hashed.result(), texture.result()
     members = {
-        "default.usda": root_layer(scene, FORMAT_VERSION),
-        STATIC_LAYER: static_layer(scene.static),
-        ACTORS_LAYER: actors_layer(scene),
-        CAMERAS_LAYER: cameras_layer(scene, fits),
-        SKY_TEXTURE: latlong_exr(scene.sky),
+        **layers,
+        SKY_TEXTURE: sky,
         **sidecars(scene, digest, fits, derived_map),
         FACTS: codec.dump(scene_facts(scene), FACTS),
         ISP: codec.dump(scene.isp, ISP, indent=2),
