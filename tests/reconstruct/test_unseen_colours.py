@@ -78,3 +78,22 @@ def test_thirty_two_are_mixed_and_nothing_changes_if_all_or_none_are_seen(monkey
         np.testing.assert_array_equal(colours_by_likeness(made, seen), made.rgb)
     monkeypatch.setattr(unseen_colours, "MOST_SEEN", 1)
     assert colours_by_likeness(made, np.arange(34) > 32)[0] == pytest.approx(GREEN)
+
+
+def test_what_shares_a_cell_shares_neighbours_and_weighs_them_by_its_own_place():
+    made = street([[0, 0, 0], [0, 0, 0.04], [0, 0, 1], [0, 0, -1]], [GREY, GREY, RED, GREEN])
+    first, second, *_ = colours_by_likeness(made, np.arange(4) > 1)
+    assert first == pytest.approx([0.5, 0.5, 0])
+    near, far = 1 / 0.961**2, 1 / 1.041**2
+    assert second == pytest.approx([near / (near + far), far / (near + far), 0], abs=1e-4)
+
+
+def test_cells_part_what_differs_along_any_feature():
+    """Numbers of cells start anew only after 65 km."""
+    for column in range(6):
+        features = np.zeros((4, 6))
+        features[:, column] = [0, 0.04, 0.1, -0.1]
+        centre, cell = unseen_colours._cells(features)
+        assert cell[0] == cell[1]
+        assert len({*cell[1:]}) == 3
+        np.testing.assert_allclose(centre[cell, column], [0, 0, 0.1, -0.1])
