@@ -22,8 +22,8 @@ All commands: nurec-sim --help; options of a command: nurec-sim COMMAND --help""
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb; errors of ours become one line and exit status 1, Ctrl-C becomes 130."""
-    # Read when NumPy is imported. Matrices here are small: threads of OpenBLAS would wait for each other, in a loop that
-    # takes whole cores from the kernels, and sum in another order on another number of cores.
+    # Read when NumPy is imported. Matrices here are small: threads of OpenBLAS would wait for each other, in a loop
+    # that takes whole cores from the kernels, and sum in another order on another number of cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] == ["health"]:  # called every few seconds by container health checks

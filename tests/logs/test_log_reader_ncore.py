@@ -52,7 +52,8 @@ def test_points_are_moved_to_the_end_of_the_sweep(clip, sequence):
     for index in range(clip.sweep_count("top")):
         sweep, given = opened.sweep("top", index), clip.sweep("top", index)
         assert (sweep.start_us, sweep.end_us, sweep.t_us) == (given.start_us, given.end_us, given.end_us)
-        # The ray without a return is left out; float32 directions err by a micrometre, interpolated poses by less than half a millimetre.
+        # The ray without a return is left out; float32 directions err by a micrometre,
+        # interpolated poses by less than half a millimetre.
         assert np.abs(sweep.xyz_world_m - given.xyz_world_m).max() < 1e-3
         assert np.array_equal(sweep.point_t_us, given.point_t_us) and np.allclose(sweep.intensity, given.intensity)
 
