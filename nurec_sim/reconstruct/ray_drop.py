@@ -169,12 +169,13 @@ def found_scanner(nominal: LidarModel, sweeps: Sequence[MappedSweep]) -> LidarMo
     """
     rows = int(np.median([len(each.seen_rad) for each in sweeps]))
     alike = [each for each in sweeps if len(each.seen_rad) == rows]
-    columns = round(float(np.median([each.beams.point.shape[1] for each in alike])))
     elevation = np.median([each.seen_rad for each in alike], axis=0)
     if not np.all(np.diff(elevation) < 0):
         elevation = np.median([each.beams.lidar.elevation_rad for each in alike], axis=0)
-    turn = alike[0].beams.lidar.azimuth_rad
-    azimuth = turn[0] + (turn[-1] - turn[0]) / (len(turn) - 1) * np.arange(columns)
+    # Columns and their spacing are those of one sweep: of several, they would not make one turn.
+    middle = sorted(alike, key=lambda each: each.beams.point.shape[1])[(len(alike) - 1) // 2]
+    turn = middle.beams.lidar.azimuth_rad
+    azimuth = np.linspace(turn[0], turn[-1], len(turn))
     beams, expected, back = np.zeros((3, rows * LIDAR_SECTORS))
     for each in alike:
         cell = np.arange(rows)[:, None] * LIDAR_SECTORS + beam_sectors(each.beams.lidar)

@@ -1,6 +1,7 @@
 """Ray drop learnt from recorded beams that did not return, and the beams that the car blocks."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from reconstruct_street import Street
 
 from nurec_sim import logs, sensors
 from nurec_sim.reconstruct import ray_drop_fit, reconstruct
-from nurec_sim.reconstruct.ray_drop import _shift
+from nurec_sim.reconstruct.ray_drop import _shift, found_scanner
 from nurec_sim.reconstruct.ray_drop_fit import RIDGE, logistic, sigmoid
 from nurec_sim.render import make_renderer
 from nurec_sim.types import SensorRequest, Sweep
@@ -128,3 +129,16 @@ def test_as_many_beams_are_dropped_as_were_recorded():
     odds = np.log(p / (1 - p)) - _shift(p, 250)
     assert np.count_nonzero(odds >= 0) == 250
     assert _shift(p, 0) == 0 and _shift(p, 1000) == 0
+
+
+@pytest.mark.parametrize("columns", [(8, 10, 10), (10, 10, 8), (10, 8, 10)])
+def test_a_scanner_makes_one_turn_whatever_columns_its_sweeps_have(clip, columns):
+    nominal, sweeps = clip.rig.lidars["top"], []
+    for count in columns:
+        lidar = dataclasses.replace(nominal, azimuth_rad=np.pi - 2 * np.pi * np.arange(count) / count)
+        beams = SimpleNamespace(lidar=lidar, point=np.full((len(lidar.elevation_rad), count), -1))
+        sweeps.append(SimpleNamespace(beams=beams, seen_rad=lidar.elevation_rad, world_from_lidar=np.eye(4)[None],
+                                      frame=SimpleNamespace(beam=np.zeros(0, np.int64))))  # fmt: skip
+    scanner = found_scanner(nominal, sweeps)
+    sensors.check_lidar(scanner)
+    assert scanner.azimuth_rad == pytest.approx(np.pi - 2 * np.pi * np.arange(10) / 10)
