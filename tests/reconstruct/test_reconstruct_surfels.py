@@ -100,6 +100,16 @@ def test_a_pole_before_a_wall_stays_before_it():
     assert np.mean(np.abs(found.xyz_m[: len(wall), 0] - 10) < 0.01) > 0.9
 
 
+def test_cells_get_the_sums_of_those_beside_them():
+    cells = np.unique(np.random.default_rng(0).integers(1, 5, (30, 3)), axis=0)
+    keys, own = (cells << (42, 21, 0)).sum(axis=1), np.arange(2.0 * len(cells)).reshape(-1, 2)
+    for step in [(0, 0, 0), (1, -1, 0), (-1, 0, 1), (0, 0, -1)]:
+        total = np.ones_like(own)
+        surfaces._add_beside(keys, sum(each << bits for each, bits in zip(step, (42, 21, 0), strict=True)), own, total)
+        for cell, found in zip(cells, total - 1, strict=True):
+            assert (found == own[(cells == cell + step).all(axis=1)].sum(axis=0)).all()
+
+
 def test_planes_do_not_depend_on_where_the_origin_is():
     """Sums of squares of coordinates in the hundreds of kilometres would have no digits left for millimetres."""
     wall, far = noisy_wall(0.03), np.array([5e5, -4e6, 100.0])
