@@ -10,7 +10,6 @@ from nurec_sim.evaluate.scores.images import psnr
 from nurec_sim.reconstruct import ColourSettings, LiftSettings, ViewSettings, reconstruct
 from nurec_sim.reconstruct.lift import colour_solve, method
 from nurec_sim.render import CpuRenderer
-from nurec_sim.render.cpu.pack import BLOCK, COLOUR, FIELDS
 from nurec_sim.scene import scene_hash
 from nurec_sim.scene.usd.dome_texture import sample_cubemap
 from nurec_sim.types import DynamicGaussians, Gaussians, Pinhole, SensorRequest
@@ -184,18 +183,3 @@ def test_the_image_of_a_longer_lens_leaves_no_edge_in_the_sky(lifted):
     assert np.ptp(grey) > 0.03, "the long lens takes part"
     # 0.12 over the 4 degrees of the fall, and 0.24 over the 20 of the longer lens itself.
     assert steps.max() < 0.12 / 4 + 0.24 / 20
-
-
-def test_of_two_images_the_later_one_counts_more():
-    # By hand: the first image, after trust in 0.5 pixels, moves by 1 / (0.5 / 2 + 1); the second by 1 / (1.5 / 2 + 1).
-    fields, seen = np.zeros((1, FIELDS, BLOCK), np.float32), np.full((1, BLOCK), 0.5, np.float32)
-    sky, seen_sky = np.zeros((1, 1, 3), np.float32), np.full((1, 1), 0.5, np.float32)
-    shares, first = np.zeros((BLOCK, 4), np.float32), np.zeros(1, np.int64)
-    for wanted, colour in [(1.0, 0.8), (0.0, 0.8 - 0.8 / 1.75)]:
-        shares[0] = 1, *(wanted - fields[0, COLOUR : COLOUR + 3, 0])
-        colour_solve._change_blocks(first, first, shares, seen, fields)
-        colour_solve._change_sky(np.array([[[1, *(wanted - sky[0, 0])]]], np.float32), seen_sky, sky)
-        assert fields[0, COLOUR : COLOUR + 3, 0] == pytest.approx(colour, rel=1e-6)
-        assert sky[0, 0] == pytest.approx(colour, rel=1e-6)
-    assert (seen[0, 0], seen_sky[0, 0]) == (2.5, 2.5)
-    assert not fields[0, COLOUR, 1:].any(), "what the image does not show keeps its colour"
