@@ -15,6 +15,7 @@ from nurec_sim.compute.kernels import kernel
 
 Square = Float64[np.ndarray, "p p"]
 BLOCK = 64
+"""Rows and columns of the blocks that equations are solved by."""
 
 
 class Rows:
