@@ -56,6 +56,8 @@ class LogFlags:
     align_sweeps: bool = True
     """CLIP: correct beams and poses of the log by the planes that its sweeps share, as in `nurec-sim reconstruct`; what
     is held out takes no part, and moves with the rest."""
+    complete_actors: bool = True
+    """CLIP: give labelled actors that the sensors hardly saw a body of their class, as in `nurec-sim reconstruct`."""
     input_cameras: tuple[str, ...] = ()
     """CLIP: input cameras of the reconstruction; default: all."""
     target_cameras: tuple[str, ...] = ()
@@ -208,6 +210,7 @@ def evaluate_log(path: Path, flags: LogFlags, hold_out_every: int, network: Feed
                 actors=flags.actors,
                 align_actors=flags.align_actors,
                 align_sweeps=flags.align_sweeps,
+                complete_actors=flags.complete_actors,
             )
     if flags.json is not None:
         write_file(flags.json, json.dumps(figures, indent=1, sort_keys=True) + "\n")

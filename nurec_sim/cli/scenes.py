@@ -38,6 +38,7 @@ def reconstruct(
     actors: ActorsName = "auto",
     align_actors: bool = True,
     align_sweeps: bool = True,
+    complete_actors: bool = True,
     map_from_gaussians: bool = False,
     refine: float | None = None,
     budget: int | None = None,
@@ -70,6 +71,8 @@ def reconstruct(
             surface (docs/lift.md).
         align_sweeps: correct elevations of LiDAR beams, mountings of LiDARs and poses so that all sweeps see the same
             planes and images show them where they are, if they disagree (docs/log_formats.md).
+        complete_actors: give labelled actors that the sensors hardly saw a body of their class where nothing was
+            measured, so that they are seen when they or the ego drive elsewhere (docs/lift.md).
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
         refine: time budget in seconds for optimising the scene on the log's images and sweeps.
@@ -101,6 +104,7 @@ def reconstruct(
             actors=actors,
             align_actors=align_actors,
             align_sweeps=align_sweeps,
+            complete_actors=complete_actors,
         )
     derived = None
     if map_from_gaussians and world_scene.road_map is None:

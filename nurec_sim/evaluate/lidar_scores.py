@@ -10,12 +10,12 @@ from jaxtyping import Float64, Int64
 from nurec_sim import geometry
 from nurec_sim.evaluate.log_regions import RANGES_M, range_name
 from nurec_sim.evaluate.scores.free_space import FARTHEST_M, FiredSweep, RecordedBeams, false_obstacles, in_boxes
-from nurec_sim.evaluate.scores.lidar import CloudScore, LidarScore, scanner_along, score_sweep
+from nurec_sim.evaluate.scores.lidar import CloudScore, LidarScore, copied_sweep, scanner_along, score_sweep
 from nurec_sim.evaluate.scores.surfaces import KINDS, surfaces_of
 from nurec_sim.logs.fired import as_fired, fired_fraction
 from nurec_sim.reconstruct.free_space import balls, chosen_sweeps, in_free_space, sweep_beams
 from nurec_sim.sensors import lidar_model, range_map
-from nurec_sim.types import Clip, LidarFrame, LidarModel, Sense, SensorRequest
+from nurec_sim.types import Clip, LidarFrame, LidarModel, Sense, SensorRequest, Sweep
 
 LEFT_M = (0.0, 1.0, 2.0, 3.0)
 """Lateral offsets from the path at which false obstacles are counted, on both sides."""
@@ -36,7 +36,9 @@ def score_sweeps(
     """Scores of held-out sweeps, by the names of their conventions (docs/evaluation.md).
 
     Along recorded beams: errors of range and intensity, by range and by what the returns lie on. Of whole sweeps:
-    Chamfer distances, number of returns, and, where the log's beams are known, which of them return.
+    Chamfer distances, number of returns, and, where the log's beams are known, which of them return. ``copied`` has the
+    figures along beams of the nearest sweep in time that is not held out, in place of the simulated one
+    (``scores.lidar.copied_sweep``); None if there is none.
 
     Args:
         clip: the log.
@@ -45,7 +47,7 @@ def score_sweeps(
         sense: renders the scene.
         report: called with a stage and the share of it done.
     """
-    scores, names, clouds, drops = [], [], [], []
+    scores, names, clouds, drops, copies = [], [], [], [], []
     jobs = [(lidar, i) for lidar in clip.rig.lidars for i in held if i < len(clip.sweep_times_us(lidar))]
     for done, (lidar, index) in enumerate(jobs):
         report("held-out sweeps", done / len(jobs))
@@ -64,19 +66,14 @@ def score_sweeps(
         clouds.append(CloudScore.of(seen, sweep.xyz_world_m))
         drops.append(_drop_agreement(clip.rig.lidars[lidar], scanner, fired, whole))
         names.append({"lidar": lidar, "sweep": index})
+        if (other := _nearest_seen(clip, lidar, index, held)) is not None:
+            here = geometry.inverse(sweep.world_from_lidar)
+            both = (geometry.transform_points(here, each.xyz_world_m) for each in (sweep, other))
+            copies.append(copied_sweep(*both, surface))
     report("held-out sweeps", 1.0)
-    total = LidarScore.pooled(scores)
-    bins = [(range_name(k), RANGES_M[k], RANGES_M[k + 1]) for k in range(len(RANGES_M) - 1)]
     return {
-        **_figures(total),
-        "by_range": {name: _figures(total.within(low, high)) for name, low, high in bins},
-        "by_surface": {
-            kind: {
-                **_figures(total.on(kind)),
-                "by_range": {name: _figures(total.on(kind).within(low, high)) for name, low, high in bins},
-            }
-            for kind in KINDS
-        },
+        **_along_beams(LidarScore.pooled(scores)),
+        "copied": _along_beams(LidarScore.pooled(copies)) if copies else None,
         **_means([cloud.figures() for cloud in clouds]),
         **_means(drops),
         "per_sweep": [
@@ -89,6 +86,27 @@ def score_sweeps(
             for name, s, cloud in zip(names, scores, clouds, strict=True)
         ],
     }
+
+
+def _along_beams(total: LidarScore) -> dict[str, object]:
+    """Errors along beams: of all, by range, and by what the recorded returns lie on."""
+    bins = [(range_name(k), RANGES_M[k], RANGES_M[k + 1]) for k in range(len(RANGES_M) - 1)]
+
+    def by_range(score: LidarScore) -> dict[str, object]:
+        return {name: _figures(score.within(low, high)) for name, low, high in bins}
+
+    return {
+        **_figures(total),
+        "by_range": by_range(total),
+        "by_surface": {kind: {**_figures(total.on(kind)), "by_range": by_range(total.on(kind))} for kind in KINDS},
+    }
+
+
+def _nearest_seen(clip: Clip, lidar: str, index: int, held: Sequence[int]) -> Sweep | None:
+    """The sweep of the same LiDAR nearest in time that is not held out."""
+    middle = clip.sweep_times_us(lidar).sum(axis=1) // 2
+    seen = np.setdiff1d(np.arange(len(middle)), held)
+    return clip.sweep(lidar, int(seen[np.abs(middle[seen] - middle[index]).argmin()])) if len(seen) else None
 
 
 def _means(rows: list[dict[str, float]]) -> dict[str, float | None]:

@@ -91,6 +91,14 @@ def _lidar_rows(lidar: Mapping[str, Any]) -> list[Row]:
                     Row(f"LiDAR: {kind}", f"mean {what} error, {title} (m)", part[f"mean_{key}"], 2, -1),
                 ]
         rows.append(Row(f"LiDAR: {kind}", f"beams, {kind}", parts["beams"], 0))
+    if copied := lidar.get("copied"):
+        group = "LiDAR: copying the nearest recorded sweep, for comparison"
+        for name, part in [("all ranges", copied), *copied["by_range"].items()]:
+            rows += [
+                Row(group, f"copied, mean error, {name} (m)", part["mean_abs_range_error_m"], 2),
+                Row(group, f"copied, median error, {name} (m)", part["median_abs_range_error_m"], 3),
+                Row(group, f"copied, within 0.1 m, {name}", part["within_0.1_m"], 3),
+            ]
     return rows
 
 

@@ -70,6 +70,7 @@ def reconstruct(
     actors: ActorsName = "auto",
     align_actors: bool = True,
     align_sweeps: bool = True,
+    complete_actors: bool = True,
 ) -> GaussianScene:
     """Build a Gaussian scene from a clip, at the precision of archives: reading it from one gives the same values.
 
@@ -89,6 +90,7 @@ def reconstruct(
         align_sweeps: correct elevations of beams, mountings of LiDARs and poses of a log that was opened from disk, so
             that all sweeps see the same planes, and images of these cameras the same points (``logs.alignment``); the
             scene's path is the corrected one.
+        complete_actors: give labelled actors that the sensors hardly saw a body of their class (``hidden_actors``).
 
     Raises:
         ReconstructError: no such method, camera, sweep or choice of actors, settings of another method, or the clip
@@ -156,6 +158,10 @@ def reconstruct(
         from nurec_sim.reconstruct.ray_drop import with_ray_drop
 
         scene = with_ray_drop(scene, clip, held, lambda done: report("ray drop", 1.0))
+    if complete_actors:
+        from nurec_sim.reconstruct.hidden_actors import with_hidden_actors
+
+        scene = with_hidden_actors(scene, clip, held)
     return archived(scene)
 
 

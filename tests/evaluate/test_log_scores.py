@@ -13,7 +13,7 @@ from nurec_sim.evaluate.image_scores import image_request
 from nurec_sim.evaluate.log_regions import actor_mask, seen_points
 from nurec_sim.evaluate.scores.flip import flip, flip_map
 from nurec_sim.evaluate.scores.free_space import FiredSweep, RecordedBeams, false_obstacles
-from nurec_sim.evaluate.scores.lidar import CloudScore, LidarScore
+from nurec_sim.evaluate.scores.lidar import CloudScore, LidarScore, copied_sweep
 from nurec_sim.evaluate.scores.sharpness import octave_energy, sharpness
 from nurec_sim.evaluate.scores.surfaces import KINDS, surfaces_of
 from nurec_sim.logs import hold_out, without_images
@@ -309,3 +309,42 @@ def test_a_scene_of_another_path_is_refused(figures):
     late = dataclasses.replace(scene, ego=Trajectory(scene.ego.t_us + 10**9, scene.ego.world_from_body))
     with pytest.raises(ReconstructError, match="is of another time than clip"):
         score_scene(clip, late, via_grpc=False)
+
+
+def test_a_copied_sweep_tells_the_range_of_its_return_nearest_in_direction():
+    def at(azimuth_deg, range_m):
+        return range_m[:, None] * np.stack(
+            [np.cos(np.radians(azimuth_deg)), np.sin(np.radians(azimuth_deg)), 0 * range_m], axis=1
+        )
+
+    recorded = at(np.array([0.0, 10.0, 20.0, 30.0]), np.array([5.0, 8.0, 0.0, 12.0]))
+    other = at(np.array([0.9, 10.4, 9.8, 31.2, 50.0]), np.array([5.5, 3.0, 8.25, 12.0, 0.0]))
+    score = copied_sweep(recorded, other)
+    # The return at no distance has no direction; at 30 degrees the nearest direction is 1.2 degrees off.
+    assert score.recorded_m == pytest.approx([5, 8, 12])
+    assert score.simulated_m == pytest.approx([5.5, 8.25, np.nan], nan_ok=True)
+
+
+def test_scores_of_sweeps_have_those_of_the_nearest_seen_sweep_beside_them(monkeypatch):
+    clip, asked, copied = Street(frames=6), [], []
+    monkeypatch.setattr(
+        lidar_scores,
+        "copied_sweep",
+        lambda xyz, other, surface: copied.append(other) or copied_sweep(xyz, other, surface),
+    )
+    measured = clip.sweep
+    clip.sweep = lambda lidar, index: asked.append(index) or measured(lidar, index)
+
+    def sense(requests):
+        none = np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32)
+        return [LidarFrame(request.sensor, request.start_us, request.end_us, *none) for request in requests]
+
+    figures = lidar_scores.score_sweeps(clip, clip.rig.lidars, [1, 2, 4], sense, lambda stage, done: None)
+    # 0 is as near to 1 as 2 is, which is held out; 3 is the nearest to 2, and to 4 the first of 3 and 5.
+    assert asked == [1, 0, 2, 3, 4, 3]
+    # In the frame of the sweep itself: the walls are 8 m to the left and right, whichever sweep saw them.
+    assert all(np.abs(cloud[:, 1]).max() == pytest.approx(8) for cloud in copied)
+    assert figures["copied"]["return_recall"] > 0.9 > figures["return_recall"] == 0
+    assert figures["copied"]["by_range"]["0-10 m"]["median_abs_range_error_m"] < 0.1
+    every = range(len(clip.t_us))
+    assert lidar_scores.score_sweeps(clip, clip.rig.lidars, every, sense, lambda stage, done: None)["copied"] is None

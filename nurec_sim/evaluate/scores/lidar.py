@@ -17,6 +17,8 @@ from nurec_sim import sensors
 from nurec_sim.evaluate.scores.surfaces import KINDS, Surfaces
 from nurec_sim.types import LidarFrame, LidarModel
 
+COPIED_RAD = np.radians(1.0)
+"""A copied sweep tells the range of beams that have a return of it so near in direction."""
 FSCORE_M = (0.05, 0.1, 0.2)
 ROW_STEP_RAD = np.radians(0.05)
 SAME_SURFACE = 0.05
@@ -212,3 +214,27 @@ def score_sweep(
 
 def _elevation(xyz_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
     return np.arctan2(xyz_m[:, 2], np.hypot(xyz_m[:, 0], xyz_m[:, 1]))
+
+
+def copied_sweep(
+    xyz_m: Float64[np.ndarray, "n 3"], other_m: Float64[np.ndarray, "m 3"], surface: Surfaces | None = None
+) -> LidarScore:
+    """Another recorded sweep in place of a simulated one: what a scene should beat.
+
+    The range of a beam is that of the other sweep's return nearest in direction; none where that is more than
+    ``COPIED_RAD`` off.
+
+    Args:
+        xyz_m: recorded returns in the sensor's frame of one instant.
+        other_m: returns of the other sweep in the same frame.
+        surface: what the recorded returns lie on.
+    """
+    from scipy.spatial import cKDTree
+
+    recorded, other = (np.linalg.norm(xyz, axis=1) for xyz in (xyz_m, other_m))
+    usable, shown = recorded > 0, other > 0
+    tree = cKDTree(other_m[shown] / other[shown, None])
+    directions = xyz_m[usable] / recorded[usable, None]
+    _, nearest = tree.query(directions, distance_upper_bound=2 * np.sin(COPIED_RAD / 2))
+    distance = np.append(other[shown], np.nan)[nearest]
+    return LidarScore(xyz_m[usable], distance, None, None if surface is None else surface[usable])

@@ -30,4 +30,5 @@ class Optimized(ShippedMethod):
             actors="recorded",
             align_actors=False,
             align_sweeps=False,
+            complete_actors=False,
         )

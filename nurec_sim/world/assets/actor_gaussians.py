@@ -50,13 +50,14 @@ class _Surface:
     laser: float
 
 
-def actor_gaussians(kind: str, size_m: Size, colour: Colour) -> Gaussians:
+def actor_gaussians(kind: str, size_m: Size, colour: Colour, coarser: float = 1.0) -> Gaussians:
     """The Gaussians of an actor in its box frame: x forward, y left, z up, origin at the centre of the box.
 
     Args:
         kind: one of ``ACTOR_SIZES_M``.
         size_m: length, width and height of its box; vehicles fill it.
         colour: of paint or shirt, 0..1.
+        coarser: Gaussians are so many times as far apart as usual, and as wide.
 
     Raises:
         ValueError: no such kind.
@@ -65,7 +66,7 @@ def actor_gaussians(kind: str, size_m: Size, colour: Colour) -> Gaussians:
     rng = np.random.default_rng([0, *kind.encode()])
     person = kind in ("pedestrian", "cyclist")
     surfaces = _person(rng, kind, size_m, colour) if person else _vehicle(rng, kind, size_m, colour)
-    spacing = float(np.clip(SPACING_SHARE * max(size_m), *SPACING_M))
+    spacing = coarser * float(np.clip(SPACING_SHARE * max(size_m), *SPACING_M))
     parts = [_sampled(surface, spacing) for surface in surfaces]
     footprint = (1.5 if kind == "cyclist" else 0.45, 0.4) if person else size_m[:2]
     return Gaussians.concatenate([*parts, _shadow(*footprint, size_m[2])])

@@ -1,0 +1,169 @@
+"""Labelled actors that the sensors hardly saw: bodies of their class where nothing was measured.
+
+A car that another hid in the log, or whose rear alone was seen, has no surface there: once the ego drives elsewhere or
+a scenario moves the car, no camera and no LiDAR would see what collisions count. Such actors get the missing part of a
+body of the procedural towns (``world.actor_gaussians``), as large as their box, its paint the median colour of what was
+seen.
+Actors that were seen from two sides or more stay as they are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.spatial import cKDTree
+
+from nurec_sim import geometry
+from nurec_sim.reconstruct.free_space import SweepBeams, balls, chosen_sweeps, in_free_space, sweep_beams
+from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene, Label, Track
+from nurec_sim.world import ACTOR_SIZES_M, LABEL_OF_KIND, actor_gaussians
+
+LABELS = ("automobile", "heavy_truck", "bus", "person", "rider")
+"""Classes that there are bodies of."""
+COARSER = 2.0
+"""Distance of their Gaussians by that of actors that a scenario adds: a quarter of the number."""
+REACH_M = 0.4
+"""A body's surface was seen where a Gaussian of the actor is so near."""
+DIRECTIONS, LEAST_SEEN, LEAST_OF_EACH = 16, 0.5, 3
+"""Actors that were seen in half of the directions around their middle stay as they are: two sides are; behind is not.
+A direction was seen with so many Gaussians in it."""
+NEAR_M = 60.0
+"""Only actors that come so near to the recorded path."""
+LEAST_COLOURED = 30
+"""Gaussians that tell the colour of an actor."""
+GREY = (0.45, 0.45, 0.47)
+DAYLIGHT, DARKEST = 0.33, 0.3
+"""Median luminance of static Gaussians by day, about; by night bodies are as much darker, down to this factor."""
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+SWEEPS = 16
+"""Recorded sweeps, at most, whose beams may show that there is no such body."""
+CELL_M, BALL_M, MOST_FREE = 0.5, 0.15, 0.5
+"""A box is tested with a ball in each such cell. If beams passed through more of them the label is not believed."""
+SOLID = 0.3
+"""Least opacity of what counts as seen."""
+
+
+def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[int] = ()) -> GaussianScene:
+    """The scene with bodies for labelled actors that the sensors hardly saw.
+
+    What recorded beams passed through is left out. If they passed through most of the box the label is wrong, and there
+    is no body.
+    The provenance has the share of directions that was seen by actor id (``completed_actors``), and a note.
+
+    Args:
+        scene: a reconstruction; actors that deform (Gaussians of their own that are not fixed to their box) stay.
+        clip: its log.
+        hold_out: sweeps that must not be read, by index, of every LiDAR.
+    """
+    parts, seen = [], {}
+    beams: list[SweepBeams] | None = None
+    driven, light = cKDTree(scene.ego.position_m), _light(scene.static)
+    for number, track in enumerate(scene.tracks):
+        if not (track.labelled and track.actor and track.label in LABELS):
+            continue
+        if not np.isfinite(driven.query(track.path.position_m, distance_upper_bound=NEAR_M)[0]).any():
+            continue
+        own = _own(scene, number)
+        if own is None or (share := _seen(own, track.size_m)) >= LEAST_SEEN:
+            continue
+        body = _body(track, own, light)
+        missing = _missing(body, own)
+        if beams is None:
+            chosen = chosen_sweeps(clip, hold_out, SWEEPS)
+            beams = [sweep_beams(clip, lidar, clip.sweep(lidar, index)) for lidar, index in chosen]
+        if _free(_cells(track), track, beams).mean() > MOST_FREE:
+            continue
+        part = body[missing & ~_free(body, track, beams)]
+        if not len(part):
+            continue
+        parts.append(DynamicGaussians.rigid(part, np.full(len(part), number, np.int32), track.path.start_us))
+        seen[track.id] = share
+    if not parts:
+        return scene
+    note = (
+        f"{len(seen)} labelled actors were hardly seen: where nothing was measured they have bodies of their class "
+        "(completed_actors)"
+    )
+    unknown = [*scene.provenance.get("unknown", ()), note]
+    provenance = {**scene.provenance, "completed_actors": seen, "unknown": unknown}
+    dynamic = DynamicGaussians.concatenate([scene.dynamic, *parts] if len(scene.dynamic) else parts)
+    return dataclasses.replace(scene, dynamic=dynamic, provenance=provenance)
+
+
+def _own(scene: GaussianScene, number: int) -> Gaussians | None:
+    """The Gaussians of an actor in the frame of its box; None if some are not fixed to it.
+
+    Methods may have left an actor that stands in the static layer, as movable Gaussians.
+    """
+    dynamic, track = scene.dynamic, scene.tracks[number]
+    mine = dynamic.track == number
+    if mine.any():
+        fixed = dynamic.in_box is not None and dynamic.in_box[mine].all()
+        return dynamic.gaussians[mine] if fixed else None
+    place = track.path.position_m
+    if np.ptp(place, axis=0).max() > min(track.size_m) / 2:
+        return Gaussians.empty()
+    near = np.linalg.norm(scene.static.mean_m - place[0], axis=1) < np.linalg.norm(track.size_m)
+    near &= scene.static.label == Label.MOVABLE
+    xyz = geometry.transform_points(geometry.inverse(track.path.world_from_body[0]), scene.static.mean_m[near])
+    inside = (np.abs(xyz) < np.array(track.size_m) / 2).all(axis=1)
+    found = scene.static[np.flatnonzero(near)[inside]]
+    return dataclasses.replace(found, mean_m=xyz[inside].astype(np.float32))
+
+
+def _seen(own: Gaussians, size_m: tuple[float, float, float]) -> float:
+    """Share of the directions around the middle of a box, in units of its sides, in which Gaussians lie."""
+    x, y = (own.mean_m[own.opacity > SOLID, :2] / np.array(size_m[:2])).T
+    direction = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * DIRECTIONS).astype(np.int64) % DIRECTIONS
+    return float((np.bincount(direction, minlength=DIRECTIONS) >= LEAST_OF_EACH).mean())
+
+
+def _light(static: Gaussians) -> float:
+    """How bright bodies are that were made for the light of a day, 0..1."""
+    solid = static.opacity > SOLID
+    if not solid.any():
+        return 1.0
+    return float(np.clip(np.median(static.rgb[solid] @ np.array(LUMINANCE)) / DAYLIGHT, DARKEST, 1.0))
+
+
+def _body(track: Track, own: Gaussians, light: float) -> Gaussians:
+    """A body of the actor's class as large as its box, without a shadow: that of the log lies on the ground already."""
+    label = np.array([LABEL_OF_KIND.get(kind, "automobile") for kind in ACTOR_SIZES_M])
+    kinds = [kind for kind, other in zip(ACTOR_SIZES_M, label, strict=True) if other == track.label]
+    # Of several kinds of car the one that has to be stretched least.
+    stretch = [np.abs(np.log(np.array(track.size_m) / ACTOR_SIZES_M[kind])).max() for kind in kinds]
+    solid = own.opacity > SOLID
+    colour = GREY
+    if solid.sum() >= LEAST_COLOURED:
+        colour = tuple(np.clip(np.median(own.rgb[solid], axis=0) / light, 0, 1).tolist())
+    body = actor_gaussians(kinds[int(np.argmin(stretch))], track.size_m, colour, COARSER)
+    return dataclasses.replace(body, rgb=(light * body.rgb).astype(np.float32))[body.label == Label.MOVABLE]
+
+
+def _missing(body: Gaussians, own: Gaussians) -> Bool[np.ndarray, " n"]:
+    """Which Gaussians of a body lie where nothing of the actor was seen."""
+    solid = own.mean_m[own.opacity > SOLID]
+    if not len(solid):
+        return np.ones(len(body), bool)
+    return cKDTree(solid).query(body.mean_m, distance_upper_bound=REACH_M)[0] > REACH_M
+
+
+def _cells(track: Track) -> Gaussians:
+    """Balls that fill an actor's box."""
+    sides = [(np.arange(n) + 0.5) / n * size - size / 2
+             for size in track.size_m if (n := max(1, round(size / CELL_M)))]  # fmt: skip
+    xyz = np.stack([part.ravel() for part in np.meshgrid(*sides, indexing="ij")], axis=1)
+    return balls(xyz, np.full(len(xyz), BALL_M))
+
+
+def _free(gaussians: Gaussians, track: Track, beams: list[SweepBeams]) -> Bool[np.ndarray, " n"]:
+    """Which Gaussians in the frame of an actor's box recorded beams passed through, while it was labelled."""
+    path = track.path
+
+    def place(t_us: int) -> Float64[np.ndarray, "4 4"] | None:
+        return path.at(t_us) if path.start_us <= t_us <= path.end_us else None
+
+    return in_free_space(gaussians, beams, place)

@@ -1,0 +1,152 @@
+"""Labelled actors that no sensor saw, or saw from one side, get bodies of their class; others stay as they are."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from reconstruct_street import Street
+
+from nurec_sim import geometry
+from nurec_sim.reconstruct import reconstruct
+from nurec_sim.reconstruct.free_space import balls
+from nurec_sim.reconstruct.hidden_actors import with_hidden_actors
+from nurec_sim.render import make_renderer
+from nurec_sim.types import (
+    DynamicGaussians,
+    Gaussians,
+    GaussianScene,
+    Label,
+    SensorRequest,
+    Track,
+    Trajectory,
+)
+
+SIZE_M = (4.5, 1.8, 1.5)
+HIDDEN_M, OPEN_M, FAR_M = (8.0, 11.0), (8.0, 2.0), (8.0, 90.0)
+"""Behind the wall, on the road that the LiDAR sees to be free, and farther than 60 m from the path."""
+
+
+@pytest.fixture(scope="module")
+def street() -> Street:
+    return Street(frames=7, speed_mps=4.0)
+
+
+def track(place_m=HIDDEN_M, **changes) -> Track:
+    pose = geometry.pose_from_xyyaw(*place_m, 0.0, SIZE_M[2] / 2)
+    whole = Trajectory(np.array([1_000_000, 2_400_000]), np.stack([pose, pose]))
+    return dataclasses.replace(Track("car", "automobile", SIZE_M, whole), **changes)
+
+
+def scene_of(street: Street, what: Track, own: Gaussians | None = None, in_box: bool = True) -> GaussianScene:
+    dynamic = DynamicGaussians.empty()
+    if own is not None:
+        dynamic = DynamicGaussians.rigid(own, np.zeros(len(own), np.int32), 1_000_000)
+        dynamic = dataclasses.replace(dynamic, in_box=np.full(len(own), in_box))
+    return GaussianScene(
+        id="street", static=Gaussians.empty(), dynamic=dynamic, sky=np.zeros((6, 8, 8, 3), np.float32), isp={},
+        rig=street.rig, ego=street.ego, tracks=(what,), road_map=None, span_us=street.span_us,
+        camera_times_us={}, provenance={"unknown": ["no map"]},
+    )  # fmt: skip
+
+
+def plate(x_m: float, y_m: float = 0.0, across: bool = True) -> Gaussians:
+    """A wall of red Gaussians 10 cm apart: the rear of the box, or one of its sides."""
+    width = SIZE_M[1] if across else SIZE_M[0]
+    a, z = (
+        part.ravel() for part in np.meshgrid(np.arange(0.05 - width / 2, width / 2, 0.1), np.arange(-0.7, 0.75, 0.1))
+    )
+    where = np.stack([np.full(a.size, x_m), a, z] if across else [a, np.full(a.size, y_m), z], axis=1)
+    red = np.tile(np.array([[0.6, 0.1, 0.1]], np.float32), (len(where), 1))
+    solid = np.full(len(where), 0.9, np.float32)
+    return dataclasses.replace(balls(where, np.full(len(where), 0.05)), rgb=red, opacity=solid)
+
+
+def test_an_actor_that_nothing_saw_gets_a_body_that_fills_its_box(street):
+    completed = with_hidden_actors(scene_of(street, track()), street)
+    body = completed.dynamic.gaussians
+    assert (completed.dynamic.track == 0).all() and completed.dynamic.in_box.all()
+    assert np.allclose(np.ptp(body.mean_m, axis=0), SIZE_M, atol=0.1)
+    assert np.allclose(body.mean_m.min(axis=0), -np.array(SIZE_M) / 2, atol=0.1)
+    assert (body.label == Label.MOVABLE).all()  # no second shadow
+    assert completed.provenance["completed_actors"] == {"car": 0.0}
+    assert completed.provenance["unknown"][0] == "no map" and "1 labelled actor" in completed.provenance["unknown"][1]
+
+
+@pytest.mark.parametrize("grey, factor", [(0.33, 1.0), (0.6, 1.0), (0.165, 0.5), (0.01, 0.3)])
+def test_bodies_are_as_dark_as_the_night_around_them(street, grey, factor):
+    around = plate(20.0)
+    dark = dataclasses.replace(around, rgb=np.full((len(around), 3), grey, np.float32))
+    by_night = dataclasses.replace(scene_of(street, track()), static=dark)
+    bodies = [with_hidden_actors(each, street).dynamic.gaussians for each in (scene_of(street, track()), by_night)]
+    assert bodies[1].rgb == pytest.approx(factor * bodies[0].rgb, abs=1e-5)
+
+
+def test_what_was_seen_from_behind_keeps_its_rear_and_gets_the_rest_in_its_colour(street):
+    rear = plate(-2.2)
+    completed = with_hidden_actors(scene_of(street, track(), rear), street)
+    added = completed.dynamic.gaussians[len(rear) :]
+    distance = np.linalg.norm(added.mean_m[:, None] - rear.mean_m[None], axis=2).min(axis=1)
+    assert distance.min() > 0.4 and added.mean_m[:, 0].max() > 2.1
+    red, green, _ = np.median(added.rgb[(np.abs(added.mean_m[:, 1]) > 0.8) & (added.mean_m[:, 2] < 0)], axis=0)
+    assert red > 3 * green
+    # Four of sixteen directions are those to the rear, from corner to corner.
+    assert completed.provenance["completed_actors"]["car"] == 0.25
+
+
+@pytest.mark.parametrize(
+    "what, own",
+    [
+        (track(), Gaussians.concatenate([plate(-2.2), plate(0, 0.9, across=False)])),
+        (track(labelled=False), None),
+        (track(actor=False), None),
+        (track(label="animal"), None),
+        (track(FAR_M), None),
+        (track(OPEN_M), None),
+    ],
+    ids=["seen from two sides", "found", "no actor", "no body of its class", "far away", "in free space"],
+)
+def test_others_stay_as_they_are(street, what, own):
+    before = scene_of(street, what, own)
+    assert with_hidden_actors(before, street) is before
+
+
+def test_what_is_not_fixed_to_its_box_stays(street):
+    before = scene_of(street, track(), plate(-2.2), in_box=False)
+    assert with_hidden_actors(before, street) is before
+
+
+def test_a_standing_car_that_a_method_left_in_the_static_layer_was_seen(street):
+    around = Gaussians.concatenate([plate(x) for x in (-2.2, 2.2)] + [plate(0, y, across=False) for y in (-0.8, 0.8)])
+    place = around.mean_m + np.array([*HIDDEN_M, SIZE_M[2] / 2], np.float32)
+    label = np.full(len(around), Label.MOVABLE, np.uint8)
+    before = dataclasses.replace(
+        scene_of(street, track()), static=dataclasses.replace(around, mean_m=place, label=label)
+    )
+    assert with_hidden_actors(before, street) is before
+    wall = dataclasses.replace(before, static=dataclasses.replace(before.static, label=np.zeros_like(label)))
+    assert with_hidden_actors(wall, street).provenance["completed_actors"] == {"car": 0.0}
+
+
+def test_sweeps_that_are_held_out_are_not_read(street):
+    class Careful(Street):
+        def sweep(self, lidar_id, index):
+            assert index not in (1, 3)
+            return super().sweep(lidar_id, index)
+
+    with_hidden_actors(scene_of(street, track()), Careful(frames=7, speed_mps=4.0), {1, 3})
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_reconstruct_makes_a_hidden_actor_visible_to_a_lidar_beside_it(complete):
+    log = Street(frames=5, speed_mps=4.0)
+    log.tracks = [track()]
+    scene = reconstruct(log, "lift", complete_actors=complete)
+    assert ("completed_actors" in scene.provenance) == complete
+    lidar = log.rig.lidars["top"]
+    pose = geometry.pose_from_xyyaw(0.0, HIDDEN_M[1], 0.0) @ lidar.rig_from_lidar  # behind it, behind the wall
+    (sweep,) = make_renderer(scene, "cpu").sense(
+        [SensorRequest("street", lidar, 1_500_000, 1_500_001, np.stack([pose, pose]))]
+    )
+    points = geometry.transform_points(pose, sweep.xyz_m.astype(np.float64)) - [*HIDDEN_M, SIZE_M[2] / 2]
+    on_it = (np.abs(points) < np.array(SIZE_M) / 2 + 0.1).all(axis=1) & (points[:, 2] > 0)  # not on the ground
+    assert (on_it.sum() > 20) == complete
