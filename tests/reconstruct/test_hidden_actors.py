@@ -7,7 +7,7 @@ import pytest
 from reconstruct_street import Street
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct import reconstruct
+from nurec_sim.reconstruct import hidden_actors, reconstruct
 from nurec_sim.reconstruct.free_space import balls
 from nurec_sim.reconstruct.hidden_actors import with_hidden_actors
 from nurec_sim.render import make_renderer
@@ -20,6 +20,7 @@ from nurec_sim.types import (
     Track,
     Trajectory,
 )
+from nurec_sim.world import actor_gaussians
 
 SIZE_M = (4.5, 1.8, 1.5)
 HIDDEN_M, OPEN_M, FAR_M = (8.0, 11.0), (8.0, 2.0), (8.0, 90.0)
@@ -70,6 +71,40 @@ def test_an_actor_that_nothing_saw_gets_a_body_that_fills_its_box(street):
     assert (body.label == Label.MOVABLE).all()  # no second shadow
     assert completed.provenance["completed_actors"] == {"car": 0.0}
     assert completed.provenance["unknown"][0] == "no map" and "1 labelled actor" in completed.provenance["unknown"][1]
+
+
+@pytest.mark.parametrize(
+    "label, size_m, kind",
+    [
+        ("automobile", (4.7, 1.8, 1.4), "sedan"),
+        ("automobile", (5.2, 2.0, 2.2), "van"),
+        ("bus", (12.0, 2.5, 3.2), "bus"),
+        ("person", (0.6, 0.6, 1.8), "pedestrian"),
+        ("rider", (1.8, 0.6, 1.7), "cyclist"),
+    ],
+)
+def test_the_body_is_of_the_actors_class_and_the_kind_that_is_stretched_least(street, monkeypatch, label, size_m, kind):
+    made = []
+
+    def noted(*given):
+        made.append(given)
+        return actor_gaussians(*given)
+
+    monkeypatch.setattr(hidden_actors, "actor_gaussians", noted)
+    completed = with_hidden_actors(scene_of(street, track(label=label, size_m=size_m)), street)
+    assert [given[:2] for given in made] == [(kind, size_m)]
+    # Twice as far apart as those of an actor that a scenario adds: a fourth as many, less so where parts are small.
+    usual = actor_gaussians(kind, size_m, (0.5, 0.5, 0.5))
+    assert 0.2 < len(completed.dynamic) / (usual.label == Label.MOVABLE).sum() < 0.35
+
+
+def test_what_beams_passed_through_is_left_out(street):
+    # Half of the box lies behind the wall at y = 8 m, the other half stands over the pavement that the LiDAR saw.
+    over = with_hidden_actors(scene_of(street, track((8.0, 8.2))), street).dynamic.gaussians
+    behind = with_hidden_actors(scene_of(street, track()), street).dynamic.gaussians
+    inside, outside = ([(each.mean_m[:, 1] * side > 0.3).sum() for side in (1, -1)] for each in (behind, over))
+    assert inside[0] == pytest.approx(inside[1], rel=0.1)
+    assert outside[0] == pytest.approx(inside[0], rel=0.05) and outside[1] < 0.9 * inside[1]
 
 
 @pytest.mark.parametrize("grey, factor", [(0.33, 1.0), (0.6, 1.0), (0.165, 0.5), (0.01, 0.3)])
