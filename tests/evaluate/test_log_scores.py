@@ -326,12 +326,13 @@ def test_a_copied_sweep_tells_the_range_of_its_return_nearest_in_direction():
 
 
 def test_scores_of_sweeps_have_those_of_the_nearest_seen_sweep_beside_them(monkeypatch):
-    clip, asked, copied = Street(frames=6), [], []
-    monkeypatch.setattr(
-        lidar_scores,
-        "copied_sweep",
-        lambda xyz, other, surface: copied.append(other) or copied_sweep(xyz, other, surface),
-    )
+    clip, asked, copied = Street(frames=6, boxes={"post": ((0.5, 0.5, 2.0), (12.0, 2.0))}, labelled=False), [], []
+
+    def noted(xyz, other, surface):
+        copied.append((xyz, other))
+        return copied_sweep(xyz, other, surface)
+
+    monkeypatch.setattr(lidar_scores, "copied_sweep", noted)
     measured = clip.sweep
     clip.sweep = lambda lidar, index: asked.append(index) or measured(lidar, index)
 
@@ -342,8 +343,12 @@ def test_scores_of_sweeps_have_those_of_the_nearest_seen_sweep_beside_them(monke
     figures = lidar_scores.score_sweeps(clip, clip.rig.lidars, [1, 2, 4], sense, lambda stage, done: None)
     # 0 is as near to 1 as 2 is, which is held out; 3 is the nearest to 2, and to 4 the first of 3 and 5.
     assert asked == [1, 0, 2, 3, 4, 3]
-    # In the frame of the sweep itself: the walls are 8 m to the left and right, whichever sweep saw them.
-    assert all(np.abs(cloud[:, 1]).max() == pytest.approx(8) for cloud in copied)
+    # In the frame of the sweep itself, 1 m farther along the road each time: the front of the post is at x = 11.75 m.
+    for index, clouds in zip([1, 2, 4], copied, strict=True):
+        assert not np.array_equal(*clouds)
+        for cloud in clouds:
+            post = cloud[(np.abs(cloud[:, 1] - 2) < 0.24) & (cloud[:, 2] > -1)]
+            assert post[:, 0].min() == pytest.approx(11.75 - 0.5 - 1.0 * index)
     assert figures["copied"]["return_recall"] > 0.9 > figures["return_recall"] == 0
     assert figures["copied"]["by_range"]["0-10 m"]["median_abs_range_error_m"] < 0.1
     every = range(len(clip.t_us))
