@@ -23,8 +23,8 @@ from nurec_sim.world import ACTOR_SIZES_M, LABEL_OF_KIND, actor_gaussians
 
 LABELS = ("automobile", "heavy_truck", "bus", "person", "rider")
 """Classes that there are bodies of."""
-COARSER = 2.0
-"""Distance of their Gaussians by that of actors that a scenario adds: a quarter of the number."""
+COARSER = 1.5
+"""Distance of their Gaussians by that of actors that a scenario adds: less than half of the number."""
 REACH_M = 0.4
 """A body's surface was seen where a Gaussian of the actor is so near."""
 DIRECTIONS, LEAST_SEEN, LEAST_OF_EACH = 16, 0.5, 3
