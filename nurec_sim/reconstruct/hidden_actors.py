@@ -3,8 +3,7 @@
 A car that another hid in the log, or whose rear alone was seen, has no surface there: once the ego drives elsewhere or
 a scenario moves the car, no camera and no LiDAR would see what collisions count. Such actors get the missing part of a
 body of the procedural towns (``world.actor_gaussians``), as large as their box, its paint the median colour of what was
-seen.
-Actors that were seen from two sides or more stay as they are.
+seen. Actors that were seen from two sides or more stay as they are.
 """
 
 from __future__ import annotations
@@ -18,11 +17,12 @@ from scipy.spatial import cKDTree
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.free_space import SweepBeams, balls, chosen_sweeps, in_free_space, sweep_beams
+from nurec_sim.scene.edits import joined_dynamic
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene, Label, Track
 from nurec_sim.world import ACTOR_SIZES_M, LABEL_OF_KIND, actor_gaussians
 
-LABELS = ("automobile", "heavy_truck", "bus", "person", "rider")
-"""Classes that there are bodies of."""
+MOST_STRETCH = 2.5
+"""A side of a box by that of the body, or the reverse: others are not of this class, or wrong."""
 COARSER = 1.5
 """Distance of their Gaussians by that of actors that a scenario adds: less than half of the number."""
 REACH_M = 0.4
@@ -50,8 +50,7 @@ def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[in
     """The scene with bodies for labelled actors that the sensors hardly saw.
 
     What recorded beams passed through is left out. If they passed through most of the box the label is wrong, and there
-    is no body.
-    The provenance has the share of directions that was seen by actor id (``completed_actors``), and a note.
+    is no body. The provenance has the share of directions that was seen by actor id (``completed_actors``), and a note.
 
     Args:
         scene: a reconstruction; actors that deform (Gaussians of their own that are not fixed to their box) stay.
@@ -62,14 +61,14 @@ def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[in
     beams: list[SweepBeams] | None = None
     driven, light = cKDTree(scene.ego.position_m), _light(scene.static)
     for number, track in enumerate(scene.tracks):
-        if not (track.labelled and track.actor and track.label in LABELS):
+        if not (track.labelled and track.actor and (kind := _kind(track))):
             continue
         if not np.isfinite(driven.query(track.path.position_m, distance_upper_bound=NEAR_M)[0]).any():
             continue
         own = _own(scene, number)
         if own is None or (share := _seen(own, track.size_m)) >= LEAST_SEEN:
             continue
-        body = _body(track, own, light)
+        body = _body(kind, track, own, light)
         missing = _missing(body, own)
         if beams is None:
             chosen = chosen_sweeps(clip, hold_out, SWEEPS)
@@ -89,8 +88,17 @@ def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[in
     )
     unknown = [*scene.provenance.get("unknown", ()), note]
     provenance = {**scene.provenance, "completed_actors": seen, "unknown": unknown}
-    dynamic = DynamicGaussians.concatenate([scene.dynamic, *parts] if len(scene.dynamic) else parts)
+    bodies = DynamicGaussians.concatenate(parts)
+    dynamic = joined_dynamic(scene.dynamic, bodies) if len(scene.dynamic) else bodies
     return dataclasses.replace(scene, dynamic=dynamic, provenance=provenance)
+
+
+def _kind(track: Track) -> str | None:
+    """The kind of the actor's class that has to be stretched least to fill its box; None if there is none like it."""
+    kinds = [kind for kind in ACTOR_SIZES_M if LABEL_OF_KIND.get(kind, "automobile") == track.label]
+    size_m = np.maximum(track.size_m, 1e-3)
+    stretch = [np.exp(np.abs(np.log(size_m / ACTOR_SIZES_M[kind])).max()) for kind in kinds]
+    return kinds[int(np.argmin(stretch))] if kinds and min(stretch) <= MOST_STRETCH else None
 
 
 def _own(scene: GaussianScene, number: int) -> Gaussians | None:
@@ -129,17 +137,13 @@ def _light(static: Gaussians) -> float:
     return float(np.clip(np.median(static.rgb[solid] @ np.array(LUMINANCE)) / DAYLIGHT, DARKEST, 1.0))
 
 
-def _body(track: Track, own: Gaussians, light: float) -> Gaussians:
-    """A body of the actor's class as large as its box, without a shadow: that of the log lies on the ground already."""
-    label = np.array([LABEL_OF_KIND.get(kind, "automobile") for kind in ACTOR_SIZES_M])
-    kinds = [kind for kind, other in zip(ACTOR_SIZES_M, label, strict=True) if other == track.label]
-    # Of several kinds of car the one that has to be stretched least.
-    stretch = [np.abs(np.log(np.array(track.size_m) / ACTOR_SIZES_M[kind])).max() for kind in kinds]
+def _body(kind: str, track: Track, own: Gaussians, light: float) -> Gaussians:
+    """A body as large as the actor's box, without a shadow: that of the log lies on the ground already."""
     solid = own.opacity > SOLID
     colour = GREY
     if solid.sum() >= LEAST_COLOURED:
         colour = tuple(np.clip(np.median(own.rgb[solid], axis=0) / light, 0, 1).tolist())
-    body = actor_gaussians(kinds[int(np.argmin(stretch))], track.size_m, colour, COARSER)
+    body = actor_gaussians(kind, track.size_m, colour, COARSER)
     return dataclasses.replace(body, rgb=(light * body.rgb).astype(np.float32))[body.label == Label.MOVABLE]
 
 

@@ -204,7 +204,7 @@ def _grown(scene: GaussianScene, track: Track, asset: Asset) -> GaussianScene:
             f"an edited scene may have {MAX_DYNAMIC:,} moving Gaussians; with track {track.id!r} it has {total:,}"
         )
     added = DynamicGaussians.rigid(look, np.full(len(look), len(scene.tracks), np.int32), first)
-    dynamic = _joined(scene.dynamic, added) if len(scene.dynamic) else added
+    dynamic = joined_dynamic(scene.dynamic, added) if len(scene.dynamic) else added
     return dataclasses.replace(scene, dynamic=dynamic, tracks=(*scene.tracks, track))
 
 
@@ -232,7 +232,7 @@ def _rows(dynamic: DynamicGaussians, keep: Bool[np.ndarray, " n"]) -> DynamicGau
     )
 
 
-def _joined(one: DynamicGaussians, other: DynamicGaussians) -> DynamicGaussians:
+def joined_dynamic(one: DynamicGaussians, other: DynamicGaussians) -> DynamicGaussians:
     """Concatenation, with harmonics padded to the higher degree."""
     count = len(one)
     gaussians = joined([one.gaussians, other.gaussians])

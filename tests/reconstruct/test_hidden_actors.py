@@ -135,10 +135,21 @@ def test_what_was_seen_from_behind_keeps_its_rear_and_gets_the_rest_in_its_colou
         (track(labelled=False), None),
         (track(actor=False), None),
         (track(label="animal"), None),
+        (track(size_m=(14.0, 1.8, 1.5)), None),
+        (track(size_m=(4.5, 0.0, 1.5)), None),
         (track(FAR_M), None),
         (track(OPEN_M), None),
     ],
-    ids=["seen from two sides", "found", "no actor", "no body of its class", "far away", "in free space"],
+    ids=[
+        "seen from two sides",
+        "found",
+        "no actor",
+        "no body of its class",
+        "far too long",
+        "no width",
+        "far away",
+        "in free space",
+    ],
 )
 def test_others_stay_as_they_are(street, what, own):
     before = scene_of(street, what, own)
@@ -148,6 +159,12 @@ def test_others_stay_as_they_are(street, what, own):
 def test_what_is_not_fixed_to_its_box_stays(street):
     before = scene_of(street, track(), plate(-2.2), in_box=False)
     assert with_hidden_actors(before, street) is before
+
+
+def test_a_body_joins_view_dependent_colours(street):
+    rear = dataclasses.replace(plate(-2.2), sh_rest=np.full((len(plate(-2.2)), 3, 3), 0.1, np.float32))
+    rest = with_hidden_actors(scene_of(street, track(), rear), street).dynamic.gaussians.sh_rest
+    assert (rest[: len(rear)] == np.float32(0.1)).all() and (rest[len(rear) :] == 0).all() and len(rest) > len(rear)
 
 
 def test_a_standing_car_that_a_method_left_in_the_static_layer_was_seen(street):
