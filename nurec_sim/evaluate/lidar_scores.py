@@ -68,8 +68,8 @@ def score_sweeps(
         names.append({"lidar": lidar, "sweep": index})
         if (other := _nearest_seen(clip, lidar, index, held)) is not None:
             here = geometry.inverse(sweep.world_from_lidar)
-            both = (geometry.transform_points(here, each.xyz_world_m) for each in (sweep, other))
-            copies.append(copied_sweep(*both, surface))
+            xyz, instead = (geometry.transform_points(here, each.xyz_world_m) for each in (sweep, other))
+            copies.append(copied_sweep(xyz, instead, surface))
     report("held-out sweeps", 1.0)
     return {
         **_along_beams(LidarScore.pooled(scores)),

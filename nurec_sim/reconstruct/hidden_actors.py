@@ -17,6 +17,8 @@ from scipy.spatial import cKDTree
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.free_space import SweepBeams, balls, chosen_sweeps, in_free_space, sweep_beams
+from nurec_sim.render import make_renderer
+from nurec_sim.render.support import Points, Support, recorded_frames
 from nurec_sim.scene.edits import joined_dynamic
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene, Label, Track
 from nurec_sim.world import ACTOR_SIZES_M, LABEL_OF_KIND, actor_gaussians
@@ -38,8 +40,8 @@ GREY = (0.45, 0.45, 0.47)
 DAYLIGHT, DARKEST = 0.33, 0.3
 """Median luminance of static Gaussians by day, about; by night bodies are as much darker, down to this factor."""
 LUMINANCE = (0.2126, 0.7152, 0.0722)
-SWEEPS = 16
-"""Recorded sweeps, at most, whose beams may show that there is no such body."""
+SWEEPS, VIEWS = 16, 16
+"""Recorded sweeps, at most, and images, about, that may show that there is no such body."""
 CELL_M, BALL_M, MOST_FREE = 0.5, 0.15, 0.5
 """A box is tested with a ball in each such cell. If beams passed through more of them the label is not believed."""
 SOLID = 0.3
@@ -49,15 +51,18 @@ SOLID = 0.3
 def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[int] = ()) -> GaussianScene:
     """The scene with bodies for labelled actors that the sensors hardly saw.
 
-    What recorded beams passed through is left out. If they passed through most of the box the label is wrong, and there
-    is no body. The provenance has the share of directions that was seen by actor id (``completed_actors``), and a note.
+    What recorded beams passed through is left out, and what recorded images look at: there the scene shows what they
+    saw. If beams passed through most of the box, or images look at most of what would be added, the label is wrong or
+    the actor elsewhere, and there is no body. The provenance has the share of directions that was seen by actor id
+    (``completed_actors``), and a note.
 
     Args:
         scene: a reconstruction; actors that deform (Gaussians of their own that are not fixed to their box) stay.
         clip: its log.
         hold_out: sweeps that must not be read, by index, of every LiDAR.
     """
-    parts, seen = [], {}
+    bodies: dict[int, Gaussians] = {}
+    seen: dict[int, float] = {}
     beams: list[SweepBeams] | None = None
     driven, light = cKDTree(scene.ego.position_m), _light(scene.static)
     for number, track in enumerate(scene.tracks):
@@ -68,28 +73,26 @@ def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[in
         own = _own(scene, number)
         if own is None or (share := _seen(own, track.size_m)) >= LEAST_SEEN:
             continue
-        body = _body(kind, track, own, light)
-        missing = _missing(body, own)
         if beams is None:
             chosen = chosen_sweeps(clip, hold_out, SWEEPS)
             beams = [sweep_beams(clip, lidar, clip.sweep(lidar, index)) for lidar, index in chosen]
         if _free(_cells(track), track, beams).mean() > MOST_FREE:
             continue
-        part = body[missing & ~_free(body, track, beams)]
-        if not len(part):
-            continue
-        parts.append(DynamicGaussians.rigid(part, np.full(len(part), number, np.int32), track.path.start_us))
-        seen[track.id] = share
-    if not parts:
+        body = _body(kind, track, own, light)
+        bodies[number], seen[number] = body[_missing(body, own) & ~_free(body, track, beams)], share
+    bodies = _out_of_sight(scene, bodies)
+    if not bodies:
         return scene
     note = (
-        f"{len(seen)} labelled actors were hardly seen: where nothing was measured they have bodies of their class "
+        f"{len(bodies)} labelled actors were hardly seen: where nothing was measured they have bodies of their class "
         "(completed_actors)"
     )
     unknown = [*scene.provenance.get("unknown", ()), note]
-    provenance = {**scene.provenance, "completed_actors": seen, "unknown": unknown}
-    bodies = DynamicGaussians.concatenate(parts)
-    dynamic = joined_dynamic(scene.dynamic, bodies) if len(scene.dynamic) else bodies
+    told = {scene.tracks[number].id: seen[number] for number in bodies}
+    provenance = {**scene.provenance, "completed_actors": told, "unknown": unknown}
+    of_track = np.repeat(np.array(list(bodies), np.int32), [len(body) for body in bodies.values()])
+    added = DynamicGaussians.rigid(Gaussians.concatenate(list(bodies.values())), of_track, scene.span_us[0])
+    dynamic = joined_dynamic(scene.dynamic, added) if len(scene.dynamic) else added
     return dataclasses.replace(scene, dynamic=dynamic, provenance=provenance)
 
 
@@ -171,3 +174,21 @@ def _free(gaussians: Gaussians, track: Track, beams: list[SweepBeams]) -> Bool[n
         return path.at(t_us) if path.start_us <= t_us <= path.end_us else None
 
     return in_free_space(gaussians, beams, place)
+
+
+def _out_of_sight(scene: GaussianScene, bodies: dict[int, Gaussians]) -> dict[int, Gaussians]:
+    """The parts of bodies, by track, that no recorded image sees or looks through; none of bodies that most do."""
+    if not recorded_frames(scene) or not any(map(len, bodies.values())):
+        return {number: body for number, body in bodies.items() if len(body)}
+    poses = {number: scene.tracks[number].path.world_from_body[0] for number in bodies}
+    place = np.concatenate(
+        [geometry.transform_points(poses[number], body.mean_m.astype(np.float64)) for number, body in bodies.items()]
+    )
+    eye = scene.ego.position_m[0]
+    distance = np.linalg.norm(place - eye, axis=1)
+    counts = [len(body) for body in bodies.values()]
+    points = Points(eye, (place - eye) / distance[:, None], distance, np.repeat(list(bodies), counts), poses)
+    evidence = Support(make_renderer(scene, "cpu"), most=VIEWS).evidence(points)
+    hidden = np.split((evidence.seen == 0) & (evidence.through == 0), np.cumsum(counts)[:-1])
+    return {number: body[unseen] for (number, body), unseen in zip(bodies.items(), hidden, strict=True)
+            if len(body) and unseen.mean() > 1 - MOST_FREE}  # fmt: skip

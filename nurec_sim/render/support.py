@@ -102,14 +102,17 @@ class Support:
     Args:
         renderer: of the scene.
         progress: called with the fraction done.
+        most: about so many recorded views, evenly over the log; together, but ``LEAST_PER_CAMERA`` of each.
 
     Raises:
         RequestError: the scene does not know when its cameras recorded.
     """
 
-    def __init__(self, renderer: Renderer, progress: Callable[[float], None] = lambda done: None) -> None:
+    def __init__(
+        self, renderer: Renderer, progress: Callable[[float], None] = lambda done: None, most: int = MOST_VIEWS
+    ) -> None:
         self._renderer, self._scene = renderer, renderer.scene
-        frames = recorded_frames(renderer.scene)
+        frames = recorded_frames(renderer.scene, most)
         if not frames:
             raise RequestError(f"scene {renderer.scene.id!r} has no times of recorded frames: its support is unknown")
         self._views = []
@@ -158,15 +161,15 @@ class Support:
         return Evidence(seen, through, angle, closer)
 
 
-def recorded_frames(scene: GaussianScene) -> list[tuple[CameraModel, int]]:
-    """Camera and middle of the exposure of the frames that a scene was made from; at most about ``MOST_VIEWS``."""
+def recorded_frames(scene: GaussianScene, most: int = MOST_VIEWS) -> list[tuple[CameraModel, int]]:
+    """Camera and middle of the exposure of the frames that a scene was made from; at most about ``most``."""
     used = [name for name in scene.provenance.get("cameras", scene.rig.cameras) if name in scene.rig.cameras]
     used = [name for name in used if len(scene.camera_times_us.get(name, ()))]
-    most = max(MOST_VIEWS // max(len(used), 1), LEAST_PER_CAMERA)
+    each = max(most // max(len(used), 1), LEAST_PER_CAMERA)
     frames = []
     for name in used:
         middle = np.asarray(scene.camera_times_us[name], np.int64).sum(axis=1) // 2
-        for place in np.unique(np.linspace(0, len(middle) - 1, min(most, len(middle))).round().astype(int)):
+        for place in np.unique(np.linspace(0, len(middle) - 1, min(each, len(middle))).round().astype(int)):
             # An instant [t, t + 1) must lie in the scene.
             frames.append((scene.rig.cameras[name], int(np.clip(middle[place], scene.span_us[0], scene.span_us[1]))))
     return frames

@@ -156,6 +156,22 @@ def test_others_stay_as_they_are(street, what, own):
     assert with_hidden_actors(before, street) is before
 
 
+@pytest.mark.parametrize("wall_m, added", [(4.0, True), (14.0, False)])
+def test_images_decide_where_a_body_would_be_seen(street, wall_m, added):
+    # The car stands 2 m above the road, where no beam of the LiDAR came by; the camera sees a wall before or behind it.
+    place = geometry.pose_from_xyyaw(9.0, 0.0, 0.0, 4.0)
+    there = Trajectory(np.array([1_000_000, 2_400_000]), np.stack([place, place]))
+    across, z = (part.ravel() for part in np.meshgrid(np.arange(-9, 9, 0.15), np.arange(-1, 14, 0.15)))
+    wall = balls(np.stack([np.full(across.size, wall_m), across, z], axis=1), np.full(across.size, 0.15))
+    solid = dataclasses.replace(wall, opacity=np.full(len(wall), 0.95, np.float32))
+    ahead = dataclasses.replace(
+        scene_of(street, track(path=there)),
+        static=solid,
+        camera_times_us={"front": street.camera_times_us("front")[:1]},
+    )
+    assert (len(with_hidden_actors(ahead, street).dynamic) > 0) == added
+
+
 def test_what_is_not_fixed_to_its_box_stays(street):
     before = scene_of(street, track(), plate(-2.2), in_box=False)
     assert with_hidden_actors(before, street) is before
