@@ -156,20 +156,25 @@ def test_others_stay_as_they_are(street, what, own):
     assert with_hidden_actors(before, street) is before
 
 
-@pytest.mark.parametrize("wall_m, added", [(4.0, True), (14.0, False)])
-def test_images_decide_where_a_body_would_be_seen(street, wall_m, added):
-    # The car stands 2 m above the road, where no beam of the LiDAR came by; the camera sees a wall before or behind it.
+def test_no_part_of_a_body_is_where_an_image_looks(street):
+    # The car stands 3.2 m above the road, where no beam came by; the camera 5.25 m behind it sees a wall and its lower
+    # part.
     place = geometry.pose_from_xyyaw(9.0, 0.0, 0.0, 4.0)
     there = Trajectory(np.array([1_000_000, 2_400_000]), np.stack([place, place]))
     across, z = (part.ravel() for part in np.meshgrid(np.arange(-9, 9, 0.15), np.arange(-1, 14, 0.15)))
-    wall = balls(np.stack([np.full(across.size, wall_m), across, z], axis=1), np.full(across.size, 0.15))
-    solid = dataclasses.replace(wall, opacity=np.full(len(wall), 0.95, np.float32))
-    ahead = dataclasses.replace(
-        scene_of(street, track(path=there)),
-        static=solid,
-        camera_times_us={"front": street.camera_times_us("front")[:1]},
-    )
-    assert (len(with_hidden_actors(ahead, street).dynamic) > 0) == added
+    times_us = {"front": street.camera_times_us("front")[:1]}
+
+    def along(wall_m):
+        wall = balls(np.stack([np.full(across.size, wall_m), across, z], axis=1), np.full(across.size, 0.15))
+        solid = dataclasses.replace(wall, opacity=np.full(len(wall), 0.95, np.float32))
+        before = dataclasses.replace(scene_of(street, track(path=there)), static=solid, camera_times_us=times_us)
+        return with_hidden_actors(before, street).dynamic.gaussians.mean_m[:, 0]
+
+    before_it, at_its_rear, behind_it = along(4.0), along(6.9), along(14.0)
+    assert not len(behind_it)  # the image looks through it
+    assert before_it.max() > 2.2 and at_its_rear.max() > 2.2
+    rear = [(each < -2.2).sum() for each in (before_it, at_its_rear)]
+    assert rear[1] < 0.9 * rear[0]  # what the image sees there is the wall, 15 cm thick
 
 
 def test_what_is_not_fixed_to_its_box_stays(street):

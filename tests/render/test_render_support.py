@@ -184,3 +184,18 @@ def test_the_renderer_of_a_scene_of_gaussians_is_enough():
     assert support.map(look(), 60) == pytest.approx(ONE, abs=0.01)
     angle = np.arctan2(1, BOARD_M)
     assert support.map(look(y=1), 61)[20, 30] == pytest.approx(ONE * np.exp(-angle / ANGLE_RAD), abs=0.01)
+
+
+@pytest.mark.parametrize("most, views", [(48, 30), (12, 12), (2, 8)])
+def test_fewer_recorded_views_may_do_but_some_of_each_camera(most, views):
+    recorded = drive([(0.5 * k, 0.0) for k in range(30)])
+    assert len(recorded_frames(recorded, most)) == views
+    asked = []
+
+    class Counted(Planes):
+        def render_camera(self, request, outputs):
+            asked.append(request)
+            return super().render_camera(request, outputs)
+
+    Support(Counted(recorded), most=most)
+    assert len(asked) == views
