@@ -118,6 +118,8 @@ def reconstruct(
     print_table(f"scene {world_scene.id}", scene.summary(world_scene))
     for text in world_scene.provenance.get("unknown", ()):
         out.print(f"not known: {text}", markup=False)
+    if completed := world_scene.provenance.get("completed_actors"):
+        out.print(f"{len(completed)} labelled actors were hardly seen: they have bodies of their class (docs/lift.md)")
     out.print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
     if (kept := _checkpoint_of(target)).exists():
         out.print(f"the optimisation was interrupted: the same command with --resume goes on ({kept})", soft_wrap=True)

@@ -54,7 +54,7 @@ def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[in
     What recorded beams passed through is left out, and what recorded images look at: there the scene shows what they
     saw. If beams passed through most of the box, or images look at most of what would be added, the label is wrong or
     the actor elsewhere, and there is no body. The provenance has the share of directions that was seen by actor id
-    (``completed_actors``), and a note.
+    (``completed_actors``).
 
     Args:
         scene: a reconstruction; actors that deform (Gaussians of their own that are not fixed to their box) stay.
@@ -83,13 +83,8 @@ def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[in
     bodies = _out_of_sight(scene, bodies)
     if not bodies:
         return scene
-    note = (
-        f"{len(bodies)} labelled actors were hardly seen: where nothing was measured they have bodies of their class "
-        "(completed_actors)"
-    )
-    unknown = [*scene.provenance.get("unknown", ()), note]
     told = {scene.tracks[number].id: seen[number] for number in bodies}
-    provenance = {**scene.provenance, "completed_actors": told, "unknown": unknown}
+    provenance = {**scene.provenance, "completed_actors": told}
     of_track = np.repeat(np.array(list(bodies), np.int32), [len(body) for body in bodies.values()])
     added = DynamicGaussians.rigid(Gaussians.concatenate(list(bodies.values())), of_track, scene.span_us[0])
     dynamic = joined_dynamic(scene.dynamic, added) if len(scene.dynamic) else added
