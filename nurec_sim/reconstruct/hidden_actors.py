@@ -19,7 +19,8 @@ from nurec_sim import geometry
 from nurec_sim.reconstruct.free_space import SweepBeams, balls, chosen_sweeps, in_free_space, sweep_beams
 from nurec_sim.render import make_renderer
 from nurec_sim.render.support import Points, Support, recorded_frames
-from nurec_sim.scene.edits import joined_dynamic
+from nurec_sim.scene.edits import baked_in, joined_dynamic
+from nurec_sim.scene.transform import transformed
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene, Label, Track
 from nurec_sim.world import ACTOR_SIZES_M, LABEL_OF_KIND, actor_gaussians
 
@@ -109,15 +110,8 @@ def _own(scene: GaussianScene, number: int) -> Gaussians | None:
     if mine.any():
         fixed = dynamic.in_box is not None and dynamic.in_box[mine].all()
         return dynamic.gaussians[mine] if fixed else None
-    place = track.path.position_m
-    if np.ptp(place, axis=0).max() > min(track.size_m) / 2:
-        return Gaussians.empty()
-    near = np.linalg.norm(scene.static.mean_m - place[0], axis=1) < np.linalg.norm(track.size_m)
-    near &= scene.static.label == Label.MOVABLE
-    xyz = geometry.transform_points(geometry.inverse(track.path.world_from_body[0]), scene.static.mean_m[near])
-    inside = (np.abs(xyz) < np.array(track.size_m) / 2).all(axis=1)
-    found = scene.static[np.flatnonzero(near)[inside]]
-    return dataclasses.replace(found, mean_m=xyz[inside].astype(np.float32))
+    standing = scene.static[baked_in(scene, track)]
+    return transformed(standing, geometry.inverse(track.path.world_from_body[0])) if len(standing) else standing
 
 
 def _seen(own: Gaussians, size_m: tuple[float, float, float]) -> float:

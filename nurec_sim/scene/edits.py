@@ -60,7 +60,7 @@ def asset_of(scene: GaussianScene, track_id: str) -> Asset:
         parts.append(transformed(world, geometry.inverse(pose)))
     if not own.any():
         pose = track.path.world_from_body[0]
-        parts = [transformed(scene.static[_baked_in(scene, track)], geometry.inverse(pose))]
+        parts = [transformed(scene.static[baked_in(scene, track)], geometry.inverse(pose))]
     look = Gaussians.concatenate(parts)
     if not len(look):
         raise RequestError(f"track {track_id!r} of scene {scene.id!r} has no Gaussians of its own; {have(scene)}")
@@ -124,7 +124,7 @@ def without_track(scene: GaussianScene, track_id: str) -> GaussianScene:
     """
     number = _number_of(scene, track_id)
     own = scene.dynamic.track == number
-    static = scene.static if own.any() else scene.static[~_baked_in(scene, scene.tracks[number])]
+    static = scene.static if own.any() else scene.static[~baked_in(scene, scene.tracks[number])]
     kept = _rows(scene.dynamic, ~own)
     # Indices of later tracks move down by one.
     dynamic = dataclasses.replace(kept, track=(kept.track - (kept.track > number)).astype(np.int32))
@@ -173,13 +173,15 @@ def _standing(path: Trajectory, scene: GaussianScene) -> Trajectory:
     return Trajectory(np.array(scene.span_us), np.repeat(path.world_from_body[:1], 2, axis=0))
 
 
-def _baked_in(scene: GaussianScene, track: Track) -> Bool[np.ndarray, " n"]:
+def baked_in(scene: GaussianScene, track: Track) -> Bool[np.ndarray, " n"]:
     """Mask of static Gaussians that belong to a static track: the movable ones in its box, enlarged by 10 %."""
-    if not _stands(track):
-        return np.zeros(len(scene.static), bool)
-    local = geometry.transform_points(geometry.inverse(track.path.world_from_body[0]), scene.static.mean_m)
-    inside = (np.abs(local) <= 0.55 * np.array(track.size_m)).all(axis=1)
-    return inside & (scene.static.label == Label.MOVABLE)
+    inside = np.zeros(len(scene.static), bool)
+    if _stands(track):
+        movable = np.flatnonzero(scene.static.label == Label.MOVABLE)
+        box_from_world = geometry.inverse(track.path.world_from_body[0])
+        local = geometry.transform_points(box_from_world, scene.static.mean_m[movable])
+        inside[movable] = (np.abs(local) <= 0.55 * np.array(track.size_m)).all(axis=1)
+    return inside
 
 
 def _grown(scene: GaussianScene, track: Track, asset: Asset) -> GaussianScene:
