@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.free_space import SweepBeams, balls, in_free_space, sweep_beams
+from nurec_sim.reconstruct.free_space import VOTES, SweepBeams, balls, count_beams, sweep_beams
 from nurec_sim.reconstruct.lift.ground import Ground, find_ground
 from nurec_sim.reconstruct.lift.settings import GroundSettings
 from nurec_sim.types import Clip, Sweep
@@ -31,6 +31,8 @@ MOST_SWEEPS = 24
 """Sweeps of a window that have a say."""
 BALL_M = 0.15
 """Standard deviation of a return as a round Gaussian: about the distance between beams at 40 m."""
+CROSSED = 8
+"""Beams through a return, by those that ended at it, both within their noise, that make it one of a slow mover."""
 GROUND = GroundSettings(cell_m=0.2, reach_m=REACH_M)
 
 
@@ -43,12 +45,16 @@ class Seen:
         fired_us: when each was measured; what moves is where it was then.
         height_m: above the ground.
         moving: whether their place is free in other sweeps.
+        crossed: whether nearly all beams of other sweeps that came so far went through it, within their noise. This
+            tells earlier that something moves that moves slowly or ahead of the car, which only a few sweeps see past;
+            but it is true of foliage, too.
     """
 
     xyz_m: Float64[np.ndarray, "n 3"]
     fired_us: Int64[np.ndarray, " n"]
     height_m: Float64[np.ndarray, " n"]
     moving: Bool[np.ndarray, " n"]
+    crossed: Bool[np.ndarray, " n"]
 
 
 def main_lidar(clip: Clip, hold_out: Collection[int]) -> tuple[str, list[int]] | None:
@@ -123,8 +129,9 @@ def _seen(clip: Clip, sweep: Sweep, ground: Ground, others: list[SweepBeams]) ->
     height = ground.above(xyz)
     rows = np.flatnonzero((height > HEIGHT_M[0]) & (height < HEIGHT_M[1]))
     rows = rows[_thinned(xyz[rows], CELL_M)]
-    moving = in_free_space(balls(xyz[rows], np.full(len(rows), BALL_M, np.float32)), others)
-    return Seen(xyz[rows], fired_us[rows], height[rows], moving)
+    counts = count_beams(balls(xyz[rows], np.full(len(rows), BALL_M, np.float32)), others)
+    crossed = (counts.through >= VOTES) & (counts.through > CROSSED * counts.ended)
+    return Seen(xyz[rows], fired_us[rows], height[rows], counts.free, crossed)
 
 
 def _thinned(xyz: Float64[np.ndarray, "n 3"], cell_m: float) -> Int64[np.ndarray, " m"]:

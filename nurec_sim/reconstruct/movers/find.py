@@ -8,7 +8,8 @@ What stands throughout cannot be told from scenery, and is not found.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,14 +19,32 @@ from nurec_sim import geometry
 from nurec_sim.reconstruct.movers.boxes import BEST_VIEW, Sighting, lengthened, track_of
 from nurec_sim.reconstruct.movers.contradicted import main_lidar, off_ground
 from nurec_sim.reconstruct.movers.following import Path, follow
-from nurec_sim.reconstruct.movers.objects import blobs_of
+from nurec_sim.reconstruct.movers.objects import Blob, blobs_of
 from nurec_sim.types import Clip, Track
 
 NAME = "found-"
 """Ids of found tracks begin with this."""
 FEWEST_SIGHTINGS = 4
-FOUND_SHARE = 0.5
-"""Least share of the sweeps of its life in which an object is seen."""
+
+
+class Evidence(NamedTuple):
+    """What an object must show to be taken for one that moves."""
+
+    share: float
+    """In how many of the sweeps of its life it is seen, at least."""
+    life_s: float
+    """How long it is seen, at least."""
+    shape_m: float
+    """Largest median distance between the returns of two sightings, the motion undone."""
+    returns: int
+    """How many cells with returns it has in the middle of its sightings, at least."""
+
+
+OF_MOVING, OF_CROSSED = Evidence(0.5, 0.0, 0.3, 1), Evidence(0.75, 1.0, 0.2, 20)
+"""Of what is ``Seen.moving``, and of what is ``Seen.crossed``: foliage and the edges of what the scanner sees are the
+latter, too, but not for long, nor as one, nor with many returns."""
+KEEPS_SHARE = 0.5
+"""``Evidence.shape_m`` as a share of the distance without the motion undone."""
 LEAST_MOVED_M, LEAST_MPS = 1.0, 0.5
 STRAIGHT = 0.6
 """Least ratio of the distance between the ends of a path to its length: what jitters in place does not move."""
@@ -34,8 +53,6 @@ LEAST_HEIGHT_M = 0.4
 STEP_M = 1.0
 """Sightings are compared with the next one at which the object has moved this far."""
 PART_MARGIN_M = 0.5
-KEEPS_SHAPE_M, KEEPS_SHARE = 0.3, 0.5
-"""Largest median distance between returns of such sightings, the motion undone; also as a share of that without."""
 
 
 def find_actors(
@@ -58,28 +75,47 @@ def find_actors(
     if chosen is None:
         return ()
     lidar, indices = chosen
-    sweeps = []
+    free, crossed = [], []
     for done, seen in enumerate(off_ground(clip, lidar, indices)):
-        sweeps.append(blobs_of(seen))
+        free.append(blobs_of(seen, seen.moving))
+        crossed.append(blobs_of(seen, seen.crossed))
         progress((done + 1) / len(indices))
     times = clip.sweep_times_us(lidar).sum(axis=1) // 2
     step_us = int(np.median(np.diff(times[indices])))
+    tracks = _whole(_tracks(free, clip, step_us, OF_MOVING))
+    slow = _whole(_tracks(crossed, clip, step_us, OF_CROSSED))
+    tracks += [new for new in slow if not any(_inside(new, track) or _inside(track, new) for track in tracks)]
+    tracks.sort(key=lambda track: track.path.start_us)
+    return tuple(dataclasses.replace(track, id=f"{NAME}{number + 1}") for number, track in enumerate(tracks))
+
+
+def _tracks(sweeps: Sequence[Sequence[Blob]], clip: Clip, step_us: int, wanted: Evidence) -> list[Track]:
+    """Tracks of those objects in the sweeps of a log, ``step_us`` apart, that show what is wanted."""
     tracks = []
     for path in follow(sweeps):
         life_us = path.blobs[-1].t_us - path.blobs[0].t_us
-        if len(path.blobs) >= max(FEWEST_SIGHTINGS, FOUND_SHARE * (life_us / step_us + 1)):
+        least = max(FEWEST_SIGHTINGS, wanted.share * (life_us / step_us + 1))
+        returns = np.median([len(blob.xyz_m) for blob in path.blobs])
+        if len(path.blobs) >= least and life_us >= 1e6 * wanted.life_s and returns >= wanted.returns:
             track = _track(path, clip)
-            if _moves(path, track):
+            if _moves(path, track, wanted.shape_m):
                 tracks.append(_lasting(track, clip, step_us))
-    whole = [track for track in tracks if not any(_part_of(track, other) for other in tracks)]
-    return tuple(dataclasses.replace(track, id=f"{NAME}{number + 1}") for number, track in enumerate(whole))
+    return tracks
 
 
-def _part_of(track: Track, other: Track) -> bool:
-    """Whether a track follows a part of an object that another one follows for longer."""
-    life_us, longer_us = (each.path.end_us - each.path.start_us for each in (track, other))
+def _whole(tracks: Sequence[Track]) -> list[Track]:
+    """Those tracks that do not follow a part of an object that another one follows for longer."""
+
+    def longer(other: Track, track: Track) -> bool:
+        return other.path.end_us - other.path.start_us > track.path.end_us - track.path.start_us
+
+    return [track for track in tracks if not any(longer(other, track) and _inside(track, other) for other in tracks)]
+
+
+def _inside(track: Track, other: Track) -> bool:
+    """Whether what a track follows is inside of the box of another one, for more than half of the former's life."""
     times = track.path.t_us[[other.path.covers(int(t)) for t in track.path.t_us]]
-    if track is other or longer_us <= life_us or not len(times):
+    if not len(times):
         return False
     centre = track.path.at(times)[:, None, :3, 3]
     box_from_world = geometry.inverse(other.path.at(times))
@@ -109,11 +145,11 @@ def _boxed(path: Path, velocity: Float64[np.ndarray, "t 2"], clip: Clip) -> Trac
     return track_of("", sightings, clip.ego)
 
 
-def _moves(path: Path, track: Track) -> bool:
+def _moves(path: Path, track: Track, shape_m: float = OF_MOVING.shape_m) -> bool:
     """Whether an object gets somewhere and keeps its shape on the way, other than edges that come and go.
 
     Of a surface that stands every sweep sees another part, which looks like motion; but the returns of two sweeps then
-    agree best where they are.
+    agree best where they are. ``shape_m`` is the most that they may be apart, the motion undone.
     """
     place = track.path.position_m
     if len(place) < len(path.blobs):  # slow: ``track_of`` gave it one pose
@@ -125,7 +161,7 @@ def _moves(path: Path, track: Track) -> bool:
     if moved < max(LEAST_MOVED_M, STRAIGHT * length, LEAST_MPS * seconds) or height < LEAST_HEIGHT_M:
         return False
     followed, stood = _apart(path, track)
-    return followed <= min(KEEPS_SHAPE_M, KEEPS_SHARE * stood)
+    return followed <= min(shape_m, KEEPS_SHARE * stood)
 
 
 def _apart(path: Path, track: Track) -> tuple[float, float]:

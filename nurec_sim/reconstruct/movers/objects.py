@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -41,9 +41,14 @@ class Blob:
     middle_m: Float64[np.ndarray, " 2"]
 
 
-def blobs_of(seen: Seen) -> list[Blob]:
-    """The moving objects among the returns of a sweep."""
-    moving = np.flatnonzero(seen.moving)
+def blobs_of(seen: Seen, moves: Bool[np.ndarray, " n"]) -> list[Blob]:
+    """The moving objects among the returns of a sweep.
+
+    Args:
+        seen: the returns.
+        moves: which of them move: ``seen.moving`` or ``seen.crossed``.
+    """
+    moving = np.flatnonzero(moves)
     if not len(moving):
         return []
     tree = cKDTree(seen.xyz_m[moving, :2])
