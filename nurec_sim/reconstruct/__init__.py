@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -149,20 +150,32 @@ def reconstruct(
         scene = fit_to_log(
             scene, clip, used, held, lambda stage, done: report(stage, share + (1 - share) * done), refine
         )
-    if scene.static.falloff is None and np.isfinite(scene.static.intensity).any():
+    with ThreadPoolExecutor(1) as beside:
+        # Neither needs the other, and each has parts on one core.
+        from nurec_sim.reconstruct.hidden_actors import hidden_bodies, with_bodies
+
+        bodies = beside.submit(hidden_bodies, scene, clip, held) if complete_actors else None
+        scene = _with_returns(scene, clip, held, report)
+        if bodies is not None:
+            scene = with_bodies(scene, bodies.result())
+    return archived(scene)
+
+
+def _with_returns(
+    scene: GaussianScene, clip: Clip, held: set[int], report: Callable[[str, float], None]
+) -> GaussianScene:
+    """The scene with what LiDAR tells of how its beams return, where it gave surfaces their intensity."""
+    if not np.isfinite(scene.static.intensity).any():
+        return scene
+    if scene.static.falloff is None:
         from nurec_sim.reconstruct.incidence import with_incidence
 
         scene = with_incidence(scene, clip, held)
-    # Surfaces that LiDAR gave their intensity are also told how often beams return from them.
-    if scene.static.ray_drop is None and np.isfinite(scene.static.intensity).any():
+    if scene.static.ray_drop is None:
         from nurec_sim.reconstruct.ray_drop import with_ray_drop
 
         scene = with_ray_drop(scene, clip, held, lambda done: report("ray drop", 1.0))
-    if complete_actors:
-        from nurec_sim.reconstruct.hidden_actors import with_hidden_actors
-
-        scene = with_hidden_actors(scene, clip, held)
-    return archived(scene)
+    return scene
 
 
 def _start_share(refine: OptimizeSettings) -> float:

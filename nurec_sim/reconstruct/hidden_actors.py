@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -49,13 +50,39 @@ SOLID = 0.3
 """Least opacity of what counts as seen."""
 
 
+class Bodies(NamedTuple):
+    """Missing parts of actors, by the index of their track."""
+
+    gaussians: dict[int, Gaussians]
+    """In the frames of their boxes."""
+    seen: dict[int, float]
+    """Share of the directions around each actor in which the sensors saw it."""
+
+
 def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[int] = ()) -> GaussianScene:
-    """The scene with bodies for labelled actors that the sensors hardly saw.
+    """The scene with bodies for labelled actors that the sensors hardly saw; arguments as for ``hidden_bodies``."""
+    return with_bodies(scene, hidden_bodies(scene, clip, hold_out))
+
+
+def with_bodies(scene: GaussianScene, bodies: Bodies) -> GaussianScene:
+    """The scene with bodies; its provenance names the actors, with the share that was seen (``completed_actors``)."""
+    added = bodies.gaussians
+    if not added:
+        return scene
+    told = {scene.tracks[number].id: bodies.seen[number] for number in added}
+    of_track = np.repeat(np.array(list(added), np.int32), [len(body) for body in added.values()])
+    moving = DynamicGaussians.rigid(Gaussians.concatenate(list(added.values())), of_track, scene.span_us[0])
+    dynamic = joined_dynamic(scene.dynamic, moving) if len(scene.dynamic) else moving
+    provenance = {**scene.provenance, "completed_actors": told}
+    return dataclasses.replace(scene, dynamic=dynamic, provenance=provenance)
+
+
+def hidden_bodies(scene: GaussianScene, clip: Clip, hold_out: Collection[int] = ()) -> Bodies:
+    """Bodies for labelled actors that the sensors hardly saw.
 
     What recorded beams passed through is left out, and what recorded images look at: there the scene shows what they
     saw. If beams passed through most of the box, or images look at most of what would be added, the label is wrong or
-    the actor elsewhere, and there is no body. The provenance has the share of directions that was seen by actor id
-    (``completed_actors``).
+    the actor elsewhere, and there is no body.
 
     Args:
         scene: a reconstruction; actors that deform (Gaussians of their own that are not fixed to their box) stay.
@@ -81,15 +108,7 @@ def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[in
             continue
         body = _body(kind, track, own, light)
         bodies[number], seen[number] = body[_missing(body, own) & ~_free(body, track, beams)], share
-    bodies = _out_of_sight(scene, bodies)
-    if not bodies:
-        return scene
-    told = {scene.tracks[number].id: seen[number] for number in bodies}
-    provenance = {**scene.provenance, "completed_actors": told}
-    of_track = np.repeat(np.array(list(bodies), np.int32), [len(body) for body in bodies.values()])
-    added = DynamicGaussians.rigid(Gaussians.concatenate(list(bodies.values())), of_track, scene.span_us[0])
-    dynamic = joined_dynamic(scene.dynamic, added) if len(scene.dynamic) else added
-    return dataclasses.replace(scene, dynamic=dynamic, provenance=provenance)
+    return Bodies(_out_of_sight(scene, bodies), seen)
 
 
 def _kind(track: Track) -> str | None:
@@ -177,7 +196,8 @@ def _out_of_sight(scene: GaussianScene, bodies: dict[int, Gaussians]) -> dict[in
     distance = np.linalg.norm(place - eye, axis=1)
     counts = [len(body) for body in bodies.values()]
     points = Points(eye, (place - eye) / distance[:, None], distance, np.repeat(list(bodies), counts), poses)
-    evidence = Support(make_renderer(scene, "cpu"), most=VIEWS).evidence(points)
+    # Few views look where they are, and only these are shown.
+    evidence = Support(make_renderer(scene, "cpu"), most=VIEWS, ahead=False).evidence(points)
     hidden = np.split((evidence.seen == 0) & (evidence.through == 0), np.cumsum(counts)[:-1])
     return {number: body[unseen] for (number, body), unseen in zip(bodies.items(), hidden, strict=True)
             if len(body) and unseen.mean() > 1 - MOST_FREE}  # fmt: skip

@@ -19,6 +19,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -45,12 +46,21 @@ BOX_MARGIN_M = 0.2
 
 @dataclass(frozen=True, eq=False)
 class RecordedView:
-    """What a recorded frame saw of the scene: ``inverse_m`` is 1 / depth along the optical axis, 0 for the sky."""
+    """A recorded frame, at a smaller size; ``renderer`` shows what it saw of the scene."""
 
+    renderer: Renderer
     camera: CameraModel
     t_us: int
     world_from_camera: Float64[np.ndarray, "4 4"]
-    inverse_m: Float32[np.ndarray, "h w"]
+
+    @cached_property
+    def inverse_m(self) -> Float32[np.ndarray, "h w"]:
+        """1 / depth along the optical axis, 0 for the sky."""
+        pair, scene_id = np.stack([self.world_from_camera] * 2), self.renderer.scene.id
+        request = SensorRequest(scene_id, self.camera, self.t_us, self.t_us + 1, pair)
+        frame = self.renderer.render_camera(request, ("depth",))
+        assert frame.depth_m is not None
+        return np.where(frame.depth_m > 0, 1 / np.maximum(frame.depth_m, 1e-6), 0).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +113,18 @@ class Support:
         renderer: of the scene.
         progress: called with the fraction done.
         most: about so many recorded views, evenly over the log; together, but ``LEAST_PER_CAMERA`` of each.
+        ahead: whether to show all views of the scene now, instead of each when it is first compared with.
 
     Raises:
         RequestError: the scene does not know when its cameras recorded.
     """
 
     def __init__(
-        self, renderer: Renderer, progress: Callable[[float], None] = lambda done: None, most: int = MOST_VIEWS
+        self,
+        renderer: Renderer,
+        progress: Callable[[float], None] = lambda done: None,
+        most: int = MOST_VIEWS,
+        ahead: bool = True,
     ) -> None:
         self._renderer, self._scene = renderer, renderer.scene
         frames = recorded_frames(renderer.scene, most)
@@ -118,7 +133,11 @@ class Support:
         self._views = []
         for number, (camera, t_us) in enumerate(frames):
             progress(number / len(frames))
-            self._views.append(_recorded_view(renderer, camera, t_us))
+            small = small_camera(camera, min(VIEW_PX, camera.width_px))
+            pose = self._scene.ego.at(t_us) @ camera.rig_from_camera
+            self._views.append(RecordedView(renderer, small, t_us, pose))
+            if ahead:
+                _ = self._views[-1].inverse_m
 
     def map(self, request: SensorRequest, width_px: int = MAP_PX) -> Float32[np.ndarray, "h w"]:
         """Support of what a camera shows.
@@ -173,16 +192,6 @@ def recorded_frames(scene: GaussianScene, most: int = MOST_VIEWS) -> list[tuple[
             # An instant [t, t + 1) must lie in the scene.
             frames.append((scene.rig.cameras[name], int(np.clip(middle[place], scene.span_us[0], scene.span_us[1]))))
     return frames
-
-
-def _recorded_view(renderer: Renderer, camera: CameraModel, t_us: int) -> RecordedView:
-    scene = renderer.scene
-    small = small_camera(camera, min(VIEW_PX, camera.width_px))
-    pose = scene.ego.at(t_us) @ camera.rig_from_camera
-    frame = renderer.render_camera(SensorRequest(scene.id, small, t_us, t_us + 1, np.stack([pose, pose])), ("depth",))
-    assert frame.depth_m is not None
-    inverse = np.where(frame.depth_m > 0, 1 / np.maximum(frame.depth_m, 1e-6), 0)
-    return RecordedView(small, t_us, pose, inverse.astype(np.float32))
 
 
 def points_of(
@@ -245,7 +254,8 @@ def _compare(
     inside = valid & sensors.in_image(view.camera, uv) & (local[:, 2] > 0)
     inverse = np.where(far, 0.0, 1 / np.maximum(local[:, 2], 1e-6))
     saw, passed = np.zeros(len(far), bool), np.zeros(len(far), bool)
-    saw[inside], passed[inside] = _same_depth(view.inverse_m, uv[inside], inverse[inside])
+    if inside.any():
+        saw[inside], passed[inside] = _same_depth(view.inverse_m, uv[inside], inverse[inside])
     return saw, passed, np.arccos(np.clip(along, -1, 1)), np.where(far, np.inf, distance)
 
 
