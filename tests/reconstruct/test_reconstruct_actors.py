@@ -71,8 +71,12 @@ def test_gaussians_of_an_actor_are_stored_once_in_its_box():
 
 def test_a_track_that_is_labelled_once_is_there_for_a_tenth_of_a_second():
     clip = Log(Track("car", "automobile", (4.0, 1.8, 1.5), Trajectory(np.array([2_000_000]), np.eye(4)[None])))
-    (shown,) = tracks_of(clip, actors_of(clip, PointSettings()))
+    (found,) = actors_of(clip, PointSettings())
+    (shown,) = tracks_of(clip, [found])
     assert shown.path.t_us.tolist() == [1_950_000, 2_050_000]
+    # An image 35 ms before the sweep shows the car, not a wall where the car is.
+    times = np.array([1_949_999, 1_950_000, 1_965_000, 2_050_000, 2_050_001])
+    assert found.present(times).tolist() == [False, True, True, True, False]
 
 
 def test_a_standing_actor_stays_to_be_hit_after_its_labels_end():

@@ -8,11 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Int64
 
-from nurec_sim.reconstruct.lift.points import Actor
+from nurec_sim.reconstruct.lift.points import LONE_LABEL_US, Actor
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Track, Trajectory
 
-BRIEF_US = 50_000
-"""A track that is labelled once is there so long before and after."""
 OUTSIDE = 1.2
 """Knots of what stands over a whole span lie this much farther from its middle than its ends: the fade at the ends is
 exp(-(1 / 1.2)**10) = 0.85."""
@@ -29,7 +27,7 @@ def tracks_of(clip: Clip, actors: Sequence[Actor]) -> tuple[Track, ...]:
         if actor.standing:
             path = Trajectory(np.array(clip.span_us), np.stack([pose, pose]))
         elif len(path.t_us) == 1:
-            path = Trajectory(path.t_us[0] + np.array([-BRIEF_US, BRIEF_US]), np.stack([pose, pose]))
+            path = Trajectory(path.t_us[0] + np.array([-LONE_LABEL_US, LONE_LABEL_US]), np.stack([pose, pose]))
         else:
             continue
         tracks[actor.index] = dataclasses.replace(actor.track, path=path)

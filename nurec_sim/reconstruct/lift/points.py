@@ -22,6 +22,10 @@ NEAREST_M, BODY_MARGIN_M = 0.5, 0.3
 """Returns from nearer, or this near to the ego car's box, are of the car."""
 
 
+LONE_LABEL_US = 50_000
+"""A track that is labelled once is there so long before and after: its sweep, and images beside it, show it as well."""
+
+
 @dataclass(frozen=True)
 class Actor:
     """A labelled object, ``clip.tracks[index]``; a static one has one pose, and exists over the whole clip.
@@ -39,7 +43,8 @@ class Actor:
         """Whether the actor is known to be where its path says."""
         if self.standing:
             return np.ones(np.shape(t_us), bool)
-        known = (t_us >= self.path.start_us) & (t_us <= self.path.end_us)
+        around_us = LONE_LABEL_US if len(self.path.t_us) == 1 else 0
+        known = (t_us >= self.path.start_us - around_us) & (t_us <= self.path.end_us + around_us)
         return known if self.window_us is None else known & (t_us >= self.window_us[0]) & (t_us < self.window_us[1])
 
 

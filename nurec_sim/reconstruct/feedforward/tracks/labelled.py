@@ -14,14 +14,12 @@ from jaxtyping import Bool, Float64, Int32, Int64
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lift.actors import standing_knots_us
-from nurec_sim.reconstruct.lift.points import Actor, actors_of
+from nurec_sim.reconstruct.lift.points import LONE_LABEL_US, Actor, actors_of
 from nurec_sim.reconstruct.lift.settings import PointSettings
 from nurec_sim.types import Clip, Trajectory
 
 PADDING_M = 0.5
 """Boxes grow by this on every side for movable points: 1 m on each whole dimension, as in the released model."""
-LONE_LABEL_US = 50_000
-"""An object that was labelled once is assumed static for this long before and after."""
 
 Vectors = Float64[np.ndarray, "n 3"]
 Times = Int64[np.ndarray, " n"]
