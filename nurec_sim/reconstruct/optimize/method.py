@@ -258,14 +258,14 @@ class Optimization:
         loss, by_shown = colour_loss(shown, recorded, weights.dssim)
         error = float(np.abs(shown - recorded).mean(dtype=np.float64))
 
-        by_planes, by_sky, by_pose, by_response = composite.back(response, shown, by_shown)
-        by_alpha, by_distance = by_planes[0, :height, :width], by_planes[4, :height, :width]
-        loss += depth_loss(view.returns, alpha, distance, frame.ray_z, weights.depth, weights.solid, by_alpha,
-                           by_distance)  # fmt: skip
-        # The sky mask is fixed at a view's first step: taken anew, it would follow what it is meant to hold.
+        # Fixed at a view's first step: taken anew, the mask would follow what it is meant to hold.
         if number not in self._clear:
             self._clear[number] = np.argwhere(alpha < SEEN_SKY).astype(np.int16)
         sky = tuple(self._clear[number].T)
+        by_planes, by_sky, by_pose, by_response = composite.back(response, shown, by_shown, sky)
+        by_alpha, by_distance = by_planes[0, :height, :width], by_planes[4, :height, :width]
+        loss += depth_loss(view.returns, alpha, distance, frame.ray_z, weights.depth, weights.solid, by_alpha,
+                           by_distance)  # fmt: skip
         if len(sky[0]):
             by_alpha[sky] += weights.sky / len(sky[0])
             loss += weights.sky * float(alpha[sky].mean())
