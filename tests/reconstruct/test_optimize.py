@@ -298,7 +298,10 @@ def test_the_start_holds_once_for_all_images_together(street, lifted, monkeypatc
 
     monkeypatch.setattr(Parameters, "step", noted)
     settings = OptimizeSettings(
-        steps=3, check_every=2, start=StartPriors(0.5, 0.25, 1e9, 0.1), weights=LossWeights(0, 0, 0, 0)
+        steps=3,
+        check_every=2,
+        start=StartPriors(0.5, 0.25, 1e9, 0.1),
+        weights=LossWeights(dssim=0, depth=0, solid=0, sky=0, surface=0),
     )
     run = method.Optimization(lifted, views, settings)
     # Without the other terms the loss is the mean absolute error.

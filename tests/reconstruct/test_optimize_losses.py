@@ -12,8 +12,10 @@ from nurec_sim.evaluate.scores.images import psnr
 from nurec_sim.reconstruct import OptimizeSettings
 from nurec_sim.reconstruct.optimize import method
 from nurec_sim.reconstruct.optimize.adam import BRIGHTEST, SkyAdam
+from nurec_sim.reconstruct.optimize.coverage import Coverage, coverage_loss
 from nurec_sim.reconstruct.optimize.depth_loss import depth_loss
 from nurec_sim.reconstruct.optimize.image_loss import colour_loss
+from nurec_sim.reconstruct.optimize.settings import LossWeights
 from nurec_sim.reconstruct.optimize.views import Returns, returns_in, training_views
 
 
@@ -130,3 +132,32 @@ def test_the_ego_vehicle_in_an_image_teaches_nothing(street, lifted):
     ]
     before = image_of(lifted, street, "front", 0)[48:]
     assert psnr(below[0], before) > psnr(below[1], before) + 8, (psnr(below[0], before), psnr(below[1], before))
+
+
+ALPHA = np.array([[0.0, 0.04, 0.5], [0.96, 1.0, 0.0]], np.float32)
+RAYS = np.array([[1, 1, 1], [1, 1, 0]], np.float32)
+"""The last pixel has no ray."""
+
+
+def test_sky_stays_open_and_surfaces_stay_closed():
+    sky, surface = Coverage().of(0, ALPHA, RAYS)
+    assert sky.tolist() == [[True, True, False], [False, False, False]]
+    assert surface.tolist() == [[False, False, False], [True, True, False]]
+    by_alpha = np.ones((2, 3), np.float32)
+    loss = coverage_loss(ALPHA, sky, surface, LossWeights(sky=0.3, surface=0.5), by_alpha)
+    # Mean alpha in the sky is 0.02, mean 1 - alpha on the surface as well.
+    assert loss == pytest.approx(0.3 * 0.02 + 0.5 * 0.02)
+    assert by_alpha == pytest.approx(np.array([[1.15, 1.15, 1.0], [0.75, 0.75, 1.0]]))
+    nothing = np.zeros((2, 3), bool)
+    assert coverage_loss(ALPHA, nothing, nothing, LossWeights(), by_alpha) == 0
+
+
+def test_what_shows_the_sky_is_what_showed_it_at_first():
+    coverage = Coverage()
+    first = coverage.of(3, ALPHA, RAYS)
+    again = coverage.of(3, 1 - ALPHA, RAYS)
+    assert all(np.array_equal(one, other) for one, other in zip(first, again, strict=True))
+    assert not np.array_equal(coverage.of(4, 1 - ALPHA, RAYS)[0], first[0])
+    resumed = Coverage()
+    resumed.restore({"numbers": np.zeros(5), **coverage.state()})
+    assert np.array_equal(resumed.of(3, 1 - ALPHA, RAYS), first)

@@ -155,7 +155,8 @@ def test_gradients_of_the_shown_image_are_those_of_differences():
         np.moveaxis(planes[1:4, :24, :40], 0, -1) + through * np.moveaxis(frame.draw_sky(sky), 0, -1)
     ) @ response[:, :3].T + response[:, 3]
     assert np.allclose(shown, expected, atol=1e-5)
-    by_planes, by_sky, _, sums = composite.back(response, shown, weight)
+    everywhere = np.ones((24, 40), bool)
+    by_planes, by_sky, _, sums = composite.back(response, shown, weight, everywhere)
     by_planes = by_planes.copy()
     assert sums == pytest.approx(np.stack([(weight * shown).sum(axis=(0, 1)), weight.sum(axis=(0, 1))]), rel=1e-4)
 
@@ -174,6 +175,13 @@ def test_gradients_of_the_shown_image_are_those_of_differences():
     step = np.zeros_like(sky)
     step[texel] = 0.01
     assert by_sky[texel] == pytest.approx((loss(sky + step) - loss(sky - step)) / 0.02, rel=1e-3)
+    # The sky changes by pixels that show it alone, and those with the Gaussian still tell how the Gaussian changes.
+    open_sky = planes[0, :24, :40] == 0
+    by_planes, by_open_sky, _, _ = composite.back(response, shown, weight, open_sky)
+    assert by_planes[1, v, u] != 0
+    weight[~open_sky] = 0
+    _, of_open_sky, _, _ = composite.back(response, shown, weight, everywhere)
+    assert np.array_equal(by_open_sky, of_open_sky) and not np.array_equal(by_open_sky, by_sky)
 
 
 def test_a_mean_moves_along_the_axes_in_proportion_to_its_standard_deviations(lifted):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int16
+from jaxtyping import Bool, Float32, Float64
 
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.render.cpu.backward.frame import Frame, shared_workers
@@ -45,16 +45,16 @@ class Composite:
         response: Float64[np.ndarray, "3 4"],
         shown: Float32[np.ndarray, "h w 3"],
         by_shown: Float32[np.ndarray, "h w 3"],
-        sky: tuple[Int16[np.ndarray, " n"], Int16[np.ndarray, " n"]],
+        sky: Bool[np.ndarray, "h w"],
     ) -> tuple[
         Float32[np.ndarray, "6 h w"], Float64[np.ndarray, "6 s s 3"], Float64[np.ndarray, "4 4"],
         Float64[np.ndarray, "2 3"],
     ]:  # fmt: skip
         """Gradients by the frame's planes, and by the sky and the pose it is seen from; sums for the response.
 
-        Only pixels that show the sky, their rows and columns ``sky``, change it: what is wrong with a surface, of which
-        a little lets the sky through, would be painted on the sky behind. The sums over all pixels, by channel, are
-        those of ``by_shown * shown`` and of ``by_shown``.
+        Only pixels that show the ``sky`` change it: what is wrong with a surface that lets a little of the sky through
+        would be painted on the sky behind. The sums over all pixels, by channel, are those of ``by_shown * shown`` and
+        of ``by_shown``.
         """
         by_planes, by_behind = self._frame.empty_planes(), np.empty((3, *self._valid.shape), np.float32)
         sums = np.zeros((PARTS, 2, 3))
@@ -69,9 +69,8 @@ class Composite:
             by_behind,
         )
         shared_workers(None).run(_take_back, [(*rows, *values, sums[k]) for k, rows in enumerate(self._bands)])
-        by_sky = np.zeros_like(by_behind)
-        by_sky[:, *sky] = by_behind[:, *sky]
-        return by_planes, *self._frame.draw_sky_back(self._sky, by_sky), sums.sum(axis=0)
+        by_behind[:, ~sky] = 0
+        return by_planes, *self._frame.draw_sky_back(self._sky, by_behind), sums.sum(axis=0)
 
 
 @kernel

@@ -22,6 +22,7 @@ from nurec_sim.reconstruct.free_space import SweepBeams
 from nurec_sim.reconstruct.optimize.adam import SkyAdam
 from nurec_sim.reconstruct.optimize.checkpoint import read_checkpoint, write_checkpoint
 from nurec_sim.reconstruct.optimize.compositing import Composite
+from nurec_sim.reconstruct.optimize.coverage import Coverage, coverage_loss
 from nurec_sim.reconstruct.optimize.depth_loss import depth_loss
 from nurec_sim.reconstruct.optimize.frames import Frames, cpu_frames, frames_on
 from nurec_sim.reconstruct.optimize.free import CLEARINGS, recorded_beams, take_out
@@ -40,8 +41,6 @@ from nurec_sim.scene import scene_hash
 from nurec_sim.types import Clip, GaussianScene
 
 Progress = Callable[[str, float], None]
-SEEN_SKY = 0.05
-"""Pixels with less alpha than this at the start show the sky."""
 CHECK_SHARE = 0.05
 """The images held out are looked at once in this share of the budget."""
 WARM_UP_STEPS = 20
@@ -133,7 +132,7 @@ class Optimization:
             number for number, view in enumerate(views)
             if every and counts[view.camera.id] >= 2 * every and view.frame % every == every // 2
         ]  # fmt: skip
-        self._clear: dict[int, np.ndarray] = {}
+        self._coverage = Coverage()
         self.steps, self._seconds_before, self._cleared = 0, 0.0, 0
         self.best: dict[str, np.ndarray] = {}
         self.best_psnr_db, self.best_steps = -np.inf, 0
@@ -223,15 +222,14 @@ class Optimization:
         """Everything that a later run needs to go on exactly; ``seconds`` have been spent."""
         numbers = np.array([self.steps, seconds, self.best_steps, self.best_psnr_db, self._cleared])
         best = {f"best {name}": array for name, array in self.best.items()}
-        clear = {f"clear {number}": rows for number, rows in self._clear.items()}
-        return self._result() | self._moments() | best | clear | {"numbers": numbers}
+        return self._result() | self._moments() | best | self._coverage.state() | {"numbers": numbers}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on from a state."""
         steps, self._seconds_before, best_steps, self.best_psnr_db, cleared = state["numbers"].tolist()
         self.steps, self.best_steps, self._cleared = int(steps), int(best_steps), int(cleared)
         self.best = {name.removeprefix("best "): a for name, a in state.items() if name.startswith("best ")}
-        self._clear = {int(name.split()[1]): a for name, a in state.items() if name.startswith("clear ")}
+        self._coverage.restore(state)
         self._restore({name: state[name] for name in self._result() | self._moments()})
 
     def _restore(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -258,17 +256,12 @@ class Optimization:
         loss, by_shown = colour_loss(shown, recorded, weights.dssim)
         error = float(np.abs(shown - recorded).mean(dtype=np.float64))
 
-        # Fixed at a view's first step: taken anew, the mask would follow what it is meant to hold.
-        if number not in self._clear:
-            self._clear[number] = np.argwhere(alpha < SEEN_SKY).astype(np.int16)
-        sky = tuple(self._clear[number].T)
+        sky, surface = self._coverage.of(number, alpha, frame.sensor.grid.valid)
         by_planes, by_sky, by_pose, by_response = composite.back(response, shown, by_shown, sky)
         by_alpha, by_distance = by_planes[0, :height, :width], by_planes[4, :height, :width]
         loss += depth_loss(view.returns, alpha, distance, frame.ray_z, weights.depth, weights.solid, by_alpha,
                            by_distance)  # fmt: skip
-        if len(sky[0]):
-            by_alpha[sky] += weights.sky / len(sky[0])
-            loss += weights.sky * float(alpha[sky].mean())
+        loss += coverage_loss(alpha, sky, surface, weights, by_alpha)
 
         world = drawn.world
         *_, by_pose_too = frame.draw_back(

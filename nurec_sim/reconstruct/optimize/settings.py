@@ -50,6 +50,8 @@ class LossWeights(_Group):
     """1 - alpha at LiDAR returns."""
     sky: float = 0.02
     """Alpha where the start of the optimisation shows the sky."""
+    surface: float = 0.2
+    """1 - alpha where it shows surfaces."""
     opacity: float = 0.0
     """Mean opacity of the Gaussians in view (Kheradmand et al. 2024, with 0.01)."""
     scale: float = 0.0
