@@ -295,10 +295,10 @@ def test_a_hedge_of_which_each_sweep_sees_another_part_does_not_move():
     hedge = np.random.default_rng(1).uniform([0, 8, 0.3], [30, 9, 1.8], (1500, 3))
     parts = [hedge[np.abs(hedge[:, 0] - 5 - 0.5 * k) < 2] for k in range(20)]
     path = seen_path(parts)
-    assert not _moves(path, _track(path, EGO))
+    assert not _moves(path, _track(path, EGO), 0.3)
     body = parts[0]
     path = seen_path([body + [0.5 * k, 0, 0] for k in range(20)])
-    assert _moves(path, _track(path, EGO))
+    assert _moves(path, _track(path, EGO), 0.3)
 
 
 def test_what_is_flat_or_hardly_moves_is_no_actor():
@@ -306,7 +306,7 @@ def test_what_is_flat_or_hardly_moves_is_no_actor():
     flat = body * [1, 1, 0.2]
     for points, step_m in ((flat, 0.5), (body, 0.04)):
         path = seen_path([points + [step_m * k, 0, 0] for k in range(20)])
-        assert not _moves(path, _track(path, EGO))
+        assert not _moves(path, _track(path, EGO), 0.3)
 
 
 def test_an_object_moves_as_a_whole():

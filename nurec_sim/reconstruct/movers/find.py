@@ -145,7 +145,7 @@ def _boxed(path: Path, velocity: Float64[np.ndarray, "t 2"], clip: Clip) -> Trac
     return track_of("", sightings, clip.ego)
 
 
-def _moves(path: Path, track: Track, shape_m: float = OF_MOVING.shape_m) -> bool:
+def _moves(path: Path, track: Track, shape_m: float) -> bool:
     """Whether an object gets somewhere and keeps its shape on the way, other than edges that come and go.
 
     Of a surface that stands every sweep sees another part, which looks like motion; but the returns of two sweeps then
