@@ -150,15 +150,15 @@ def reconstruct(
         scene = fit_to_log(
             scene, clip, used, held, lambda stage, done: report(stage, share + (1 - share) * done), refine
         )
+    if not complete_actors:
+        return archived(_with_returns(scene, clip, held, report))
+    from nurec_sim.reconstruct.hidden_actors import hidden_bodies, with_bodies
+
     with ThreadPoolExecutor(1) as beside:
         # Neither needs the other, and each has parts on one core.
-        from nurec_sim.reconstruct.hidden_actors import hidden_bodies, with_bodies
-
-        bodies = beside.submit(hidden_bodies, scene, clip, held) if complete_actors else None
+        bodies = beside.submit(hidden_bodies, scene, clip, held)
         scene = _with_returns(scene, clip, held, report)
-        if bodies is not None:
-            scene = with_bodies(scene, bodies.result())
-    return archived(scene)
+        return archived(with_bodies(scene, bodies.result()))
 
 
 def _with_returns(

@@ -59,11 +59,6 @@ class Bodies(NamedTuple):
     """Share of the directions around each actor in which the sensors saw it."""
 
 
-def with_hidden_actors(scene: GaussianScene, clip: Clip, hold_out: Collection[int] = ()) -> GaussianScene:
-    """The scene with bodies for labelled actors that the sensors hardly saw; arguments as for ``hidden_bodies``."""
-    return with_bodies(scene, hidden_bodies(scene, clip, hold_out))
-
-
 def with_bodies(scene: GaussianScene, bodies: Bodies) -> GaussianScene:
     """The scene with bodies; its provenance names the actors, with the share that was seen (``completed_actors``)."""
     added = bodies.gaussians

@@ -9,7 +9,7 @@ from reconstruct_street import Street
 from nurec_sim import geometry
 from nurec_sim.reconstruct import hidden_actors, reconstruct
 from nurec_sim.reconstruct.free_space import balls
-from nurec_sim.reconstruct.hidden_actors import with_hidden_actors
+from nurec_sim.reconstruct.hidden_actors import hidden_bodies, with_bodies
 from nurec_sim.render import make_renderer
 from nurec_sim.types import (
     DynamicGaussians,
@@ -30,6 +30,10 @@ HIDDEN_M, OPEN_M, FAR_M = (8.0, 11.0), (8.0, 2.0), (8.0, 90.0)
 @pytest.fixture(scope="module")
 def street() -> Street:
     return Street(frames=7, speed_mps=4.0)
+
+
+def with_hidden_actors(scene, clip, hold_out=()) -> GaussianScene:
+    return with_bodies(scene, hidden_bodies(scene, clip, hold_out))
 
 
 def track(place_m=HIDDEN_M, **changes) -> Track:
