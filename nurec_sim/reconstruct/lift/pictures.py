@@ -16,7 +16,7 @@ from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.fusion import FARTHEST, fused_depths
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
 from nurec_sim.reconstruct.lift.settings import LiftSettings
-from nurec_sim.reconstruct.lift.splat import draw_surfels, trim_silhouettes, world_point
+from nurec_sim.reconstruct.lift.splat import close_gaps, draw_surfels, trim_silhouettes, world_point
 from nurec_sim.reconstruct.lift.views import WorkingView
 
 OUTLINE_M = 0.6
@@ -113,6 +113,8 @@ def _draw(view: WorkingView, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.
     body[drawn] = np.searchsorted(starts, index[drawn], side="right") - 1
     # Bodies without surfels share their start with the next one: searchsorted picks the last, which holds the row.
     index[drawn] -= np.asarray(starts, np.int32)[body[drawn]]
+    length_m = np.array([0.0 if surfels.actor is None else surfels.box_size_m[0] for surfels in bodies])
+    close_gaps(inverse_depth, index, body, length_m, np.float32(view.tile.focal_px))
     return inverse_depth, index, body
 
 

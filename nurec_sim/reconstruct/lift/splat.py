@@ -12,6 +12,8 @@ from nurec_sim.compute.kernels import inner, kernel
 
 SPLAT_RADIUS = 0.5
 """Radius of a drawn surfel per metre of its spacing; what stays open is filled by matching."""
+HIGHEST_GAP, DEEPEST_GAP = 1 / 8, 1 / 4
+"""Gaps in an actor are filled up to this share of its length, if the depths of their ends differ by so little."""
 
 
 @inner
@@ -164,6 +166,40 @@ def drop_shine_through(inverse_depth, index):
             if bad[row, column]:
                 inverse_depth[row, column] = 0
                 index[row, column] = -1
+
+
+@kernel
+def close_gaps(inverse_depth, index, body, length, focal):
+    """Fill what lies between two pixels of one actor in a column: between rows of beams the scenery shines through.
+
+    Glass lets beams pass as well, and what images show there is the car. Rows are left open: from its side there is a
+    gap between the wheels of a car.
+
+    Args:
+        inverse_depth: [h,w] 1/m, 0 where there is none; changed.
+        index: [h,w] surfel of each pixel; changed to that of the nearer end of the gap.
+        body: [h,w] its body; changed.
+        length: [bodies] metres; 0 of those that stay open.
+        focal: of the view, pixels.
+    """
+    height, width = index.shape
+    for column in range(width):
+        above = -1
+        for row in range(height):
+            number = body[row, column]
+            if length[number] == 0:
+                continue
+            if 0 <= above < row - 1 and body[above, column] == number:
+                upper, lower = inverse_depth[above, column], inverse_depth[row, column]
+                high = (row - above) / (focal * min(upper, lower)) <= HIGHEST_GAP * length[number]
+                if high and abs(1 / upper - 1 / lower) <= DEEPEST_GAP * length[number]:
+                    for r in range(above + 1, row):
+                        share = np.float32(r - above) / np.float32(row - above)
+                        w = upper + share * (lower - upper)
+                        if inverse_depth[r, column] < w:
+                            inverse_depth[r, column], body[r, column] = w, number
+                            index[r, column] = index[above if share < 0.5 else row, column]
+            above = row
 
 
 @kernel

@@ -191,6 +191,7 @@ def _between(one: Float64[np.ndarray, "n 3"], other: Float64[np.ndarray, "m 3"])
 
 def _lasting(track: Track, clip: Clip, step_us: int) -> Track:
     """The track over half a sweep more than its object was seen, both ways."""
+    begin, end = clip.span_us[0], clip.span_us[1] - 1
     first, last = track.path.start_us - step_us // 2, track.path.end_us + step_us // 2
-    life_us = max(first, clip.span_us[0]), min(last, clip.span_us[1] - 1)
+    life_us = begin if first < begin + 2 * step_us else first, end if last > end - 2 * step_us else last
     return dataclasses.replace(track, path=lengthened(track.path, life_us), labelled=False)
