@@ -57,7 +57,7 @@ class LogFlags:
     """CLIP: correct beams and poses of the log by the planes that its sweeps share, as in `nurec-sim reconstruct`; what
     is held out takes no part, and moves with the rest."""
     complete_actors: bool = True
-    """CLIP: give labelled actors that the sensors hardly saw a body of their class, as in `nurec-sim reconstruct`."""
+    """CLIP: give actors that the sensors hardly saw a body of their class, as in `nurec-sim reconstruct`."""
     input_cameras: tuple[str, ...] = ()
     """CLIP: input cameras of the reconstruction; default: all."""
     target_cameras: tuple[str, ...] = ()

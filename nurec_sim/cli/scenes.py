@@ -71,7 +71,7 @@ def reconstruct(
             surface (docs/lift.md).
         align_sweeps: correct elevations of LiDAR beams, mountings of LiDARs and poses so that all sweeps see the same
             planes and images show them where they are, if they disagree (docs/log_formats.md).
-        complete_actors: give labelled actors that the sensors hardly saw a body of their class where nothing was
+        complete_actors: give actors that the sensors hardly saw a body of their class where nothing was
             measured, so that they are seen when they or the ego drive elsewhere (docs/lift.md).
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the
             road-class Gaussians.
@@ -119,7 +119,7 @@ def reconstruct(
     for text in world_scene.provenance.get("unknown", ()):
         out.print(f"not known: {text}", markup=False)
     if completed := world_scene.provenance.get("completed_actors"):
-        out.print(f"{len(completed)} labelled actors were hardly seen: they have bodies of their class (docs/lift.md)")
+        out.print(f"{len(completed)} actors were hardly seen: they have bodies of their class (docs/lift.md)")
     out.print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
     if (kept := _checkpoint_of(target)).exists():
         out.print(f"the optimisation was interrupted: the same command with --resume goes on ({kept})", soft_wrap=True)

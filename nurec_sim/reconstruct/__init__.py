@@ -91,7 +91,7 @@ def reconstruct(
         align_sweeps: correct elevations of beams, mountings of LiDARs and poses of a log that was opened from disk, so
             that all sweeps see the same planes, and images of these cameras the same points (``logs.alignment``); the
             scene's path is the corrected one.
-        complete_actors: give labelled actors that the sensors hardly saw a body of their class (``hidden_actors``).
+        complete_actors: give actors that the sensors hardly saw a body of their class (``hidden_actors``).
 
     Raises:
         ReconstructError: no such method, camera, sweep or choice of actors, settings of another method, or the clip

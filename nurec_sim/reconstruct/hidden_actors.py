@@ -1,9 +1,9 @@
-"""Labelled actors that the sensors hardly saw: bodies of their class where nothing was measured.
+"""Actors that the sensors hardly saw: bodies of their class where nothing was measured.
 
 A car that another hid in the log, or whose rear alone was seen, has no surface there: once the ego drives elsewhere or
-a scenario moves the car, no camera and no LiDAR would see what collisions count. Such actors get the missing part of a
-body of the procedural towns (``world.actor_gaussians``), as large as their box, its paint the median colour of what was
-seen. Actors that were seen from two sides or more stay as they are.
+a scenario moves the car, no camera and no LiDAR would see what collisions count. Such actors, labelled or found in
+sweeps, get the missing part of a body of the procedural towns (``world.actor_gaussians``), as large as their box, its
+paint the median colour of what was seen. Actors that were seen from three sides stay as they are.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ COARSER = 1.5
 """Distance of their Gaussians by that of actors that a scenario adds: less than half of the number."""
 REACH_M = 0.4
 """A body's surface was seen where a Gaussian of the actor is so near."""
-DIRECTIONS, LEAST_SEEN, LEAST_OF_EACH = 16, 0.5, 3
-"""Actors that were seen in half of the directions around their middle stay as they are: two sides are; behind is not.
-A direction was seen with so many Gaussians in it."""
+DIRECTIONS, LEAST_SEEN, LEAST_OF_EACH = 16, 0.6, 3
+"""Actors that were seen in this share of the directions around their middle stay as they are: a car's rear and one of
+its sides are half. A direction was seen with so many Gaussians in it."""
 NEAR_M = 60.0
 """Only actors that come so near to the recorded path."""
 LEAST_COLOURED = 30
@@ -73,23 +73,24 @@ def with_bodies(scene: GaussianScene, bodies: Bodies) -> GaussianScene:
 
 
 def hidden_bodies(scene: GaussianScene, clip: Clip, hold_out: Collection[int] = ()) -> Bodies:
-    """Bodies for labelled actors that the sensors hardly saw.
+    """Bodies for the actors of a log that the sensors hardly saw, labelled ones and those found in its sweeps.
 
     What recorded beams passed through is left out, and what recorded images look at: there the scene shows what they
     saw. If beams passed through most of the box, or images look at most of what would be added, the label is wrong or
     the actor elsewhere, and there is no body.
 
     Args:
-        scene: a reconstruction; actors that deform (Gaussians of their own that are not fixed to their box) stay.
+        scene: a reconstruction; actors that deform (Gaussians of their own that are not fixed to their box) stay, and
+            so do those that only a network has found.
         clip: its log.
         hold_out: sweeps that must not be read, by index, of every LiDAR.
     """
     bodies: dict[int, Gaussians] = {}
     seen: dict[int, float] = {}
     beams: list[SweepBeams] | None = None
-    driven, light = cKDTree(scene.ego.position_m), _light(scene.static)
+    driven, light, found = cKDTree(scene.ego.position_m), _light(scene.static), {track.id for track in clip.tracks}
     for number, track in enumerate(scene.tracks):
-        if not (track.labelled and track.actor and (kind := _kind(track))):
+        if not (track.actor and (track.labelled or track.id in found) and (kind := _kind(track))):
             continue
         if not np.isfinite(driven.query(track.path.position_m, distance_upper_bound=NEAR_M)[0]).any():
             continue
@@ -170,7 +171,7 @@ def _cells(track: Track) -> Gaussians:
 
 
 def _free(gaussians: Gaussians, track: Track, beams: list[SweepBeams]) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians in the frame of an actor's box recorded beams passed through, while it was labelled."""
+    """Which Gaussians in the frame of an actor's box recorded beams passed through, while it is known where it was."""
     path = track.path
 
     def place(t_us: int) -> Float64[np.ndarray, "4 4"] | None:

@@ -1,4 +1,4 @@
-"""Labelled actors that no sensor saw, or saw from one side, get bodies of their class; others stay as they are."""
+"""Actors that no sensor saw, or saw from one or two sides, get bodies of their class; others stay as they are."""
 
 import dataclasses
 
@@ -132,10 +132,25 @@ def test_what_was_seen_from_behind_keeps_its_rear_and_gets_the_rest_in_its_colou
     assert completed.provenance["completed_actors"]["car"] == 0.25
 
 
+def test_what_was_seen_from_two_sides_gets_the_others(street):
+    own = Gaussians.concatenate([plate(-2.2), plate(0, 0.9, across=False)])
+    completed = with_hidden_actors(scene_of(street, track(), own), street)
+    added = completed.dynamic.gaussians[len(own) :].mean_m
+    assert added[:, 1].min() < -0.8 and added[:, 0].max() > 2.1
+    assert added[np.abs(added[:, 0]) < 1.5, 1].max() < 0.6
+    assert completed.provenance["completed_actors"]["car"] == 0.5
+
+
+def test_an_actor_found_in_the_sweeps_of_the_log_gets_a_body(street, monkeypatch):
+    found = track(labelled=False)
+    monkeypatch.setattr(street, "tracks", (found,))
+    assert with_hidden_actors(scene_of(street, found), street).provenance["completed_actors"] == {"car": 0.0}
+
+
 @pytest.mark.parametrize(
     "what, own",
     [
-        (track(), Gaussians.concatenate([plate(-2.2), plate(0, 0.9, across=False)])),
+        (track(), Gaussians.concatenate([plate(-2.2), *(plate(0, side, across=False) for side in (0.9, -0.9))])),
         (track(labelled=False), None),
         (track(actor=False), None),
         (track(label="animal"), None),
@@ -145,8 +160,8 @@ def test_what_was_seen_from_behind_keeps_its_rear_and_gets_the_rest_in_its_colou
         (track(OPEN_M), None),
     ],
     ids=[
-        "seen from two sides",
-        "found",
+        "seen from three sides",
+        "found by a network",
         "no actor",
         "no body of its class",
         "far too long",

@@ -12,7 +12,7 @@ from nurec_sim.errors import ReconstructError
 from nurec_sim.reconstruct import load_method, reconstruct
 from nurec_sim.reconstruct.movers import find_actors, with_actors
 from nurec_sim.reconstruct.movers.contradicted import Seen, off_ground
-from nurec_sim.reconstruct.movers.find import _moves, _track, _whole
+from nurec_sim.reconstruct.movers.find import _lasting, _moves, _track, _whole
 from nurec_sim.reconstruct.movers.following import follow
 from nurec_sim.reconstruct.movers.objects import Blob, blobs_of
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Rig, Track, Trajectory
@@ -125,6 +125,20 @@ def test_a_slow_car_ahead_is_found_though_few_sweeps_see_past_it(slow):
     middle = track.path.position_m[0]
     rear_m = middle[0] - track.size_m[0] / 2
     assert abs(rear_m - (5.8 + 0.8 * (track.path.start_us - slow.t_us[0]) / 1e6)) < 0.3 and abs(middle[1]) < 0.3
+
+
+@pytest.mark.parametrize("late, until", [(0, "the end"), (1, "the end"), (2, "half a sweep later")])
+def test_an_object_that_is_lost_near_the_end_of_the_log_is_there_until_then(late, until):
+    """Sweeps every 100 ms over a second; the last sighting is at 850 ms, or one or two sweeps earlier."""
+    clip = SimpleNamespace(span_us=(0, 1_000_000))
+    seen_us = np.array([450_000, 850_000 - 100_000 * late])
+    poses = np.stack([geometry.pose(np.eye(3), np.array([t / 1e5, 0.0, 0.0])) for t in seen_us])
+    lasting = _lasting(Track("", "automobile", (4.0, 2.0, 1.5), Trajectory(seen_us, poses)), clip, 100_000)
+    assert lasting.path.start_us == 400_000
+    assert lasting.path.end_us == {"the end": 999_999, "half a sweep later": 700_000}[until]
+    assert lasting.path.position_m[-1, 0] == pytest.approx(lasting.path.end_us / 1e5)
+    mirrored = Track("", "automobile", (4.0, 2.0, 1.5), Trajectory(1_000_000 - seen_us[::-1], poses))
+    assert _lasting(mirrored, clip, 100_000).path.start_us == {"the end": 0, "half a sweep later": 300_000}[until]
 
 
 def test_beams_cross_a_slow_car_within_their_noise_before_they_pass_it_by_the_margin(slow):

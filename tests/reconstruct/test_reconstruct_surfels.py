@@ -56,6 +56,40 @@ def test_what_shines_through_a_surface_is_dropped():
     assert seen_among(0.115, 48) == (np.float32(0.1), 0)
 
 
+def closed(rows, length_m=4.0):
+    """A column of pixels: body, inverse depth and surfel of each, its gaps filled; 0.1 m high at 10 m."""
+    body, inverse_depth, index = (np.array(part)[:, None] for part in zip(*rows, strict=True))
+    body, inverse_depth, index = body.astype(np.int32), inverse_depth.astype(np.float32), index.astype(np.int32)
+    splat.close_gaps(inverse_depth, index, body, np.array([0.0, length_m, 4.0]), np.float32(100.0))
+    return list(zip(body[:, 0].tolist(), inverse_depth[:, 0].astype(float).round(4).tolist(), index[:, 0].tolist(), strict=True))
+
+
+CAR, FAR, OPEN, NEAR = (1, 0.1, 7), (0, 0.09, 3), (0, 0.0, -1), (0, 0.2, 3)
+
+
+def test_scenery_does_not_shine_through_between_rows_of_beams_on_an_actor():
+    """The gap takes the depth between those of its ends, and the surfel of the nearer one; what is nearer stays."""
+    lower = (1, 0.104, 8)
+    assert closed([FAR, CAR, FAR, OPEN, NEAR, lower, FAR]) == [
+        FAR, CAR, (1, 0.101, 7), (1, 0.102, 8), (0, 0.2, 3), lower, FAR,
+    ]  # fmt: skip
+
+
+def test_gaps_that_are_high_or_deep_for_an_actor_stay_and_so_do_those_of_the_world():
+    # Up to an eighth of its length, 0.5 m or five pixels, and a quarter of it, 1 m, in depth.
+    for rows, kept in ((5, False), (6, True)):
+        column = [CAR, *[FAR] * (rows - 1), CAR]
+        assert (closed(column) == column) == kept
+    for length_m, kept in ((4.0, False), (0.6, True)):
+        column = [CAR, FAR, CAR]
+        assert (closed(column, length_m) == column) == kept
+    for depth_m, kept in ((10.9, False), (11.1, True)):
+        column = [CAR, OPEN, (1, round(1 / depth_m, 4), 8)]
+        assert (closed(column) == column) == kept
+    assert closed([CAR, OPEN, (2, 0.1, 9)]) == [CAR, OPEN, (2, 0.1, 9)]
+    assert closed([(0, 0.1, 1), OPEN, (0, 0.1, 2)]) == [(0, 0.1, 1), OPEN, (0, 0.1, 2)]
+
+
 @pytest.mark.parametrize(("grey", "kept"), [(28, False), (92, True)])
 def test_a_rim_that_looks_like_what_lies_behind_it_is_trimmed(grey, kept):
     """A near surface of grey 100 left of a far one of grey 20; the rim of the near one has another grey."""

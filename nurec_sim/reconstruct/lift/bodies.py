@@ -55,7 +55,7 @@ class Surfels:
 
     def ended_share(self, counts: BeamCounts) -> Float64[np.ndarray, " n"]:
         """Share of beams that ended at each Gaussian within their noise; boxes are not so exact: within the margin."""
-        return counts.ended_share if self.actor is None else counts.stopped_share
+        return counts.ended_share if self.actor is None or self.actor.standing else counts.stopped_share
 
     def outside_free_space(
         self, gaussians: Gaussians, beams: Sequence[SweepBeams], ground: Ground

@@ -53,6 +53,8 @@ LEAST_HEIGHT_M = 0.4
 STEP_M = 1.0
 """Sightings are compared with the next one at which the object has moved this far."""
 PART_MARGIN_M = 0.5
+END_SWEEPS = 2
+"""Objects that are seen until so many sweeps before the end of the log, or from so many after its begin, are there."""
 
 
 def find_actors(
@@ -190,8 +192,11 @@ def _between(one: Float64[np.ndarray, "n 3"], other: Float64[np.ndarray, "m 3"])
 
 
 def _lasting(track: Track, clip: Clip, step_us: int) -> Track:
-    """The track over half a sweep more than its object was seen, both ways."""
-    begin, end = clip.span_us[0], clip.span_us[1] - 1
+    """The track over half a sweep more than its object was seen, both ways; if that is near an end of the log, to there.
+
+    At the ends of a log, sweeps are contradicted from one side only, so that an object is found late or lost early.
+    """
+    (begin, end), near_us = clip.span_us, END_SWEEPS * step_us
     first, last = track.path.start_us - step_us // 2, track.path.end_us + step_us // 2
-    life_us = begin if first < begin + 2 * step_us else first, end if last > end - 2 * step_us else last
+    life_us = begin if first <= begin + near_us else first, end - 1 if last >= end - near_us else last
     return dataclasses.replace(track, path=lengthened(track.path, life_us), labelled=False)
