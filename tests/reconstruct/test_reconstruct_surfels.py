@@ -6,12 +6,14 @@ from reconstruct_street import Street
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lift import colour, lifting, splat, surfaces
-from nurec_sim.reconstruct.lift.bodies import surfels_of
+from nurec_sim.reconstruct.lift.bodies import Surfels, surfels_of
 from nurec_sim.reconstruct.lift.cloud import Cloud
-from nurec_sim.reconstruct.lift.points import actors_of, gather, voxel_edge_m
+from nurec_sim.reconstruct.lift.pictures import depth_pictures
+from nurec_sim.reconstruct.lift.points import Actor, actors_of, gather, voxel_edge_m
 from nurec_sim.reconstruct.lift.settings import LiftSettings, PointSettings
 from nurec_sim.reconstruct.lift.smoothing import UNIT, smooth_depth
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView
+from nurec_sim.types import Track, Trajectory
 
 TOWARDS = np.array([[0.0, 0.0, -1.0]])
 """The normal of a surface that faces the views of these tests, which look along z."""
@@ -61,7 +63,9 @@ def closed(rows, length_m=4.0):
     body, inverse_depth, index = (np.array(part)[:, None] for part in zip(*rows, strict=True))
     body, inverse_depth, index = body.astype(np.int32), inverse_depth.astype(np.float32), index.astype(np.int32)
     splat.close_gaps(inverse_depth, index, body, np.array([0.0, length_m, 4.0]), np.float32(100.0))
-    return list(zip(body[:, 0].tolist(), inverse_depth[:, 0].astype(float).round(4).tolist(), index[:, 0].tolist(), strict=True))
+    return list(
+        zip(body[:, 0].tolist(), inverse_depth[:, 0].astype(float).round(4).tolist(), index[:, 0].tolist(), strict=True)
+    )
 
 
 CAR, FAR, OPEN, NEAR = (1, 0.1, 7), (0, 0.09, 3), (0, 0.0, -1), (0, 0.2, 3)
@@ -88,6 +92,27 @@ def test_gaps_that_are_high_or_deep_for_an_actor_stay_and_so_do_those_of_the_wor
         assert (closed(column) == column) == kept
     assert closed([CAR, OPEN, (2, 0.1, 9)]) == [CAR, OPEN, (2, 0.1, 9)]
     assert closed([(0, 0.1, 1), OPEN, (0, 0.1, 2)]) == [(0, 0.1, 1), OPEN, (0, 0.1, 2)]
+
+
+def test_pictures_show_an_actor_between_its_rows_of_returns_and_the_world_between_its_own():
+    """A wall 12 m ahead, and 2 m before it a car of which beams met two rows, or the same as part of the world."""
+    across, up = (part.ravel() for part in np.meshgrid(np.arange(-2, 2, 0.05), np.arange(-2, 2, 0.05)))
+    wall = np.column_stack([across, up, np.full(len(across), 12.0)])
+    rows = np.column_stack([np.tile(np.arange(-1, 1, 0.05), 2), np.repeat([-0.2, 0.2], 40), np.full(80, 10.0)])
+    tile = Tile(40, 40, 100.0, (20.0, 20.0), np.eye(3), 1, None, np.ones((40, 40), bool), np.zeros(3))
+    grey = np.full((40, 40, 3), 90, np.uint8)
+    view = WorkingView("front", 0, 1_000_000, True, tile, np.eye(4), np.zeros(3), grey)
+    path = Trajectory(np.array([0, 2_000_000]), np.stack([np.eye(4), np.eye(4)]))
+    actor = Actor(0, Track("car", "automobile", (4.0, 2.0, 1.5), path), False, path)
+    for bodies, number, depth_m in (([(None, wall), (actor, rows)], 1, 10.0), ([(None, [*wall, *rows])], 0, 12.0)):
+        made = [
+            Surfels(who, Cloud(np.array(xyz), np.zeros((len(xyz), 3)), sizes, sizes), np.repeat(TOWARDS, len(xyz), 0)
+                    .astype(np.float32), sizes, sizes, np.zeros(len(xyz), np.uint8))
+            for who, xyz in bodies for sizes in [np.full(len(xyz), 0.06, np.float32)]
+        ]  # fmt: skip
+        (picture,) = depth_pictures([view], made, LiftSettings(), lambda fraction: None)
+        assert picture.body[18:22, 15:25].tolist() == [[number] * 10] * 4
+        assert 1 / picture.inverse_depth[19:21, 15:25] == pytest.approx(depth_m, abs=0.1)
 
 
 @pytest.mark.parametrize(("grey", "kept"), [(28, False), (92, True)])
