@@ -192,7 +192,7 @@ def _between(one: Float64[np.ndarray, "n 3"], other: Float64[np.ndarray, "m 3"])
 
 
 def _lasting(track: Track, clip: Clip, step_us: int) -> Track:
-    """The track over half a sweep more than its object was seen, both ways; if that is near an end of the log, to there.
+    """The track over half a sweep more than its object was seen, both ways, or to the end of the log if that is near.
 
     At the ends of a log, sweeps are contradicted from one side only, so that an object is found late or lost early.
     """
