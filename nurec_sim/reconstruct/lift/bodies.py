@@ -112,7 +112,7 @@ def ground_of(clip: Clip, gathered: Gathered, settings: GroundSettings) -> Groun
     """The ground under the driven path of a clip, by its gathered sweeps."""
     feet = [world for _, world in gathered.feet.values()]
     under = np.concatenate(feet) if feet else None
-    return find_ground(gathered.static.xyz_m, clip.ego.world_from_body, settings, under)
+    return find_ground(gathered.static.xyz_m, clip.ego.world_from_body, settings, under, gathered.sweep_count)
 
 
 def _world_surfels(gathered: Gathered, ground: Ground, carve: bool) -> Surfels:

@@ -18,8 +18,15 @@ MAX_CELLS = 16_000_000
 """Larger grids get larger cells."""
 BAND_M, BAND_SLOPE = 0.4, 0.08
 """Ground is looked for this far above and below the driven path, and this much more per metre away from it."""
+BESIDE_M, FEWEST_BESIDE = 3.0, 30
+"""Under the car, the ground is as far from the path as the median of the returns this near to it, if there are so many:
+the origins of rigs lie on the ground within a decimetre only."""
+EVEN_M = 0.6
+"""Standard deviation of the Gaussian that evens out a road of which there is one sweep; with more, as much less."""
 UNDER_M = 0.05
 """Returns from under a vehicle are of the ground if they lie this near to it, and else of wheels and sills."""
+LEAST_MASS = 0.01
+"""Where less than this share of the cells around was measured, the road is as even as it gets by filling holes."""
 ENOUGH_SHARE, ENOUGH_CELLS = 0.12, 3.0
 """A hole is filled with the mean under the narrowest Gaussian that holds this share of measured cells, or as many."""
 
@@ -121,6 +128,7 @@ def find_ground(
     world_from_rig: Float64[np.ndarray, "k 4 4"],
     settings: GroundSettings,
     under_m: Float64[np.ndarray, "m 3"] | None = None,
+    sweeps: int | None = None,
 ) -> Ground:
     """Fit the height grid to the lowest points near the driven path and grow the road from it.
 
@@ -130,6 +138,7 @@ def find_ground(
         settings: cells, and what ends a road.
         under_m: points in the lowest part of boxes. Where nothing else was measured they tell heights, but not where
             the road ends: a ring of returns from wheels would fence off what is under a parked car.
+        sweeps: how many sweeps the points are of; None: many.
     """
     from scipy.spatial import cKDTree
 
@@ -154,7 +163,9 @@ def find_ground(
     # The band widens with the distance: the ground may slope away from the path.
     band = np.abs(offset) < BAND_M + BAND_SLOPE * distance.reshape(-1)[flat]
     height, known = _low_heights(points[band, 2], flat[band], rows, columns)
-    for x, y, z in path:
+    beside = offset[band & (distance.reshape(-1)[flat] < BESIDE_M)]
+    rise = float(np.median(beside)) if len(beside) >= FEWEST_BESIDE else 0.0
+    for x, y, z in path + (0, 0, rise):
         row, column = int((y - low[1]) / cell), int((x - low[0]) / cell)
         if not known[row, column]:
             height[row, column], known[row, column] = z, True
@@ -169,6 +180,8 @@ def find_ground(
         below = np.abs(points[:, 2] - filled.reshape(-1)[flat]) < UNDER_M
         more, measured = _low_heights(points[below, 2], flat[below], rows, columns)
         filled, known = _fill(np.where(known, height, more), known | measured), known | measured
+    if sweeps is not None and EVEN_M >= sweeps * cell:
+        filled = _evened(filled, road, known, EVEN_M / sweeps / cell)
     near = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) * cell <= FILL_M
     stride = np.where(distance < 8, 1, np.where(distance < 16, 2, 4)).astype(np.uint8)
     return Ground(low, cell, filled, known, near | (distance < DRIVEN_M), road, stride)
@@ -215,6 +228,23 @@ def _drop_raised(height: np.ndarray, known: np.ndarray, cell_m: float) -> np.nda
         around = cv2.erode(low, np.ones((size, size), np.uint8))
         known = known & (height - around < rise_m)
     return known
+
+
+def _evened(height: np.ndarray, road: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
+    """Heights of which those of the road are even over ``sigma`` cells, and end at its kerbs.
+
+    A beam's elevation is wrong by hundredths of a degree. The rings of one sweep then lie centimetres too high or too
+    low, and from beside the path the lines on such a road wind. What the mean takes away from crowns and ramps is added
+    again, as far as it is even itself (twicing, Tukey 1977).
+    """
+    weight = (road & known).astype(np.float32)
+    mass = cv2.GaussianBlur(weight, (0, 0), sigma)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(values * weight, (0, 0), sigma) / np.maximum(mass, 1e-6)
+
+    once = mean(height)
+    return np.where(road & (mass > LEAST_MASS), once + mean(height - once), height)
 
 
 def _fill(height: np.ndarray, known: np.ndarray) -> np.ndarray:
