@@ -5,6 +5,7 @@ import pytest
 from reconstruct_street import Street
 
 from nurec_sim import geometry
+from nurec_sim.reconstruct.free_space import BeamCounts
 from nurec_sim.reconstruct.lift import colour, lifting, splat, surfaces
 from nurec_sim.reconstruct.lift.bodies import Surfels, surfels_of
 from nurec_sim.reconstruct.lift.cloud import Cloud
@@ -56,6 +57,17 @@ def test_what_shines_through_a_surface_is_dropped():
     assert seen_among(0.2, 40) == (0.0, -1)
     assert seen_among(0.2, 20) == (np.float32(0.1), 0)
     assert seen_among(0.115, 48) == (np.float32(0.1), 0)
+
+
+@pytest.mark.parametrize(("standing", "share"), [(None, 0.5), (True, 0.5), (False, 8 / 9)])
+def test_noise_of_beams_counts_on_what_stands_and_the_margin_for_poses_on_what_moves(standing, share):
+    """Passed by one of eight beams by the margin, and by two of three across it; each Gaussian has stopped one more."""
+    counts = BeamCounts(*(np.array([n]) for n in (1, 7, 2, 1)))
+    path = Trajectory(np.array([0, 2_000_000]), np.stack([np.eye(4), np.eye(4)]))
+    actor = standing if standing is None else Actor(0, Track("", "automobile", (4.0, 2.0, 1.5), path), standing, path)
+    empty = np.zeros(0, np.float32)
+    body = Surfels(actor, Cloud(np.zeros((0, 3)), np.zeros((0, 3)), empty, empty), empty, empty, empty, empty)
+    assert body.ended_share(counts)[0] == pytest.approx(share)
 
 
 def closed(rows, length_m=4.0):

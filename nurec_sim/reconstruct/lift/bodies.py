@@ -54,8 +54,9 @@ class Surfels:
         return count_beams(gaussians, beams, poses.get, self.box_size_m)
 
     def ended_share(self, counts: BeamCounts) -> Float64[np.ndarray, " n"]:
-        """Share of beams that ended at each Gaussian within their noise; boxes are not so exact: within the margin."""
-        return counts.ended_share if self.actor is None or self.actor.standing else counts.stopped_share
+        """Share of beams that ended at each Gaussian within their noise; if the body moves, within the margin."""
+        still = self.actor is None or self.actor.standing
+        return counts.ended_share if still else counts.stopped_share
 
     def outside_free_space(
         self, gaussians: Gaussians, beams: Sequence[SweepBeams], ground: Ground
