@@ -3,7 +3,7 @@
 A car that another hid in the log, or whose rear alone was seen, has no surface there: once the ego drives elsewhere or
 a scenario moves the car, no camera and no LiDAR would see what collisions count. Such actors, labelled or found in
 sweeps, get the missing part of a body of the procedural towns (``world.actor_gaussians``), as large as their box, its
-paint the median colour of what was seen. Actors that were seen from three sides stay as they are.
+paint the median colour of the brighter half of what was seen. Actors that were seen from three sides stay as they are.
 """
 
 from __future__ import annotations
@@ -149,7 +149,11 @@ def _body(kind: str, track: Track, own: Gaussians, light: float) -> Gaussians:
     solid = own.opacity > SOLID
     colour = GREY
     if solid.sum() >= LEAST_COLOURED:
-        colour = tuple(np.clip(np.median(own.rgb[solid], axis=0) / light, 0, 1).tolist())
+        seen = own.rgb[solid]
+        luminance = seen @ np.array(LUMINANCE)
+        # Windows, tyres and what lies in their shade are the darker half of most cars; the paint is in the other.
+        paint = np.median(seen[luminance >= np.median(luminance)], axis=0)
+        colour = tuple(np.clip(paint / light, 0, 1).tolist())
     body = actor_gaussians(kind, track.size_m, colour, COARSER)
     return dataclasses.replace(body, rgb=(light * body.rgb).astype(np.float32))[body.label == Label.MOVABLE]
 
