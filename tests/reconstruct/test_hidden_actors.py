@@ -132,6 +132,17 @@ def test_what_was_seen_from_behind_keeps_its_rear_and_gets_the_rest_in_its_colou
     assert completed.provenance["completed_actors"]["car"] == 0.25
 
 
+def test_the_paint_is_the_colour_of_the_brighter_half_of_what_was_seen(street):
+    """More than half of a rear is a dark window."""
+    rear = plate(-2.2)
+    dark = dataclasses.replace(rear, rgb=np.where(rear.mean_m[:, 2:] > -0.2, np.float32(0.02), rear.rgb))
+    assert (dark.rgb[:, 0] < 0.1).mean() == pytest.approx(0.6)
+    bodies = [with_hidden_actors(scene_of(street, track(), own), street).dynamic.gaussians[len(own) :]
+              for own in (rear, dark)]  # fmt: skip
+    sides = [np.median(body.rgb[(np.abs(body.mean_m[:, 1]) > 0.8) & (body.mean_m[:, 2] < 0)], axis=0) for body in bodies]
+    assert sides[1][0] > 0.5 * sides[0][0] and sides[1][0] > 2 * sides[1][1]
+
+
 def test_what_was_seen_from_two_sides_gets_the_others(street):
     own = Gaussians.concatenate([plate(-2.2), plate(0, 0.9, across=False)])
     completed = with_hidden_actors(scene_of(street, track(), own), street)
