@@ -150,10 +150,9 @@ def _body(kind: str, track: Track, own: Gaussians, light: float) -> Gaussians:
     colour = GREY
     if solid.sum() >= LEAST_COLOURED:
         seen = own.rgb[solid]
-        luminance = seen @ np.array(LUMINANCE)
         # Windows, tyres and what lies in their shade are the darker half of most cars; the paint is in the other.
-        paint = np.median(seen[luminance >= np.median(luminance)], axis=0)
-        colour = tuple(np.clip(paint / light, 0, 1).tolist())
+        bright = np.argsort(seen @ np.array(LUMINANCE), kind="stable")[len(seen) // 2 :]
+        colour = tuple(np.clip(np.median(seen[bright], axis=0) / light, 0, 1).tolist())
     body = actor_gaussians(kind, track.size_m, colour, COARSER)
     return dataclasses.replace(body, rgb=(light * body.rgb).astype(np.float32))[body.label == Label.MOVABLE]
 

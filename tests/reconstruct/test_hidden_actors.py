@@ -139,7 +139,9 @@ def test_the_paint_is_the_colour_of_the_brighter_half_of_what_was_seen(street):
     assert (dark.rgb[:, 0] < 0.1).mean() == pytest.approx(0.6)
     bodies = [with_hidden_actors(scene_of(street, track(), own), street).dynamic.gaussians[len(own) :]
               for own in (rear, dark)]  # fmt: skip
-    sides = [np.median(body.rgb[(np.abs(body.mean_m[:, 1]) > 0.8) & (body.mean_m[:, 2] < 0)], axis=0) for body in bodies]
+    sides = [
+        np.median(body.rgb[(np.abs(body.mean_m[:, 1]) > 0.8) & (body.mean_m[:, 2] < 0)], axis=0) for body in bodies
+    ]
     assert sides[1][0] > 0.5 * sides[0][0] and sides[1][0] > 2 * sides[1][1]
 
 
