@@ -18,9 +18,9 @@ MAX_CELLS = 16_000_000
 """Larger grids get larger cells."""
 BAND_M, BAND_SLOPE = 0.4, 0.08
 """Ground is looked for this far above and below the driven path, and this much more per metre away from it."""
-BESIDE_M, FEWEST_BESIDE = 3.0, 30
+BESIDE_M, FEWEST_BESIDE, LEAST_RISE_M = 3.0, 30, 0.03
 """Under the car, the ground is as far from the path as the median of the returns this near to it, if there are so many:
-the origins of rigs lie on the ground within a decimetre only."""
+the origins of rigs lie on the ground within a decimetre only. Less than the last is the crown of the road."""
 EVEN_M = 0.6
 """Standard deviation of the Gaussian that evens out a road of which there is one sweep; with more, as much less."""
 UNDER_M = 0.05
@@ -165,7 +165,7 @@ def find_ground(
     height, known = _low_heights(points[band, 2], flat[band], rows, columns)
     beside = offset[band & (distance.reshape(-1)[flat] < BESIDE_M)]
     rise = float(np.median(beside)) if len(beside) >= FEWEST_BESIDE else 0.0
-    for x, y, z in path + (0, 0, rise):
+    for x, y, z in path + (0, 0, rise if abs(rise) > LEAST_RISE_M else 0.0):
         row, column = int((y - low[1]) / cell), int((x - low[0]) / cell)
         if not known[row, column]:
             height[row, column], known[row, column] = z, True
