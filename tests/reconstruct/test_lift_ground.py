@@ -45,9 +45,11 @@ def test_pavement_level_with_the_road_cannot_be_told_apart():
     assert ground.is_road(np.array([[10.0, 6.0, 0.0]]))[0]
 
 
-@pytest.mark.parametrize(("rise_m", "returns", "under_m"), [(-0.1, 2000, -0.1), (0.08, 2000, 0.08), (-0.1, 20, 0.0)])
+@pytest.mark.parametrize(
+    ("rise_m", "returns", "under_m"), [(-0.1, 2000, -0.1), (0.08, 2000, 0.08), (0.025, 2000, 0.0), (-0.1, 20, 0.0)]
+)
 def test_under_the_car_the_ground_is_as_high_as_beside_it_and_not_as_the_origin_of_the_rig(rise_m, returns, under_m):
-    """The car stands, and the LiDAR sees the road from 2.5 m on; few returns are no reason to doubt the path."""
+    """The car stands, and the LiDAR sees the road from 2.5 m on; few returns, or less than 3 cm, leave the path."""
     points = ground_points(STEP_M, noise_m=0.0) + (0, 0, rise_m)
     away = np.abs(points[:, :2] - [1, 0]).max(axis=1)
     near = np.flatnonzero((away > 2.5) & (away < 4.5))[:returns]

@@ -191,8 +191,8 @@ def close_gaps(inverse_depth, index, body, length, focal):
                 continue
             if 0 <= above < row - 1 and body[above, column] == number:
                 upper, lower = inverse_depth[above, column], inverse_depth[row, column]
-                high = (row - above) / (focal * min(upper, lower)) <= HIGHEST_GAP * length[number]
-                if high and abs(1 / upper - 1 / lower) <= DEEPEST_GAP * length[number]:
+                low = (row - above) / (focal * min(upper, lower)) <= HIGHEST_GAP * length[number]
+                if low and abs(1 / upper - 1 / lower) <= DEEPEST_GAP * length[number]:
                     for r in range(above + 1, row):
                         share = np.float32(r - above) / np.float32(row - above)
                         w = upper + share * (lower - upper)
