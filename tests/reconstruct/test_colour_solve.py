@@ -74,14 +74,22 @@ def test_results_do_not_depend_on_the_number_of_threads(street, lifted, solved, 
 
 
 @pytest.mark.slow
-def test_the_method_solves(street, lifted):
-    # More trust, and a pixel at least: colours of less follow that ``lifted`` was rounded to half floats, as archives
-    # are: at the kerb, where little shows through gaps.
-    settings = dataclasses.replace(SOLVED, colours=ColourSettings(trust=0.5))
-    solved, pixels = colour_solve.solve_colours(lifted, street, ["front"], settings, lambda fraction: None)
-    scene = reconstruct(street, settings=settings, cameras=["front"])
-    shown = pixels > 1
-    assert shown.mean() > 0.1 and np.abs(scene.static.rgb - solved.static.rgb)[shown].max() < 0.01
+def test_the_method_solves(street, lifted, monkeypatch):
+    """What it has lifted, before that is rounded to half floats, as archives are: colours of few pixels follow that."""
+    solves = []
+
+    def noted(*given):
+        solves.append((given, colour_solve.solve_colours(*given)))
+        return solves[0][1]
+
+    monkeypatch.setattr(method, "solve_colours", noted)
+    scene = reconstruct(street, settings=SOLVED, cameras=["front"])
+    (((before, clip, cameras, *_), (solved, pixels)),) = solves
+    assert before.static.mean_m == pytest.approx(lifted.static.mean_m, abs=0.01)
+    assert clip.id == street.id and cameras == ["front"]
+    shown = pixels > 2 * method.SHOWN_PX
+    assert shown.any() and np.abs(scene.static.rgb - solved.static.rgb)[shown].max() < 0.01
+    assert np.abs(solved.static.rgb - before.static.rgb)[shown].max() > 0.1
     assert scene.exposures["front"] == pytest.approx(solved.exposures["front"], abs=0.01)
 
 
