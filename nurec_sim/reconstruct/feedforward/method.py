@@ -16,7 +16,7 @@ from nurec_sim.network.checkpoints.download import find_weights
 from nurec_sim.network.checkpoints.state_dicts import load_weights
 from nurec_sim.network.model import InstantNuRec, Precision
 from nurec_sim.network.sky.background import is_static
-from nurec_sim.reconstruct.ego_images import find_ego_images
+from nurec_sim.reconstruct.ego_vehicle import find_ego_images
 from nurec_sim.reconstruct.feedforward.chunks import ChunkLayers
 from nurec_sim.reconstruct.feedforward.inputs.frames import ChunkWindow, choose_cameras, chunk_windows
 from nurec_sim.reconstruct.feedforward.inputs.window import chunk_inputs

@@ -21,7 +21,7 @@ from jaxtyping import Float32, Float64, UInt8
 from nurec_sim import sensors
 from nurec_sim.compute.cores import in_order, usable_cores
 from nurec_sim.compute.kernels import kernel
-from nurec_sim.reconstruct.ego_images import shows_ego
+from nurec_sim.reconstruct.ego_vehicle import shows_ego
 from nurec_sim.reconstruct.lift.colour import SATURATED
 from nurec_sim.reconstruct.lift.image_errors import BYTE, LEAST_CLEAR, image_errors
 from nurec_sim.reconstruct.lift.settings import LiftSettings, ViewSettings

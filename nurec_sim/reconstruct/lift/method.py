@@ -19,7 +19,7 @@ from jaxtyping import Bool
 from nurec_sim.compute.cores import in_order
 from nurec_sim.errors import ReconstructError
 from nurec_sim.geometry import arc_length
-from nurec_sim.reconstruct.ego_images import find_ego_images
+from nurec_sim.reconstruct.ego_vehicle import find_ego_images
 from nurec_sim.reconstruct.lift import actors as actor_layer
 from nurec_sim.reconstruct.lift import colour, people, points
 from nurec_sim.reconstruct.lift.bake import Baked, body_gaussians, body_pixels, camera_isp

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.compute.cores import in_order
-from nurec_sim.reconstruct.ego_images import shows_ego
+from nurec_sim.reconstruct.ego_vehicle import shows_ego
 from nurec_sim.reconstruct.lift.settings import ViewSettings
 from nurec_sim.types import Box, CameraModel, Clip, Shutter
 
