@@ -126,7 +126,7 @@ def _running_minimum(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _closed(rows: Int64[np.ndarray, " w"], height: int) -> Int64[np.ndarray, " w"]:
     """The boundary without dents narrower than ``DENT`` of its length."""
-    width = round(DENT * len(rows))
+    width = 2 * round(DENT * len(rows) / 2) + 1
     heights = cv2.morphologyEx((height - rows)[None].astype(np.float32), cv2.MORPH_CLOSE, np.ones((1, width)))
     return height - heights[0].astype(int)
 
