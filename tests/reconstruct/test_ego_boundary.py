@@ -87,6 +87,15 @@ def test_what_hangs_into_the_image_ends_at_its_edge():
     assert mask[:10].all() and not mask[10:].any()
 
 
+def test_it_does_not_reach_through_what_is_bright():
+    """An edge 30 rows further down earns as much, and costs what lies between."""
+    bright, edges, near = hanging()
+    edges[9], edges[40] = 0.9, 1.0
+    bright[30:41] = 0.0
+    mask = vehicle_above(bright, edges, near)
+    assert mask[:10].all() and not mask[10:].any()
+
+
 @pytest.mark.parametrize("doubt", ["bright", "open", "a sky"])
 def test_what_is_bright_or_open_or_large_does_not_hang(doubt: str):
     bright, edges, near = hanging()
@@ -108,7 +117,7 @@ def steps(*rows: int, width: int = 30) -> list[np.ndarray]:
 
 
 def test_edges_that_stay_have_a_gradient_and_those_that_move_have_none():
-    """A step of 100 levels, blurred by one pixel: 100 / sqrt(2 pi) = 40 levels per pixel at most, less for the kernel."""
+    """A step of 100 levels, blurred by one pixel: 40 per pixel, less for the kernel."""
     stays = static_gradient(steps(15, 15, 15))
     assert 20 < stays[1, 14:18].max() < 40 and stays[0] == pytest.approx(0)
     assert abs(static_gradient(steps(8, 15, 22))).max() < 1

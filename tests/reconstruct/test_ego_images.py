@@ -10,6 +10,8 @@ from feedforward_clip import MadeClip, clip_of, frame_times, pinhole
 
 from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.ego_vehicle import find_ego_images
+from nurec_sim.reconstruct.ego_vehicle.evidence import compare
+from nurec_sim.reconstruct.ego_vehicle.images import ground_before
 from nurec_sim.reconstruct.lift.settings import ViewSettings
 from nurec_sim.reconstruct.lift.views import read_views
 from nurec_sim.types import LidarModel, Rig, Sweep, Track, Trajectory
@@ -34,7 +36,7 @@ class GroundClip(MadeClip):
 
     bonnet: bool = True
     step_m: float = 1.5
-    paint: tuple[tuple[np.ndarray, float], ...] = ()
+    paint: tuple[tuple[np.ndarray, np.ndarray | float], ...] = ()
     """Masks of the image and their grey levels, over all else."""
 
     @property
@@ -89,12 +91,26 @@ def test_plain_paint_is_found_to_the_edge_that_stays():
 
 
 def test_a_line_along_the_motion_is_of_the_street():
-    """A white line beside the bonnet, towards the vanishing point at (200, 120), on road without texture."""
+    """A kerb beside the bonnet, towards the vanishing point at (200, 120), has ten times the contrast of its edge."""
     rows, columns = np.indices((240, 400))
-    road, line = rows > 150, (rows > 150) & (abs(columns - 200 - 0.9 * (rows - 120)) < 0.04 * (rows - 120))
-    clip = driving(bonnet=False, paint=((road, 128.0), (line, 250.0), (bonnet_mask(), 20.0)))
+    road, pavement = rows > 122, (rows > 122) & (columns > 200 + 0.9 * (rows - 120))
+    clip = driving(bonnet=False, paint=((road, 60.0), (pavement, 250.0), (bonnet_mask(), 40.0)))
     (image,) = find_ego_images(clip, ["front"]).values()
     assert overlap(image[..., 3] > 127, bonnet_mask()) > 0.85
+
+
+@pytest.mark.parametrize(("side_px", "street"), [(20, False), (50, True)])
+def test_reflections_in_the_paint_are_no_street(side_px: int, street: bool):
+    """A square of the bonnet shows ground that moves: a connected part counts from 0.2 % of the image, 14 px square."""
+    rows, columns = np.indices((240, 400))
+    square = (abs(rows - 215) < side_px / 2) & (abs(columns - 200) < side_px / 2)
+    clip = driving(paint=((bonnet_mask() & ~square, VEHICLE),), bonnet=False)
+    small, poses = clip.rig.cameras["front"], [clip.world_from_camera("front", k)[0] for k in (0, 1)]
+    rays, depth_m = ground_before(small, clip)
+    points = np.nan_to_num(depth_m, nan=1.0)[..., None] * rays
+    first, second = (clip.image("front", k)[..., 0].astype(np.float32) for k in (0, 1))
+    _, there = compare(small, first, second, points, geometry.inverse(poses[1]) @ poses[0])
+    assert there[square].any() == street
 
 
 def hanging_mask() -> np.ndarray:
@@ -112,11 +128,16 @@ def test_what_hangs_into_the_image_belongs_to_the_vehicle():
     )
 
 
-@pytest.mark.parametrize("hanging", ["bright", "sky"])
+@pytest.mark.parametrize("hanging", ["cloud", "cloud at night", "sky at night"])
 def test_what_is_bright_above_or_a_sky_at_night_does_not(hanging: str):
-    """The corner in the colour of a cloud; and a black sky, down to a horizon that stays."""
-    mask, level = (hanging_mask(), 200.0) if hanging == "bright" else (np.indices((240, 400))[0] < 118, 0.0)
-    (image,) = find_ego_images(driving(paint=((mask, level),)), ["front"]).values()
+    """The corner in the colour of a cloud; brighter than a black sky; and that sky, down to a horizon that stays."""
+    sky = (np.indices((240, 400))[0] < 118, 5.0)
+    paint = {
+        "cloud": ((hanging_mask(), 200.0),),
+        "cloud at night": (sky, (hanging_mask(), 45.0)),
+        "sky at night": (sky,),
+    }
+    (image,) = find_ego_images(driving(paint=paint[hanging]), ["front"]).values()
     assert not image[:110, :, 3].any()
 
 

@@ -94,7 +94,7 @@ def _find_mask(clip: Clip, camera: str, hold_out: Collection[int]) -> Bool[np.nd
     pairs = _pairs(poses)
     if not pairs:
         return shows_ego(sensors.pixel_rays(model)[0], model, clip.rig.body)
-    rays, depth_m = _ground(small, clip)
+    rays, depth_m = ground_before(small, clip)
     near = np.isfinite(depth_m)
     if not near.any():
         return None
@@ -141,7 +141,7 @@ def _pairs(poses: Sequence[Float64[np.ndarray, "4 4"]]) -> list[tuple[int, int]]
     return [pairs[k] for k in chosen]
 
 
-def _ground(camera: CameraModel, clip: Clip) -> tuple[Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w"]]:
+def ground_before(camera: CameraModel, clip: Clip) -> tuple[Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w"]]:
     """Rays of the pixels in the camera frame, and the distance at which each meets the ground, or nan."""
     rays, seen = sensors.pixel_rays(camera)
     body = clip.rig.body
