@@ -96,13 +96,15 @@ def test_it_does_not_reach_through_what_is_bright():
     assert mask[:10].all() and not mask[10:].any()
 
 
-@pytest.mark.parametrize("doubt", ["bright", "open", "a sky"])
-def test_what_is_bright_or_open_or_large_does_not_hang(doubt: str):
+@pytest.mark.parametrize("doubt", ["bright", "open", "brighter than what is below", "a sky"])
+def test_what_is_in_doubt_does_not_hang(doubt: str):
     bright, edges, near = hanging()
     if doubt == "bright":
         bright[2:10] = 1.0
     elif doubt == "open":
         edges[9] = 0.4
+    elif doubt == "brighter than what is below":
+        edges[9] = -1.0
     else:
         bright[:50], edges[:], edges[49] = 0.0, 0.0, 1.0
     assert not vehicle_above(bright, edges, near).any()

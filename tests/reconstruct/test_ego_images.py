@@ -128,16 +128,12 @@ def test_what_hangs_into_the_image_belongs_to_the_vehicle():
     )
 
 
-@pytest.mark.parametrize("hanging", ["cloud", "cloud at night", "sky at night"])
-def test_what_is_bright_above_or_a_sky_at_night_does_not(hanging: str):
-    """The corner in the colour of a cloud; brighter than a black sky; and that sky, down to a horizon that stays."""
-    sky = (np.indices((240, 400))[0] < 118, 5.0)
-    paint = {
-        "cloud": ((hanging_mask(), 200.0),),
-        "cloud at night": (sky, (hanging_mask(), 45.0)),
-        "sky at night": (sky,),
-    }
-    (image,) = find_ego_images(driving(paint=paint[hanging]), ["front"]).values()
+@pytest.mark.parametrize("hanging", ["cloud", "sky at night"])
+def test_clouds_and_the_sky_at_night_do_not(hanging: str):
+    """The corner in the colour of a cloud; a black sky, down to a horizon that stays."""
+    sky = np.indices((240, 400))[0] < 118
+    paint = (hanging_mask(), 200.0) if hanging == "cloud" else (sky, 5.0)
+    (image,) = find_ego_images(driving(paint=(paint,)), ["front"]).values()
     assert not image[:110, :, 3].any()
 
 

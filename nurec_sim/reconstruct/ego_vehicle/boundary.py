@@ -65,12 +65,13 @@ def vehicle_above(bright: Map, edges: Map, near: Bool[np.ndarray, "h w"]) -> Boo
 
     Args:
         bright: pixels too bright for it, 0 or 1.
-        edges: edges that stay, darker above than below, 0..1.
+        edges: edges that stay, 0..1, negative where it is brighter above than below.
         near: ground before the camera; what hangs is above.
     """
     height, width = bright.shape
     none = np.zeros((1, width))
     cost = np.vstack([none, np.cumsum(bright + PRIOR, axis=0)])
+    edges = np.maximum(edges, 0)
     cost[1:] -= EDGE * edges
     cost[np.arange(height + 1)[:, None] > _first_row(near)] = np.inf
     # Seen upside down it is a vehicle below.
