@@ -92,9 +92,9 @@ def compare(
     here = clear & (staying > CORRELATION) & (staying > moving + MARGIN)
     there = (moving > CORRELATION) & (moving > staying + MARGIN)
     # Reflections in the paint move as well, and match here and there by chance.
-    there = cv2.medianBlur(there.astype(np.uint8), WINDOW_PX)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(there)
-    return here, (there > 0) & (stats[labels, cv2.CC_STAT_AREA] >= SMALLEST_PART * there.size)
+    most = cv2.medianBlur(there.astype(np.uint8), WINDOW_PX)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(most)
+    return here, (most > 0) & (stats[labels, cv2.CC_STAT_AREA] >= SMALLEST_PART * there.size)
 
 
 def flow_of(
