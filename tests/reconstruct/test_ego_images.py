@@ -204,8 +204,6 @@ class FollowingClip(GroundClip):
             grey[REAR] = VEHICLE[REAR]
         if self.bonnet:
             grey = np.where(bonnet_mask(), VEHICLE, grey)
-        for mask, level in self.paint:
-            grey = np.where(mask, level, grey)
         return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
 
 
