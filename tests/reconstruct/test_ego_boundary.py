@@ -76,8 +76,8 @@ def test_what_is_in_doubt_is_no_vehicle(doubt: str):
 
 def hanging() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ten dark rows above an edge, sky below it, ground from row 60."""
-    bright, edges = np.ones((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH))
-    bright[:10], edges[9] = 0.0, 1.0
+    bright, edges = np.ones((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH))
+    bright[:10], edges[9] = False, 1.0
     return bright, edges, np.arange(HEIGHT)[:, None] >= np.full(WIDTH, 60)
 
 
@@ -90,7 +90,7 @@ def test_it_does_not_reach_through_what_is_bright():
     """An edge 30 rows further down earns as much, and costs what lies between."""
     bright, edges, near = hanging()
     edges[9], edges[40] = 0.9, 1.0
-    bright[30:41] = 0.0
+    bright[30:41] = False
     mask = vehicle_above(bright, edges, near)
     assert mask[:10].all() and not mask[10:].any()
 
@@ -99,13 +99,13 @@ def test_it_does_not_reach_through_what_is_bright():
 def test_what_is_in_doubt_does_not_hang(doubt: str):
     bright, edges, near = hanging()
     if doubt == "bright":
-        bright[2:10] = 1.0
+        bright[2:10] = True
     elif doubt == "open":
         edges[9] = 0.4
     elif doubt == "brighter than what is below":
         edges[9] = -1.0
     else:
-        bright[:50], edges[:], edges[49] = 0.0, 0.0, 1.0
+        bright[:50], edges[:], edges[49] = False, 0.0, 1.0
     assert not vehicle_above(bright, edges, near).any()
 
 

@@ -60,11 +60,13 @@ def vehicle_below(ego: Map, street: Map, edges: Map, near: Bool[np.ndarray, "h w
     return good[labels]
 
 
-def vehicle_above(bright: Map, edges: Map, near: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def vehicle_above(
+    bright: Bool[np.ndarray, "h w"], edges: Map, near: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
     """What hangs into an image from above: the housing of a camera, a roof rack.
 
     Args:
-        bright: pixels too bright for it, 0 or 1.
+        bright: pixels too bright for it.
         edges: edges that stay, 0..1, negative where it is brighter above than below.
         near: ground before the camera; what hangs is above.
     """

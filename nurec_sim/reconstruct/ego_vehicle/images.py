@@ -121,7 +121,7 @@ def _find_mask(clip: Clip, camera: str, hold_out: Collection[int]) -> Bool[np.nd
     across = along / np.maximum(strength, 1e-6)
     mask = vehicle_below(ego, street, edges * np.minimum(0.5 + across, 1.0), near)
     bright = np.max(list(grey.values()), axis=0) > DARK
-    mask |= vehicle_above(bright.astype(float), np.copysign(edges, gradient[1]), near)
+    mask |= vehicle_above(bright, np.copysign(edges, gradient[1]), near)
     if not mask.any():
         return None
     full = cv2.resize(mask.astype(np.float32), (model.width_px, model.height_px), interpolation=cv2.INTER_LINEAR)
