@@ -72,7 +72,7 @@ def compare(
         Pixels of the first frame that stay at their place in the second, and those that move as the street does.
     """
     height, width = first.shape
-    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    columns, rows = _pixel_centres(height, width)
     moving = np.full(first.shape, -1.0)
     flow = None
     for part in DEPTHS:
@@ -104,9 +104,13 @@ def flow_of(
     way = -second_from_first[:3, :3].T @ second_from_first[:3, 3]
     height, width = ground_points.shape[:2]
     uv, seen = sensors.project(camera, (ground_points - 0.01 * way).reshape(-1, 3))
-    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    flow = uv.T.reshape(2, height, width) - np.stack([columns, rows])
+    flow = uv.T.reshape(2, height, width) - _pixel_centres(height, width)
     return np.where(seen.reshape(height, width), flow, 0.0)
+
+
+def _pixel_centres(height: int, width: int) -> Float64[np.ndarray, "2 h w"]:
+    """Columns and rows."""
+    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
