@@ -29,6 +29,7 @@ from nurec_sim.reconstruct.lift.pictures import DepthPicture, depth_pictures
 from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
+from nurec_sim.reconstruct.lift.thin_parts import with_thin_parts
 from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, WorkingView, border_weight, key_frames, read_views
 from nurec_sim.reconstruct.unseen_colours import colours_by_likeness
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene
@@ -76,6 +77,7 @@ def lift(
     stages.start("depth")
     pictures = depth_pictures(views, bodies, settings, stages.fraction)
     views = [view for view in views if view.key]
+    pictures = with_thin_parts(views, bodies, pictures, settings.views.agreement)
     stages.start("colours")
     isp, unaligned_cameras = camera_isp(views, pictures, bodies, cameras)
     # Responses first: colours of different cameras are mixed from here on.

@@ -1,4 +1,4 @@
-"""People, who change their shape as they walk: each one is built anew several times a second.
+"""People, who change their shape as they walk or ride: each one is built anew several times a second.
 
 What a rigid body gathers over its life would be a person with a blur of legs. So the life of a person that moves is cut
 into windows of one or two images; each is a body of its own, made from the sweeps and images of its time. Where no
@@ -18,9 +18,9 @@ from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.scene.transform import transformed
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, Trajectory
 
-LABELS = ("person", "animal")
+LABELS = ("person", "animal", "rider")
 SHORTEST_US = 200_000
-"""Windows are no shorter; a walking person takes half a second for a step."""
+"""Windows are no shorter, but the last one; a walking person takes half a second for a step."""
 OFF_M, OFF_RAD = 0.1, np.radians(20.0)
 """Gaussians move straight from knot to knot and do not turn. Where the track differs from that by more, those of a long
 window are repeated for shorter times."""
@@ -64,10 +64,13 @@ def _seen_us(actor: Actor, clip: Clip, frames: Sequence[tuple[str, int]]) -> Int
 
 
 def _ends_us(path: Trajectory, seen_us: Int64[np.ndarray, " n"]) -> list[int]:
-    """Where windows end: half-way between images, ``SHORTEST_US`` apart at least; the last one after the last label."""
+    """Where windows end: half-way between images, ``SHORTEST_US`` apart at least, and half of it before the last label.
+
+    The last window ends after the last label.
+    """
     ends = [path.start_us]
     for end in ((seen_us[1:] + seen_us[:-1]) // 2).tolist():
-        if end - ends[-1] >= SHORTEST_US and path.end_us - end >= SHORTEST_US:
+        if end - ends[-1] >= SHORTEST_US and path.end_us - end >= SHORTEST_US // 2:
             ends.append(end)
     return [*ends, path.end_us + 1]
 

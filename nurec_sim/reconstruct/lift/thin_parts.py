@@ -1,0 +1,210 @@
+"""Thin parts of movers: pixels whose depth is of the world behind a mover, but whose colour is not.
+
+Beams pass beside a leg and between the spokes of a wheel, so the depth there is that of the wall and the road behind:
+each image would paint a leg on the wall, and the rider would have none. But a mover moves on. What other images show at
+the same point of the wall, where no mover is near, is the wall; a pixel that looks like none of them shows the mover.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, UInt8
+
+from nurec_sim import geometry
+from nurec_sim.compute.cores import in_order
+from nurec_sim.compute.kernels import kernel
+from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.fusion import AGREE, points_of
+from nurec_sim.reconstruct.lift.pictures import DepthPicture
+from nurec_sim.reconstruct.lift.splat import project_point
+from nurec_sim.reconstruct.lift.views import WorkingView
+
+MOVES_M = 1.0
+"""What moves less may hide the world behind it from all images."""
+BESIDE_M = 0.2
+"""Parts are looked for so far outside of a box: those that no beam met are no part of boxes found in sweeps."""
+NEAREST_M = 0.5
+"""Boxes that come nearer to the camera have no outline in its image."""
+NEIGHBOURS = 8
+"""Other images of the camera that are asked, the nearest in time."""
+MARGIN_PX = 8
+"""So near to a mover they are not: thin parts of it may be there, and its shadow."""
+DIFFERS = 30
+"""Levels of 255 by which a pixel differs from all of them, in one channel at least."""
+GRID_PX, FEWEST = 8, 100
+"""Exposures of two images are compared at every so many pixels in each direction, if so many show the same."""
+DARKEST, BRIGHTEST = 10, 245
+"""Channels outside of these levels tell nothing about exposure."""
+
+
+def with_thin_parts(
+    views: Sequence[WorkingView], bodies: Sequence[Surfels], pictures: Sequence[DepthPicture], tolerance: float
+) -> list[DepthPicture]:
+    """The pictures with thin parts of movers given to these, as far away as their nearest pixel.
+
+    Args:
+        views: key views.
+        bodies: the static world, then the actors; ``DepthPicture.body`` indexes them.
+        pictures: of the views.
+        tolerance: inverse depths of one surface differ by less than this, 1/m, and a share of themselves.
+    """
+    moving = [n for n, body in enumerate(bodies) if body.actor and np.ptp(body.actor.path.position_m, 0).max() > MOVES_M]
+    if not moving:
+        return list(pictures)
+    outlines = list(in_order(lambda view: _outlines(view, bodies, moving), views))
+    world = [_shows_world(picture, outline) for picture, (outline, _) in zip(pictures, outlines, strict=True)]
+
+    def one(k: int) -> DepthPicture:
+        outline, nearest = outlines[k]
+        behind = (pictures[k].body == 0) & (pictures[k].inverse_depth < nearest) & views[k].tile.valid
+        if not behind.any():
+            return pictures[k]
+        others = [n for n in range(len(views)) if n != k and views[n].camera_id == views[k].camera_id]
+        others = sorted(others, key=lambda n: abs(views[n].t_us - views[k].t_us))[:NEIGHBOURS]
+        differs = np.zeros(behind.shape, bool)
+        differs[behind] = _differs(k, others, behind, views, pictures, world, tolerance)
+        return _given_to_movers(pictures[k], np.where(behind, outline, 0), differs)
+
+    return list(in_order(one, range(len(views))))
+
+
+def _outlines(
+    view: WorkingView, bodies: Sequence[Surfels], moving: Sequence[int]
+) -> tuple[Int32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """The mover in whose outline each pixel lies, 0 in none, and the inverse depth of its nearest corner, 1/m, or 0."""
+    outline, nearest = np.zeros(view.rgb.shape[:2], np.int32), np.zeros(view.rgb.shape[:2], np.float32)
+    found = []
+    for n in moving:
+        if not bodies[n].present(view.t_us):
+            continue
+        half = np.array(bodies[n].box_size_m) / 2 + BESIDE_M
+        corners = half * np.stack(np.meshgrid(*[(-1, 1)] * 3), axis=-1).reshape(-1, 3)
+        xyz = geometry.transform_points(
+            geometry.inverse(view.world_from_view) @ bodies[n].world_from_body(view.t_us), corners
+        )
+        if (near := xyz[:, 2].min()) > NEAREST_M:
+            uv = view.tile.focal_px * xyz[:, :2] / xyz[:, 2:] + view.tile.center_px
+            found.append((near, n, cv2.convexHull(np.rint(uv - 0.5).clip(-1e5, 1e5).astype(np.int32))))
+    # The nearest one last: it hides the others.
+    for near, n, hull in sorted(found, key=lambda each: -each[0]):
+        cv2.fillConvexPoly(outline, hull, n)
+        cv2.fillConvexPoly(nearest, hull, 1 / near)
+    return outline, nearest
+
+
+def _shows_world(picture: DepthPicture, outline: Int32[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels of a picture that show the static world, away from the pixels of movers in their outlines."""
+    window = np.ones((2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1), np.uint8)
+    movers = (picture.body > 0) & (outline > 0)
+    near = (outline > 0) & (cv2.dilate(movers.astype(np.uint8), window) > 0)
+    return (picture.body == 0) & (picture.inverse_depth >= 0) & ~near
+
+
+def _differs(
+    k: int,
+    others: Sequence[int],
+    asked: Bool[np.ndarray, "h w"],
+    views: Sequence[WorkingView],
+    pictures: Sequence[DepthPicture],
+    world: Sequence[Bool[np.ndarray, "h w"]],
+    tolerance: float,
+) -> Bool[np.ndarray, " asked"]:
+    """Which of the asked pixels of the k-th view look like what none of the others shows there, if any shows it."""
+    view, grid = views[k], np.zeros(asked.shape, bool)
+    grid[::GRID_PX, ::GRID_PX] = world[k][::GRID_PX, ::GRID_PX]
+    points, even = (
+        points_of(view.packed, view.world_from_view, pictures[k].inverse_depth, mask) for mask in (asked, grid)
+    )
+    rgb, least = view.rgb[asked].astype(np.float32), np.full(len(points), np.inf, np.float32)
+    for n in others:
+        other = views[n].packed, pictures[n].inverse_depth, world[n], tolerance
+        gain = _gain(view.rgb[grid], views[n].rgb, _places(even, *other))
+        _lower_differences(rgb, _places(points, *other), gain, views[n].rgb, least)
+    return np.isfinite(least) & (least > DIFFERS)
+
+
+def _gain(
+    rgb: UInt8[np.ndarray, "n 3"], picture: UInt8[np.ndarray, "h w 3"], places: Int32[np.ndarray, " n"]
+) -> Float32[np.ndarray, " 3"]:
+    """By how much brighter each channel of some pixels is than in another picture that shows them in these places."""
+    shown = places >= 0
+    pair = np.stack([rgb[shown], picture.reshape(-1, 3)[places[shown]]]).astype(np.float32)
+    told = ((pair > DARKEST) & (pair < BRIGHTEST)).all(axis=(0, 2))
+    if np.count_nonzero(told) < FEWEST:
+        return np.ones(3, np.float32)
+    return np.median(pair[0, told] / pair[1, told], axis=0).astype(np.float32)
+
+
+@kernel
+def _places(points, view, inverse_depth, world, tolerance):
+    """Where a view shows points [n,3] of the world: the index [n] of a pixel, row by row; -1 where it does not.
+
+    Args:
+        points: metres; not a number where there is none.
+        view: [23] packed projection.
+        inverse_depth: [h,w] of the view, 1/m.
+        world: [h,w] pixels that show the world.
+        tolerance: see ``with_thin_parts``.
+    """
+    (height, width), views = inverse_depth.shape, view.reshape(1, -1)
+    places = np.full(len(points), -1, np.int32)
+    for i in range(len(points)):
+        u, v, far = project_point(views, 0, points[i, 0], points[i, 1], points[i, 2])
+        # With a pixel around it.
+        if far > 0.3 and 1 <= u < width - 1 and 1 <= v < height - 1 and world[int(v), int(u)]:
+            if abs(inverse_depth[int(v), int(u)] - 1 / far) < tolerance + AGREE / far:
+                places[i] = int(v) * width + int(u)
+    return places
+
+
+@kernel
+def _lower_differences(rgb, places, gain, picture, least):
+    """Lower ``least`` [n] to the difference of colours [n,3] from the nearest of the 3 x 3 pixels around their places.
+
+    Depth and poses are wrong by a pixel. The difference is that of the channel that differs most, in levels of 255.
+    """
+    width = picture.shape[1]
+    for i in range(len(places)):
+        if places[i] < 0:
+            continue
+        row, column = places[i] // width, places[i] % width
+        for v in range(row - 1, row + 2):
+            for u in range(column - 1, column + 2):
+                most = np.float32(0)
+                for c in range(3):
+                    most = max(most, abs(rgb[i, c] - gain[c] * picture[v, u, c]))
+                least[i] = min(least[i], most)
+
+
+def _given_to_movers(
+    picture: DepthPicture, behind: Int32[np.ndarray, "h w"], differs: Bool[np.ndarray, "h w"]
+) -> DepthPicture:
+    """The picture in which pixels that differ from the world belong to the mover that they are connected to.
+
+    Args:
+        picture: of one view.
+        behind: the mover in whose outline, and behind which, a pixel shows the world; 0 elsewhere.
+        differs: pixels that do not look like the world.
+    """
+    closed = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
+    body, depth = picture.body.copy(), picture.inverse_depth.copy()
+    for n in np.unique(behind[differs]):
+        own = picture.body == n
+        part = closed & (behind == n)
+        count, region = cv2.connectedComponents((part | own).astype(np.uint8), connectivity=8)
+        touches = np.zeros(count, bool)
+        touches[region[own]] = True
+        part &= touches[region]
+        if part.any():
+            # Each pixel's label is that of the nearest pixel of the mover.
+            _, label = cv2.distanceTransformWithLabels(
+                (~own).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+            )
+            depth_of = np.zeros(label.max() + 1, np.float32)
+            depth_of[label[own]] = depth[own]
+            depth[part], body[part] = depth_of[label[part]], n
+    return replace(picture, inverse_depth=depth, body=body, surfel=np.where(body == picture.body, picture.surfel, -1))
