@@ -33,7 +33,7 @@ def street(steps=(-1, 0, 1), step_px=STEP_PX, gains=(1.0, 1.0, 1.0), shift_px=(0
     """Views, bodies and pictures of a rider that passes before a wall: a block of 9 x 9 pixels and a leg below it.
 
     The leg, 3 pixels wide and 6 high, has the depth of the wall. The brightness of images differs by ``gains``, and the
-    wall in them lies so many pixels farther right than its depth says.
+    wall in them lies so many pixels farther right and farther down than its depth says.
     """
     wall = np.random.default_rng(0).integers(30, 100, (SIZE, SIZE, 3)).astype(np.float32)
     times_us = 100_000 * np.arange(len(steps))
@@ -44,7 +44,7 @@ def street(steps=(-1, 0, 1), step_px=STEP_PX, gains=(1.0, 1.0, 1.0), shift_px=(0
     tile = Tile(SIZE, SIZE, focal_px, (MIDDLE, MIDDLE), np.eye(3), 1, None, np.ones((SIZE, SIZE), bool), np.zeros(3))
     views, pictures = [], []
     for t_us, step, gain, shift in zip(times_us, steps, gains, shift_px, strict=False):
-        rgb, body = np.roll(wall, shift, axis=1), np.zeros((SIZE, SIZE), np.int32)
+        rgb, body = np.roll(wall, (shift, shift), axis=(0, 1)), np.zeros((SIZE, SIZE), np.int32)
         column = MIDDLE + step_px * step
         body[MIDDLE - 8 : MIDDLE + 1, column - 4 : column + 5] = 1
         rgb[body == 1], rgb[leg(step, step_px)] = 150, LEG
@@ -87,7 +87,16 @@ def test_other_exposures_and_a_pixel_of_parallax_are_no_difference():
 def test_the_world_near_the_rider_in_another_image_tells_nothing():
     """Half of the rider is 4 pixels wide, half of its leg 1, and the margin 8; the first and the third image know."""
     assert [mask.sum() for mask in given(*street(step_px=11))] == [18, 0, 18]
-    assert [mask.sum() for mask in given(*street(step_px=14))] == [18, 18, 18]
+    assert [mask.sum() for mask in given(*street(step_px=12))] == [18, 18, 18]
+
+
+def test_an_image_that_shows_something_else_there_tells_nothing():
+    """Inverse depths of one surface differ by less than 0.001 and a twentieth, 0.006 in all."""
+    for more, found in ((0.0055, 18), (0.0065, 0)):
+        views, bodies, pictures = street()
+        for other in (0, 2):
+            pictures[other].inverse_depth[leg()] += np.float32(more)
+        assert given(views, bodies, pictures)[1].sum() == found
 
 
 def test_images_of_other_cameras_tell_nothing():
