@@ -8,8 +8,7 @@ from reconstruct_street import FRAME_US, Street
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct import LiftSettings, PointSettings, ViewSettings, reconstruct
-from nurec_sim.reconstruct.lift import people
-from nurec_sim.reconstruct.lift.people import _straight_parts, in_windows, moving
+from nurec_sim.reconstruct.lift.people import _ends_us, _straight_parts, in_windows, moving
 from nurec_sim.reconstruct.lift.points import Actor, actors_of, gather
 from nurec_sim.types import Gaussians, Track, Trajectory
 
@@ -36,6 +35,20 @@ def windows_of(street, frames, name="walker"):
     return [actor.window_us for actor in actors if actor.track.id == name]
 
 
+def test_only_people_that_move_have_windows(street):
+    assert windows_of(street, range(FRAMES), "waiting") == windows_of(street, range(FRAMES), "car") == [None]
+    assert None not in windows_of(street, range(FRAMES))
+
+
+def test_windows_end_half_way_between_images(street):
+    t = street.t_us.tolist()
+    # Half of the first gap is shorter than 0.2 s, and half of the last one is as short as the last window may be.
+    half = [time + FRAME_US // 2 for time in t[1:-1]]
+    assert windows_of(street, range(FRAMES)) == list(zip([t[0], *half], [*half, t[-1] + 1], strict=True))
+    assert windows_of(street, [0, 4]) == [(t[0], t[2]), (t[2], t[-1] + 1)]
+    assert windows_of(street, []) == [(t[0], t[-1] + 1)]
+
+
 def test_riders_have_windows_as_walkers_do(street):
     rides = Street(frames=FRAMES, boxes=BOXES)
     rides.tracks[0] = dataclasses.replace(street.tracks[0], label="rider")
@@ -46,7 +59,7 @@ def test_riders_have_windows_as_walkers_do(street):
 def test_windows_are_no_shorter_than_200_ms_but_the_last_one(frame_us, images):
     """Of twelve images, the first and the last ones at the times of the first and the last label."""
     path = Trajectory(frame_us * np.arange(12), np.tile(np.eye(4), (12, 1, 1)))
-    ends = np.array(people._ends_us(path, path.t_us))
+    ends = np.array(_ends_us(path, path.t_us))
     assert np.histogram(path.t_us, ends)[0].tolist() == images and ends[-1] == path.end_us + 1
     assert (np.diff(ends)[:-1] >= 200_000).all() and ends[-1] - ends[-2] >= 100_000
 

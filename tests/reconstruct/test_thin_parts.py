@@ -99,10 +99,12 @@ def test_an_image_that_shows_something_else_there_tells_nothing():
         assert given(views, bodies, pictures)[1].sum() == found
 
 
-def test_images_of_other_cameras_tell_nothing():
+def test_images_of_other_cameras_and_other_tiles_tell_nothing():
     views, bodies, pictures = street()
-    views[1] = dataclasses.replace(views[1], camera_id="rear")
-    assert [mask.sum() for mask in given(views, bodies, pictures)] == [18, 0, 18]
+    turned = dataclasses.replace(views[1].tile, camera_from_tile=np.diag([-1.0, -1.0, 1.0]))
+    for other in ({"camera_id": "rear"}, {"tile": turned}):
+        some = [views[0], dataclasses.replace(views[1], **other), views[2]]
+        assert [mask.sum() for mask in given(some, bodies, pictures)] == [18, 0, 18]
 
 
 def test_an_actor_that_moves_a_metre_at_most_has_no_thin_parts():

@@ -30,7 +30,7 @@ BESIDE_M = 0.2
 NEAREST_M = 0.5
 """Boxes that come nearer to the camera have no outline in its image."""
 NEIGHBOURS = 8
-"""Other images of the camera that are asked, the nearest in time."""
+"""Other images of the camera, the nearest in time, that are asked."""
 MARGIN_PX = 8
 """So near to a mover they are not: thin parts of it may be there, and its shadow."""
 DIFFERS = 30
@@ -52,7 +52,9 @@ def with_thin_parts(
         pictures: of the views.
         tolerance: inverse depths of one surface differ by less than this, 1/m, and a share of themselves.
     """
-    moving = [n for n, body in enumerate(bodies) if body.actor and np.ptp(body.actor.path.position_m, 0).max() > MOVES_M]
+    moving = [
+        n for n, body in enumerate(bodies) if body.actor and np.ptp(body.actor.path.position_m, 0).max() > MOVES_M
+    ]
     if not moving:
         return list(pictures)
     outlines = list(in_order(lambda view: _outlines(view, bodies, moving), views))
@@ -63,13 +65,19 @@ def with_thin_parts(
         behind = (pictures[k].body == 0) & (pictures[k].inverse_depth < nearest) & views[k].tile.valid
         if not behind.any():
             return pictures[k]
-        others = [n for n in range(len(views)) if n != k and views[n].camera_id == views[k].camera_id]
+        others = [n for n in range(len(views)) if n != k and _look_alike(views[n], views[k])]
         others = sorted(others, key=lambda n: abs(views[n].t_us - views[k].t_us))[:NEIGHBOURS]
         differs = np.zeros(behind.shape, bool)
         differs[behind] = _differs(k, others, behind, views, pictures, world, tolerance)
         return _given_to_movers(pictures[k], np.where(behind, outline, 0), differs)
 
     return list(in_order(one, range(len(views))))
+
+
+def _look_alike(view: WorkingView, other: WorkingView) -> bool:
+    """Whether they are of one camera and, where its images are cut into several tiles, of the same one."""
+    turns = view.tile.camera_from_tile, other.tile.camera_from_tile
+    return view.camera_id == other.camera_id and np.array_equal(*turns)
 
 
 def _outlines(
