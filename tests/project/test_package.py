@@ -1,6 +1,5 @@
 """What is released: every package and data file is in the wheel, every file of the repository in the sdist."""
 
-import fnmatch
 import json
 import shutil
 import subprocess
@@ -15,9 +14,6 @@ import nurec_sim
 REPO = Path(__file__).parents[2]
 PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text())
 FOLDERS = PROJECT["tool"]["setuptools"]["package-dir"]
-NOT_IN_WHEEL = ("nurec_sim/network/weights/*_curves.csv",)
-"""How the shipped weights were trained; nothing reads it."""
-
 ASK_SETUPTOOLS = """\
 import json, sys
 from distutils.core import run_setup
@@ -57,9 +53,8 @@ def test_every_folder_with_code_is_a_package(asked):
 
 
 def test_the_wheel_holds_every_file_of_the_packages(asked):
-    exempt = {path for path in package_files() for pattern in NOT_IN_WHEEL if fnmatch.fnmatch(path, pattern)}
     held = {path.removeprefix("./") for path in asked["wheel"]}
-    assert held == {in_wheel(path) for path in package_files() - exempt}
+    assert held == {in_wheel(path) for path in package_files()}
     assert "nurec_sim/py.typed" in held
 
 
