@@ -32,7 +32,7 @@ NEAREST_M = 0.5
 NEIGHBOURS = 8
 """Other images of the camera, the nearest in time, that are asked."""
 MARGIN_PX = 8
-"""So near to a mover they are not: thin parts of it may be there, and its shadow."""
+"""So near to a mover other images are not asked: its thin parts may be there, and its shadow."""
 DIFFERS = 30
 """Levels of 255 by which a pixel differs from all of them, in one channel at least."""
 GRID_PX, FEWEST = 8, 100
@@ -121,7 +121,7 @@ def _differs(
     world: Sequence[Bool[np.ndarray, "h w"]],
     tolerance: float,
 ) -> Bool[np.ndarray, " asked"]:
-    """Which of the asked pixels of the k-th view look like what none of the others shows there, if any shows it."""
+    """Which of the asked pixels of the k-th view look otherwise than in all others that show their points."""
     view, grid = views[k], np.zeros(asked.shape, bool)
     grid[::GRID_PX, ::GRID_PX] = world[k][::GRID_PX, ::GRID_PX]
     points, even = (
@@ -201,8 +201,10 @@ def _given_to_movers(
     closed = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
     body, depth = picture.body.copy(), picture.inverse_depth.copy()
     for n in np.unique(behind[differs]):
-        own = picture.body == n
-        part = closed & (behind == n)
+        own, part = picture.body == n, closed & (behind == n)
+        left, top, width, height = cv2.boundingRect((own | part).astype(np.uint8))
+        cut = slice(top, top + height), slice(left, left + width)
+        own, part = own[cut], part[cut]
         count, region = cv2.connectedComponents((part | own).astype(np.uint8), connectivity=8)
         touches = np.zeros(count, bool)
         touches[region[own]] = True
@@ -213,6 +215,6 @@ def _given_to_movers(
                 (~own).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
             )
             depth_of = np.zeros(label.max() + 1, np.float32)
-            depth_of[label[own]] = depth[own]
-            depth[part], body[part] = depth_of[label[part]], n
+            depth_of[label[own]] = depth[cut][own]
+            depth[cut][part], body[cut][part] = depth_of[label[part]], n
     return replace(picture, inverse_depth=depth, body=body, surfel=np.where(body == picture.body, picture.surfel, -1))
