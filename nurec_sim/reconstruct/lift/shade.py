@@ -9,19 +9,24 @@ from jaxtyping import Float64
 
 from nurec_sim import geometry
 from nurec_sim.compute.kernels import kernel
-from nurec_sim.types import Track
+from nurec_sim.types import Track, Trajectory
 
 MOVES_M = 1.0
-"""Shadows of what moves less stay with the ground."""
+"""Shadows of what moves less stay with the ground; it may hide the world behind it from all images."""
 REACH_M = 1.0
 """Shadows are looked for so far beside a box: under a high sun or an overcast sky they lie within."""
 ABOVE_M, BELOW_M = 0.1, 0.4
 """The ground lies between these, above and below the underside of the box."""
 
 
+def moves(path: Trajectory) -> bool:
+    """Whether it leads farther than ``MOVES_M``, along one axis of the world."""
+    return bool(np.ptp(path.position_m, axis=0).max() > MOVES_M)
+
+
 def movers(tracks: Sequence[Track]) -> list[Track]:
     """Those that move."""
-    return [track for track in tracks if np.ptp(track.path.position_m, axis=0).max() > MOVES_M]
+    return [track for track in tracks if moves(track.path)]
 
 
 def shading_boxes(tracks: Sequence[Track], t_us: int) -> Float64[np.ndarray, "k 15"]:

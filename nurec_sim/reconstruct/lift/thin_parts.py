@@ -20,11 +20,10 @@ from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.fusion import AGREE, points_of
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
+from nurec_sim.reconstruct.lift.shade import moves
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import WorkingView
 
-MOVES_M = 1.0
-"""What moves less may hide the world behind it from all images."""
 BESIDE_M = 0.2
 """Parts are looked for so far outside of a box: those that no beam met are no part of boxes found in sweeps."""
 NEAREST_M = 0.5
@@ -52,9 +51,7 @@ def with_thin_parts(
         pictures: of the views.
         tolerance: inverse depths of one surface differ by less than this, 1/m, and a share of themselves.
     """
-    moving = [
-        n for n, body in enumerate(bodies) if body.actor and np.ptp(body.actor.path.position_m, 0).max() > MOVES_M
-    ]
+    moving = [n for n, body in enumerate(bodies) if body.actor and moves(body.actor.path)]
     if not moving:
         return list(pictures)
     outlines = list(in_order(lambda view: _outlines(view, bodies, moving), views))
