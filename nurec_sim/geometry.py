@@ -263,6 +263,9 @@ def interpolate_pose_pairs(
 
 # -------------------------------------------------------------------------------------------------- boxes, polygons
 
+BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""[8,3] of a box in its frame, in units of its sides."""
+
 
 def box_corners_xy(
     world_from_box: Float64[np.ndarray, "*n 4 4"], length_m: float, width_m: float

@@ -24,7 +24,6 @@ AROUND_PX = 2
 HIDDEN = 1.15
 """A point farther by this factor than another within ``CELL_PX`` is visible to the LiDAR but occluded in the camera."""
 CELL_PX = 12
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
 def range_name(index: int) -> str:
@@ -51,7 +50,9 @@ def actor_mask(clip: Clip, request: SensorRequest, size_px: tuple[int, int] | No
     for track in clip.tracks:
         if track.label not in MOVABLE_LABELS or not track.path.covers(request.start_us):
             continue
-        corners = geometry.transform_points(track.path.at(request.start_us), _CORNERS * np.asarray(track.size_m))
+        corners = geometry.transform_points(
+            track.path.at(request.start_us), geometry.BOX_CORNERS * np.asarray(track.size_m)
+        )
         uv, valid, _ = sensors.project_rolling(camera, request.world_from_sensor, corners)
         # A box with a corner behind the camera or outside the lens's valid field has no convex image outline.
         if valid.all():

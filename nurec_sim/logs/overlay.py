@@ -10,6 +10,7 @@ from jaxtyping import Float64, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.errors import ClipError
+from nurec_sim.geometry import BOX_CORNERS
 from nurec_sim.logs.checks.sampling import pose_at
 from nurec_sim.logs.clip import Clip
 from nurec_sim.types import CameraModel, Matrix4, Sweep
@@ -23,8 +24,7 @@ DOT_PX = 2
 EDGE_STEPS = 12
 BOX_RGB = (255, 255, 255)
 CAPTION_RGB = (235, 235, 235)
-_CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
-_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
+_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(BOX_CORNERS[a] - BOX_CORNERS[b]).sum() == 1]
 
 Image = UInt8[np.ndarray, "h w 3"]
 
@@ -138,8 +138,8 @@ def draw_box(
     rgb: tuple[int, int, int] = BOX_RGB,
 ) -> None:
     """Draws a box's twelve edges and a cross on its front face; arguments as those of ``draw_lines``."""
-    front = [index for index, corner in enumerate(_CORNERS) if corner[0] > 0]
-    ends = _CORNERS[[*_EDGES, (front[0], front[3]), (front[1], front[2])]] * np.array(size_m)
+    front = [index for index, corner in enumerate(BOX_CORNERS) if corner[0] > 0]
+    ends = BOX_CORNERS[[*_EDGES, (front[0], front[3]), (front[1], front[2])]] * np.array(size_m)
     share = np.linspace(0, 1, EDGE_STEPS + 1)[:, None]
     lines = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])
     draw_lines(image, camera, poses, geometry.transform_points(world_from_box, lines), rgb)

@@ -28,7 +28,6 @@ SHARE, PIXELS = np.array([0.25, 0.12]), 16.0
 """An object is visible if at least this share of its box's outline, by kind, and this many pixels of such an image show
 it. A vehicle that nothing hides fills 0.6 to 0.8 of its outline, a person 0.2 to 0.5."""
 NEAREST_M = 0.3
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +149,7 @@ def outlines(camera: CameraModel, objects: Objects) -> list[Float64[np.ndarray, 
         forward = np.array([np.sin(heading), 0.0, np.cos(heading)])
         up = np.array([0.0, -1.0, 0.0])
         pose = geometry.pose(np.stack([forward, np.cross(up, forward), up], axis=1), centre)
-        corners = geometry.transform_points(pose, _CORNERS * size)
+        corners = geometry.transform_points(pose, geometry.BOX_CORNERS * size)
         uv, valid = sensors.project(camera, corners)
         found.append(uv if valid.all() and corners[:, 2].min() >= NEAREST_M else None)
     return found
@@ -158,7 +157,7 @@ def outlines(camera: CameraModel, objects: Objects) -> list[Float64[np.ndarray, 
 
 def _outline(camera: CameraModel, camera_from_box: Matrix4, size_m: Sequence[float]) -> np.ndarray | None:
     """The box's outline in pixels; None if it reaches behind the camera or out of the lens's valid field."""
-    corners = geometry.transform_points(camera_from_box, _CORNERS * np.asarray(size_m))
+    corners = geometry.transform_points(camera_from_box, geometry.BOX_CORNERS * np.asarray(size_m))
     if corners[:, 2].min() < NEAREST_M:
         return None
     uv, valid = sensors.project(camera, corners)

@@ -27,7 +27,6 @@ SPACING_PX = 9
 windows of this size in which images are compared reach beyond what stands there."""
 DOWN = 9
 """Places from a return down to the road that are marked."""
-CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), axis=-1).reshape(8, 3)
 
 
 def shows_others(
@@ -51,7 +50,7 @@ def shows_others(
             _mark_returns(clip, camera, pair, lidar, min(near)[1], shown)
     for track in clip.tracks:
         if track.path.covers(t_us):
-            corners = geometry.transform_points(track.path.at(t_us), CORNERS * track.size_m)
+            corners = geometry.transform_points(track.path.at(t_us), geometry.BOX_CORNERS * track.size_m)
             uv, seen, _ = sensors.project_rolling(camera, pair, corners)
             # A box that reaches behind the image plane has no hull in the image.
             if seen.all() and np.abs(uv).max() < 1e5:

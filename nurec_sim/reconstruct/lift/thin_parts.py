@@ -86,11 +86,9 @@ def _outlines(
     for n in moving:
         if not bodies[n].present(view.t_us):
             continue
-        half = np.array(bodies[n].box_size_m) / 2 + BESIDE_M
-        corners = half * np.stack(np.meshgrid(*[(-1, 1)] * 3), axis=-1).reshape(-1, 3)
-        xyz = geometry.transform_points(
-            geometry.inverse(view.world_from_view) @ bodies[n].world_from_body(view.t_us), corners
-        )
+        corners = geometry.BOX_CORNERS * (np.array(bodies[n].box_size_m) + 2 * BESIDE_M)
+        view_from_box = geometry.inverse(view.world_from_view) @ bodies[n].world_from_body(view.t_us)
+        xyz = geometry.transform_points(view_from_box, corners)
         if (near := xyz[:, 2].min()) > NEAREST_M:
             uv = view.tile.focal_px * xyz[:, :2] / xyz[:, 2:] + view.tile.center_px
             found.append((near, n, cv2.convexHull(np.rint(uv - 0.5).clip(-1e5, 1e5).astype(np.int32))))
