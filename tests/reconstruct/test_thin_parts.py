@@ -29,18 +29,19 @@ def leg(step=0, step_px=STEP_PX):
     return mask
 
 
-def street(steps=(-1, 0, 1), step_px=STEP_PX, gains=(1.0, 1.0, 1.0), shift_px=(0, 0, 0), focal_px=60.0):
+def street(steps=(-1, 0, 1), step_px=STEP_PX, gains=(1.0, 1.0, 1.0), shift_px=(0, 0, 0), focal_px=60.0, deep_m=1.0):
     """Views, bodies and pictures of a rider that passes before a wall: a block of 9 x 9 pixels and a leg below it.
 
     The leg, 3 pixels wide and 6 high, has the depth of the wall. The brightness of images differs by ``gains``, and the
-    wall in them lies so many pixels farther right and farther down than its depth says.
+    wall in them lies so many pixels farther right and farther down than its depth says. The box is ``deep_m`` along the
+    camera's axis.
     """
     wall = np.random.default_rng(0).integers(30, 100, (SIZE, SIZE, 3)).astype(np.float32)
     times_us = 100_000 * np.arange(len(steps))
     poses = np.tile(np.eye(4), (len(steps), 1, 1))
     poses[:, :3, 3] = [(5.0 / focal_px * step_px * step, 0.0, 5.0) for step in steps]
     path = Trajectory(times_us, poses)
-    actor = Actor(0, Track("rider", "rider", (1.6, 1.6, 1.0), path), False, path)
+    actor = Actor(0, Track("rider", "rider", (1.6, 1.6, deep_m), path), False, path)
     tile = Tile(SIZE, SIZE, focal_px, (MIDDLE, MIDDLE), np.eye(3), 1, None, np.ones((SIZE, SIZE), bool), np.zeros(3))
     views, pictures = [], []
     for t_us, step, gain, shift in zip(times_us, steps, gains, shift_px, strict=False):
@@ -120,6 +121,21 @@ def test_what_is_far_from_the_riders_pixels_or_before_its_box_stays_the_worlds()
     views[1].rgb[speck] = LEG
     pictures[1].inverse_depth[pole & leg()] = 0.3
     assert (given(views, bodies, pictures)[1] == (leg() & ~pole)).all()
+
+
+def test_parts_end_20_cm_outside_of_the_box():
+    """1 m below its middle and 4.3 m away: 13.95 pixels."""
+    views, bodies, pictures = street()
+    for view, step in zip(views, (-1, 0, 1), strict=True):
+        view.rgb[MIDDLE + 1 :, MIDDLE + STEP_PX * step - 1 : MIDDLE + STEP_PX * step + 2] = LEG
+    assert np.flatnonzero(given(views, bodies, pictures)[1].any(axis=1)).tolist() == list(
+        range(MIDDLE + 1, MIDDLE + 14)
+    )
+
+
+def test_a_box_that_reaches_the_camera_has_no_outline():
+    """Its middle is 5 m away, and 0.2 m are added to its half: it ends 0.6 or 0.4 m before the camera."""
+    assert [[mask.sum() for mask in given(*street(deep_m=deep_m))] for deep_m in (8.4, 8.8)] == [[18] * 3, [0] * 3]
 
 
 @pytest.mark.parametrize(("level", "found"), [(130, 18), (129, 0)])
