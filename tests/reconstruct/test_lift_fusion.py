@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.lift import depth, fusion, lifting
+from nurec_sim.reconstruct.lift import depth, fusion, sky_pixels
 from nurec_sim.reconstruct.lift.settings import ViewSettings
 from nurec_sim.reconstruct.lift.smoothing import PRIOR_COST, UNIT
 from nurec_sim.reconstruct.lift.splat import project_point, world_point
@@ -164,6 +164,6 @@ def test_sky_reaches_the_upper_end_and_is_wider_than_a_pole():
         ".wwww.....pp.....",
     ]
     signs = np.array([list(row) for row in picture])
-    found = lifting.sky_likeness(np.isin(signs, ["s", "w", "p"]), signs != "#")
+    found = sky_pixels.sky_likeness(np.isin(signs, ["s", "w", "p"]), signs != "#")
     expected = np.select([signs == "s", signs == "w"], [depth.SKY, depth.MAYBE_SKY], depth.NOT_SKY)
     assert np.array_equal(found, expected)

@@ -5,7 +5,7 @@ import pytest
 from packed_views import TOWARDS, looking_ahead
 
 from nurec_sim import geometry
-from nurec_sim.reconstruct.lift import colour, lifting
+from nurec_sim.reconstruct.lift import colour, lifting, sky_pixels
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView
 
 
@@ -18,7 +18,7 @@ def owned(views, own_view=0, own_rgb=100.0, depth_m=10.0, owning=True):
     inverse_depth = np.stack([np.full((9, 9), w, np.float32) for _, w, _ in views])
     pictures = np.stack([np.full((9, 9, 3), grey, np.uint8) for _, _, grey in views])
     rgb, owns = np.full((1, 3), own_rgb, np.float32), np.full(inverse_depth.shape, owning)
-    one = np.array([[0.0, 0.0, 10.0]]), np.array([depth_m]), np.array([own_view], np.int32), np.zeros(1, bool)
+    one = np.array([[0.0, 0.0, 10.0]]), TOWARDS, np.array([depth_m]), np.array([own_view], np.int32), np.zeros(1, bool)
     keep = lifting.owned(*one, rgb, packed, inverse_depth, owns, pictures, np.ones(len(views), bool), 0.002,
                          lifting.OWNER_RING, lifting.OWNER_BORDER)  # fmt: skip
     return bool(keep[0]), rgb[0, 0]
@@ -41,6 +41,22 @@ def test_the_nearest_view_owns_a_surface_and_of_equally_near_ones_the_first():
     assert not owned([AGREES, (-2.0, 1 / 8, 100)], own_view=0)[0]
     assert owned([(2.0, 1 / 12, 100), AGREES], own_view=1)[0]
     assert not owned([(0.4, 1 / 10.4, 100), AGREES], own_view=1)[0]
+
+
+@pytest.mark.parametrize(("normal", "stays"), [((8.0, 0.0, -4.0), True), ((4.0, 0.0, -8.0), False)])
+def test_a_nearer_view_that_grazes_a_wall_does_not_own_it(normal, stays):
+    """A point 4 m beside the axis, 10 m ahead of the own view and 8 m of the other, whose rays lie in the first wall:
+    their product with its normal, (4, 0, 8) times (8, 0, -4), is 0. The own view sees it from a sine of 0.083, so it
+    counts as 10 m / 0.83 away. Both see the second wall well: sines of 0.66 and 0.6.
+    """
+    normal = np.array([normal]) / np.linalg.norm(normal)
+    packed = np.stack([looking_ahead(behind_m, width=19) for behind_m in (0.0, -2.0)])
+    inverse_depth = np.stack([np.full((9, 19), w, np.float32) for w in (1 / 10, 1 / 8)])
+    pictures, owns = np.full((2, 9, 19, 3), 100, np.uint8), np.ones((2, 9, 19), bool)
+    one = np.array([[4.0, 0.0, 10.0]]), normal, np.array([10.0]), np.zeros(1, np.int32), np.zeros(1, bool)
+    keep = lifting.owned(*one, np.full((1, 3), 100, np.float32), packed, inverse_depth, owns, pictures,
+                         np.ones(2, bool), 0.002, lifting.OWNER_RING, lifting.OWNER_BORDER)  # fmt: skip
+    assert keep[0] == stays
 
 
 def test_a_view_whose_pixel_is_gone_agrees_and_owns_nothing():
@@ -90,7 +106,7 @@ def test_normals_face_the_camera_where_one_surface_ends_before_another():
 )
 def test_sky_is_bright_or_clearly_blue_and_above_the_horizon(rgb, sky):
     """Beside a brightest grey of 240: from 192 on it is bright; what is blue counts from 108 on."""
-    found = lifting.sky_coloured(view_of(np.full((8, 8, 3), rgb, np.uint8)), np.zeros((8, 8), np.float32), 240.0)
+    found = sky_pixels.sky_coloured(view_of(np.full((8, 8, 3), rgb, np.uint8)), np.zeros((8, 8), np.float32), 240.0)
     assert (found[:4] == sky).all() and not found[4:].any()
 
 

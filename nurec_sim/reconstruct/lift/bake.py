@@ -268,6 +268,7 @@ def _owned(
     kept = in_order(
         lambda part: lifting.owned(
             everything.xyz_m[part],
+            everything.normal[part],
             everything.depth_m[part],
             everything.view[part],
             matched[part],

@@ -15,7 +15,7 @@ from nurec_sim.reconstruct.lift.matching import census, open_costs
 from nurec_sim.reconstruct.lift.smoothing import PRIOR_COST, UNIT, smooth_depth
 
 NOT_SKY, MAYBE_SKY, SKY = 0, 1, 2
-"""What a pixel looks like (``lifting.sky_likeness``)."""
+"""What a pixel looks like (``sky_pixels.sky_likeness``)."""
 SKY_COST, NOT_SKY_COST = 60 * UNIT, 40 * UNIT
 NO_SURFACE = 0.0035
 """Levels up to this inverse depth (1/m; from 285 m on) are sky rather than a surface."""

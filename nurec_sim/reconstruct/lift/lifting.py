@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
-from nurec_sim.compute.kernels import kernel
+from nurec_sim.compute.kernels import inner, kernel
 from nurec_sim.reconstruct.lift.blocks import painted
-from nurec_sim.reconstruct.lift.depth import MAYBE_SKY, NOT_SKY, SKY
+from nurec_sim.reconstruct.lift.bodies import LEVEL
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import WorkingView
 from nurec_sim.types.rows import rows_of
@@ -25,8 +24,9 @@ FARTHER = 1.5
 """Views this many times as far away as the own view resolve a surface too badly to be asked about it as others are."""
 HIDING = 2
 """So many views that see something in front of a matched point drop it, if none agrees with it."""
-SKY_PX = 3
-"""Least width of a patch of sky, pixels."""
+GRAZING = 0.1
+"""Sine of the angle between ray and surface under which a view loses to others that see the surface better: a camera
+that passes a corner sees the wall behind it from nearest, but in a few columns of pixels, each a metre of wall."""
 OWNER_BORDER = 0.04
 """Views own nothing in this part of their width at the border, where nothing checks their depth."""
 
@@ -139,21 +139,56 @@ def _normals(view, world_from_view, inverse_depth):
     return normals
 
 
+@inner
+def _owner_distance(views, k, xyz, normal, z):
+    """Depth ``z`` of a point in a view, larger where the view sees its surface from less than ``GRAZING``.
+
+    On level ground it is the depth: pixels are longest where they are farthest, so the nearest view sees it best.
+    """
+    if abs(normal[2]) > LEVEL:
+        return z
+    a = views[k, 5] * xyz[0] + views[k, 6] * xyz[1] + views[k, 7] * xyz[2] + views[k, 14]
+    b = views[k, 8] * xyz[0] + views[k, 9] * xyz[1] + views[k, 10] * xyz[2] + views[k, 15]
+    c = views[k, 11] * xyz[0] + views[k, 12] * xyz[1] + views[k, 13] * xyz[2] + views[k, 16]
+    across = normal[0] * (views[k, 5] * a + views[k, 8] * b + views[k, 11] * c)
+    across += normal[1] * (views[k, 6] * a + views[k, 9] * b + views[k, 12] * c)
+    across += normal[2] * (views[k, 7] * a + views[k, 10] * b + views[k, 13] * c)
+    sine = abs(across) / np.sqrt(a * a + b * b + c * c)
+    return z * max(1.0, GRAZING / max(sine, 1e-3))
+
+
 @kernel
-def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictures, present, tolerance, ring, border):
+def owned(
+    xyz,
+    normal,
+    depth,
+    own_view,
+    matched,
+    rgb,
+    packed,
+    inverse_depth,
+    owns,
+    pictures,
+    present,
+    tolerance,
+    ring,
+    border,
+):
     """Which points no other view owns, and that few views look through.
 
-    The owner of a surface is the view in the nearest ring of distance, rings growing by the factor ``exp(ring)``, and
-    the first of these; a strict order, so that exactly one view owns it. A view agrees with a point that projects well
-    inside it if its inverse depth there is the same within ``tolerance`` plus 10 %; it looks through the point if it is
-    clearly smaller. Points are dropped if more than half as many views look through them as agree. Matched points that
-    no other view agrees with are dropped if any view looks through them, from however far: wrong depth at the edges of
-    trees puts points in front of the sky, which often only views from farther back see past. They are dropped as well
-    if ``HIDING`` views see something in front of them: depth that is matched too far hides behind the true surface from
-    all views along the path, and would hang beside it as a dot for a camera that is turned or moved aside.
+    The owner of a surface is the view in the nearest ring of distance (``_owner_distance``), rings growing by the
+    factor ``exp(ring)``, and the first of these; a strict order, so that exactly one view owns it. A view agrees with a
+    point that projects well inside it if its inverse depth there is the same within ``tolerance`` plus 10 %; it looks
+    through the point if it is clearly smaller. Points are dropped if more than half as many views look through them as
+    agree. Matched points that no other view agrees with are dropped if any view looks through them, from however far:
+    wrong depth at the edges of trees puts points in front of the sky, which often only views from farther back see
+    past. They are dropped as well if ``HIDING`` views see something in front of them: depth that is matched too far
+    hides behind the true surface from all views along the path, and would hang beside it as a dot for a camera that is
+    turned or moved aside.
 
     Args:
         xyz: [n,3] points in the body's frame, metres.
+        normal: [n,3] their unit normals there.
         depth: [n] depth in their own view, metres.
         own_view: [n] index of that view.
         matched: [n] whether the depth is matched; only then views from ``FARTHER`` are asked.
@@ -177,7 +212,8 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
         far_agree, far_through = 0, 0
         # Rings instead of plain distance: neighbouring pixels then share one owner, and the surface does not become a
         # patchwork of views with slightly different depth.
-        own_ring = np.floor(np.log(depth[i]) / ring)
+        own_distance = _owner_distance(packed, own_view[i], xyz[i], normal[i], depth[i])
+        own_ring = np.floor(np.log(own_distance) / ring)
         for c in range(3):
             mixed[c] = rgb[i, c]
         # From the next view on: where another view owns the point, it is most often this one, which is nearer.
@@ -202,9 +238,11 @@ def owned(xyz, depth, own_view, matched, rgb, packed, inverse_depth, owns, pictu
                 margin = border * width
                 inside = margin < u < width - margin and 0.5 * margin < v < height - 0.5 * margin
                 owner = inside and owns[k, int(v), int(u)]
-                if owner and (np.floor(np.log(z) / ring), k) < (own_ring, own_view[i]):
-                    keep[i] = False
-                    break
+                if owner:
+                    distance = _owner_distance(packed, k, xyz[i], normal[i], z)
+                    if (np.floor(np.log(distance) / ring), k) < (own_ring, own_view[i]):
+                        keep[i] = False
+                        break
                 # Views from farther resolve the surface less: by the area of their pixels on it.
                 share = MIXING * (depth[i] / z) ** 2
                 total += share
@@ -250,32 +288,3 @@ def stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
     for k, picture in enumerate(pictures):
         result[k, : picture.shape[0], : picture.shape[1]] = picture
     return result
-
-
-def sky_coloured(view: WorkingView, prior: Float32[np.ndarray, "h w"], bright: float) -> Bool[np.ndarray, "h w"]:
-    """Pixels that look like sky: above the horizon, no surface measured, and bright or clearly blue."""
-    rgb = view.rgb.astype(np.float32)
-    up = rays_of(view) @ view.world_from_view[2, :3]
-    light = rgb.mean(axis=-1)
-    blue = (rgb[..., 2] > 1.15 * rgb[..., 0] + 5) & (light > 0.45 * bright)
-    return (up > 0.0) & (prior <= 0) & ((light > 0.8 * bright) | blue) & view.tile.valid
-
-
-def sky_likeness(coloured: Bool[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """How much pixels look like sky: ``NOT_SKY``, ``MAYBE_SKY`` or ``SKY``.
-
-    White walls and bright poles have the colour of the sky too. But the sky goes on beyond the upper end of the image,
-    and is wider than a pole. Sky-coloured pixels that surfaces enclose may be either.
-
-    Args:
-        coloured: pixels with the colour of the sky (``sky_coloured``).
-        valid: pixels that show the world.
-    """
-    wide = cv2.morphologyEx(coloured.astype(np.uint8), cv2.MORPH_OPEN, np.ones((SKY_PX, SKY_PX), np.uint8))
-    count, region = cv2.connectedComponents(wide, connectivity=8)
-    upper_end = valid & ~np.pad(valid, ((1, 0), (0, 0)))[:-1]
-    ends_above = np.zeros(count, bool)
-    ends_above[region[upper_end]] = True
-    return np.where(ends_above[region] & (wide > 0), SKY, np.where(coloured & (wide > 0), MAYBE_SKY, NOT_SKY)).astype(
-        np.uint8
-    )

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Int32
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import inner, kernel
-from nurec_sim.reconstruct.lift import depth, lifting
+from nurec_sim.reconstruct.lift import depth, sky_pixels
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.fusion import FARTHEST, fused_depths
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
@@ -63,8 +63,8 @@ def depth_pictures(
         view = views[k]
         prior, index, body = _draw(view, bodies)
         trim_silhouettes(prior, index, grays[k])
-        sky = lifting.sky_coloured(view, prior, bright)
-        likeness = lifting.sky_likeness(sky, view.tile.valid)
+        sky = sky_pixels.sky_coloured(view, prior, bright)
+        likeness = sky_pixels.sky_likeness(sky, view.tile.valid)
         around = [(views[n].packed, views[n].rgb, codes[n]) for n in neighbours_of(views, k, options.neighbours)]
         dense = depth.dense_inverse_depth(
             view.packed, view.world_from_view, view.rgb, prior, likeness, around, options.inverse_depths
