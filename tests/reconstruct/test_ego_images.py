@@ -151,6 +151,13 @@ def test_of_a_car_that_stands_its_outline_is_taken():
     assert 160 < row < 220 and not image[: int(row) - 4, 200, 3].any() and (image[int(row) + 5 :, 200, 3] == 255).all()
 
 
+def test_where_neither_vehicle_nor_street_has_texture_it_is_taken_too():
+    """The street of ``test_a_street_without_a_bonnet_has_none`` has."""
+    plain = driving(bonnet=False, paint=((np.ones((240, 400), bool), 128.0),))
+    outline = find_ego_images(driving(step_m=0.0), ["front"])["front"][..., 3]
+    np.testing.assert_array_equal(find_ego_images(plain, ["front"])["front"][..., 3], outline)
+
+
 def test_the_masks_of_the_log_come_first():
     class Masked(GroundClip):
         def ego_mask(self, camera_id: str) -> np.ndarray:
@@ -222,7 +229,9 @@ def with_box(clip: GroundClip, rear_m: float):
 
 @pytest.mark.parametrize("known", ["returns", "box"])
 def test_a_car_ahead_that_keeps_its_distance_is_not_the_ego_vehicle(known: str):
-    assert find_ego_images(following(known, bonnet=False), ["front"]) == {}
+    """Without a bonnet nothing but its outline is taken: the road is plain."""
+    (outline,) = find_ego_images(following(known, bonnet=False), ["front"]).values()
+    np.testing.assert_array_equal(outline[..., 3], find_ego_images(driving(step_m=0.0), ["front"])["front"][..., 3])
     (image,) = find_ego_images(following(known), ["front"]).values()
     (alone,) = find_ego_images(following("nothing", ahead=False), ["front"]).values()
     found, true = image[..., 3] > 127, alone[..., 3] > 127

@@ -33,7 +33,8 @@ def kept(depth_m, seen_m, back_m, matched):
     for k, distance in enumerate((depth_m, *seen_m)):
         inverse[k] = 1 / distance
     packed = np.stack([view_at(back) for back in (0.0, *back_m)])
-    one = np.array([[0.2, -0.1, depth_m]]), np.array([depth_m]), np.zeros(1, np.int32), np.array([matched])
+    place, normal = np.array([[0.2, -0.1, depth_m]]), np.array([[0.0, 0.0, -1.0]])
+    one = place, normal, np.array([depth_m]), np.zeros(1, np.int32), np.array([matched])
     rgb, pictures = np.full((1, 3), 90, np.float32), np.full((count, SIZE[1], SIZE[0], 3), 90, np.uint8)
     present, owns = np.ones(count, bool), np.ones(inverse.shape, bool)
     return bool(owned(*one, rgb, packed, inverse, owns, pictures, present, TOLERANCE, OWNER_RING, OWNER_BORDER)[0])

@@ -53,7 +53,8 @@ def find_ego_images(
     """Images of the ego vehicle as each camera sees it, RGBA of the camera's size; none of cameras that do not see it.
 
     Sweeps of ``hold_out`` are not read. The log's own masks (``Clip.ego_mask``) come first. Without two frames at least
-    ``BASELINE_M`` apart the vehicle is taken to be where its outline is, below ``EGO_HEIGHT_M``.
+    ``BASELINE_M`` apart, or without evidence in it, the vehicle is taken to be where its outline is, below
+    ``EGO_HEIGHT_M``.
     """
     images = {}
     for number, camera in enumerate(cameras):
@@ -91,9 +92,9 @@ def _find_mask(clip: Clip, camera: str, hold_out: Collection[int]) -> Bool[np.nd
         geometry.interpolate_pose_pair(np.asarray(clip.world_from_camera(camera, frame), np.float64), np.array(0.5))
         for frame in range(len(clip.camera_times_us(camera)))
     ]
-    pairs = _pairs(poses)
+    pairs, outline = _pairs(poses), shows_ego(sensors.pixel_rays(model)[0], model, clip.rig.body)
     if not pairs:
-        return shows_ego(sensors.pixel_rays(model)[0], model, clip.rig.body)
+        return outline
     rays, depth_m = ground_before(small, clip)
     near = np.isfinite(depth_m)
     if not near.any():
@@ -123,7 +124,9 @@ def _find_mask(clip: Clip, camera: str, hold_out: Collection[int]) -> Bool[np.nd
     bright = np.max(list(grey.values()), axis=0) > DARK
     mask |= vehicle_above(bright, np.copysign(edges, gradient[1]), near)
     if not mask.any():
-        return None
+        # Neither plain paint nor plain asphalt tells anything.
+        street_seen = street[hidden & near].sum() > ego[hidden & near].sum()
+        return None if street_seen else outline
     full = cv2.resize(mask.astype(np.float32), (model.width_px, model.height_px), interpolation=cv2.INTER_LINEAR)
     return full > 0.25
 

@@ -21,7 +21,6 @@ from jaxtyping import Float32, Float64, UInt8
 from nurec_sim import sensors
 from nurec_sim.compute.cores import in_order, usable_cores
 from nurec_sim.compute.kernels import kernel
-from nurec_sim.reconstruct.ego_vehicle import shows_ego
 from nurec_sim.reconstruct.lift.colour import SATURATED
 from nurec_sim.reconstruct.lift.image_errors import BYTE, LEAST_CLEAR, image_errors
 from nurec_sim.reconstruct.lift.settings import LiftSettings, ViewSettings
@@ -123,11 +122,10 @@ def _pixel_weights(
     reduction = views.reduction_of(model.width_px)
     width, height = model.width_px // reduction, model.height_px // reduction
     rays, seen = sensors.pixel_rays(sensors.scaled_camera(model, width, height))
-    if (image := scene.ego_images.get(camera)) is None:
-        street = (seen & ~shows_ego(rays, model, scene.rig.body)).astype(np.float32)
-    else:
+    street = seen.astype(np.float32)
+    if (image := scene.ego_images.get(camera)) is not None:
         cover = cv2.resize(image[..., 3].astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-        street = (seen & (cover == 0)).astype(np.float32)
+        street[cover > 0] = 0
     if not several:
         return np.stack([street, street])
     texels = _middle_solid_angle(rays) / (4 * np.pi / scene.sky[..., 0].size)

@@ -16,9 +16,8 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from nurec_sim import geometry, sensors
 from nurec_sim.compute.cores import in_order
-from nurec_sim.reconstruct.ego_vehicle import shows_ego
 from nurec_sim.reconstruct.lift.settings import ViewSettings
-from nurec_sim.types import Box, CameraModel, Clip, Shutter
+from nurec_sim.types import CameraModel, Clip, Shutter
 
 BORDER, LEAST_WEIGHT = 0.2, 0.4
 """Part of an image's shorter side over which ``border_weight`` falls, and the weight at its border."""
@@ -122,16 +121,6 @@ def _field(camera: CameraModel) -> tuple[float, float, float, float]:
     left, right = np.percentile(azimuth, [0.5, 99.5])
     top, bottom = np.clip(np.percentile(elevation, [0.5, 99.5]), -0.96, 0.96)
     return left, right, top, bottom
-
-
-def without_ego(tile: Tile, camera: CameraModel, body: Box) -> Tile:
-    """The tile without the pixels that must show the ego car: their rays pass through its lower body.
-
-    Cameras below ``EGO_HEIGHT_M`` look out of that body, and keep all pixels.
-    """
-    u, v = np.meshgrid(np.arange(tile.width) + 0.5, np.arange(tile.height) + 0.5)
-    rays = np.stack([(u - tile.center_px[0]) / tile.focal_px, (v - tile.center_px[1]) / tile.focal_px, u * 0 + 1], -1)
-    return dataclasses.replace(tile, valid=tile.valid & ~shows_ego(rays @ tile.camera_from_tile.T, camera, body))
 
 
 def border_weight(height: int, width: int, least: float = LEAST_WEIGHT) -> Float32[np.ndarray, "h w"]:
@@ -250,8 +239,7 @@ def read_views(
         model = clip.rig.cameras[camera]
         ego = ego_images.get(camera)
         tiles[camera] = [
-            without_ego(tile, model, clip.rig.body) if ego is None else without_pixels(tile, ego[..., 3] > 0)
-            for tile in tiles_of(model, settings)
+            tile if ego is None else without_pixels(tile, ego[..., 3] > 0) for tile in tiles_of(model, settings)
         ]
     frames = choose_frames(clip, cameras, sum(map(len, tiles.values())), settings)
 
