@@ -40,6 +40,17 @@ def kept(depth_m, seen_m, back_m, matched):
     return bool(owned(*one, rgb, packed, inverse, owns, pictures, present, TOLERANCE, OWNER_RING, OWNER_BORDER)[0])
 
 
+def test_a_pixel_between_two_rows_of_beams_is_not_only_matched():
+    """Two pictures of 5 rows and 1 column: the first has beams in rows 0 and 4 at one depth, the second has none."""
+    surfel = np.array([7, -1, -1, -1, 8], np.int32)[:, None]
+    flat, none = np.full((5, 1), 0.1, np.float32), np.zeros((5, 1), bool)
+    pictures = [DepthPicture(flat, 0 * surfel, each, none, none) for each in (surfel, 0 * surfel - 1)]
+    three, vector, index = np.ones(3), np.zeros((3, 3)), np.array([0, 0, 1], np.int32)
+    pixels = Lifted(vector, vector, vector, three, three, vector.astype(np.float32), np.array([7, -1, -1], np.int32),
+                    index, np.array([0, 2, 2], np.int32), np.ones(3, np.uint8))  # fmt: skip
+    assert bake._only_matched(pixels, pictures).tolist() == [False, False, True]
+
+
 SKY_M = np.inf
 
 

@@ -43,6 +43,19 @@ def test_the_nearest_view_owns_a_surface_and_of_equally_near_ones_the_first():
     assert not owned([(0.4, 1 / 10.4, 100), AGREES], own_view=1)[0]
 
 
+def test_depth_between_two_rows_of_beams_on_one_surface_is_known():
+    """Columns: a wall at 10 m; a gap of another depth; beams on two surfaces; a beam above only. Rows 0 and 4 hold the
+    beams; row 2 of the first column is 4 % nearer, row 3 6 %.
+    """
+    inverse_depth = np.full((6, 4), 0.1, np.float32)
+    inverse_depth[2:4, 0] = 0.1 / 0.96, 0.1 / 0.94
+    inverse_depth[1:4, 1], inverse_depth[4, 2] = 0.02, 0.05
+    measured = np.zeros((6, 4), bool)
+    measured[0], measured[4, :3] = True, True
+    found = lifting.between_measured(inverse_depth, measured)
+    assert np.argwhere(found).tolist() == [[1, 0], [2, 0]]
+
+
 @pytest.mark.parametrize(("normal", "stays"), [((8.0, 0.0, -4.0), True), ((4.0, 0.0, -8.0), False)])
 def test_a_nearer_view_that_grazes_a_wall_does_not_own_it(normal, stays):
     """A point 4 m beside the axis, 10 m ahead of the own view and 8 m of the other, whose rays lie in the first wall:

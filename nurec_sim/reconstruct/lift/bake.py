@@ -244,6 +244,16 @@ def _discs(body: Surfels, colours: np.ndarray, rows: np.ndarray, opacity: float)
     return Gaussians.concatenate([Gaussians.empty(), *in_order(made, parts_of(len(rows)))])
 
 
+def _only_matched(pixels: Lifted, pictures: Sequence[DepthPicture]) -> Bool[np.ndarray, " n"]:
+    """Which pixels have a depth that no beam supports: neither their own surfel nor those above and below them."""
+    matched = pixels.surfel < 0
+    for k, picture in enumerate(pictures):
+        rows = np.flatnonzero(matched & (pixels.view == k))
+        between = lifting.between_measured(picture.inverse_depth, picture.surfel >= 0)
+        matched[rows] = ~between.flat[pixels.pixel[rows]]
+    return matched
+
+
 def _owned(
     everything: Lifted,
     body: Surfels,
@@ -264,7 +274,7 @@ def _owned(
     depth_stack, rgb_stack = lifting.stacked(depths), lifting.stacked(rgb)
     owner_stack = np.ones(depth_stack.shape, bool) if owns is None else lifting.stacked(owns)
     # Boxes are not exact enough to tell from afar whether a view looks through an actor.
-    matched = (everything.surfel < 0) & (body.actor is None)
+    matched = _only_matched(everything, pictures) & (body.actor is None)
     kept = in_order(
         lambda part: lifting.owned(
             everything.xyz_m[part],

@@ -27,6 +27,8 @@ HIDING = 2
 GRAZING = 0.1
 """Sine of the angle between ray and surface under which a view loses to others that see the surface better: a camera
 that passes a corner sees the wall behind it from nearest, but in a few columns of pixels, each a metre of wall."""
+BETWEEN = 0.05
+"""Share by which inverse depths of one surface differ between two rows of beams."""
 OWNER_BORDER = 0.04
 """Views own nothing in this part of their width at the border, where nothing checks their depth."""
 
@@ -139,6 +141,31 @@ def _normals(view, world_from_view, inverse_depth):
     return normals
 
 
+@kernel
+def between_measured(inverse_depth, measured):
+    """Pixels [h,w] as far away as the next measured ones above and below them, within ``BETWEEN``.
+
+    Args:
+        inverse_depth: [h,w], 1/m.
+        measured: [h,w] whether a surfel gave it.
+    """
+    height, width = measured.shape
+    found = np.zeros((height, width), np.bool_)
+    for column in range(width):
+        above = -1
+        for row in range(height):
+            if not measured[row, column]:
+                continue
+            if above >= 0:
+                upper, lower = inverse_depth[above, column], inverse_depth[row, column]
+                for k in range(above + 1, row):
+                    here = inverse_depth[k, column]
+                    near = BETWEEN * here
+                    found[k, column] = abs(here - upper) < near and abs(here - lower) < near
+            above = row
+    return found
+
+
 @inner
 def _owner_distance(views, k, xyz, normal, z):
     """Depth ``z`` of a point in a view, larger where the view sees its surface from less than ``GRAZING``.
@@ -191,7 +218,7 @@ def owned(
         normal: [n,3] their unit normals there.
         depth: [n] depth in their own view, metres.
         own_view: [n] index of that view.
-        matched: [n] whether the depth is matched; only then views from ``FARTHER`` are asked.
+        matched: [n] whether only matching tells the depth; only then views from ``FARTHER`` are asked.
         rgb: [n,3] colours 0..255; changed: those of kept points are mixed with the colours that agreeing views show,
             weighted by nearness, which evens out exposure drift and reflections.
         packed: [k,23] projections from the points' frame into the views.
