@@ -44,32 +44,46 @@ def test_the_nearest_view_owns_a_surface_and_of_equally_near_ones_the_first():
 
 
 def test_depth_between_two_rows_of_beams_on_one_surface_is_known():
-    """Columns: a wall at 10 m; a gap of another depth; beams on two surfaces; a beam above only. Rows 0 and 4 hold the
-    beams; row 2 of the first column is 4 % nearer, row 3 6 %.
+    """Columns: a wall at 10 m; a gap of another depth; beams on two surfaces, twice; a beam above only. Rows 0 and 4
+    hold the beams; row 2 of the first column is 4 % nearer, row 3 6 %.
     """
-    inverse_depth = np.full((6, 4), 0.1, np.float32)
+    inverse_depth = np.full((6, 5), 0.1, np.float32)
     inverse_depth[2:4, 0] = 0.1 / 0.96, 0.1 / 0.94
-    inverse_depth[1:4, 1], inverse_depth[4, 2] = 0.02, 0.05
-    measured = np.zeros((6, 4), bool)
-    measured[0], measured[4, :3] = True, True
+    inverse_depth[1:4, 1], inverse_depth[4, 2], inverse_depth[0, 3] = 0.02, 0.05, 0.05
+    measured = np.zeros((6, 5), bool)
+    measured[0], measured[4, :4] = True, True
     found = lifting.between_measured(inverse_depth, measured)
     assert np.argwhere(found).tolist() == [[1, 0], [2, 0]]
 
 
-@pytest.mark.parametrize(("normal", "stays"), [((8.0, 0.0, -4.0), True), ((4.0, 0.0, -8.0), False)])
-def test_a_nearer_view_that_grazes_a_wall_does_not_own_it(normal, stays):
-    """A point 4 m beside the axis, 10 m ahead of the own view and 8 m of the other, whose rays lie in the first wall:
-    their product with its normal, (4, 0, 8) times (8, 0, -4), is 0. The own view sees it from a sine of 0.083, so it
-    counts as 10 m / 0.83 away. Both see the second wall well: sines of 0.66 and 0.6.
+@pytest.mark.parametrize(
+    ("place", "normal", "stays"),
+    [
+        ((4.0, 0.0, 10.0), (8.0, 0.0, -4.0), [True, False]),
+        ((4.0, 0.0, 10.0), (4.0, 0.0, -8.0), [False, True]),
+        ((10.0, 0.0, 3.0), (0.1, 0.0, -1.0), [False, True]),
+    ],
+)
+def test_the_nearer_of_two_views_does_not_own_a_wall_that_it_grazes(place, normal, stays):
+    """The second view is 2 m nearer. Its rays (4, 0, 8) lie in the first wall: their product with its normal is 0; the
+    first view sees that wall from a sine of 0.083, as if from 10 m / 0.83. Both see the second wall well: sines of 0.66
+    and 0.6. The rays (10, 0, 1) of the second view graze the third surface, but it is level: 0.1 and -1 up.
     """
     normal = np.array([normal]) / np.linalg.norm(normal)
-    packed = np.stack([looking_ahead(behind_m, width=19) for behind_m in (0.0, -2.0)])
-    inverse_depth = np.stack([np.full((9, 19), w, np.float32) for w in (1 / 10, 1 / 8)])
-    pictures, owns = np.full((2, 9, 19, 3), 100, np.uint8), np.ones((2, 9, 19), bool)
-    one = np.array([[4.0, 0.0, 10.0]]), normal, np.array([10.0]), np.zeros(1, np.int32), np.zeros(1, bool)
-    keep = lifting.owned(*one, np.full((1, 3), 100, np.float32), packed, inverse_depth, owns, pictures,
-                         np.ones(2, bool), 0.002, lifting.OWNER_RING, lifting.OWNER_BORDER)  # fmt: skip
-    assert keep[0] == stays
+    packed = np.stack([looking_ahead(behind_m, width=219) for behind_m in (0.0, -2.0)])
+    inverse_depth = np.stack([np.full((9, 219), 1 / (place[2] - nearer_m), np.float32) for nearer_m in (0.0, 2.0)])
+    pictures, owns, grey = (
+        np.full((2, 9, 219, 3), 100, np.uint8),
+        np.ones((2, 9, 219), bool),
+        np.ones((1, 3), np.float32),
+    )
+    kept = [
+        lifting.owned(np.array([place]), normal, np.array([place[2] - 2.0 * own_view]), np.array([own_view], np.int32),
+                      np.zeros(1, bool), grey.copy(), packed, inverse_depth, owns, pictures, np.ones(2, bool), 0.002,
+                      lifting.OWNER_RING, lifting.OWNER_BORDER)[0]
+        for own_view in (0, 1)
+    ]  # fmt: skip
+    assert kept == stays
 
 
 def test_a_view_whose_pixel_is_gone_agrees_and_owns_nothing():
