@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from packed_views import TOWARDS, looking_ahead
 
-from nurec_sim.reconstruct.lift import splat
+from nurec_sim.reconstruct.lift import pictures, splat
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.cloud import Cloud
 from nurec_sim.reconstruct.lift.pictures import depth_pictures
@@ -78,25 +78,55 @@ def test_gaps_that_are_high_or_deep_for_an_actor_stay_and_so_do_those_of_the_wor
     assert closed([(0, 0.1, 1), OPEN, (0, 0.1, 2)]) == [(0, 0.1, 1), OPEN, (0, 0.1, 2)]
 
 
-def test_pictures_show_an_actor_between_its_rows_of_returns_and_the_world_between_its_own():
-    """A wall 12 m ahead, and 2 m before it a car of which beams met two rows, or the same as part of the world."""
+def wall_and_car():
+    """Points of a wall 12 m ahead, and of two rows of beams on a car 2 m before it."""
     across, up = (part.ravel() for part in np.meshgrid(np.arange(-2, 2, 0.05), np.arange(-2, 2, 0.05)))
     wall = np.column_stack([across, up, np.full(len(across), 12.0)])
     rows = np.column_stack([np.tile(np.arange(-1, 1, 0.05), 2), np.repeat([-0.2, 0.2], 40), np.full(80, 10.0)])
+    path = Trajectory(np.array([0, 2_000_000]), np.stack([np.eye(4), np.eye(4)]))
+    return wall, rows, Actor(0, Track("car", "automobile", (4.0, 2.0, 1.5), path), False, path)
+
+
+def picture_of(bodies):
+    """The picture, in a grey image of 40 x 40 pixels, of bodies: pairs of actor, or None, and points."""
     tile = Tile(40, 40, 100.0, (20.0, 20.0), np.eye(3), 1, None, np.ones((40, 40), bool), np.zeros(3))
     grey = np.full((40, 40, 3), 90, np.uint8)
     view = WorkingView("front", 0, 1_000_000, True, tile, np.eye(4), np.zeros(3), grey)
-    path = Trajectory(np.array([0, 2_000_000]), np.stack([np.eye(4), np.eye(4)]))
-    actor = Actor(0, Track("car", "automobile", (4.0, 2.0, 1.5), path), False, path)
+    made = [
+        Surfels(who, Cloud(np.array(xyz), np.zeros((len(xyz), 3)), sizes, sizes), np.repeat(TOWARDS, len(xyz), 0)
+                .astype(np.float32), sizes, sizes, np.zeros(len(xyz), np.uint8))
+        for who, xyz in bodies for sizes in [np.full(len(xyz), 0.06, np.float32)]
+    ]  # fmt: skip
+    (picture,) = depth_pictures([view], made, LiftSettings(), lambda fraction: None)
+    return picture
+
+
+def test_pictures_show_an_actor_between_its_rows_of_returns_and_the_world_between_its_own():
+    """A wall, and before it a car of which beams met two rows, or the same as part of the world."""
+    wall, rows, actor = wall_and_car()
     for bodies, number, depth_m in (([(None, wall), (actor, rows)], 1, 10.0), ([(None, [*wall, *rows])], 0, 12.0)):
-        made = [
-            Surfels(who, Cloud(np.array(xyz), np.zeros((len(xyz), 3)), sizes, sizes), np.repeat(TOWARDS, len(xyz), 0)
-                    .astype(np.float32), sizes, sizes, np.zeros(len(xyz), np.uint8))
-            for who, xyz in bodies for sizes in [np.full(len(xyz), 0.06, np.float32)]
-        ]  # fmt: skip
-        (picture,) = depth_pictures([view], made, LiftSettings(), lambda fraction: None)
+        picture = picture_of(bodies)
         assert picture.body[18:22, 15:25].tolist() == [[number] * 10] * 4
         assert 1 / picture.inverse_depth[19:21, 15:25] == pytest.approx(depth_m, abs=0.1)
+
+
+def test_pixels_that_edges_of_the_image_move_to_the_wall_show_the_world_and_no_surfel(monkeypatch):
+    """One pixel of a row of returns on a car, and the one beside it, which stays."""
+    wall, rows, actor = wall_and_car()
+    bodies = [(None, wall), (actor, rows)]
+    before = picture_of(bodies)
+    assert (before.body[18, 20:22] == 1).all() and (before.surfel[18, 20:22] >= 0).all()
+
+    def moved(inverse_depth, rgb):
+        depth = inverse_depth.copy()
+        depth[18, 20] = 1 / 12
+        return depth
+
+    monkeypatch.setattr(pictures, "trim_edges", moved)
+    after = picture_of(bodies)
+    assert after.inverse_depth[18, 20] == np.float32(1 / 12)
+    assert (after.body[18, 20], after.surfel[18, 20]) == (0, -1)
+    assert (after.body[18, 21], after.surfel[18, 21]) == (1, before.surfel[18, 21])
 
 
 @pytest.mark.parametrize(("grey", "kept"), [(28, False), (92, True)])

@@ -13,6 +13,7 @@ from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import inner, kernel
 from nurec_sim.reconstruct.lift import depth, sky_pixels
 from nurec_sim.reconstruct.lift.bodies import Surfels
+from nurec_sim.reconstruct.lift.edges import trim_edges
 from nurec_sim.reconstruct.lift.fusion import FARTHEST, fused_depths
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
 from nurec_sim.reconstruct.lift.settings import LiftSettings
@@ -95,7 +96,14 @@ def depth_pictures(
         replace(picture, inverse_depth=np.where(body == 0, depth, picture.inverse_depth))
         for picture, body, depth in zip(drawn, bodies_of, fused, strict=True)
     ]
-    return list(in_order(lambda each: with_bodies(*each), zip(keys, drawn, strict=True)))
+
+    def trimmed(k: int, picture: DepthPicture) -> DepthPicture:
+        depth = trim_edges(picture.inverse_depth, views[k].rgb)
+        stays = (depth == picture.inverse_depth) | np.isnan(depth)
+        body, surfel = np.where(stays, picture.body, STATIC), np.where(stays, picture.surfel, -1)
+        return with_bodies(k, replace(picture, inverse_depth=depth, body=body, surfel=surfel))
+
+    return list(in_order(lambda each: trimmed(*each), zip(keys, drawn, strict=True)))
 
 
 def _draw(view: WorkingView, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

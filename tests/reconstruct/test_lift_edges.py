@@ -1,0 +1,61 @@
+"""Silhouettes in depth pictures end where the image shows an edge (``lift/edges.py``)."""
+
+import numpy as np
+import pytest
+
+from nurec_sim.reconstruct.lift.edges import trim_edges
+
+NEAR, WALL = 1 / 4, 1 / 10
+RED, GREY = (200, 60, 50), (90, 90, 90)
+
+
+def _scene(seen_px: int, drawn_px: int, behind: float = WALL) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A red post in front of a grey wall: depth drawn, the image, and true depth. Widths of the post in pixels."""
+    depth, truth = np.full((24, 40), behind, np.float32), np.full((24, 40), behind, np.float32)
+    image = np.full((24, 40, 3), GREY, np.uint8)
+    depth[:, 20 - drawn_px // 2 : 20 + drawn_px // 2] = NEAR
+    truth[:, 20 - seen_px // 2 : 20 + seen_px // 2] = NEAR
+    image[:, 20 - seen_px // 2 : 20 + seen_px // 2] = RED
+    return depth, image, truth
+
+
+def test_a_post_drawn_too_wide_is_as_wide_as_in_the_image() -> None:
+    # Of the grey pixels within 5 columns of the outer column drawn too wide, two are near and five far; of the inner
+    # one two and four.
+    depth, image, truth = _scene(seen_px=8, drawn_px=12)
+    np.testing.assert_array_equal(trim_edges(depth, image), truth)
+
+
+def test_a_thin_post_of_its_own_colour_stays() -> None:
+    depth, image, truth = _scene(seen_px=2, drawn_px=2)
+    np.testing.assert_array_equal(trim_edges(depth, image), truth)
+
+
+def test_a_post_drawn_too_narrow_stays_so() -> None:
+    depth, image, _ = _scene(seen_px=8, drawn_px=6)
+    np.testing.assert_array_equal(trim_edges(depth, image), depth)
+
+
+def test_a_wide_post_of_the_colour_of_the_wall_stays() -> None:
+    depth, image, _ = _scene(seen_px=0, drawn_px=14)
+    np.testing.assert_array_equal(trim_edges(depth, image), depth)
+
+
+@pytest.mark.parametrize("sky", [0.0, 0.003])
+def test_nothing_becomes_sky(sky: float) -> None:
+    depth, image, _ = _scene(seen_px=8, drawn_px=14, behind=sky)
+    np.testing.assert_array_equal(trim_edges(depth, image), depth)
+
+
+def test_one_surface_that_leans_away_stays() -> None:
+    # Within 5 pixels its inverse depth changes by less than a tenth, plus 0.003.
+    depth = np.tile(np.linspace(0.25, 0.18, 40, dtype=np.float32), (24, 1))
+    image = np.random.default_rng(0).integers(0, 255, (24, 40, 3)).astype(np.uint8)
+    np.testing.assert_array_equal(trim_edges(depth, image), depth)
+
+
+def test_what_is_masked_takes_no_part() -> None:
+    depth, image, truth = _scene(seen_px=8, drawn_px=12)
+    # Right of the post one column of the wall is left, against the two columns that are drawn too wide.
+    depth[:, 27:], truth[:, 27:], truth[:, 24:26] = np.nan, np.nan, NEAR
+    np.testing.assert_array_equal(trim_edges(depth, image), truth)
