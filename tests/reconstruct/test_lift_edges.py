@@ -54,8 +54,25 @@ def test_one_surface_that_leans_away_stays() -> None:
     np.testing.assert_array_equal(trim_edges(depth, image), depth)
 
 
+def test_nothing_becomes_sky_beside_a_wall() -> None:
+    depth, image, truth = _scene(seen_px=8, drawn_px=12, behind=0.0)
+    # A wall far away, in sight of the lowest rows only; most of what they see is sky.
+    depth[21:, :10], truth[21:, :10] = 1 / 30, 1 / 30
+    truth[:, 14:26] = NEAR
+    np.testing.assert_array_equal(trim_edges(depth, image), truth)
+
+
+def test_nothing_comes_nearer_beside_what_is_farther() -> None:
+    depth, image, _ = _scene(seen_px=8, drawn_px=6)
+    depth[21:, :10] = depth[21:, 30:] = 1 / 30
+    image[21:, :10] = image[21:, 30:] = (0, 0, 0)
+    depth[:3, 17:23] = 1 / 30
+    image[:3, 17:23] = (0, 0, 0)
+    np.testing.assert_array_equal(trim_edges(depth, image), depth)
+
+
 def test_what_is_masked_takes_no_part() -> None:
     depth, image, truth = _scene(seen_px=8, drawn_px=12)
-    # Right of the post one column of the wall is left, against the two columns that are drawn too wide.
-    depth[:, 27:], truth[:, 27:], truth[:, 24:26] = np.nan, np.nan, NEAR
+    # Of the grey pixels around the outer column drawn too wide, two are near, three far and two masked.
+    depth[:, 29:] = truth[:, 29:] = np.nan
     np.testing.assert_array_equal(trim_edges(depth, image), truth)

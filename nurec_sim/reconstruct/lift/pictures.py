@@ -100,8 +100,7 @@ def depth_pictures(
     def trimmed(k: int, picture: DepthPicture) -> DepthPicture:
         depth = trim_edges(picture.inverse_depth, views[k].rgb)
         stays = (depth == picture.inverse_depth) | np.isnan(depth)
-        body, surfel = np.where(stays, picture.body, STATIC), np.where(stays, picture.surfel, -1)
-        return with_bodies(k, replace(picture, inverse_depth=depth, body=body, surfel=surfel))
+        return with_bodies(k, replace(picture, inverse_depth=depth, body=np.where(stays, picture.body, STATIC)))
 
     return list(in_order(lambda each: trimmed(*each), zip(keys, drawn, strict=True)))
 
