@@ -99,8 +99,8 @@ def depth_pictures(
 
     def trimmed(k: int, picture: DepthPicture) -> DepthPicture:
         depth = trim_edges(picture.inverse_depth, views[k].rgb)
-        stays = (depth == picture.inverse_depth) | np.isnan(depth)
-        return with_bodies(k, replace(picture, inverse_depth=depth, body=np.where(stays, picture.body, STATIC)))
+        body = np.where(depth < picture.inverse_depth, STATIC, picture.body)
+        return with_bodies(k, replace(picture, inverse_depth=depth, body=body))
 
     return list(in_order(lambda each: trimmed(*each), zip(keys, drawn, strict=True)))
 
