@@ -76,3 +76,10 @@ def test_what_is_masked_takes_no_part() -> None:
     # Of the grey pixels around the outer column drawn too wide, two are near, three far and two masked.
     depth[:, 29:] = truth[:, 29:] = np.nan
     np.testing.assert_array_equal(trim_edges(depth, image), truth)
+
+
+def test_nothing_moves_within_its_surface() -> None:
+    # Of eleven columns three are far, five of one surface and three nearer: the median is of its surface, 5 % behind.
+    depth, image = np.full((24, 40), 0.19, np.float32), np.full((24, 40, 3), GREY, np.uint8)
+    depth[:, 15:18], depth[:, 20], depth[:, 23:26] = 0.05, 0.2, 0.4
+    np.testing.assert_array_equal(trim_edges(depth, image)[:, 20], depth[:, 20])
