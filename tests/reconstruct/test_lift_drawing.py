@@ -11,14 +11,14 @@ from nurec_sim.reconstruct.lift.pictures import depth_pictures
 from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.views import Tile, WorkingView
-from nurec_sim.types import Track, Trajectory
+from nurec_sim.types import LidarModel, Track, Trajectory
 
 
 @pytest.mark.parametrize(("behind", "shown"), [(0.097, (0.1 + 0.097) / 2), (0.095, 0.1)])
 def test_surfels_within_four_percent_of_the_front_are_averaged(behind, shown):
     """Two at the middle of the same pixel, at inverse depths 0.1 and a little less."""
     bodies = [
-        (looking_ahead(), np.array([[0.0, 0.0, 1 / w]]), TOWARDS, np.array([1.0]), offset)
+        (looking_ahead(), np.array([[0.0, 0.0, 1 / w]]), TOWARDS, np.array([1.0]), 8.0, offset)
         for offset, w in ((5, 0.1), (8, behind))
     ]
     inverse_depth, index = splat.draw_surfels((9, 9), bodies)
@@ -87,7 +87,7 @@ def wall_and_car():
     return wall, rows, Actor(0, Track("car", "automobile", (4.0, 2.0, 1.5), path), False, path)
 
 
-def picture_of(bodies):
+def picture_of(bodies, lidars=()):
     """The picture, in a grey image of 40 x 40 pixels, of bodies: pairs of actor, or None, and points."""
     tile = Tile(40, 40, 100.0, (20.0, 20.0), np.eye(3), 1, None, np.ones((40, 40), bool), np.zeros(3))
     grey = np.full((40, 40, 3), 90, np.uint8)
@@ -97,7 +97,7 @@ def picture_of(bodies):
                 .astype(np.float32), sizes, sizes, np.zeros(len(xyz), np.uint8))
         for who, xyz in bodies for sizes in [np.full(len(xyz), 0.06, np.float32)]
     ]  # fmt: skip
-    (picture,) = depth_pictures([view], made, LiftSettings(), lambda fraction: None)
+    (picture,) = depth_pictures([view], made, lidars, LiftSettings(), lambda fraction: None)
     return picture
 
 
@@ -108,6 +108,24 @@ def test_pictures_show_an_actor_between_its_rows_of_returns_and_the_world_betwee
         picture = picture_of(bodies)
         assert picture.body[18:22, 15:25].tolist() == [[number] * 10] * 4
         assert 1 / picture.inverse_depth[19:21, 15:25] == pytest.approx(depth_m, abs=0.1)
+
+
+def test_pictures_show_a_surface_of_the_world_between_its_rows_of_beams():
+    """Rows of beams 0.04 apart, 4 pixels, over a wall that is seen from elsewhere; the pixels show no surfel."""
+    wall, rows, _ = wall_and_car()
+    for step, depth_m in ((0.04, 10.0), (0.02, 12.0)):
+        lidar = LidarModel("roof", np.array([step, 0.0]), np.linspace(-3, 3, 8), np.zeros(2), np.eye(4))
+        picture = picture_of([(None, [*wall, *rows])], [lidar])
+        assert 1 / picture.inverse_depth[19:21, 15:25] == pytest.approx(depth_m, abs=0.1)
+        assert ((picture.surfel[19:21, 15:25] < 0) == (depth_m == 10)).all()
+
+
+def test_discs_of_near_actors_are_as_wide_as_their_surfels_are_apart_and_others_are_not():
+    """One surfel 0.31 m ahead: half of 0.06 m are 9.7 pixels; the world's discs end at 8."""
+    _, _, actor = wall_and_car()
+    for who, shown in ((actor, True), (None, False)):
+        picture = picture_of([(None, np.zeros((0, 3))), (who, [[0.0, 0.0, 0.31]])])
+        assert (picture.surfel[20, 27] >= 0) and (picture.surfel[20, 28] >= 0) == shown
 
 
 def test_pixels_that_edges_of_the_image_move_to_the_wall_show_the_world_and_no_surfel(monkeypatch):

@@ -75,7 +75,7 @@ def lift(
         stages.start("images")
         ego_images, views = seen.result()
     stages.start("depth")
-    pictures = depth_pictures(views, bodies, settings, stages.fraction)
+    pictures = depth_pictures(views, bodies, list(clip.rig.lidars.values()), settings, stages.fraction)
     views = [view for view in views if view.key]
     pictures = with_thin_parts(views, bodies, pictures, settings.views.agreement)
     stages.start("colours")

@@ -12,13 +12,22 @@ from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import inner, kernel
 from nurec_sim.reconstruct.lift import depth, sky_pixels
+from nurec_sim.reconstruct.lift.beam_rows import close_rows, row_gaps
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.edges import trim_edges
 from nurec_sim.reconstruct.lift.fusion import FARTHEST, fused_depths
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
 from nurec_sim.reconstruct.lift.settings import LiftSettings
-from nurec_sim.reconstruct.lift.splat import close_gaps, draw_surfels, trim_silhouettes, world_point
+from nurec_sim.reconstruct.lift.splat import (
+    WIDEST_OF_ACTORS_PX,
+    WIDEST_PX,
+    close_gaps,
+    draw_surfels,
+    trim_silhouettes,
+    world_point,
+)
 from nurec_sim.reconstruct.lift.views import WorkingView
+from nurec_sim.types import LidarModel
 
 OUTLINE_M = 0.6
 """Unmeasured pixels up to this far outside of a box may show its object."""
@@ -41,13 +50,18 @@ class DepthPicture:
 
 
 def depth_pictures(
-    views: Sequence[WorkingView], bodies: Sequence[Surfels], settings: LiftSettings, progress: Callable[[float], None]
+    views: Sequence[WorkingView],
+    bodies: Sequence[Surfels],
+    lidars: Sequence[LidarModel],
+    settings: LiftSettings,
+    progress: Callable[[float], None],
 ) -> list[DepthPicture]:
     """Dense depth of the key views, matched against all views and fused among key views.
 
     Args:
         views: working views; those with ``key`` get a picture.
         bodies: measured surfaces, the static world first.
+        lidars: scanners that measured them.
         settings: ``views``: depth levels and number of neighbours.
         progress: called with the fraction of the key views that is done.
     """
@@ -62,7 +76,7 @@ def depth_pictures(
 
     def one(k: int) -> DepthPicture:
         view = views[k]
-        prior, index, body = _draw(view, bodies)
+        prior, index, body = _draw(view, bodies, lidars)
         trim_silhouettes(prior, index, grays[k])
         sky = sky_pixels.sky_coloured(view, prior, bright)
         likeness = sky_pixels.sky_likeness(sky, view.tile.valid)
@@ -105,14 +119,19 @@ def depth_pictures(
     return list(in_order(lambda each: trimmed(*each), zip(keys, drawn, strict=True)))
 
 
-def _draw(view: WorkingView, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _draw(
+    view: WorkingView, bodies: Sequence[Surfels], lidars: Sequence[LidarModel]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Splat all bodies: inverse depth, surfel row within its body, and body number per pixel."""
     offset, starts, jobs = 0, [], []
     for surfels in bodies:
         starts.append(offset)
         if surfels.present(view.t_us) and len(surfels.cloud):
             pose = geometry.inverse(view.world_from_view) @ surfels.world_from_body(view.t_us)
-            jobs.append((view.packed_from(pose), surfels.cloud.xyz_m, surfels.normal, surfels.spacing_m, offset))
+            widest = WIDEST_PX if surfels.actor is None else WIDEST_OF_ACTORS_PX
+            jobs.append(
+                (view.packed_from(pose), surfels.cloud.xyz_m, surfels.normal, surfels.spacing_m, widest, offset)
+            )
         offset += len(surfels.cloud)
     inverse_depth, index = draw_surfels(view.rgb.shape[:2], jobs)
     body = np.zeros(index.shape, np.int32)
@@ -120,6 +139,7 @@ def _draw(view: WorkingView, bodies: Sequence[Surfels]) -> tuple[np.ndarray, np.
     body[drawn] = np.searchsorted(starts, index[drawn], side="right") - 1
     # Bodies without surfels share their start with the next one: searchsorted picks the last, which holds the row.
     index[drawn] -= np.asarray(starts, np.int32)[body[drawn]]
+    close_rows(inverse_depth, index, body, row_gaps(view, lidars))
     length_m = np.array([0.0 if surfels.actor is None else surfels.box_size_m[0] for surfels in bodies])
     close_gaps(inverse_depth, index, body, length_m, np.float32(view.tile.focal_px))
     return inverse_depth, index, body

@@ -12,6 +12,9 @@ from nurec_sim.compute.kernels import inner, kernel
 
 SPLAT_RADIUS = 0.5
 """Radius of a drawn surfel per metre of its spacing; what stays open is filled by matching."""
+WIDEST_PX, WIDEST_OF_ACTORS_PX = 8.0, 64.0
+"""Drawn surfels have no larger radius: wide discs reach over trunks and bars. Actors are bodies without gaps, and a car
+in the next lane, whose surfels are 20 pixels apart, would be pierced."""
 HIGHEST_GAP, DEEPEST_GAP = 1 / 8, 1 / 4
 """Gaps in an actor are filled up to this share of its length, if the depths of their ends differ by so little."""
 
@@ -88,7 +91,7 @@ def project_surfels(view, xyz):
 
 
 @kernel
-def splat(view, rows, places, normal, spacing, offset, front, total, weight, nearest, index, second):
+def splat(view, rows, places, normal, spacing, widest, offset, front, total, weight, nearest, index, second):
     """Splat surfels: the first pass keeps the smallest depth in ``front``, the second averages near it.
 
     Each surfel covers a disc of its spacing and takes at every pixel the depth of its tangent plane, bounded so that a
@@ -101,6 +104,7 @@ def splat(view, rows, places, normal, spacing, offset, front, total, weight, nea
         places: likewise.
         normal: [n,3] unit normals.
         spacing: [n] distance between surfels, metres.
+        widest: largest radius of a disc, pixels.
         offset: added to row numbers in ``index``.
         front: [h,w] largest inverse depth so far, 1/m; written in the first pass, read in the second.
         total: [h,w] weighted sum of inverse depths; added to in the second pass.
@@ -112,8 +116,8 @@ def splat(view, rows, places, normal, spacing, offset, front, total, weight, nea
     width, height, focal = int(view[3]), int(view[4]), view[0]
     for k in range(len(rows)):
         i, u, v, depth = rows[k], places[k, 0], places[k, 1], places[k, 2]
-        # Distant surfels should still hit a pixel; the upper bound limits the cost of surfels close to the camera.
-        radius = min(max(SPLAT_RADIUS * spacing[i] * focal / depth, 0.6), 8.0)
+        # Distant surfels should still hit a pixel.
+        radius = min(max(SPLAT_RADIUS * spacing[i] * focal / depth, 0.6), widest)
         n0 = view[5] * normal[i, 0] + view[6] * normal[i, 1] + view[7] * normal[i, 2]
         n1 = view[8] * normal[i, 0] + view[9] * normal[i, 1] + view[10] * normal[i, 2]
         n2 = view[11] * normal[i, 0] + view[12] * normal[i, 1] + view[13] * normal[i, 2]
@@ -232,9 +236,9 @@ def trim_silhouettes(inverse_depth, index, gray):
 
 
 def draw_surfels(
-    shape: tuple[int, int], bodies: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]]
+    shape: tuple[int, int], bodies: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, int]]
 ) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"]]:
-    """Inverse depth (0: nothing) and surfel per pixel (-1: none) of (packed view, xyz, normal, spacing, offset)."""
+    """Inverse depth (0: nothing) and surfel per pixel (-1: none) of (packed view, xyz, normal, spacing, widest, offset)."""
     front, total, weight = (np.zeros(shape, np.float32) for _ in range(3))
     nearest, index = np.full(shape, 2.0, np.float32), np.full(shape, -1, np.int32)
     jobs = [(packed, *project_surfels(packed, xyz), *rest) for packed, xyz, *rest in bodies]
