@@ -238,7 +238,10 @@ def trim_silhouettes(inverse_depth, index, gray):
 def draw_surfels(
     shape: tuple[int, int], bodies: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, int]]
 ) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"]]:
-    """Inverse depth (0: nothing) and surfel per pixel (-1: none) of (packed view, xyz, normal, spacing, widest, offset)."""
+    """Inverse depth (0: nothing) and surfel per pixel (-1: none) of bodies: arguments of ``splat`` and their points.
+
+    Each body is (packed view, xyz, normal, spacing, widest, offset).
+    """
     front, total, weight = (np.zeros(shape, np.float32) for _ in range(3))
     nearest, index = np.full(shape, 2.0, np.float32), np.full(shape, -1, np.int32)
     jobs = [(packed, *project_surfels(packed, xyz), *rest) for packed, xyz, *rest in bodies]
