@@ -126,6 +126,9 @@ def test_discs_of_near_actors_are_as_wide_as_their_surfels_are_apart_and_others_
     for who, shown in ((actor, True), (None, False)):
         picture = picture_of([(None, np.zeros((0, 3))), (who, [[0.0, 0.0, 0.31]])])
         assert (picture.surfel[20, 27] >= 0) and (picture.surfel[20, 28] >= 0) == shown
+    # 8.6 pixels left of the image, its disc ends 1.1 pixels inside.
+    picture = picture_of([(None, np.zeros((0, 3))), (actor, [[-0.286 * 0.31, 0.0, 0.31]])])
+    assert (picture.surfel[20] >= 0).tolist() == [True] + [False] * 39
 
 
 def test_pixels_that_edges_of_the_image_move_to_the_wall_show_the_world_and_no_surfel(monkeypatch):

@@ -63,12 +63,12 @@ def close_rows(inverse_depth, index, body, gap):
                 upper = inverse_depth[above, column]
                 if upper < (1 - SAME_DEPTH) * lower:
                     continue
-                if (1 - SAME_DEPTH) * upper <= lower and body[above, column] == body[row, column]:
+                number = body[row, column]
+                if (1 - SAME_DEPTH) * upper <= lower and body[above, column] == number:
                     for r in range(above + 1, row):
                         share = np.float32(r - above) / np.float32(row - above)
+                        nearer = above if share < 0.5 else row
                         inverse_depth[r, column] = upper + share * (lower - upper)
-                        index[r, column] = index[above if share < 0.5 else row, column]
-                        body[r, column] = body[row, column]
-                        if body[row, column] == 0:
-                            index[r, column] = -1
+                        index[r, column] = index[nearer, column] if number > 0 else -1
+                        body[r, column] = number
                 break

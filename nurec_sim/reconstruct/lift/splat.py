@@ -78,13 +78,16 @@ def world_point(view, world_from_view, u, v, inverse_depth):
 
 
 @kernel
-def project_surfels(view, xyz):
-    """Rows [m] of the points [n,3] that may reach into the image, and their pixels and depths [m,3] (u, v, metres)."""
+def project_surfels(view, xyz, widest):
+    """Rows [m] of the points [n,3] that may reach into the image, and their pixels and depths [m,3] (u, v, metres).
+
+    ``widest``: how far a point reaches at most, pixels.
+    """
     width, height, views = int(view[3]), int(view[4]), view.reshape(1, -1)
     rows, places, count = np.empty(len(xyz), np.int64), np.empty((len(xyz), 3)), 0
     for i in range(len(xyz)):
         u, v, depth = project_point(views, 0, xyz[i, 0], xyz[i, 1], xyz[i, 2])
-        if depth >= 0.3 and u >= -8 and v >= -8 and u <= width + 8 and v <= height + 8:
+        if depth >= 0.3 and -widest <= u <= width + widest and -widest <= v <= height + widest:
             rows[count], places[count, 0], places[count, 1], places[count, 2] = i, u, v, depth
             count += 1
     return rows[:count].copy(), places[:count].copy()
@@ -244,7 +247,10 @@ def draw_surfels(
     """
     front, total, weight = (np.zeros(shape, np.float32) for _ in range(3))
     nearest, index = np.full(shape, 2.0, np.float32), np.full(shape, -1, np.int32)
-    jobs = [(packed, *project_surfels(packed, xyz), *rest) for packed, xyz, *rest in bodies]
+    jobs = [
+        (packed, *project_surfels(packed, xyz, widest), normal, spacing, widest, offset)
+        for packed, xyz, normal, spacing, widest, offset in bodies
+    ]
     for second in (False, True):
         for job in jobs:
             splat(*job, front, total, weight, nearest, index, second)
