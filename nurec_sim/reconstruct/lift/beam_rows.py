@@ -12,13 +12,14 @@ import numpy as np
 from jaxtyping import Float32
 
 from nurec_sim.compute.kernels import kernel
+from nurec_sim.reconstruct.lift.lifting import BETWEEN
 from nurec_sim.reconstruct.lift.views import WorkingView
 from nurec_sim.types import LidarModel
 
 WIDER = 1.1
 """Gaps are closed up to so many times the angle between rows: the camera is not where the LiDAR is."""
-SAME_DEPTH = np.float32(0.05)
-"""Share by which inverse depths of one surface differ between two rows of beams."""
+SAME_DEPTH = np.float32(BETWEEN)
+"""``BETWEEN`` at the precision of depth pictures."""
 
 
 def row_gaps(view: WorkingView, lidars: Sequence[LidarModel]) -> Float32[np.ndarray, "h w"]:
