@@ -115,10 +115,10 @@ def test_impossible_settings_are_named(make, changed, message):
 
 @pytest.mark.parametrize(
     ("width_px", "reduction"),
-    [(640, 1), (960, 1), (961, 2), (1242, 2), (1600, 2), (1920, 3), (1936, 3), (3848, 6), (100, 1)],
+    [(800, 1), (1200, 1), (1201, 2), (1242, 2), (1600, 2), (1920, 2), (2000, 2), (2048, 3), (3848, 5), (100, 1)],
 )
 def test_images_are_reduced_by_the_whole_number_that_comes_nearest(width_px, reduction):
-    """To 640 pixels; of two as near the smaller, which keeps more: 1600 becomes 800 and not 533."""
+    """To 800 pixels; of two as near the smaller, which keeps more: 1200 stays, and 2000 becomes 1000 and not 667."""
     assert ViewSettings().reduction_of(width_px) == reduction
 
 

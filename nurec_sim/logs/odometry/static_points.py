@@ -54,10 +54,22 @@ def standing(clip: Clip, sweep: Sweep, moving: Sequence[Track]) -> tuple[Bool[np
     for track in moving:
         if track.path.covers(sweep.t_us):
             box_from_rig = geometry.inverse(track.path.at(sweep.t_us)) @ world_from_rig
-            kept = np.flatnonzero(keep)
-            local = geometry.transform_points(box_from_rig, points[kept])
-            keep[kept] = ~geometry.points_in_box(local, track.size_m, MARGIN_M)
+            reach = float(np.linalg.norm(np.asarray(track.size_m) / 2 + MARGIN_M)) + MARGIN_M
+            # Most points are far from most boxes.
+            beside = np.flatnonzero(_beside(points, keep, geometry.inverse(box_from_rig)[:3, 3], reach))
+            local = geometry.transform_points(box_from_rig, points[beside])
+            keep[beside] = ~geometry.points_in_box(local, track.size_m, MARGIN_M)
     return keep, points
+
+
+@kernel
+def _beside(points: np.ndarray, keep: np.ndarray, center: np.ndarray, reach: float) -> Bool[np.ndarray, " n"]:
+    """Which of the points to keep lie in a cube around a place, whose sides are as far away as ``reach``."""
+    found = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        off = max(abs(points[i, 0] - center[0]), abs(points[i, 1] - center[1]), abs(points[i, 2] - center[2]))
+        found[i] = keep[i] and off <= reach
+    return found
 
 
 @kernel

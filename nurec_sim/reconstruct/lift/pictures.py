@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Bool, Float32, Int32, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
@@ -33,6 +34,8 @@ OUTLINE_M = 0.6
 """Unmeasured pixels up to this far outside of a box may show its object."""
 MARGIN_M = 0.1
 """Pixels this far outside of a box belong to it: boxes are not exact."""
+CODES = 128
+"""So many views' census, 8 bytes a pixel, are kept: neighbours of one key view are mostly those of the next ones."""
 
 
 @dataclass(frozen=True)
@@ -71,16 +74,18 @@ def depth_pictures(
     bright = (
         float(np.percentile(np.concatenate([v.rgb[::8, ::8].mean(axis=-1).ravel() for v in views]), 98)) if views else 0
     )
-    grays = list(in_order(lambda view: view.rgb.mean(axis=-1).astype(np.uint8), views))
-    codes = list(in_order(depth.census, grays))
+
+    @lru_cache(CODES)
+    def code(n: int) -> np.ndarray:
+        return depth.census(_gray(views[n]))
 
     def one(k: int) -> DepthPicture:
         view = views[k]
         prior, index, body = _draw(view, bodies, lidars)
-        trim_silhouettes(prior, index, grays[k])
+        trim_silhouettes(prior, index, _gray(view))
         sky = sky_pixels.sky_coloured(view, prior, bright)
         likeness = sky_pixels.sky_likeness(sky, view.tile.valid)
-        around = [(views[n].packed, views[n].rgb, codes[n]) for n in neighbours_of(views, k, options.neighbours)]
+        around = [(views[n].packed, views[n].rgb, code(n)) for n in neighbours_of(views, k, options.neighbours)]
         dense = depth.dense_inverse_depth(
             view.packed, view.world_from_view, view.rgb, prior, likeness, around, options.inverse_depths
         )
@@ -117,6 +122,10 @@ def depth_pictures(
         return with_bodies(k, replace(picture, inverse_depth=depth, body=body))
 
     return list(in_order(lambda each: trimmed(*each), zip(keys, drawn, strict=True)))
+
+
+def _gray(view: WorkingView) -> UInt8[np.ndarray, "h w"]:
+    return view.rgb.mean(axis=-1).astype(np.uint8)
 
 
 def _draw(

@@ -51,7 +51,7 @@ class GroundSettings:
 class ViewSettings:
     """The pinhole working views, their depth and the pixels lifted from them."""
 
-    width_px: int = 640
+    width_px: int = 800
     """Working views have about this width, by a whole-number reduction of the image (``reduction_of``); wider ones in
     short logs (``widened``)."""
     pixels: int = 8_000_000
