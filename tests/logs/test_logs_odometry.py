@@ -65,6 +65,13 @@ def test_points_of_what_moves_and_of_the_car_are_left_out(exact):
         return int(geometry.points_in_box(geometry.transform_points(box_from_rig, points), lead.size_m).sum())
 
     assert inside(everything) > 20 and inside(still) == 0 and len(still) < len(everything)
+    taken = np.zeros(len(everything), bool)
+    for track in moving:
+        if track.path.covers(sweep.t_us):
+            box_from_rig = geometry.inverse(track.path.at(sweep.t_us)) @ exact.ego.at(sweep.t_us)
+            local = geometry.transform_points(box_from_rig, everything)
+            taken |= geometry.points_in_box(local, track.size_m, 0.3)  # boxes grow by 0.3 m
+    assert np.array_equal(still, everything[~taken])
     body = exact.rig.body
     assert not geometry.points_in_box(still - np.array(body.center_m), body.size_m).any()
 
