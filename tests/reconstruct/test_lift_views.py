@@ -144,7 +144,7 @@ def test_limits_follow_what_the_cameras_see_at_once(path_m, images, limits):
 
 
 def test_short_logs_of_large_images_are_worked_on_in_more_detail():
-    """8 million pixels: 12 images of 1936 x 1216 fit at half their size; 300 do not at any, and are as wide as others."""
+    """8 million pixels: 12 images of 1936 x 1216 fit at half their size; of 300 none does, as in long logs."""
     settings = ViewSettings()
     assert settings.widened([(1936, 1216, 2)] * 6).width_px == 968
     assert settings.widened([(1936, 1216, 50)] * 6) == settings

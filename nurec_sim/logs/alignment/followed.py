@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -95,7 +95,7 @@ def followed_points(
     """
     moving = moving_tracks(clip)
 
-    @lru_cache(maxsize=None)
+    @cache
     def still(lidar: str, index: int) -> np.ndarray:
         """Of which points of a sweep: images of all cameras share it."""
         return standing(clip, clip.sweep(lidar, index), moving)[0]
