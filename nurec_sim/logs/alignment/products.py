@@ -45,10 +45,8 @@ class Rows:
         self._group_starts = np.searchsorted(group[self._by_group], np.arange(group.max() + 2))
         # Where the sums have entries: half of those of level planes are zero, as such planes do not tell where they are
         # along themselves.
-        part_of = sparse.csr_matrix((np.ones(count), (group, np.arange(count))))
-        self._sums = part_of @ sparse.csr_matrix((np.abs(values).ravel(), columns.ravel(), starts), (count, width))
-        self._sums.eliminate_zeros()
-        self._sums.sort_indices()
+        layout = _entries_of_sums(self._by_group, self._group_starts, *self._entries, width)
+        self._sums = sparse.csr_matrix((np.ones(len(layout[1])), layout[1], layout[0]), (len(layout[0]) - 1, width))
 
     def products(self, weight: Float64[np.ndarray, " n"]) -> Square:
         """``rows.T @ diag(weight) @ rows``, the lower triangle of it."""
@@ -158,6 +156,28 @@ def _add_sparse(
             weighted, row = weight[i] * value[a], total[column[a]]
             for b in range(starts[i], a + 1):
                 row[column[b]] += weighted * value[b]
+
+
+@kernel
+def _entries_of_sums(
+    order: np.ndarray, groups: np.ndarray, values: np.ndarray, columns: np.ndarray, width: int
+) -> tuple[Int64[np.ndarray, " groups+1"], Int64[np.ndarray, " entries"]]:
+    """Columns in which a row of each group is not zero, ascending, behind where those of each group start."""
+    starts, found = np.zeros(len(groups), np.int64), np.empty(values.size, np.int64)
+    taken, count = np.zeros(width, np.bool_), 0
+    for group in range(len(groups) - 1):
+        for i in order[groups[group] : groups[group + 1]]:
+            for a in range(values.shape[1]):
+                if values[i, a] != 0 and not taken[columns[i, a]]:
+                    taken[columns[i, a]] = True
+                    found[count] = columns[i, a]
+                    count += 1
+        mine = found[starts[group] : count]
+        mine.sort()
+        for column in mine:
+            taken[column] = False
+        starts[group + 1] = count
+    return starts, found[:count].copy()
 
 
 @kernel
