@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from nurec_sim import geometry
 from nurec_sim.reconstruct.lift import lifting
@@ -52,6 +53,17 @@ def test_a_far_label_that_jitters_stands_but_a_starting_car_does_not():
     assert actor(Trajectory(1_000_000 + 100_000 * np.arange(9), poses)).standing
     poses = np.stack([geometry.pose_from_xyyaw(x, 0, 0) for x in (0, 0, 0, 0, 0, 0.2, 0.5, 0.9, 1.4)])
     assert not actor(Trajectory(1_000_000 + 100_000 * np.arange(9), poses)).standing
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_a_car_that_creeps_to_a_stop_moves_but_labels_that_go_to_and_fro_do_not(turn):
+    """The first third has gone 0.35 m, too little for the medians of thirds; 0.45 m in all, or back by half of it."""
+    stops = [0.0, 0.12, 0.22, 0.30, 0.36, 0.40, 0.42, 0.44, *[0.45] * 16][::turn]
+    poses = np.stack([geometry.pose_from_xyyaw(3 + 0.6 * x, 4 + 0.8 * x, 0.9) for x in stops])
+    assert not actor(Trajectory(1_000_000 + 100_000 * np.arange(24), poses)).standing
+    jitters = [0.0, 0.12, 0.22, 0.30, 0.06, 0.40, 0.42, 0.44, *[0.45] * 8, 0.2, *[0.45] * 7][::turn]
+    poses = np.stack([geometry.pose_from_xyyaw(3 + 0.6 * x, 4 + 0.8 * x, 0.9) for x in jitters])
+    assert actor(Trajectory(1_000_000 + 100_000 * np.arange(24), poses)).standing
 
 
 def test_things_that_cannot_move_are_no_actors():

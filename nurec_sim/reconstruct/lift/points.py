@@ -54,18 +54,40 @@ def actors_of(clip: Clip, settings: PointSettings) -> list[Actor]:
     for index, track in enumerate(clip.tracks):
         if track.label not in MOVABLE_LABELS:
             continue
-        moved = np.linalg.norm(track.path.position_m - np.median(track.path.position_m, axis=0), axis=1).max()
-        third = max(len(track.path.t_us) // 3, 1)
-        shift = np.median(track.path.position_m[-third:], axis=0) - np.median(track.path.position_m[:third], axis=0)
-        # Labels of far objects jitter: without a net shift they are static even if single labels are farther off.
-        standing = bool(moved < settings.standing_m or (moved < 1.0 and np.linalg.norm(shift) < settings.standing_m))
-        standing &= len(track.path.t_us) > 1
+        standing = len(track.path.t_us) > 1 and not _moves(track.path.position_m, settings.standing_m)
         path = track.path
         if standing:
             middle = int(np.argmin(np.linalg.norm(path.position_m - np.median(path.position_m, axis=0), axis=1)))
             path = Trajectory(path.t_us[middle : middle + 1], path.world_from_body[middle : middle + 1])
         actors.append(Actor(index, track, standing, path))
     return actors
+
+
+FAR_M, LARGEST_BACK = 1.0, 0.5
+"""What is labelled so far from its middle moves. Less far, what moves goes back by this share of its way at most, where
+labels that jitter go to and fro."""
+
+
+def _moves(place_m: Float64[np.ndarray, "k 3"], standing_m: float) -> bool:
+    """Whether a labelled object moves: labels of what stands jitter, those of far objects by decimetres.
+
+    A car that stops or starts within the log moves by little, and for a short time: most labels are at one place.
+
+    Args:
+        place_m: its labelled places, in order of time.
+        standing_m: what moves less than this stands.
+    """
+    apart = np.linalg.norm(place_m - np.median(place_m, axis=0), axis=1).max()
+    if not standing_m <= apart < FAR_M:
+        return bool(apart >= FAR_M)
+    third = max(len(place_m) // 3, 1)
+    if np.linalg.norm(np.median(place_m[-third:], axis=0) - np.median(place_m[:third], axis=0)) >= standing_m:
+        return True
+    way = place_m[-1] - place_m[0]
+    length = np.linalg.norm(way)
+    along = place_m @ (way / max(length, 1e-9))
+    back = (np.maximum.accumulate(along) - along).max()
+    return bool(length >= standing_m and back < LARGEST_BACK * length)
 
 
 PATH_PART = 16
