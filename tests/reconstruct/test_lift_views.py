@@ -46,6 +46,35 @@ def test_views_project_like_their_camera(lens):
     assert len(errors) > 10 and np.mean(np.array(errors) < 12) > 0.85
 
 
+@pytest.mark.parametrize(("half_field_deg", "tiles", "least"), [(39.5, 1, 0.985), (55.0, 2, 0.985), (85.0, 3, 0.96)])
+def test_tiles_show_all_that_a_wide_lens_does_at_its_resolution(half_field_deg, tiles, least):
+    """But what is steep: 54 degrees in the middle of a tile, less at its sides."""
+    f = 320 / np.radians(half_field_deg)
+    wide = CameraModel("front", 640, 400, Fisheye(f, f, 320, 200), np.eye(4))
+    found = tiles_of(wide, ViewSettings())
+    rays, _ = sensors.pixel_rays(wide)
+    shown = np.zeros(rays.shape[:2], bool)
+    for tile in found:
+        x, y, z = np.moveaxis(rays @ tile.camera_from_tile, -1, 0)
+        u, v = tile.focal_px * x / z + tile.center_px[0], tile.focal_px * y / z + tile.center_px[1]
+        shown |= (z > 0) & (u >= 0) & (u < tile.width) & (v >= 0) & (v < tile.height)
+    steep = np.abs(rays[..., 1]) > 1.4 * np.cos(np.radians(40)) * np.hypot(rays[..., 0], rays[..., 2])
+    assert len(found) == tiles and shown[~steep].mean() > least
+    assert all(tile.focal_px == pytest.approx(f, rel=1e-3) for tile in found)
+    if tiles == 2:  # one plane is 2 tan(55 deg) = 2.86 wide, two are 4 tan(27.5 deg) = 2.08, and as much less high
+        (plane,) = tiles_of(wide, ViewSettings(max_field_deg=120))
+        assert sum(tile.valid.sum() for tile in found) < 2.1 / 2.86 * plane.valid.sum()
+
+
+def test_a_camera_in_tiles_gives_as_many_frames_as_others():
+    fisheye = CameraModel("front", 320, 160, Fisheye(100, 100, 160, 80), camera().rig_from_camera)
+    settings = ViewSettings(max_views=10, max_frames=25)
+    clip = Street(frames=50, cameras=(fisheye,))
+    assert len(tiles_of(fisheye, settings)) == 3
+    assert choose_frames(clip, ["front"], settings) == choose_frames(Street(frames=50), ["front"], settings)
+    assert sum(view.key for view in read_views(clip, ["front"], {}, settings)) == 3 * 9
+
+
 def test_rolling_shutter_points_project_back():
     base = camera()
     rolling = CameraModel("front", 192, 96, base.lens, base.rig_from_camera, Shutter.TOP_TO_BOTTOM)
@@ -67,7 +96,7 @@ def test_rolling_shutter_points_project_back():
 
 
 def test_frames_are_thinned_evenly():
-    frames = choose_frames(Street(frames=50), ["front"], 1, ViewSettings(max_views=10, max_frames=25))
+    frames = choose_frames(Street(frames=50), ["front"], ViewSettings(max_views=10, max_frames=25))
     assert [frame for _, frame, _ in frames] == list(range(0, 50, 2))
     assert [frame for _, frame, key in frames if key] == list(range(0, 50, 6))
 

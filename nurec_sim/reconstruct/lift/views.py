@@ -25,6 +25,10 @@ LEAST_SKY_WEIGHT = 0.02
 """The same in the sky, where an edge shows most."""
 
 
+STEEPEST = 1.4
+"""Tiles end at this height above and below their middle, per metre of depth: at 54 degrees."""
+
+
 @dataclass(frozen=True, eq=False)
 class Tile:
     """A pinhole window into a camera: its size and matrix, how it is turned, and where its pixels lie in the image."""
@@ -83,44 +87,32 @@ def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
         valid = np.ones((height, width), bool)
         tile = Tile(width, height, lens.fx_px / reduction, center, np.eye(3), reduction, None, valid, np.zeros(3))
         return [_with_fraction(tile, camera)]
-    left, right, top, bottom = _field(camera)
-    count = tile_count(camera, settings)
+    rays, seen = sensors.pixel_rays(sensors.scaled_camera(camera, camera.width_px // 8, camera.height_px // 8))
+    rays = rays[seen]
+    azimuth = np.arctan2(rays[:, 0], rays[:, 2])
+    left, right = np.percentile(azimuth, [0.5, 99.5])
+    count = int(np.ceil((right - left) / np.radians(settings.max_field_deg)))
     focal = _pixels_per_radian(camera) / reduction
     tiles = []
     for k in range(count):
         a, b = left + (right - left) * k / count, left + (right - left) * (k + 1) / count
         half = np.tan((b - a) / 2 + 0.01)
         width = int(np.ceil(2 * half * focal))
-        up, down = np.tan(top), np.tan(bottom)
-        height = int(np.ceil((down - up) * focal))
         turn = np.array(
             [[np.cos((a + b) / 2), 0, np.sin((a + b) / 2)], [0, 1, 0], [-np.sin((a + b) / 2), 0, np.cos((a + b) / 2)]]
         )
-        tiles.append(_resampled_tile(camera, reduction, focal, (width / 2, -up * focal), (width, height), turn))
+        # Rows of a plane rise towards its sides, as seen from its middle.
+        mine = rays[(azimuth > a) & (azimuth < b)] @ turn
+        up, down = np.clip(np.percentile(mine[:, 1] / mine[:, 2], [0.1, 99.9]), -STEEPEST, STEEPEST)
+        height = int(np.ceil((down - up) * focal))
+        tiles.append(_resampled_tile(camera, reduction, focal, (width / 2, float(-up * focal)), (width, height), turn))
     return tiles
-
-
-def tile_count(camera: CameraModel, settings: ViewSettings) -> int:
-    """Number of tiles that a camera is cut into."""
-    if _square(camera):
-        return 1
-    left, right, _, _ = _field(camera)
-    return int(np.ceil((right - left) / np.radians(settings.max_field_deg)))
 
 
 def _square(camera: CameraModel) -> bool:
     """Whether a camera is a plain pinhole with square pixels."""
     lens = camera.ideal_pinhole
     return lens is not None and abs(lens.fx_px - lens.fy_px) < 1e-3 * lens.fx_px
-
-
-def _field(camera: CameraModel) -> tuple[float, float, float, float]:
-    """Field of view: azimuths left and right, elevations top and bottom, radians to the right and down."""
-    rays, seen = sensors.pixel_rays(sensors.scaled_camera(camera, camera.width_px // 8, camera.height_px // 8))
-    azimuth, elevation = np.arctan2(rays[..., 0], rays[..., 2])[seen], np.arcsin(np.clip(rays[..., 1], -1, 1))[seen]
-    left, right = np.percentile(azimuth, [0.5, 99.5])
-    top, bottom = np.clip(np.percentile(elevation, [0.5, 99.5]), -0.96, 0.96)
-    return left, right, top, bottom
 
 
 def border_weight(height: int, width: int, least: float = LEAST_WEIGHT) -> Float32[np.ndarray, "h w"]:
@@ -191,19 +183,18 @@ def _with_fraction(tile: Tile, camera: CameraModel) -> Tile:
     return dataclasses.replace(tile, fraction=solution)
 
 
-def choose_frames(
-    clip: Clip, cameras: Sequence[str], tiles: int, settings: ViewSettings
-) -> list[tuple[str, int, bool]]:
+def choose_frames(clip: Clip, cameras: Sequence[str], settings: ViewSettings) -> list[tuple[str, int, bool]]:
     """(camera, frame, whether it is a key frame) in order of time, thinned evenly to the limits of the settings.
+
+    The tiles of a camera share its pixels, so that they count as one view.
 
     Args:
         clip: the driving log.
         cameras: ids of the cameras.
-        tiles: number of tiles of all cameras together; every frame gives one view per tile.
         settings: ``max_frames`` and ``max_views``.
     """
     counts = {camera: len(clip.camera_times_us(camera)) for camera in cameras}
-    total = sum(counts.values()) * tiles / max(len(cameras), 1)
+    total = sum(counts.values())
     skip = max(1, int(np.ceil(total / settings.max_frames)))
     step = max(1, int(np.ceil(total / skip / settings.max_views)))
     chosen = [
@@ -214,8 +205,7 @@ def choose_frames(
 
 def key_frames(clip: Clip, cameras: Sequence[str], settings: ViewSettings) -> list[tuple[str, int]]:
     """(camera, frame) of the key frames that ``read_views`` reads, in order of time."""
-    tiles = sum(tile_count(clip.rig.cameras[camera], settings) for camera in cameras)
-    return [(camera, frame) for camera, frame, key in choose_frames(clip, cameras, tiles, settings) if key]
+    return [(camera, frame) for camera, frame, key in choose_frames(clip, cameras, settings) if key]
 
 
 def read_views(
@@ -241,7 +231,7 @@ def read_views(
         tiles[camera] = [
             tile if ego is None else without_pixels(tile, ego[..., 3] > 0) for tile in tiles_of(model, settings)
         ]
-    frames = choose_frames(clip, cameras, sum(map(len, tiles.values())), settings)
+    frames = choose_frames(clip, cameras, settings)
 
     def read(chosen: tuple[str, int, bool]) -> list[WorkingView]:
         camera, frame, key = chosen
