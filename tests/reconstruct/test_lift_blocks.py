@@ -102,11 +102,11 @@ def test_the_budget_takes_the_plainest_blocks_first():
     for number, (row, column) in enumerate(((0, 0), (0, 2), (2, 0), (2, 2))):
         rgb[row, column] += np.uint8(20 * number)
     costs = [block_costs(rgb, depth, body)]
-    found = {wanted: tolerance_for(costs, 16, wanted) for wanted in (16, 13, 12, 10, 7, 4)}
+    found = {wanted: tolerance_for(costs, [16], [1.0], wanted) for wanted in (16, 13, 12, 10, 7, 4)}
     assert found == {16: LEAST_TOLERANCE, 13: LEAST_TOLERANCE, 12: 20, 10: 20, 7: 40, 4: 60}
     for wanted, tolerance in found.items():
         assert len(chosen_blocks(costs[0], body, tolerance)[0]) <= wanted
-    assert tolerance_for(costs, 16, 1) == 4 * 60 and tolerance_for(costs, 16, 0) == NEVER - 1
+    assert tolerance_for(costs, [16], [1.0], 1) == 4 * 60 and tolerance_for(costs, [16], [1.0], 0) == NEVER - 1
 
 
 def test_means_and_maxima_over_blocks():

@@ -144,6 +144,24 @@ def test_of_pixels_in_a_gap_of_the_ground_the_nearest_stay(monkeypatch):
     assert len(gaussians) == np.count_nonzero(pixels.view == 0) > 0
 
 
+@pytest.mark.parametrize("count", [1, 6])
+def test_the_budget_is_met_however_many_views_show_a_surface(count):
+    """Of six views from one place the first owns all but what lies at their border."""
+    shape, rng = (96, 96), np.random.default_rng(0)
+    tile = Tile(96, 96, 96.0, (48.0, 48.0), np.eye(3), 1, None, np.ones(shape, bool), np.zeros(3))
+    contrast = np.kron(rng.uniform(1, 120, (12, 12)), np.ones((8, 8)))  # any number of blocks has its tolerance
+    rgb = [(128 + contrast[..., None] * rng.uniform(-1, 1, (*shape, 3))).astype(np.uint8)] * count
+    views = [WorkingView("front", k, 1_000_000, True, tile, np.eye(4), np.zeros(3), rgb[0]) for k in range(count)]
+    flags = np.zeros(shape, np.int32), np.full(shape, -1, np.int32), *np.zeros((2, *shape), bool)
+    pictures = [DepthPicture(np.full(shape, 0.1, np.float32), *flags)] * count
+    nothing = np.zeros((0, 3), np.float32), *np.zeros((2, 0), np.float32), np.zeros(0, np.uint8)
+    body, settings = Surfels(None, Cloud.empty(), *nothing), LiftSettings()
+    settings = dataclasses.replace(settings, views=dataclasses.replace(settings.views, budget=3000))
+    pixels = body_pixels([body], views, pictures, rgb, settings)[0]
+    owned = bake._owned(pixels, body, views, pictures, rgb, settings)
+    assert owned.sum() == pytest.approx(3000 / bake.STAYING, rel=0.15)
+
+
 def test_pixels_of_a_kept_block_own_and_those_of_other_bodies_do():
     """Of nine columns body 0 shows six, as a block of four by four, which was not kept, and one of two by two."""
     body = np.array([[0, 0, 0, 0, 0, 0, 3, 3, 3]] * 4, np.int32)

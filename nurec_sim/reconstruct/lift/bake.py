@@ -23,8 +23,10 @@ from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.views import WorkingView
 from nurec_sim.types import Gaussians
 
-OWNING_SHARE = 0.4
-"""Share of the blocks of all views that owns a surface, about; to meet the budget before ownership is known."""
+STAYING = 0.88
+"""Share of the blocks that own a surface and are not dropped for another reason, about: most lie in free space."""
+SAMPLED = slice(4, None, 8)
+"""Rows and columns of the pixels that tell which share of a view owns what it shows."""
 COARSE_PIXEL = 2.0
 """Pixels replace surfels unless they are so many times as wide as surfels are apart."""
 
@@ -100,8 +102,9 @@ def body_pixels(
         for view, picture in zip(views, pictures, strict=True)
     ]
     costs = list(in_order(lambda k: block_costs(rgb[k], pictures[k].inverse_depth, near[k]), range(len(views))))
-    pixels = sum(int(np.count_nonzero(body >= 0)) for body in near)
-    tolerance = tolerance_for(costs, pixels, round(settings.views.budget / OWNING_SHARE))
+    pixels = [int(np.count_nonzero(body >= 0)) for body in near]
+    share = _owning_share(bodies[0], views, pictures, near, rgb, settings)
+    tolerance = tolerance_for(costs, pixels, share, round(settings.views.budget / STAYING))
     parts = [[Lifted.empty()] for _ in bodies]
 
     def lift(k: int) -> list[tuple[int, Lifted]]:
@@ -117,6 +120,33 @@ def body_pixels(
         for number, lifted in found:
             parts[number].append(lifted)
     return [Lifted.concatenate(each) for each in parts]
+
+
+def _owning_share(
+    world: Surfels,
+    views: Sequence[WorkingView],
+    pictures: Sequence[DepthPicture],
+    near: Sequence[np.ndarray],
+    rgb: Sequence[np.ndarray],
+    settings: LiftSettings,
+) -> list[float]:
+    """Which share of the pixels of each view owns the static surface that it shows, about: by some of its pixels.
+
+    A car that crawls sees every surface in many views, one that drives fast in few.
+    """
+
+    def some(k: int) -> Lifted:
+        number = np.arange(near[k].size, dtype=np.int32).reshape(near[k].shape)[SAMPLED, SAMPLED]
+        first = number[near[k][SAMPLED, SAMPLED] == 0]
+        if not len(first):
+            return Lifted.empty()
+        single = np.ones(len(first), np.uint8)
+        return _in_body(_world_points(k, views[k], pictures[k], rgb[k], first, single), views[k], world)
+
+    parts = list(in_order(some, range(len(views))))
+    owned = _owned(Lifted.concatenate([Lifted.empty(), *parts]), world, views, pictures, rgb, settings)
+    ends = np.cumsum([len(part) for part in parts])[:-1]
+    return [float(each.mean()) if len(each) else 1.0 for each in np.split(owned, ends)]
 
 
 def _world_points(

@@ -52,20 +52,27 @@ def block_costs(
     return costs
 
 
-def tolerance_for(costs: Sequence[Sequence[UInt16[np.ndarray, "rows columns"]]], pixels: int, blocks: int) -> int:
-    """The least tolerance with which all views together have no more blocks than wanted, if there is one.
+def tolerance_for(
+    costs: Sequence[Sequence[UInt16[np.ndarray, "rows columns"]]],
+    pixels: Sequence[int],
+    share: Sequence[float],
+    blocks: int,
+) -> int:
+    """The least tolerance with which no more blocks than wanted are left of all views, if there is one.
 
     Args:
         costs: of each view (``block_costs``).
-        pixels: number of pixels of all views that show a body.
+        pixels: of each view, the number of pixels that show a body.
+        share: of each view, which share of its blocks is left.
         blocks: how many blocks are wanted at most.
     """
     # Taking four blocks as one makes three fewer, whatever their edge.
-    counts = np.zeros(NEVER + 1, np.int64)
-    for cost in (cost for view in costs for cost in view):
-        counts += np.bincount(cost.ravel(), minlength=NEVER + 1)
-    left = pixels - 3 * np.cumsum(counts[:NEVER])
-    enough = np.flatnonzero(left <= blocks)
+    counts, left = np.zeros(NEVER + 1), 0.0
+    for view, count, part in zip(costs, pixels, share, strict=True):
+        left += part * count
+        for cost in view:
+            counts += part * np.bincount(cost.ravel(), minlength=NEVER + 1)
+    enough = np.flatnonzero(left - 3 * np.cumsum(counts[:NEVER]) <= blocks)
     return max(LEAST_TOLERANCE, int(enough[0]) if len(enough) else NEVER - 1)
 
 
