@@ -59,7 +59,7 @@ class ViewSettings:
     max_field_deg: float = 80.0
     """Wider lenses are cut into several views: a plane has more pixels at its border than the image has there."""
     max_views: int = 40
-    """Pixels are lifted from every n-th frame, so that no more frames than this are left."""
+    """Pixels are lifted from every n-th frame, so that no more working views than this are left."""
     max_frames: int = 240
     """Frames between them only help to find depth; they too are thinned evenly to this number."""
     budget: int = 700_000

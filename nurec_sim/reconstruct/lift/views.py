@@ -23,8 +23,6 @@ BORDER, LEAST_WEIGHT = 0.2, 0.4
 """Part of an image's shorter side over which ``border_weight`` falls, and the weight at its border."""
 LEAST_SKY_WEIGHT = 0.02
 """The same in the sky, where an edge shows most."""
-
-
 STEEPEST = 1.4
 """Tiles end at this height above and below their middle, per metre of depth: at 54 degrees."""
 
@@ -87,11 +85,9 @@ def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
         valid = np.ones((height, width), bool)
         tile = Tile(width, height, lens.fx_px / reduction, center, np.eye(3), reduction, None, valid, np.zeros(3))
         return [_with_fraction(tile, camera)]
-    rays, seen = sensors.pixel_rays(sensors.scaled_camera(camera, camera.width_px // 8, camera.height_px // 8))
-    rays = rays[seen]
+    rays = _some_rays(camera)
     azimuth = np.arctan2(rays[:, 0], rays[:, 2])
-    left, right = np.percentile(azimuth, [0.5, 99.5])
-    count = int(np.ceil((right - left) / np.radians(settings.max_field_deg)))
+    (left, right), count = _field(rays), tile_count(camera, settings)
     focal = _pixels_per_radian(camera) / reduction
     tiles = []
     for k in range(count):
@@ -109,10 +105,30 @@ def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
     return tiles
 
 
+def tile_count(camera: CameraModel, settings: ViewSettings) -> int:
+    """Number of tiles that a camera is cut into."""
+    if _square(camera):
+        return 1
+    left, right = _field(_some_rays(camera))
+    return int(np.ceil((right - left) / np.radians(settings.max_field_deg)))
+
+
 def _square(camera: CameraModel) -> bool:
     """Whether a camera is a plain pinhole with square pixels."""
     lens = camera.ideal_pinhole
     return lens is not None and abs(lens.fx_px - lens.fy_px) < 1e-3 * lens.fx_px
+
+
+def _some_rays(camera: CameraModel) -> Float64[np.ndarray, "n 3"]:
+    """Rays of every eighth pixel in both directions."""
+    rays, seen = sensors.pixel_rays(sensors.scaled_camera(camera, camera.width_px // 8, camera.height_px // 8))
+    return np.asarray(rays[seen])
+
+
+def _field(rays: Float64[np.ndarray, "n 3"]) -> tuple[float, float]:
+    """Azimuths of the left and the right end of a field of view, radians to the right."""
+    left, right = np.percentile(np.arctan2(rays[:, 0], rays[:, 2]), [0.5, 99.5])
+    return float(left), float(right)
 
 
 def border_weight(height: int, width: int, least: float = LEAST_WEIGHT) -> Float32[np.ndarray, "h w"]:
@@ -183,18 +199,19 @@ def _with_fraction(tile: Tile, camera: CameraModel) -> Tile:
     return dataclasses.replace(tile, fraction=solution)
 
 
-def choose_frames(clip: Clip, cameras: Sequence[str], settings: ViewSettings) -> list[tuple[str, int, bool]]:
+def choose_frames(
+    clip: Clip, cameras: Sequence[str], tiles: int, settings: ViewSettings
+) -> list[tuple[str, int, bool]]:
     """(camera, frame, whether it is a key frame) in order of time, thinned evenly to the limits of the settings.
-
-    The tiles of a camera share its pixels, so that they count as one view.
 
     Args:
         clip: the driving log.
         cameras: ids of the cameras.
+        tiles: number of tiles of all cameras together; every frame gives one view per tile.
         settings: ``max_frames`` and ``max_views``.
     """
     counts = {camera: len(clip.camera_times_us(camera)) for camera in cameras}
-    total = sum(counts.values())
+    total = sum(counts.values()) * tiles / max(len(cameras), 1)
     skip = max(1, int(np.ceil(total / settings.max_frames)))
     step = max(1, int(np.ceil(total / skip / settings.max_views)))
     chosen = [
@@ -205,7 +222,8 @@ def choose_frames(clip: Clip, cameras: Sequence[str], settings: ViewSettings) ->
 
 def key_frames(clip: Clip, cameras: Sequence[str], settings: ViewSettings) -> list[tuple[str, int]]:
     """(camera, frame) of the key frames that ``read_views`` reads, in order of time."""
-    return [(camera, frame) for camera, frame, key in choose_frames(clip, cameras, settings) if key]
+    tiles = sum(tile_count(clip.rig.cameras[camera], settings) for camera in cameras)
+    return [(camera, frame) for camera, frame, key in choose_frames(clip, cameras, tiles, settings) if key]
 
 
 def read_views(
@@ -231,7 +249,7 @@ def read_views(
         tiles[camera] = [
             tile if ego is None else without_pixels(tile, ego[..., 3] > 0) for tile in tiles_of(model, settings)
         ]
-    frames = choose_frames(clip, cameras, settings)
+    frames = choose_frames(clip, cameras, sum(map(len, tiles.values())), settings)
 
     def read(chosen: tuple[str, int, bool]) -> list[WorkingView]:
         camera, frame, key = chosen
