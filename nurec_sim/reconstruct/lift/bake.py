@@ -145,8 +145,9 @@ def _owning_share(
 
     parts = list(in_order(some, range(len(views))))
     owned = _owned(Lifted.concatenate([Lifted.empty(), *parts]), world, views, pictures, rgb, settings)
-    ends = np.cumsum([len(part) for part in parts])[:-1]
-    return [float(each.mean()) if len(each) else 1.0 for each in np.split(owned, ends)]
+    ends = np.cumsum([0, *map(len, parts)])
+    mine = [owned[first:last] for first, last in zip(ends, ends[1:], strict=False)]
+    return [float(each.mean()) if len(each) else 1.0 for each in mine]
 
 
 def _world_points(
