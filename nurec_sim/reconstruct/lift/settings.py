@@ -84,6 +84,8 @@ class ViewSettings:
         for name, least in (limits | {"neighbours": 0, "fusion_rounds": 0}).items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be {least} or more, got {getattr(self, name)}")
+        if not 0 < self.max_field_deg < 180:
+            raise ValueError(f"max_field_deg must be above 0 and below 180, got {self.max_field_deg}")
         if not 0 < self.min_depth_m < self.max_depth_m:
             raise ValueError(
                 f"min_depth_m must be above 0 and below max_depth_m, got {self.min_depth_m} and {self.max_depth_m}"
