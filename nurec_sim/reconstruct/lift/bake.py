@@ -24,7 +24,7 @@ from nurec_sim.reconstruct.lift.views import WorkingView
 from nurec_sim.types import Gaussians
 
 STAYING = 0.88
-"""Share of the blocks that own a surface and are not dropped for another reason, about: most lie in free space."""
+"""Share of the blocks that own a surface and stay, about: most of the others lie in free space."""
 SAMPLED = slice(4, None, 8)
 """Rows and columns of the pixels that tell which share of a view owns what it shows."""
 COARSE_PIXEL = 2.0
@@ -143,11 +143,10 @@ def _owning_share(
         single = np.ones(len(first), np.uint8)
         return _in_body(_world_points(k, views[k], pictures[k], rgb[k], first, single), views[k], world)
 
-    parts = list(in_order(some, range(len(views))))
-    owned = _owned(Lifted.concatenate([Lifted.empty(), *parts]), world, views, pictures, rgb, settings)
-    ends = np.cumsum([0, *map(len, parts)])
-    mine = [owned[first:last] for first, last in zip(ends, ends[1:], strict=False)]
-    return [float(each.mean()) if len(each) else 1.0 for each in mine]
+    sample = Lifted.concatenate([Lifted.empty(), *in_order(some, range(len(views)))])
+    owned = _owned(sample, world, views, pictures, rgb, settings)
+    count, owning = (np.bincount(sample.view, weight, len(views)) for weight in (None, owned))
+    return list(np.where(count > 0, owning / np.maximum(count, 1), 1.0))
 
 
 def _world_points(
