@@ -124,7 +124,8 @@ def _own(scene: GaussianScene, number: int) -> Gaussians | None:
     mine = dynamic.track == number
     if mine.any():
         fixed = dynamic.in_box is not None and dynamic.in_box[mine].all()
-        return dynamic.gaussians[mine] if fixed else None
+        own = dynamic.gaussians[mine]
+        return own[own.label != Label.ROAD] if fixed else None  # without its shadow
     standing = scene.static[baked_in(scene, track)]
     return transformed(standing, geometry.inverse(track.path.world_from_body[0])) if len(standing) else standing
 

@@ -71,7 +71,7 @@ def test_tiles_count_as_views():
     clip = Street(frames=50, cameras=(fisheye,))
     views = read_views(clip, ["front"], {}, ViewSettings(max_views=10, max_frames=25))
     assert [view.frame for view in views] == [frame for frame in range(0, 50, 6) for _ in range(3)]
-    assert [view.frame for view in views if view.key] == [0, 0, 0, 18, 18, 18, 36, 36, 36]
+    assert [view.frame for view in views if view.key] == [0, 0, 0, 24, 24, 24, 48, 48, 48]
 
 
 def test_rolling_shutter_points_project_back():
@@ -97,7 +97,14 @@ def test_rolling_shutter_points_project_back():
 def test_frames_are_thinned_evenly():
     frames = choose_frames(Street(frames=50), ["front"], 1, ViewSettings(max_views=10, max_frames=25))
     assert [frame for _, frame, _ in frames] == list(range(0, 50, 2))
+    # Nine of the 25, spread from the first to the last one: three frames apart.
     assert [frame for _, frame, key in frames if key] == list(range(0, 50, 6))
+
+
+@pytest.mark.parametrize(("frames", "keys"), [(8, [0, 2, 5, 7]), (9, [0, 2, 4, 6, 8]), (2, [0]), (1, [0])])
+def test_the_last_frame_is_a_key_frame_as_the_first_is(frames, keys):
+    chosen = choose_frames(Street(frames=frames), ["front"], 1, ViewSettings(max_views=-(-frames // 2)))
+    assert [frame for _, frame, key in chosen if key] == keys
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,22 @@ def test_windows_end_half_way_between_images(street):
     assert windows_of(street, []) == [(t[0], t[-1] + 1)]
 
 
+def test_windows_without_a_sweep_last_until_the_next_one(street):
+    """Sweeps lie around the images."""
+    labelled, frames = actors_of(street, PointSettings()), [("front", k) for k in range(FRAMES)]
+    t = street.t_us.tolist()
+
+    def windows(hold_out):
+        actors = in_windows(labelled, street, frames, hold_out)
+        return [actor.window_us for actor in actors if actor.track.id == "walker"]
+
+    half = [time + FRAME_US // 2 for time in t[:-1]]
+    assert windows(()) == windows_of(street, range(FRAMES))
+    assert windows({2}) == list(zip([t[0], *half[1::2], half[4]], [half[1], *half[3:], t[-1] + 1], strict=True))
+    assert windows({4, 5}) == [(t[0], half[1]), (half[1], half[2]), (half[2], t[-1] + 1)]
+    assert windows(set(range(FRAMES))) == [(t[0], t[-1] + 1)]
+
+
 def test_riders_have_windows_as_walkers_do(street):
     rides = Street(frames=FRAMES, boxes=BOXES)
     rides.tracks[0] = dataclasses.replace(street.tracks[0], label="rider")
@@ -59,7 +75,7 @@ def test_riders_have_windows_as_walkers_do(street):
 def test_windows_are_no_shorter_than_200_ms_but_the_last_one(frame_us, images):
     """Of twelve images, the first and the last ones at the times of the first and the last label."""
     path = Trajectory(frame_us * np.arange(12), np.tile(np.eye(4), (12, 1, 1)))
-    ends = np.array(_ends_us(path, path.t_us))
+    ends = np.array(_ends_us(path, path.t_us, path.t_us))
     assert np.histogram(path.t_us, ends)[0].tolist() == images and ends[-1] == path.end_us + 1
     assert (np.diff(ends)[:-1] >= 200_000).all() and ends[-1] - ends[-2] >= 100_000
 

@@ -24,7 +24,8 @@ from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.colour import SATURATED
 from nurec_sim.reconstruct.lift.image_errors import BYTE, LEAST_CLEAR, image_errors
 from nurec_sim.reconstruct.lift.settings import LiftSettings, ViewSettings
-from nurec_sim.reconstruct.lift.shade import movers, shading_boxes, unweigh_shaded
+from nurec_sim.reconstruct.lift.shade import Shades, add_shaded, find_shaded
+from nurec_sim.reconstruct.lift.shadows import with_shadows
 from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, border_weight
 from nurec_sim.reconstruct.optimize.responses import borrowed_responses
 from nurec_sim.render.cpu.backward.colours import spread_errors, spread_sky_errors
@@ -107,7 +108,8 @@ def solve_colours(
         responses[camera] = np.stack(columns, axis=1).reshape(-1, 3, 4)
     others = [camera for camera in clip.rig.cameras if camera not in responses]
     responses |= borrowed_responses(responses, times, clip.rig, others)
-    return Solved(replace(solve.scene(), exposures=responses), solve.pixels() / len(order))
+    solved = with_shadows(replace(solve.scene(), exposures=responses), solve.shades)
+    return Solved(solved, solve.pixels() / len(order))
 
 
 def _pixel_weights(
@@ -162,7 +164,7 @@ class ColourSolve:
     """
 
     def __init__(self, scene: GaussianScene, trust: float, gain_pull: float) -> None:
-        self._scene, self._gain_pull, self._movers = scene, gain_pull, movers(scene.tracks)
+        self._scene, self._gain_pull, self.shades = scene, gain_pull, Shades(scene.tracks)
         self._static, self._moving = pack(scene.static), PackedMoving.of(scene.dynamic, scene.tracks)
         self._sky = np.array(scene.sky, np.float32)
         shapes = ((len(self._static), BLOCK), (len(self._moving), BLOCK), self._sky.shape[:3])
@@ -194,9 +196,12 @@ class ColourSolve:
             back = np.linalg.inv(response[:, :3]), response[:, 3].copy()
             pixels = (image.rgb, *back, planes, clear, behind, image.weights, valid, error, weight, sky_weight)
             self._workers.run(image_errors, [(*part, *pixels) for part in rows])
-            if len(boxes := shading_boxes(self._movers, image.t_us)):
-                shaded = (view.directions, turn, eye, planes, boxes, weight)
-                self._workers.run(unweigh_shaded, [(*part, *shaded) for part in rows])
+            if len(boxes := self.shades.boxes(image.t_us)):
+                cell, shade = np.empty(weight.shape, np.int32), np.empty((4, *weight.shape), np.float32)
+                sums = self.shades.sums
+                ground = (view.directions, turn, eye, planes, clear, behind, boxes, sums, weight, error, cell, shade)
+                self._workers.run(find_shaded, [(*part, *ground) for part in rows])
+                add_shaded(cell, shade, sums)
             texels = np.zeros((*self._sky.shape[:3], 4), np.float32)
             sky = self._beside.submit(spread_sky_errors, view.directions, turn, sky_weight, error, texels)
             shares = spread_errors(picture, planes, weight, error, self._workers)

@@ -60,7 +60,8 @@ def lift(
     given, settings = settings, settings.for_log(path_m, span_us / 1e6, images)
     stages = _Stages(progress)
     stages.start("sweeps")
-    actors = people.in_windows(points.actors_of(clip, settings.points), clip, key_frames(clip, cameras, settings.views))
+    frames = key_frames(clip, cameras, settings.views)
+    actors = people.in_windows(points.actors_of(clip, settings.points), clip, frames, hold_out)
     gathered = points.gather(clip, actors, hold_out, settings.points, stages.fraction)
     if gathered.point_count == 0:
         raise ReconstructError(

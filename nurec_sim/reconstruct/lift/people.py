@@ -2,13 +2,13 @@
 
 What a rigid body gathers over its life would be a person with a blur of legs. So the life of a person that moves is cut
 into windows of one or two images; each is a body of its own, made from the sweeps and images of its time. Where no
-image shows the person, the window lasts until one does.
+image shows the person, the window lasts until one does, and where no sweep may be read, until the end of the next one.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from jaxtyping import Int64
@@ -29,21 +29,25 @@ BEYOND, BEYOND_US = 0.1, 100_000
 the next begins, neither has faded by more than a third: exp(-(1 / 1.1)**10) = 0.68."""
 
 
-def in_windows(actors: Sequence[Actor], clip: Clip, frames: Sequence[tuple[str, int]]) -> list[Actor]:
+def in_windows(
+    actors: Sequence[Actor], clip: Clip, frames: Sequence[tuple[str, int]], hold_out: Collection[int] = ()
+) -> list[Actor]:
     """The actors, with each person that moves replaced by one actor for each of its windows.
 
     Args:
         actors: of the clip.
         clip: the driving log.
         frames: (camera, frame) of the images whose pixels are lifted.
+        hold_out: sweeps that must not be read, by index, of every LiDAR.
     """
     result: list[Actor] = []
+    swept_us = _swept_us(clip, hold_out)
     for actor in actors:
         stands = len(actor.path.t_us) == 1
         if stands or actor.track.label not in LABELS:
             result.append(actor)
             continue
-        ends = _ends_us(actor.path, _seen_us(actor, clip, frames))
+        ends = _ends_us(actor.path, _seen_us(actor, clip, frames), swept_us)
         result += [dataclasses.replace(actor, window_us=pair) for pair in zip(ends[:-1], ends[1:], strict=True)]
     return result
 
@@ -63,14 +67,27 @@ def _seen_us(actor: Actor, clip: Clip, frames: Sequence[tuple[str, int]]) -> Int
     return np.unique(np.array(seen, np.int64))
 
 
-def _ends_us(path: Trajectory, seen_us: Int64[np.ndarray, " n"]) -> list[int]:
+def _swept_us(clip: Clip, hold_out: Collection[int]) -> Int64[np.ndarray, " n"]:
+    """Middles of the sweeps of all LiDARs that may be read."""
+    middle = [clip.sweep_times_us(lidar).sum(axis=1) // 2 for lidar in clip.rig.lidars]
+    kept = [each[~np.isin(np.arange(len(each)), sorted(hold_out))] for each in middle]
+    return np.concatenate([np.zeros(0, np.int64), *kept])
+
+
+def _ends_us(path: Trajectory, seen_us: Int64[np.ndarray, " n"], swept_us: Int64[np.ndarray, " m"]) -> list[int]:
     """Where windows end: half-way between images, ``SHORTEST_US`` apart at least, and half of it before the last label.
 
-    The last window ends after the last label.
+    The last window ends after the last label. Each holds the middle of a sweep, the last one within ``SHORTEST_US``
+    after it: without returns there is no body.
     """
+
+    def swept(first_us: int, last_us: int) -> bool:
+        return bool(((swept_us >= first_us) & (swept_us < last_us)).any())
+
     ends = [path.start_us]
     for end in ((seen_us[1:] + seen_us[:-1]) // 2).tolist():
-        if end - ends[-1] >= SHORTEST_US and path.end_us - end >= SHORTEST_US // 2:
+        long = end - ends[-1] >= SHORTEST_US and path.end_us - end >= SHORTEST_US // 2
+        if long and swept(ends[-1], end) and swept(end, path.end_us + SHORTEST_US):
             ends.append(end)
     return [*ends, path.end_us + 1]
 

@@ -204,6 +204,8 @@ def choose_frames(
 ) -> list[tuple[str, int, bool]]:
     """(camera, frame, whether it is a key frame) in order of time, thinned evenly to the limits of the settings.
 
+    The last frame of a camera is a key frame as the first is: what passes the car then, no other one shows.
+
     Args:
         clip: the driving log.
         cameras: ids of the cameras.
@@ -214,9 +216,12 @@ def choose_frames(
     total = sum(counts.values()) * tiles / max(len(cameras), 1)
     skip = max(1, int(np.ceil(total / settings.max_frames)))
     step = max(1, int(np.ceil(total / skip / settings.max_views)))
-    chosen = [
-        (camera, frame, frame // skip % step == 0) for camera in cameras for frame in range(0, counts[camera], skip)
-    ]
+    chosen = []
+    for camera in cameras:
+        frames = range(0, counts[camera], skip)
+        spread = np.linspace(0, len(frames) - 1, -(-len(frames) // step)) if len(frames) else []
+        keys = set(np.round(spread).astype(int))
+        chosen += [(camera, frame, number in keys) for number, frame in enumerate(frames)]
     return sorted(chosen, key=lambda row: (int(clip.camera_times_us(row[0])[row[1]].sum()), row))
 
 
