@@ -12,7 +12,7 @@ from nurec_sim.reconstruct import LiftSettings, ViewSettings, reconstruct
 from nurec_sim.reconstruct.movers import registration, with_aligned_actors
 from nurec_sim.reconstruct.movers.alignment import _corrected
 from nurec_sim.reconstruct.movers.registration import Returns, corrections, disagreement, moved
-from nurec_sim.types import Trajectory
+from nurec_sim.types import Track, Trajectory
 
 FRAMES = 12
 SIGMA = np.array([0.15, 0.15, 0.05, np.radians(2.0)])
@@ -146,7 +146,12 @@ def walls(values):
         # A label that is off by E shows the point x of the object at E^-1 x.
         xyz.append(geometry.transform_points(geometry.inverse(change(*row)), points))
         sweep.append(np.full(len(points), k))
-    return Returns(100_000 * np.arange(len(values)), np.concatenate(xyz), np.concatenate(sweep))
+    return seen_from((-10, -10, 0), 100_000 * np.arange(len(values)), np.concatenate(xyz), np.concatenate(sweep))
+
+
+def seen_from(eye, t_us, xyz, sweep):
+    ray = xyz - np.array(eye)
+    return Returns(t_us, xyz, sweep, ray / np.linalg.norm(ray, axis=1, keepdims=True))
 
 
 def test_corrections_undo_shifts_and_turns():
@@ -173,7 +178,7 @@ def test_gradients_of_pairs_are_derivatives_of_half_their_squares():
     sweep, near = np.array([0, 0, 0, 1, 1, 1]), np.array([[3, 1], [4, -1], [5, 4], [0, 2], [1, -1], [2, 4]])
 
     def cost(values):
-        at = moved(Returns(np.arange(2), xyz, sweep), values.reshape(2, 4))
+        at = moved(Returns(np.arange(2), xyz, sweep, 0 * xyz), values.reshape(2, 4))
         pairs = [(i, j) for i, row in enumerate(near) for j in row if j >= 0 and sweep[i] != sweep[j]]
         return sum(flat[j] * (normal[j] @ (at[i] - at[j])) ** 2 / 2 for i, j in pairs)
 
@@ -188,13 +193,41 @@ def test_gradients_of_pairs_are_derivatives_of_half_their_squares():
     assert information[np.ix_(shifts, shifts)] == pytest.approx(np.array(second), abs=1e-5)
 
 
+def test_rows_of_few_beams_are_not_pulled_onto_each_other():
+    """The bent rear of a car 10 m ahead, by two beams that meet it 0.1 m higher in every other sweep."""
+    xyz, sweep, y = [], [], np.linspace(-0.8, 0.8, 40)
+    for k in range(8):
+        for down_deg in (3.0, 5.0):
+            x = 10.0 + 0.3 * y**2
+            z = 1.8 - x * np.tan(np.radians(down_deg)) + 0.1 * (k % 2)
+            xyz.append(np.column_stack([x, y, z]))
+            sweep.append(np.full(len(y), k))
+    returns = seen_from((0, 0, 1.8), 100_000 * np.arange(8), np.concatenate(xyz), np.concatenate(sweep))
+    found = corrections(returns, np.tile(np.eye(4), (8, 1, 1)), SIGMA)
+    assert np.abs(found[:, 2]).max() < 0.005
+
+
+@pytest.mark.parametrize(("labelled", "changed"), [(True, False), (False, True)])
+def test_labels_that_are_exact_but_for_centimetres_stay(labelled, changed):
+    off = np.tile([0.02, -0.02, 0, np.radians(0.3)], (12, 1)) * np.array([1.0, -1.0] * 6)[:, None]
+    seen = walls(off)
+    parts = [(int(t), np.concatenate([seen.xyz_m, seen.ray], axis=1)[seen.sweep == k]) for k, t in enumerate(seen.t_us)]
+    path = Trajectory(seen.t_us, np.array([change(*row) for row in off]))
+    track = Track("1", "automobile", SIZE, path, labelled=labelled)
+    assert (_corrected(track, parts) is not None) == changed
+    twice = walls(2.5 * off)
+    parts = [(t, np.concatenate([twice.xyz_m, twice.ray], axis=1)[twice.sweep == k]) for k, (t, _) in enumerate(parts)]
+    path = Trajectory(seen.t_us, np.array([change(*row) for row in 2.5 * off]))
+    assert _corrected(dataclasses.replace(track, path=path), parts) is not None
+
+
 def test_where_surfaces_do_not_tell_the_motion_is_steady():
     """Along one wall nothing tells the shift but that speed does not jump: labels zigzag by 0.2 m at 10 Hz, 80 m/s2."""
     zigzag = np.zeros((9, 4))
     zigzag[:, 0] = 0.1 * (-1.0) ** np.arange(9)
     returns = walls(zigzag)
     wall = returns.xyz_m[:, 1] > 0.99
-    returns = Returns(returns.t_us, returns.xyz_m[wall], returns.sweep[wall])
+    returns = Returns(returns.t_us, returns.xyz_m[wall], returns.sweep[wall], returns.ray[wall])
     poses = np.array([change(*row) for row in zigzag])
     found = poses @ geometry.inverse(np.array([change(*row) for row in corrections(returns, poses, SIGMA)]))
     assert np.abs(np.diff(found[:, 0, 3], 2)).max() < 0.05
@@ -206,8 +239,9 @@ def test_long_tracks_are_corrected_in_parts(monkeypatch):
     monkeypatch.setattr(registration, "MOST_TIMES", 4)
     found = corrections(whole, poses, SIGMA)
     first = whole.sweep < 4
-    alone = corrections(Returns(whole.t_us[:4], whole.xyz_m[first], whole.sweep[first]), poses[:4], SIGMA)
-    rest = Returns(whole.t_us[4:], whole.xyz_m[~first], whole.sweep[~first] - 4)
+    part = Returns(whole.t_us[:4], whole.xyz_m[first], whole.sweep[first], whole.ray[first])
+    alone = corrections(part, poses[:4], SIGMA)
+    rest = Returns(whole.t_us[4:], whole.xyz_m[~first], whole.sweep[~first] - 4, whole.ray[~first])
     assert np.array_equal(found, np.concatenate([alone, corrections(rest, poses[4:], SIGMA)]))
 
 
@@ -216,7 +250,7 @@ def test_a_part_without_returns_stays(monkeypatch):
     seen = walls(np.random.default_rng(2).normal(size=(4, 4)) * OFF * (1, 1, 0, 1))
     times = np.append(seen.t_us, seen.t_us[-1] + 5_000 * np.arange(1, 5))
     monkeypatch.setattr(registration, "MOST_TIMES", 4)
-    found = corrections(Returns(times, seen.xyz_m, seen.sweep), np.tile(np.eye(4), (8, 1, 1)), SIGMA)
+    found = corrections(Returns(times, seen.xyz_m, seen.sweep, seen.ray), np.tile(np.eye(4), (8, 1, 1)), SIGMA)
     assert np.abs(found[:4]).max() > 0.01 and not found[4:].any()
 
 
@@ -247,8 +281,12 @@ def test_a_track_lasts_as_long_as_it_was_labelled(street, wrong):
 
 def test_a_track_stays_if_no_two_sweeps_show_the_same_part(wrong):
     rng = np.random.default_rng(1)
-    rear, front = (np.column_stack([np.full(40, x), *rng.uniform(-0.7, 0.7, (2, 40))]) for x in (-2.0, 2.0))
+    # As seen from behind.
+    rear, front = (
+        np.column_stack([np.full(40, x), *rng.uniform(-0.7, 0.7, (2, 40)), np.tile([1.0, 0, 0], (40, 1))])
+        for x in (-2.0, 2.0)
+    )
     track = wrong.tracks[0]
     times = track.path.t_us.tolist()
-    assert _corrected(track, [(times[2], rear), (times[3], rear + (0.1, 0, 0))]) is not None
+    assert _corrected(track, [(times[2], rear), (times[3], rear + (0.1, 0, 0, 0, 0, 0))]) is not None
     assert _corrected(track, [(times[2], rear), (times[3], front)]) is None

@@ -34,7 +34,10 @@ LABELLED_SIGMA, FOUND_SIGMA = (0.15, 0.15, 0.05, np.radians(2.0)), (0.4, 0.4, 0.
 """Standard deviations of boxes that were labelled and found: along, across and up in metres, turn in radians."""
 LARGEST, BETTER = 4.0, 0.9
 """A track stays as it was if a correction is more standard deviations than the first, or if returns disagree by more
-than the second times what they did before: what is nearly exact is not made better."""
+than the second times what they did before."""
+EXACT = (0.03, 0.03, 0.03, np.radians(0.5))
+"""It also stays if its corrections are no larger than this (root of their mean square, units as above): few returns do
+not tell more, and tracks of simulated logs are exact."""
 EXTENT = (0.01, 0.99)
 """Quantiles of the returns that count as the ends of an object."""
 
@@ -61,8 +64,9 @@ def with_aligned_actors(clip: Clip, hold_out: Collection[int] = ()) -> tuple[Cli
     return (with_tracks(clip, tracks) if changed else clip), changed
 
 
-Part = tuple[int, Float64[np.ndarray, "n 3"]]
-"""The returns of one sweep on an object in the frame of its box, and their mean time."""
+Part = tuple[int, Float64[np.ndarray, "n 6"]]
+"""The mean time of the returns of one sweep on an object, and in the frame of its box where they are and the unit rays
+to them."""
 
 
 def _gathered(clip: Clip, actors: Sequence[Actor], hold_out: Collection[int]) -> dict[int, list[Part]]:
@@ -87,11 +91,13 @@ def _parts(clip: Clip, actors: Sequence[Actor], lidar: str, index: int) -> dict[
     eye = np.broadcast_to(sweep.world_from_lidar[:3, 3], xyz.shape)
     free, found = np.isfinite(xyz).all(axis=1), {}
     for actor in actors:
-        inside, box_m, _, foot = returns_in_box(actor, xyz, eye, t_us, free, MARGIN_M)
+        inside, box_m, eye_m, foot = returns_in_box(actor, xyz, eye, t_us, free, MARGIN_M)
         free[inside] = False
         if len(inside) - foot.sum() >= FEWEST_POINTS:
             times = t_us[inside][~foot]
-            found[actor.index] = int(times[0]) + round(float((times - times[0]).mean())), box_m[~foot]
+            rays = (box_m - eye_m) / np.linalg.norm(box_m - eye_m, axis=1, keepdims=True)
+            mean_us = int(times[0]) + round(float((times - times[0]).mean()))
+            found[actor.index] = mean_us, np.concatenate([box_m, rays], axis=1)[~foot]
     return found
 
 
@@ -102,7 +108,8 @@ def _corrected(track: Track, parts: Sequence[Part]) -> Track | None:
     poses = track.path.at(returns.t_us)
     values = corrections(returns, poses, sigma)
     before, after = disagreement(returns, np.zeros_like(values)), disagreement(returns, values)
-    if (np.abs(values) > LARGEST * sigma).any() or after >= BETTER * before:
+    exact = track.labelled and (np.sqrt((values**2).mean(axis=0)) <= EXACT).all()
+    if exact or (np.abs(values) > LARGEST * sigma).any() or after >= BETTER * before:
         return None
     change = np.array([geometry.pose_from_xyyaw(x, y, yaw, z) for x, y, z, yaw in values])
     times = np.union1d(returns.t_us, track.path.t_us[far])
@@ -126,11 +133,11 @@ def _returns(label_us: Int64[np.ndarray, " l"], parts: Sequence[Part]) -> tuple[
     most = max(MOST_POINTS // len(parts), FEWEST_POINTS)
     sweep_us: list[int] = []
     points, sweep = [], []
-    for at_us, xyz in parts:
+    for at_us, seen in parts:
         if not sweep_us or at_us - sweep_us[-1] > TOGETHER_US:
             sweep_us.append(at_us)
         # In the order of firing every n-th return leaves all parts of the object.
-        chosen = xyz[:: -(-len(xyz) // most)]
+        chosen = seen[:: -(-len(seen) // most)]
         points.append(chosen)
         sweep.append(np.full(len(chosen), len(sweep_us) - 1))
     seen_us = np.array(sweep_us, np.int64)
@@ -140,4 +147,6 @@ def _returns(label_us: Int64[np.ndarray, " l"], parts: Sequence[Part]) -> tuple[
     # The ends stay: the object is there as long as it was labelled.
     own[[0, -1]] = True
     t_us = np.union1d(seen_us, label_us[own & ~far])
-    return Returns(t_us, np.concatenate(points), np.searchsorted(t_us, seen_us)[np.concatenate(sweep)]), far
+    place = np.searchsorted(t_us, seen_us)[np.concatenate(sweep)]
+    xyz, ray = np.split(np.concatenate(points), 2, axis=1)
+    return Returns(t_us, xyz, place, ray), far

@@ -22,6 +22,9 @@ PLANE_POINTS, FLATNESS = 8, 0.3
 NEAREST, GROUPS = 16, 8
 """Partners of each return: the nearest of all, many of which are in sweeps with like errors, and the nearest in each
 group of sweeps one after the other."""
+FACING = 0.3
+"""Planes that rays meet at a smaller sine do not count. The returns of one beam on a bent surface lie in such a plane,
+which holds the ray: beams far apart would be pulled onto each other."""
 REACH_M = (0.6, 0.3, 0.15)
 """Largest distances between returns of two sweeps that may show one surface, one after the other."""
 ROUNDS, STILL = 4, 0.01
@@ -45,11 +48,13 @@ class Returns:
         t_us: [k] mean times of the returns of each sweep, and the times of labels between and around them, ascending.
         xyz_m: [n,3] returns.
         sweep: [n] the sweep of each, by its place in ``t_us``, ascending.
+        ray: [n,3] unit vectors from the LiDAR to them.
     """
 
     t_us: Int64[np.ndarray, " k"]
     xyz_m: Float64[np.ndarray, "n 3"]
     sweep: Int64[np.ndarray, " n"]
+    ray: Float64[np.ndarray, "n 3"]
 
     @cached_property
     def planes(self) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
@@ -65,7 +70,8 @@ class Returns:
             spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / PLANE_POINTS)
             thin = np.sqrt(np.maximum(spread[:, 0], 0) / np.maximum(spread[:, 2], 1e-12))
             # The returns of one beam lie on a line, which has no plane: its second extent vanishes as well.
-            plane = spread[:, 1] > 4 * spread[:, 0]
+            facing = np.abs((axes[:, :, 0] * self.ray[first:last]).sum(axis=1))
+            plane = (spread[:, 1] > 4 * spread[:, 0]) & (facing > FACING)
             normal[first:last] = axes[:, :, 0]
             flat[first:last] = np.where(plane, np.clip(1 - thin / FLATNESS, 0, 1), 0)
         return normal, flat
@@ -84,7 +90,7 @@ def corrections(
     parts = []
     for times in np.array_split(np.arange(len(returns.t_us)), -(-len(returns.t_us) // MOST_TIMES)):
         rows = slice(*np.searchsorted(returns.sweep, [times[0], times[-1] + 1]))
-        part = Returns(returns.t_us[times], returns.xyz_m[rows], returns.sweep[rows] - times[0])
+        part = Returns(returns.t_us[times], returns.xyz_m[rows], returns.sweep[rows] - times[0], returns.ray[rows])
         parts.append(_solved(part, world_from_box[times], sigma))
     return np.concatenate(parts)
 
