@@ -24,6 +24,8 @@ AROUND_PX = 2
 HIDDEN = 1.15
 """A point farther by this factor than another within ``CELL_PX`` is visible to the LiDAR but occluded in the camera."""
 CELL_PX = 12
+FARTHEST_PX = 1 << 20
+"""Corners of outlines end so far outside of an image."""
 
 
 def range_name(index: int) -> str:
@@ -56,8 +58,9 @@ def actor_mask(clip: Clip, request: SensorRequest, size_px: tuple[int, int] | No
         uv, valid, _ = sensors.project_rolling(camera, request.world_from_sensor, corners)
         # A box with a corner behind the camera or outside the lens's valid field has no convex image outline.
         if valid.all():
-            outline = cv2.convexHull((uv * (width / camera.width_px, height / camera.height_px)).astype(np.int32))
-            cv2.fillConvexPoly(mask, outline, 1)
+            # Polynomials of lenses reach any pixel for rays far outside of the image.
+            corners_px = np.clip(uv * (width / camera.width_px, height / camera.height_px), -FARTHEST_PX, FARTHEST_PX)
+            cv2.fillConvexPoly(mask, cv2.convexHull(corners_px.astype(np.int32)), 1)
     return mask.astype(bool)
 
 

@@ -18,7 +18,7 @@ from nurec_sim.evaluate.scores.sharpness import octave_energy, sharpness
 from nurec_sim.evaluate.scores.surfaces import KINDS, surfaces_of
 from nurec_sim.logs import hold_out, without_images
 from nurec_sim.reconstruct import LiftSettings, ViewSettings, reconstruct
-from nurec_sim.types import MOVABLE_LABELS, LidarFrame, Track, Trajectory
+from nurec_sim.types import MOVABLE_LABELS, LidarFrame, Pinhole, Track, Trajectory
 
 SMALL = LiftSettings(sky_px=32, views=ViewSettings(levels=32))
 
@@ -188,6 +188,17 @@ def test_holding_out_everything_or_less_than_nothing_is_refused():
         hold_out(street(), ["left"], images_every=1)
     with pytest.raises(ReconstructError, match="camera 'left' has 6 images, none to hold out when every 9th is"):
         hold_out(street(), ["left"], images_every=9)
+
+
+def test_outlines_end_though_a_lens_sends_their_corners_billions_of_pixels_away():
+    """A car beside the camera: its rear is 86 degrees off the axis, where the polynomial is 1e11 pixels from there."""
+    lens = Pinhole(fx_px=120, fy_px=120, cx_px=96, cy_px=48, radial=(0.0, 0.0, 20.0, 0.0, 0.0, 0.0))
+    wide = dataclasses.replace(camera("left"), lens=lens)
+    box = ((8.0, 2.0, 2.0), np.array([5.5, 6.0]))
+    clip = Street(frames=2, boxes={"beside": box}, cameras=(wide,))
+    clip.tracks[0] = dataclasses.replace(clip.tracks[0], label="automobile")
+    mask = actor_mask(clip, image_request(clip, "left", 0))
+    assert mask[60, 0] and not mask[:, 120:].any()
 
 
 def test_lidar_points_in_an_image_have_their_range_and_are_not_hidden():
