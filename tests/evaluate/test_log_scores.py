@@ -194,7 +194,7 @@ def test_outlines_end_though_a_lens_sends_their_corners_billions_of_pixels_away(
     """A bus beside the camera: its rear is 86 degrees off the axis, where the polynomial is 1e11 pixels from there."""
     lens = Pinhole(fx_px=120, fy_px=120, cx_px=96, cy_px=48, radial=(0.0, 0.0, 20.0, 0.0, 0.0, 0.0))
     wide = dataclasses.replace(camera("left"), lens=lens)
-    box = ((20.0, 2.0, 2.0), np.array([11.5, 6.0]))
+    box = ((20.0, 2.0, 2.0), np.array([12.0, 6.0]))
     clip = Street(frames=2, boxes={"beside": box}, cameras=(wide,))
     clip.tracks[0] = dataclasses.replace(clip.tracks[0], label="automobile")
     mask = actor_mask(clip, image_request(clip, "left", 0))
