@@ -50,14 +50,14 @@ def main(log: Path, archive: Path) -> None:
                 text = "rendered, same pose"
             view = render.render_view(renderer, camera, frame, left_m=left_m, yaw_deg=yaw_deg)
             pictures.append(captioned(view.rgb, text))
-        (IMAGES / f"gallery_{name}.jpg").write_bytes(display.jpeg(sheet(pictures, 2), 64))
+        (IMAGES / f"gallery_{name}.jpg").write_bytes(display.jpeg(sheet(pictures, 2), 60))
         if name == "turn":
             chain = [pictures[0], pictures[1], captioned(render.render_view(renderer, camera, frame, left_m=1.5).rgb,
                                                          "rendered, 1.5 m to the left")]  # fmt: skip
-            (IMAGES / "chain.jpg").write_bytes(display.jpeg(sheet(chain, 3), 85))
+            (IMAGES / "chain.jpg").write_bytes(display.jpeg(sheet(chain, 3), 78))
             requests = [view_request(renderer.scene, camera, frame, left_m=left_m) for left_m in SUPPORT_AT_M]
             shown = [support_picture(renderer, request) for request in requests]
-            (IMAGES / "support.jpg").write_bytes(display.jpeg(sheet(shown, len(shown)), 85))
+            (IMAGES / "support.jpg").write_bytes(display.jpeg(sheet(shown, len(shown)), 78))
 
 
 if __name__ == "__main__":

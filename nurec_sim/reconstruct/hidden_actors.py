@@ -121,11 +121,10 @@ def _own(scene: GaussianScene, number: int) -> Gaussians | None:
     Methods may have left an actor that stands in the static layer, as movable Gaussians.
     """
     dynamic, track = scene.dynamic, scene.tracks[number]
-    mine = dynamic.track == number
+    mine = (dynamic.track == number) & (dynamic.gaussians.label != Label.ROAD)  # without its shadow
     if mine.any():
         fixed = dynamic.in_box is not None and dynamic.in_box[mine].all()
-        own = dynamic.gaussians[mine]
-        return own[own.label != Label.ROAD] if fixed else None  # without its shadow
+        return dynamic.gaussians[mine] if fixed else None
     standing = scene.static[baked_in(scene, track)]
     return transformed(standing, geometry.inverse(track.path.world_from_body[0])) if len(standing) else standing
 

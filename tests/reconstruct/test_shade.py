@@ -71,7 +71,7 @@ def test_ground_beneath_and_beside_a_mover_counts_little(point, shaded):
 )
 def test_pixels_of_the_ground_around_a_mover_have_a_cell(point, cell):
     shades = Shades([track(4.0)])
-    columns = shades.shape(track(4.0))[1]
+    columns = shades.grounds[0].shape[1]
     _, _, found, added = look(point, shades)
     if cell is None:
         assert found == -1
@@ -85,12 +85,12 @@ def test_ground_between_two_movers_belongs_to_the_nearer_one():
     right = Track("2", "automobile", SIZE, Trajectory(track(4.0).path.t_us, track(4.0).path.world_from_body.copy()))
     right.path.world_from_body[:, 0, 3] = 16.0  # 6 m farther away
     shades = Shades([right, track(4.0)])
-    cells = int(np.prod(shades.shape(right)))
+    cells = shades.grounds[1].first
     assert look((12.0, 0.0, 0.0), shades)[2] >= cells > look((14.6, 0.0, 0.0), shades)[2] >= 0
 
 
 def test_what_stands_or_is_not_there_shades_nothing():
-    assert len(Shades([track(4.0), track(0.5)]).grids()) == 1
+    assert len(Shades([track(4.0), track(0.5)]).grounds) == 1
     shades = Shades([track(4.0)])
     assert len(shades.boxes(500_000)) == 1 and len(shades.boxes(1_500_000)) == 0
 
@@ -112,7 +112,7 @@ def test_pixels_add_to_their_cell_and_lack_less_once_the_shadow_is_known():
 
 def seen_ground(left=1.0, pixels=100.0):
     """Sums of a grid whose cells have shown so many pixels of 0.5, with this share of their light left."""
-    along, across = Shades.shape(track(4.0))
+    along, across = Shades([track(4.0)]).grounds[0].shape
     return np.tile(pixels * np.array([0.25 * left, 0.25, 1, 0.02]), (along, across, 1))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -22,6 +23,8 @@ ABOVE_M, BELOW_M = 0.1, 0.4
 
 SHADOW_REACH_M = 3.0
 """Shadows are looked for so far beside a box."""
+TURN = np.radians(15.0)
+"""A mover that turns has a shadow for every so much of it."""
 CELL_M = 0.1
 SHADOW_ABOVE_M = 0.06
 """A shadow lies so high over its ground. Gaussians are blended in the order of their centres, those of the ground are
@@ -37,46 +40,76 @@ def moves(path: Trajectory) -> bool:
     return bool(np.ptp(path.position_m, axis=0).max() > MOVES_M)
 
 
+class Ground(NamedTuple):
+    """The ground around the box of a mover while its heading hardly changes: the sun stands still."""
+
+    number: int
+    """Of the track."""
+    track: Track
+    window_us: tuple[int, int] | None
+    """None: the whole path."""
+    first: int
+    """Number of its first cell among those of all."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Cells along and across the box; cell 0, 0 is behind it and to its right."""
+        along, across = (int(np.ceil((side + 2 * SHADOW_REACH_M) / CELL_M)) for side in self.track.size_m[:2])
+        return along, across
+
+    def covers(self, t_us: int) -> bool:
+        """Whether the mover is there at a time."""
+        inside = self.window_us is None or self.window_us[0] <= t_us < self.window_us[1]
+        return inside and self.track.path.covers(t_us)
+
+
 class Shades:
-    """The ground around the boxes of movers: a grid each, and what images show in its cells.
+    """The ground around the boxes of movers: grids, and what images show in their cells.
 
     Args:
         tracks: of the scene; those that do not move have no grid.
     """
 
     def __init__(self, tracks: Sequence[Track]) -> None:
-        self._tracks, self._first, count = {}, {}, 0
+        self.grounds: list[Ground] = []
+        count = 0
         for number, track in enumerate(tracks):
-            if moves(track.path):
-                self._tracks[number], self._first[number] = track, count
-                count += int(np.prod(self.shape(track)))
+            for window_us in headings(track.path) if moves(track.path) else []:
+                self.grounds.append(Ground(number, track, window_us, count))
+                count += int(np.prod(self.grounds[-1].shape))
         self.sums = np.zeros((count, 4))
         """Of each cell: products of shown and wanted colours, squares of shown ones, weights, and heights over the
         underside of the box; all weighted."""
 
-    @staticmethod
-    def shape(track: Track) -> tuple[int, int]:
-        """Cells of a grid along and across the box."""
-        along, across = (int(np.ceil((side + 2 * SHADOW_REACH_M) / CELL_M)) for side in track.size_m[:2])
-        return along, across
-
-    def grids(self) -> dict[int, Float64[np.ndarray, "x y 4"]]:
-        """The sums of each mover, by the index of its track; cell 0, 0 is behind and right of the box."""
-        return {
-            number: self.sums[first : first + int(np.prod(self.shape(track)))].reshape(*self.shape(track), 4)
-            for (number, track), first in zip(self._tracks.items(), self._first.values(), strict=True)
-        }
+    def sums_of(self, ground: Ground) -> Float64[np.ndarray, "x y 4"]:
+        """The sums of one grid."""
+        return self.sums[ground.first : ground.first + int(np.prod(ground.shape))].reshape(*ground.shape, 4)
 
     def boxes(self, t_us: int) -> Float64[np.ndarray, "k 18"]:
         """Boxes of movers that are there at a time: rows of ``find_shaded``."""
         rows = []
-        for number, track in self._tracks.items():
-            if track.path.covers(t_us):
-                box_from_world = geometry.inverse(track.path.at(t_us))
-                length, width, height = track.size_m
-                shape = self._first[number], *self.shape(track)
-                rows.append([*box_from_world[:3].ravel(), length / 2, width / 2, -height / 2, *shape])
+        for ground in self.grounds:
+            if ground.covers(t_us):
+                box_from_world = geometry.inverse(ground.track.path.at(t_us))
+                length, width, height = ground.track.size_m
+                sides = length / 2, width / 2, -height / 2
+                rows.append([*box_from_world[:3].ravel(), *sides, ground.first, *ground.shape])
         return np.array(rows, np.float64).reshape(-1, 18)
+
+
+def headings(path: Trajectory) -> list[tuple[int, int] | None]:
+    """Windows of a path in which its heading changes by less than ``TURN``; None for one that it never changes by more.
+
+    The last one ends behind the path.
+    """
+    yaw = np.unwrap(geometry.yaw_of(path.world_from_body))
+    ends, low, high = [path.start_us], yaw[0], yaw[0]
+    for t_us, angle in zip(path.t_us.tolist(), yaw, strict=True):
+        low, high = min(low, angle), max(high, angle)
+        if high - low > TURN:
+            ends.append(t_us)
+            low = high = angle
+    return list(zip(ends, [*ends[1:], path.end_us + 1], strict=True)) if len(ends) > 1 else [None]
 
 
 @kernel

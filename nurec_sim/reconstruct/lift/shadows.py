@@ -3,7 +3,7 @@
 Where a mover is, the ground around it is darker than the same ground in other images. The share of light that is left
 is the same for all ground that passes through the shadow, and so are black Gaussians of that opacity: blended over
 ground of colour c, opacity 1 - s gives s c. Each cell of a grid around the box gets the share s that fits the pixels
-that show it best, by least squares. A turning car takes its shadow with it, also the part that the sun casts.
+that show it best, by least squares. A mover that turns has a shadow for each heading, as the sun casts it.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from nurec_sim.reconstruct.lift import people
+from nurec_sim.reconstruct.lift.actors import in_box
+from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.shade import CELL_M, LEAST_PIXELS, SHADOW_ABOVE_M, SHADOW_REACH_M, Shades
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label
 
@@ -35,16 +38,16 @@ def with_shadows(scene: GaussianScene, shades: Shades) -> GaussianScene:
         scene: with solved colours.
         shades: of its tracks, with what its images show.
     """
-    shown, parts, tracks = set(scene.dynamic.track.tolist()), [], []
+    shown, parts = set(scene.dynamic.track.tolist()), []
     intensity = _intensity_of_road(scene.static)
-    for number, sums in shades.grids().items():
-        if number in shown and len(shadow := shadow_of(sums, scene.tracks[number].size_m, intensity)):
-            parts.append(shadow)
-            tracks.append(np.full(len(shadow), number, np.int32))
+    for ground in shades.grounds:
+        track = ground.track
+        if ground.number in shown and len(shadow := shadow_of(shades.sums_of(ground), track.size_m, intensity)):
+            actor = Actor(ground.number, track, False, track.path, ground.window_us)
+            parts.append(in_box(actor, shadow) if ground.window_us is None else people.moving(actor, shadow))
     if not parts:
         return scene
-    moving = DynamicGaussians.rigid(Gaussians.concatenate(parts), np.concatenate(tracks), scene.span_us[0])
-    return replace(scene, dynamic=DynamicGaussians.concatenate([scene.dynamic, moving]))
+    return replace(scene, dynamic=DynamicGaussians.concatenate([scene.dynamic, *parts]))
 
 
 def shadow_of(sums: Float64[np.ndarray, "x y 4"], size_m: tuple[float, float, float], intensity: float) -> Gaussians:
