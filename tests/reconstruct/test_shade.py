@@ -9,7 +9,7 @@ from reconstruct_street import Street, camera
 from nurec_sim import geometry
 from nurec_sim.reconstruct import ColourSettings, LiftSettings, ViewSettings, reconstruct
 from nurec_sim.reconstruct.lift.colour_solve import solve_colours
-from nurec_sim.reconstruct.lift.shade import CELL_M, SHADED_WEIGHT, Shades, add_shaded, find_shaded
+from nurec_sim.reconstruct.lift.shade import CELL_M, SHADED_WEIGHT, Shades, add_shaded, find_shaded, headings
 from nurec_sim.reconstruct.lift.shadows import STRONGER, shadow_of
 from nurec_sim.render import CpuRenderer
 from nurec_sim.scene.edits import _rows
@@ -93,6 +93,20 @@ def test_what_stands_or_is_not_there_shades_nothing():
     assert len(Shades([track(4.0), track(0.5)]).grounds) == 1
     shades = Shades([track(4.0)])
     assert len(shades.boxes(500_000)) == 1 and len(shades.boxes(1_500_000)) == 0
+
+
+def test_a_mover_that_turns_has_a_grid_for_every_15_degrees():
+    """It turns by 10 degrees a second from the third to the seventh second, and back by 5."""
+    t_s = np.arange(11)
+    yaw_deg = np.array([0, 0, 0, 10, 20, 30, 40, 40, 35, 35, 35]) + 175.0  # past 180
+    poses = np.stack([geometry.pose_from_xyyaw(2.0 * t, 0, np.radians(y), 0.75) for t, y in zip(t_s, yaw_deg, strict=True)])
+    path = Trajectory(t_s * 1_000_000, poses)
+    assert headings(path) == [(0, 4_000_000), (4_000_000, 6_000_000), (6_000_000, 10_000_001)]
+    shades = Shades([Track("1", "automobile", SIZE, path)])
+    first = [ground.first for ground in shades.grounds]
+    boxes = [shades.boxes(t_us) for t_us in (0, 3_999_999, 4_000_000, 10_000_000)]
+    assert [rows[:, 15].tolist() for rows in boxes] == [[first[0]], [first[0]], [first[1]], [first[2]]]
+    assert headings(track(4.0).path) == [None]
 
 
 def test_pixels_add_to_their_cell_and_lack_less_once_the_shadow_is_known():
