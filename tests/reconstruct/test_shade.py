@@ -99,7 +99,9 @@ def test_a_mover_that_turns_has_a_grid_for_every_15_degrees():
     """It turns by 10 degrees a second from the third to the seventh second, and back by 5."""
     t_s = np.arange(11)
     yaw_deg = np.array([0, 0, 0, 10, 20, 30, 40, 40, 35, 35, 35]) + 175.0  # past 180
-    poses = np.stack([geometry.pose_from_xyyaw(2.0 * t, 0, np.radians(y), 0.75) for t, y in zip(t_s, yaw_deg, strict=True)])
+    poses = np.stack(
+        [geometry.pose_from_xyyaw(2.0 * t, 0, np.radians(y), 0.75) for t, y in zip(t_s, yaw_deg, strict=True)]
+    )
     path = Trajectory(t_s * 1_000_000, poses)
     assert headings(path) == [(0, 4_000_000), (4_000_000, 6_000_000), (6_000_000, 10_000_001)]
     shades = Shades([Track("1", "automobile", SIZE, path)])

@@ -68,11 +68,11 @@ def shadow_of(sums: Float64[np.ndarray, "x y 4"], size_m: tuple[float, float, fl
     opacity = _opacity((1 - cover[row, column]) ** STRONGER)
     return Gaussians(
         mean_m=place.astype(np.float32),
-        quat_wxyz=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        scale_m=np.tile(np.float32([SIGMA * CELL_M, SIGMA * CELL_M, THICKNESS_M]), (count, 1)),
+        quat_wxyz=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scale_m=np.tile(np.array([SIGMA * CELL_M, SIGMA * CELL_M, THICKNESS_M], np.float32), (count, 1)),
         opacity=opacity.astype(np.float32),
         rgb=np.zeros((count, 3), np.float32),
-        normal=np.tile(np.float32([0, 0, 1]), (count, 1)),
+        normal=np.tile(np.array([0, 0, 1], np.float32), (count, 1)),
         label=np.full(count, Label.ROAD, np.uint8),
         intensity=np.full(count, intensity, np.float32),
     )

@@ -219,8 +219,7 @@ def choose_frames(
     chosen = []
     for camera in cameras:
         frames = range(0, counts[camera], skip)
-        spread = np.linspace(0, len(frames) - 1, -(-len(frames) // step)) if len(frames) else []
-        keys = set(np.round(spread).astype(int))
+        keys = set(np.round(np.linspace(0, len(frames) - 1, -(-len(frames) // step))).astype(int).tolist())
         chosen += [(camera, frame, number in keys) for number, frame in enumerate(frames)]
     return sorted(chosen, key=lambda row: (int(clip.camera_times_us(row[0])[row[1]].sum()), row))
 
