@@ -8,9 +8,10 @@ from reconstruct_street import Street
 
 from nurec_sim import geometry
 from nurec_sim.logs.selection import with_tracks
-from nurec_sim.reconstruct import LiftSettings, ViewSettings, reconstruct
+from nurec_sim.reconstruct import LiftSettings, PointSettings, ViewSettings, reconstruct
+from nurec_sim.reconstruct.lift.points import actors_of
 from nurec_sim.reconstruct.movers import registration, with_aligned_actors
-from nurec_sim.reconstruct.movers.alignment import _corrected
+from nurec_sim.reconstruct.movers.alignment import _corrected, _parts
 from nurec_sim.reconstruct.movers.registration import Returns, corrections, disagreement, moved
 from nurec_sim.types import Track, Trajectory
 
@@ -73,6 +74,18 @@ def test_labels_that_are_off_are_corrected(street, wrong):
     assert changed == 1 and better_shift < 0.2 * shift and better_turn < 0.2 * turn
     assert log.tracks[0].size_m == SIZE
     assert np.array_equal(log.tracks[0].path.t_us, street.t_us)
+
+
+def test_returns_come_with_the_rays_that_found_them(street):
+    """Of the car ahead the rear is seen, from the roof of the car behind it."""
+    actors = [actor for actor in actors_of(street, PointSettings()) if actor.track.id == "lead"]
+    _, seen = _parts(street, actors, "top", 3)[actors[0].index]
+    xyz, ray = np.split(seen, 2, axis=1)
+    assert len(xyz) > 20 and np.linalg.norm(ray, axis=1) == pytest.approx(1)
+    eye = street.sweep("top", 3).world_from_lidar[:3, 3]
+    eye = geometry.transform_points(geometry.inverse(actors[0].path.at(int(street.t_us[3]))), eye[None])
+    expected = (xyz - eye) / np.linalg.norm(xyz - eye, axis=1, keepdims=True)
+    assert np.abs(ray - expected).max() < 0.02 and ray[:, 0].min() > 0.9
 
 
 def test_exact_labels_and_what_stands_stay(street):

@@ -154,6 +154,22 @@ def test_what_was_seen_from_two_sides_gets_the_others(street):
     assert completed.provenance["completed_actors"]["car"] == 0.5
 
 
+@pytest.mark.parametrize("in_box", [True, False])
+def test_a_shadow_shows_nothing_of_its_actor(street, in_box):
+    """It lies around the whole box; that of a turning car is not fixed to it."""
+    own = plate(-2.2)
+    dark = plate(0, 0.9, across=False)
+    dark = dataclasses.replace(dark, label=np.full(len(dark), Label.ROAD, np.uint8))
+    alone = with_hidden_actors(scene_of(street, track(), own), street)
+    scene = scene_of(street, track(), Gaussians.concatenate([own, dark]))
+    fixed = np.arange(len(scene.dynamic)) < len(own)
+    scene = dataclasses.replace(scene, dynamic=dataclasses.replace(scene.dynamic, in_box=fixed | in_box))
+    completed = with_hidden_actors(scene, street)
+    added = completed.dynamic.gaussians[len(scene.dynamic) :]
+    assert np.array_equal(added.mean_m, alone.dynamic.gaussians[len(own) :].mean_m)
+    assert np.array_equal(added.rgb, alone.dynamic.gaussians[len(own) :].rgb)
+
+
 def test_an_actor_found_in_the_sweeps_of_the_log_gets_a_body(street, monkeypatch):
     found = track(labelled=False)
     monkeypatch.setattr(street, "tracks", (found,))

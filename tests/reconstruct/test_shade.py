@@ -10,10 +10,10 @@ from nurec_sim import geometry
 from nurec_sim.reconstruct import ColourSettings, LiftSettings, ViewSettings, reconstruct
 from nurec_sim.reconstruct.lift.colour_solve import solve_colours
 from nurec_sim.reconstruct.lift.shade import CELL_M, SHADED_WEIGHT, Shades, add_shaded, find_shaded, headings
-from nurec_sim.reconstruct.lift.shadows import STRONGER, shadow_of
+from nurec_sim.reconstruct.lift.shadows import STRONGER, shadow_of, with_shadows
 from nurec_sim.render import CpuRenderer
 from nurec_sim.scene.edits import _rows
-from nurec_sim.types import Label, SensorRequest, Track, Trajectory
+from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, SensorRequest, Track, Trajectory
 
 SIZE = (4.0, 2.0, 1.5)
 
@@ -109,6 +109,28 @@ def test_a_mover_that_turns_has_a_grid_for_every_15_degrees():
     boxes = [shades.boxes(t_us) for t_us in (0, 3_999_999, 4_000_000, 10_000_000)]
     assert [rows[:, 15].tolist() for rows in boxes] == [[first[0]], [first[0]], [first[1]], [first[2]]]
     assert headings(track(4.0).path) == [None]
+
+
+def test_a_shadow_lasts_as_long_as_its_heading():
+    """A car that turns to the left, in whose scene only the first of the headings has a shadow."""
+    t_us = np.arange(5) * 500_000
+    poses = np.stack([geometry.pose_from_xyyaw(4.0 * k, 0, np.radians(10 * k), 0.75) for k in range(5)])
+    turning = Track("1", "automobile", SIZE, Trajectory(t_us, poses))
+    street = Street(frames=2)
+    body = DynamicGaussians.rigid(Gaussians.empty(1), np.zeros(1, np.int32), 0)
+    scene = GaussianScene("s", Gaussians.empty(), body, np.zeros((6, 8, 8, 3), np.float32), {}, street.rig, street.ego,
+                          (turning,), None, (0, 2_000_000))  # fmt: skip
+    shades = Shades([turning])
+    first, *others = shades.grounds
+    assert first.window_us == (0, 1_000_000) and others
+    shades.sums_of(first)[:] = seen_ground()
+    shades.sums_of(first)[25:75, 25:55, 0] *= 0.4
+    dynamic = with_shadows(scene, shades).dynamic
+    at = {at_us: dynamic.at(at_us)[0] for at_us in (500_000, 1_500_000)}
+    assert (dynamic.gaussians.label[at[500_000]] == Label.ROAD).sum() > 1000
+    assert (dynamic.gaussians.label[at[1_500_000]] == Label.ROAD).sum() == 0
+    # Of a car of which nothing was lifted there is no shadow either.
+    assert not len(with_shadows(replace(scene, dynamic=DynamicGaussians.empty()), shades).dynamic)
 
 
 def test_pixels_add_to_their_cell_and_lack_less_once_the_shadow_is_known():
