@@ -90,7 +90,8 @@ def test_ground_between_two_movers_belongs_to_the_nearer_one():
 
 
 def test_what_stands_or_is_not_there_shades_nothing():
-    assert len(Shades([track(4.0), track(0.5)]).grounds) == 1
+    endless = replace(track(4.0), size_m=(1e6, 2.0, 1.5))
+    assert len(Shades([track(4.0), track(0.5), endless]).grounds) == 1
     shades = Shades([track(4.0)])
     assert len(shades.boxes(500_000)) == 1 and len(shades.boxes(1_500_000)) == 0
 

@@ -2,7 +2,7 @@
 
 What a rigid body gathers over its life would be a person with a blur of legs. So the life of a person that moves is cut
 into windows of one or two images; each is a body of its own, made from the sweeps and images of its time. Where no
-image shows the person, the window lasts until one does, and where no sweep may be read, until the end of the next one.
+image shows the person, the window lasts until one does, and where no sweep may be read, until the next one.
 """
 
 from __future__ import annotations

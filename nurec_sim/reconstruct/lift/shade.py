@@ -23,6 +23,8 @@ ABOVE_M, BELOW_M = 0.1, 0.4
 
 SHADOW_REACH_M = 3.0
 """Shadows are looked for so far beside a box."""
+LONGEST_M = 40.0
+"""Boxes with a longer side are no vehicles: they have no shadow, and grids stay small."""
 TURN = np.radians(15.0)
 """A mover that turns has a shadow for every so much of it."""
 CELL_M = 0.1
@@ -67,14 +69,16 @@ class Shades:
     """The ground around the boxes of movers: grids, and what images show in their cells.
 
     Args:
-        tracks: of the scene; those that do not move have no grid.
+        tracks: of the scene; those that do not move, or are longer than ``LONGEST_M``, have no grid.
     """
 
     def __init__(self, tracks: Sequence[Track]) -> None:
         self.grounds: list[Ground] = []
         count = 0
         for number, track in enumerate(tracks):
-            for window_us in headings(track.path) if moves(track.path) else []:
+            if not moves(track.path) or max(track.size_m) > LONGEST_M:
+                continue
+            for window_us in headings(track.path):
                 self.grounds.append(Ground(number, track, window_us, count))
                 count += int(np.prod(self.grounds[-1].shape))
         self.sums = np.zeros((count, 4))
