@@ -120,6 +120,22 @@ def test_pictures_show_a_surface_of_the_world_between_its_rows_of_beams():
         assert ((picture.surfel[19:21, 15:25] < 0) == (depth_m == 10)).all()
 
 
+def test_fusing_keeps_sky_and_surfaces_apart_and_disputed_depths_are_not_believed(monkeypatch):
+    """Beams met the lower half of the wall; above it the image is as bright as its brightest parts, up to its end."""
+    wall, doubted = wall_and_car()[0], np.arange(40)[:, None] * np.ones(40) > 35
+
+    def fused(views, depths, fixed, surfaces, *rest):
+        # The wall begins half a pixel below the axis of the camera; its discs reach 3 pixels farther.
+        assert fixed[0][:16].all() and not surfaces[0][:16].any()
+        # It ends 2 m aside and below: 16 pixels.
+        assert surfaces[0][21:36, 5:35].all() and (depths[0][:16] == 0).all()
+        return depths, [doubted]
+
+    monkeypatch.setattr("nurec_sim.reconstruct.lift.pictures.fused_depths", fused)
+    picture = picture_of([(None, wall[wall[:, 1] > 0])])
+    assert np.array_equal(picture.free, doubted)
+
+
 def test_discs_of_near_actors_are_as_wide_as_their_surfels_are_apart_and_others_are_not():
     """One surfel 0.31 m ahead: half of 0.06 m are 9.7 pixels; the world's discs end at 8."""
     _, _, actor = wall_and_car()

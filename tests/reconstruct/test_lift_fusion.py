@@ -25,10 +25,13 @@ def view_at(right_m, drift_m=(0.0, 0.0, 0.0), fraction=(0.0, 0.0, 0.0), turn=Non
     return WorkingView("front", 0, 0, True, tile, pose, np.array(drift_m), np.zeros((*SHAPE, 3), np.uint8))
 
 
-def fused(depths, fixed=None, rounds=1):
-    views = [view_at(0.5 * k) for k in range(len(depths))]
-    fixed = [np.zeros(SHAPE, bool)] * len(depths) if fixed is None else fixed
-    return fusion.fused_depths(views, depths, fixed, TOLERANCE, rounds)
+def fuse_all(depths, fixed=None, surfaces=None, rounds=1):
+    views, nowhere = [view_at(0.5 * k) for k in range(len(depths))], [np.zeros(SHAPE, bool)] * len(depths)
+    return fusion.fused_depths(views, depths, fixed or nowhere, surfaces or nowhere, TOLERANCE, rounds)
+
+
+def fused(depths, **options):
+    return fuse_all(depths, **options)[0]
 
 
 def walls(count):
@@ -52,9 +55,36 @@ def test_depths_that_agree_become_their_mean():
 def test_measured_depths_stay_and_support_others():
     depths, fixed = walls(3), [np.ones(SHAPE, bool), np.zeros(SHAPE, bool), np.ones(SHAPE, bool)]
     depths[0][3, 6], depths[1][3, 6] = 0.104, 0.2
-    result = fused(depths, fixed)
+    result = fused(depths, fixed=fixed)
     assert result[0][3, 6] == np.float32(0.104)
     assert result[1][3, 6] == pytest.approx(0.1, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("far", "surface", "result"),
+    [(0.002, True, 0.1), (0.002, False, 0.002), (0.0034, True, 0.1), (0.0036, True, 0.0036)],
+)
+def test_what_does_not_look_like_sky_becomes_no_farther_than_a_surface_can_be(far, surface, result):
+    """Surfaces end at 286 m, or 0.0035 1/m; both neighbours look through the own depth of 10 m."""
+    depths = [np.full(SHAPE, np.float32(each)) for each in (far, 0.1, far)]
+    assert fused(depths, surfaces=[np.full(SHAPE, surface)] * 3)[1][3, 6] == pytest.approx(result, rel=1e-6)
+
+
+def test_depths_are_disputed_where_neighbours_show_something_and_none_of_them_supports_them():
+    # Inverse depths of 0.1 support each other up to 0.001 + 0.05 * 0.1 apart. What the neighbours show of 0.13 and
+    # 0.07, 1.3 and 0.7 pixels aside, they show everywhere but at the border.
+    depths = [np.full(SHAPE, np.float32(each)) for each in (0.13, 0.1, 0.07)]
+    depths[1][3, 6] = 0.124
+    depths[1][3, 7] = np.nan
+    result, disputed = fuse_all(depths)
+    expected = np.ones((SHAPE[0], 6), bool)
+    expected[3, 3:5] = False
+    assert np.array_equal(disputed[1][:, 3:9], expected)
+    assert result[1][2, 5] == np.float32(0.1)
+    # Neither measured ones, nor what no neighbour shows, nor without rounds.
+    assert not fuse_all(depths, fixed=[np.ones(SHAPE, bool)] * 3)[1][1].any()
+    assert not fuse_all([np.full(SHAPE, np.float32(np.nan)), *depths[1:2]])[1][1].any()
+    assert not np.any(fuse_all(depths, rounds=0)[1])
 
 
 def test_masked_pixels_take_no_part():
@@ -80,9 +110,8 @@ def test_a_farther_depth_wins_only_if_more_neighbours_look_through_the_near_one(
     others = np.stack([view_at(0.5).packed, view_at(-0.5).packed])
     shown = np.stack([np.full(SHAPE, np.float32(w)) for w in seen])
     view = view_at(0.0)
-    found = fusion.fuse(
-        own, NUMBERS, candidates.reshape(3, -1), view.packed, view.world_from_view, others, shown, TOLERANCE
-    )
+    found, _ = fusion.fuse(own, NUMBERS, candidates.reshape(3, -1), view.packed, view.world_from_view, others, shown,
+                           np.zeros(SHAPE, bool), TOLERANCE)  # fmt: skip
     assert found[3, 6] == pytest.approx(result, rel=1e-6)
 
 
@@ -90,7 +119,8 @@ def test_the_own_depth_stays_where_another_has_no_more_support():
     own, view = np.full(SHAPE, np.float32(0.2)), view_at(0.0)
     candidates = np.stack([np.full(SHAPE, np.float32(w)) for w in (0.3, 0.2, 0.3)])
     none = np.zeros((0, 23)), np.zeros((0, *SHAPE), np.float32)
-    found = fusion.fuse(own, NUMBERS, candidates.reshape(3, -1), view.packed, view.world_from_view, *none, TOLERANCE)
+    found, _ = fusion.fuse(own, NUMBERS, candidates.reshape(3, -1), view.packed, view.world_from_view, *none,
+                           np.zeros(SHAPE, bool), TOLERANCE)  # fmt: skip
     assert found[3, 6] == pytest.approx(0.2, rel=1e-6)
 
 

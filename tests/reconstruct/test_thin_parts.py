@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from nurec_sim import geometry
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.cloud import Cloud
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
@@ -133,9 +134,38 @@ def test_parts_end_20_cm_outside_of_the_box():
     )
 
 
-def test_a_box_that_reaches_the_camera_has_no_outline():
-    """Its middle is 5 m away, and 0.2 m are added to its half: it ends 0.6 or 0.4 m before the camera."""
-    assert [[mask.sum() for mask in given(*street(deep_m=deep_m))] for deep_m in (8.4, 8.8)] == [[18] * 3, [0] * 3]
+def test_a_box_that_reaches_past_the_camera_has_the_outline_of_what_is_before_it():
+    """Its middle is 5 m away: one of 8.8 m ends 0.4 m before the camera, one of 12 m 1.2 m behind it."""
+    for deep_m in (8.4, 8.8, 12.0):
+        assert [mask.sum() for mask in given(*street(deep_m=deep_m))] == [18] * 3
+    views, bodies, pictures = street((0, 1))
+    behind = [
+        dataclasses.replace(view, world_from_view=geometry.pose(np.eye(3), np.array([0, 0, 6.0]))) for view in views
+    ]
+    assert not any(mask.any() for mask in given(behind, bodies, pictures))
+
+
+@pytest.mark.parametrize(("label", "solid"), [("automobile", True), ("bus", True), ("rider", False), ("person", False)])
+def test_the_lower_half_of_a_vehicle_is_its_own_without_another_image(label, solid):
+    """One image of a body of 1.6 m, 5 m away, whose upper half beams met; z of the box is up, y of the camera down.
+
+    The lower half ends 0.2 m above its underside, and begins 0.15 m inside its sides: 0.65 m from the middle, and 0.6 m
+    below it. At a focal length of 60 pixels and the depth of the near face, 4.65 m, these are 8.4 and 7.7 pixels.
+    """
+    views, bodies, pictures = street((0, 1))
+    path = bodies[1].actor.path
+    upright = Trajectory(path.t_us, path.world_from_body @ geometry.pose(
+        np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.zeros(3)))  # fmt: skip
+    track = dataclasses.replace(bodies[1].actor.track, label=label, size_m=(1.0, 1.6, 1.6), path=upright)
+    bodies[1] = dataclasses.replace(bodies[1], actor=dataclasses.replace(bodies[1].actor, track=track, path=upright))
+    views, pictures = views[:1], pictures[:1]
+    expected = np.zeros((SIZE, SIZE), bool)
+    expected[MIDDLE : MIDDLE + 8, MIDDLE - 8 : MIDDLE + 8] = solid
+    expected &= pictures[0].body == 0
+    assert np.array_equal(given(views, bodies, pictures)[0], expected)
+    # What is nearer than the lower half hides it.
+    pictures[0].inverse_depth[MIDDLE + 3 :] = 0.25
+    assert np.array_equal(given(views, bodies, pictures)[0], expected & (np.arange(SIZE)[:, None] < MIDDLE + 3))
 
 
 @pytest.mark.parametrize(("level", "found"), [(130, 18), (129, 0)])

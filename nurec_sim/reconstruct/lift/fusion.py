@@ -2,7 +2,8 @@
 
 Visibility-based fusion (Merrell et al. 2007): at each pixel the own depth competes with what the neighbours show there.
 The depth that most of them support wins, and becomes the mean of its supporters. A nearer surface hides what lies
-behind it, so a farther depth also needs neighbours that look through the near one.
+behind it, so a farther depth also needs neighbours that look through the near one. A depth that neighbours show
+nothing like is disputed: it is as likely to be wrong as theirs.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Float32, Int32
 
 from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import kernel
+from nurec_sim.reconstruct.lift.depth import NO_SURFACE
 from nurec_sim.reconstruct.lift.lifting import stacked
 from nurec_sim.reconstruct.lift.splat import project_point, world_point
 from nurec_sim.reconstruct.lift.views import WorkingView
@@ -34,17 +36,23 @@ def fused_depths(
     views: Sequence[WorkingView],
     depths: Sequence[Float32[np.ndarray, "h w"]],
     fixed: Sequence[Bool[np.ndarray, "h w"]],
+    surfaces: Sequence[Bool[np.ndarray, "h w"]],
     tolerance: float,
     rounds: int,
-) -> list[Float32[np.ndarray, "h w"]]:
+) -> tuple[list[Float32[np.ndarray, "h w"]], list[Bool[np.ndarray, "h w"]]]:
     """Inverse depths of all views after fusing them ``rounds`` times.
 
     Args:
         views: working views.
         depths: their inverse depths, 1/m; 0 is infinitely far, NaN takes no part.
-        fixed: pixels that keep their depth: it is measured. They support others.
+        fixed: pixels that keep their depth: it is measured, or that of the sky. They support others.
+        surfaces: pixels that do not look like the sky: they become no farther than a surface can be.
         tolerance: 1/m, see ``AGREE``.
         rounds: each spreads agreement to the neighbours of neighbours.
+
+    Returns:
+        The inverse depths, and which pixels are disputed in the last round: neighbours show something there, but none
+        of them supports what became of it.
     """
     around, everyone = nearest_views(views), range(len(views))
     packed = np.stack([view.packed for view in views]) if views else np.zeros((0, 23))
@@ -56,21 +64,21 @@ def fused_depths(
             warp(points[n], packed[k], numbers[k], seen[row])
         return seen
 
-    def one(k: int) -> Float32[np.ndarray, "h w"]:
+    def one(k: int) -> tuple[np.ndarray, np.ndarray]:
         near = around[k]
         if not near:
-            return before[k]
+            return before[k], disputed[k]
         return fuse(
             before[k], numbers[k], shown(k, points, measured[k].copy()), packed[k], poses[k], packed[near],
-            stacked([before[n] for n in near]), tolerance,
+            stacked([before[n] for n in near]), surfaces[k], tolerance,
         )  # fmt: skip
 
     def points_where(masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         return list(in_order(lambda k: points_of(packed[k], poses[k], before[k], masks[k]), everyone))
 
-    before = list(depths)
+    before, disputed = list(depths), [np.zeros(depth.shape, bool) for depth in depths]
     if not rounds:
-        return before
+        return before, disputed
     # What is measured stays, so its points are taken to the neighbours only once.
     points = points_where(fixed)
     nothing = [np.full((len(near), number.max(initial=-1) + 1), np.nan, np.float32)
@@ -78,8 +86,9 @@ def fused_depths(
     measured = list(in_order(lambda k: shown(k, points, nothing[k]), everyone))
     for _ in range(rounds):
         points = points_where([number >= 0 for number in numbers])
-        before = list(in_order(one, everyone))
-    return before
+        fused = list(in_order(one, everyone))
+        before, disputed = [depth for depth, _ in fused], [mask for _, mask in fused]
+    return before, disputed
 
 
 def _numbered(mask: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "h w"]:
@@ -142,8 +151,8 @@ def warp(points, other, numbers, shown):
 
 
 @kernel
-def fuse(own, numbers, candidates, view, world_from_view, others, other_depths, tolerance):
-    """The fused inverse depth [h,w] of a view.
+def fuse(own, numbers, candidates, view, world_from_view, others, other_depths, surfaces, tolerance):
+    """The fused inverse depth [h,w] of a view, and which of its pixels [h,w] are disputed.
 
     Args:
         own: [h,w] its inverse depth, 1/m; 0 is infinitely far.
@@ -153,17 +162,20 @@ def fuse(own, numbers, candidates, view, world_from_view, others, other_depths, 
         world_from_view: [4,4] its pose.
         others: [n,23] packed projections of the neighbours.
         other_depths: [n,h',w'] their inverse depths.
+        surfaces: [h,w] pixels that do not become sky.
         tolerance: 1/m, see ``AGREE``.
     """
     result, some = own.copy(), np.empty(len(candidates) + 1, np.float32)
+    disputed = np.zeros(own.shape, np.bool_)
     for row in range(own.shape[0]):
         for column in range(own.shape[1]):
             number = numbers[row, column]
             if number < 0:
                 continue
             some[0], count = own[row, column], 1
+            least = NO_SURFACE if surfaces[row, column] else 0.0
             for n in range(len(candidates)):
-                if candidates[n, number] >= 0.0:
+                if candidates[n, number] >= least:
                     some[count] = candidates[n, number]
                     count += 1
             best, support, own_support = 0, 0, 0
@@ -187,10 +199,11 @@ def fuse(own, numbers, candidates, view, world_from_view, others, other_depths, 
                     through += there <= here - tolerance - AGREE * here
                 if through <= agree:
                     best, support = 0, own_support
+            disputed[row, column] = support == 1 and count > 1
             if support > 1:
                 total, reach = 0.0, tolerance + AGREE * some[best]
                 for j in range(count):
                     if abs(some[j] - some[best]) < reach:
                         total += some[j]
                 result[row, column] = total / support
-    return result
+    return result, disputed

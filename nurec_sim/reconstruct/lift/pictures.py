@@ -42,7 +42,7 @@ CODES = 128
 class DepthPicture:
     """Inverse depth of a view; the body that each pixel shows, the surfel that gave its depth (-1: none); sky.
 
-    ``free``: the depth is wrong, because recorded beams passed there.
+    ``free``: the depth is not to be believed, because recorded beams passed there or other views dispute it.
     """
 
     inverse_depth: Float32[np.ndarray, "h w"]
@@ -79,7 +79,7 @@ def depth_pictures(
     def code(n: int) -> np.ndarray:
         return depth.census(_gray(views[n]))
 
-    def one(k: int) -> DepthPicture:
+    def one(k: int) -> tuple[DepthPicture, np.ndarray]:
         view = views[k]
         prior, index, body = _draw(view, bodies, lidars)
         trim_silhouettes(prior, index, _gray(view))
@@ -94,26 +94,34 @@ def depth_pictures(
         # Where smoothing overruled the splatted surfel, the pixel does not show that surfel.
         index[dense != prior] = -1
         drawn = np.where(index >= 0, body, STATIC)
-        return DepthPicture(dense, drawn, index, sky, np.zeros(dense.shape, bool))
+        return DepthPicture(dense, drawn, index, sky, np.zeros(dense.shape, bool)), likeness
 
     def with_bodies(k: int, picture: DepthPicture) -> DepthPicture:
         body = _bodies_of_pixels(views[k], bodies, picture.inverse_depth, picture.body)
         return replace(picture, body=body, surfel=np.where(body == picture.body, picture.surfel, -1))
 
-    drawn = []
-    for done, picture in enumerate(in_order(one, keys)):
+    drawn, likeness = [], []
+    for done, (picture, like) in enumerate(in_order(one, keys)):
         progress(done / len(keys))
         drawn.append(picture)
+        likeness.append(like)
     bodies_of = [p.body for p in in_order(lambda each: with_bodies(*each), zip(keys, drawn, strict=True))]
     # What moves is not where its neighbours in time show it.
     static = [
         np.where(body == 0, p.inverse_depth, np.float32(np.nan)) for p, body in zip(drawn, bodies_of, strict=True)
     ]
-    fixed = [p.surfel >= 0 for p in drawn]
-    fused = fused_depths([views[k] for k in keys], static, fixed, options.agreement, options.fusion_rounds)
+    # What looks like sky and is far stays so, and what does not look like it is no farther than a surface can be.
+    fixed = [
+        (p.surfel >= 0) | ((like == depth.SKY) & (p.inverse_depth <= depth.NO_SURFACE))
+        for p, like in zip(drawn, likeness, strict=True)
+    ]
+    surfaces = [like == depth.NOT_SKY for like in likeness]
+    fused, disputed = fused_depths(
+        [views[k] for k in keys], static, fixed, surfaces, options.agreement, options.fusion_rounds
+    )
     drawn = [
-        replace(picture, inverse_depth=np.where(body == 0, depth, picture.inverse_depth))
-        for picture, body, depth in zip(drawn, bodies_of, fused, strict=True)
+        replace(picture, inverse_depth=np.where(body == 0, fused_depth, picture.inverse_depth), free=doubt)
+        for picture, body, fused_depth, doubt in zip(drawn, bodies_of, fused, disputed, strict=True)
     ]
 
     def trimmed(k: int, picture: DepthPicture) -> DepthPicture:

@@ -1,8 +1,11 @@
-"""Thin parts of movers: pixels whose depth is of the world behind a mover, but whose colour is not.
+"""Parts of movers that no beam met: pixels whose depth is of the world behind a mover, but which show the mover.
 
 Beams pass beside a leg and between the spokes of a wheel, so the depth there is that of the wall and the road behind:
 each image would paint a leg on the wall, and the rider would have none. But a mover moves on. What other images show at
 the same point of the wall, where no mover is near, is the wall; a pixel that looks like none of them shows the mover.
+
+Near cars reach out of the field of view of a scanner, downwards most often. Where no other image shows the road there,
+the box tells: one cannot look through the lower half of a vehicle.
 """
 
 from __future__ import annotations
@@ -14,20 +17,16 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
-from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.fusion import AGREE, points_of
+from nurec_sim.reconstruct.lift.outlines import outlines_of
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
 from nurec_sim.reconstruct.lift.shade import moves
 from nurec_sim.reconstruct.lift.splat import project_point
 from nurec_sim.reconstruct.lift.views import WorkingView
 
-BESIDE_M = 0.2
-"""Parts are looked for so far outside of a box: those that no beam met are no part of boxes found in sweeps."""
-NEAREST_M = 0.5
-"""Boxes that come nearer to the camera have no outline in its image."""
 NEIGHBOURS = 8
 """Other images of the camera, the nearest in time, that are asked."""
 MARGIN_PX = 8
@@ -43,7 +42,7 @@ DARKEST, BRIGHTEST = 10, 245
 def with_thin_parts(
     views: Sequence[WorkingView], bodies: Sequence[Surfels], pictures: Sequence[DepthPicture], tolerance: float
 ) -> list[DepthPicture]:
-    """The pictures with thin parts of movers given to these, as far away as their nearest pixel.
+    """The pictures with parts of movers that no beam met given to these, as far away as their nearest pixel.
 
     Args:
         views: key views.
@@ -54,11 +53,11 @@ def with_thin_parts(
     moving = [n for n, body in enumerate(bodies) if body.actor and moves(body.actor.path)]
     if not moving:
         return list(pictures)
-    outlines = list(in_order(lambda view: _outlines(view, bodies, moving), views))
-    world = [_shows_world(picture, outline) for picture, (outline, _) in zip(pictures, outlines, strict=True)]
+    outlines = list(in_order(lambda view: outlines_of(view, bodies, moving), views))
+    world = [_shows_world(picture, each.body) for picture, each in zip(pictures, outlines, strict=True)]
 
     def one(k: int) -> DepthPicture:
-        outline, nearest = outlines[k]
+        outline, nearest, solid = outlines[k]
         behind = (pictures[k].body == 0) & (pictures[k].inverse_depth < nearest) & views[k].tile.valid
         if not behind.any():
             return pictures[k]
@@ -66,7 +65,8 @@ def with_thin_parts(
         others = sorted(others, key=lambda n: abs(views[n].t_us - views[k].t_us))[:NEIGHBOURS]
         differs = np.zeros(behind.shape, bool)
         differs[behind] = _differs(k, others, behind, views, pictures, world, tolerance)
-        return _given_to_movers(pictures[k], np.where(behind, outline, 0), differs)
+        hidden = behind & (pictures[k].inverse_depth < solid)
+        return _given_to_movers(pictures[k], np.where(behind, outline, 0), differs | hidden)
 
     return list(in_order(one, range(len(views))))
 
@@ -75,28 +75,6 @@ def _look_alike(view: WorkingView, other: WorkingView) -> bool:
     """Whether they are of one camera and, where its images are cut into several tiles, of the same one."""
     turns = view.tile.camera_from_tile, other.tile.camera_from_tile
     return view.camera_id == other.camera_id and np.array_equal(*turns)
-
-
-def _outlines(
-    view: WorkingView, bodies: Sequence[Surfels], moving: Sequence[int]
-) -> tuple[Int32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """The mover in whose outline each pixel lies, 0 in none, and the inverse depth of its nearest corner, 1/m, or 0."""
-    outline, nearest = np.zeros(view.rgb.shape[:2], np.int32), np.zeros(view.rgb.shape[:2], np.float32)
-    found = []
-    for n in moving:
-        if not bodies[n].present(view.t_us):
-            continue
-        corners = geometry.BOX_CORNERS * (np.array(bodies[n].box_size_m) + 2 * BESIDE_M)
-        view_from_box = geometry.inverse(view.world_from_view) @ bodies[n].world_from_body(view.t_us)
-        xyz = geometry.transform_points(view_from_box, corners)
-        if (near := xyz[:, 2].min()) > NEAREST_M:
-            uv = view.tile.focal_px * xyz[:, :2] / xyz[:, 2:] + view.tile.center_px
-            found.append((near, n, cv2.convexHull(np.rint(uv - 0.5).clip(-1e5, 1e5).astype(np.int32))))
-    # The nearest one last: it hides the others.
-    for near, n, hull in sorted(found, key=lambda each: -each[0]):
-        cv2.fillConvexPoly(outline, hull, n)
-        cv2.fillConvexPoly(nearest, hull, 1 / near)
-    return outline, nearest
 
 
 def _shows_world(picture: DepthPicture, outline: Int32[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -191,7 +169,7 @@ def _given_to_movers(
     Args:
         picture: of one view.
         behind: the mover in whose outline, and behind which, a pixel shows the world; 0 elsewhere.
-        differs: pixels that do not look like the world.
+        differs: pixels that do not show the world.
     """
     closed = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
     body, depth = picture.body.copy(), picture.inverse_depth.copy()
