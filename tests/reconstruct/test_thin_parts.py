@@ -150,9 +150,9 @@ def test_the_lower_half_of_a_vehicle_is_its_own_without_another_image(label, sol
     """One image of a body of 1.6 m, 5 m away, whose upper half beams met; z of the box is up, y of the camera down.
 
     The lower half ends 0.2 m above its underside, and begins 0.15 m inside its sides: 0.65 m from the middle, and 0.6 m
-    below it. At a focal length of 60 pixels and the depth of the near face, 4.65 m, these are 8.4 and 7.7 pixels.
+    below it. At a focal length of 90 pixels and the depth of the near face, 4.65 m, these are 12.6 and 11.6 pixels.
     """
-    views, bodies, pictures = street((0, 1))
+    views, bodies, pictures = street((0, 1), focal_px=90.0)
     path = bodies[1].actor.path
     upright = Trajectory(path.t_us, path.world_from_body @ geometry.pose(
         np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.zeros(3)))  # fmt: skip
@@ -160,11 +160,11 @@ def test_the_lower_half_of_a_vehicle_is_its_own_without_another_image(label, sol
     bodies[1] = dataclasses.replace(bodies[1], actor=dataclasses.replace(bodies[1].actor, track=track, path=upright))
     views, pictures = views[:1], pictures[:1]
     expected = np.zeros((SIZE, SIZE), bool)
-    expected[MIDDLE : MIDDLE + 8, MIDDLE - 8 : MIDDLE + 8] = solid
+    expected[MIDDLE : MIDDLE + 12, MIDDLE - 13 : MIDDLE + 13] = solid
     expected &= pictures[0].body == 0
     assert np.array_equal(given(views, bodies, pictures)[0], expected)
-    # What is nearer than the lower half hides it.
-    pictures[0].inverse_depth[MIDDLE + 3 :] = 0.25
+    # What is nearer than the lower half hides it, within the box too.
+    pictures[0].inverse_depth[MIDDLE + 3 :] = 0.22
     assert np.array_equal(given(views, bodies, pictures)[0], expected & (np.arange(SIZE)[:, None] < MIDDLE + 3))
 
 
