@@ -152,7 +152,7 @@ def test_the_lower_half_of_a_vehicle_is_its_own_without_another_image(label, sol
     The lower half ends 0.2 m above its underside, and begins 0.15 m inside its sides: 0.65 m from the middle, and 0.6 m
     below it. At a focal length of 90 pixels and the depth of the near face, 4.65 m, these are 12.6 and 11.6 pixels.
     """
-    views, bodies, pictures = street((0, 1), focal_px=90.0)
+    views, bodies, pictures = street((0, 1), 36, focal_px=90.0)
     path = bodies[1].actor.path
     upright = Trajectory(path.t_us, path.world_from_body @ geometry.pose(
         np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.zeros(3)))  # fmt: skip
