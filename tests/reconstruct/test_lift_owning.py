@@ -161,6 +161,9 @@ def test_what_lies_well_behind_a_depth_that_beams_passed_is_not_seen_there():
     """0.3 m and 2 % of 10 m behind it: 9.4 m hides the point, 9.6 m does not."""
     for depth_m, grey in ((9.4, 200), (9.6, (4 * 100 + 200) / 5)):
         assert seen_colours((depth_m, 20), (True, False))[0][0] == pytest.approx([grey] * 3)
+    # A disputed depth may be infinite, and then hides nothing.
+    rgb, _, through = seen_colours((np.inf, 20), (True, False))
+    assert rgb[0] == pytest.approx([200] * 3) and through[0] == 1
 
 
 def test_points_that_no_image_shows_are_grey_by_their_intensity():

@@ -172,7 +172,7 @@ def test_errors_say_what_there_is(street):
         reconstruct(street, cameras=["back"])
     with pytest.raises(ReconstructError, match=r"no sweeps \[7\] to hold out; have 0..4"):
         reconstruct(street, hold_out_sweeps=[7])
-    with pytest.raises(ReconstructError, match="needs LiDAR sweeps"):
+    with pytest.raises(ReconstructError, match="'lift' needs LiDAR sweeps.*'dense' needs images only"):
         reconstruct(street, hold_out_sweeps=range(5))
 
 

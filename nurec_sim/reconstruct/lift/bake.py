@@ -293,7 +293,7 @@ def _owned(
     settings: LiftSettings,
     owns: Sequence[np.ndarray] | None = None,
 ) -> np.ndarray:
-    """Which pixels of a body no other view owns; those of wrong depth (``DepthPicture.free``) own nothing.
+    """Which pixels of a body no other view owns; those not to be believed (``DepthPicture.free``) tell nothing.
 
     ``owns`` says which pixels of each view may own; None: all.
     """

@@ -31,7 +31,7 @@ def seen_colours(xyz, normal, packed, inverse_depth, free, pictures, present, to
         normal: [n,3] unit normals in that frame.
         packed: [k,23] projections into the views (``packed_views``).
         inverse_depth: [k,h,w] of the views, 1/m; NaN where a pixel is masked.
-        free: [k,h,w] whether it is wrong, because beams passed there; a point well behind it is then not seen.
+        free: [k,h,w] whether it is not to be believed (``DepthPicture.free``); a point well behind it is then not seen.
         pictures: [k,h,w,3] colours of the views, 0..255.
         present: [k] whether the body is there at each view's time.
         tolerance: 1/m, see above.
@@ -53,11 +53,12 @@ def seen_colours(xyz, normal, packed, inverse_depth, free, pictures, present, to
             if z <= 0.3 or u < 1 or v < 1 or u >= packed[k, 3] - 1 or v >= packed[k, 4] - 1:
                 continue
             row, column = int(v), int(u)
-            if free[k, row, column] and z - 1.0 / inverse_depth[k, row, column] > MARGIN_M + MARGIN_SHARE * z:
+            w = inverse_depth[k, row, column]
+            if free[k, row, column] and w > 0 and z - 1.0 / w > MARGIN_M + MARGIN_SHARE * z:
                 continue
             # Written so that a masked pixel, NaN, neither agrees nor is looked through.
-            if not abs(inverse_depth[k, row, column] - 1.0 / z) <= tolerance + 0.08 / z:
-                through[i] += inverse_depth[k, row, column] < 1.0 / z
+            if not abs(w - 1.0 / z) <= tolerance + 0.08 / z:
+                through[i] += w < 1.0 / z
                 continue
             focal = packed[k, 0]
             rx, ry = (u - packed[k, 1]) / focal, (v - packed[k, 2]) / focal

@@ -66,7 +66,8 @@ def lift(
     if gathered.point_count == 0:
         raise ReconstructError(
             f"clip {clip.id!r}: method 'lift' needs LiDAR sweeps; have lidars {list(clip.rig.lidars)} "
-            f"with no usable points after holding out sweeps {sorted(hold_out)}"
+            f"with no usable points after holding out sweeps {sorted(hold_out)}; method 'dense' needs images only, and "
+            "--refine SECONDS optimises its scene"
         )
     stages.start("ground and surfaces")
     with ThreadPoolExecutor(1) as beside:
