@@ -4,8 +4,8 @@ Beams pass beside a leg and between the spokes of a wheel, so the depth there is
 each image would paint a leg on the wall, and the rider would have none. But a mover moves on. What other images show at
 the same point of the wall, where no mover is near, is the wall; a pixel that looks like none of them shows the mover.
 
-Near cars reach out of the field of view of a scanner, downwards most often. Where no other image shows the road there,
-the box tells: one cannot look through the lower half of a vehicle.
+Near cars reach out of the field of view of a scanner, downwards most often, and often no other image shows the road
+there. But one cannot look through the lower half of a vehicle: what lies behind it is the vehicle's.
 """
 
 from __future__ import annotations
