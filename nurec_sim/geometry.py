@@ -267,6 +267,22 @@ BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for 
 """[8,3] of a box in its frame, in units of its sides."""
 
 
+def box_crossings(
+    origin: Float64[np.ndarray, "*n 3"],
+    direction: Float64[np.ndarray, "*n 3"],
+    low: Float64[np.ndarray, " 3"],
+    high: Float64[np.ndarray, " 3"],
+) -> tuple[Float64[np.ndarray, " *n"], Float64[np.ndarray, " *n"]]:
+    """Where lines enter and leave a box along the axes, in units of ``direction``; those that miss it leave first.
+
+    Slab test (Kay and Kajiya 1986): a line is inside while it is between all three pairs of faces.
+    """
+    # A line along a face never crosses it; a tiny step instead of none keeps 0 / 0 out.
+    direction = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
+    first, second = (low - origin) / direction, (high - origin) / direction
+    return np.minimum(first, second).max(axis=-1), np.maximum(first, second).min(axis=-1)
+
+
 def box_corners_xy(
     world_from_box: Float64[np.ndarray, "*n 4 4"], length_m: float, width_m: float
 ) -> Float64[np.ndarray, "*n 4 2"]:

@@ -76,10 +76,7 @@ def shows_ego(rays: Float64[np.ndarray, "h w 3"], camera: CameraModel, body: Box
     if np.all((origin >= low) & (origin <= high)):
         return np.zeros(rays.shape[:2], bool)
     rays = rays @ camera.rig_from_camera[:3, :3].T
-    # Slab test against the box; no division by zero for rays along a face.
-    rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
-    near, far = (low - origin) / rays, (high - origin) / rays
-    enter, leave = np.minimum(near, far).max(axis=-1), np.maximum(near, far).min(axis=-1)
+    enter, leave = geometry.box_crossings(origin, rays, low, high)
     return (enter < leave) & (leave > 0)
 
 

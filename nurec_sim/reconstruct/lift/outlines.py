@@ -89,11 +89,6 @@ def _lower_half(
             for number, middle in zip((column, row), view.tile.center_px, strict=True))  # fmt: skip
     box_from_view = geometry.inverse(view_from_box)
     start, step = box_from_view[:3, 3], np.stack([u, v, np.ones_like(u)], axis=1) @ box_from_view[:3, :3].T
-    # A ray along a face never crosses it; a tiny step instead of none keeps 0 / 0 out of the slabs.
-    step = np.where(np.abs(step) < 1e-12, 1e-12, step)
     low = np.array([INSIDE_M, INSIDE_M, CLEARANCE_M]) - size_m / 2
-    high = np.array([-low[0], -low[1], 0.0])
-    # Slab test (Kay and Kajiya 1986): the ray is inside while it is between all three pairs of faces.
-    first, second = (low - start) / step, (high - start) / step
-    enter, leave = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
+    enter, leave = geometry.box_crossings(start, step, low, np.array([-low[0], -low[1], 0.0]))
     return np.where((enter < leave) & (enter > 0), 1 / np.maximum(enter, NEAREST_M), 0.0)

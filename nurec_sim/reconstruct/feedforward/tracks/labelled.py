@@ -103,11 +103,7 @@ def owners_of_rays(
         box_from_world = geometry.inverse(poses_at(actor.path, t_us[near]))
         start = _turned(box_from_world, origin_m[near]) + box_from_world[:, :3, 3]
         step = _turned(box_from_world, direction[near])
-        # A ray along a face never crosses it; a tiny step instead of none keeps 0 / 0 out of the slabs.
-        step = np.where(np.abs(step) < 1e-12, 1e-12, step)
-        first, second = (-half - start) / step, (half - start) / step
-        # Slab test (Kay and Kajiya 1986): the ray is inside while it is between all three pairs of faces.
-        enter, leave = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
+        enter, leave = geometry.box_crossings(start, step, -half, half)
         met = near[(enter < leave) & (enter > 0)]
         owner[met] = number
         hits[met] += 1
