@@ -37,7 +37,9 @@ def kept(depth_m, seen_m, back_m, matched):
     one = place, normal, np.array([depth_m]), np.zeros(1, np.int32), np.array([matched])
     rgb, pictures = np.full((1, 3), 90, np.float32), np.full((count, SIZE[1], SIZE[0], 3), 90, np.uint8)
     present, owns = np.ones(count, bool), np.ones(inverse.shape, bool)
-    return bool(owned(*one, rgb, packed, inverse, owns, pictures, present, TOLERANCE, OWNER_RING, OWNER_BORDER)[0])
+    return bool(
+        owned(*one, rgb, packed, inverse, owns, pictures, present, TOLERANCE, OWNER_RING, OWNER_BORDER, False)[0]
+    )
 
 
 def test_a_pixel_between_two_rows_of_beams_is_not_only_matched():

@@ -20,7 +20,7 @@ def owned(views, own_view=0, own_rgb=100.0, depth_m=10.0, owning=True):
     rgb, owns = np.full((1, 3), own_rgb, np.float32), np.full(inverse_depth.shape, owning)
     one = np.array([[0.0, 0.0, 10.0]]), TOWARDS, np.array([depth_m]), np.array([own_view], np.int32), np.zeros(1, bool)
     keep = lifting.owned(*one, rgb, packed, inverse_depth, owns, pictures, np.ones(len(views), bool), 0.002,
-                         lifting.OWNER_RING, lifting.OWNER_BORDER)  # fmt: skip
+                         lifting.OWNER_RING, lifting.OWNER_BORDER, False)  # fmt: skip
     return bool(keep[0]), rgb[0, 0]
 
 
@@ -56,6 +56,24 @@ def test_depth_between_two_rows_of_beams_on_one_surface_is_known():
     assert np.argwhere(found).tolist() == [[1, 0], [2, 0]]
 
 
+def kept_by_two(place, normal, actor):
+    """Whether a point stays, lifted by the first of two views and by the second, which is 2 m nearer."""
+    normal = np.array([normal]) / np.linalg.norm(normal)
+    packed = np.stack([looking_ahead(behind_m, width=219) for behind_m in (0.0, -2.0)])
+    inverse_depth = np.stack([np.full((9, 219), 1 / (place[2] - nearer_m), np.float32) for nearer_m in (0.0, 2.0)])
+    pictures, owns, grey = (
+        np.full((2, 9, 219, 3), 100, np.uint8),
+        np.ones((2, 9, 219), bool),
+        np.ones((1, 3), np.float32),
+    )
+    return [
+        lifting.owned(np.array([place]), normal, np.array([place[2] - 2.0 * own_view]), np.array([own_view], np.int32),
+                      np.zeros(1, bool), grey.copy(), packed, inverse_depth, owns, pictures, np.ones(2, bool), 0.002,
+                      lifting.OWNER_RING, lifting.OWNER_BORDER, actor)[0]
+        for own_view in (0, 1)
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("place", "normal", "stays"),
     [
@@ -65,25 +83,18 @@ def test_depth_between_two_rows_of_beams_on_one_surface_is_known():
     ],
 )
 def test_the_nearer_of_two_views_does_not_own_a_wall_that_it_grazes(place, normal, stays):
-    """The second view is 2 m nearer. Its rays (4, 0, 8) lie in the first wall: their product with its normal is 0; the
-    first view sees that wall from a sine of 0.083, as if from 10 m / 0.83. Both see the second wall well: sines of 0.66
-    and 0.6. The rays (10, 0, 1) of the second view graze the third surface, but it is level: 0.1 and -1 up.
+    """The rays (4, 0, 8) of the second view lie in the first wall: their product with its normal is 0; the first view
+    sees that wall from a sine of 0.083, as if from 10 m / 0.83. Both see the second wall well: sines of 0.66 and 0.6.
+    The rays (10, 0, 1) of the second view graze the third surface, but it is level: 0.1 and -1 up.
     """
-    normal = np.array([normal]) / np.linalg.norm(normal)
-    packed = np.stack([looking_ahead(behind_m, width=219) for behind_m in (0.0, -2.0)])
-    inverse_depth = np.stack([np.full((9, 219), 1 / (place[2] - nearer_m), np.float32) for nearer_m in (0.0, 2.0)])
-    pictures, owns, grey = (
-        np.full((2, 9, 219, 3), 100, np.uint8),
-        np.ones((2, 9, 219), bool),
-        np.ones((1, 3), np.float32),
-    )
-    kept = [
-        lifting.owned(np.array([place]), normal, np.array([place[2] - 2.0 * own_view]), np.array([own_view], np.int32),
-                      np.zeros(1, bool), grey.copy(), packed, inverse_depth, owns, pictures, np.ones(2, bool), 0.002,
-                      lifting.OWNER_RING, lifting.OWNER_BORDER)[0]
-        for own_view in (0, 1)
-    ]  # fmt: skip
-    assert kept == stays
+    assert kept_by_two(place, normal, actor=False) == stays
+
+
+def test_the_view_with_the_smaller_pixels_owns_the_side_of_an_actor():
+    """Sines of 0.177 and 0.0948: pixels as large as if seen squarely from 10 m / 0.177^0.5 = 23.8 m and 26.0 m."""
+    side = (4.0, 0.0, 10.0), (2.0, 0.0, -1.25)
+    assert kept_by_two(*side, actor=False) == [False, True]
+    assert kept_by_two(*side, actor=True) == [True, False]
 
 
 def test_a_view_whose_pixel_is_gone_agrees_and_owns_nothing():

@@ -321,6 +321,7 @@ def _owned(
             settings.views.agreement,
             lifting.OWNER_RING,
             lifting.OWNER_BORDER,
+            body.actor is not None,
         ),
         parts_of(len(everything)),
     )

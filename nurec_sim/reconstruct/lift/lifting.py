@@ -167,9 +167,11 @@ def between_measured(inverse_depth, measured):
 
 
 @inner
-def _owner_distance(views, k, xyz, normal, z):
-    """Depth ``z`` of a point in a view, larger where the view sees its surface from less than ``GRAZING``.
+def _owner_distance(views, k, xyz, normal, z, actor):
+    """Depth ``z`` of a point in a view, larger where the view sees its surface obliquely.
 
+    In the static world that is from less than ``GRAZING``. Views of actors are compared by the areas of their pixels on
+    the surface, z^2 over the sine: a car that turns shows its side across the view first, and along it when it is near.
     On level ground it is the depth: pixels are longest where they are farthest, so the nearest view sees it best.
     """
     if abs(normal[2]) > LEVEL:
@@ -181,7 +183,8 @@ def _owner_distance(views, k, xyz, normal, z):
     across += normal[1] * (views[k, 6] * a + views[k, 9] * b + views[k, 12] * c)
     across += normal[2] * (views[k, 7] * a + views[k, 10] * b + views[k, 13] * c)
     sine = abs(across) / np.sqrt(a * a + b * b + c * c)
-    return z * max(1.0, GRAZING / max(sine, 1e-3))
+    sine = max(sine, 1e-3)
+    return z / np.sqrt(sine) if actor else z * max(1.0, GRAZING / sine)
 
 
 @kernel
@@ -200,6 +203,7 @@ def owned(
     tolerance,
     ring,
     border,
+    actor,
 ):
     """Which points no other view owns, and that few views look through.
 
@@ -229,6 +233,7 @@ def owned(
         tolerance: 1/m, see above.
         ring: logarithm of the factor between rings of distance.
         border: share of a view's width at its border in which it owns nothing.
+        actor: whether the body is one (``_owner_distance``).
 
     Returns:
         [n] True where the point stays.
@@ -239,7 +244,7 @@ def owned(
         far_agree, far_through = 0, 0
         # Rings instead of plain distance: neighbouring pixels then share one owner, and the surface does not become a
         # patchwork of views with slightly different depth.
-        own_distance = _owner_distance(packed, own_view[i], xyz[i], normal[i], depth[i])
+        own_distance = _owner_distance(packed, own_view[i], xyz[i], normal[i], depth[i], actor)
         own_ring = np.floor(np.log(own_distance) / ring)
         for c in range(3):
             mixed[c] = rgb[i, c]
@@ -266,7 +271,7 @@ def owned(
                 inside = margin < u < width - margin and 0.5 * margin < v < height - 0.5 * margin
                 owner = inside and owns[k, int(v), int(u)]
                 if owner:
-                    distance = _owner_distance(packed, k, xyz[i], normal[i], z)
+                    distance = _owner_distance(packed, k, xyz[i], normal[i], z, actor)
                     if (np.floor(np.log(distance) / ring), k) < (own_ring, own_view[i]):
                         keep[i] = False
                         break
