@@ -234,6 +234,19 @@ def test_labels_that_are_exact_but_for_centimetres_stay(labelled, changed):
     assert _corrected(dataclasses.replace(track, path=path), parts) is not None
 
 
+@pytest.mark.parametrize(("up_m", "stays"), [(0.045, True), (0.06, False)])
+def test_labels_of_exact_place_keep_their_height(up_m, stays):
+    """Corrections of 45 mm of height are not believed where nothing else is off."""
+    off = np.zeros((12, 4))
+    off[:, 2] = up_m * (-1.0) ** np.arange(12)
+    seen = walls(off)
+    track = Track(
+        "1", "automobile", SIZE, Trajectory(seen.t_us, np.array([change(*row) for row in off])), labelled=True
+    )
+    parts = [(int(t), np.concatenate([seen.xyz_m, seen.ray], axis=1)[seen.sweep == k]) for k, t in enumerate(seen.t_us)]
+    assert (_corrected(track, parts) is None) == stays
+
+
 def test_where_surfaces_do_not_tell_the_motion_is_steady():
     """Along one wall nothing tells the shift but that speed does not jump: labels zigzag by 0.2 m at 10 Hz, 80 m/s2."""
     zigzag = np.zeros((9, 4))

@@ -35,9 +35,10 @@ LABELLED_SIGMA, FOUND_SIGMA = (0.15, 0.15, 0.05, np.radians(2.0)), (0.4, 0.4, 0.
 LARGEST, BETTER = 4.0, 0.9
 """A track stays as it was if a correction is more standard deviations than the first, or if returns disagree by more
 than the second times what they did before."""
-EXACT = (0.03, 0.03, 0.03, np.radians(0.5))
+EXACT = (0.03, 0.03, 0.05, np.radians(0.5))
 """It also stays if its corrections are no larger than this (root of their mean square, units as above): few returns do
-not tell more, and tracks of simulated logs are exact."""
+not tell more, and tracks of simulated logs are exact. Height is told worst: of a car that is followed some ten beams a
+sweep show the rear and nothing else, 3 cm were made up, and its number plate was smeared."""
 EXTENT = (0.01, 0.99)
 """Quantiles of the returns that count as the ends of an object."""
 
