@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 
+from nurec_sim import plugins
 from nurec_sim.cli import (  # noqa: F401  (each registers its commands)
     comparison,
     conformance,
@@ -85,6 +86,8 @@ def _check_verb(words: list[str]) -> None:
         return
     near = difflib.get_close_matches(words[0], known, n=1, cutoff=0.5)
     hint = f"did you mean '{near[0]}'?" if near else f"have {', '.join(known)}."
+    if words[0] in plugins.available(plugins.METHODS):
+        hint = f"it is a method: nurec-sim reconstruct LOG --method {words[0]}."
     text = f"nurec-sim: unknown command '{words[0]}'; {hint} All commands: nurec-sim --help"
     err.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
     raise SystemExit(2)

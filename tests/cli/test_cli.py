@@ -247,10 +247,11 @@ def test_version_and_first_steps_need_nothing_heavy(capsys: pytest.CaptureFixtur
     [
         ("rnder", "did you mean 'render'?"),
         ("inspct", "did you mean 'inspect'?"),
+        ("lift", "it is a method: nurec-sim reconstruct LOG --method lift."),
         ("zzz", "have compare, conformance, "),
     ],
 )
-def test_a_misspelt_verb_is_one_line_that_names_the_nearest(word: str, hint: str, capsys) -> None:
+def test_a_wrong_verb_is_one_line_that_names_the_nearest(word: str, hint: str, capsys) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main([word, "scene.usdz"])
     assert stop.value.code == 2
