@@ -6,12 +6,13 @@ from reconstruct_street import Street, camera
 
 from nurec_sim import geometry, sensors
 from nurec_sim.reconstruct.lift import lifting, splat
+from nurec_sim.reconstruct.lift.method import _settings_for
 from nurec_sim.reconstruct.lift.settings import (
     ColourSettings,
     LiftSettings,
     ViewSettings,
 )
-from nurec_sim.reconstruct.lift.views import choose_frames, read_views, tiles_of
+from nurec_sim.reconstruct.lift.views import choose_frames, key_pixels, read_views, tiles_of
 from nurec_sim.types import CameraModel, Fisheye, Pinhole, Shutter
 
 
@@ -94,6 +95,17 @@ def test_rolling_shutter_points_project_back():
     assert np.abs(uv - np.column_stack([u.ravel(), v.ravel()])).max() < 0.15
 
 
+@pytest.mark.parametrize(("budget", "width_px"), [(86_000, 640), (85_000, 320), (1_000, 320)])
+def test_views_are_narrower_where_their_pixels_outnumber_the_budget(budget, width_px):
+    """Four key frames of 640 x 400 have 1,024,000 pixels, 12 for each of 85,333 Gaussians; half is the least width."""
+    clip = Street(frames=7, cameras=(camera(width=640, height=400),))
+    given = LiftSettings(views=ViewSettings(width_px=640, pixels=1, max_views=4, budget=budget))
+    views = _settings_for(clip, ["front"], given).views
+    (tile,) = tiles_of(clip.rig.cameras["front"], views)
+    assert (tile.width, views.budget) == (width_px, budget)
+    assert key_pixels(clip, ["front"], views) == 4 * width_px * width_px * 400 // 640
+
+
 def test_frames_are_thinned_evenly():
     frames = choose_frames(Street(frames=50), ["front"], 1, ViewSettings(max_views=10, max_frames=25))
     assert [frame for _, frame, _ in frames] == list(range(0, 50, 2))
@@ -133,6 +145,7 @@ def test_limits_follow_the_length_of_the_log(path_m, duration_s, lengths):
         (ViewSettings, {"levels": 1}, "levels must be 2 or more, got 1"),
         (ViewSettings, {"neighbours": -1}, "neighbours must be 0 or more, got -1"),
         (ViewSettings, {"max_field_deg": 0.0}, "max_field_deg must be above 0 and below 180, got 0.0"),
+        (ViewSettings, {"pixels_per_gaussian": 0.5}, "pixels_per_gaussian must be 1 or more, got 0.5"),
         (ViewSettings, {"min_depth_m": 200.0}, "below max_depth_m, got 200.0 and 150.0"),
         (ColourSettings, {"rounds": -1}, "rounds must be 0 or more, got -1"),
         (ColourSettings, {"images": 0}, "images must be 1 or more, got 0"),

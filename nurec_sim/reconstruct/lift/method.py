@@ -30,11 +30,20 @@ from nurec_sim.reconstruct.lift.points import Actor
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.sky_cubemap import make_sky
 from nurec_sim.reconstruct.lift.thin_parts import with_thin_parts
-from nurec_sim.reconstruct.lift.views import LEAST_SKY_WEIGHT, WorkingView, border_weight, key_frames, read_views
+from nurec_sim.reconstruct.lift.views import (
+    LEAST_SKY_WEIGHT,
+    WorkingView,
+    border_weight,
+    key_frames,
+    key_pixels,
+    read_views,
+)
 from nurec_sim.reconstruct.unseen_colours import colours_by_likeness
 from nurec_sim.types import Clip, DynamicGaussians, Gaussians, GaussianScene
 
 Progress = Callable[[str, float], None]
+NARROWER = (1.0, 0.8, 0.64, 0.5)
+"""Widths of working views that are tried, as shares of the largest, until ``pixels_per_gaussian`` is met."""
 SHOWN_PX = 0.1
 """Images show a surfel if its shares of all their pixels add up to more than this."""
 
@@ -54,10 +63,7 @@ def lift(
     Raises:
         ReconstructError: the clip has no LiDAR sweep to build from.
     """
-    path_m, span_us = float(arc_length(clip.ego.world_from_body[:, :3, 3])[-1]), clip.span_us[1] - clip.span_us[0]
-    images = [(model.width_px, model.height_px, len(clip.camera_times_us(camera)))
-              for camera, model in clip.rig.cameras.items() if camera in cameras]  # fmt: skip
-    given, settings = settings, settings.for_log(path_m, span_us / 1e6, images)
+    given, settings = settings, _settings_for(clip, cameras, settings)
     stages = _Stages(progress)
     stages.start("sweeps")
     frames = key_frames(clip, cameras, settings.views)
@@ -152,6 +158,19 @@ def lift(
         shown = (np.arange(len(shown)) < static.lifted) | (taken_px > SHOWN_PX) | (static.shown & white)
     stages.stop()
     return dataclasses.replace(scene, static=_coloured(scene.static, shown))
+
+
+def _settings_for(clip: Clip, cameras: Sequence[str], given: LiftSettings) -> LiftSettings:
+    """The settings for a log, with views that are as wide as its budget of Gaussians is worth."""
+    path_m, span_us = float(arc_length(clip.ego.world_from_body[:, :3, 3])[-1]), clip.span_us[1] - clip.span_us[0]
+    images = [(model.width_px, model.height_px, len(clip.camera_times_us(camera)))
+              for camera, model in clip.rig.cameras.items() if camera in cameras]  # fmt: skip
+    settings = given.for_log(path_m, span_us / 1e6, images)
+    for share in NARROWER:
+        views = dataclasses.replace(settings.views, width_px=max(1, round(share * settings.views.width_px)))
+        if key_pixels(clip, cameras, views) <= views.pixels_per_gaussian * views.budget:
+            break
+    return dataclasses.replace(settings, views=views)
 
 
 def _images(

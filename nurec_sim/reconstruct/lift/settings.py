@@ -53,7 +53,7 @@ class ViewSettings:
 
     width_px: int = 800
     """Working views have about this width, by a whole-number reduction of the image (``reduction_of``); wider ones in
-    short logs (``widened``)."""
+    short logs (``widened``), down to half of it where pixels outnumber the budget (``pixels_per_gaussian``)."""
     pixels: int = 8_000_000
     """Working views are wider as long as all images together have at most this many pixels."""
     max_field_deg: float = 80.0
@@ -64,6 +64,10 @@ class ViewSettings:
     """Frames between them only help to find depth; they too are thinned evenly to this number."""
     budget: int = 700_000
     """Gaussians to lift from pixels at most, about: the plainest blocks of pixels become one each to meet it."""
+    pixels_per_gaussian: float = 12.0
+    """Working views are narrower as long as those that are lifted have more pixels than this for each Gaussian of the
+    budget, about 4 of which own what they show. At edges of depth every pixel becomes one, and the rest is left to few
+    large blocks; in narrower views edges have fewer pixels."""
     levels: int = 72
     """Inverse-depth hypotheses of the matching, from infinity to ``min_depth_m``."""
     min_depth_m: float = 3.5
@@ -81,7 +85,8 @@ class ViewSettings:
             ValueError: one is too small, or the range of depths is empty.
         """
         limits = {"width_px": 1, "pixels": 1, "max_views": 1, "max_frames": 1, "budget": 1, "levels": 2}
-        for name, least in (limits | {"neighbours": 0, "fusion_rounds": 0}).items():
+        limits |= {"pixels_per_gaussian": 1, "neighbours": 0, "fusion_rounds": 0}
+        for name, least in limits.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be {least} or more, got {getattr(self, name)}")
         if not 0 < self.max_field_deg < 180:

@@ -230,6 +230,13 @@ def key_frames(clip: Clip, cameras: Sequence[str], settings: ViewSettings) -> li
     return [(camera, frame) for camera, frame, key in choose_frames(clip, cameras, tiles, settings) if key]
 
 
+def key_pixels(clip: Clip, cameras: Sequence[str], settings: ViewSettings) -> int:
+    """Number of pixels of all key views together."""
+    frames = [camera for camera, _ in key_frames(clip, cameras, settings)]
+    each = {camera: tiles_of(clip.rig.cameras[camera], settings) for camera in cameras}
+    return sum(frames.count(camera) * sum(t.width * t.height for t in tiles) for camera, tiles in each.items())
+
+
 def read_views(
     clip: Clip,
     cameras: Sequence[str],
