@@ -145,7 +145,7 @@ def test_limits_follow_the_length_of_the_log(path_m, duration_s, lengths):
         (ViewSettings, {"levels": 1}, "levels must be 2 or more, got 1"),
         (ViewSettings, {"neighbours": -1}, "neighbours must be 0 or more, got -1"),
         (ViewSettings, {"max_field_deg": 0.0}, "max_field_deg must be above 0 and below 180, got 0.0"),
-        (ViewSettings, {"pixels_per_gaussian": 0.5}, "pixels_per_gaussian must be 1 or more, got 0.5"),
+        (ViewSettings, {"pixels_per_gaussian": float("nan")}, "pixels_per_gaussian must be 1 or more, got nan"),
         (ViewSettings, {"min_depth_m": 200.0}, "below max_depth_m, got 200.0 and 150.0"),
         (ColourSettings, {"rounds": -1}, "rounds must be 0 or more, got -1"),
         (ColourSettings, {"images": 0}, "images must be 1 or more, got 0"),

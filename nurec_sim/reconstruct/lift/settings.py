@@ -87,7 +87,7 @@ class ViewSettings:
         limits = {"width_px": 1, "pixels": 1, "max_views": 1, "max_frames": 1, "budget": 1, "levels": 2}
         limits |= {"pixels_per_gaussian": 1, "neighbours": 0, "fusion_rounds": 0}
         for name, least in limits.items():
-            if getattr(self, name) < least:
+            if not getattr(self, name) >= least:
                 raise ValueError(f"{name} must be {least} or more, got {getattr(self, name)}")
         if not 0 < self.max_field_deg < 180:
             raise ValueError(f"max_field_deg must be above 0 and below 180, got {self.max_field_deg}")
