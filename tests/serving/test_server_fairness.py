@@ -79,6 +79,7 @@ def test_a_connection_may_ask_for_so_many_rays_at_a_time_and_others_still_may():
         def both_held():
             if first[1].done():  # refused: a third image was read before it
                 first[1] = stub.render_rgb.future(camera_message())
+            time.sleep(0.1)
             return refused_for_now(stub) and not first[1].done()
 
         wait_until(both_held)
