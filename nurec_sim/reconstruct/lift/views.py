@@ -85,11 +85,16 @@ def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
         valid = np.ones((height, width), bool)
         tile = Tile(width, height, lens.fx_px / reduction, center, np.eye(3), reduction, None, valid, np.zeros(3))
         return [_with_fraction(tile, camera)]
+    return [_resampled_tile(camera, reduction, *window) for window in _windows(camera, reduction, settings)]
+
+
+def _windows(camera: CameraModel, reduction: int, settings: ViewSettings) -> list[tuple]:
+    """Focal length, middle, size in pixels, and turn of the tiles of a camera that is no plain pinhole."""
     rays = _some_rays(camera)
     azimuth = np.arctan2(rays[:, 0], rays[:, 2])
     (left, right), count = _field(rays), tile_count(camera, settings)
     focal = _pixels_per_radian(camera) / reduction
-    tiles = []
+    windows = []
     for k in range(count):
         a, b = left + (right - left) * k / count, left + (right - left) * (k + 1) / count
         half = np.tan((b - a) / 2 + 0.01)
@@ -101,8 +106,8 @@ def tiles_of(camera: CameraModel, settings: ViewSettings) -> list[Tile]:
         mine = rays[(azimuth > a) & (azimuth < b)] @ turn
         up, down = np.clip(np.percentile(mine[:, 1] / mine[:, 2], [0.1, 99.9]), -STEEPEST, STEEPEST)
         height = int(np.ceil((down - up) * focal))
-        tiles.append(_resampled_tile(camera, reduction, focal, (width / 2, float(-up * focal)), (width, height), turn))
-    return tiles
+        windows.append((focal, (width / 2, float(-up * focal)), (width, height), turn))
+    return windows
 
 
 def tile_count(camera: CameraModel, settings: ViewSettings) -> int:
@@ -232,9 +237,16 @@ def key_frames(clip: Clip, cameras: Sequence[str], settings: ViewSettings) -> li
 
 def key_pixels(clip: Clip, cameras: Sequence[str], settings: ViewSettings) -> int:
     """Number of pixels of all key views together."""
-    frames = [camera for camera, _ in key_frames(clip, cameras, settings)]
-    each = {camera: tiles_of(clip.rig.cameras[camera], settings) for camera in cameras}
-    return sum(frames.count(camera) * sum(t.width * t.height for t in tiles) for camera, tiles in each.items())
+    each = {camera: _tile_pixels(clip.rig.cameras[camera], settings) for camera in cameras}
+    return sum(each[camera] for camera, _ in key_frames(clip, cameras, settings))
+
+
+def _tile_pixels(camera: CameraModel, settings: ViewSettings) -> int:
+    """Number of pixels of the tiles of a camera."""
+    reduction = settings.reduction_of(camera.width_px)
+    if _square(camera):
+        return (camera.width_px // reduction) * (camera.height_px // reduction)
+    return sum(width * height for _, _, (width, height), _ in _windows(camera, reduction, settings))
 
 
 def read_views(
