@@ -16,41 +16,41 @@ from typing import Any
 import numpy as np
 
 from nurec_sim.errors import ArchiveError
-from nurec_sim.files.decoding import LIMITS, image_pixels
+from nurec_sim.files.decoding import LIMITS
 from nurec_sim.files.npy import array_from_npy, npy_bytes
 from nurec_sim.files.zip_package import Package, write_package
-from nurec_sim.scene import codec, knots
+from nurec_sim.scene import codec, knots, pictures
 from nurec_sim.scene.checks import check_scene
 from nurec_sim.scene.describe import scene_hash
 from nurec_sim.scene.facts import facts_from_json, scene_facts
-from nurec_sim.scene.precision import archived, half
+from nurec_sim.scene.precision import archived
 from nurec_sim.scene.sidecars import ftheta_fits, sidecars
-from nurec_sim.scene.usd.actors import actors_layer, field_paths
+from nurec_sim.scene.usd.actors import actors_layer, field_paths, read_columns
 from nurec_sim.scene.usd.cameras import cameras_layer
 from nurec_sim.scene.usd.dome_texture import latlong_exr
+from nurec_sim.scene.usd.fields import gather, read_field
 from nurec_sim.scene.usd.layers import (
     ACTORS_LAYER,
     CAMERAS_LAYER,
     SKY_TEXTURE,
     STATIC_LAYER,
-    gather,
     open_member,
-    read_field,
     root_layer,
     static_layer,
 )
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Label, RoadMap
 
-FORMAT_VERSION = 2
-"""Version 1 had float32 everywhere, and the knots of all moving Gaussians; it is still read."""
+FORMAT_VERSION = 3
+"""Version 1 had float32 everywhere, and the knots of all moving Gaussians; version 2 all normals, halves instead of
+bytes, the sky as an array, and columns of moving Gaussians as members. Both are still read."""
 MANIFEST = "nurec_sim/manifest.json"
-FACTS, ISP, SKY = "nurec_sim/scene.json", "nurec_sim/isp.json", "nurec_sim/sky_cubemap.npy"
+FACTS, ISP, SKY = "nurec_sim/scene.json", "nurec_sim/isp.json", "nurec_sim/sky_cubemap.png"
+SKY_OF_VERSION_2 = "nurec_sim/sky_cubemap.npy"
 EXPOSURES = "nurec_sim/exposures.json"
 EGO_IMAGES = "nurec_sim/ego_images"
-IN_BOX = "nurec_sim/dynamic_in_box.npy"
-TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP, SKY)
-"""Members required by ``read_archive`` besides those of ``scene.knots`` and the optional ``IN_BOX`` and ``EXPOSURES``;
-others are for other programs."""
+TRUTH = (STATIC_LAYER, ACTORS_LAYER, FACTS, ISP)
+"""Members required by ``read_archive`` besides the sky, those of ``scene.knots`` and the optional ``EXPOSURES``; others
+are for other programs."""
 
 
 def write_scene(
@@ -78,12 +78,13 @@ def write_scene(
     check_scene(scene)
     scene = archived(scene)
     fits = ftheta_fits(scene)
+    arrays, columns = knots.knot_arrays(scene.dynamic)
     with ThreadPoolExecutor(1) as beside:
         hashed, texture = beside.submit(scene_hash, scene), beside.submit(latlong_exr, scene.sky)
         layers = {
             "default.usda": root_layer(scene, FORMAT_VERSION),
             STATIC_LAYER: static_layer(scene.static),
-            ACTORS_LAYER: actors_layer(scene),
+            ACTORS_LAYER: actors_layer(scene, columns),
             CAMERAS_LAYER: cameras_layer(scene, fits),
         }
         digest, sky = hashed.result(), texture.result()
@@ -93,15 +94,13 @@ def write_scene(
         **sidecars(scene, digest, fits, derived_map),
         FACTS: codec.dump(scene_facts(scene), FACTS),
         ISP: codec.dump(scene.isp, ISP, indent=2),
-        SKY: npy_bytes(half(scene.sky)),
-        **{name: npy_bytes(array) for name, array in knots.knot_arrays(scene.dynamic).items()},
+        SKY: pictures.png_of_sky(scene.sky),
+        **{name: npy_bytes(array) for name, array in arrays.items()},
     }
     if scene.exposures:
         members[EXPOSURES] = codec.dump(scene.exposures, EXPOSURES)
     for camera, image in scene.ego_images.items():
-        members[f"{EGO_IMAGES}/{camera}.png"] = _png(image)
-    if scene.dynamic.in_box is not None:
-        members[IN_BOX] = npy_bytes(scene.dynamic.in_box)
+        members[f"{EGO_IMAGES}/{camera}.png"] = pictures.png_of_ego_image(image)
     members[MANIFEST] = codec.dump(_manifest(scene, digest, members), MANIFEST, indent=2)
     write_package(path, members)
     return path
@@ -118,9 +117,11 @@ def read_archive(path: Path | str) -> GaussianScene:
     path = Path(path)
     with Package(path) as package:
         manifest = _read_manifest(package)
-        knot_members = tuple(knots.KINDS) if manifest["version"] > 1 else knots.OF_VERSION_1
-        _check_hashes(package, manifest, TRUTH + knot_members)
-        counts = manifest["counts"]
+        version, counts = manifest["version"], manifest["counts"]
+        columns_there = knots.columns_of(version, bool(counts.get("dynamic_in_box")))
+        column_members = () if version > 2 else map(knots.member_of, columns_there)
+        sky_member = SKY if version > 2 else SKY_OF_VERSION_2
+        _check_hashes(package, manifest, (*TRUTH, sky_member, *knots.KINDS, *column_members))
         facts_json = codec.load(package.read(FACTS, LIMITS.json_bytes), f"{path}: {FACTS}")
         facts = facts_from_json(facts_json, f"{path}: {FACTS}")
         static_usd = open_member(path, STATIC_LAYER)
@@ -132,18 +133,19 @@ def read_archive(path: Path | str) -> GaussianScene:
             drop = np.zeros(0, np.float32) if counts.get("dynamic_ray_drop") else None
             falloff = np.zeros(0, np.float32) if counts.get("dynamic_falloff") else None
             moving = dataclasses.replace(moving, sh_rest=harmonics, ray_drop=drop, falloff=falloff)
-        in_box = None
-        if counts.get("dynamic_in_box"):
-            _check_hashes(package, manifest, (IN_BOX,))
-            in_box = _array(package, IN_BOX, "b")
-        arrays = {name: _array(package, name, knots.KINDS[name]) for name in knot_members}
-        dynamic = DynamicGaussians(moving, *knots.knots_of(arrays, moving.mean_m, str(path)), in_box)
+        if version > 2:
+            columns = read_columns(actors_usd, columns_there, f"{path}: dynamic")
+        else:
+            kinds = knots.COLUMN_KINDS
+            columns = {name: _array(package, knots.member_of(name), kinds[name]) for name in columns_there}
+        arrays = {name: _array(package, name, kind) for name, kind in knots.KINDS.items()}
+        dynamic = DynamicGaussians(moving, *knots.knots_of(arrays, columns, moving.mean_m, str(path)))
         isp_json = codec.load(package.read(ISP, LIMITS.json_bytes), f"{path}: {ISP}")
         isp = codec.from_json(codec.mapping(codec.array(np.float64, 3, 4)), isp_json, f"{path}: {ISP}")
         scene = GaussianScene(
             static=static,
             dynamic=dynamic,
-            sky=_array(package, SKY, "f").astype(np.float32),
+            sky=_sky(package, sky_member),
             isp=isp,
             exposures=_exposures(package, manifest),
             ego_images=_ego_images(package, manifest),
@@ -255,28 +257,22 @@ def _exposures(package: Package, manifest: dict[str, Any]) -> dict[str, np.ndarr
     return codec.from_json(codec.mapping(codec.array(np.float64, -1, 3, 4)), raw, where)
 
 
-def _png(image: np.ndarray) -> bytes:
-    import cv2
-
-    return bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))[1])
+def _sky(package: Package, name: str) -> np.ndarray:
+    if name == SKY_OF_VERSION_2:
+        return _array(package, name, "f").astype(np.float32)
+    return pictures.sky_of_png(package.read(name), f"{package.path}: {name}")
 
 
 def _ego_images(package: Package, manifest: dict[str, Any]) -> dict[str, np.ndarray]:
     """What the cameras see of the ego vehicle, if anything."""
-    import cv2
-
     names = [name for name in manifest["sha256"] if name.startswith(f"{EGO_IMAGES}/")]
     _check_hashes(package, manifest, tuple(names))
-    images = {}
-    for name in names:
-        try:
-            bgra = image_pixels(package.read(name), cv2.IMREAD_UNCHANGED)
-        except ValueError as error:
-            raise ArchiveError(f"{package.path}: {name} is not a readable PNG") from error
-        if bgra.ndim != 3 or bgra.shape[2] != 4 or bgra.dtype != np.uint8:
-            raise ArchiveError(f"{package.path}: {name} must be RGBA with 8 bits, got {bgra.dtype} {bgra.shape}")
-        images[name.removeprefix(f"{EGO_IMAGES}/").removesuffix(".png")] = cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGBA)
-    return images
+    return {
+        name.removeprefix(f"{EGO_IMAGES}/").removesuffix(".png"): pictures.ego_image_of_png(
+            package.read(name), f"{package.path}: {name}"
+        )
+        for name in names
+    }
 
 
 def _array(package: Package, name: str, kinds: str) -> np.ndarray:

@@ -1,9 +1,10 @@
-"""The precision of archives: half floats for everything but positions.
+"""The precision of archives: float32 for positions, bytes for what a LiDAR tells, half floats for everything else.
 
 A half float has 11 significant bits. Its spacing at a distance of 64 to 128 m is 6 cm, so positions stay float32. What
-remains is rounded by less than an 8-bit image or a LiDAR's intensity resolves: colours by 0.04 of 255 levels at most,
-scales and opacities by 0.05 %, rotations by 0.05 degrees. Colours are stored as constant terms of spherical harmonics
-(colour = 0.5 + SH_C0 * term), which every reader of ParticleFields needs.
+remains is rounded by less than an 8-bit image resolves: colours by 0.04 of 255 levels at most, scales and opacities by
+0.05 %, rotations by 0.05 degrees. Colours are stored as constant terms of spherical harmonics (colour = 0.5 + SH_C0 *
+term), which every reader of ParticleFields needs. LiDARs report intensity in bytes; so are intensity and ray drop kept.
+The normal of a disc is its third axis: normals that are, within ``AXIS_TOLERANCE``, are that axis exactly.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float, Float16, Float32
+from jaxtyping import Float, Float16, Float32, UInt8
 
 from nurec_sim.scene.harmonics import SH_C0
 from nurec_sim.types import Gaussians, GaussianScene
@@ -20,7 +21,14 @@ LARGEST = float(np.finfo(np.float16).max)
 TERM_STEP = 2.0**-14
 """Constant terms are multiples of this. Half floats near 0 are closer together than the float32 colours made of them:
 rounding twice would differ from rounding once."""
-_HALF_FIELDS = ("quat_wxyz", "scale_m", "opacity", "normal", "intensity", "sh_rest", "ray_drop", "falloff")
+LEVELS = 254
+"""The byte of 1.0."""
+UNKNOWN = 255
+"""The byte of NaN."""
+AXIS_TOLERANCE = 0.002
+"""Length of the difference of unit vectors, 0.1 degrees: more than half floats round normals and rotations by."""
+_HALF_FIELDS = ("quat_wxyz", "scale_m", "opacity", "normal", "sh_rest", "falloff")
+_BYTE_FIELDS = ("intensity", "ray_drop")
 
 
 def archived(scene: GaussianScene) -> GaussianScene:
@@ -35,6 +43,23 @@ def half(values: Float[np.ndarray, "*n"]) -> Float16[np.ndarray, "*n"]:
     return np.clip(values, -LARGEST, LARGEST).astype(np.float16, order="C")
 
 
+def byte_levels(values: Float32[np.ndarray, " n"]) -> UInt8[np.ndarray, " n"]:
+    """Values of 0..1, or NaN, as bytes."""
+    return np.where(np.isnan(values), UNKNOWN, np.rint(np.nan_to_num(values) * LEVELS)).astype(np.uint8)
+
+
+def from_byte_levels(levels: UInt8[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
+    """Values of ``byte_levels``."""
+    return np.where(levels == UNKNOWN, np.float32(np.nan), levels / np.float32(LEVELS)).astype(np.float32)
+
+
+def third_axes(quat_wxyz: Float32[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 3"]:
+    """The third axis of Gaussians, at the precision of half floats."""
+    w, x, y, z = np.ascontiguousarray(quat_wxyz.T, np.float64)
+    axes = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z], axis=-1)
+    return half(axes / (w * w + x * x + y * y + z * z)[:, None]).astype(np.float32)
+
+
 def constant_terms(rgb: Float32[np.ndarray, "n 3"]) -> Float16[np.ndarray, "n 3"]:
     """Spherical-harmonics terms of degree 0 of display colours."""
     return half(np.rint((rgb.astype(np.float64) - 0.5) / SH_C0 / TERM_STEP) * TERM_STEP)
@@ -46,6 +71,13 @@ def colours(terms: Float16[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
 
 
 def _rounded(gaussians: Gaussians) -> Gaussians:
-    given = {name: getattr(gaussians, name) for name in _HALF_FIELDS}
-    fields = {name: half(values).astype(np.float32) for name, values in given.items() if values is not None}
+    given = {name: getattr(gaussians, name) for name in (*_HALF_FIELDS, *_BYTE_FIELDS)}
+    fields = {
+        name: half(values).astype(np.float32) if name in _HALF_FIELDS else from_byte_levels(byte_levels(values))
+        for name, values in given.items()
+        if values is not None
+    }
+    axes, normal = third_axes(fields["quat_wxyz"]), fields["normal"]
+    of_disc = np.linalg.norm(axes - normal, axis=1, keepdims=True) < AXIS_TOLERANCE
+    fields["normal"] = np.where(of_disc, axes, normal)
     return dataclasses.replace(gaussians, rgb=colours(constant_terms(gaussians.rgb)), **fields)

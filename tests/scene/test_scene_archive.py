@@ -2,19 +2,21 @@
 
 import dataclasses
 import hashlib
-import io
 import os
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from pxr import Usd
 from scene_worlds import END_US, START_US, curved_path, empty_scene, full_scene, gaussians, hilly_road, moving_car
 
+from nurec_sim import geometry
 from nurec_sim.errors import ArchiveError
 from nurec_sim.scene import archive_faults, read_scene, scene_hash, summary, write_scene
 from nurec_sim.scene.describe import scene_arrays
@@ -76,7 +78,7 @@ def with_ray_drop(scene):
     """The scene with a drop probability and a falloff for every Gaussian."""
 
     def dropping(part):
-        probability = np.random.default_rng(len(part)).integers(0, 9, len(part)).astype(np.float32) / 8
+        probability = np.random.default_rng(len(part)).integers(0, 3, len(part)).astype(np.float32) / 2
         return dataclasses.replace(part, ray_drop=probability, falloff=1 - probability)
 
     moving = dataclasses.replace(scene.dynamic, gaussians=dropping(scene.dynamic.gaussians))
@@ -130,24 +132,57 @@ def test_round_trip_of_any_numbers(tmp_path_factory, data, count, scene_id):
         assert np.array_equal(getattr(scene.dynamic, name), getattr(back.dynamic, name)), name
 
 
-def test_all_but_positions_are_rounded_to_half_floats():
-    """By the format of IEEE 754 binary16, and by what an image of 8 bits shows of a colour."""
-    given = gaussians(10_000, 2, 3)
+def test_all_but_positions_are_rounded():
+    """To IEEE 754 binary16, what LiDARs tell to 254ths, and colours by less than an image of 8 bits shows."""
+    given = dataclasses.replace(gaussians(10_000, 2, 3), ray_drop=np.linspace(0, 1, 10_000, dtype=np.float32))
     kept = archived(dataclasses.replace(empty_scene(), static=given)).static
     assert np.array_equal(kept.mean_m, given.mean_m)
     assert np.array_equal(kept.label, given.label)
-    for name in ("quat_wxyz", "scale_m", "opacity", "normal", "intensity", "sh_rest"):
+    for name in ("quat_wxyz", "scale_m", "opacity", "normal", "sh_rest"):
         wanted = getattr(given, name)
         assert np.array_equal(getattr(kept, name), wanted.astype(np.float16), equal_nan=True), name
+    for name in ("intensity", "ray_drop"):
+        wanted = np.round(getattr(given, name) * 254) / np.float32(254)
+        assert np.array_equal(getattr(kept, name), wanted, equal_nan=True), name
     assert np.abs(kept.rgb - given.rgb).max() * 255 < 0.04
     tiny = dataclasses.replace(given, scale_m=np.full_like(given.scale_m, 1e6))
     assert archived(dataclasses.replace(empty_scene(), static=tiny)).static.scale_m.max() == 65504
 
 
+def as_discs(given: Gaussians, degrees: float = 0.0) -> Gaussians:
+    """The Gaussians with normals this far from their third axis, about the first one."""
+    axes = geometry.matrix_from_quat(given.quat_wxyz.astype(np.float64))
+    angle = np.deg2rad(degrees)
+    normal = np.cos(angle) * axes[:, :, 2] - np.sin(angle) * axes[:, :, 1]
+    return dataclasses.replace(given, normal=normal.astype(np.float32))
+
+
+def test_normals_of_discs_are_not_stored_twice(tmp_path):
+    """A field has no normals if all are the third axis of their Gaussians within 0.1 degrees; else it has them all."""
+
+    def written(static):
+        path = write_scene(dataclasses.replace(full_scene(0), static=static), tmp_path / "a.usdz", overwrite=True)
+        stage = Usd.Stage.Open(str(path))
+        normals = stage.GetPrimAtPath("/World/Static/road").GetAttribute("primvars:nurec_sim:normal")
+        return read_scene(path).static, normals.HasAuthoredValue()
+
+    discs = as_discs(gaussians(400, 4))
+    for degrees, stored in ((0.0, False), (0.05, False), (1.0, True)):
+        turned = as_discs(discs, degrees)
+        back, has_normals = written(turned)
+        assert has_normals == stored
+        assert np.abs(back.normal - turned.normal).max() < 0.002
+    one_turned = dataclasses.replace(discs, normal=discs.normal.copy())
+    one_turned.normal[np.flatnonzero(discs.label == Label.ROAD)[0]] *= -1
+    back, has_normals = written(one_turned)
+    assert has_normals
+    assert np.abs(back.normal - one_turned.normal).max() < 0.002
+
+
 def test_bytes_of_a_gaussian(tmp_path):
     """Its attributes and an index; knots only for those that change place, times of knots once."""
     count = 20_000
-    given = gaussians(count, 4)
+    given = as_discs(gaussians(count, 4))
 
     def size_of(**changes):
         path = write_scene(dataclasses.replace(full_scene(0), **changes), tmp_path / "a.usdz", overwrite=True)
@@ -155,31 +190,51 @@ def test_bytes_of_a_gaussian(tmp_path):
             own = [entry for entry in package.infolist() if "splats" in entry.filename or "dynamic" in entry.filename]
         return sum(entry.file_size for entry in own)
 
-    position, halves, label, index = 3 * 4, 2 * (4 + 3 + 1 + 3 + 3 + 1), 1, 1
-    one, base = position + halves + label + index, size_of()
+    position, halves, intensity, label, index = 3 * 4, 2 * (4 + 3 + 1 + 3), 1, 1, 1
+    one, base = position + halves + intensity + label + index, size_of()
     assert (size_of(static=given) - base) / count < one
     rigid = DynamicGaussians.rigid(given, np.zeros(count, np.int32), START_US)
-    track, window, moves, in_box = 2, 2, 1, 1
-    assert (size_of(dynamic=rigid) - base) / count < one + track + window + moves + in_box
+    columns = 0.1  # equal numbers in a row take no room
+    assert (size_of(dynamic=rigid) - base) / count < one + columns
 
 
-def scene_of_version_1():
-    """What ``version_1.usdz`` was written from."""
+ARCHIVES = Path(__file__).parents[1] / "data" / "archives"
+
+
+def old_scene(name: str) -> GaussianScene:
+    """What ``version_1.usdz`` and ``version_2.usdz`` were written from, without ray drop."""
     rigid = DynamicGaussians.rigid(gaussians(4, 8, 3), np.zeros(4, np.int32), START_US)
     dynamic = DynamicGaussians.concatenate([moving_car(1, 6, 5, 3), rigid])
     sky = np.random.default_rng(1).random((6, 8, 8, 3), np.float32)
     return dataclasses.replace(
-        full_scene(3), id="version-1", static=gaussians(12, 7, 3), dynamic=dynamic, sky=sky,
+        full_scene(3), id=name, static=gaussians(12, 7, 3), dynamic=dynamic, sky=sky,
         rig=Rig({}, {}), isp={}, camera_times_us={}, ego=curved_path(3), road_map=None,
     )  # fmt: skip
 
 
 def test_archives_of_version_1_are_read_exactly(tmp_path):
     """Written by release 0.1: float32 throughout, a primvar of colours, all knots of all moving Gaussians."""
-    path = Path(__file__).parents[1] / "data" / "archives" / "version_1.usdz"
-    scene = read_scene(path)
-    assert_same(scene_of_version_1(), scene)
+    scene = read_scene(ARCHIVES / "version_1.usdz")
+    assert_same(old_scene("version-1"), scene)
     assert scene.static.opacity[0] != np.float16(scene.static.opacity[0])
+    write_scene(scene, tmp_path / "a.usdz")
+    assert_same(archived(scene), read_scene(tmp_path / "a.usdz"))
+
+
+def test_archives_of_version_2_are_read_exactly(tmp_path):
+    """Half floats for all but positions, the sky as an array, columns of moving Gaussians as members."""
+    scene = read_scene(ARCHIVES / "version_2.usdz")
+    given, moving = old_scene("version-2"), scene.dynamic
+    assert np.array_equal(scene.static.mean_m, given.static.mean_m)
+    for name in ("quat_wxyz", "normal", "intensity"):
+        wanted = getattr(given.static, name).astype(np.float16).astype(np.float32)
+        assert np.array_equal(getattr(scene.static, name), wanted, equal_nan=True), name
+    drop = np.random.default_rng(12).random(12, np.float32)
+    assert np.array_equal(scene.static.ray_drop, drop.astype(np.float16))
+    assert np.array_equal(scene.sky, given.sky.astype(np.float16))
+    for name in (*KNOT_FIELDS, "in_box"):
+        assert np.array_equal(getattr(moving, name), getattr(given.dynamic, name)), name
+    assert moving.in_box is not None and moving.in_box.tolist() == [False] * 6 + [True] * 4
     write_scene(scene, tmp_path / "a.usdz")
     assert_same(archived(scene), read_scene(tmp_path / "a.usdz"))
 
@@ -328,12 +383,16 @@ def test_summary_counts_what_is_there():
 
 
 def test_the_faces_of_the_sky_are_archived_in_their_order(tmp_path):
-    """Read without our reader: a cubemap whose face n has the colour n."""
-    sky = np.broadcast_to(np.arange(6, dtype=np.float32)[:, None, None, None] / 8, (6, 4, 4, 3)).copy()
+    """Read without our reader: a cubemap whose face n has as much red."""
+    sky = np.broadcast_to(np.float32([0, 0.5, 0.25]), (6, 4, 4, 3)).copy()
+    sky[..., 0] = np.arange(6)[:, None, None] / 8
     write_scene(dataclasses.replace(full_scene(0), sky=sky), tmp_path / "a.usdz")
     with zipfile.ZipFile(tmp_path / "a.usdz") as package:
-        kept = np.load(io.BytesIO(package.read("nurec_sim/sky_cubemap.npy")))
-    assert kept[:, 0, 0, 0].tolist() == [0, 0.125, 0.25, 0.375, 0.5, 0.625]
+        png = np.frombuffer(package.read("nurec_sim/sky_cubemap.png"), np.uint8)
+    blue_green_red = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
+    assert blue_green_red.shape == (24, 4, 3)
+    kept = blue_green_red[..., ::-1].copy().view(np.float16)
+    assert kept[::4, 0].tolist() == [[n / 8, 0.5, 0.25] for n in range(6)]
     assert np.array_equal(read_scene(tmp_path / "a.usdz").sky, sky)
 
 

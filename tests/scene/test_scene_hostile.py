@@ -9,6 +9,7 @@ import struct
 import zipfile
 import zlib
 
+import cv2
 import numpy as np
 import pytest
 from scene_worlds import empty_scene, full_scene
@@ -16,6 +17,7 @@ from scene_worlds import empty_scene, full_scene
 from nurec_sim.errors import ArchiveError
 from nurec_sim.files.zip_package import Package, write_package
 from nurec_sim.scene import archive, archive_faults, knots, read_scene, scene_hash, write_scene
+from nurec_sim.scene.usd.actors import actors_layer
 from nurec_sim.scene.usd.layers import static_layer
 
 
@@ -184,7 +186,7 @@ def test_array_with_a_pickle(good, monkeypatch):
     monkeypatch.chdir(good.parent)
     buffer = io.BytesIO()
     np.save(buffer, np.array([Trap()], dtype=object), allow_pickle=True)
-    refused(forge(good, **{archive.SKY: buffer.getvalue()}), "must hold plain values in C order, got object")
+    refused(forge(good, **{knots.KNOTS: buffer.getvalue()}), "must hold plain values in C order, got object")
     assert not os.path.exists("unpickled")
 
 
@@ -192,7 +194,7 @@ def test_array_that_promises_too_much(good):
     header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (6, 1000000000, 1000000000, 3), }"
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     data = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
-    refused(forge(good, **{archive.SKY: data}), "promises float32 .* but holds 0 bytes")
+    refused(forge(good, **{knots.KNOTS: data}), "promises float32 .* but holds 0 bytes")
 
 
 def test_array_of_another_shape(good):
@@ -200,22 +202,47 @@ def test_array_of_another_shape(good):
     refused(forge(good, **{knots.KNOTS: data}), "must hold plain values in C order, got int64")
     data = archive.npy_bytes(np.zeros((2, 3), np.float32))
     refused(forge(good, **{knots.KNOTS: data}), "dynamic_knot_m.npy must have the knots of those of 53 Gaussians")
-    data = archive.npy_bytes(np.full(53, 99, np.int16))
-    refused(
-        forge(good, **{knots.WINDOW: data}), "dynamic_window.npy must name one of 2 triples of times for each of 53"
-    )
 
 
-def test_array_of_another_type(good):
-    data = archive.npy_bytes(np.zeros((6, 8, 8, 3), np.int32))
-    refused(forge(good, **{archive.SKY: data}), "must hold plain values in C order, got int32")
+def test_columns_that_do_not_fit(good):
+    """Numbers of moving Gaussians in the layer of actors: missing, too few, or beyond the times that there are."""
+    scene = read_scene(good)
+    columns = knots.knot_arrays(scene.dynamic)[1]
+    without = {name: column for name, column in columns.items() if name != knots.TRACK}
+    short = columns | {knots.WINDOW: columns[knots.WINDOW][1:]}
+    beyond = columns | {knots.WINDOW: np.full(53, 99, np.int32)}
+    for changed, text in (
+        (without, "track must be int32 .* got nothing"),
+        (short, r"53 moving Gaussians, but other shapes .*window.*\(52,\)"),
+        (beyond, "window must name one of 2 triples of times for each of 53"),
+    ):
+        refused(forge(good, **{archive.ACTORS_LAYER: actors_layer(scene, changed)}), text)
+
+
+def png_of(pixels):
+    return bytes(cv2.imencode(".png", pixels)[1])
+
+
+def test_another_picture_than_a_sky(good):
+    text = "sky_cubemap.png must be RGB with 16 bits, six squares below each other, got"
+    for shape, dtype in (((48, 8, 3), np.uint8), ((48, 8), np.uint16), ((40, 8, 3), np.uint16)):
+        refused(forge(good, **{archive.SKY: png_of(np.zeros(shape, dtype))}), text)
+    refused(forge(good, **{archive.SKY: b"hello"}), "sky_cubemap.png is not a readable PNG")
+    infinite = np.full((48, 8, 3), 0x7C00, np.uint16)
+    refused(forge(good, **{archive.SKY: png_of(infinite)}), "sky.*not finite")
+
+
+def test_a_label_that_is_none(good):
+    scene = read_scene(good)
+    scene.static.label[3] = 77
+    refused(forge(good, **{archive.STATIC_LAYER: static_layer(scene.static)}), "label.*1 of 400 are not a Label")
 
 
 def test_text_instead_of_an_array(good):
-    refused(forge(good, **{knots.OWNERS: b"hello"}), "is no array file")
+    refused(forge(good, **{knots.TIMES: b"hello"}), "is no array file")
 
 
-@pytest.mark.parametrize("name", [*archive.TRUTH, *knots.KINDS])
+@pytest.mark.parametrize("name", [*archive.TRUTH, archive.SKY, *knots.KINDS])
 def test_missing_member(good, name):
     refused(forge(good, **{name: None}), "does not list")
     members = members_of(good)
@@ -224,7 +251,7 @@ def test_missing_member(good, name):
     refused(good, f"{name} is missing; have")
 
 
-@pytest.mark.parametrize("name", [*archive.TRUTH, *knots.KINDS])
+@pytest.mark.parametrize("name", [*archive.TRUTH, archive.SKY, *knots.KINDS])
 def test_changed_member(good, name):
     members = members_of(good)
     members[name] = members[name][:-1] + bytes([members[name][-1] ^ 1])
@@ -240,11 +267,11 @@ def test_changed_sidecar_is_reported_but_does_not_stop_reading(good):
     ]
 
 
-@pytest.mark.parametrize("version", [3, 0, "1", None])
+@pytest.mark.parametrize("version", [4, 0, "1", None])
 def test_other_version(good, version):
     manifest = json.loads(members_of(good)[archive.MANIFEST]) | {"version": version}
     path = forge(good, **{archive.MANIFEST: json.dumps(manifest).encode()})
-    refused(path, f"format version {version!r}; this nurec_sim reads versions 1 to 2")
+    refused(path, f"format version {version!r}; this nurec_sim reads versions 1 to 3")
 
 
 @pytest.mark.parametrize("text", [b"[]", b"{}", b"{", b"\xff", b"[" * 100_000, b'{"format": NaN}', b'{"a":1,"a":2}'])

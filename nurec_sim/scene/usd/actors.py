@@ -9,22 +9,25 @@ window in the frame of the box, animated with it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Int32, Int64
 
+from nurec_sim.errors import ArchiveError
 from nurec_sim.geometry import quat_from_matrix
-from nurec_sim.scene.usd.layers import NAMESPACE, author_field, crate_bytes, extent_of, new_stage, time_code
+from nurec_sim.scene.usd.fields import NAMESPACE, author_field, extent_of
+from nurec_sim.scene.usd.layers import crate_bytes, new_stage, time_code
 from nurec_sim.types import DynamicGaussians, Gaussians, GaussianScene, Track
 
 MAX_WINDOWS = 5000
 _COARSE_WINDOW_US = 500_000
 
 
-def actors_layer(scene: GaussianScene) -> bytes:
-    """``splats_actors.usdc``."""
+def actors_layer(scene: GaussianScene, columns: Mapping[str, Int32[np.ndarray, " n"]]) -> bytes:
+    """``splats_actors.usdc``; ``columns`` of all moving Gaussians, in the scene's order, are attributes of /Actors."""
     stage = new_stage("Actors")
+    _author_columns(stage.GetPrimAtPath("/Actors"), columns)
     start_us = scene.span_us[0]
     prims = _prim_names(scene.tracks)
     for track, name in zip(scene.tracks, prims, strict=True):
@@ -48,6 +51,30 @@ def field_paths(layer) -> list[str]:
         return []
     fields = (field for actor in root.nameChildren for field in actor.nameChildren)
     return [str(field.path) for field in fields if field.typeName == "ParticleField3DGaussianSplat"]
+
+
+def read_columns(layer, names: Iterable[str], what: str) -> dict[str, Int32[np.ndarray, " n"]]:
+    """Columns of ``actors_layer``.
+
+    Raises:
+        ArchiveError: one is missing, or holds anything but integers.
+    """
+    columns = {}
+    for name in names:
+        spec = layer.GetAttributeAtPath(f"/Actors.{NAMESPACE}:{name}")
+        column = None if spec is None or spec.default is None else np.array(spec.default)
+        if column is None or column.dtype != np.int32:
+            found = "nothing" if column is None else column.dtype
+            raise ArchiveError(f"{what} /Actors.{NAMESPACE}:{name} must be int32 [n], got {found}")
+        columns[name] = column
+    return columns
+
+
+def _author_columns(prim, columns: Mapping[str, Int32[np.ndarray, " n"]]) -> None:
+    from pxr import Sdf, Vt
+
+    for name, column in columns.items():
+        prim.CreateAttribute(f"{NAMESPACE}:{name}", Sdf.ValueTypeNames.IntArray).Set(Vt.IntArray.FromNumpy(column))
 
 
 def _prim_names(tracks: Sequence[Track]) -> list[str]:

@@ -12,7 +12,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from nurec_sim.scene.usd.actors import author_path
-from nurec_sim.scene.usd.layers import NAMESPACE, crate_bytes, new_stage
+from nurec_sim.scene.usd.fields import NAMESPACE
+from nurec_sim.scene.usd.layers import crate_bytes, new_stage
 from nurec_sim.types import CameraModel, FTheta, GaussianScene
 
 _APERTURE_MM = 20.955  # USD's default width; only its ratio to the focal length matters

@@ -7,6 +7,7 @@ on the right. With the pole on z, longitude 0 looks along -y and longitude pi/2 
 from __future__ import annotations
 
 import struct
+import zlib
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -14,6 +15,7 @@ from jaxtyping import Float32, Float64
 from nurec_sim.geometry import cubemap_coordinates
 
 MAX_ROWS = 512
+_BLOCK_ROWS = 16
 
 
 def latlong_directions(rows: int) -> Float64[np.ndarray, "rows columns 3"]:
@@ -52,7 +54,7 @@ def latlong_exr(sky: Float32[np.ndarray, "6 h h 3"]) -> bytes:
 
 
 def encode_exr(image: np.ndarray) -> bytes:
-    """An uncompressed single-part scan-line OpenEXR file of half-float RGB ``[h, w, 3]``.
+    """A single-part scan-line OpenEXR file of half-float RGB ``[h, w, 3]``, in ZIP compression.
 
     Layout: https://openexr.com/en/latest/OpenEXRFileLayout.html. (OpenCV's wheels cannot write EXR.)
     """
@@ -61,7 +63,7 @@ def encode_exr(image: np.ndarray) -> bytes:
     def attribute(name: str, kind: str, data: bytes) -> bytes:
         return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<I", len(data)) + data
 
-    half, linear_channel = 1, 0
+    half, linear_channel, zip_of_16_lines = 1, 0, b"\3"
     channels = b"".join(
         name + b"\0" + struct.pack("<iBBBBii", half, linear_channel, 0, 0, 0, 1, 1) for name in (b"B", b"G", b"R")
     )
@@ -70,7 +72,7 @@ def encode_exr(image: np.ndarray) -> bytes:
         # Magic number and version 2 without flags: single-part scan lines.
         struct.pack("<II", 20000630, 2)
         + attribute("channels", "chlist", channels + b"\0")
-        + attribute("compression", "compression", b"\0")
+        + attribute("compression", "compression", zip_of_16_lines)
         + attribute("dataWindow", "box2i", window)
         + attribute("displayWindow", "box2i", window)
         + attribute("lineOrder", "lineOrder", b"\0")
@@ -79,11 +81,26 @@ def encode_exr(image: np.ndarray) -> bytes:
         + attribute("screenWindowWidth", "float", struct.pack("<f", 1.0))
         + b"\0"
     )
-    row_bytes = width * 3 * 2
-    first = len(header) + 8 * height
-    # The offset table: each line is its y, its size in bytes, and the pixels.
-    offsets = first + np.arange(height, dtype="<u8") * (8 + row_bytes)
     # Channels are stored in alphabetical order, one after the other within a scan line.
     rows = np.ascontiguousarray(image[:, :, ::-1].transpose(0, 2, 1), dtype="<f2")  # [h, BGR, w]
-    lines = b"".join(struct.pack("<ii", y, row_bytes) + rows[y].tobytes() for y in range(height))
-    return header + offsets.tobytes() + lines
+    blocks = [
+        struct.pack("<ii", y, len(data)) + data
+        for y in range(0, height, _BLOCK_ROWS)
+        for data in [_zip_block(rows[y : y + _BLOCK_ROWS].tobytes())]
+    ]
+    # The offset table: each block is its first y, its size in bytes, and the data.
+    first = len(header) + 8 * len(blocks)
+    offsets = first + np.cumsum([0, *map(len, blocks[:-1])]).astype("<u8")
+    return header + offsets.astype("<u8").tobytes() + b"".join(blocks)
+
+
+def _zip_block(data: bytes) -> bytes:
+    """A block of scan lines as OpenEXR compresses it: even bytes, then odd ones, as differences from the one before.
+
+    A block that would not become smaller is stored as it is; readers tell by its size.
+    """
+    given = np.frombuffer(data, np.uint8)
+    planes = np.concatenate([given[::2], given[1::2]])
+    planes[1:] -= planes[:-1].copy() + np.uint8(128)  # modulo 256
+    packed = zlib.compress(planes.tobytes())
+    return packed if len(packed) < len(data) else data

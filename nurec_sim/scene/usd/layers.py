@@ -1,32 +1,23 @@
-"""The USD layers of an archive: the root, and Gaussians as ParticleField3DGaussianSplat prims.
+"""The USD layers of an archive: the root, and the static Gaussians.
 
-Conventions of OpenUSD: quaternion arrays are ``x, y, z, w`` in memory, spherical harmonics follow 3DGS files (colour =
-0.5 + C0 * DC + ...), particle-major with the constant term first. Time codes are milliseconds after
-``absoluteTimeOffsetMicroSec``, which is the scene's start.
-
-Positions are float32, everything else half floats (``scene.precision``). Data that a ParticleField cannot represent are
-primvars of our namespace: the normal, the semantic class, LiDAR intensity and ray drop, and ``index``, its index in the
-scene. Archives of version 1 are float32 throughout, with the exact display colour as primvar ``rgb``.
+Time codes are milliseconds after ``absoluteTimeOffsetMicroSec``, which is the scene's start.
 """
 
 from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
 
 from nurec_sim.errors import ArchiveError
 from nurec_sim.files.new_files import temporary_folder
 from nurec_sim.files.zip_package import Package
-from nurec_sim.scene.precision import colours, constant_terms, half
 from nurec_sim.scene.usd.crate_check import check_crate
+from nurec_sim.scene.usd.fields import author_field
 from nurec_sim.types import Gaussians, GaussianScene, Label
 
-NAMESPACE = "nurec_sim"
 LAYER_SUFFIXES = (".usda", ".usdc", ".usd")
 STATIC_LAYER, ACTORS_LAYER, CAMERAS_LAYER = "splats_static.usdc", "splats_actors.usdc", "cameras.usdc"
 SKY_TEXTURE = "sky/envmap_latlong.exr"
@@ -151,148 +142,3 @@ def static_layer(static: Gaussians) -> bytes:
         index = np.flatnonzero(mask).astype(np.int32)
         author_field(stage, f"/Static/{name}", static[index], index)
     return crate_bytes(stage)
-
-
-def extent_of(positions: Sequence[Float32[np.ndarray, "n 3"]], scale_m: Float32[np.ndarray, "n 3"]) -> np.ndarray:
-    """Bounds [2,3] of Gaussians at any of several sets of positions, three standard deviations wide."""
-    if len(scale_m) == 0:
-        return np.zeros((2, 3), np.float32)
-    # The largest axis bounds the ellipsoid whatever its rotation.
-    margin = 3 * scale_m.max(axis=1, keepdims=True).astype(np.float64)
-    low = np.min([(p - margin).min(axis=0) for p in positions], axis=0)
-    high = np.max([(p + margin).max(axis=0) for p in positions], axis=0)
-    return _to_float32(np.stack([low, high]))
-
-
-def _to_float32(values: Float64[np.ndarray, "*n"]) -> Float32[np.ndarray, "*n"]:
-    """Nearest float32, clamped to the largest finite one."""
-    largest = np.finfo(np.float32).max
-    return np.clip(values, -largest, largest).astype(np.float32)
-
-
-def author_field(stage, path: str, gaussians: Gaussians, index: Int32[np.ndarray, " n"]):
-    """Adds Gaussians as one ParticleField.
-
-    An empty field is written for our reader, but inactive: NVIDIA's asset requirement VG.035 refuses empty fields.
-
-    Args:
-        stage: the ``Usd.Stage`` to add to.
-        path: prim path of the field.
-        gaussians: n Gaussians, in the frame of the prim.
-        index: [n] their indices in the scene's layer, by which ``gather`` restores the order.
-
-    Returns:
-        The ``UsdVol.ParticleField3DGaussianSplat`` schema object.
-    """
-    from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
-
-    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
-    rest = gaussians.sh_rest
-    dc = constant_terms(gaussians.rgb)[:, None]
-    coefficients = dc if rest is None else np.concatenate([dc, half(rest)], axis=1)
-    terms = coefficients.shape[1]
-
-    field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(gaussians.mean_m)))
-    field.CreateOrientationshAttr(Vt.QuathArray.FromNumpy(half(gaussians.quat_wxyz[:, [1, 2, 3, 0]])))
-    field.CreateScaleshAttr(Vt.Vec3hArray.FromNumpy(half(gaussians.scale_m)))
-    field.CreateOpacitieshAttr(Vt.HalfArray.FromNumpy(half(gaussians.opacity)))
-    # Degree d has (d + 1)^2 terms.
-    field.CreateRadianceSphericalHarmonicsDegreeAttr(int(np.sqrt(terms)) - 1)
-    radiance = field.CreateRadianceSphericalHarmonicsCoefficientshAttr(
-        Vt.Vec3hArray.FromNumpy(np.ascontiguousarray(coefficients.reshape(-1, 3)))
-    )
-    # ``elementSize`` values of the flat array belong to one particle.
-    radiance.SetMetadata("elementSize", terms)
-    radiance.SetMetadata("interpolation", UsdGeom.Tokens.vertex)  # the default is "constant"; VG.035 requires "vertex"
-    field.CreateSortingModeHintAttr("cameraDistance")
-    field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent_of([gaussians.mean_m], gaussians.scale_m)))
-    Usd.ColorSpaceAPI.Apply(field.GetPrim()).CreateColorSpaceNameAttr("srgb_rec709_display")
-
-    types = Sdf.ValueTypeNames
-    primvars = UsdGeom.PrimvarsAPI(field)
-    columns = [
-        ("index", types.IntArray, Vt.IntArray.FromNumpy(np.ascontiguousarray(index))),
-        ("normal", types.Normal3hArray, Vt.Vec3hArray.FromNumpy(half(gaussians.normal))),
-        ("semanticClass", types.UCharArray, Vt.UCharArray.FromNumpy(np.ascontiguousarray(gaussians.label))),
-        ("intensity", types.HalfArray, Vt.HalfArray.FromNumpy(half(gaussians.intensity))),
-    ]
-    for name, values in (("rayDrop", gaussians.ray_drop), ("falloff", gaussians.falloff)):
-        if values is not None:
-            columns.append((name, types.HalfArray, Vt.HalfArray.FromNumpy(half(values))))
-    for name, kind, array in columns:
-        primvars.CreatePrimvar(f"{NAMESPACE}:{name}", kind, UsdGeom.Tokens.vertex).Set(array)
-    if not len(gaussians):
-        field.GetPrim().SetActive(False)
-    return field
-
-
-def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Gaussians]:
-    """Reads the Gaussians of one ParticleField and their indices in the scene.
-
-    Raises:
-        ArchiveError: an attribute is missing, of another type, or of another length than the positions.
-    """
-
-    def values(name: str, dtype: type, *shape: int) -> np.ndarray:
-        """The values of an attribute; floats may be halves, which the schema names ``<name>h``."""
-        specs = (layer.GetAttributeAtPath(f"{path}.{each}") for each in (name, f"{name}h"))
-        spec = next((spec for spec in specs if spec is not None and spec.default is not None), None)
-        given = None if spec is None else np.array(spec.default)
-        allowed = (np.float32, np.float16) if dtype is np.float32 else (dtype,)
-        if given is None or given.dtype not in allowed or given.shape[1:] != shape:
-            found = "nothing" if given is None else f"{given.dtype} {given.shape}"
-            raise ArchiveError(f"{what} {path}.{name} must be {np.dtype(dtype).name} [n, {shape}], got {found}")
-        return given.astype(dtype, copy=False)
-
-    positions = values("positions", np.float32, 3)
-    n = len(positions)
-    degree = layer.GetAttributeAtPath(f"{path}.radiance:sphericalHarmonicsDegree")
-    if degree is None or degree.default not in (0, 1, 2, 3):
-        raise ArchiveError(f"{what} {path}: the spherical-harmonics degree must be 0, 1, 2 or 3")
-    terms = (degree.default + 1) ** 2
-    coefficients = values("radiance:sphericalHarmonicsCoefficients", np.float32, 3)
-    prefix = f"primvars:{NAMESPACE}:"
-    columns = {
-        "orientations": values("orientations", np.float32, 4),
-        "scales": values("scales", np.float32, 3),
-        "opacities": values("opacities", np.float32),
-        "normal": values(f"{prefix}normal", np.float32, 3),
-        "label": values(f"{prefix}semanticClass", np.uint8),
-        "intensity": values(f"{prefix}intensity", np.float32),
-        "index": values(f"{prefix}index", np.int32),
-    }
-    for name, attribute, *shape in (("rgb", "rgb", 3), ("ray_drop", "rayDrop"), ("falloff", "falloff")):
-        if layer.GetAttributeAtPath(f"{path}.{prefix}{attribute}") is not None:
-            columns[name] = values(f"{prefix}{attribute}", np.float32, *shape)
-    lengths = {name: len(column) for name, column in columns.items()} | {"coefficients": len(coefficients) / terms}
-    wrong = {name: length for name, length in lengths.items() if length != n}
-    if wrong:
-        raise ArchiveError(f"{what} {path}: {n} positions, but other counts in {wrong}")
-    coefficients = coefficients.reshape(n, terms, 3)
-    rest = np.ascontiguousarray(coefficients[:, 1:]) if terms > 1 else None
-    rgb = columns.get("rgb", colours(coefficients[:, 0]))
-    quat_wxyz = np.ascontiguousarray(columns["orientations"][:, [3, 0, 1, 2]])
-    return columns["index"], Gaussians(
-        positions, quat_wxyz, columns["scales"], columns["opacities"], rgb, columns["normal"],
-        columns["label"], columns["intensity"], rest, columns.get("ray_drop"),
-        columns.get("falloff"),
-    )  # fmt: skip
-
-
-def gather(parts: Sequence[tuple[Int32[np.ndarray, " k"], Gaussians]], count: int, what: str) -> Gaussians:
-    """Restores the scene's order of Gaussians from several fields.
-
-    Raises:
-        ArchiveError: the indices are not a permutation of 0..count-1, or the parts have different degrees.
-    """
-    places = np.concatenate([index for index, _ in parts]) if parts else np.zeros(0, np.int32)
-    if len(places) != count or not np.array_equal(np.sort(places), np.arange(count)):
-        raise ArchiveError(f"{what}: the archive promises {count:,} Gaussians, each in its place; got {len(places):,}")
-    try:
-        merged = Gaussians.concatenate([part for _, part in parts])
-    except ValueError as error:
-        raise ArchiveError(f"{what}: the fields differ in spherical-harmonics degree") from error
-    # ``places`` is a permutation; its inverse sorts the concatenated parts.
-    order = np.empty(count, np.int64)
-    order[places] = np.arange(count)
-    return merged[order]
