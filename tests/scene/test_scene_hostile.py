@@ -19,6 +19,7 @@ from nurec_sim.files.zip_package import Package, write_package
 from nurec_sim.scene import archive, archive_faults, knots, read_scene, scene_hash, write_scene
 from nurec_sim.scene.usd.actors import actors_layer
 from nurec_sim.scene.usd.layers import static_layer
+from nurec_sim.types import Label
 
 
 @pytest.fixture(scope="module")
@@ -233,9 +234,12 @@ def test_another_picture_than_a_sky(good):
 
 
 def test_a_label_that_is_none(good):
-    scene = read_scene(good)
-    scene.static.label[3] = 77
-    refused(forge(good, **{archive.STATIC_LAYER: static_layer(scene.static)}), "label.*1 of 400 are not a Label")
+    static = read_scene(good).static
+    for wrong in (77, 256 + Label.ROAD, -1):
+        labels = static.label.astype(np.int32)
+        labels[3] = wrong
+        layer = static_layer(dataclasses.replace(static, label=labels))
+        refused(forge(good, **{archive.STATIC_LAYER: layer}), "label.*1 of 400 are not a Label")
 
 
 def test_text_instead_of_an_array(good):

@@ -22,6 +22,8 @@ from nurec_sim.scene.precision import byte_levels, colours, constant_terms, from
 from nurec_sim.types import Gaussians
 
 NAMESPACE = "nurec_sim"
+_NO_LABEL = 255
+"""What numbers beyond a byte are read as; the check of the scene refuses it."""
 
 
 def extent_of(positions: Sequence[Float32[np.ndarray, "n 3"]], scale_m: Float32[np.ndarray, "n 3"]) -> np.ndarray:
@@ -137,13 +139,13 @@ def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Ga
     coefficients = floats("radiance:sphericalHarmonicsCoefficients", 3)
     prefix = f"primvars:{NAMESPACE}:"
     quat_wxyz = np.ascontiguousarray(floats("orientations", 4)[:, [3, 0, 1, 2]])
+    labels = given(f"{prefix}semanticClass", (np.int32, np.uint8))
     columns = {
         "orientations": quat_wxyz,
         "scales": floats("scales", 3),
         "opacities": floats("opacities"),
         "normal": floats(f"{prefix}normal", 3) if has(f"{prefix}normal") else third_axes(quat_wxyz),
-        # What is no byte is no label either, as the check of the scene will say.
-        "label": given(f"{prefix}semanticClass", (np.int32, np.uint8)).clip(0, 255).astype(np.uint8),
+        "label": np.where((labels < 0) | (labels > _NO_LABEL), _NO_LABEL, labels).astype(np.uint8),
         "intensity": shares(f"{prefix}intensity"),
         "index": given(f"{prefix}index", (np.int32,)),
     }
