@@ -26,6 +26,24 @@ def test_surfels_within_four_percent_of_the_front_are_averaged(behind, shown):
     assert np.count_nonzero(inverse_depth) == 1 and (index >= 0).sum() == 1
 
 
+@pytest.mark.parametrize(("degrees", "shown"), [(0, True), (90, True), (100, True), (105, False), (180, False)])
+def test_surfels_seen_from_behind_are_not_drawn(degrees, shown):
+    """They face the camera at 0, the other way at 180 degrees; what they were not measured from may hide them."""
+    angle = np.deg2rad(degrees)
+    normal = np.array([[np.sin(angle), 0.0, -np.cos(angle)]])
+    body = (looking_ahead(), np.array([[0.0, 0.0, 10.0]]), normal, np.array([1.0]), 8.0, 0)
+    inverse_depth, index = splat.draw_surfels((9, 9), [body])
+    assert (inverse_depth[4, 4] > 0) == (index[4, 4] == 0) == shown
+
+
+def test_the_ray_to_a_surfel_tells_which_side_it_shows():
+    """Seen at 45 degrees to the right, a wall that faces right, measured from there, is seen from behind."""
+    place = np.array([[3.0, 0.0, 3.0]])
+    for normal, shown in (([1.0, 0.0, 0.0], False), ([-1.0, 0.0, 0.0], True), ([0.6, 0.0, -0.8], True)):
+        body = (looking_ahead(width=41), place, np.array([normal]), np.array([1.0]), 8.0, 0)
+        assert (splat.draw_surfels((9, 41), [body])[1] == 0).any() == shown
+
+
 def seen_among(others, count):
     """What is left of a pixel at 10 m, of whose 48 neighbours so many are at the other inverse depth."""
     inverse_depth = np.full(49, 0.1, np.float32)

@@ -97,6 +97,13 @@ def test_the_view_with_the_smaller_pixels_owns_the_side_of_an_actor():
     assert kept_by_two(*side, actor=True) == [True, False]
 
 
+@pytest.mark.parametrize(("off", "stays"), [(0.0057, False), (-0.0057, False), (0.0058, True), (-0.0058, True)])
+def test_a_nearer_view_owns_a_point_only_if_it_shows_it_in_the_same_place(off, stays):
+    """From 8 m its inverse depth is 0.125, which 0.002 + 0.03 * 0.125 = 0.00575 more or less are the same as."""
+    nearer = (-2.0, 0.125 + off, 100)
+    assert owned([AGREES, nearer, AGREES, AGREES])[0] == stays
+
+
 def test_a_view_whose_pixel_is_gone_agrees_and_owns_nothing():
     nearer = (-2.0, 1 / 8, 100)
     assert not owned([AGREES, nearer])[0] and owned([AGREES, nearer], owning=False)[0]

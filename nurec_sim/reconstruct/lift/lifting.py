@@ -20,6 +20,8 @@ OWNER_RING = 0.1
 """Views own by rings of distance, each larger by exp of this."""
 MIXING = 0.3
 """Weight of another view's colour for a surface, next to 1 for the owner's."""
+AGREEING = 0.03
+"""Share by which inverse depths of a point may differ besides: who owns a point by more would show another place."""
 FARTHER = 1.5
 """Views this many times as far away as the own view resolve a surface too badly to be asked about it as others are."""
 HIDING = 2
@@ -209,8 +211,8 @@ def owned(
 
     The owner of a surface is the view in the nearest ring of distance (``_owner_distance``), rings growing by the
     factor ``exp(ring)``, and the first of these; a strict order, so that exactly one view owns it. A view agrees with a
-    point that projects well inside it if its inverse depth there is the same within ``tolerance`` plus 10 %; it looks
-    through the point if it is clearly smaller. Points are dropped if more than half as many views look through them as
+    point that projects well inside it if its inverse depth there is the same within ``tolerance`` plus ``AGREEING``; it
+    looks through the point if it is smaller. Points are dropped if more than half as many views look through them as
     agree. Matched points that no other view agrees with are dropped if any view looks through them, from however far:
     wrong depth at the edges of trees puts points in front of the sky, which often only views from farther back see
     past. They are dropped as well if ``HIDING`` views see something in front of them: depth that is matched too far
@@ -260,7 +262,7 @@ def owned(
             if farther and not matched[i]:
                 continue
             here, w = 1.0 / z, inverse_depth[k, int(v), int(u)]
-            agrees = abs(w - here) < tolerance + 0.1 * here
+            agrees = abs(w - here) < tolerance + AGREEING * here
             if farther:
                 far_agree += agrees
                 far_through += not agrees and w < here

@@ -15,6 +15,9 @@ SPLAT_RADIUS = 0.5
 WIDEST_PX, WIDEST_OF_ACTORS_PX = 8.0, 64.0
 """Drawn surfels have no larger radius: wide discs reach over trunks and bars. Actors are bodies without gaps, and a car
 in the next lane, whose surfels are 20 pixels apart, would be pierced."""
+FROM_BEHIND = 0.2
+"""Cosine between ray and normal from which on surfels are not drawn: they were measured from their other side, and what
+hides them from here, a wall higher than beams reach, may not be measured at all."""
 HIGHEST_GAP, DEEPEST_GAP = 1 / 8, 1 / 4
 """Gaps in an actor are filled up to this share of its length, if the depths of their ends differ by so little."""
 
@@ -98,14 +101,15 @@ def splat(view, rows, places, normal, spacing, widest, offset, front, total, wei
     """Splat surfels: the first pass keeps the smallest depth in ``front``, the second averages near it.
 
     Each surfel covers a disc of its spacing and takes at every pixel the depth of its tangent plane, bounded so that a
-    grazing plane does not run away. The second pass sums inverse depths within 4 % of the front, weighted by the
-    distance from the pixel's centre, so that noise does not pull surfaces forward.
+    grazing plane does not run away. Those seen from behind (``FROM_BEHIND``) are left out. The second pass sums inverse
+    depths within 4 % of the front, weighted by the distance from the pixel's centre, so that noise does not pull
+    surfaces forward.
 
     Args:
         view: [23] packed projection from the surfels' frame.
         rows: see ``project_surfels``.
         places: likewise.
-        normal: [n,3] unit normals.
+        normal: [n,3] unit normals, towards where the surfels were measured from.
         spacing: [n] distance between surfels, metres.
         widest: largest radius of a disc, pixels.
         offset: added to row numbers in ``index``.
@@ -124,7 +128,10 @@ def splat(view, rows, places, normal, spacing, widest, offset, front, total, wei
         n0 = view[5] * normal[i, 0] + view[6] * normal[i, 1] + view[7] * normal[i, 2]
         n1 = view[8] * normal[i, 0] + view[9] * normal[i, 1] + view[10] * normal[i, 2]
         n2 = view[11] * normal[i, 0] + view[12] * normal[i, 1] + view[13] * normal[i, 2]
-        along = n0 * (u - view[1]) / focal + n1 * (v - view[2]) / focal + n2
+        x, y = (u - view[1]) / focal, (v - view[2]) / focal
+        along = n0 * x + n1 * y + n2
+        if along > FROM_BEHIND * np.sqrt(x * x + y * y + 1.0):
+            continue
         w = 1.0 / depth
         # dw = w^2 dz: the tangent plane may deviate by 1.5 spacings over the slope, and by 10 % at most.
         limit = min(1.5 * spacing[i] * w * w / max(abs(along), 0.05), 0.1 * w)
