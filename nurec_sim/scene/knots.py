@@ -38,7 +38,7 @@ class DynamicKnots(NamedTuple):
 TIMES, KNOTS = "nurec_sim/dynamic_knot_t_us.npy", "nurec_sim/dynamic_knot_m.npy"
 KINDS = {TIMES: "i", KNOTS: "f"}
 """Members and the kinds of their dtypes, as for ``array_from_npy``."""
-WINDOW, MOVES, TRACK, IN_BOX = COLUMNS = ("window", "moves", "track", "in_box")
+WINDOW, MOVES, TRACK, IN_BOX = "window", "moves", "track", "in_box"
 COLUMN_KINDS = {WINDOW: "iu", MOVES: "b", TRACK: "i", IN_BOX: "b"}
 """Those of members of earlier versions."""
 
