@@ -1,8 +1,10 @@
-"""Pictures of an archive as PNG files: the sky, and what cameras see of the ego vehicle."""
+"""Pictures of an archive as PNG files: the sky, and what cameras see of the ego vehicle.
+
+OpenCV is imported where it is needed: it takes longer than everything else that a server imports to start.
+"""
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
@@ -19,6 +21,8 @@ def png_of_sky(sky: Float32[np.ndarray, "6 h h 3"]) -> bytes:
 
     Patterns of positive half floats grow with their values, so that PNG's prediction from neighbours works.
     """
+    import cv2
+
     patterns = half(sky).view(np.uint16).reshape(-1, sky.shape[2], 3)
     return bytes(cv2.imencode(".png", patterns[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, _EFFORT])[1])
 
@@ -41,6 +45,8 @@ def sky_of_png(data: bytes, where: str) -> Float32[np.ndarray, "6 h h 3"]:
 
 def png_of_ego_image(image: UInt8[np.ndarray, "h w 4"]) -> bytes:
     """An RGBA image."""
+    import cv2
+
     return bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))[1])
 
 
@@ -50,6 +56,8 @@ def ego_image_of_png(data: bytes, where: str) -> UInt8[np.ndarray, "h w 4"]:
     Raises:
         ArchiveError: not such a file; ``where`` names it.
     """
+    import cv2
+
     bgra = _pixels(data, where)
     if bgra.ndim != 3 or bgra.shape[2] != 4 or bgra.dtype != np.uint8:
         raise ArchiveError(f"{where} must be RGBA with 8 bits, got {bgra.dtype} {bgra.shape}")
@@ -57,6 +65,8 @@ def ego_image_of_png(data: bytes, where: str) -> UInt8[np.ndarray, "h w 4"]:
 
 
 def _pixels(data: bytes, where: str) -> np.ndarray:
+    import cv2
+
     try:
         return image_pixels(data, cv2.IMREAD_UNCHANGED)
     except ValueError as error:
