@@ -211,19 +211,20 @@ def check_image(data: bytes, most_pixels: int | None = None) -> tuple[int, int]:
     return width, height
 
 
-def image_pixels(data: bytes, flags: int) -> np.ndarray:
+def image_pixels(data: bytes, flags: int, most_pixels: int | None = None) -> np.ndarray:
     """The pixels of a JPEG or PNG file, channels as OpenCV gives them.
 
     Args:
         data: the file.
         flags: of ``cv2.imdecode``.
+        most_pixels: see ``check_image``.
 
     Raises:
         ValueError: it is truncated, not an image, or has too many pixels.
     """
     import cv2
 
-    check_image(data)  # decoders silently fill the missing part of a truncated file with grey
+    check_image(data, most_pixels)  # decoders silently fill the missing part of a truncated file with grey
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:

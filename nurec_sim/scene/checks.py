@@ -10,6 +10,8 @@ from nurec_sim.errors import ArchiveError
 from nurec_sim.types import GAUSSIAN_FIELDS, DynamicGaussians, Gaussians, GaussianScene, Label, Rig, Trajectory
 
 MIN_START_US = 1_000_000  # AlpaSim requests times up to half a second before the start, as unsigned integers
+MAX_FACE_TEXELS = 4096
+"""Largest edge of a face of the sky."""
 _GAUSSIAN_SHAPES = {
     "mean_m": (3,),
     "quat_wxyz": (4,),
@@ -34,8 +36,8 @@ def check_scene(scene: GaussianScene) -> None:
     _check_dynamic(scene.dynamic, len(scene.tracks))
     _check_array(scene.sky, "sky", np.float32, (6, *scene.sky.shape[1:2] * 2, 3))
     _refuse(~np.isfinite(scene.sky).reshape(6, -1).all(axis=1), "sky", "face", "not finite")
-    if scene.sky.shape[1] == 0:
-        raise ArchiveError("the sky needs faces of at least one texel")
+    if not 1 <= scene.sky.shape[1] <= MAX_FACE_TEXELS:
+        raise ArchiveError(f"the sky needs faces of 1 to {MAX_FACE_TEXELS} texels, got {scene.sky.shape[1]}")
     for camera_id, matrix in scene.isp.items():
         _check_array(matrix, f"isp[{camera_id!r}]", np.float64, (3, 4))
         if not np.isfinite(matrix).all():

@@ -10,6 +10,7 @@ from jaxtyping import Float32, UInt8
 
 from nurec_sim.errors import ArchiveError
 from nurec_sim.files.decoding import image_pixels
+from nurec_sim.scene.checks import MAX_FACE_TEXELS
 from nurec_sim.scene.precision import half
 
 _EFFORT = 3
@@ -33,7 +34,7 @@ def sky_of_png(data: bytes, where: str) -> Float32[np.ndarray, "6 h h 3"]:
     Raises:
         ArchiveError: not such a file; ``where`` names it.
     """
-    patterns = _pixels(data, where)
+    patterns = _pixels(data, where, 6 * MAX_FACE_TEXELS**2)
     height, width = patterns.shape[:2]
     if patterns.ndim != 3 or patterns.shape[2] != 3 or patterns.dtype != np.uint16 or height != 6 * width:
         raise ArchiveError(
@@ -64,10 +65,10 @@ def ego_image_of_png(data: bytes, where: str) -> UInt8[np.ndarray, "h w 4"]:
     return cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGBA)
 
 
-def _pixels(data: bytes, where: str) -> np.ndarray:
+def _pixels(data: bytes, where: str, most_pixels: int | None = None) -> np.ndarray:
     import cv2
 
     try:
-        return image_pixels(data, cv2.IMREAD_UNCHANGED)
+        return image_pixels(data, cv2.IMREAD_UNCHANGED, most_pixels)
     except ValueError as error:
         raise ArchiveError(f"{where} is not a readable PNG") from error

@@ -396,6 +396,13 @@ def test_the_faces_of_the_sky_are_archived_in_their_order(tmp_path):
     assert np.array_equal(read_scene(tmp_path / "a.usdz").sky, sky)
 
 
+def test_a_sky_that_has_more_pixels_than_an_image_may_have_is_read(tmp_path):
+    """A NuRec scene may have faces of 4096 texels; six of 2360 are more than a camera image of 7680 x 4320."""
+    sky = np.full((6, 2360, 2360, 3), 0.5, np.float32)
+    write_scene(dataclasses.replace(full_scene(0), sky=sky), tmp_path / "a.usdz")
+    assert np.array_equal(read_scene(tmp_path / "a.usdz").sky, sky)
+
+
 def scene_with_bonnet(shape=(720, 1280, 4)) -> GaussianScene:
     image = np.zeros(shape, np.uint8)
     image[-4:] = (200, 30, 40, 255)

@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float32
 
 from nurec_sim.errors import ArchiveError
+from nurec_sim.scene.checks import MAX_FACE_TEXELS
 from nurec_sim.scene.interop.columns import Columns, sigmoid
 from nurec_sim.scene.interop.found import Found
 from nurec_sim.scene.interop.nurec.state import GAUSSIANS, NurecState
 from nurec_sim.types import Label
 
 NEEDED = ("positions", "rotations", "scales", "densities", "features_albedo")
-MAX_FACE_TEXELS = 4096
 _SHOWN = 8
 _ACTIVATIONS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
     "sigmoid": sigmoid,
