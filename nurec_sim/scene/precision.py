@@ -57,7 +57,8 @@ def third_axes(quat_wxyz: Float32[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 
     """The third axis of Gaussians, at the precision of half floats."""
     w, x, y, z = np.ascontiguousarray(quat_wxyz.T, np.float64)
     axes = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z], axis=-1)
-    return half(axes / (w * w + x * x + y * y + z * z)[:, None]).astype(np.float32)
+    # What is read may be no rotation; the check of the scene will say so.
+    return half(axes / np.maximum(w * w + x * x + y * y + z * z, 1e-12)[:, None]).astype(np.float32)
 
 
 def constant_terms(rgb: Float32[np.ndarray, "n 3"]) -> Float16[np.ndarray, "n 3"]:

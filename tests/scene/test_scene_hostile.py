@@ -17,6 +17,7 @@ from scene_worlds import empty_scene, full_scene
 from nurec_sim.errors import ArchiveError
 from nurec_sim.files.zip_package import Package, write_package
 from nurec_sim.scene import archive, archive_faults, knots, read_scene, scene_hash, write_scene
+from nurec_sim.scene.precision import third_axes
 from nurec_sim.scene.usd.actors import actors_layer
 from nurec_sim.scene.usd.layers import static_layer
 from nurec_sim.types import Label
@@ -231,6 +232,13 @@ def test_another_picture_than_a_sky(good):
     refused(forge(good, **{archive.SKY: b"hello"}), "sky_cubemap.png is not a readable PNG")
     infinite = np.full((48, 8, 3), 0x7C00, np.uint16)
     refused(forge(good, **{archive.SKY: png_of(infinite)}), "sky.*not finite")
+
+
+def test_a_rotation_that_is_none(good):
+    static = read_scene(good).static
+    static.quat_wxyz[3] = 0
+    static.normal[:] = third_axes(static.quat_wxyz)
+    refused(forge(good, **{archive.STATIC_LAYER: static_layer(static)}), "quat_wxyz.*1 of 400 are not of unit length")
 
 
 def test_a_label_that_is_none(good):
