@@ -130,7 +130,7 @@ def read_field(layer, path: str, what: str) -> tuple[Int32[np.ndarray, " n"], Ga
     def has(name: str) -> bool:
         return layer.GetAttributeAtPath(f"{path}.{name}") is not None
 
-    positions = given("positions", (np.float32,), 3)
+    positions = floats("positions", 3)
     n = len(positions)
     degree = layer.GetAttributeAtPath(f"{path}.radiance:sphericalHarmonicsDegree")
     if degree is None or degree.default not in (0, 1, 2, 3):
