@@ -83,14 +83,12 @@ def encode_exr(image: np.ndarray) -> bytes:
     )
     # Channels are stored in alphabetical order, one after the other within a scan line.
     rows = np.ascontiguousarray(image[:, :, ::-1].transpose(0, 2, 1), dtype="<f2")  # [h, BGR, w]
-    blocks = [
-        struct.pack("<ii", y, len(data)) + data
-        for y in range(0, height, _BLOCK_ROWS)
-        for data in [_zip_block(rows[y : y + _BLOCK_ROWS].tobytes())]
-    ]
+    starts = range(0, height, _BLOCK_ROWS)
+    blocks = [_zip_block(rows[y : y + _BLOCK_ROWS].tobytes()) for y in starts]
+    blocks = [struct.pack("<ii", y, len(data)) + data for y, data in zip(starts, blocks, strict=True)]
     # The offset table: each block is its first y, its size in bytes, and the data.
     first = len(header) + 8 * len(blocks)
-    offsets = first + np.cumsum([0, *map(len, blocks[:-1])]).astype("<u8")
+    offsets = first + np.cumsum([0, *map(len, blocks[:-1])])
     return header + offsets.astype("<u8").tobytes() + b"".join(blocks)
 
 
