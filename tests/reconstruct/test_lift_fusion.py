@@ -182,6 +182,13 @@ def test_measured_depths_lie_between_levels():
     assert at.tolist() == [[1.25 * PRIOR_COST, -1, 3.5 * PRIOR_COST]]
 
 
+def likeness_of(picture: list[str], colours: dict[str, int]) -> tuple[np.ndarray, np.ndarray]:
+    """The signs of a picture, and how much it looks like sky; of its grey ``colours`` those above 99 are the sky's."""
+    signs = np.array([list(row) for row in picture])
+    gray = np.vectorize(colours.get)(signs).astype(np.uint8)
+    return signs, sky_pixels.sky_likeness(np.repeat(gray[..., None], 3, axis=2), gray > 99, signs != "#")
+
+
 def test_sky_reaches_the_upper_end_and_is_wider_than_a_pole():
     """A white wall below the roof, a white pole into the sky, and a lens whose last columns start at row 2."""
     picture = [
@@ -193,7 +200,27 @@ def test_sky_reaches_the_upper_end_and_is_wider_than_a_pole():
         ".wwww.....pp.....",
         ".wwww.....pp.....",
     ]
-    signs = np.array([list(row) for row in picture])
-    found = sky_pixels.sky_likeness(np.isin(signs, ["s", "w", "p"]), signs != "#")
+    signs, found = likeness_of(picture, {"s": 200, "w": 200, "p": 200, ".": 50, "#": 0})
     expected = np.select([signs == "s", signs == "w"], [depth.SKY, depth.MAYBE_SKY], depth.NOT_SKY)
     assert np.array_equal(found, expected)
+
+
+def test_sky_ends_where_a_bright_wall_begins():
+    """Clouds change the colour by 10 from a pixel to the next; the wall below differs by 13 and may be sky or not."""
+    rows = {"a": 250, "b": 240, "c": 230, "w": 217}
+    signs, found = likeness_of([each * 9 for each in "aaabbbcccwwww"], rows)
+    assert np.array_equal(found, np.where(signs == "w", depth.MAYBE_SKY, depth.SKY))
+
+
+@pytest.mark.parametrize(("wire_px", "piece_px", "gray", "expected"), [
+    (4, 11, 200, depth.SKY),
+    (5, 11, 200, depth.MAYBE_SKY),
+    (4, 10, 200, depth.MAYBE_SKY),
+    (4, 11, 213, depth.MAYBE_SKY),
+])  # fmt: skip
+def test_a_wide_piece_of_sky_across_a_wire_is_sky(wire_px, piece_px, gray, expected):
+    """A piece as bright as the sky, or 13 of 255 brighter, below a wire from side to side of the picture."""
+    picture = ["s" * 20] * 6 + ["." * 20] * wire_px + ["." * 3 + "p" * piece_px + "." * (17 - piece_px)] * piece_px
+    signs, found = likeness_of(picture, {"s": 200, ".": 50, "p": gray})
+    assert (found[signs == "s"] == depth.SKY).all()
+    assert (found[signs == "p"] == expected).all()

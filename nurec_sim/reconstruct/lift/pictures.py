@@ -84,7 +84,7 @@ def depth_pictures(
         prior, index, body = _draw(view, bodies, lidars)
         trim_silhouettes(prior, index, _gray(view))
         sky = sky_pixels.sky_coloured(view, prior, bright)
-        likeness = sky_pixels.sky_likeness(sky, view.tile.valid)
+        likeness = sky_pixels.sky_likeness(view.rgb, sky, view.tile.valid)
         around = [(views[n].packed, views[n].rgb, code(n)) for n in neighbours_of(views, k, options.neighbours)]
         dense = depth.dense_inverse_depth(
             view.packed, view.world_from_view, view.rgb, prior, likeness, around, options.inverse_depths
