@@ -52,6 +52,35 @@ def test_depths_that_agree_become_their_mean():
     assert fused(depths)[1][3, 6] == pytest.approx((0.1 + 0.102 + 0.103) / 3, rel=1e-6)
 
 
+def test_smoothing_averages_a_surface_and_keeps_its_edges_and_what_is_fixed():
+    """A wall whose columns are 1 % nearer and farther by turns, beside one of twice the depth, below the sky."""
+    depth, fixed = np.full((40, 40), 0.1, np.float32), np.zeros((40, 40), bool)
+    depth[:, ::2] *= np.exp(0.01)
+    depth[:, 1::2] *= np.exp(-0.01)
+    depth[:, 20:] = 0.05
+    depth[:10] = 0
+    fixed[25, 10] = True
+    found = fusion.smooth_surfaces(depth, fixed)
+    # Columns of the other kind differ by half a standard deviation, exp(-0.5^2 / 2) = 0.88: (1 - 0.88) / (1 + 0.88)
+    # of the noise is left, a sixteenth, as far as both kinds lie equally near.
+    inside = np.delete(np.abs(np.log(found[14:36, 5:15] / 0.1)), [25 - 14], axis=0)
+    assert inside.max() < 0.002
+    np.testing.assert_allclose(found[:, 20:], depth[:, 20:], rtol=1e-6)
+    assert not found[:10].any()
+    assert found[25, 10] == depth[25, 10]
+
+
+def test_depths_are_smoothed_between_the_first_rounds():
+    """A single view has nothing to fuse with; its noise goes all the same, once."""
+    noisy = [
+        np.where(np.arange(SHAPE[1]) % 2 == 0, WALL * 1.01, WALL / 1.01).astype(np.float32) * np.ones(SHAPE, np.float32)
+    ]
+    once = fusion.smooth_surfaces(noisy[0], np.zeros(SHAPE, bool))
+    assert np.array_equal(fused(noisy, rounds=1)[0], noisy[0])
+    assert np.array_equal(fused(noisy, rounds=2)[0], once)
+    assert np.array_equal(fused(noisy, rounds=3)[0], once)
+
+
 def test_measured_depths_stay_and_support_others():
     depths, fixed = walls(3), [np.ones(SHAPE, bool), np.zeros(SHAPE, bool), np.ones(SHAPE, bool)]
     depths[0][3, 6], depths[1][3, 6] = 0.104, 0.2

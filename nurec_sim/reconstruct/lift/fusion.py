@@ -4,12 +4,16 @@ Visibility-based fusion (Merrell et al. 2007): at each pixel the own depth compe
 The depth that most of them support wins, and becomes the mean of its supporters. A nearer surface hides what lies
 behind it, so a farther depth also needs neighbours that look through the near one. A depth that neighbours show
 nothing like is disputed: it is as likely to be wrong as theirs.
+
+What is left of the noise of a view's own depth tears surfaces: seen from elsewhere, neighbouring pixels lie apart. So
+depths are smoothed along surfaces after the first round; the rounds after it make views agree again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
@@ -31,6 +35,9 @@ AGREE = 0.05
 FARTHEST = 1e-3
 """1/m; pixels at infinity are taken to the neighbours at this inverse depth."""
 
+SMOOTH_PX, SMOOTH_SHARE = 9, 0.04
+"""Diameter of the window that depths are smoothed in, and the standard deviation of their likeness, a share of them."""
+
 
 def fused_depths(
     views: Sequence[WorkingView],
@@ -40,7 +47,7 @@ def fused_depths(
     tolerance: float,
     rounds: int,
 ) -> tuple[list[Float32[np.ndarray, "h w"]], list[Bool[np.ndarray, "h w"]]]:
-    """Inverse depths of all views after fusing them ``rounds`` times.
+    """Inverse depths of all views after fusing them ``rounds`` times, and smoothing them once between.
 
     Args:
         views: working views.
@@ -84,11 +91,25 @@ def fused_depths(
     nothing = [np.full((len(near), number.max(initial=-1) + 1), np.nan, np.float32)
                for near, number in zip(around, numbers, strict=True)]  # fmt: skip
     measured = list(in_order(lambda k: shown(k, points, nothing[k]), everyone))
-    for _ in range(rounds):
+    for done in range(rounds):
+        if done == 1:
+            before = list(in_order(lambda each: smooth_surfaces(*each), zip(before, fixed, strict=True)))
         points = points_where([number >= 0 for number in numbers])
         fused = list(in_order(one, everyone))
         before, disputed = [depth for depth, _ in fused], [mask for _, mask in fused]
     return before, disputed
+
+
+def smooth_surfaces(depth: Float32[np.ndarray, "h w"], fixed: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Inverse depth after a bilateral filter (Tomasi and Manduchi 1998) of its logarithm, but for ``fixed`` pixels.
+
+    Pixels of about the same depth are averaged, so surfaces keep their edges; the sky takes no part.
+    """
+    surface = depth > NO_SURFACE
+    nothing = np.float32(NO_SURFACE / np.e)
+    logarithm = np.log(np.where(surface, depth, nothing))
+    smooth = np.exp(cv2.bilateralFilter(logarithm, SMOOTH_PX, SMOOTH_SHARE, SMOOTH_PX / 3))
+    return np.where(surface & ~fixed, smooth, depth)
 
 
 def _numbered(mask: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "h w"]:
