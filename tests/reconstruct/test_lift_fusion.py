@@ -71,14 +71,14 @@ def test_smoothing_averages_a_surface_and_keeps_its_edges_and_what_is_fixed():
 
 
 def test_depths_are_smoothed_between_the_first_rounds():
-    """A single view has nothing to fuse with; its noise goes all the same, once."""
-    noisy = [
-        np.where(np.arange(SHAPE[1]) % 2 == 0, WALL * 1.01, WALL / 1.01).astype(np.float32) * np.ones(SHAPE, np.float32)
-    ]
-    once = fusion.smooth_surfaces(noisy[0], np.zeros(SHAPE, bool))
-    assert np.array_equal(fused(noisy, rounds=1)[0], noisy[0])
-    assert np.array_equal(fused(noisy, rounds=2)[0], once)
-    assert np.array_equal(fused(noisy, rounds=3)[0], once)
+    """Rows differ by 2 %, which fusing with the same rows of other views leaves; a view alone keeps its own."""
+    rows = np.where(np.arange(SHAPE[0]) % 2 == 0, 1.01, 1 / 1.01)[:, None]
+    noisy = [(WALL * rows * np.ones(SHAPE)).astype(np.float32) for _ in range(3)]
+    once = fusion.smooth_surfaces(noisy[1], np.zeros(SHAPE, bool))
+    assert abs(once[3, 6] - noisy[1][3, 6]) > 5e-4
+    for rounds, expected in ((1, noisy[1]), (2, once), (3, once)):
+        np.testing.assert_allclose(fused(noisy, rounds=rounds)[1][2:4, 5:8], expected[2:4, 5:8], rtol=1e-5)
+    assert np.array_equal(fused(noisy[:1], rounds=2)[0], noisy[0])
 
 
 def test_measured_depths_stay_and_support_others():

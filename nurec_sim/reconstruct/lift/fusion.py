@@ -6,7 +6,8 @@ behind it, so a farther depth also needs neighbours that look through the near o
 nothing like is disputed: it is as likely to be wrong as theirs.
 
 What is left of the noise of a view's own depth tears surfaces: seen from elsewhere, neighbouring pixels lie apart. So
-depths are smoothed along surfaces after the first round; the rounds after it make views agree again.
+depths are smoothed along surfaces after the first round; the rounds after it make views agree again. A view without
+neighbours keeps its own.
 """
 
 from __future__ import annotations
@@ -80,6 +81,9 @@ def fused_depths(
             stacked([before[n] for n in near]), surfaces[k], tolerance,
         )  # fmt: skip
 
+    def smoothed(k: int) -> np.ndarray:
+        return smooth_surfaces(before[k], fixed[k]) if around[k] else before[k]
+
     def points_where(masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         return list(in_order(lambda k: points_of(packed[k], poses[k], before[k], masks[k]), everyone))
 
@@ -93,7 +97,7 @@ def fused_depths(
     measured = list(in_order(lambda k: shown(k, points, nothing[k]), everyone))
     for done in range(rounds):
         if done == 1:
-            before = list(in_order(lambda each: smooth_surfaces(*each), zip(before, fixed, strict=True)))
+            before = list(in_order(smoothed, everyone))
         points = points_where([number >= 0 for number in numbers])
         fused = list(in_order(one, everyone))
         before, disputed = [depth for depth, _ in fused], [mask for _, mask in fused]
