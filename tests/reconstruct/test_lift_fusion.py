@@ -248,7 +248,7 @@ def test_sky_ends_where_a_bright_wall_begins():
     (4, 11, 213, depth.MAYBE_SKY),
 ])  # fmt: skip
 def test_a_wide_piece_of_sky_across_a_wire_is_sky(wire_px, piece_px, gray, expected):
-    """A piece as bright as the sky, or 13 of 255 brighter, below a wire from side to side, with a tail 4 pixels wide."""
+    """A piece as bright as the sky, or 13 of 255 brighter, below a wire across the picture; its tail has 4 pixels."""
     picture = ["s" * 20] * 6 + ["." * 20] * wire_px + ["..." + "p" * piece_px + "." * (17 - piece_px)] * piece_px
     picture += ["." * 5 + "p" * 4 + "." * 11] * 8
     signs, found = likeness_of(picture, {"s": 200, ".": 50, "p": gray})
