@@ -221,6 +221,12 @@ def test_a_wrong_pose_is_corrected(street, lifted):
 def test_steps_on_a_gpu_are_those_on_the_cpu(street, lifted, place):
     """The kernels of the GPU in place of those of the CPU, beside the same losses and the same Adam."""
     views, drawn = training_views(street, lifted, ["front"], set())[:2], []
+    # The gradient of an absolute error is a sign, which rounding decides where the scene shows what was recorded.
+    off = [dataclasses.replace(view.returns, depth_m=1.02 * view.returns.depth_m) for view in views]
+    views = [
+        dataclasses.replace(view, returns=returns, image=np.roll(view.image, 20, axis=1))
+        for view, returns in zip(views, off, strict=True)
+    ]
     frames_on_gpu = GpuFrames(launcher_at(place))
 
     def gpu_frames(camera, pair):
