@@ -49,7 +49,7 @@ def sky_likeness(
     across = _grown(upper_end, _morphed(wide, cv2.MORPH_CLOSE, WIRE_PX), _morphed(rgb, cv2.MORPH_CLOSE, WIRE_PX))
     pieces = _morphed((across & ~sky & (wide > 0)).astype(np.uint8), cv2.MORPH_OPEN, PIECE_PX)
     sky |= _grown(pieces > 0, wide, rgb)
-    return np.where(sky, SKY, np.where(coloured & (wide > 0), MAYBE_SKY, NOT_SKY)).astype(np.uint8)
+    return np.where(sky, SKY, np.where(wide > 0, MAYBE_SKY, NOT_SKY)).astype(np.uint8)
 
 
 def _morphed(picture: np.ndarray, operation: int, window_px: int) -> np.ndarray:
