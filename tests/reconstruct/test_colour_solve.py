@@ -192,3 +192,23 @@ def test_the_image_of_a_longer_lens_leaves_no_edge_in_the_sky(lifted):
     assert np.ptp(grey) > 0.03, "the long lens takes part"
     # 0.12 over the 4 degrees of the fall, and 0.24 over the 20 of the longer lens itself.
     assert steps.max() < 0.12 / 4 + 0.24 / 20
+
+
+class DarkFrame(Street):
+    """A white sky over grey hills, white as well in a frame that is taken with 0.6 of the others' exposure."""
+
+    def image(self, camera_id, index):
+        image = np.full((64, 128, 3), 255, np.uint8)
+        image[32:] = 120 * (0.6 if index == 2 else 1.0)
+        return image
+
+
+def test_a_sky_that_is_white_in_a_dark_frame_is_brighter_than_white(lifted):
+    street = DarkFrame(frames=4, cameras=(camera(width=128, height=64),))
+    sky = np.full((6, 64, 64, 3), 0.5, np.float32)
+    empty = dataclasses.replace(lifted, static=Gaussians.empty(), dynamic=DynamicGaussians.empty(), tracks=(), sky=sky)
+    solved = solved_from(dataclasses.replace(empty, rig=street.rig, isp={}), street)
+    white = sample_cubemap(solved.sky, np.array([[1.0, 0.0, 0.1]]))[0]
+    dark, usual = (solved.exposures["front"][k, :, :3].diagonal() for k in (2, 1))
+    assert (dark < 0.75 * usual).all(), "gains are pulled to 1 a little"
+    assert (dark * white > 0.97).all()

@@ -39,9 +39,9 @@ from nurec_sim.render.cpu.pipeline import NO_TABLE, Picture, blocks_in_view, dra
 from nurec_sim.render.cpu.workers import Buffers, Workers
 from nurec_sim.types import CameraModel, Clip, Gaussians, GaussianScene
 
-BRIGHTEST = 1.25
-"""Colours end here: what is white in a dark frame is brighter than white in others."""
 GAINS, OFFSETS = (0.5, 2.0), (-0.1, 0.1)
+BRIGHTEST = 1 / GAINS[0]
+"""Colours end here: what is white in the darkest frame, so that many times brighter than white in others."""
 OFFSET_PULL = 20.0
 """Offsets are pulled to 0 this much more than gains to 1: fog and glare are rarer than other exposures."""
 FIT_PX = 3

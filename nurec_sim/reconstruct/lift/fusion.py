@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
@@ -22,6 +21,7 @@ from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import kernel
 from nurec_sim.reconstruct.lift.depth import NO_SURFACE
 from nurec_sim.reconstruct.lift.lifting import stacked
+from nurec_sim.reconstruct.lift.smooth_surfaces import smooth_surfaces
 from nurec_sim.reconstruct.lift.splat import project_point, world_point
 from nurec_sim.reconstruct.lift.views import WorkingView
 
@@ -35,9 +35,6 @@ AGREE = 0.05
 """Two depths support each other within this share of the inverse depth, plus ``tolerance``."""
 FARTHEST = 1e-3
 """1/m; pixels at infinity are taken to the neighbours at this inverse depth."""
-
-SMOOTH_PX, SMOOTH_SHARE = 9, 0.04
-"""Diameter of the window that depths are smoothed in, and the standard deviation of their likeness, a share of them."""
 
 
 def fused_depths(
@@ -102,18 +99,6 @@ def fused_depths(
         fused = list(in_order(one, everyone))
         before, disputed = [depth for depth, _ in fused], [mask for _, mask in fused]
     return before, disputed
-
-
-def smooth_surfaces(depth: Float32[np.ndarray, "h w"], fixed: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Inverse depth after a bilateral filter (Tomasi and Manduchi 1998) of its logarithm, but for ``fixed`` pixels.
-
-    Pixels of about the same depth are averaged, so surfaces keep their edges; the sky takes no part.
-    """
-    surface = depth > NO_SURFACE
-    nothing = np.float32(NO_SURFACE / np.e)
-    logarithm = np.log(np.where(surface, depth, nothing))
-    smooth = np.exp(cv2.bilateralFilter(logarithm, SMOOTH_PX, SMOOTH_SHARE, SMOOTH_PX / 3))
-    return np.where(surface & ~fixed, smooth, depth)
 
 
 def _numbered(mask: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "h w"]:
