@@ -73,8 +73,22 @@ def smooth_surfaces(depth, fixed):
                 x, near = np.float32(i), np.float32(np.exp(-(i * i + j * j) / (2 * SPREAD_PX * SPREAD_PX)))
                 own = slice(max(0, -i), min(width, width - i))
                 there = slice(max(0, i), min(width, width + i))
-                _add(depth[row, own], depth[row + j, there], near, x, y, w[own], wx[own], wy[own], wxx[own], wxy[own],
-                     wyy[own], v[own], vx[own], vy[own])
+                _add(
+                    depth[row, own],
+                    depth[row + j, there],
+                    near,
+                    x,
+                    y,
+                    w[own],
+                    wx[own],
+                    wy[own],
+                    wxx[own],
+                    wxy[own],
+                    wyy[own],
+                    v[own],
+                    vx[own],
+                    vy[own],
+                )
         for column in range(width):
             own = depth[row, column]
             if fixed[row, column] or not own > NO_SURFACE:
