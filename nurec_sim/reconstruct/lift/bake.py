@@ -13,9 +13,10 @@ from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
 from nurec_sim.reconstruct.free_space import SweepBeams
 from nurec_sim.reconstruct.lift import colour, lifting, surfaces
+from nurec_sim.reconstruct.lift.backdrop import backdrop
 from nurec_sim.reconstruct.lift.blocks import block_costs, block_maxima, block_means, chosen_blocks, tolerance_for
 from nurec_sim.reconstruct.lift.bodies import Surfels
-from nurec_sim.reconstruct.lift.footprints import marked_free, on_level, outside_free_space, parts_of
+from nurec_sim.reconstruct.lift.footprints import footprints_of, marked_free, on_level, outside_free_space, parts_of
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import NOBODY, Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
@@ -237,6 +238,10 @@ def body_gaussians(
         more.append(left[nearest | in_gaps(left, nearest)])
     progress(0.8)
     parts.append(outside_free_space(Lifted.concatenate(more), body, ground, settings, beams)[0])
+    if body.actor is None and views:
+        behind = backdrop(views, pictures, rgb, colour.packed_views(views), ground, settings.views.max_depth_m)
+        behind_gaussians = footprints_of(behind, body, ground, settings)
+        parts.append(body.outside_free_space(behind_gaussians, beams, ground)[0])
     progress(0.85)
     cloud = body.cloud
     seen_rgb, pixel, through = _look_up(cloud.xyz_m, body.normal, views, pictures, rgb, body)
