@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float64, UInt8
 
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
@@ -44,7 +44,7 @@ def backdrop(
     views: Sequence[WorkingView],
     pictures: Sequence[DepthPicture],
     rgb: Sequence[UInt8[np.ndarray, "h w 3"]],
-    packed: Float32[np.ndarray, "k 23"],
+    packed: Float64[np.ndarray, "k 23"],
     ground: Ground,
     max_depth_m: float,
 ) -> Lifted:
