@@ -67,7 +67,7 @@ def backdrop(
 
     def stays(part: slice) -> np.ndarray:
         some = every[part]
-        return hidden(some.xyz_m, AROUND * some.pixel_m, some.depth_m, some.view, packed, depths)
+        return hidden(some.xyz_m, AROUND * some.pixel_m, some.depth_m, packed, depths)
 
     starts = range(0, len(every), 4096)
     kept = [np.zeros(0, bool), *in_order(lambda start: stays(slice(start, start + 4096)), starts)]
@@ -107,16 +107,15 @@ def _in_blocks(picture: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def hidden(xyz, around_m, depth, own_view, packed, inverse_depth):
+def hidden(xyz, around_m, depth, packed, inverse_depth):
     """Which points [n] all views hide that look there, with what is around them, but for one in ``SEEN`` of them.
 
-    Nor is there a view from much nearer that hides it, whose own backdrop is finer.
+    Nor does a view look there from much nearer, whose own backdrop is finer.
 
     Args:
         xyz: [n,3] points in the world, metres.
         around_m: [n] how far around them must be hidden.
         depth: [n] in their own view, metres.
-        own_view: [n] which one this is.
         packed: [k,23] projections into the views.
         inverse_depth: [k,h,w] of the views, 1/m.
     """
@@ -127,6 +126,9 @@ def hidden(xyz, around_m, depth, own_view, packed, inverse_depth):
             u, v, z = project_point(packed, k, xyz[i, 0], xyz[i, 1], xyz[i, 2])
             if z <= 0.3 or u < 0 or v < 0 or u >= packed[k, 3] or v >= packed[k, 4]:
                 continue
+            nearer = z < NEARER * depth[i]
+            if nearer:
+                break
             hides, step = True, around_m[i] / z * packed[k, 0] / 2
             for a in range(-2, 3):
                 for b in range(-2, 3):
@@ -135,6 +137,5 @@ def hidden(xyz, around_m, depth, own_view, packed, inverse_depth):
                         hides = hides and not inverse_depth[k, int(y), int(x)] * z < HIDING
             hiding += hides
             seeing += not hides
-            nearer = nearer or (hides and k != own_view[i] and z < NEARER * depth[i])
         stays[i] = not nearer and SEEN * seeing <= hiding
     return stays
