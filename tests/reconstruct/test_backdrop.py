@@ -43,16 +43,23 @@ def test_everything_around_a_backdrop_must_be_nearer(column, stays):
     assert is_hidden([wall], around_m=0.6) == stays
 
 
+def test_what_lies_around_it_outside_of_an_image_needs_not_be_hidden():
+    """6 m are 5.7 pixels: from -1.2, which is not the last column, to 10.2; columns 1 and 7 lie between."""
+    wall = np.full((9, 9), WALL, np.float32)
+    wall[:, 8] = wall[8] = 0.0
+    assert is_hidden([wall], around_m=6.0)
+
+
 @pytest.mark.parametrize(("ahead_m", "stays"), [(1.0, True), (1.1, False)])
 def test_a_view_from_much_nearer_has_a_backdrop_of_its_own(ahead_m, stays):
     """10.5 - 1.05 m is 0.9 times as far."""
     assert is_hidden([WALL, 1 / 9], [0.0, -ahead_m]) == stays
 
 
-def behind_of(depth, rgb, body=0, ground_known=False):
+def behind_of(depth, rgb, body=0, ground_known=False, valid=True):
     """The backdrop of one view with 8 x 8 pixels, a focal length of 8, 1.5 m above the ground."""
     shape, empty = depth.shape, np.zeros(depth.shape, bool)
-    tile = Tile(8, 8, 8.0, (4.0, 4.0), np.eye(3), 1, None, ~empty, np.zeros(3))
+    tile = Tile(8, 8, 8.0, (4.0, 4.0), np.eye(3), 1, None, np.broadcast_to(valid, shape).copy(), np.zeros(3))
     view = WorkingView("front", 0, 0, True, tile, LOOKING_ALONG_X, np.zeros(3), rgb)
     bodies = np.broadcast_to(np.int32(body), shape).copy()
     picture = DepthPicture(depth, bodies, np.full(shape, -1, np.int32), empty, empty)
@@ -84,6 +91,7 @@ def test_blocks_with_sky_or_another_body_have_none():
     body = np.zeros((8, 8), np.int32)
     depth[0, 0], body[0, 7] = 0.0, 1
     assert behind_of(depth, rgb, body).pixel.tolist() == [32, 36]
+    assert not len(behind_of(depth, rgb, valid=False))
 
 
 @pytest.mark.parametrize(("column", "blocks"), [(2, [4, 32, 36]), (3, [32, 36])])

@@ -24,8 +24,8 @@ def _add(depth, others, near, x, y, w, wx, wy, wxx, wxy, wyy, v, vx, vy):
     for n in range(len(depth)):
         differs = (others[n] - depth[n]) / (depth[n] * ALIKE)
         like = one - differs * differs
-        # Nor do pixels without depth, NaN, count.
-        weight = near * like * like if like > zero and others[n] > NO_SURFACE else zero
+        # Where depth is NaN the comparison is false.
+        weight = near * like * like if like > zero else zero
         value = weight * differs if weight > zero else zero
         w[n] += weight
         wx[n] += weight * x
