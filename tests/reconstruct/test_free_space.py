@@ -354,7 +354,8 @@ def test_pixels_low_over_the_road_are_moved_down_to_it_along_their_rays():
 def test_a_pixel_in_free_space_leaves_its_place_to_the_surfels_behind_it(parked):
     """A wall at 10.7 m. Matching puts the right half of the picture at 10 m, where the surfel there agrees with it.
 
-    Stripes keep blocks of pixels to two by two: four in either half.
+    Stripes keep blocks of pixels to two by two: four in either half. Behind the left half lies one more, its backdrop;
+    that of the right half would be seen through the left one.
     """
     wall = np.array([[10.7, -1.0, 0.0], [10.7, 1.0, 0.0]])
     body = body_of(wall, np.tile(np.float32([-1, 0, 0]), (2, 1)))
@@ -367,7 +368,7 @@ def test_a_pixel_in_free_space_leaves_its_place_to_the_surfels_behind_it(parked)
     picture = DepthPicture(depth, np.zeros(shape, np.int32), np.full(shape, -1, np.int32), *np.zeros((2, *shape), bool))
     settings = LiftSettings(opacity=0.5)
     pixels = body_pixels([body], [view], [picture], [rgb], settings)[0]
-    for beams, left, discs in (([], 8, 0), ([sweep_of(parked, 10.7 / directions()[:, 0])] * 3, 4, 1)):
+    for beams, left, discs in (([], 9, 0), ([sweep_of(parked, 10.7 / directions()[:, 0])] * 3, 5, 1)):
         gaussians, lifted, _ = body_gaussians(body, pixels, level_ground(), [view], [picture], [rgb], settings, beams)
         assert lifted == left and len(gaussians) - lifted == discs
     assert gaussians.mean_m[-1] == pytest.approx(wall[0])
