@@ -18,9 +18,12 @@ RIDGE = np.float32(0.5)
 
 
 @unchecked_inner
-def _add(depth, others, near, x, y, w, wx, wy, wxx, wxy, wyy, v, vx, vy):
-    """Adds pixels x and y aside, ``others`` [n], to the sums over the windows of pixels of ``depth`` [n]."""
-    zero, one = np.float32(0), np.float32(1)
+def _add(sums, first, depth, others, near, x, y):
+    """Adds pixels x and y aside, ``others`` [n], to ``sums`` [9,w] of pixels ``first`` to first + n, ``depth`` [n]."""
+    zero, one, last = np.float32(0), np.float32(1), first + len(depth)
+    w, wx, wy = sums[0, first:last], sums[1, first:last], sums[2, first:last]
+    wxx, wxy, wyy = sums[3, first:last], sums[4, first:last], sums[5, first:last]
+    v, vx, vy = sums[6, first:last], sums[7, first:last], sums[8, first:last]
     for n in range(len(depth)):
         differs = (others[n] - depth[n]) / (depth[n] * ALIKE)
         like = one - differs * differs
@@ -55,48 +58,29 @@ def smooth_surfaces(depth, fixed):
     """
     height, width = depth.shape
     smooth = depth.copy()
-    one, zero = np.float32(1), np.float32(0)
-    # Sums over the window for all pixels of a row at once, several per instruction: of weights w, of w times the
-    # column and row aside, x and y, and their squares, and of the three right-hand sides.
-    w, wx, wy = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
-    wxx, wxy, wyy = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
-    v, vx, vy = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+    one = np.float32(1)
+    # Sums over the windows of all pixels of a row at once, several per instruction: of weights w, of w times the column
+    # and row aside, x and y, and their products, and of w, w x and w y times how much the depth differs.
+    sums = np.empty((9, width), np.float32)
     for row in range(height):
-        for column in range(width):
-            w[column], wx[column], wy[column], wxx[column], wxy[column] = zero, zero, zero, zero, zero
-            wyy[column], v[column], vx[column], vy[column] = zero, zero, zero, zero
+        sums[:] = 0
         for j in range(max(-REACH_PX, -row), min(REACH_PX, height - 1 - row) + 1):
-            y = np.float32(j)
             for i in range(-REACH_PX, REACH_PX + 1):
                 if i * i + j * j > REACH_PX * REACH_PX:
                     continue
-                x, near = np.float32(i), np.float32(np.exp(-(i * i + j * j) / (2 * SPREAD_PX * SPREAD_PX)))
-                own = slice(max(0, -i), min(width, width - i))
-                there = slice(max(0, i), min(width, width + i))
-                _add(
-                    depth[row, own],
-                    depth[row + j, there],
-                    near,
-                    x,
-                    y,
-                    w[own],
-                    wx[own],
-                    wy[own],
-                    wxx[own],
-                    wxy[own],
-                    wyy[own],
-                    v[own],
-                    vx[own],
-                    vy[own],
-                )
+                near = np.float32(np.exp(-(i * i + j * j) / (2 * SPREAD_PX * SPREAD_PX)))
+                first, last = max(0, -i), min(width, width - i)
+                others = depth[row + j, first + i : last + i]
+                _add(sums, first, depth[row, first:last], others, near, np.float32(i), np.float32(j))
         for column in range(width):
             own = depth[row, column]
             if fixed[row, column] or not own > NO_SURFACE:
                 continue
             # Normal equations of value = a + b x + c y, by Cramer's rule for a.
-            xx, xy, yy = wxx[column] + RIDGE, wxy[column], wyy[column] + RIDGE
-            a, b, c = xx * yy - xy * xy, wy[column] * xy - wx[column] * yy, wx[column] * xy - wy[column] * xx
-            value = v[column] * a + vx[column] * b + vy[column] * c
-            size = w[column] * a + wx[column] * b + wy[column] * c
+            w, wx, wy = sums[0, column], sums[1, column], sums[2, column]
+            v, vx, vy = sums[6, column], sums[7, column], sums[8, column]
+            xx, xy, yy = sums[3, column] + RIDGE, sums[4, column], sums[5, column] + RIDGE
+            a, b, c = xx * yy - xy * xy, wy * xy - wx * yy, wx * xy - wy * xx
+            value, size = v * a + vx * b + vy * c, w * a + wx * b + wy * c
             smooth[row, column] = own * (one + ALIKE * value / size)
     return smooth
