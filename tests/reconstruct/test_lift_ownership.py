@@ -164,6 +164,7 @@ def test_of_pixels_in_a_gap_of_the_ground_the_nearest_stay(monkeypatch):
         return first if owns is None else (everything.view == 0) | ~owns[0].ravel()[everything.pixel]
 
     monkeypatch.setattr(bake, "_owned", owned)
+    monkeypatch.setattr(bake, "backdrop", lambda *arguments: Lifted.empty())
     gaussians, *_ = body_gaussians(body, pixels, ground, views, pictures, rgb, settings)
     assert len(gaussians) == np.count_nonzero(pixels.view == 0) > 0
 
