@@ -11,13 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import UInt8
 
 from nurec_sim import geometry
 from nurec_sim.compute.cores import in_order
 from nurec_sim.compute.kernels import kernel
-from nurec_sim.reconstruct.lift import lifting
+from nurec_sim.reconstruct.lift import colour, lifting
 from nurec_sim.reconstruct.lift.blocks import block_means
+from nurec_sim.reconstruct.lift.footprints import parts_of
 from nurec_sim.reconstruct.lift.ground import Ground
 from nurec_sim.reconstruct.lift.lifting import Lifted
 from nurec_sim.reconstruct.lift.pictures import DepthPicture
@@ -35,7 +36,7 @@ HIDING = 1.01
 AROUND = 0.6
 """How far around its centre a backdrop must be hidden, in widths of its block."""
 SEEN = 20
-"""A backdrop is dropped if more than one view in so many that hide it and one does not."""
+"""For each view that does not hide it a backdrop needs so many that do."""
 NEARER = 0.9
 """Views nearer than this share of the own depth have backdrops of their own, and smaller ones."""
 
@@ -44,7 +45,6 @@ def backdrop(
     views: Sequence[WorkingView],
     pictures: Sequence[DepthPicture],
     rgb: Sequence[UInt8[np.ndarray, "h w 3"]],
-    packed: Float64[np.ndarray, "k 23"],
     ground: Ground,
     max_depth_m: float,
 ) -> Lifted:
@@ -56,22 +56,19 @@ def backdrop(
         views: working views.
         pictures: their dense depth, in the same order.
         rgb: their canonical colours, 0..255, in the same order.
-        packed: their projections, in the same order.
         ground: of the static world.
         max_depth_m: what is farther has no backdrop.
     """
     parts = in_order(lambda k: _behind(k, views[k], pictures[k], rgb[k], max_depth_m), range(len(views)))
     every = Lifted.concatenate([Lifted.empty(), *parts])
     every = every[ground.above(every.xyz_m) > 0]
-    depths = lifting.stacked([picture.inverse_depth for picture in pictures])
+    packed, depths = colour.packed_views(views), lifting.stacked([picture.inverse_depth for picture in pictures])
 
     def stays(part: slice) -> np.ndarray:
         some = every[part]
         return hidden(some.xyz_m, AROUND * some.pixel_m, some.depth_m, packed, depths)
 
-    starts = range(0, len(every), 4096)
-    kept = [np.zeros(0, bool), *in_order(lambda start: stays(slice(start, start + 4096)), starts)]
-    return every[np.concatenate(kept)]
+    return every[np.concatenate([np.zeros(0, bool), *in_order(stays, parts_of(len(every)))])]
 
 
 def _behind(
@@ -84,7 +81,7 @@ def _behind(
     inverse, colours = _in_blocks(depth)[row, column], _in_blocks(rgb)[row, column]
     farthest = inverse.min(axis=1)
     counts = inverse < FARTHEST * farthest[:, None]
-    colour = (colours * counts[..., None]).sum(axis=1) / counts.sum(axis=1)[:, None]
+    mean = (colours * counts[..., None]).sum(axis=1) / counts.sum(axis=1)[:, None]
     moved = np.zeros_like(depth)
     for r in range(EDGE):
         for c in range(EDGE):
@@ -95,7 +92,7 @@ def _behind(
     ray = geometry.rotate_vectors(view.world_from_view[:3, :3], ray)
     ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
     z = BEHIND / farthest.astype(np.float64)
-    return Lifted(xyz, -ray, ray, z, EDGE * z / tile.focal_px, colour.astype(np.float32),
+    return Lifted(xyz, -ray, ray, z, EDGE * z / tile.focal_px, mean.astype(np.float32),
                   np.full(len(first), -1, np.int32), np.full(len(first), k, np.int32), first, edge)  # fmt: skip
 
 

@@ -239,7 +239,7 @@ def body_gaussians(
     progress(0.8)
     parts.append(outside_free_space(Lifted.concatenate(more), body, ground, settings, beams)[0])
     if body.actor is None and views:
-        behind = backdrop(views, pictures, rgb, colour.packed_views(views), ground, settings.views.max_depth_m)
+        behind = backdrop(views, pictures, rgb, ground, settings.views.max_depth_m)
         behind_gaussians = footprints_of(behind, body, ground, settings)
         parts.append(body.outside_free_space(behind_gaussians, beams, ground)[0])
     progress(0.85)
