@@ -64,9 +64,9 @@ def behind_of(depth, rgb, body=0, ground_known=False, valid=True):
     bodies = np.broadcast_to(np.int32(body), shape).copy()
     picture = DepthPicture(depth, bodies, np.full(shape, -1, np.int32), empty, empty)
     cells = np.full((100, 100), ground_known)
-    ground = Ground(np.array([0.0, -50.0]), 1.0, np.zeros((100, 100), np.float32), cells, cells, ~cells & cells,
+    ground = Ground(np.array([0.0, -50.0]), 1.0, np.zeros((100, 100), np.float32), cells, cells, np.zeros_like(cells),
                     np.ones((100, 100), np.uint8))  # fmt: skip
-    return backdrop([view], [picture], [rgb], view.packed[None], ground, 200.0)
+    return backdrop([view], [picture], [rgb], ground, 200.0)
 
 
 def test_a_block_lies_behind_its_farthest_pixels_in_their_colour():

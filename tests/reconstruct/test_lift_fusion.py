@@ -90,6 +90,7 @@ def test_depths_are_smoothed_between_the_first_rounds():
     noisy = [(WALL * rows * np.ones(SHAPE)).astype(np.float32) for _ in range(3)]
     once = fusion.smooth_surfaces(noisy[1], np.zeros(SHAPE, bool))
     assert abs(once[3, 6] - noisy[1][3, 6]) > 5e-4
+    # Windows of what the neighbours show of the next columns end at the border of the image.
     for rounds, expected in ((1, noisy[1]), (2, once), (3, once)):
         np.testing.assert_allclose(fused(noisy, rounds=rounds)[1][2:4, 5:7], expected[2:4, 5:7], rtol=1e-5)
     assert np.array_equal(fused(noisy[:1], rounds=2)[0], noisy[0])
