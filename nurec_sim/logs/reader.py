@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 from nurec_sim import plugins
 from nurec_sim.errors import ClipError, NurecSimError, UnknownFormatError
 from nurec_sim.logs.clip import Clip
+from nurec_sim.logs.clocks import with_image_clocks
 from nurec_sim.logs.consistency import EARLIEST_US, table_faults
 from nurec_sim.logs.moved import later
 from nurec_sim.logs.origins import with_origins
@@ -67,7 +68,7 @@ def read_tables(path: str | Path, reader: LogReader | str | None = None) -> Clip
             f"{path.name}: log reader {reader.name!r} must return a nurec_sim.logs.Clip, got {type(clip).__name__}"
         )
     clip.path, clip.format = path, reader.name
-    return with_origins(_late_enough(clip))
+    return with_image_clocks(with_origins(_late_enough(clip)))
 
 
 def is_log(path: Path) -> bool:

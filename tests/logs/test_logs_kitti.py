@@ -221,7 +221,8 @@ def test_a_published_drive_is_that_of_the_pack(rawlogs, realdata):
         ours, theirs = clip.rig.cameras[name], pack.rig.cameras[other]
         assert np.allclose(ours.rig_from_camera, shift @ theirs.rig_from_camera, atol=2e-6)
         assert ours.lens == theirs.lens and (ours.width_px, ours.height_px) == (theirs.width_px, theirs.height_px)
-        assert np.abs(clip.camera_times_us(name) - pack.camera_times_us(other)).max() <= 1  # the pack has seconds
+        # Offsets between stamps and poses follow from the poses, which differ; the stamps are the same.
+        assert np.abs(clip.camera_times_us(name) - pack.camera_times_us(other)).max() <= 10
         difference = clip.image(name, 4).astype(float) - pack.image(other, 4)
         assert 10 * np.log10(255**2 / np.mean(difference**2)) > 37  # the pack has JPEGs of 37.8 dB
     assert np.abs(clip.sweep_times_us("velodyne") - pack.sweep_times_us("lidar")).max() <= 1
@@ -229,7 +230,8 @@ def test_a_published_drive_is_that_of_the_pack(rawlogs, realdata):
     assert np.allclose(ours.xyz_m, theirs.xyz_m, atol=1e-6) and np.allclose(ours.intensity, theirs.intensity, atol=0.01)
     # Images were triggered by the LiDAR: the camera is where it was at the time of the sweep, not at the later stamp.
     record, sweep = clip.image_records("image_02")[3], clip.sweep_records("velodyne")[3]
-    assert record.start_us - sweep.t_us == pytest.approx(10_550, abs=20)
+    assert record.start_us - sweep.t_us == pytest.approx(0, abs=200)
+    assert clip.facts["times_of_image_02"].startswith("are those of its poses, 10.5 ms before its stamps")
     lidar_from_camera = geometry.inverse(sweep.world_from_lidar) @ record.world_from_camera[0]
     camera, lidar = clip.rig.cameras["image_02"], clip.rig.lidars["velodyne"]
     assert np.allclose(lidar_from_camera, geometry.inverse(lidar.rig_from_lidar) @ camera.rig_from_camera, atol=1e-9)
