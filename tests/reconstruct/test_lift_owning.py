@@ -201,6 +201,18 @@ def test_the_response_of_a_camera_is_not_that_of_the_glare_in_it():
     assert isp["b"] @ [0.4, 0.4, 0.4, 1] == pytest.approx([0.32] * 3, abs=0.02)
 
 
+def test_of_points_of_one_colour_a_camera_has_another_exposure_and_no_haze():
+    """Two cameras share grey asphalt, half as bright again in one of them: what is black is so in both."""
+    random = np.random.default_rng(0)
+    true = np.repeat(random.uniform(0.3, 0.4, (2000, 1)), 3, axis=1) + random.normal(0, 0.01, (2000, 3))
+    every = np.ones(2000, bool)
+    isp, _ = colour.solve_isp(
+        ["a", "b"], {"a": (true.astype(np.float32), every), "b": (1.5 * true.astype(np.float32), every)}
+    )
+    assert isp["b"] @ [0.35, 0.35, 0.35, 1] == pytest.approx([0.525] * 3, abs=0.005)
+    assert np.abs(isp["b"][:, 3]).max() < 0.01
+
+
 def test_pixels_without_depth_have_no_point_and_those_at_infinity_lie_at_1000_m():
     points = lifting.points_of(view_of(np.zeros((1, 3, 3), np.uint8)), np.array([[np.nan, 0, 0.1]], np.float32))
     assert np.isnan(points[0, 0]).all() and points[0, 1:, 0] == pytest.approx([1000, 10])

@@ -15,6 +15,8 @@ from nurec_sim.reconstruct.lift.views import WorkingView
 
 SATURATED = 0.98
 """Recorded colours above this may stand for any brighter one."""
+OFFSET_PULL = 20.0
+"""Offsets between cameras are pulled to 0 this much more than gains to those of an exposure: haze is rarer."""
 ENOUGH_SHARED = 300
 """Points that two cameras must share before their colours are compared."""
 
@@ -132,23 +134,32 @@ def solve_isp(
 
 
 def _affine(canonical: np.ndarray, shown: np.ndarray, rounds: int = 6) -> np.ndarray:
-    weight = np.ones(len(canonical))
+    # A gain per channel first, as of another exposure.
+    weight, gain = np.ones(len(canonical)), np.ones(3)
+    for _ in range(rounds):
+        square = (weight[:, None] * canonical**2).sum(axis=0)
+        gain = (weight[:, None] * canonical * shown).sum(axis=0) / np.maximum(square, 1e-9)
+        weight = _cauchy(shown - canonical * gain)
+    # Ridge towards it: points of few colours (asphalt) leave directions of the matrix undetermined. By an offset a
+    # camera could not show what is darker, so it must be clear.
+    pull = 0.02 * len(canonical) * np.diag([1.0, 1.0, 1.0, OFFSET_PULL])
+    target = np.concatenate([np.diag(gain), np.zeros((3, 1))], axis=1)
     basis = np.column_stack([canonical, np.ones(len(canonical))])
-    # Ridge towards the identity: points of few colours (asphalt) leave directions of the matrix undetermined.
-    pull = 0.02 * len(canonical)
-    target = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
     result = target
     for _ in range(rounds):
-        left = (basis * weight[:, None]).T @ basis + pull * np.diag([1.0, 1.0, 1.0, 1.0])
-        right = (basis * weight[:, None]).T @ shown + pull * target.T
+        left = (basis * weight[:, None]).T @ basis + pull
+        right = (basis * weight[:, None]).T @ shown + pull @ target.T
         result = np.linalg.solve(left, right).T
-        error = np.linalg.norm(shown - basis @ result.T, axis=1)
-        # Cauchy weights (iteratively reweighted least squares): highlights and wrong matches count little.
-        weight = 1 / (1 + (error / 0.08) ** 2)
+        weight = _cauchy(shown - basis @ result.T)
     # A camera that turned colours inside out would be a failed fit, not a camera.
     if np.linalg.det(result[:, :3]) < 0.1:
         return target
     return result
+
+
+def _cauchy(error: np.ndarray) -> np.ndarray:
+    """Weights of iteratively reweighted least squares: highlights and wrong matches count little."""
+    return 1 / (1 + (np.linalg.norm(error, axis=1) / 0.08) ** 2)
 
 
 def to_canonical(rgb: np.ndarray, isp: Float64[np.ndarray, "3 4"]) -> np.ndarray:
