@@ -20,7 +20,7 @@ from nurec_sim.evaluate.actor_scores import score_actors
 from nurec_sim.evaluate.detection.log import score_log_detections
 from nurec_sim.evaluate.image_scores import score_images
 from nurec_sim.evaluate.lidar_scores import score_free_space, score_sweeps
-from nurec_sim.logs.alignment import FACT, aligned_as, with_aligned_sweeps
+from nurec_sim.logs.alignment import FACT, aligned_as, with_aligned_sensors
 from nurec_sim.logs.held_out import HeldOut, hold_out, without_images
 from nurec_sim.logs.selection import with_tracks
 from nurec_sim.metrics.offroad_agreement import road_agreement
@@ -88,7 +88,7 @@ def evaluate(
     )
     stages = _StageClock(_part(report, 0.0, 0.6))
     if align_sweeps:
-        clip = with_aligned_sweeps(clip, held.sweeps, stages, cameras, held.images)
+        clip = with_aligned_sensors(clip, held.sweeps, stages, cameras, held.images)
     scene = reconstruct(
         without_images(clip, held), method, cameras=input_cameras, hold_out_sweeps=sorted(held.sweeps), progress=stages,
         align_sweeps=False, **options,

@@ -117,7 +117,7 @@ def reconstruct(
     if wrong:
         raise ReconstructError(f"clip {clip.id!r} has no sweeps {wrong} to hold out; have 0..{most - 1}")
 
-    from nurec_sim.logs.alignment import with_aligned_sweeps
+    from nurec_sim.logs.alignment import with_aligned_sensors
     from nurec_sim.reconstruct.movers import with_actors, with_aligned_actors
     from nurec_sim.scene.precision import archived
 
@@ -126,7 +126,7 @@ def reconstruct(
     share = 1.0 if refine is None else _start_share(refine)
     begun = 0.0
     if align_sweeps:
-        clip = with_aligned_sweeps(clip, held, report, chosen)
+        clip = with_aligned_sensors(clip, held, report, chosen)
 
     def search(done: float) -> None:
         nonlocal begun
@@ -191,15 +191,15 @@ def _with_provenance(
 
     The note says more than what methods say about logs without boxes, and replaces it.
     """
-    from nurec_sim.logs.alignment import FACT
+    from nurec_sim.logs.alignment import CAMERA_FACT, FACT
 
     known: dict[str, Any] = {"method": method, "cameras": cameras}
     if clip.time_offset_us:
         known["time_offset_us"] = clip.time_offset_us
     if aligned:
         known["aligned_tracks"] = aligned
-    if FACT in (facts := getattr(clip, "facts", {})):
-        known[FACT] = facts[FACT]
+    facts = getattr(clip, "facts", {})
+    known |= {name: facts[name] for name in (FACT, CAMERA_FACT) if name in facts}
     provenance = known | dict(scene.provenance)
     if note is not None:
         others = [text for text in provenance.get("unknown", ()) if not text.startswith("no boxes:")]

@@ -16,11 +16,11 @@ LIDAR = "lidar_top"
 ELEVATION_RAD = np.radians(np.arange(-30, 10, 0.5))
 
 
-def street(sweeps: int, camera: str | None = None) -> logs.Clip:
-    """The first sweeps of the demo log, and the images of a camera until then."""
+def street(sweeps: int, *names: str) -> logs.Clip:
+    """The first sweeps of the demo log, and the images of some cameras until then."""
     demo = logs.open_clip(Path(__file__).parents[2] / "scenarios" / "demo_clip.zip")
     records = {LIDAR: demo.sweep_records(LIDAR)[:sweeps]}
-    cameras = {} if camera is None else {camera: demo.rig.cameras[camera]}
+    cameras = {name: demo.rig.cameras[name] for name in names}
     images = {name: [r for r in demo.image_records(name) if r.end_us <= records[LIDAR][-1].t_us] for name in cameras}
     rig = Rig(cameras, demo.rig.lidars)
     return logs.Clip("street", rig, demo.ego, images, records, demo.source, tracks=demo.tracks)

@@ -5,7 +5,7 @@ Scanners are calibrated no better, nor are the angles of most poses; but every s
 near, by many beams, and every house by many images.
 """
 
-from nurec_sim.logs.alignment.align import with_aligned_sweeps
-from nurec_sim.logs.alignment.stored import FACT, aligned_as
+from nurec_sim.logs.alignment.align import with_aligned_sensors, with_aligned_sweeps
+from nurec_sim.logs.alignment.stored import CAMERA_FACT, FACT, aligned_as
 
-__all__ = ["FACT", "aligned_as", "with_aligned_sweeps"]
+__all__ = ["CAMERA_FACT", "FACT", "aligned_as", "with_aligned_sensors", "with_aligned_sweeps"]

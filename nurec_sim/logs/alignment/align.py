@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 from jaxtyping import Int64
 
+from nurec_sim.logs.alignment.cameras import with_aligned_cameras
 from nurec_sim.logs.alignment.fit import Errors, errors_of
 from nurec_sim.logs.alignment.followed import followed_points
 from nurec_sim.logs.alignment.planes import plane_points
@@ -23,6 +24,21 @@ WORSE, WORSE_M, WORSE_PX = 1.02, 0.001, 0.05
 TIMES_PER_SWEEP = 4
 MOST_TIMES = 400
 """At most so many poses are corrected, evenly chosen; those in between follow."""
+
+
+def with_aligned_sensors(
+    clip: Clip,
+    hold_out: Collection[int] = (),
+    progress: Progress = lambda stage, done: None,
+    cameras: Sequence[str] | None = None,
+    held_images: Mapping[str, Collection[int]] | None = None,
+) -> Clip:
+    """The log with its sweeps and poses aligned (``with_aligned_sweeps``), then its cameras (``with_aligned_cameras``).
+
+    Arguments and errors are those of both.
+    """
+    clip = with_aligned_sweeps(clip, hold_out, progress, cameras, held_images)
+    return with_aligned_cameras(clip, hold_out, progress, cameras, held_images)
 
 
 def with_aligned_sweeps(

@@ -15,7 +15,7 @@ from nurec_sim.logs.clip import Clip as LoadedClip
 from nurec_sim.logs.moved import corrected
 from nurec_sim.types import Clip, GaussianScene, Matrix4, Trajectory
 
-FACT = "sweep_alignment"
+FACT, CAMERA_FACT = "sweep_alignment", "camera_alignment"
 """Where ``Clip.facts``, and the provenance of scenes, say what was corrected."""
 
 
@@ -68,8 +68,14 @@ def aligned_as(clip: Clip, scene: GaussianScene) -> Clip:
     Raises:
         ClipError: the scene's provenance does not say how.
     """
+    if not isinstance(clip, LoadedClip):
+        return clip
+    return _cameras_as(_sweeps_as(clip, scene), scene)
+
+
+def _sweeps_as(clip: LoadedClip, scene: GaussianScene) -> LoadedClip:
     found = scene.provenance.get(FACT)
-    if found is None or not isinstance(clip, LoadedClip) or FACT in clip.facts:
+    if found is None or FACT in clip.facts:
         return clip
     beams = found.get("beams") if isinstance(found, Mapping) else None
     if not isinstance(beams, Mapping) or not set(beams) <= set(clip.rig.lidars) & set(scene.rig.lidars):
@@ -83,4 +89,29 @@ def aligned_as(clip: Clip, scene: GaussianScene) -> Clip:
     mountings = {name: scene.rig.lidars[name].rig_from_lidar for name in beams}
     moved = with_beams(moved, mountings, {name: errors_from(each) for name, each in beams.items()})
     moved.facts[FACT] = dict(found)
+    return moved
+
+
+def _cameras_as(clip: LoadedClip, scene: GaussianScene) -> LoadedClip:
+    found = scene.provenance.get(CAMERA_FACT)
+    if found is None or CAMERA_FACT in clip.facts:
+        return clip
+    turns = found.get("turn_deg") if isinstance(found, Mapping) else None
+    if not isinstance(turns, Mapping) or not set(turns) <= set(clip.rig.cameras) & set(scene.rig.cameras):
+        raise ClipError(f"scene {scene.id!r} says {CAMERA_FACT} of cameras that clip {clip.id!r} does not have")
+    mountings = {name: scene.rig.cameras[name].rig_from_camera for name in turns}
+    return with_mountings(clip, mountings, found)
+
+
+def with_mountings(clip: LoadedClip, mountings: Mapping[str, Matrix4], fact: Mapping[str, Any]) -> LoadedClip:
+    """The log with cameras at these mountings in the rig, and their images moved with them; ``fact`` is noted."""
+    cameras, images = dict(clip.rig.cameras), {name: clip.image_records(name) for name in clip.rig.cameras}
+    for name, mounting in mountings.items():
+        turn = geometry.inverse(cameras[name].rig_from_camera) @ mounting
+        cameras[name] = dataclasses.replace(cameras[name], rig_from_camera=mounting)
+        images[name] = tuple(
+            dataclasses.replace(record, world_from_camera=record.world_from_camera @ turn) for record in images[name]
+        )
+    moved = clip.replaced(images=images, rig=dataclasses.replace(clip.rig, cameras=cameras))
+    moved.facts[CAMERA_FACT] = dict(fact)
     return moved

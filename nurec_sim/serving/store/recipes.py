@@ -49,7 +49,7 @@ class Recipe:
             ClipError, ReconstructError, WeightsError: see ``reconstruct.reconstruct``.
         """
         from nurec_sim.logs import hold_out, open_clip, without_images
-        from nurec_sim.logs.alignment import with_aligned_sweeps
+        from nurec_sim.logs.alignment import with_aligned_sensors
         from nurec_sim.reconstruct import reconstruct
 
         chosen: dict[str, Any] = {}
@@ -65,7 +65,7 @@ class Recipe:
             cameras = self.cameras or list(clip.rig.cameras)
             held = hold_out(clip, cameras, images_every=self.hold_out_every)
             clip = without_images(
-                with_aligned_sweeps(clip, held.sweeps, cameras=cameras, held_images=held.images), held
+                with_aligned_sensors(clip, held.sweeps, cameras=cameras, held_images=held.images), held
             )
             chosen["hold_out_sweeps"] = sorted(held.sweeps)
         return reconstruct(clip, self.method, progress=progress, **chosen)

@@ -1,0 +1,149 @@
+"""Mountings of cameras corrected by what two of them show: a part of the demo log, with one camera turned."""
+
+import types
+
+import numpy as np
+import pytest
+from misaligned import street, turned
+from scipy.spatial.transform import Rotation
+
+from nurec_sim import geometry, logs
+from nurec_sim.errors import ClipError
+from nurec_sim.logs.alignment import CAMERA_FACT, aligned_as, with_aligned_sensors
+from nurec_sim.logs.alignment.cameras import disagreement_px, turns_of, with_aligned_cameras
+from nurec_sim.logs.alignment.shared import SharedFeatures, shared_features
+from nurec_sim.logs.alignment.stored import with_mountings
+from nurec_sim.types import Rig
+
+FRONT, LEFT = "camera_front", "camera_front_left"
+OFF_DEG = np.array([0.25, -0.3, 0.2])
+SWEEPS = 3
+
+
+@pytest.fixture(scope="module")
+def exact() -> logs.Clip:
+    return street(SWEEPS, FRONT, LEFT)
+
+
+def with_turned_camera(clip: logs.Clip) -> logs.Clip:
+    """The log whose calibration has the left camera, and its images, turned."""
+    mounting = clip.rig.cameras[LEFT].rig_from_camera @ turned(OFF_DEG)
+    wrong = with_mountings(clip, {LEFT: mounting}, {})
+    del wrong.facts[CAMERA_FACT]
+    return wrong
+
+
+def between(clip: logs.Clip) -> np.ndarray:
+    """The rotation from the left camera to the front one."""
+    front, left = (clip.rig.cameras[name].rig_from_camera for name in (FRONT, LEFT))
+    return (geometry.inverse(front) @ left)[:3, :3]
+
+
+def apart_deg(clip: logs.Clip, other: logs.Clip) -> float:
+    return float(np.degrees(Rotation.from_matrix(between(clip).T @ between(other)).magnitude()))
+
+
+def test_a_camera_that_is_off_agrees_with_the_other_again(exact):
+    wrong = with_turned_camera(exact)
+    assert apart_deg(wrong, exact) == pytest.approx(np.linalg.norm(OFF_DEG), abs=1e-6)
+    right = with_aligned_cameras(wrong)
+    assert apart_deg(right, exact) < 0.07
+    before, after = right.facts[CAMERA_FACT]["apart_px"]
+    assert after < 0.4 * before and CAMERA_FACT not in wrong.facts
+    # Both cameras turn, by half each: which of them is off nobody can tell.
+    turns = right.facts[CAMERA_FACT]["turn_deg"]
+    assert set(turns) == {FRONT, LEFT} and np.linalg.norm(turns[FRONT]) == pytest.approx(
+        0.5 * np.linalg.norm(OFF_DEG), rel=0.25
+    )
+    # Images turn with their camera, about its own place.
+    for name in (FRONT, LEFT):
+        mountings = [clip.rig.cameras[name].rig_from_camera for clip in (wrong, right)]
+        poses = [clip.world_from_camera(name, 1)[0] for clip in (wrong, right)]
+        assert geometry.inverse(poses[0]) @ poses[1] == pytest.approx(
+            geometry.inverse(mountings[0]) @ mountings[1], abs=1e-9
+        )
+        assert mountings[0][:3, 3] == pytest.approx(mountings[1][:3, 3])
+    assert with_aligned_cameras(right) is right
+
+
+def test_logs_that_show_nothing_wrong_stay(exact):
+    assert with_aligned_cameras(exact) is exact
+    wrong = with_turned_camera(exact)
+    assert with_aligned_cameras(wrong, cameras=[LEFT]) is wrong, "one camera"
+    assert with_aligned_cameras(wrong, hold_out=range(SWEEPS)) is wrong, "no sweep"
+    blind = wrong.replaced(rig=Rig(wrong.rig.cameras, {}), sweeps={})
+    assert with_aligned_cameras(blind) is blind
+
+
+def test_held_out_images_are_not_read(exact, monkeypatch):
+    wrong = with_turned_camera(exact)
+    read = []
+    monkeypatch.setattr(
+        wrong, "image", lambda camera, index: read.append((camera, index)) or exact.image(camera, index)
+    )
+    shared_features(wrong, [FRONT, LEFT], (), {LEFT: [0, 2]})
+    assert {index for camera, index in read if camera == LEFT} <= {1, 3} and any(camera == FRONT for camera, _ in read)
+
+
+def test_a_scene_says_how_its_log_was_aligned(exact):
+    wrong = with_turned_camera(exact)
+    right = with_aligned_sensors(wrong)
+    scene = types.SimpleNamespace(id="street", ego=right.ego, rig=right.rig, provenance=dict(right.facts))
+    again = aligned_as(wrong, scene)
+    for name in (FRONT, LEFT):
+        assert again.world_from_camera(name, 1) == pytest.approx(right.world_from_camera(name, 1), abs=1e-12)
+    assert again.facts[CAMERA_FACT] == right.facts[CAMERA_FACT] and aligned_as(again, scene) is again
+    for damaged in ("turned", {"turn_deg": 3}, {"turn_deg": {"other": [0, 0, 0]}}):
+        scene = types.SimpleNamespace(id="street", ego=right.ego, rig=right.rig, provenance={CAMERA_FACT: damaged})
+        with pytest.raises(ClipError, match="says camera_alignment of cameras that clip 'street' does not have"):
+            aligned_as(wrong, scene)
+
+
+def given_features(off_px: np.ndarray, by_depth: np.ndarray, group: np.ndarray | None = None) -> SharedFeatures:
+    """Features of camera 0 in camera 1; turns about y and x move them along x and y, those of both cameras opposite."""
+    n = len(off_px)
+    by_turn = np.zeros((n, 2, 2, 3))
+    by_turn[:, 0, :, 1], by_turn[:, 1, :, 0] = [1000.0, -1000.0], [-1000.0, 1000.0]
+    cameras = np.tile([0, 1], (n, 1))
+    return SharedFeatures(np.zeros(n, int) if group is None else group, cameras, off_px, by_turn, by_depth)
+
+
+def relative(turns: np.ndarray) -> np.ndarray:
+    """How far camera 1 turned against camera 0, milliradian; both turn alike far."""
+    assert turns[0] == pytest.approx(-turns[1])
+    return 1000 * (turns[1] - turns[0])
+
+
+def test_a_few_wrong_matches_do_not_matter():
+    """All others say 4 and 2 px, by 1000 px per radian."""
+    off = np.tile([-4.0, 2.0], (60, 1))
+    off[::5] = [25.0, -30.0]
+    given = given_features(off, np.zeros((60, 2)))
+    turns = turns_of(given, 2)
+    assert relative(turns) == pytest.approx([2, 4, 0], rel=0.05)
+    assert disagreement_px(given, turns) < 0.3
+
+
+def test_what_a_wrong_depth_explains_tells_little():
+    """Off by 20 px along the line on which a depth that is wrong by 5 % moves them."""
+    off, along = np.tile([-20.0, 2.0], (60, 1)), np.tile([400.0, 0.0], (60, 1))
+    # By exact depths the turn would be 20 mrad. Now 20 of 60 count, each with a noise of 20 px, beside the prior of
+    # 5.2 mrad for each camera, 7.4 mrad or px for both: 20^2 / 20 of variance against 7.4^2, with Cauchy weights less.
+    assert relative(turns_of(given_features(off, np.zeros((60, 2))), 2))[:2] == pytest.approx([2, 20], rel=0.05)
+    turns = relative(turns_of(given_features(off, along), 2))
+    assert turns[0] == pytest.approx(2, rel=0.05) and 7 < turns[1] < 17
+
+
+def test_many_features_of_one_pair_of_images_count_as_few():
+    """300 features of one pair say 1 px, 20 of another say 0: both count alike."""
+    off = np.concatenate([np.tile([0.0, 1.0], (300, 1)), np.zeros((20, 2))])
+    group = np.repeat([0, 1], [300, 20])
+    assert relative(turns_of(given_features(off, np.zeros((320, 2)), group), 2))[0] == pytest.approx(0.5, rel=0.1)
+
+
+def test_that_all_cameras_look_up_is_hardly_believed():
+    """Only camera 1 is seen to be off: the other one turns, against it, by as much."""
+    given = given_features(np.tile([0.0, 2.0], (60, 1)), np.zeros((60, 2)))
+    given.by_turn[:, :, 0] = 0
+    turns = 1000 * turns_of(given, 2)
+    assert turns[1, 0] == pytest.approx(2, rel=0.05) and turns[0, 0] == pytest.approx(-2, rel=0.15)
