@@ -11,27 +11,58 @@ import atexit
 import subprocess
 import sys
 from pathlib import Path
+from typing import IO
 
 from nurec_sim.compute.cores import usable_cores
 from nurec_sim.render.cpu.blend.sweep import sweep_returns
 
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None  # type: ignore[assignment]
+
 MODULE = "nurec_sim.reconstruct.small_scene"
 _started: list[subprocess.Popen] = []
+_locks: list[IO[bytes]] = []
 
 
 def compile_ahead() -> None:
     """Starts the process, once, if kernels are not compiled yet and a core is free. It ends with this process."""
-    if _started or usable_cores() < 2 or not _missing():
+    folder = cache_folder()
+    if _started or usable_cores() < 2 or folder is None or compiled(folder) or not _only_one(folder):
         return
     quiet = subprocess.DEVNULL
     _started.append(subprocess.Popen([sys.executable, "-m", MODULE], stdin=quiet, stdout=quiet, stderr=quiet))
     atexit.register(_stop, _started[0])
 
 
-def _missing() -> bool:
-    """Whether Numba's cache lacks the kernel that a reconstruction compiles last; without a cache it is never there."""
-    folder = sweep_returns.stats.cache_path  # type: ignore[attr-defined]
-    return bool(folder) and not any(Path(folder).glob(f"*.{sweep_returns.__qualname__}-*.nbi"))
+def cache_folder() -> Path | None:
+    """Where Numba keeps the kernel that a reconstruction compiles last; None if it cannot keep any."""
+    path = sweep_returns.stats.cache_path  # type: ignore[attr-defined]
+    return Path(path) if path else None
+
+
+def compiled(folder: Path) -> bool:
+    """Whether that kernel is there."""
+    return any(folder.glob(f"*.{sweep_returns.__qualname__}-*.nbi"))
+
+
+def _only_one(folder: Path) -> bool:
+    """Whether no other process has begun; from now on none does until this one ends."""
+    if fcntl is None:
+        return True
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / "ahead.lock").open("ab")
+    except OSError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        return False
+    _locks.append(lock)
+    return True
 
 
 def _stop(process: subprocess.Popen) -> None:

@@ -1,8 +1,10 @@
 """Kernels that a process beside the first reconstruction compiles ahead."""
 
+import fcntl
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,25 +27,42 @@ for kernel in kernels:
 
 
 @pytest.fixture
-def started(monkeypatch) -> list[list[str]]:
+def started(monkeypatch, tmp_path) -> Iterator[list[list[str]]]:
     """What has been started, on two cores and with kernels missing."""
     commands: list[list[str]] = []
     monkeypatch.setattr(ahead, "_started", [])
     monkeypatch.setattr(ahead, "usable_cores", lambda: 2)
-    monkeypatch.setattr(ahead, "_missing", lambda: True)
+    monkeypatch.setattr(ahead, "_locks", [])
+    monkeypatch.setattr(ahead, "cache_folder", lambda: tmp_path / "cache")
     monkeypatch.setattr(ahead.atexit, "register", lambda *arguments: None)
     monkeypatch.setattr(ahead.subprocess, "Popen", lambda command, **options: commands.append(command))
-    return commands
+    yield commands
+    for lock in ahead._locks:
+        lock.close()
 
 
 def test_one_process_is_started(started):
+    assert not ahead.compiled(ahead.cache_folder())
     ahead.compile_ahead()
     ahead.compile_ahead()
     assert started == [[sys.executable, "-m", "nurec_sim.reconstruct.small_scene"]]
 
 
-@pytest.mark.parametrize(("name", "value"), [("usable_cores", lambda: 1), ("_missing", lambda: False)])
-def test_none_is_started_without_a_core_or_need(started, monkeypatch, name, value):
+def test_none_is_started_beside_that_of_another_process(started, tmp_path):
+    (tmp_path / "cache").mkdir()
+    with (tmp_path / "cache" / "ahead.lock").open("ab") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        ahead.compile_ahead()
+        assert not started
+    ahead.compile_ahead()
+    assert len(started) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("usable_cores", lambda: 1), ("cache_folder", lambda: None), ("compiled", lambda folder: True)],
+)
+def test_none_is_started_without_a_core_a_cache_or_need(started, monkeypatch, name, value):
     monkeypatch.setattr(ahead, name, value)
     ahead.compile_ahead()
     assert not started
@@ -51,7 +70,7 @@ def test_none_is_started_without_a_core_or_need(started, monkeypatch, name, valu
 
 def test_kernels_are_missing_until_they_have_been_compiled():
     draw_small_scene()
-    assert not ahead._missing()
+    assert ahead.compiled(ahead.cache_folder())
 
 
 def test_the_small_log_passes_through_all_stages():
