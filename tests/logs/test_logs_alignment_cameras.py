@@ -47,7 +47,7 @@ def test_a_camera_that_is_off_agrees_with_the_other_again(exact):
     wrong = with_turned_camera(exact)
     assert apart_deg(wrong, exact) == pytest.approx(np.linalg.norm(OFF_DEG), abs=1e-6)
     right = with_aligned_cameras(wrong)
-    assert apart_deg(right, exact) < 0.07
+    assert apart_deg(right, exact) < 0.08
     before, after = right.facts[CAMERA_FACT]["apart_px"]
     assert after < 0.4 * before and CAMERA_FACT not in wrong.facts
     # Both cameras turn, by half each: which of them is off nobody can tell.
@@ -125,8 +125,8 @@ def test_a_few_wrong_matches_do_not_matter():
 
 
 def test_what_a_wrong_depth_explains_tells_little():
-    """Off by 20 px along the line on which a depth that is wrong by 5 % moves them."""
-    off, along = np.tile([-20.0, 2.0], (60, 1)), np.tile([400.0, 0.0], (60, 1))
+    """Off by 20 px along the line on which a depth that is wrong by 10 % moves them."""
+    off, along = np.tile([-20.0, 2.0], (60, 1)), np.tile([200.0, 0.0], (60, 1))
     # By exact depths the turn would be 20 mrad. Now 20 of 60 count, each with a noise of 20 px, beside the prior of
     # 5.2 mrad for each camera, 7.4 mrad or px for both: 20^2 / 20 of variance against 7.4^2, with Cauchy weights less.
     assert relative(turns_of(given_features(off, np.zeros((60, 2))), 2))[:2] == pytest.approx([2, 20], rel=0.05)

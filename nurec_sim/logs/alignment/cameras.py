@@ -17,7 +17,7 @@ EXPECTED_RAD = np.radians(0.3)
 """Standard deviation of how far mountings are turned from the calibration."""
 MEAN_RAD = np.radians(0.05)
 """The same of the mean of all cameras: overlaps hardly tell whether all look up, but then they are off the LiDAR."""
-PIXEL, DEPTH_SHARE = 2.0, 0.05
+PIXEL, DEPTH_SHARE = 2.0, 0.1
 """Standard deviations of where a feature is found, and of its depth: between rows of beams, and of another time."""
 ALIKE = 20
 """Features of one pair of images count for so many at most: they err alike, by poses and depths."""

@@ -22,7 +22,7 @@ from nurec_sim.errors import ClipError
 from nurec_sim.logs.clip import Clip
 from nurec_sim.logs.odometry.static_points import moving_tracks, standing
 
-MOST_SWEEPS = 8
+MOST_SWEEPS = 6
 """Sweeps, evenly over the log, at whose times images are compared."""
 APART_US = 100_000
 """Images are those nearest to a sweep, if so near."""
@@ -30,12 +30,13 @@ NEAREST_M = 2.0
 FEWEST_POINTS = 100
 """Returns that two cameras must share."""
 MARGIN_PX = 24
-FEATURES = 4_000
+FEATURES = 1_500
+"""Per image and overlap, those of most contrast."""
 SURFACE_PX, SURFACE_SHARE = 14.0, 0.03
 """A feature is as far as the three nearest returns, if within so many pixels, at depths that differ by this share."""
 SEARCH_PX = 40.0
 LIKENESS = 0.8
-"""The best match must be nearer than the second best by this factor (Lowe 2004), in both directions."""
+"""The best match must be nearer than the second best by this factor (Lowe 2004)."""
 Described = tuple[Float64[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]]
 
 
