@@ -70,17 +70,32 @@ def summary(scene: GaussianScene) -> list[tuple[str, str]]:
         ("road map", "none" if scene.road_map is None else str(scene.road_map)),
         ("method", str(scene.provenance.get("method", "unknown"))),
         *_alignment(scene.provenance.get("sweep_alignment")),
+        *_camera_alignment(scene.provenance.get("camera_alignment")),
         ("in memory", f"{sum(array.nbytes for array in arrays.values()) / 2**20:.1f} MiB"),
     ]
 
 
 def _alignment(found: object) -> list[tuple[str, str]]:
     """The row about sweeps that disagreed and were aligned."""
-    apart = found.get("apart_m") if isinstance(found, Mapping) else None
-    if not (isinstance(apart, list) and len(apart) == 2 and all(isinstance(each, float) for each in apart)):
+    if (apart := _before_and_after(found, "apart_m")) is None:
         return []
     before, after = (1000 * each for each in apart)
     return [("sweeps aligned", f"points were {before:.1f} mm off the planes that sweeps share, and are {after:.1f} mm")]
+
+
+def _camera_alignment(found: object) -> list[tuple[str, str]]:
+    """The row about cameras that disagreed and were turned."""
+    if (apart := _before_and_after(found, "apart_px")) is None:
+        return []
+    return [("cameras aligned", f"features that two share were {apart[0]:.1f} px off, and are {apart[1]:.1f} px")]
+
+
+def _before_and_after(found: object, name: str) -> list[float] | None:
+    """Two numbers of what a provenance says of an alignment; None if it does not say them."""
+    apart = found.get(name) if isinstance(found, Mapping) else None
+    if isinstance(apart, list) and len(apart) == 2 and all(isinstance(each, float) for each in apart):
+        return apart
+    return None
 
 
 def _tracks(scene: GaussianScene) -> str:

@@ -21,6 +21,7 @@ from nurec_sim.compute.cores import in_order
 from nurec_sim.errors import ClipError
 from nurec_sim.logs.clip import Clip
 from nurec_sim.logs.odometry.static_points import moving_tracks, standing
+from nurec_sim.types import Track
 
 MOST_SWEEPS = 6
 """Sweeps, evenly over the log, at whose times images are compared."""
@@ -33,7 +34,7 @@ MARGIN_PX = 24
 FEATURES = 1_500
 """Per image and overlap, those of most contrast."""
 SURFACE_PX, SURFACE_SHARE = 14.0, 0.03
-"""A feature is as far as the three nearest returns, if within so many pixels, at depths that differ by this share."""
+"""A feature is as far as the three nearest returns, if within so many pixels, and alike far up to this share."""
 SEARCH_PX = 40.0
 LIKENESS = 0.8
 """The best match must be nearer than the second best by this factor (Lowe 2004)."""
@@ -49,7 +50,7 @@ class SharedFeatures:
         cameras: numbers of both cameras.
         off_px: where it was found minus where it was expected.
         by_turn: pixels in the second image per radian of the turns of both cameras, each about its own axes.
-        by_depth: pixels in the second image per share of the depth.
+        by_depth: pixels in the second image per share of the distance from the first camera.
     """
 
     group: Int64[np.ndarray, " n"]
@@ -76,8 +77,9 @@ def shared_features(
     Raises:
         ClipError: a sweep cannot be read.
     """
-    parts = [part for found in in_order(lambda each: _at_sweep(clip, cameras, held_images, *each),
-                                        _sweeps(clip, hold_out)) for part in found]  # fmt: skip
+    moving = moving_tracks(clip)
+    at_sweeps = in_order(lambda each: _at_sweep(clip, cameras, held_images, moving, *each), _sweeps(clip, hold_out))
+    parts = [part for found in at_sweeps for part in found]
     sizes = [len(part[1]) for part in parts]
     shapes = ((2,), (2, 2, 3), (2,))
     rows = [np.concatenate([np.zeros((0, *shape)), *(part[1 + k] for part in parts)]) for k, shape in enumerate(shapes)]
@@ -94,11 +96,16 @@ def _sweeps(clip: Clip, hold_out: Collection[int]) -> list[tuple[str, int]]:
 
 
 def _at_sweep(
-    clip: Clip, cameras: Sequence[str], held_images: Mapping[str, Collection[int]], lidar: str, index: int
+    clip: Clip,
+    cameras: Sequence[str],
+    held_images: Mapping[str, Collection[int]],
+    moving: Sequence[Track],
+    lidar: str,
+    index: int,
 ) -> list[tuple]:
     """Of each pair of cameras: their numbers, and the last three fields of ``SharedFeatures``."""
     sweep = clip.sweep(lidar, index)
-    xyz = geometry.transform_points(sweep.world_from_lidar, sweep.xyz_m)[standing(clip, sweep, moving_tracks(clip))[0]]
+    xyz = geometry.transform_points(sweep.world_from_lidar, sweep.xyz_m)[standing(clip, sweep, moving)[0]]
     frames = {
         number: _frame(clip, camera, held_images.get(camera, ()), sweep.t_us) for number, camera in enumerate(cameras)
     }
@@ -171,15 +178,13 @@ def _found(first: _View, second: _View, xyz: np.ndarray, shared: np.ndarray) -> 
     mine, theirs = first.features(shared), second.features(shared)
     if mine is None or theirs is None:
         return None
-    depth = geometry.transform_points(geometry.inverse(first.pair[0]), xyz[shared])[:, 2]
+    range_m = np.linalg.norm(xyz[shared] - first.pair[0, :3, 3], axis=1)
     apart, near = cKDTree(first.uv[shared]).query(mine[0], k=3)
-    spread = depth[near.clip(max=len(depth) - 1)]
-    good = np.flatnonzero((apart[:, -1] < SURFACE_PX) & (np.ptp(spread, axis=1) < SURFACE_SHARE * spread.min(axis=1)))
-    if not len(good):
-        return None
-    rays, valid = sensors.unproject(first.clip.rig.cameras[first.camera], mine[0][good])
-    good, rays, depth = good[valid], rays[valid], spread[good[valid]].mean(axis=1)
-    points = rays / rays[:, 2:] * depth[:, None]
+    ranges_m = range_m[near]
+    alike = np.ptp(ranges_m, axis=1) < SURFACE_SHARE * ranges_m.min(axis=1)
+    rays, valid = sensors.unproject(first.clip.rig.cameras[first.camera], mine[0])
+    good = np.flatnonzero(valid & alike & (apart[:, -1] < SURFACE_PX))
+    points = rays[good] * ranges_m[good].mean(axis=1)[:, None]
     expected, seen = _shown(second, first.pair[0], points)
     match = _matches(mine[1][good], theirs, expected)
     kept = np.flatnonzero(seen & (match >= 0))
