@@ -74,6 +74,8 @@ def test_logs_that_show_nothing_wrong_stay(exact):
     assert with_aligned_cameras(wrong, hold_out=range(SWEEPS)) is wrong, "no sweep"
     blind = wrong.replaced(rig=Rig(wrong.rig.cameras, {}), sweeps={})
     assert with_aligned_cameras(blind) is blind
+    wrong.facts[CAMERA_FACT] = {}
+    assert with_aligned_cameras(wrong) is wrong, "aligned already"
 
 
 def test_held_out_images_are_not_read(exact, monkeypatch):

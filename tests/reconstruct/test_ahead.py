@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from reconstruct_street import Street
 
-from nurec_sim.reconstruct import ahead
+from nurec_sim.reconstruct import ahead, reconstruct
 from nurec_sim.reconstruct.small_scene import draw_small_scene, lift_small_log
 
 LIFTED = """
@@ -66,6 +67,18 @@ def test_none_is_started_without_a_core_a_cache_or_need(started, monkeypatch, na
     monkeypatch.setattr(ahead, name, value)
     ahead.compile_ahead()
     assert not started
+
+
+def test_a_reconstruction_begins_with_it(monkeypatch):
+    class BegunError(Exception):
+        pass
+
+    def begin() -> None:
+        raise BegunError
+
+    monkeypatch.setattr(ahead, "compile_ahead", begin)
+    with pytest.raises(BegunError):
+        reconstruct(Street(frames=2))
 
 
 def test_kernels_are_missing_until_they_have_been_compiled():

@@ -39,7 +39,7 @@ def with_aligned_cameras(
     Images turn with them. What was done is in ``Clip.facts``, under ``camera_alignment``. Arguments and errors are
     those of ``with_aligned_sweeps``; a log with one camera, or whose cameras agree or share too little, stays as it is.
     """
-    if not isinstance(clip, LoadedClip) or CAMERA_FACT in clip.facts or not clip.rig.lidars:
+    if not isinstance(clip, LoadedClip) or CAMERA_FACT in clip.facts:
         return clip
     names = [name for name in (clip.rig.cameras if cameras is None else cameras) if clip.frame_count(name)]
     if len(names) < 2:
