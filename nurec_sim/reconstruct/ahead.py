@@ -29,7 +29,7 @@ _locks: list[IO[bytes]] = []
 def compile_ahead() -> None:
     """Starts the process, once, if kernels are not compiled yet and a core is free. It ends with this process."""
     folder = cache_folder()
-    if _started or usable_cores() < 2 or folder is None or compiled(folder) or not _only_one(folder):
+    if usable_cores() < 2 or folder is None or compiled(folder) or not _only_one(folder):
         return
     quiet = subprocess.DEVNULL
     _started.append(subprocess.Popen([sys.executable, "-m", MODULE], stdin=quiet, stdout=quiet, stderr=quiet))
@@ -50,7 +50,7 @@ def compiled(folder: Path) -> bool:
 def _only_one(folder: Path) -> bool:
     """Whether no other process has begun; from now on none does until this one ends."""
     if fcntl is None:
-        return True
+        return not _started
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / "ahead.lock").open("ab")

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from nurec_sim import geometry, logs
 from nurec_sim.errors import ClipError
-from nurec_sim.logs.alignment import CAMERA_FACT, aligned_as, with_aligned_sensors
+from nurec_sim.logs.alignment import CAMERA_FACT, aligned_as, shared, with_aligned_sensors
 from nurec_sim.logs.alignment.cameras import disagreement_px, turns_of, with_aligned_cameras
 from nurec_sim.logs.alignment.shared import SharedFeatures, shared_features
 from nurec_sim.logs.alignment.stored import with_mountings
@@ -86,6 +86,28 @@ def test_held_out_images_are_not_read(exact, monkeypatch):
     )
     shared_features(wrong, [FRONT, LEFT], (), {LEFT: [0, 2]})
     assert {index for camera, index in read if camera == LEFT} <= {1, 3} and any(camera == FRONT for camera, _ in read)
+
+
+def test_images_of_other_times_are_not_compared(exact):
+    """Of the left camera only the fourth image may be read, a quarter of a second after the third sweep."""
+    assert len(shared_features(exact, [FRONT, LEFT], (), {LEFT: [1, 2]})) > 0
+    assert len(shared_features(exact, [FRONT, LEFT], (), {LEFT: [0, 1, 2]})) == 0
+
+
+def test_features_without_returns_beside_them_do_not_count(exact, monkeypatch):
+    features = len(shared_features(exact, [FRONT, LEFT], (), {}))
+    monkeypatch.setattr(shared, "SURFACE_PX", 6.0)
+    assert 0 < len(shared_features(exact, [FRONT, LEFT], (), {})) < 0.5 * features
+
+
+def test_pixels_of_features_count_from_the_corner_of_the_image():
+    """A round spot in the middle of the pixel of column 60 and row 40."""
+    rows, columns = np.indices((96, 128))
+    spot = 200 * np.exp(-((columns - 60) ** 2 + (rows - 40) ** 2) / 18)
+    ends = np.array([[30.0, 30.0], [100.0, 80.0]])
+    view = shared._View(None, "", 0, np.eye(4), ends, np.ones(2, bool), spot.astype(np.uint8))
+    points, _ = view.features(np.ones(2, bool))
+    assert points[0] == pytest.approx([60.5, 40.5], abs=0.1)
 
 
 def test_a_scene_says_how_its_log_was_aligned(exact):

@@ -166,7 +166,9 @@ class _View:
         low = np.maximum(self.uv[shared].min(axis=0).astype(int) - MARGIN_PX, 0)
         high = np.minimum(self.uv[shared].max(axis=0).astype(int) + MARGIN_PX, (width, height))
         part = self.gray[low[1] : high[1], low[0] : high[0]]
-        points, described = cv2.SIFT.create(FEATURES, contrastThreshold=0.02).detectAndCompute(part, None)
+        points, described = cv2.SIFT.create(
+            FEATURES, contrastThreshold=0.02, enable_precise_upscale=True
+        ).detectAndCompute(part, None)
         if described is None:
             return None
         # Pixel centres are at 0 there, at 0.5 here.

@@ -15,8 +15,6 @@ from nurec_sim.reconstruct.lift.views import WorkingView
 
 SATURATED = 0.98
 """Recorded colours above this may stand for any brighter one."""
-OFFSET_PULL = 20.0
-"""Offsets between cameras are pulled to 0 this much more than gains to those of an exposure: haze is rarer."""
 ENOUGH_SHARED = 300
 """Points that two cameras must share before their colours are compared."""
 
@@ -134,32 +132,25 @@ def solve_isp(
 
 
 def _affine(canonical: np.ndarray, shown: np.ndarray, rounds: int = 6) -> np.ndarray:
-    # A gain per channel first, as of another exposure.
-    weight, gain = np.ones(len(canonical)), np.ones(3)
-    for _ in range(rounds):
-        square = (weight[:, None] * canonical**2).sum(axis=0)
-        gain = (weight[:, None] * canonical * shown).sum(axis=0) / np.maximum(square, 1e-9)
-        weight = _cauchy(shown - canonical * gain)
-    # Ridge towards it: points of few colours (asphalt) leave directions of the matrix undetermined. By an offset a
-    # camera could not show what is darker, so it must be clear.
-    pull = 0.02 * len(canonical) * np.diag([1.0, 1.0, 1.0, OFFSET_PULL])
-    target = np.concatenate([np.diag(gain), np.zeros((3, 1))], axis=1)
+    weight = np.ones((len(canonical), 1))
     basis = np.column_stack([canonical, np.ones(len(canonical))])
-    result = target
+    result = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
     for _ in range(rounds):
-        left = (basis * weight[:, None]).T @ basis + pull
-        right = (basis * weight[:, None]).T @ shown + pull @ target.T
+        # A gain per channel first, as of another exposure: points of few colours (asphalt) leave directions of the
+        # matrix undetermined. With an offset instead of it a camera could not show what is darker.
+        gain = (weight * canonical * shown).sum(axis=0) / np.maximum((weight * canonical**2).sum(axis=0), 1e-9)
+        target = np.concatenate([np.diag(gain), np.zeros((3, 1))], axis=1)
+        # Ridge towards it.
+        pull = 0.02 * len(canonical)
+        left = (basis * weight).T @ basis + pull * np.eye(4)
+        right = (basis * weight).T @ shown + pull * target.T
         result = np.linalg.solve(left, right).T
-        weight = _cauchy(shown - basis @ result.T)
+        # Cauchy weights (iteratively reweighted least squares): highlights and wrong matches count little.
+        weight = 1 / (1 + (np.linalg.norm(shown - basis @ result.T, axis=1, keepdims=True) / 0.08) ** 2)
     # A camera that turned colours inside out would be a failed fit, not a camera.
     if np.linalg.det(result[:, :3]) < 0.1:
-        return target
+        return np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
     return result
-
-
-def _cauchy(error: np.ndarray) -> np.ndarray:
-    """Weights of iteratively reweighted least squares: highlights and wrong matches count little."""
-    return 1 / (1 + (np.linalg.norm(error, axis=1) / 0.08) ** 2)
 
 
 def to_canonical(rgb: np.ndarray, isp: Float64[np.ndarray, "3 4"]) -> np.ndarray:
