@@ -100,7 +100,7 @@ def test_actors_and_blind_driving_are_the_same_whatever_the_method(world, clip):
 def test_progress_names_every_stage(world):
     _, stages = world
     names = [name for name, _ in stages]
-    assert names[:2] == ["aligning sweeps", "weights"]
+    assert names[:3] == ["aligning sweeps", "aligning cameras", "weights"]
     assert any(name.startswith("chunk 1 of ") for name in names)
     assert {"merging", "tracks"} <= set(names)
     told = [fraction for _, fraction in stages]
