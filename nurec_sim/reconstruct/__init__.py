@@ -118,11 +118,9 @@ def reconstruct(
         raise ReconstructError(f"clip {clip.id!r} has no sweeps {wrong} to hold out; have 0..{most - 1}")
 
     from nurec_sim.logs.alignment import with_aligned_sensors
-    from nurec_sim.reconstruct.ahead import compile_ahead
     from nurec_sim.reconstruct.movers import with_actors, with_aligned_actors
     from nurec_sim.scene.precision import archived
 
-    compile_ahead()
     held = {int(index) for index in hold_out_sweeps}
     report = progress or (lambda stage, fraction: None)
     share = 1.0 if refine is None else _start_share(refine)
