@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -113,12 +114,13 @@ def _at_sweep(
         number: _View.of(clip, cameras[number], frame, xyz) for number, frame in frames.items() if frame is not None
     }
     found = []
-    for a in views:
-        for b in views:
-            shared = views[a].seen & views[b].seen
-            if a == b or np.count_nonzero(shared) < FEWEST_POINTS:
-                continue
-            part = _found(views[a], views[b], xyz, shared)
+    for pair in combinations(views, 2):
+        shared = views[pair[0]].seen & views[pair[1]].seen
+        if np.count_nonzero(shared) < FEWEST_POINTS:
+            continue
+        described = {number: views[number].features(shared) for number in pair}
+        for a, b in (pair, pair[::-1]):
+            part = _found(views[a], views[b], described[a], described[b], xyz, shared)
             if part is not None:
                 found.append(((a, b), *part))
     return found
@@ -175,9 +177,15 @@ class _View:
         return np.array([point.pt for point in points]) + low + 0.5, described
 
 
-def _found(first: _View, second: _View, xyz: np.ndarray, shared: np.ndarray) -> tuple | None:
-    """The last three fields of ``SharedFeatures``; None if there are none."""
-    mine, theirs = first.features(shared), second.features(shared)
+def _found(
+    first: _View,
+    second: _View,
+    mine: Described | None,
+    theirs: Described | None,
+    xyz: Float64[np.ndarray, "n 3"],
+    shared: Bool[np.ndarray, " n"],
+) -> tuple | None:
+    """The last three fields of ``SharedFeatures``, of the features of both views; None if there are none."""
     if mine is None or theirs is None:
         return None
     range_m = np.linalg.norm(xyz[shared] - first.pair[0, :3, 3], axis=1)
