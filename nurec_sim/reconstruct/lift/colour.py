@@ -134,14 +134,14 @@ def solve_isp(
 def _affine(canonical: np.ndarray, shown: np.ndarray, rounds: int = 6) -> np.ndarray:
     weight = np.ones((len(canonical), 1))
     basis = np.column_stack([canonical, np.ones(len(canonical))])
-    result = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
+    result = np.eye(3, 4)
+    pull = 0.02 * len(canonical)
     for _ in range(rounds):
         # A gain per channel first, as of another exposure: points of few colours (asphalt) leave directions of the
         # matrix undetermined. With an offset instead of it a camera could not show what is darker.
         gain = (weight * canonical * shown).sum(axis=0) / np.maximum((weight * canonical**2).sum(axis=0), 1e-9)
         target = np.concatenate([np.diag(gain), np.zeros((3, 1))], axis=1)
         # Ridge towards it.
-        pull = 0.02 * len(canonical)
         left = (basis * weight).T @ basis + pull * np.eye(4)
         right = (basis * weight).T @ shown + pull * target.T
         result = np.linalg.solve(left, right).T
@@ -149,7 +149,7 @@ def _affine(canonical: np.ndarray, shown: np.ndarray, rounds: int = 6) -> np.nda
         weight = 1 / (1 + (np.linalg.norm(shown - basis @ result.T, axis=1, keepdims=True) / 0.08) ** 2)
     # A camera that turned colours inside out would be a failed fit, not a camera.
     if np.linalg.det(result[:, :3]) < 0.1:
-        return np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
+        return np.eye(3, 4)
     return result
 
 
