@@ -54,8 +54,8 @@ class LogFlags:
     align_actors: bool = True
     """CLIP: correct tracks of moving objects by the LiDAR returns on them, as in `nurec-sim reconstruct`."""
     align_sweeps: bool = True
-    """CLIP: correct beams and poses of the log by the planes that its sweeps share, as in `nurec-sim reconstruct`; what
-    is held out takes no part, and moves with the rest."""
+    """CLIP: correct beams and poses of the log by the planes that its sweeps share, and mountings of cameras, as in
+    `nurec-sim reconstruct`; what is held out takes no part, and moves with the rest."""
     complete_actors: bool = True
     """CLIP: give actors that the sensors hardly saw a body of their class, as in `nurec-sim reconstruct`."""
     input_cameras: tuple[str, ...] = ()

@@ -70,7 +70,8 @@ def reconstruct(
         align_actors: correct tracks of moving objects so that the returns of all LiDAR sweeps on an object make one
             surface (docs/lift.md).
         align_sweeps: correct elevations of LiDAR beams, mountings of LiDARs and poses so that all sweeps see the same
-            planes and images show them where they are, if they disagree (docs/log_formats.md).
+            planes and images show them where they are, and mountings of cameras so that they show the same where they
+            overlap, if they disagree (docs/log_formats.md).
         complete_actors: give actors that the sensors hardly saw a body of their class where nothing was
             measured, so that they are seen when they or the ego drive elsewhere (docs/lift.md).
         map_from_gaussians: for a log without a map, write one for other simulators (map.xodr) with the area of the

@@ -89,8 +89,8 @@ def reconstruct(
             (``none``); ``auto`` takes the boxes, and what moves if there are none.
         align_actors: correct tracks of moving objects so that the returns of all sweeps on an object make one surface.
         align_sweeps: correct elevations of beams, mountings of LiDARs and poses of a log that was opened from disk, so
-            that all sweeps see the same planes, and images of these cameras the same points (``logs.alignment``); the
-            scene's path is the corrected one.
+            that all sweeps see the same planes, and images of these cameras the same points (``logs.alignment``), and
+            mountings of these cameras; the scene's path and rig are the corrected ones.
         complete_actors: give actors that the sensors hardly saw a body of their class (``hidden_actors``).
 
     Raises:
