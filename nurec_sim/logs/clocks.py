@@ -55,14 +55,18 @@ def _late_us(clip: Clip, camera: str) -> int:
     """How much later than their poses all images of a camera are stamped, microseconds; 0 if not clearly."""
     records = clip.image_records(camera)
     t_us = np.array([(record.start_us + record.end_us) // 2 for record in records], np.int64)
-    inside = (t_us - STEP_US >= clip.ego.start_us) & (t_us + STEP_US <= clip.ego.end_us)
-    if np.count_nonzero(inside) < FEWEST:
+    places = np.array([record.world_from_camera[:, :3, 3].mean(axis=0) for record in records]).reshape(-1, 3)
+    # Poses that are no numbers are a fault that is told elsewhere.
+    known = (
+        (t_us - STEP_US >= clip.ego.start_us) & (t_us + STEP_US <= clip.ego.end_us) & np.isfinite(places).all(axis=1)
+    )
+    if np.count_nonzero(known) < FEWEST:
         return 0
-    places = np.array([record.world_from_camera[:, :3, 3].mean(axis=0) for record in records])[inside]
+    t_us, places = t_us[known], places[known]
     late_us, speed_mps = np.zeros(len(places)), np.zeros(len(places))
     mounting = clip.rig.cameras[camera].rig_from_camera
     for _ in range(2):  # Newton's method; the path is all but straight in between
-        off_us, speed_mps = _behind(clip, mounting, t_us[inside] - np.round(late_us).astype(np.int64), places)
+        off_us, speed_mps = _behind(clip, mounting, t_us - np.round(late_us).astype(np.int64), places)
         late_us = np.clip(late_us + off_us, -2 * MOST_US, 2 * MOST_US)
     driving = speed_mps >= SLOWEST_MPS
     if np.count_nonzero(driving) < FEWEST:

@@ -70,6 +70,12 @@ def test_noise_of_single_images_does_not_matter():
     assert np.abs(np.subtract(starts(found, "left"), starts(log(0), "left"))).max() <= 1_500
 
 
+def test_a_pose_that_is_no_number_tells_nothing():
+    given = log(10_500)
+    given.image_records("left")[5].world_from_camera[:] = np.nan
+    assert starts(with_image_clocks(given), "left") == pytest.approx(starts(log(0), "left"), abs=20)
+
+
 @pytest.mark.parametrize(
     "given",
     [
