@@ -1,4 +1,4 @@
-"""Mountings of cameras turned so that cameras agree where their fields of view overlap."""
+"""Mountings of cameras turned and shifted so that cameras agree where their fields of view overlap."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from nurec_sim.types import Clip, Progress
 
 EXPECTED_RAD = np.radians(0.3)
 """Standard deviation of how far mountings are turned from the calibration."""
-MEAN_RAD = np.radians(0.05)
-"""The same of the mean of all cameras: overlaps hardly tell whether all look up, but then they are off the LiDAR."""
+EXPECTED_M = 0.05
+"""The same of how far they are shifted: what is near is then off by more pixels than what is far."""
+MEAN_RAD, MEAN_M = np.radians(0.05), 0.01
+"""Both of the mean of all cameras: overlaps hardly tell whether all look up, but then they are off the LiDAR."""
 PIXEL, DEPTH_SHARE = 2.0, 0.1
 """Standard deviations of where a feature is found, and of its depth: between rows of beams, and of another time."""
 ALIKE = 20
@@ -34,9 +36,9 @@ def with_aligned_cameras(
     cameras: Sequence[str] | None = None,
     held_images: Mapping[str, Collection[int]] | None = None,
 ) -> Clip:
-    """The log with mountings of cameras turned so that they show the same where their fields of view overlap.
+    """The log with mountings of cameras moved so that they show the same where their fields of view overlap.
 
-    Images turn with them. What was done is in ``Clip.facts``, under ``camera_alignment``. Arguments and errors are
+    Images move with them. What was done is in ``Clip.facts``, under ``camera_alignment``. Arguments and errors are
     those of ``with_aligned_sweeps``; a log with one camera, or whose cameras agree or share too little, stays as it is.
     """
     if not isinstance(clip, LoadedClip) or CAMERA_FACT in clip.facts:
@@ -48,24 +50,28 @@ def with_aligned_cameras(
     features = shared_features(clip, names, hold_out, held_images or {})
     if len(features) < FEWEST:
         return clip
-    turns = turns_of(features, len(names))
-    before, after = disagreement_px(features), disagreement_px(features, turns)
+    moves = moves_of(features, len(names))
+    before, after = disagreement_px(features), disagreement_px(features, moves)
     if after > BETTER * before:
         return clip
     fact = {
         "apart_px": [before, after],
-        "turn_deg": {name: np.degrees(turn).round(5).tolist() for name, turn in zip(names, turns, strict=True)},
+        "turn_deg": {name: np.degrees(move[:3]).round(5).tolist() for name, move in zip(names, moves, strict=True)},
+        "shift_m": {name: move[3:].round(5).tolist() for name, move in zip(names, moves, strict=True)},
     }
     mountings = {
-        name: clip.rig.cameras[name].rig_from_camera @ geometry.pose(rotation(turn), np.zeros(3))
-        for name, turn in zip(names, turns, strict=True)
+        name: clip.rig.cameras[name].rig_from_camera @ geometry.pose(rotation(move[:3]), move[3:])
+        for name, move in zip(names, moves, strict=True)
     }
     return with_mountings(clip, mountings, fact)
 
 
-def turns_of(features: SharedFeatures, count: int) -> Float64[np.ndarray, "count 3"]:
-    """Turns of cameras, each about its own axes (radian), by robust least squares with a prior of no turn."""
-    turns = np.zeros((count, 3))
+def moves_of(features: SharedFeatures, count: int) -> Float64[np.ndarray, "count 6"]:
+    """Turns (radian) and shifts (metres) of cameras, each about and along its own axes.
+
+    By robust least squares with a prior of none.
+    """
+    moves = np.zeros((count, 6))
     sizes = np.bincount(features.group)[features.group]
     share = np.minimum(ALIKE / sizes, 1.0)
     # Along the line on which a wrong depth moves a feature it tells less.
@@ -73,25 +79,26 @@ def turns_of(features: SharedFeatures, count: int) -> Float64[np.ndarray, "count
     noise = PIXEL**2 * np.eye(2) + along[:, :, None] * along[:, None]
     whiten = np.linalg.cholesky(np.linalg.inv(noise)).transpose(0, 2, 1)
     n = len(features)
-    rows = np.zeros((n, 2, count, 3))
+    rows = np.zeros((n, 2, count, 6))
     for k in range(2):
-        rows[np.arange(n), :, features.cameras[:, k]] += features.by_turn[:, :, k]
+        rows[np.arange(n), :, features.cameras[:, k]] += features.by_mounting[:, :, k]
     rows = whiten @ rows.reshape(n, 2, -1)
     off = (whiten @ features.off_px[:, :, None])[..., 0]
-    prior = np.eye(3 * count) / EXPECTED_RAD**2 + np.tile(np.eye(3), (count, count)) / (count * MEAN_RAD) ** 2
+    own, mean = (np.diag(np.repeat(each, 3) ** -2.0) for each in ((EXPECTED_RAD, EXPECTED_M), (MEAN_RAD, MEAN_M)))
+    prior = np.kron(np.eye(count), own) + np.kron(np.ones((count, count)), mean) / count**2
     for _ in range(ROUNDS):
-        left = off - rows @ turns.reshape(-1)
+        left = off - rows @ moves.reshape(-1)
         # Cauchy weights: features that are not the same, or not on the surface that the LiDAR saw.
         weight = share / (1 + (left**2).sum(axis=1))
         weighted = rows * weight[:, None, None]
         normal = np.einsum("nki,nkj->ij", weighted, rows) + prior
-        turns = np.linalg.solve(normal, np.einsum("nki,nk->i", weighted, off)).reshape(count, 3)
-    return turns
+        moves = np.linalg.solve(normal, np.einsum("nki,nk->i", weighted, off)).reshape(count, 6)
+    return moves
 
 
-def disagreement_px(features: SharedFeatures, turns: Float64[np.ndarray, "count 3"] | None = None) -> float:
-    """Median distance of features from where they are expected, pixels, with cameras turned."""
+def disagreement_px(features: SharedFeatures, moves: Float64[np.ndarray, "count 6"] | None = None) -> float:
+    """Median distance of features from where they are expected, pixels, with cameras moved."""
     left = features.off_px
-    if turns is not None:
-        left = left - np.einsum("nkci,nci->nk", features.by_turn, turns[features.cameras])
+    if moves is not None:
+        left = left - np.einsum("nkci,nci->nk", features.by_mounting, moves[features.cameras])
     return float(np.median(np.linalg.norm(left, axis=1)))

@@ -37,6 +37,8 @@ FEATURES = 1_500
 SURFACE_PX, SURFACE_SHARE = 14.0, 0.03
 """A feature is as far as the three nearest returns, if within so many pixels, and alike far up to this share."""
 SEARCH_PX = 40.0
+STEP = 1e-4
+"""Of derivatives: radian, metres, share of the distance."""
 LIKENESS = 0.8
 """The best match must be nearer than the second best by this factor (Lowe 2004)."""
 Described = tuple[Float64[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]]
@@ -50,14 +52,15 @@ class SharedFeatures:
         group: number of the pair of images, by which they err alike.
         cameras: numbers of both cameras.
         off_px: where it was found minus where it was expected.
-        by_turn: pixels in the second image per radian of the turns of both cameras, each about its own axes.
+        by_mounting: pixels in the second image per radian and metre by which both cameras are turned and shifted, each
+            about and along its own axes; the point is where the LiDAR saw the surface.
         by_depth: pixels in the second image per share of the distance from the first camera.
     """
 
     group: Int64[np.ndarray, " n"]
     cameras: Int64[np.ndarray, "n 2"]
     off_px: Float64[np.ndarray, "n 2"]
-    by_turn: Float64[np.ndarray, "n 2 2 3"]
+    by_mounting: Float64[np.ndarray, "n 2 2 6"]
     by_depth: Float64[np.ndarray, "n 2"]
 
     def __len__(self) -> int:
@@ -82,7 +85,7 @@ def shared_features(
     at_sweeps = in_order(lambda each: _at_sweep(clip, cameras, held_images, moving, *each), _sweeps(clip, hold_out))
     parts = [part for found in at_sweeps for part in found]
     sizes = [len(part[1]) for part in parts]
-    shapes = ((2,), (2, 2, 3), (2,))
+    shapes = ((2,), (2, 2, 6), (2,))
     rows = [np.concatenate([np.zeros((0, *shape)), *(part[1 + k] for part in parts)]) for k, shape in enumerate(shapes)]
     pairs = np.array([part[0] for part in parts], np.int64).reshape(-1, 2)
     return SharedFeatures(np.repeat(np.arange(len(parts)), sizes), np.repeat(pairs, sizes, axis=0), *rows)
@@ -201,21 +204,24 @@ def _found(
     if not len(kept):
         return None
     points, expected = points[kept], expected[kept]
-    step = 1e-4
-    by_turn = np.zeros((len(kept), 2, 2, 3))
-    for axis in range(3):
-        turn = rotation(step * np.eye(3)[axis])
-        by_turn[:, :, 0, axis] = (_shown(second, first.pair[0], points @ turn.T)[0] - expected) / step
-        by_turn[:, :, 1, axis] = (_shown(second, first.pair[0], points, turn)[0] - expected) / step
-    by_depth = (_shown(second, first.pair[0], points * (1 + step))[0] - expected) / step
+    by_mounting = np.zeros((len(kept), 2, 2, 6))
+    along = points / np.linalg.norm(points, axis=1, keepdims=True)
+    for axis, part in enumerate(STEP * np.eye(3)):
+        turn, shift = geometry.pose(rotation(part), np.zeros(3)), geometry.pose(np.eye(3), part)
+        # The LiDAR tells where the surface is: from a camera that is further ahead it is as much nearer.
+        shifted = points + part - (along @ part)[:, None] * along
+        for column, there, move in ((axis, points @ turn[:3, :3].T, turn), (3 + axis, shifted, shift)):
+            by_mounting[:, :, 0, column] = (_shown(second, first.pair[0], there)[0] - expected) / STEP
+            by_mounting[:, :, 1, column] = (_shown(second, first.pair[0], points, move)[0] - expected) / STEP
+    by_depth = (_shown(second, first.pair[0], points * (1 + STEP))[0] - expected) / STEP
     off = theirs[0][match[kept]] - expected
-    finite = np.isfinite(by_turn).all(axis=(1, 2, 3)) & np.isfinite(by_depth).all(axis=1)
-    return off[finite], by_turn[finite], by_depth[finite]
+    finite = np.isfinite(by_mounting).all(axis=(1, 2, 3)) & np.isfinite(by_depth).all(axis=1)
+    return off[finite], by_mounting[finite], by_depth[finite]
 
 
-def _shown(view: _View, world_from_first: np.ndarray, points: np.ndarray, turn: np.ndarray | None = None) -> tuple:
-    """Pixels in a view, maybe turned, of points in the frame of another camera, and which it shows."""
-    pair = view.pair if turn is None else view.pair @ geometry.pose(turn, np.zeros(3))
+def _shown(view: _View, world_from_first: np.ndarray, points: np.ndarray, move: np.ndarray | None = None) -> tuple:
+    """Pixels in a view, maybe moved, of points in the frame of another camera, and which it shows."""
+    pair = view.pair if move is None else view.pair @ move
     uv, seen, _ = sensors.project_rolling(
         view.clip.rig.cameras[view.camera], pair, geometry.transform_points(world_from_first, points)
     )

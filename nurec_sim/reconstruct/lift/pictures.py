@@ -18,6 +18,7 @@ from nurec_sim.reconstruct.lift.bodies import Surfels
 from nurec_sim.reconstruct.lift.edges import trim_edges
 from nurec_sim.reconstruct.lift.fusion import FARTHEST, fused_depths
 from nurec_sim.reconstruct.lift.lifting import NOBODY, STATIC
+from nurec_sim.reconstruct.lift.neighbours import in_colours_of, neighbours_of, views_beside
 from nurec_sim.reconstruct.lift.settings import LiftSettings
 from nurec_sim.reconstruct.lift.splat import (
     WIDEST_OF_ACTORS_PX,
@@ -86,6 +87,8 @@ def depth_pictures(
         sky = sky_pixels.sky_coloured(view, prior, bright)
         likeness = sky_pixels.sky_likeness(view.rgb, sky, view.tile.valid)
         around = [(views[n].packed, views[n].rgb, code(n)) for n in neighbours_of(views, k, options.neighbours)]
+        if options.neighbours:
+            around += [(views[n].packed, in_colours_of(view, views[n], prior), code(n)) for n in views_beside(views, k)]
         dense = depth.dense_inverse_depth(
             view.packed, view.world_from_view, view.rgb, prior, likeness, around, options.inverse_depths
         )
@@ -225,21 +228,3 @@ def _along(box_from_world, k, axis, x, y, z):
         + box_from_world[k, axis, 2] * z
         + box_from_world[k, axis, 3]
     )
-
-
-def neighbours_of(views: Sequence[WorkingView], k: int, count: int) -> list[int]:
-    """Views to match view k against: alike in direction and time, 0.25 to 8 m away and best about 1.5 m."""
-    mine = views[k]
-    scored = []
-    for n, other in enumerate(views):
-        move = other.world_from_view[:3, 3] - mine.world_from_view[:3, 3]
-        base = float(np.linalg.norm(move))
-        facing = float(other.world_from_view[:3, 2] @ mine.world_from_view[:3, 2])
-        if n == k or not 0.25 < base < 8.0 or facing < 0.9:
-            continue
-        ahead = float(move @ mine.world_from_view[:3, 2])
-        # A short baseline does not resolve depth, a long one changes the appearance; ties go to views from farther
-        # back, whose images contain this one's surroundings.
-        score = abs(np.log(base / 1.5)) + 2 * (1 - facing) + 0.3 * abs(other.t_us - mine.t_us) / 1e6
-        scored.append((score + (0.05 if ahead > 0 else 0.0), n))
-    return [n for _, n in sorted(scored)[:count]]
