@@ -59,6 +59,37 @@ def test_narrow_dents_are_closed(width: int, closed: bool):
     assert (rows[85 : 75 + width] == (TOP if closed else 75)).all()
 
 
+@pytest.mark.parametrize(
+    ("cut", "bottom", "street_seen", "closed"),
+    [(0.5, 0.5, 0.0, True), (0.5, 1.0, 0.0, False), (0.5, 0.5, 0.2, False), (0.0, 0.5, 0.0, False)],
+)
+def test_wide_dents_are_closed_where_the_paint_mirrors_an_edge(
+    cut: float, bottom: float, street_seen: float, closed: bool
+):
+    """40 columns: an edge that goes on across the dent, one at its bottom, and what in it speaks for the street."""
+    ego, street, edges, near = maps()
+    edges[TOP, 80:120], edges[75, 80:120] = cut, bottom
+    street[TOP:75, 80:120] = street_seen
+    rows = first_rows(vehicle_below(ego, street, edges, near))
+    assert (rows[:80] == TOP).all() and (rows[120:] == TOP).all()
+    assert (rows[85:115] == (TOP if closed else 75)).all()
+
+
+def test_dents_of_a_slanted_boundary_are_closed_along_its_slope():
+    """One row down every four columns; a dent of 12 columns, 15 rows deep."""
+    ego, street, edges, near = maps()
+    rows, columns = np.indices((HEIGHT, WIDTH))
+    side = 30 + columns[0] // 4
+    ego, street = (rows > side + 15) * 1.0, (rows < side - 5) * 1.0
+    edges[:] = 0
+    edges[side, columns[0]] = 1.0
+    # Closed along its rows, the dent would be closed up to its lower end, two rows below the upper one.
+    street[:, 90:102] = rows[:, 90:102] < side[90:102] + 15
+    edges[:, 90:102] = rows[:, 90:102] == side[90:102] + 15
+    found = first_rows(vehicle_below(ego, street, edges, near))
+    assert np.abs(found - side).max() <= 1
+
+
 @pytest.mark.parametrize("doubt", ["too little evidence", "contradicted", "too small"])
 def test_what_is_in_doubt_is_no_vehicle(doubt: str):
     ego, street, edges, near = maps()

@@ -20,6 +20,9 @@ ACROSS = 2.0
 """What an edge across the motion costs per pixel if it is left to the street, where the same line would move."""
 DENT = 0.08
 """Dents of the boundary that are closed are narrower than this part of the image."""
+WIDE_DENT, SPEAKS, AS_STRONG, NEAR_PX = 0.25, 0.05, 0.9, 2
+"""The same of dents that an edge cuts off which is as strong as the one at their bottom, by this share of it and within
+so many rows, and whose pixels hardly speak for the street: edges of what the paint mirrors stay at their places."""
 FOOT, FOOT_PX = 0.25, 6
 """An edge reaches as far as this part of its strength at the boundary, and at most so many rows."""
 SMALLEST_SHARE = 0.01
@@ -51,7 +54,7 @@ def vehicle_below(ego: Map, street: Map, edges: Map, near: Bool[np.ndarray, "h w
     below = np.vstack([np.cumsum((street + PRIOR)[::-1], axis=0)[::-1], none])
     cost = above + below - EDGE * np.vstack([edges, none])
     cost[np.arange(height + 1)[:, None] < _first_row(near)] = np.inf
-    mask = _outwards(_closed(_least_cost(cost), height), edges)
+    mask = _outwards(_closed(_least_cost(cost), street, edges), edges)
     labels, count, area = _parts(mask)
     of_ego, of_street = (np.bincount(labels.ravel(), weights=w.ravel(), minlength=count) for w in (ego, street))
     good = (area >= SMALLEST_SHARE * mask.size) & (of_ego >= LEAST_EVIDENCE * area)
@@ -127,11 +130,29 @@ def _running_minimum(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return least, np.maximum.accumulate(np.where(values <= least, np.arange(len(values)), 0))
 
 
-def _closed(rows: Int64[np.ndarray, " w"], height: int) -> Int64[np.ndarray, " w"]:
-    """The boundary without dents narrower than ``DENT`` of its length."""
-    width = 2 * round(DENT * len(rows) / 2) + 1
-    heights = cv2.morphologyEx((height - rows)[None].astype(np.float32), cv2.MORPH_CLOSE, np.ones((1, width)))
-    return height - heights[0].astype(int)
+def _closed(rows: Int64[np.ndarray, " w"], street: Map, edges: Map) -> Int64[np.ndarray, " w"]:
+    """The boundary without dents narrower than ``DENT``, or than ``WIDE_DENT`` if they look like the vehicle."""
+    height, width = street.shape
+    rows = _without_dents(rows, height, DENT)
+    wide = _without_dents(rows, height, WIDE_DENT)
+    columns, around = np.arange(width), cv2.dilate(edges, np.ones((2 * NEAR_PX + 1, 1)))
+    above = np.vstack([np.zeros(width), np.cumsum(street, axis=0)])
+    dents = cv2.connectedComponents((wide < rows).astype(np.uint8)[None])[1][0]
+    cut, bottom = (around[np.minimum(each, height - 1), columns] for each in (wide, rows))
+    speaks, area, cut, bottom = (
+        np.bincount(dents, each) for each in (above[rows, columns] - above[wide, columns], rows - wide, cut, bottom)
+    )
+    good = (speaks <= SPEAKS * area) & (cut >= AS_STRONG * bottom)
+    return np.where(good[dents], wide, rows)
+
+
+def _without_dents(rows: Int64[np.ndarray, " w"], height: int, part: float) -> Int64[np.ndarray, " w"]:
+    """The boundary without dents narrower than a part of its length, seen along its slope: a car's side is slanted."""
+    width, columns = 2 * round(part * len(rows) / 2) + 1, np.arange(len(rows))
+    slope = np.polyfit(columns, rows, 1)[0]
+    heights = (height - rows + slope * columns)[None].astype(np.float32)
+    closed = cv2.morphologyEx(heights, cv2.MORPH_CLOSE, np.ones((1, width)))[0] - slope * columns
+    return np.minimum(rows, height - np.rint(closed).astype(int))
 
 
 def _outwards(rows: Int64[np.ndarray, " w"], edges: Map) -> Bool[np.ndarray, "h w"]:
