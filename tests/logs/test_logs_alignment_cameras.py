@@ -65,7 +65,9 @@ def test_a_camera_that_is_off_agrees_with_the_other_again(exact):
         assert geometry.inverse(poses[0]) @ poses[1] == pytest.approx(
             geometry.inverse(mountings[0]) @ mountings[1], abs=1e-9
         )
-        assert np.linalg.norm(mountings[0][:3, 3] - mountings[1][:3, 3]) < 0.02, "nothing was shifted"
+        moved = geometry.inverse(mountings[0]) @ mountings[1]
+        assert moved[:3, 3] == pytest.approx(right.facts[CAMERA_FACT]["shift_m"][name], abs=1e-5)
+        assert 1e-4 < np.linalg.norm(moved[:3, 3]) < 0.02, "nothing was shifted"
     assert with_aligned_cameras(right) is right
 
 
@@ -207,6 +209,9 @@ def test_that_all_cameras_look_up_is_hardly_believed():
     given.by_mounting[:, :, 0] = 0
     turns = 1000 * moves_of(given, 2)
     assert turns[1, 0] == pytest.approx(2, rel=0.05) and turns[0, 0] == pytest.approx(-2, rel=0.15)
+    given.by_mounting[:, 1, 1, 4], given.by_mounting[:, :, 1, :3] = 100.0, 0.0
+    shifts = 100 * moves_of(given, 2)
+    assert shifts[1, 4] == pytest.approx(2, rel=0.1) and shifts[0, 4] == pytest.approx(-2, rel=0.2)
 
 
 def test_a_summary_of_a_scene_tells_it():

@@ -61,18 +61,18 @@ def test_narrow_dents_are_closed(width: int, closed: bool):
 
 @pytest.mark.parametrize(
     ("cut", "bottom", "street_seen", "closed"),
-    [(0.5, 0.5, 0.0, True), (0.5, 1.0, 0.0, False), (0.5, 0.5, 0.2, False), (0.0, 0.5, 0.0, False)],
+    [(0.5, 0.55, 0.0, True), (0.5, 0.6, 0.0, False), (0.5, 0.55, 0.2, False), (0.0, 0.5, 0.0, False)],
 )
 def test_wide_dents_are_closed_where_the_paint_mirrors_an_edge(
     cut: float, bottom: float, street_seen: float, closed: bool
 ):
     """40 columns: an edge that goes on across the dent, one at its bottom, and what in it speaks for the street."""
     ego, street, edges, near = maps()
-    edges[TOP, 80:120], edges[75, 80:120] = cut, bottom
-    street[TOP:75, 80:120] = street_seen
+    edges[TOP, 80:120], edges[TOP + 2, 80:120], edges[70, 80:120] = 0.0, cut, bottom
+    street[TOP:70, 80:120] = street_seen
     rows = first_rows(vehicle_below(ego, street, edges, near))
     assert (rows[:80] == TOP).all() and (rows[120:] == TOP).all()
-    assert (rows[85:115] == (TOP if closed else 75)).all()
+    assert (rows[85:115] == (TOP if closed else 70)).all()
 
 
 def test_dents_of_a_slanted_boundary_are_closed_along_its_slope():

@@ -30,7 +30,7 @@ def test_views_beside_are_of_other_cameras_that_look_elsewhere_and_share_somethi
         view_of("front"),
         view_of("front", 1.0, 40),  # the same camera
         view_of("near", 0.2, 40),  # too near to tell depth
-        view_of("far", 8.5, 40),
+        view_of("far", -8.5, 30),
         view_of("tele", 0.5, 10),  # looks the same way, to be matched as such
         view_of("side", 0.5, 90),  # fields of 77 degrees do not meet
         view_of("masked", 0.5, 40, valid=np.zeros((SIZE, SIZE), bool)),

@@ -53,7 +53,7 @@ class SharedFeatures:
         cameras: numbers of both cameras.
         off_px: where it was found minus where it was expected.
         by_mounting: pixels in the second image per radian and metre by which both cameras are turned and shifted, each
-            about and along its own axes; the point is where the LiDAR saw the surface.
+            about and along its own axes.
         by_depth: pixels in the second image per share of the distance from the first camera.
     """
 
@@ -205,12 +205,10 @@ def _found(
         return None
     points, expected = points[kept], expected[kept]
     by_mounting = np.zeros((len(kept), 2, 2, 6))
-    along = points / np.linalg.norm(points, axis=1, keepdims=True)
     for axis, part in enumerate(STEP * np.eye(3)):
         turn, shift = geometry.pose(rotation(part), np.zeros(3)), geometry.pose(np.eye(3), part)
-        # The LiDAR tells where the surface is: from a camera that is further ahead it is as much nearer.
-        shifted = points + part - (along @ part)[:, None] * along
-        for column, there, move in ((axis, points @ turn[:3, :3].T, turn), (3 + axis, shifted, shift)):
+        for column, move in ((axis, turn), (3 + axis, shift)):
+            there = geometry.transform_points(move, points)
             by_mounting[:, :, 0, column] = (_shown(second, first.pair[0], there)[0] - expected) / STEP
             by_mounting[:, :, 1, column] = (_shown(second, first.pair[0], points, move)[0] - expected) / STEP
     by_depth = (_shown(second, first.pair[0], points * (1 + STEP))[0] - expected) / STEP
