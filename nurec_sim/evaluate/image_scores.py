@@ -111,7 +111,7 @@ def image_request(clip: Clip, camera: str, index: int) -> SensorRequest:
 
 
 def summarized(frames: Sequence[FrameScore]) -> dict[str, object]:
-    """Means over frames; regions and holes pooled over pixels and points."""
+    """Means over frames, of all and of each camera; regions and holes pooled over pixels and points."""
     regions = {
         name: _psnr_of(sum(f.regions[name][0] for f in frames if name in f.regions),
                        sum(f.regions[name][1] for f in frames if name in f.regions))
@@ -128,6 +128,10 @@ def summarized(frames: Sequence[FrameScore]) -> dict[str, object]:
         "flip": _mean(frame.flip for frame in frames),
         "sharpness": {name: _mean(frame.sharpness[name] for frame in frames) for name in OCTAVES},
         "region_psnr_db": regions,
+        "camera_psnr_db": {
+            camera: _mean(frame.psnr_db for frame in frames if frame.camera == camera)
+            for camera in dict.fromkeys(frame.camera for frame in frames)
+        },
         "holes": holes,
         "worst": [
             f"{f.camera}_{f.index:04d}" for f in sorted(frames, key=lambda f: (f.psnr_db, f.camera, f.index))[:3]

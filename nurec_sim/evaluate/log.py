@@ -136,8 +136,8 @@ def score_scene(
         - ``image``: ``psnr_db`` and ``ssim`` over all frames; under ``seen`` and ``unseen`` those of the frames that
           the scene was made from and of the others, with ``flip``, ``sharpness`` (spectral energy by octave, as a part
           of the recorded image's), ``region_psnr_db`` (labelled actors, background, around LiDAR points by range),
-          ``holes`` (share of LiDAR points with alpha < 0.5, by range) and the ``worst`` frames; per camera the
-          per-frame lists and ``floor``: copying the seen image nearest in time.
+          ``camera_psnr_db``, ``holes`` (share of LiDAR points with alpha < 0.5, by range) and the ``worst`` frames; per
+          camera the per-frame lists and ``floor``: copying the seen image nearest in time.
         - ``lidar``: of the sweeps held out (``lidar_scores.score_sweeps``), None if there are none.
         - ``free_space``: false obstacles beside the path (``lidar_scores.score_free_space``), None without LiDAR.
         - ``actors``: found actors against the log's boxes (``actor_scores.score_actors``), None without either.

@@ -9,12 +9,13 @@ from reconstruct_street import Street, camera
 from nurec_sim import geometry
 from nurec_sim.errors import ReconstructError
 from nurec_sim.evaluate import lidar_scores, log, score_scene
-from nurec_sim.evaluate.image_scores import image_request
+from nurec_sim.evaluate.image_scores import FrameScore, image_request, summarized
 from nurec_sim.evaluate.log_regions import actor_mask, seen_points
+from nurec_sim.evaluate.log_tables import figure_rows
 from nurec_sim.evaluate.scores.flip import flip, flip_map
 from nurec_sim.evaluate.scores.free_space import FiredSweep, RecordedBeams, false_obstacles
 from nurec_sim.evaluate.scores.lidar import CloudScore, LidarScore, copied_sweep
-from nurec_sim.evaluate.scores.sharpness import octave_energy, sharpness
+from nurec_sim.evaluate.scores.sharpness import OCTAVES, octave_energy, sharpness
 from nurec_sim.evaluate.scores.surfaces import KINDS, surfaces_of
 from nurec_sim.logs import hold_out, without_images
 from nurec_sim.reconstruct import LiftSettings, ViewSettings, reconstruct
@@ -226,6 +227,19 @@ def test_seen_and_unseen_frames_are_told_apart(figures):
     assert set(image["unseen"]["worst"]) <= unseen
     per_frame = image["cameras"]["left"]["per_frame"]["psnr_db"]
     assert image["seen"]["psnr_db"] == pytest.approx(np.mean([per_frame[k] for k in (0, 1, 3, 4)]))
+
+
+def test_several_cameras_have_their_own_figures():
+    octaves = dict.fromkeys(OCTAVES, 1.0)
+    frames = [FrameScore(camera, k, True, psnr_db, 0.9, sharpness=octaves)
+              for k, (camera, psnr_db) in enumerate([("front", 30.0), ("left", 20.0), ("front", 32.0)])]  # fmt: skip
+    rest = {"lidar": None, "free_space": None, "road": None, "counts": {"static": 1, "dynamic": 1}, "seconds": {}}
+    for some, expected in ((frames, {"front": "31.00", "left": "20.00"}), (frames[::2], {})):
+        rows = figure_rows({"image": {"seen": summarized(some)}, **rest})
+        found = {
+            row.name.removeprefix("PSNR, ").removesuffix(" (dB)"): row.text for row in rows if "PSNR, " in row.name
+        }
+        assert found == expected
 
 
 def test_a_scene_has_few_holes_and_one_without_gaussians_only_holes(figures):
