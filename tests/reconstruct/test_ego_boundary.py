@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nurec_sim.reconstruct.ego_vehicle.boundary import vehicle_above, vehicle_below
+from nurec_sim.reconstruct.ego_vehicle.boundary import _without_dents, vehicle_above, vehicle_below
 from nurec_sim.reconstruct.ego_vehicle.evidence import static_gradient
 
 HEIGHT, WIDTH, TOP = 100, 200, 60
@@ -88,6 +88,14 @@ def test_dents_of_a_slanted_boundary_are_closed_along_its_slope():
     edges[:, 90:102] = rows[:, 90:102] == side[90:102] + 15
     found = first_rows(vehicle_below(ego, street, edges, near))
     assert np.abs(found - side).max() <= 1
+
+
+def test_a_dent_between_what_reaches_the_upper_end_of_the_image_ends_there():
+    """A boundary that rises by a row every column up to the first row, and a dent beside it."""
+    rows = np.maximum(60 - np.arange(WIDTH), 0)
+    rows[55:63] = 20
+    closed = _without_dents(rows, HEIGHT, 0.25)
+    assert closed.min() == 0 and (closed <= rows).all()
 
 
 @pytest.mark.parametrize("doubt", ["too little evidence", "contradicted", "too small"])

@@ -152,7 +152,7 @@ def _without_dents(rows: Int64[np.ndarray, " w"], height: int, part: float) -> I
     slope = np.polyfit(columns, rows, 1)[0]
     heights = (height - rows + slope * columns)[None].astype(np.float32)
     closed = cv2.morphologyEx(heights, cv2.MORPH_CLOSE, np.ones((1, width)))[0] - slope * columns
-    return np.minimum(rows, height - np.rint(closed).astype(int))
+    return np.clip(height - np.rint(closed).astype(int), 0, rows)
 
 
 def _outwards(rows: Int64[np.ndarray, " w"], edges: Map) -> Bool[np.ndarray, "h w"]:

@@ -55,12 +55,14 @@ def views_beside(views: Sequence[WorkingView], k: int) -> list[int]:
     """
     mine, nearest = views[k], dict[tuple[str, bytes], tuple[int, int]]()
     for n, other in enumerate(views):
+        window, apart = (other.camera_id, other.tile.camera_from_tile.tobytes()), (abs(other.t_us - mine.t_us), n)
+        # Most views of a long log are too late to be looked at closer.
+        if other.camera_id == mine.camera_id or apart > nearest.get(window, apart):
+            continue
         base = float(np.linalg.norm(other.world_from_view[:3, 3] - mine.world_from_view[:3, 3]))
         facing = float(other.world_from_view[:3, 2] @ mine.world_from_view[:3, 2])
-        if other.camera_id == mine.camera_id or not NEAREST_M < base < FARTHEST_M or not OPPOSITE < facing < ALIKE:
-            continue
-        window, apart = (other.camera_id, other.tile.camera_from_tile.tobytes()), (abs(other.t_us - mine.t_us), n)
-        nearest[window] = min(nearest.get(window, apart), apart)
+        if NEAREST_M < base < FARTHEST_M and OPPOSITE < facing < ALIKE:
+            nearest[window] = apart
     points = _some_points(mine)
     shared = sorted((-_share(points, views[n]), n) for _, n in nearest.values())
     return [n for share, n in shared[:BESIDE] if -share >= LEAST_SHARED]
