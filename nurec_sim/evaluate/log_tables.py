@@ -140,10 +140,9 @@ def _image_rows(group: str, frames: Mapping[str, Any]) -> list[Row]:
         Row(group, "SSIM", frames["ssim"], 3, 1),
         Row(group, "FLIP", frames["flip"], 3, -1),
     ]
-    rows += [Row(group, f"PSNR, {name} (dB)", value, 2, 1) for name, value in frames["region_psnr_db"].items()]
-    cameras = frames["camera_psnr_db"]
-    if len(cameras) > 1:
-        rows += [Row(group, f"PSNR, {name} (dB)", value, 2, 1) for name, value in cameras.items()]
+    cameras = frames["camera_psnr_db"] if len(frames["camera_psnr_db"]) > 1 else {}
+    parts = [*frames["region_psnr_db"].items(), *cameras.items()]
+    rows += [Row(group, f"PSNR, {name} (dB)", value, 2, 1) for name, value in parts]
     rows += [Row(group, f"sharpness from {name} cycle/px", frames["sharpness"][name], 2) for name in OCTAVES]
     holes = {name: None if share is None else 100 * share for name, share in frames["holes"].items()}
     return rows + [Row(group, f"holes, {name} (%)", share, 2, -1) for name, share in holes.items()]
