@@ -83,7 +83,7 @@ def test_dents_of_a_slanted_boundary_are_closed_along_its_slope():
     ego, street = (rows > side + 15) * 1.0, (rows < side - 5) * 1.0
     edges[:] = 0
     edges[side, columns[0]] = 1.0
-    # Closed along its rows, the dent would be closed up to its lower end, two rows below the upper one.
+    # Closed along its rows, the dent would be closed up to its lower end, three rows below the upper one.
     street[:, 90:102] = rows[:, 90:102] < side[90:102] + 15
     edges[:, 90:102] = rows[:, 90:102] == side[90:102] + 15
     found = first_rows(vehicle_below(ego, street, edges, near))

@@ -37,6 +37,7 @@ def test_views_beside_are_of_other_cameras_that_look_elsewhere_and_share_somethi
         view_of("right", 0.5, 55, t_us=100_000),
         view_of("right", 1.5, 55, t_us=40_000),
         view_of("left", -0.5, -40, t_us=-50_000),
+        view_of("left", -1.5, -40, t_us=-150_000),
     ]
     # More of the front is to be seen 40 than 55 degrees beside it; of two frames the one nearest in time counts.
     assert views_beside(views, 0) == [9, 8]
